@@ -1,0 +1,3 @@
+"""Waymark: the registry of machine-readable roads."""
+
+__version__ = "0.1.0"

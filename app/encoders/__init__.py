@@ -1,0 +1,1 @@
+"""Marker -> what is built."""

@@ -1,0 +1,84 @@
+"""The domain's errors. They know no HTTP: app/api/problems.py maps them in one table."""
+
+from __future__ import annotations
+
+
+class WaymarkError(Exception):
+    """Root of every error that Waymark raises on purpose.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong, in one sentence.
+    field : str, optional
+        Path of the input at fault, e.g. ``position.lon_deg``.
+    limit : str, optional
+        The bound or rule that was broken, with its unit.
+    cure : str, optional
+        What the caller can do about it.
+    """
+
+    def __init__(
+        self, message: str, *, field: str | None = None, limit: str | None = None, cure: str | None = None
+    ) -> None:
+        super().__init__(message)
+        self.message = message
+        self.field = field
+        self.limit = limit
+        self.cure = cure
+
+
+class InvalidParameter(WaymarkError, ValueError):
+    """A value is outside what the function or the marker's definition allows."""
+
+
+class CodeMismatch(InvalidParameter):
+    """Digits do not fit the scheme: wrong length, wrong alphabet or a failing check."""
+
+
+class ReferenceSystemError(InvalidParameter):
+    """A coordinate reference system is unknown or cannot be transformed with a stated accuracy."""
+
+
+class UnreadableUpload(WaymarkError):
+    """An upload is not what it claims to be, is damaged, or would not fit the limits when decoded."""
+
+
+class UploadTooLarge(UnreadableUpload):
+    """An upload exceeds the limit on bytes or pixels."""
+
+
+class UnsupportedUpload(UnreadableUpload):
+    """An upload is of a kind that no decoder reads."""
+
+
+class NotFound(WaymarkError):
+    """No such thing, or not one that this caller may see."""
+
+
+class Conflict(WaymarkError):
+    """The request contradicts what is stored."""
+
+
+class CodeTaken(Conflict):
+    """Another marker near by already carries this code."""
+
+
+class StaleVersion(Conflict):
+    """The stored row changed since the caller read it."""
+
+
+class NotAuthenticated(WaymarkError):
+    """No key, or a key that is unknown, expired or revoked."""
+
+
+class NotAllowed(WaymarkError):
+    """The key is valid, but its scope does not cover this."""
+
+
+class Unavailable(WaymarkError):
+    """A part the request needs is busy or down; trying again later can work."""
+
+
+class ProofFailed(WaymarkError):
+    """An artwork was rendered and did not read back as its own code."""

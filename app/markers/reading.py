@@ -1,0 +1,122 @@
+"""Outcomes of reading a marker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from app.markers.plate import PlateCode, PlateGeometry
+
+
+class PlateOutcome(StrEnum):
+    """What became of a candidate plate. All but READ carry no digits.
+
+    The first five after READ are the cases that the PolyU paper filters out (section II-D4).
+    """
+
+    READ = "read"
+    GREEN_MARKER_MISSING = "green-marker-missing"
+    RED_MARKER_MISSING = "red-marker-missing"
+    FEWER_THAN_FOUR_VERTICES = "fewer-than-four-vertices"
+    VERTICES_BEYOND_MARKERS = "vertices-beyond-markers"
+    CELLS_UNDECODABLE = "cells-undecodable"
+    UNSURE = "unsure"
+    NOT_IN_REGISTRY = "not-in-registry"
+
+
+@dataclass(frozen=True, slots=True)
+class PlatePose:
+    """Pose of a plate in the camera frame (OpenCV: x right, y down, z forward).
+
+    Attributes
+    ----------
+    rotation : ndarray, shape (3, 3)
+        camera_from_plate; plate axes x right, y travel, z up out of the road.
+    translation_m : ndarray, shape (3,)
+        Plate centre in the camera frame. [m]
+    covariance : ndarray, shape (6, 6)
+        Of (rotation vector [rad] about the camera's axes, translation [m]).
+    reprojection_rms_px : float
+        Root mean square of the corners' residuals. [px]
+    """
+
+    rotation: npt.NDArray[np.float64]
+    translation_m: npt.NDArray[np.float64]
+    covariance: npt.NDArray[np.float64]
+    reprojection_rms_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlateGrade:
+    """Waymark grade of a read plate, modelled on ISO/IEC 15415 (no conformance is claimed): 4 (A) to 0 (F).
+
+    The overall grade is the lowest of its parts.
+    """
+
+    overall: float
+    contrast: float
+    modulation: float
+    fixed_pattern: float
+    axial_nonuniformity: float
+    grid_nonuniformity: float
+    unused_correction: float
+
+    @property
+    def letter(self) -> str:
+        """A, B, C, D or F."""
+        return "FDCBA"[int(self.overall)]
+
+
+@dataclass(frozen=True, slots=True)
+class PlateReading:
+    """One candidate plate in a frame and what was read from it.
+
+    Attributes
+    ----------
+    outcome : PlateOutcome
+    corners_px : ndarray, shape (4, 2), or None
+        Outer corners, clockwise from the triangle's, pixel centres at integers. [px]
+    corners_covariance_px2 : ndarray, shape (8, 8), or None
+        Covariance of the flattened corners. [px2]
+    code : PlateCode or None
+        The digits with their scheme; only when the outcome is READ.
+    confidence : float
+        Probability that all digits are right, 0 to 1.
+    cell_confidence : tuple of float
+        Probability that each cell's symbol is right, in reading order.
+    corrected_cells : tuple of int
+        Cells whose symbol came from error correction or from the codebook.
+    from_codebook : bool
+        The codebook decided, the frame alone would have been refused.
+    geometry : PlateGeometry or None
+    grade : PlateGrade or None
+    pose : PlatePose or None
+        With camera parameters only.
+    height_px, width_px : float
+        Extent of the corners in the image. [px]
+    reason : str
+        Why it was refused, for people.
+    """
+
+    outcome: PlateOutcome
+    corners_px: npt.NDArray[np.float64] | None = None
+    corners_covariance_px2: npt.NDArray[np.float64] | None = None
+    code: PlateCode | None = None
+    confidence: float = 0.0
+    cell_confidence: tuple[float, ...] = ()
+    corrected_cells: tuple[int, ...] = ()
+    from_codebook: bool = False
+    geometry: PlateGeometry | None = None
+    grade: PlateGrade | None = None
+    pose: PlatePose | None = None
+    height_px: float = 0.0
+    width_px: float = 0.0
+    reason: str = ""
+
+    @property
+    def digits(self) -> str | None:
+        """Digits as read, None unless the outcome is READ."""
+        return self.code.digits if self.code else None

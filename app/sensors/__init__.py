@@ -1,0 +1,1 @@
+"""What is on the vehicle: the geometry of its sensors."""

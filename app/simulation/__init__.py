@@ -1,0 +1,1 @@
+"""Scene -> signal: what a sensor on a vehicle would record."""
