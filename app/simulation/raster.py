@@ -1,0 +1,151 @@
+"""Compiled inner loops of the camera simulation: area sampling of squares on the road, and the sensor's noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float32]
+
+
+@numba.njit(cache=True, fastmath=True)
+def accumulate_face(
+    rays: Any,
+    samples: Any,
+    row_time_s: Any,
+    motion: Any,
+    spin: Any,
+    height_m: float,
+    face_from_ground: Any,
+    reflectance: Any,
+    emission: Any,
+    light: Any,
+    shade: Any,
+    shade_from_ground: Any,
+    out: Any,
+    cover: Any,
+) -> None:  # pragma: no cover - compiled
+    """Integrate what each pixel sees of a square on the road over its area and the exposure.
+
+    Parameters
+    ----------
+    rays : float64 (H, W, 3, 3)
+        Of each pixel in the vehicle frame: direction at its centre, and its derivatives by column and by row.
+    samples : float64 (S, 3)
+        Column and row offset within the pixel [px], time from mid-exposure [s].
+    row_time_s : float64 (H,)
+        Mid-exposure of each row. [s]
+    motion, spin : float64 (3,)
+        Velocity [m/s] and angular rate [rad/s] of the camera, vehicle frame.
+    height_m : float
+        Camera above the road. [m]
+    face_from_ground : float64 (2, 3)
+        To columns and rows of the texture, texel edges at integers.
+    reflectance, emission : float32 (T, T, 3)
+        ``emission`` may have no texels.
+    light : float32 (3,)
+        Radiance of a white diffuser in full light.
+    shade : float32 (N, N), shade_from_ground : float64 (2, 3)
+        Share of the light that arrives, by bilinear lookup.
+    out, cover : float32 (H, W, 3), (H, W)
+        Added to: radiance from the square, and the share of the footprint that it fills.
+    """
+    rows, cols = out.shape[0], out.shape[1]
+    count, size = samples.shape[0], reflectance.shape[0]
+    glows = emission.shape[0] > 0
+    weight = 1.0 / count
+    for i in range(rows):
+        for j in range(cols):
+            blue = green = red = hit = 0.0
+            for s in range(count):
+                du, dv, t = samples[s, 0], samples[s, 1], samples[s, 2] + row_time_s[i]
+                dx = rays[i, j, 0, 0] + du * rays[i, j, 1, 0] + dv * rays[i, j, 2, 0]
+                dy = rays[i, j, 0, 1] + du * rays[i, j, 1, 1] + dv * rays[i, j, 2, 1]
+                dz = rays[i, j, 0, 2] + du * rays[i, j, 1, 2] + dv * rays[i, j, 2, 2]
+                ex = dx + t * (spin[1] * dz - spin[2] * dy)
+                ey = dy + t * (spin[2] * dx - spin[0] * dz)
+                ez = dz + t * (spin[0] * dy - spin[1] * dx)
+                if ez > -1e-6:
+                    continue
+                scale = (height_m + motion[2] * t) / -ez
+                gx, gy = ex * scale + motion[0] * t, ey * scale + motion[1] * t
+                fx = face_from_ground[0, 0] * gx + face_from_ground[0, 1] * gy + face_from_ground[0, 2]
+                fy = face_from_ground[1, 0] * gx + face_from_ground[1, 1] * gy + face_from_ground[1, 2]
+                if fx < 0 or fy < 0 or fx >= size or fy >= size:
+                    continue
+                a, b = int(fy), int(fx)
+                lit = weight * _bilinear(shade, shade_from_ground, gx, gy)
+                blue += lit * light[0] * reflectance[a, b, 0]
+                green += lit * light[1] * reflectance[a, b, 1]
+                red += lit * light[2] * reflectance[a, b, 2]
+                if glows:
+                    blue += weight * emission[a, b, 0]
+                    green += weight * emission[a, b, 1]
+                    red += weight * emission[a, b, 2]
+                hit += weight
+            if hit > 0:
+                out[i, j, 0] += blue
+                out[i, j, 1] += green
+                out[i, j, 2] += red
+                cover[i, j] += hit
+
+
+@numba.njit(cache=True, fastmath=True)
+def _bilinear(field: Any, field_from_ground: Any, gx: float, gy: float) -> float:  # pragma: no cover - compiled
+    size = field.shape[0]
+    if size == 1:
+        return float(field[0, 0])
+    u = field_from_ground[0, 0] * gx + field_from_ground[0, 1] * gy + field_from_ground[0, 2]
+    v = field_from_ground[1, 0] * gx + field_from_ground[1, 1] * gy + field_from_ground[1, 2]
+    u, v = min(max(u, 0.0), size - 1.001), min(max(v, 0.0), size - 1.001)
+    c, r = int(u), int(v)
+    p, q = u - c, v - r
+    top = field[r, c] * (1 - p) + field[r, c + 1] * p
+    low = field[r + 1, c] * (1 - p) + field[r + 1, c + 1] * p
+    return float(top * (1 - q) + low * q)
+
+
+@numba.njit(cache=True, fastmath=True)
+def shade_rays(
+    rays: Any, height_m: float, shade: Any, shade_from_ground: Any, out: Any
+) -> None:  # pragma: no cover - compiled
+    """Share of the light that arrives where each ray meets the road; 1 above the horizon. ``out``: float32 (H, W)."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            dz = rays[i, j, 2]
+            if dz > -0.02:
+                out[i, j] = 1.0
+                continue
+            scale = height_m / -dz
+            out[i, j] = _bilinear(shade, shade_from_ground, rays[i, j, 0] * scale, rays[i, j, 1] * scale)
+
+
+@numba.njit(cache=True, fastmath=True)
+def expose_photo(
+    photo: Any, levels: Any, encode: Any, sigma: Any, noise: Any, offsets: Any, out: Any
+) -> None:  # pragma: no cover - compiled
+    """Give a photo the camera's tone and noise.
+
+    Parameters
+    ----------
+    photo, out : uint8 (H, W, C)
+    levels : uint8 (h, w)
+        Index of the light that arrives, on a grid of 4 x 4 pixels.
+    encode, sigma : float32 (L, C, 256)
+        Encoded value and noise of a photo's value at each level. [grey levels]
+    noise : float32 (M,)
+        Standard normal numbers; ``offsets`` : int64 (H,) says where each row starts in them.
+    """
+    rows, cols, channels = photo.shape
+    for i in range(rows):
+        k = offsets[i]
+        for j in range(cols):
+            level = levels[i >> 2, j >> 2]
+            for c in range(channels):
+                v = photo[i, j, c]
+                x = encode[level, c, v] + sigma[level, c, v] * noise[k] + 0.5
+                k += 1
+                out[i, j, c] = 0 if x < 0 else (255 if x >= 255.5 else int(x))
