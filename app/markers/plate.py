@@ -1,6 +1,7 @@
 """The coded plate: layout, code and capacity.
 
-Source: PolyU paper (Wang et al., IEEE T-ITS 23(11), 2022, doi 10.1109/TITS.2022.3173656), section II-B, and docs/nomenclature.md.
+Source: PolyU paper (Wang et al., IEEE T-ITS 23(11), 2022, doi 10.1109/TITS.2022.3173656), section II-B, and
+docs/nomenclature.md.
 
 An ``n`` x ``n`` grid of square units. Two by two units make a cell. The four corner cells are boundary markers (red
 triangle top-left with its right angle at the plate's corner, green squares elsewhere); each other cell holds one
@@ -23,6 +24,7 @@ import numpy.typing as npt
 import reedsolo
 
 from app.errors import CodeMismatch, InvalidParameter
+from app.geodesy import check_lon_lat as check_lon_lat
 
 SIZES = (8, 10, 12)
 UNIT_MM = (20.0, 50.0)
@@ -275,16 +277,12 @@ class PlateCode:
         return int("".join(w[: lay.data // lay.codewords] for w in _deinterleave(self.digits, lay)), 16)
 
     @classmethod
-    def from_symbols(
-        cls, symbols: Sequence[int], scheme: PlateScheme, n: int = 8, check_digits: int = 1
-    ) -> PlateCode:
+    def from_symbols(cls, symbols: Sequence[int], scheme: PlateScheme, n: int = 8, check_digits: int = 1) -> PlateCode:
         """Code of a sequence of symbols, shape (cells,)."""
         return cls("".join(_DIGITS[s] for s in symbols), scheme, n, check_digits)
 
     @classmethod
-    def from_position(
-        cls, lon_deg: float, lat_deg: float, *, n: int = 8, check_digits: int = 0
-    ) -> PlateCode:
+    def from_position(cls, lon_deg: float, lat_deg: float, *, n: int = 8, check_digits: int = 0) -> PlateCode:
         """Position plate: the decimals of |longitude|, then of |latitude|, then the check digits if any.
 
         Parameters
@@ -330,18 +328,6 @@ class PlateCode:
         words = [list(codec.encode(data[i * per_word : (i + 1) * per_word])) for i in range(lay.codewords)]
         woven = [words[i][k] for k in range(len(words[0])) for i in range(lay.codewords)]
         return cls.from_symbols(woven + [0] * lay.spare, PlateScheme.ID, n)
-
-
-def check_lon_lat(lon_deg: float, lat_deg: float, field: str = "position") -> None:
-    """Refuse a position that is out of range or not finite."""
-    for name, value, bound in (("lon_deg", lon_deg, 180.0), ("lat_deg", lat_deg, 90.0)):
-        if not np.isfinite(value) or not -bound <= value <= bound:
-            raise InvalidParameter(
-                f"{name} is {value}, outside -{bound:g} to {bound:g} degrees",
-                field=f"{field}.{name}",
-                limit=f"-{bound:g} to {bound:g} deg",
-                cure="positions are longitude, latitude in degrees; check for swapped axes or another CRS",
-            )
 
 
 def position_decimals(n: int, scheme: PlateScheme, check_digits: int = 1) -> tuple[int, int]:

@@ -1,0 +1,1 @@
+"""HTTP: thin routers, problem documents, authentication and limits."""

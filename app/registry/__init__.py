@@ -1,0 +1,1 @@
+"""The store: tables, connections, spatial search and queries."""

@@ -1,0 +1,44 @@
+"""Answers that were given under an Idempotency-Key."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.registry.tables import idempotency_keys
+
+
+def find_answer(connection: sa.Connection, agency_id: str, key: str, now: datetime) -> sa.RowMapping | None:
+    """The answer that was given under this key, unless it has expired."""
+    query = sa.select(idempotency_keys).where(
+        idempotency_keys.c.agency_id == agency_id,
+        idempotency_keys.c.key == key,
+        idempotency_keys.c.expires_at > now,
+    )
+    return connection.execute(query).mappings().one_or_none()
+
+
+def add_answer(
+    connection: sa.Connection,
+    agency_id: str,
+    key: str,
+    *,
+    request_sha256: str,
+    response: dict[str, Any],
+    now: datetime,
+    expires_at: datetime,
+) -> None:
+    """Remember an answer, and forget all that have expired."""
+    connection.execute(sa.delete(idempotency_keys).where(idempotency_keys.c.expires_at <= now))
+    connection.execute(
+        sa.insert(idempotency_keys).values(
+            agency_id=agency_id,
+            key=key,
+            request_sha256=request_sha256,
+            response=response,
+            created_at=now,
+            expires_at=expires_at,
+        )
+    )

@@ -1,0 +1,197 @@
+"""Queries on markers and their history. All but `find_code_near` see one agency only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.errors import NotFound, StaleVersion
+from app.registry.spatial import Box, within_box, within_radius
+from app.registry.tables import marker_versions, markers
+
+Row = sa.RowMapping
+_PUBLIC = [column for column in markers.c if column.name not in ("row", "agency_id")]
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerFilter:
+    """What a list of markers is narrowed to; None does not narrow."""
+
+    box: Box | None = None
+    near: tuple[float, float, float] | None = None
+    digits: str | None = None
+    status: str | None = None
+
+
+def get_marker(connection: sa.Connection, agency_id: str, marker_id: str) -> Row:
+    """One marker.
+
+    Raises
+    ------
+    NotFound
+        There is none with this id, or it belongs to another agency.
+    """
+    query = sa.select(*_PUBLIC).where(markers.c.id == marker_id, markers.c.agency_id == agency_id)
+    row = connection.execute(query).mappings().one_or_none()
+    if row is None:
+        raise NotFound(f"there is no marker {marker_id}", field="marker_id")
+    return row
+
+
+def get_markers(connection: sa.Connection, agency_id: str, marker_ids: list[str]) -> list[Row]:
+    """Several markers, in the order asked for.
+
+    Raises
+    ------
+    NotFound
+        One is missing, or belongs to another agency.
+    """
+    query = sa.select(*_PUBLIC).where(markers.c.agency_id == agency_id)
+    found: dict[str, Row] = {}
+    for start in range(0, len(marker_ids), 500):
+        chunk = query.where(markers.c.id.in_(marker_ids[start : start + 500]))
+        found.update({row["id"]: row for row in connection.execute(chunk).mappings()})
+    missing = next((marker_id for marker_id in marker_ids if marker_id not in found), None)
+    if missing is not None:
+        raise NotFound(f"there is no marker {missing}", field="marker_ids")
+    return [found[marker_id] for marker_id in marker_ids]
+
+
+def list_markers(
+    connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, *, after: str | None, limit: int
+) -> list[Row]:
+    """Markers in the order of their ids, which is the order they were registered in."""
+    query = sa.select(*_PUBLIC).where(markers.c.agency_id == agency_id, *_conditions(narrowed))
+    if after is not None:
+        query = query.where(markers.c.id > after)
+    return list(connection.execute(query.order_by(markers.c.id).limit(limit)).mappings())
+
+
+def _conditions(narrowed: MarkerFilter) -> list[sa.ColumnElement[bool]]:
+    conditions = []
+    if narrowed.box is not None:
+        conditions.append(within_box(narrowed.box))
+    if narrowed.near is not None:
+        conditions.append(within_radius(*narrowed.near))
+    if narrowed.digits is not None:
+        conditions.append(markers.c.digits == narrowed.digits)
+    if narrowed.status is not None:
+        conditions.append(markers.c.status == narrowed.status)
+    return conditions
+
+
+def list_plates_near(
+    connection: sa.Connection, agency_id: str, lon_deg: float, lat_deg: float, radius_m: float, *, limit: int = 1000
+) -> list[Row]:
+    """The agency's plates within a radius that may be on the road: all but the retired ones."""
+    query = (
+        sa.select(*_PUBLIC)
+        .where(
+            markers.c.agency_id == agency_id,
+            markers.c.family == "plate",
+            markers.c.status != "retired",
+            within_radius(lon_deg, lat_deg, radius_m),
+        )
+        .order_by(sa.func.waymark_distance_m(markers.c.lon_deg, markers.c.lat_deg, lon_deg, lat_deg))
+        .limit(limit)
+    )
+    return list(connection.execute(query).mappings())
+
+
+def find_code_near(
+    connection: sa.Connection,
+    digits: str,
+    lon_deg: float,
+    lat_deg: float,
+    radius_m: float,
+    *,
+    ignoring: str | None = None,
+) -> Row | None:
+    """A plate of any agency that carries these digits within a radius and may be on the road."""
+    query = sa.select(markers.c.id, markers.c.agency_id).where(
+        markers.c.digits == digits, markers.c.status != "retired", within_radius(lon_deg, lat_deg, radius_m)
+    )
+    if ignoring is not None:
+        query = query.where(markers.c.id != ignoring)
+    return connection.execute(query.limit(1)).mappings().one_or_none()
+
+
+def find_id_code(connection: sa.Connection, digits: str, n: int) -> Row | None:
+    """The plate of any agency that carries, or once carried, these digits of the id scheme."""
+    query = sa.select(markers.c.id, markers.c.agency_id).where(
+        markers.c.digits == digits, markers.c.n == n, markers.c.scheme == "id"
+    )
+    return connection.execute(query).mappings().one_or_none()
+
+
+def add_marker(
+    connection: sa.Connection, agency_id: str, values: Mapping[str, Any], *, who: str, why: str | None
+) -> Row:
+    """Store a new marker with the first entry of its history."""
+    connection.execute(sa.insert(markers).values(agency_id=agency_id, **values))
+    return _recorded(connection, agency_id, values["id"], who=who, why=why)
+
+
+def update_marker(
+    connection: sa.Connection,
+    agency_id: str,
+    marker_id: str,
+    changes: Mapping[str, Any],
+    *,
+    version: int,
+    now: datetime,
+    who: str,
+    why: str | None,
+) -> Row:
+    """Change a marker that is still at the version the caller read, and add to its history.
+
+    Raises
+    ------
+    StaleVersion
+        It was changed since.
+    """
+    statement = (
+        sa.update(markers)
+        .where(markers.c.id == marker_id, markers.c.agency_id == agency_id, markers.c.version == version)
+        .values(**changes, version=version + 1, updated_at=now)
+    )
+    if connection.execute(statement).rowcount != 1:
+        raise StaleVersion(f"marker {marker_id} is no longer at version {version}", field="If-Match")
+    return _recorded(connection, agency_id, marker_id, who=who, why=why)
+
+
+def list_versions(
+    connection: sa.Connection, agency_id: str, marker_id: str, *, after: int = 0, limit: int = 100
+) -> list[Row]:
+    """The history of a marker, oldest first."""
+    query = (
+        sa.select(marker_versions)
+        .where(
+            marker_versions.c.marker_id == marker_id,
+            marker_versions.c.agency_id == agency_id,
+            marker_versions.c.version > after,
+        )
+        .order_by(marker_versions.c.version)
+        .limit(limit)
+    )
+    return list(connection.execute(query).mappings())
+
+
+def _recorded(connection: sa.Connection, agency_id: str, marker_id: str, *, who: str, why: str | None) -> Row:
+    row = get_marker(connection, agency_id, marker_id)
+    connection.execute(
+        sa.insert(marker_versions).values(
+            marker_id=marker_id,
+            version=row["version"],
+            agency_id=agency_id,
+            at=row["updated_at"],
+            who=who,
+            why=why,
+            marker=dict(row),
+        )
+    )
+    return row

@@ -1,0 +1,188 @@
+"""Tables. Every owned table has an ``agency_id``; migrations/ creates what is declared here, and a test compares."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Dialect
+
+_NAMES = {
+    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+    "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+    "ck": "ck_%(table_name)s_%(constraint_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_name)s",
+    "pk": "pk_%(table_name)s",
+}
+metadata = sa.MetaData(naming_convention=_NAMES)
+
+ID = sa.String(36)
+STATUSES = ("planned", "built", "surveyed", "active", "suspect", "retired")
+DECODE_STATES = ("queued", "running", "done", "failed", "cancelled")
+SCOPES = ("read", "decode", "write", "admin")
+
+
+class UtcTime(sa.TypeDecorator[datetime]):
+    """Aware UTC times, also on databases that keep no zone."""
+
+    impl = sa.DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Store UTC."""
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError("times are aware")
+        return value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Return aware UTC."""
+        return value.replace(tzinfo=UTC) if value is not None and value.tzinfo is None else value
+
+
+def _one_of(column: str, values: tuple[str, ...]) -> sa.CheckConstraint:
+    return sa.CheckConstraint(f"{column} IN ({', '.join(repr(v) for v in values)})", name=column)
+
+
+agencies = sa.Table(
+    "agencies",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    sa.Column("name", sa.String(200), nullable=False, unique=True),
+    sa.Column("created_at", UtcTime, nullable=False),
+)
+
+
+def _agency() -> sa.Column[str]:
+    return sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), nullable=False)
+
+
+api_keys = sa.Table(
+    "api_keys",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    _agency(),
+    sa.Column("label", sa.String(200), nullable=False),
+    sa.Column("prefix", sa.String(16), nullable=False),
+    sa.Column("sha256", sa.String(64), nullable=False, unique=True),
+    sa.Column("scope", sa.String(16), nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("expires_at", UtcTime),
+    sa.Column("revoked_at", UtcTime),
+    sa.Column("last_used_at", UtcTime),
+    _one_of("scope", SCOPES),
+)
+
+markers = sa.Table(
+    "markers",
+    metadata,
+    # the integer key is what the spatial index refers to; clients only see the id
+    sa.Column("row", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), primary_key=True, autoincrement=True),
+    sa.Column("id", ID, nullable=False, unique=True),
+    _agency(),
+    sa.Column("family", sa.String(16), nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
+    sa.Column("scheme", sa.String(16)),
+    sa.Column("digits", sa.String(64)),
+    sa.Column("check_digits", sa.Integer),
+    sa.Column("digits_match_position", sa.Boolean),
+    sa.Column("n", sa.Integer),
+    sa.Column("unit_mm", sa.Double),
+    sa.Column("gap_mm", sa.Double),
+    sa.Column("thickness_mm", sa.Double),
+    sa.Column("lon_deg", sa.Double, nullable=False),
+    sa.Column("lat_deg", sa.Double, nullable=False),
+    sa.Column("height_m", sa.Double),
+    sa.Column("heading_deg", sa.Double),
+    sa.Column("heading_rmse_deg", sa.Double),
+    sa.Column("crs", sa.String(64), nullable=False),
+    sa.Column("realization", sa.String(64)),
+    sa.Column("epoch", sa.Double),
+    sa.Column("vertical_datum", sa.String(64)),
+    sa.Column("horizontal_rmse_m", sa.Double),
+    sa.Column("vertical_rmse_m", sa.Double),
+    sa.Column("survey_method", sa.String(200)),
+    sa.Column("original", sa.JSON, nullable=False),
+    sa.Column("localization_grade", sa.String(64), nullable=False),
+    sa.Column("transform_note", sa.String(500)),
+    sa.Column("road", sa.String(200)),
+    sa.Column("measure_m", sa.Double),
+    sa.Column("offset_m", sa.Double),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    _one_of("status", STATUSES),
+    sa.CheckConstraint("lon_deg BETWEEN -180 AND 180 AND lat_deg BETWEEN -90 AND 90", name="position"),
+    sa.Index("ix_markers_agency_id_id", "agency_id", "id"),
+    sa.Index("ix_markers_digits", "digits"),
+    sqlite_autoincrement=True,
+)
+# a registry number names one plate on the whole server, for ever
+sa.Index(
+    "uq_markers_id_digits",
+    markers.c.digits,
+    markers.c.n,
+    unique=True,
+    sqlite_where=markers.c.scheme == "id",
+    postgresql_where=markers.c.scheme == "id",
+)
+
+marker_versions = sa.Table(
+    "marker_versions",
+    metadata,
+    sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    _agency(),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("why", sa.String(500)),
+    sa.Column("marker", sa.JSON, nullable=False),
+)
+
+decodes = sa.Table(
+    "decodes",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    _agency(),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("kind", sa.String(32), nullable=False),
+    sa.Column("context", sa.JSON, nullable=False),
+    sa.Column("upload_key", sa.String(200)),
+    sa.Column("picture_key", sa.String(200)),
+    sa.Column("result", sa.JSON(none_as_null=True)),
+    sa.Column("error", sa.JSON(none_as_null=True)),
+    sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("progress", sa.Double, nullable=False, server_default="0"),
+    sa.Column("cancel_requested", sa.Boolean, nullable=False, server_default=sa.false()),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("finished_at", UtcTime),
+    _one_of("state", DECODE_STATES),
+    sa.Index("ix_decodes_agency_id_id", "agency_id", "id"),
+    sa.Index("ix_decodes_state", "state"),
+)
+
+observations = sa.Table(
+    "observations",
+    metadata,
+    sa.Column("decode_id", ID, sa.ForeignKey("decodes.id"), primary_key=True),
+    sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), primary_key=True),
+    sa.Column("frame", sa.Integer, primary_key=True, autoincrement=False, server_default="0"),
+    _agency(),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("what", sa.String(32), nullable=False),
+    sa.Column("detail", sa.JSON(none_as_null=True)),
+    sa.Index("ix_observations_marker_id_at", "marker_id", "at"),
+)
+
+idempotency_keys = sa.Table(
+    "idempotency_keys",
+    metadata,
+    sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
+    sa.Column("key", sa.String(200), primary_key=True),
+    sa.Column("request_sha256", sa.String(64), nullable=False),
+    sa.Column("response", sa.JSON, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("expires_at", UtcTime, nullable=False),
+    sa.Index("ix_idempotency_keys_expires_at", "expires_at"),
+)

@@ -1,0 +1,124 @@
+"""Who may call: agencies, their keys and what a key's scope covers."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from enum import StrEnum
+
+from app.errors import InvalidParameter, NotAllowed, NotAuthenticated
+from app.registry import agencies
+from app.registry.database import Database
+from app.services.ports import Clock
+
+FIRST_AGENCY = "default"
+_ENVIRONMENT = "WAYMARK_ADMIN_KEY"
+_TOUCH_EVERY = timedelta(hours=1)
+
+
+class Scope(StrEnum):
+    """What a key may do; each covers those before it."""
+
+    READ = "read"
+    DECODE = "decode"
+    WRITE = "write"
+    ADMIN = "admin"
+
+    def covers(self, needed: Scope) -> bool:
+        """Whether this scope includes another."""
+        order = list(Scope)
+        return order.index(self) >= order.index(needed)
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """An authenticated caller."""
+
+    agency_id: str
+    key_id: str
+    label: str
+    scope: Scope
+
+    def require(self, needed: Scope) -> None:
+        """Refuse unless the key's scope covers `needed`."""
+        if not self.scope.covers(needed):
+            raise NotAllowed(
+                f"this key's scope is {self.scope}, the request needs {needed}",
+                limit=f"scope {needed}",
+                cure="use a key with a wider scope",
+            )
+
+
+class Access:
+    """Creates and checks keys."""
+
+    def __init__(self, database: Database, clock: Clock) -> None:
+        self._database = database
+        self._clock = clock
+
+    def authenticate(self, key: str) -> Caller:
+        """The caller behind a key.
+
+        Raises
+        ------
+        NotAuthenticated
+            The key is unknown, expired or revoked.
+        """
+        now = self._clock()
+        with self._database.read() as connection:
+            row = agencies.find_key(connection, key)
+        if row is None or row["revoked_at"] is not None or (row["expires_at"] is not None and row["expires_at"] <= now):
+            raise NotAuthenticated(
+                "the key is unknown, expired or revoked", field="Authorization", cure="ask your agency for a valid key"
+            )
+        if row["last_used_at"] is None or now - row["last_used_at"] >= _TOUCH_EVERY:
+            with self._database.write() as connection:
+                agencies.touch_key(connection, row["id"], now)
+        return Caller(row["agency_id"], row["id"], row["label"], Scope(row["scope"]))
+
+    def ensure_first_key(self, admin_key: str | None = None) -> str | None:
+        """On an empty database create an agency with an admin key; afterwards keep `admin_key` in step.
+
+        Returns
+        -------
+        str or None
+            The key to show once, if one was made up here.
+        """
+        now = self._clock()
+        with self._database.write() as connection:
+            first = agencies.find_first_agency(connection)
+            agency_id = first or agencies.add_agency(connection, FIRST_AGENCY, now)
+            if admin_key is not None:
+                known = agencies.find_key(connection, admin_key)
+                agencies.revoke_keys_labelled(connection, _ENVIRONMENT, now)
+                if known is None:
+                    agencies.add_key(
+                        connection, admin_key, agency_id=agency_id, scope=Scope.ADMIN, label=_ENVIRONMENT, now=now
+                    )
+                elif known["label"] == _ENVIRONMENT:
+                    agencies.restore_key(connection, known["id"])
+                return None
+            if first is not None:
+                return None
+            key = new_key()
+            agencies.add_key(connection, key, agency_id=agency_id, scope=Scope.ADMIN, label="first admin key", now=now)
+            return key
+
+    def create_key(self, agency: str, scope: Scope, label: str, expires_at: datetime | None = None) -> str:
+        """A new key for an agency, which is created if there is none of that name. Shown once, stored as a hash."""
+        if not agency.strip() or len(agency) > 200:
+            raise InvalidParameter("an agency's name has 1 to 200 characters", field="agency", limit="1 to 200")
+        now = self._clock()
+        key = new_key()
+        with self._database.write() as connection:
+            agency_id = agencies.find_agency(connection, agency) or agencies.add_agency(connection, agency, now)
+            agencies.add_key(
+                connection, key, agency_id=agency_id, scope=scope, label=label, now=now, expires_at=expires_at
+            )
+        return key
+
+
+def new_key() -> str:
+    """A key with 256 random bits."""
+    return f"wmk_{secrets.token_urlsafe(32)}"

@@ -1,0 +1,69 @@
+"""Settings: one class, read from `WAYMARK_*` when an entry point asks for it, never at import."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+MIN_ADMIN_KEY_CHARACTERS = 24
+
+
+class Settings(BaseSettings):
+    """Everything that can be set; the defaults run the embedded server on a fresh machine."""
+
+    model_config = SettingsConfigDict(env_prefix="WAYMARK_", frozen=True, extra="ignore", env_ignore_empty=True)
+
+    data_dir: Path = Field(default=Path("var"), description="Folder of the embedded database and of uploads.")
+    database_url: str = Field(default="", description="SQLAlchemy URL; empty means a SQLite file in the data folder.")
+    host: str = Field(default="127.0.0.1", description="Address to listen on.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
+    public_url: str = Field(default="", description="Where clients reach the server; goes into QR codes and links.")
+    admin_key: SecretStr | None = Field(default=None, description="Admin key to use instead of a generated one.")
+
+    max_json_bytes: int = Field(default=1024**2, ge=1024, description="Largest JSON body. [byte]")
+    max_upload_bytes: int = Field(default=32 * 1024**2, ge=1024, description="Largest upload. [byte]")
+    max_image_pixels: int = Field(default=50_000_000, ge=1, description="Largest picture. [px]")
+    body_timeout_s: float = Field(default=30.0, gt=0, description="Longest wait for the next part of a body. [s]")
+    decode_memory_bytes: int = Field(default=3 * 1024**3, ge=2**28, description="Address space of a decoder. [byte]")
+    decode_timeout_s: float = Field(default=20.0, gt=0, description="Longest decode of one frame. [s]")
+    decode_workers: int = Field(default=2, ge=1, le=256, description="Decoder processes.")
+
+    explicit_code_radius_m: float = Field(
+        default=20_000.0, ge=0, le=1e6, description="No two plates with the same given digits within this. [m]"
+    )
+    position_code_radius_m: float = Field(
+        default=1_000.0, ge=0, le=1e6, description="No two position plates with the same digits within this. [m]"
+    )
+    crs_accuracy_m: float = Field(
+        default=0.1, ge=0, le=1, description="Worst stated accuracy of a transformation that still counts as exact. [m]"
+    )
+    idempotency_ttl_h: float = Field(default=24.0, gt=0, description="How long an Idempotency-Key is remembered. [h]")
+
+    log_format: Literal["console", "json"] = Field(default="console", description="How log lines are written.")
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(default="INFO", description="Least level logged.")
+
+    @field_validator("admin_key")
+    @classmethod
+    def _long_enough(cls, key: SecretStr | None) -> SecretStr | None:
+        if key is not None and len(key.get_secret_value()) < MIN_ADMIN_KEY_CHARACTERS:
+            raise ValueError(f"an admin key has at least {MIN_ADMIN_KEY_CHARACTERS} characters")
+        return key
+
+    @model_validator(mode="after")
+    def _supported_database(self) -> Self:
+        if self.database_url and not self.database_url.startswith("sqlite:///"):
+            raise ValueError("database_url must be sqlite:///PATH; other databases are not supported yet")
+        return self
+
+    @property
+    def resolved_database_url(self) -> str:
+        """Database URL with the default filled in."""
+        return self.database_url or f"sqlite:///{self.data_dir / 'waymark.sqlite3'}"
+
+    @property
+    def resolved_public_url(self) -> str:
+        """Public URL without a trailing slash, with the default filled in."""
+        return self.public_url.rstrip("/") or f"http://{self.host}:{self.port}"

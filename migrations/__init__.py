@@ -1,0 +1,1 @@
+"""Schema migrations, applied by `waymark migrate` and by `waymark serve`."""

@@ -1,0 +1,14 @@
+"""Runs migrations on the connection that app/registry/database.py hands over, inside its transaction."""
+
+from __future__ import annotations
+
+from alembic import context
+
+from app.registry.tables import metadata
+
+context.configure(
+    connection=context.config.attributes["connection"],
+    target_metadata=metadata,
+    render_as_batch=True,
+)
+context.run_migrations()
