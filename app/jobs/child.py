@@ -1,0 +1,115 @@
+"""What runs inside a decoder process. Nothing here may write a file, open a socket or touch the database."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from app.decoders.images import load_image
+from app.errors import UnreadableUpload
+from app.jobs.annotate import draw_outlines
+from app.markers.plate import PlateCode
+from app.markers.reading import PlateReading
+from app.services.frames import AnnotationTask, FrameResult, FrameTask
+
+DecodePlates = Callable[..., list[PlateReading]]
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True, slots=True)
+class ChildLimits:
+    """What a decoder process may use.
+
+    Attributes
+    ----------
+    memory_bytes : int
+        Its whole address space, libraries included. [byte]
+    timeout_s : float
+        Longest time on one task. [s]
+    """
+
+    memory_bytes: int = 3 * 1024**3
+    timeout_s: float = 20.0
+
+
+class _State:
+    decode: DecodePlates | None = None
+
+
+def warm_child(decode: DecodePlates, limits: ChildLimits) -> None:
+    """Prepare a fresh process: one thread, compiled kernels loaded, then the address space closed."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a decoder stuck in native code must still die at once
+    cv2.setNumThreads(1)
+    cv2.ocl.setUseOpenCL(False)
+    _State.decode = decode
+    decode(_warm_frame(), camera=None, codebook=(), thermal=False)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (limits.memory_bytes, limits.memory_bytes))
+
+
+def decode_frame(task: FrameTask) -> FrameResult:
+    """Load one frame and decode its plates."""
+    if _State.decode is None:
+        raise RuntimeError("the decoder process was not warmed")
+    options = {"geometries": task.geometries} if task.geometries else {}
+    with _memory_is_the_limit():
+        began = time.perf_counter()
+        frame = load_image(task.data, task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
+        loaded = time.perf_counter()
+        readings = _State.decode(
+            frame.pixels, camera=task.camera, codebook=task.codebook, thermal=task.thermal, **options
+        )
+        done = time.perf_counter()
+    return FrameResult(frame.header, tuple(readings), 1e3 * (loaded - began), 1e3 * (done - loaded))
+
+
+def annotate_frame(task: AnnotationTask) -> bytes:
+    """Draw outlines over a frame and encode it."""
+    with _memory_is_the_limit():
+        frame = load_image(task.data, task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
+        options = [cv2.IMWRITE_JPEG_QUALITY, 90] if task.suffix == "jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 3]
+        _ok, encoded = cv2.imencode(f".{task.suffix}", draw_outlines(frame.pixels, task.outlines), options)
+        return bytes(encoded)
+
+
+@contextmanager
+def _memory_is_the_limit() -> Iterator[None]:
+    """Report an allocation that the process's limit refused as the upload's fault, which it is."""
+    try:
+        yield
+    except (MemoryError, cv2.error) as error:
+        if isinstance(error, cv2.error) and error.code != cv2.Error.StsNoMem:
+            raise
+        raise UnreadableUpload(
+            "decoding the picture takes more memory than a decoder process has",
+            field="file",
+            limit=f"{resource.getrlimit(resource.RLIMIT_AS)[0]} bytes",
+            cure="send frames at the camera's resolution, or crop them to the road",
+        ) from error
+
+
+def _warm_frame() -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """A plate seen from straight above, so that every stage of the decoder runs once."""
+    pitch, gap, unit = 10, 1, 9
+    code = PlateCode.from_position(114.179583, 22.305278)
+    side = code.n * pitch + gap
+    plate = np.full((side, side, 3), 235, np.uint8)
+    for row, column in np.argwhere(code.units):
+        y, x = gap + row * pitch, gap + column * pitch
+        plate[y : y + unit, x : x + unit] = 25
+    near, far, cell = gap, side - gap - 2 * pitch + gap, 2 * pitch - gap
+    for y, x in ((near, far), (far, far), (far, near)):
+        plate[y : y + cell, x : x + cell] = (60, 160, 30)
+    triangle = np.array([[near, near], [near + cell, near], [near, near + cell]], dtype=np.int32)
+    cv2.fillPoly(plate, [triangle], (40, 40, 200))
+    frame = np.full((480, 640, 3), 110, np.uint8)
+    frame[200 : 200 + side, 280 : 280 + side] = plate
+    return frame

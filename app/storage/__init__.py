@@ -1,0 +1,1 @@
+"""Uploads and artwork: a local folder or S3."""

@@ -1,0 +1,119 @@
+"""Blobs: uploads in a local folder or an S3 bucket, written once under keys that the server chose."""
+
+from __future__ import annotations
+
+import os
+import re
+import uuid
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import obstore
+from obstore.exceptions import AlreadyExistsError, BaseError
+from obstore.store import LocalStore, ObjectStore, from_url
+
+from app.errors import Conflict, InvalidParameter, NotFound, Unavailable
+
+_KEY = re.compile(r"[a-z]+/[0-9a-f]{2}/[0-9a-f]{32}")
+_URL = "file:///FOLDER or s3://BUCKET/PREFIX"
+
+
+def new_blob_key(kind: str) -> str:
+    """A fresh random key. Nothing of it comes from the client, and it says nothing about the content."""
+    name = uuid.uuid4().hex
+    return f"{kind}/{name[:2]}/{name}"
+
+
+class Blobs:
+    """Create-once store of bytes.
+
+    Parameters
+    ----------
+    url : str
+        ``file:///FOLDER`` or ``s3://BUCKET/PREFIX``; credentials and endpoint of S3 come from AWS_* variables.
+
+    Raises
+    ------
+    InvalidParameter
+        The URL names no store that is supported.
+    """
+
+    def __init__(self, url: str) -> None:
+        parts = urlsplit(url)
+        self._folder: Path | None = None
+        self._store: ObjectStore
+        if parts.scheme == "file" and not parts.netloc and parts.path:
+            self._folder = Path(unquote(parts.path))
+            self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._store = LocalStore(self._folder)
+        elif parts.scheme == "s3" and parts.netloc:
+            self._store = from_url(url)
+        else:
+            raise InvalidParameter(f"no blob store at {url!r}", field="blobs_url", limit=_URL)
+
+    def put(self, key: str, data: bytes, *, durable: bool = False) -> None:
+        """Write a blob that does not exist yet.
+
+        Parameters
+        ----------
+        key : str
+            From `new_blob_key`.
+        data : bytes
+        durable : bool
+            On a local folder, return only when the bytes would survive a power failure. S3 always does.
+
+        Raises
+        ------
+        Conflict
+            The key is taken.
+        """
+        _check_key(key)
+        try:
+            obstore.put(self._store, key, data, mode="create", use_multipart=False)
+        except AlreadyExistsError as error:
+            raise Conflict(f"blob {key} exists") from error
+        except (BaseError, OSError) as error:
+            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
+        if durable and self._folder is not None:
+            path = self._folder / key
+            for place in (path, path.parent, path.parent.parent):
+                _sync(place)
+
+    def get(self, key: str) -> bytes:
+        """Content of a blob.
+
+        Raises
+        ------
+        NotFound
+            There is none.
+        """
+        _check_key(key)
+        try:
+            return bytes(obstore.get(self._store, key).bytes())
+        except FileNotFoundError as error:
+            raise NotFound(f"blob {key} is gone") from error
+        except (BaseError, OSError) as error:
+            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
+
+    def delete(self, key: str) -> None:
+        """Remove a blob; one that is gone already is no error."""
+        _check_key(key)
+        try:
+            obstore.delete(self._store, key)
+        except FileNotFoundError:
+            return
+        except (BaseError, OSError) as error:
+            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
+
+
+def _check_key(key: str) -> None:
+    if not _KEY.fullmatch(key):
+        raise InvalidParameter(f"{key!r} is no blob key")
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,45 @@
+"""A decoder whose behaviour the frame's first pixel chooses: processes are tested with it, not codes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from app.errors import InvalidParameter
+from app.markers.plate import PlateCode
+from app.markers.reading import PlateOutcome, PlateReading
+
+OBEY, SLEEP, DIE, HOG, RAISE, BUG = 10, 60, 110, 160, 210, 250
+
+
+def frame_that(what: int) -> np.ndarray[Any, Any]:
+    """RGB frame that makes the decoder do something."""
+    frame = np.full((64, 96, 3), 128, np.uint8)
+    frame[:16, :16] = what
+    return frame
+
+
+def decode(pixels: Any, *, codebook: Sequence[PlateCode] = (), **_options: Any) -> list[PlateReading]:
+    """Do what the corner pixel says."""
+    what = min((OBEY, SLEEP, DIE, HOG, RAISE, BUG), key=lambda known: abs(known - int(pixels[4, 4].min())))
+    if pixels.shape[0] == 480:  # the frame that warms the process
+        return []
+    if what == SLEEP:
+        time.sleep(600)
+    elif what == DIE:
+        os.kill(os.getpid(), signal.SIGKILL)
+    elif what == HOG:
+        np.ones(4 * 1024**3, np.uint8)
+    elif what == RAISE:
+        raise InvalidParameter("no", field="a.b", limit="c", cure="d")
+    elif what == BUG:
+        raise ZeroDivisionError("a defect")
+    threads = {"cv2": __import__("cv2").getNumThreads()}
+    return [
+        PlateReading(PlateOutcome.READ, code=code, reason=f"{os.getpid()} {threads['cv2']}") for code in codebook
+    ] or [PlateReading(PlateOutcome.UNSURE, reason=str(os.getpid()))]

@@ -1,0 +1,183 @@
+"""Decoder processes: real ones, really killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from app.errors import InvalidParameter, Unavailable, UnreadableUpload
+from app.jobs.child import ChildLimits
+from app.jobs.pool import DecodePool
+from app.markers.plate import PlateCode
+from app.markers.reading import PlateOutcome
+from app.services.frames import AnnotationTask, FrameTask, Outline
+from tests.jobs import standin
+from tests.uploads.pictures import huge_png, jpeg, lying_png, png
+
+CODE = PlateCode.from_position(8.5, 49.0)
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[DecodePool]:
+    made = DecodePool(standin.decode, workers=2, limits=ChildLimits(timeout_s=2.0))
+    made.open()
+    yield made
+    made.close()
+
+
+def task_that(what: int) -> FrameTask:
+    return FrameTask(png(standin.frame_that(what)), codebook=(CODE,))
+
+
+def child_of(pool: DecodePool) -> int:
+    return int(pool.start(task_that(standin.OBEY)).result().readings[0].reason.split()[0])
+
+
+def test_a_frame_goes_there_and_back(pool: DecodePool) -> None:
+    result = pool.start(task_that(standin.OBEY)).result()
+    assert (result.header.width_px, result.header.height_px) == (96, 64)
+    assert result.readings[0].outcome is PlateOutcome.READ
+    assert result.readings[0].digits == CODE.digits
+    pid, cv2_threads = result.readings[0].reason.split()
+    assert int(pid) != os.getpid()
+    assert cv2_threads == "1"
+
+
+def test_a_refusal_keeps_its_field_limit_and_cure(pool: DecodePool) -> None:
+    with pytest.raises(InvalidParameter) as caught:
+        pool.start(task_that(standin.RAISE)).result()
+    assert (caught.value.message, caught.value.field, caught.value.limit, caught.value.cure) == ("no", "a.b", "c", "d")
+
+
+def test_a_defect_stays_a_defect(pool: DecodePool) -> None:
+    with pytest.raises(ZeroDivisionError):
+        pool.start(task_that(standin.BUG)).result()
+
+
+def test_a_killed_process_loses_only_its_own_frame(pool: DecodePool) -> None:
+    good = [pool.start(task_that(standin.OBEY)) for _ in range(4)]
+    bad = pool.start(task_that(standin.DIE))
+    more = [pool.start(task_that(standin.OBEY)) for _ in range(4)]
+    assert [p.result().readings[0].digits for p in good] == [CODE.digits] * 4
+    with pytest.raises(UnreadableUpload, match="stopped the decoder process"):
+        bad.result()
+    assert [p.result().readings[0].digits for p in more] == [CODE.digits] * 4
+
+
+def test_killing_idle_processes_costs_no_frame(pool: DecodePool) -> None:
+    for _round in range(2):
+        os.kill(child_of(pool), signal.SIGKILL)
+        assert pool.start(task_that(standin.OBEY)).result().readings[0].digits == CODE.digits
+        time.sleep(0.5)
+        assert pool.start(task_that(standin.OBEY)).result().readings[0].digits == CODE.digits
+
+
+def test_a_process_killed_from_outside_is_tried_again(pool: DecodePool) -> None:
+    """An out-of-memory killer takes a child in the middle of somebody's good frame."""
+    slow = DecodePool(slow_decode, workers=1, limits=ChildLimits(timeout_s=30))
+    slow.open()
+    try:
+        victim = int(slow.start(task_that(standin.OBEY)).result().readings[0].reason)
+        pending = slow.start(task_that(standin.OBEY))
+        time.sleep(0.2)
+        os.kill(victim, signal.SIGKILL)
+        assert int(pending.result().readings[0].reason) != victim
+    finally:
+        slow.close()
+
+
+def slow_decode(pixels: object, **_options: object) -> list[object]:
+    time.sleep(0.6)
+    return standin.decode(pixels)  # type: ignore[return-value]
+
+
+def test_a_frame_that_takes_too_long_is_stopped(pool: DecodePool) -> None:
+    began = time.monotonic()
+    with pytest.raises(UnreadableUpload, match="too long") as caught:
+        pool.start(task_that(standin.SLEEP)).result()
+    assert 1.9 < time.monotonic() - began < 8
+    assert caught.value.limit == "2 s a frame"
+    assert child_of(pool)
+
+
+def test_a_running_frame_can_be_cancelled(pool: DecodePool) -> None:
+    pending = pool.start(task_that(standin.SLEEP))
+    threading.Timer(0.3, pending.cancel).start()
+    began = time.monotonic()
+    with pytest.raises(Unavailable):
+        pending.result()
+    assert time.monotonic() - began < 1.9
+    assert child_of(pool)
+
+
+def test_memory_has_a_limit(pool: DecodePool) -> None:
+    with pytest.raises(UnreadableUpload, match="more memory") as caught:
+        pool.start(task_that(standin.HOG)).result()
+    assert caught.value.limit == f"{3 * 1024**3} bytes"
+    assert child_of(pool)
+
+
+@pytest.mark.parametrize("data", [lying_png(), huge_png(), b"", b"no picture", jpeg()[:-400]])
+def test_bad_pictures_are_refused_in_the_child_too(pool: DecodePool, data: bytes) -> None:
+    with pytest.raises(UnreadableUpload) as caught:
+        pool.start(FrameTask(data)).result()
+    assert caught.value.field == "file"
+
+
+def test_more_frames_than_places_are_refused_as_busy() -> None:
+    small = DecodePool(slow_decode, workers=1, max_waiting=2)
+    small.open()
+    try:
+        waiting = [small.start(task_that(standin.OBEY)) for _ in range(2)]
+        with pytest.raises(Unavailable, match="busy"):
+            small.start(task_that(standin.OBEY))
+        for pending in waiting:
+            pending.result()
+        small.start(task_that(standin.OBEY)).result()
+    finally:
+        small.close()
+
+
+def test_a_decoder_that_cannot_start_is_unavailable() -> None:
+    broken = DecodePool(broken_decode, workers=1)
+    with pytest.raises(Unavailable):
+        broken.open()
+    broken.close()
+
+
+def broken_decode(*_args: object, **_options: object) -> list[object]:
+    raise ImportError("no kernels")
+
+
+def test_a_closed_pool_leaves_no_process_and_takes_no_frame() -> None:
+    made = DecodePool(standin.decode, workers=1)
+    made.open()
+    child = int(made.start(task_that(standin.OBEY)).result().readings[0].reason.split()[0])
+    made.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(child, 0)
+    with pytest.raises(Unavailable):
+        made.start(task_that(standin.OBEY))
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_annotation(pool: DecodePool, suffix: str) -> None:
+    import cv2
+    import numpy as np
+
+    frame = np.full((240, 320, 3), 128, np.uint8)
+    outline = Outline(((100, 100), (200, 100), (200, 180), (100, 180)), "read", "023792168411 99 %")
+    far = Outline(((-1e9, 0), (10, 0), (10, 1e9), (0, 10)), "unsure", "?")
+    drawn = pool.annotate(AnnotationTask(jpeg(frame), (outline, far), suffix))
+    assert drawn.startswith({"png": b"\x89PNG", "jpg": b"\xff\xd8"}[suffix])
+    pixels = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
+    assert pixels.shape == (240, 320, 3)
+    blue, green, red = (int(v) for v in pixels[100, 150])
+    assert green > blue + 40
+    assert green > red + 40
+    assert abs(int(pixels[140, 150, 1]) - 128) < 8
