@@ -125,25 +125,33 @@ def shade_rays(
 
 @numba.njit(cache=True, fastmath=True)
 def expose_photo(
-    photo: Any, levels: Any, encode: Any, sigma: Any, noise: Any, offsets: Any, out: Any
+    photo: Any, share: Any, encode: Any, sigma: Any, noise: Any, offsets: Any, out: Any
 ) -> None:  # pragma: no cover - compiled
     """Give a photo the camera's tone and noise.
 
     Parameters
     ----------
     photo, out : uint8 (H, W, C)
-    levels : uint8 (h, w)
-        Index of the light that arrives, on a grid of 4 x 4 pixels.
+    share : float32 (h, w)
+        Light that arrives, 0 to 1, at every fourth row and column; a single value stands for all.
     encode, sigma : float32 (L, C, 256)
-        Encoded value and noise of a photo's value at each level. [grey levels]
+        Encoded value and noise of a photo's value at L even steps of light from 0 to 1. [grey levels]
     noise : float32 (M,)
         Standard normal numbers; ``offsets`` : int64 (H,) says where each row starts in them.
     """
     rows, cols, channels = photo.shape
+    top_level = encode.shape[0] - 1
+    even = share.size == 1
+    level = int(share[0, 0] * top_level + 0.5)
     for i in range(rows):
         k = offsets[i]
+        r, q = i >> 2, (i & 3) * 0.25
         for j in range(cols):
-            level = levels[i >> 2, j >> 2]
+            if not even:
+                c0, p = j >> 2, (j & 3) * 0.25
+                top = share[r, c0] * (1 - p) + share[r, c0 + 1] * p
+                low = share[r + 1, c0] * (1 - p) + share[r + 1, c0 + 1] * p
+                level = int((top * (1 - q) + low * q) * top_level + 0.5)
             for c in range(channels):
                 v = photo[i, j, c]
                 x = encode[level, c, v] + sigma[level, c, v] * noise[k] + 0.5
