@@ -64,8 +64,20 @@ class CodeTaken(Conflict):
     """Another marker near by already carries this code."""
 
 
+class IdempotencyConflict(Conflict):
+    """An Idempotency-Key was used before for a different request."""
+
+
 class StaleVersion(Conflict):
     """The stored row changed since the caller read it."""
+
+
+class VersionRequired(WaymarkError):
+    """A change was asked for without saying which version of the row it is based on."""
+
+
+class MalformedRequest(WaymarkError):
+    """A body or header cannot be read as what it claims to be."""
 
 
 class NotAuthenticated(WaymarkError):

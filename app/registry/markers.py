@@ -191,7 +191,7 @@ def _recorded(connection: sa.Connection, agency_id: str, marker_id: str, *, who:
             at=row["updated_at"],
             who=who,
             why=why,
-            marker=dict(row),
+            marker={str(name): value for name, value in row.items()},
         )
     )
     return row

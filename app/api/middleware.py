@@ -1,0 +1,200 @@
+"""Pure ASGI middleware: request ids and logs, metrics, authentication and limits, all before the body is read."""
+
+from __future__ import annotations
+
+import re
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+import anyio
+import structlog
+from anyio import to_thread
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from app.api.problems import BodyRefused, problem_from, unexpected
+from app.errors import MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
+from app.services.access import Caller
+from app.services.access import Scope as KeyScope
+
+T = TypeVar("T")
+
+PROTECTED = ("/v1", "/ogc")
+_SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_LOG = structlog.get_logger("waymark.access")
+
+
+def is_protected(path: str) -> bool:
+    """Whether a path needs a key."""
+    return any(path == prefix or path.startswith(prefix + "/") for prefix in PROTECTED)
+
+
+class Observed:
+    """Gives each request an id, a log line and its metrics, and turns a bug into a problem document."""
+
+    def __init__(self, app: ASGIApp, registry: CollectorRegistry) -> None:
+        self._app = app
+        labels = ("method", "route", "status")
+        self._count = Counter("waymark_http_requests", "Requests answered", labels, registry=registry)
+        self._seconds = Histogram("waymark_http_request_seconds", "Time to answer", labels[:2], registry=registry)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        asked = Headers(scope=scope).get("x-request-id", "")
+        request_id = asked if _REQUEST_ID.fullmatch(asked) else uuid.uuid4().hex
+        scope.setdefault("state", {})["request_id"] = request_id
+        structlog.contextvars.clear_contextvars()
+        structlog.contextvars.bind_contextvars(request_id=request_id)
+        started = time.perf_counter()
+        status = 0
+
+        async def send_with_id(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                MutableHeaders(scope=message)["X-Request-ID"] = request_id
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_with_id)
+        except Exception as error:
+            if status:
+                raise
+            await unexpected(error, scope)(scope, receive, send_with_id)
+        finally:
+            self._record(scope, status, time.perf_counter() - started)
+
+    def _record(self, scope: Scope, status: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", None) or "unmatched"
+        self._count.labels(scope["method"], route, str(status)).inc()
+        self._seconds.labels(scope["method"], route).observe(seconds)
+        caller = scope["state"].get("caller")
+        _LOG.info(
+            "request",
+            method=scope["method"],
+            path=scope["path"],
+            route=route,
+            status=status,
+            ms=round(seconds * 1000, 2),
+            agency=caller.agency_id if caller else None,
+        )
+
+
+class Guarded:
+    """Checks the key and the declared length before the body is read, and the length while it is.
+
+    Parameters
+    ----------
+    app : ASGIApp
+    authenticate : callable
+        The caller behind a key; runs in a thread.
+    body_limits : mapping
+        Most bytes of a body by path prefix; the empty prefix is the default. [byte]
+    needed_scopes : mapping
+        Scope that changing requests need by path prefix; the empty prefix is the default.
+    body_timeout_s : float
+        Longest wait for the next part of a body. [s]
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        authenticate: Callable[[str], Caller],
+        body_limits: Mapping[str, int],
+        needed_scopes: Mapping[str, KeyScope],
+        body_timeout_s: float,
+    ) -> None:
+        self._app = app
+        self._authenticate = authenticate
+        self._body_limits = body_limits
+        self._needed_scopes = needed_scopes
+        self._body_timeout_s = body_timeout_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        try:
+            if is_protected(scope["path"]):
+                await self._admit(scope, headers)
+            limit = _by_prefix(self._body_limits, scope["path"])
+            _check_declared_length(headers, limit)
+        except WaymarkError as error:
+            response = problem_from(error, scope)
+            response.headers["Connection"] = "close"
+            await response(scope, receive, send)
+            return
+        await self._app(scope, _limited(receive, limit, self._body_timeout_s), send)
+
+    async def _admit(self, scope: Scope, headers: Headers) -> None:
+        caller = await to_thread.run_sync(self._authenticate, _key_in(headers))
+        scope.setdefault("state", {})["caller"] = caller
+        reads = scope["method"] in _SAFE_METHODS
+        caller.require(KeyScope.READ if reads else _by_prefix(self._needed_scopes, scope["path"]))
+
+
+def _by_prefix(table: Mapping[str, T], path: str) -> T:
+    return table[max((prefix for prefix in table if path.startswith(prefix)), key=len)]
+
+
+def _key_in(headers: Headers) -> str:
+    scheme, _, key = headers.get("authorization", "").partition(" ")
+    found = key.strip() if scheme.lower() == "bearer" else headers.get("x-api-key", "").strip()
+    if not found:
+        raise NotAuthenticated(
+            "this resource needs a key",
+            field="Authorization",
+            limit="Authorization: Bearer KEY or X-API-Key: KEY",
+            cure="send the admin key that the server printed at its first start, or one made from it",
+        )
+    return found
+
+
+def _check_declared_length(headers: Headers, limit: int) -> None:
+    declared = headers.get("content-length")
+    if declared is None:
+        return
+    if not (declared.isascii() and declared.isdigit()):
+        raise MalformedRequest("Content-Length is not a number", field="Content-Length", limit="digits")
+    if len(declared) > 19 or int(declared) > limit:
+        raise _too_large(limit)
+
+
+def _too_large(limit: int) -> UploadTooLarge:
+    return UploadTooLarge(
+        f"the body is larger than {limit} bytes", field="body", limit=f"{limit} bytes", cure="send less at a time"
+    )
+
+
+def _limited(receive: Receive, limit: int, timeout_s: float) -> Receive:
+    """A `receive` that stops a body which is too long or does not come."""
+    seen, complete = 0, False
+
+    async def receive_within_limit() -> Message:
+        nonlocal seen, complete
+        if complete:
+            return await receive()
+        try:
+            with anyio.fail_after(timeout_s):
+                message = await receive()
+        except TimeoutError as error:
+            raise HTTPException(408, f"no part of the body came for {timeout_s:g} s") from error
+        if message["type"] == "http.request":
+            seen += len(message.get("body", b""))
+            complete = not message.get("more_body", False)
+            if seen > limit:
+                raise BodyRefused(_too_large(limit))
+        return message
+
+    return receive_within_limit

@@ -1,0 +1,51 @@
+"""The OpenAPI document: keys and problems are described once, for every route."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from app.api.middleware import is_protected
+from app.api.problems import Problem
+
+DESCRIPTION = """The registry of machine-readable roads: coded plates, from a coordinate to a plate to print
+to a decoded frame.
+
+Send your key as `Authorization: Bearer KEY` or `X-API-Key: KEY`. Every error is an RFC 9457 problem document that names
+the field, the limit and the cure. Positions are longitude, latitude in degrees; headings are clockwise from true north.
+"""
+
+
+def describe(app: FastAPI) -> None:
+    """Replace the app's OpenAPI document by one with keys and problems."""
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            document = get_openapi(
+                title=app.title, version=app.version, description=DESCRIPTION, routes=app.routes, license_info=_LICENSE
+            )
+            components = document.setdefault("components", {})
+            problem = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+            components.setdefault("schemas", {}).update(problem.pop("$defs", {}))
+            components["schemas"]["Problem"] = problem
+            components["securitySchemes"] = {
+                "bearer": {"type": "http", "scheme": "bearer"},
+                "apiKey": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
+            }
+            _require_keys(document)
+            app.openapi_schema = document
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+_LICENSE = {"name": "Apache-2.0", "identifier": "Apache-2.0"}
+
+
+def _require_keys(document: dict[str, Any]) -> None:
+    for path, operations in document["paths"].items():
+        if is_protected(path):
+            for operation in operations.values():
+                operation["security"] = [{"bearer": []}, {"apiKey": []}]

@@ -1,0 +1,233 @@
+"""Every error that a client can cause, as an RFC 9457 problem document: one table, one shape."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any, NamedTuple
+
+import orjson
+import structlog
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException
+
+from app import errors
+
+MEDIA_TYPE = "application/problem+json"
+_LOG = structlog.get_logger(__name__)
+
+
+class ProblemKind(NamedTuple):
+    """What one class of error is to HTTP."""
+
+    status: int
+    slug: str
+    title: str
+
+    @property
+    def type(self) -> str:
+        """Identifier of the kind."""
+        return f"urn:waymark:problem:{self.slug}"
+
+
+PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
+    errors.MalformedRequest: ProblemKind(400, "malformed-request", "The request cannot be read"),
+    errors.NotAuthenticated: ProblemKind(401, "not-authenticated", "A valid key is needed"),
+    errors.NotAllowed: ProblemKind(403, "not-allowed", "The key's scope does not cover this"),
+    errors.NotFound: ProblemKind(404, "not-found", "There is no such thing"),
+    errors.Conflict: ProblemKind(409, "conflict", "The request contradicts what is stored"),
+    errors.CodeTaken: ProblemKind(409, "code-taken", "The code is taken"),
+    errors.IdempotencyConflict: ProblemKind(409, "idempotency-conflict", "The Idempotency-Key is taken"),
+    errors.StaleVersion: ProblemKind(412, "stale-version", "The marker was changed meanwhile"),
+    errors.UploadTooLarge: ProblemKind(413, "too-large", "The request is too large"),
+    errors.UnsupportedUpload: ProblemKind(415, "unsupported-upload", "No decoder reads this"),
+    errors.InvalidParameter: ProblemKind(422, "invalid-parameter", "A value is not allowed"),
+    errors.CodeMismatch: ProblemKind(422, "code-mismatch", "The digits do not fit"),
+    errors.ReferenceSystemError: ProblemKind(422, "reference-system", "The reference system cannot be used"),
+    errors.UnreadableUpload: ProblemKind(422, "unreadable-upload", "The upload cannot be read"),
+    errors.VersionRequired: ProblemKind(428, "version-required", "The change needs a version"),
+    errors.ProofFailed: ProblemKind(500, "proof-failed", "The artwork did not read back"),
+    errors.Unavailable: ProblemKind(503, "unavailable", "Try again later"),
+}
+VALIDATION = ProblemKind(422, "invalid-parameter", "A value is not allowed")
+
+
+class BodyRefused(HTTPException):
+    """A domain error found while the body is read; FastAPI would turn any other exception there into a bare 400."""
+
+    def __init__(self, error: errors.WaymarkError) -> None:
+        super().__init__(400, error.message)
+        self.error = error
+
+
+class FieldError(BaseModel):
+    """One input at fault."""
+
+    field: str | None = None
+    detail: str
+    limit: str | None = None
+    cure: str | None = None
+
+
+class Problem(BaseModel):
+    """RFC 9457 problem document; `field`, `limit` and `cure` are those of the first error."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "type": "urn:waymark:problem:invalid-parameter",
+                "title": "A value is not allowed",
+                "status": 422,
+                "detail": "lat_deg is 91.0, outside -90 to 90 degrees",
+                "instance": "/v1/markers",
+                "field": "position.lat_deg",
+                "limit": "-90 to 90 deg",
+                "cure": "positions are longitude, latitude in degrees; check for swapped axes or another CRS",
+            }
+        }
+    )
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str
+    request_id: str | None = None
+    field: str | None = None
+    limit: str | None = None
+    cure: str | None = None
+    errors: list[FieldError] = Field(default_factory=list)
+
+
+def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI description of the problems that a route can answer with, besides those of every /v1 route."""
+    documented: dict[int | str, dict[str, Any]] = {}
+    for status in sorted({400, 401, 403, 413, 422, 500, 503, *statuses}):
+        kinds = [kind for kind in PROBLEMS.values() if kind.status == status]
+        titles = "; ".join(f"`{kind.slug}`: {kind.title}" for kind in kinds) or HTTPStatus(status).phrase
+        documented[status] = {
+            "description": titles,
+            "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        }
+    return documented
+
+
+def kind_of(error: errors.WaymarkError) -> ProblemKind | None:
+    """The table's entry for an error: that of its class, else of the nearest base class."""
+    return next((PROBLEMS[base] for base in type(error).__mro__ if base in PROBLEMS), None)
+
+
+def problem(
+    kind: ProblemKind,
+    detail: str,
+    scope: Any,
+    faults: list[FieldError] | None = None,
+    headers: dict[str, str] | None = None,
+) -> Response:
+    """A problem document as a response."""
+    faults = faults or []
+    first = faults[0] if faults else None
+    body: dict[str, Any] = {
+        "type": kind.type,
+        "title": kind.title,
+        "status": kind.status,
+        "detail": detail,
+        "instance": scope.get("path", ""),
+        "request_id": scope.get("state", {}).get("request_id"),
+    }
+    if first is not None:
+        body |= {"field": first.field, "limit": first.limit, "cure": first.cure}
+        body["errors"] = [fault.model_dump(exclude_none=True) for fault in faults]
+    body = {name: value for name, value in body.items() if value is not None}
+    content = orjson.dumps(body, default=str)
+    return Response(content, kind.status, _challenge(kind.status, headers), media_type=MEDIA_TYPE)
+
+
+def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
+    """The response to a domain error; one that is in no table is our bug."""
+    kind = kind_of(error)
+    if kind is None:
+        return unexpected(error, scope)
+    if kind.status >= 500:
+        _LOG.error("request failed", error=type(error).__name__, detail=error.message)
+    fault = FieldError(field=error.field, detail=error.message, limit=error.limit, cure=error.cure)
+    return problem(kind, error.message, scope, [fault])
+
+
+def unexpected(error: Exception, scope: Any) -> Response:
+    """The response to a bug: the log has the details, the client only the request's id."""
+    _LOG.error("unexpected error", exc_info=error, path=scope.get("path"))
+    kind = ProblemKind(500, "internal-error", "Something went wrong on the server")
+    return problem(kind, "an unexpected error; the server's log has the details under this request_id", scope)
+
+
+def install_problem_handlers(app: FastAPI) -> None:
+    """Make every error of an app a problem document."""
+
+    async def on_domain_error(request: Request, error: Exception) -> Response:
+        assert isinstance(error, errors.WaymarkError)
+        return problem_from(error, request.scope)
+
+    async def on_validation_error(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        faults = [_field_error(item) for item in error.errors()]
+        return problem(VALIDATION, faults[0].detail, request.scope, faults)
+
+    async def on_http_error(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        if isinstance(error, BodyRefused):
+            return problem_from(error.error, request.scope)
+        phrase = HTTPStatus(error.status_code).phrase
+        kind = ProblemKind(error.status_code, phrase.lower().replace(" ", "-"), phrase)
+        return problem(kind, _http_detail(request, error), request.scope, headers=dict(error.headers or {}))
+
+    app.add_exception_handler(errors.WaymarkError, on_domain_error)
+    app.add_exception_handler(RequestValidationError, on_validation_error)
+    app.add_exception_handler(HTTPException, on_http_error)
+
+
+def _http_detail(request: Request, error: HTTPException) -> str:
+    if error.status_code == 404:
+        return f"there is nothing at {request.url.path}"
+    if error.status_code == 405:
+        return f"{request.method} is not allowed at {request.url.path}"
+    return str(error.detail)
+
+
+_CONSTRAINTS = {
+    "ge": "at least {}",
+    "gt": "more than {}",
+    "le": "at most {}",
+    "lt": "less than {}",
+    "min_length": "at least {} long",
+    "max_length": "at most {} long",
+    "pattern": "pattern {}",
+    "expected": "one of {}",
+}
+
+
+def _field_error(item: dict[str, Any]) -> FieldError:
+    location = [str(part) for part in item["loc"]]
+    path = ".".join(location[1:] if len(location) > 1 else location)
+    context = item.get("ctx") or {}
+    limits = [text.format(context[name]) for name, text in _CONSTRAINTS.items() if name in context]
+    cause = context.get("error")
+    if isinstance(cause, errors.WaymarkError):
+        return FieldError(field=cause.field or path, detail=cause.message, limit=cause.limit, cure=cause.cure)
+    cures = {"missing": f"send {path}", "extra_forbidden": f"leave {path} out"}
+    return FieldError(
+        field=path,
+        detail=f"{path}: {item['msg']}",
+        limit=", ".join(limits) or item["msg"],
+        cure=cures.get(item["type"], f"correct {path}; /docs describes what it may be"),
+    )
+
+
+def _challenge(status: int, headers: dict[str, str] | None) -> dict[str, str]:
+    extra = dict(headers or {})
+    if status == 401:
+        extra["WWW-Authenticate"] = 'Bearer realm="waymark"'
+    if status == 503:
+        extra["Retry-After"] = "5"
+    return extra

@@ -1,0 +1,114 @@
+"""Fixtures that every test may use: a real server on a real socket over a real database file."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from fastapi import FastAPI
+
+from app.main import create_app
+from app.services.access import Scope
+from app.settings import Settings
+
+ADMIN_KEY = "an-admin-key-for-tests-only"
+
+
+class LiveServer:
+    """An app behind uvicorn in a thread of this process."""
+
+    def __init__(self, app: FastAPI) -> None:
+        self.app = app
+        config = uvicorn.Config(app, host="127.0.0.1", port=0, log_config=None, access_log=False, lifespan="on")
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._server.run, daemon=True)
+
+    def __enter__(self) -> LiveServer:
+        self._thread.start()
+        deadline = time.monotonic() + 60
+        while not self._server.started:
+            assert self._thread.is_alive(), "the server did not start"
+            assert time.monotonic() < deadline, "the server did not start in time"
+            time.sleep(0.005)
+        port = self._server.servers[0].sockets[0].getsockname()[1]
+        self.url = f"http://127.0.0.1:{port}"
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.should_exit = True
+        self._thread.join(30)
+        assert not self._thread.is_alive(), "the server did not stop"
+
+    def client(self, key: str | None = ADMIN_KEY) -> httpx.Client:
+        """A client that sends a key."""
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        return httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False)
+
+    def agency(self, name: str, scope: Scope = Scope.WRITE) -> httpx.Client:
+        """A client of an agency, which is created if need be."""
+        return self.client(self.app.state.access.create_key(name, scope, label=f"{name} {scope}"))
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Settings:
+    """Settings of a server with an empty folder of its own."""
+    return Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY)
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., LiveServer]]:
+    """Start servers with given settings; they stop when the test ends."""
+    running: list[LiveServer] = []
+
+    def start(settings: Settings) -> LiveServer:
+        running.append(LiveServer(create_app(settings)).__enter__())
+        return running[-1]
+
+    yield start
+    for server in running:
+        server.__exit__()
+
+
+@pytest.fixture
+def fresh_server(serve: Callable[[Settings], LiveServer], settings: Settings) -> LiveServer:
+    """A server over an empty database."""
+    return serve(settings)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
+    """A server that the tests of a module share; each test has an agency of its own."""
+    folder = tmp_path_factory.mktemp("server")
+    with LiveServer(create_app(Settings(data_dir=folder / "var", admin_key=ADMIN_KEY))) as running:
+        yield running
+
+
+_AGENCIES = itertools.count(1)
+
+
+@pytest.fixture
+def client(server: LiveServer) -> Iterator[httpx.Client]:
+    """A client with the scope `write` of an agency that only this test uses."""
+    with server.agency(f"agency {next(_AGENCIES)}") as agency:
+        yield agency
+
+
+@pytest.fixture
+def place() -> Callable[[], dict[str, Any]]:
+    """Positions that no other test uses, far from each other."""
+
+    def new_place() -> dict[str, Any]:
+        step = next(_PLACES)
+        return {"lon_deg": 10.0 + step * 0.731237 % 100, "lat_deg": 20.0 + step * 0.417713 % 40}
+
+    return new_place
+
+
+_PLACES = itertools.count(1)
