@@ -27,11 +27,11 @@ from app.simulation.footprint import (
 from app.simulation.plate_scene import FaceTruth, PlateScene, face_truth
 from app.simulation.raster import accumulate_face, expose_photo, shade_rays
 from app.simulation.sensor import (
+    blurred,
     develop,
     encode_jpeg,
     linear_from_srgb,
     noise_sigma,
-    blurred,
     shift_colours,
     through_air,
     tone,
@@ -150,10 +150,9 @@ def _encoded_with_noise(scene: PlateScene, radiance: FloatArray) -> tuple[FloatA
     sensor = scene.sensor
     gains = np.array(sensor.white_balance, np.float32)[None, :, None]
     light = through_air(radiance, scene.air) * np.float32(sensor.gain)
-    signal, step = light * gains, np.float32(2e-3)
-    below = np.minimum(signal, step)
-    slope = (tone(signal + step, sensor) - tone(signal - below, sensor)) / (step + below)
-    return tone(signal, sensor), np.asarray(noise_sigma(light, sensor) * gains * slope, np.float32)
+    signal, sigma = light * gains, noise_sigma(light, sensor) * gains
+    spread = (tone(signal + sigma, sensor) - tone(signal - sigma, sensor)) / 2
+    return tone(signal, sensor), np.asarray(spread, np.float32)
 
 
 @lru_cache(maxsize=4)

@@ -85,8 +85,9 @@ def smear_px(scene: PlateScene, placed: PlacedFace, exposure_s: float) -> float:
 
 
 def sample_count(pixels: int, smear: float) -> int:
-    """Samples a pixel: at least four for each pixel of motion, more where a window is small."""
-    return int(np.clip(max(3_000_000 / max(pixels, 1), 4 * smear + 12), 24, 160))
+    """Samples a pixel: at least four for each pixel of motion, more where a window is small, fewer where it is vast."""
+    wanted = max(3_000_000 / max(pixels, 1), 4 * smear + 12, 24)
+    return int(max(min(wanted, 160, 16_000_000 / max(pixels, 1)), 16))
 
 
 @lru_cache(maxsize=64)

@@ -31,6 +31,8 @@ class PlateLook:
         Reflectance of the half of the red marker's cell that the triangle leaves free.
     led : float
         Radiance of a lit light unit, as a share of the sensor's saturation at gain 1; 0 is off.
+    led_markers : bool
+        The boundary markers are lit too, in their colours.
     """
 
     dark: Colour = (0.04, 0.04, 0.04)
@@ -40,6 +42,7 @@ class PlateLook:
     green: Colour = (0.12, 0.36, 0.06)
     triangle_rest: Colour = (0.75, 0.75, 0.75)
     led: float = 0.0
+    led_markers: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,11 +153,41 @@ def plate_face(
     colours = np.array([look.gap, look.dark, look.light, look.red, look.green, look.triangle_rest], np.float32)
     reflectance = np.tensordot(shares, colours, axes=(0, 0)).astype(np.float32)
     reflectance = _worn(reflectance, wear, geometry.side_mm, rng)
-    emission = None
-    if look.led > 0:
-        glow = cv2.GaussianBlur(shares[2], (0, 0), 2.0 * texels_per_mm)  # light spreads inside the translucent cover
-        emission = np.repeat((look.led * glow)[..., None], 3, axis=2).astype(np.float32)
+    emission = _lit(shares, look, texels_per_mm) if look.led > 0 else None
     return Face(geometry.side_mm / 1000, reflectance, emission)
+
+
+def _lit(shares: FloatArray, look: PlateLook, texels_per_mm: float) -> FloatArray:
+    """Radiance of the light units and markers with light sources below them."""
+    glow = shares[2][..., None] * np.ones(3, np.float32)
+    if look.led_markers:
+        for share, colour in ((shares[3], look.red), (shares[4], look.green)):
+            glow = glow + share[..., None] * (np.array(colour, np.float32) / max(colour))
+    spread = cv2.GaussianBlur(glow, (0, 0), 2.0 * texels_per_mm)  # light spreads inside the translucent cover
+    return np.ascontiguousarray(look.led * spread, np.float32)
+
+
+def grid_face(cells: npt.ArrayLike, side_m: float, wear: PlateWear, rng: np.random.Generator, led: float = 0.0) -> Face:
+    """Face made of square cells of even colour, such as a tag or a chessboard, with the wear of a plate.
+
+    Parameters
+    ----------
+    cells : array_like, shape (K, K, 3)
+        Reflectances in blue, green, red.
+    side_m : float
+        Outer side. [m]
+    wear : PlateWear
+    rng : numpy.random.Generator
+        Draws the places of patches and stains.
+    led : float
+        Radiance that the lightest cells emit, as a share of saturation; others in proportion.
+    """
+    colours = np.asarray(cells, np.float32)
+    count = colours.shape[0]
+    size = max(round(side_m * 1000 / count) * count, count)
+    crisp = np.repeat(np.repeat(colours, size // count, axis=0), size // count, axis=1)
+    emission = np.ascontiguousarray(crisp * (led / max(float(colours.max()), 1e-6))) if led > 0 else None
+    return Face(side_m, _worn(crisp, wear, side_m * 1000, rng), emission)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,227 @@
+"""Conditions drawn at random: from a sunny afternoon to everything at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.errors import InvalidParameter
+from app.sensors.camera import Camera
+from app.simulation.plate_face import Face, PlateLook, PlateWarmth, PlateWear, draw_look
+from app.simulation.plate_scene import Air, Occluder, PlacedFace, PlateScene, Sensor, Shadow, face_truth
+from app.simulation.thermal import ThermalSensor
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """All of a scene but the plate's code and place.
+
+    Parameters
+    ----------
+    look, wear : PlateLook, PlateWear
+    shadow, air, sensor : Shadow, Air, Sensor
+    exposure_s : float
+        [s]
+    road_reflectance : float
+    night_light : float or None
+        As in PlateScene.
+    """
+
+    look: PlateLook
+    wear: PlateWear
+    shadow: Shadow
+    air: Air
+    sensor: Sensor
+    exposure_s: float
+    road_reflectance: float
+    night_light: float | None = None
+
+
+def draw_daylight(rng: np.random.Generator) -> Conditions:
+    """Fair weather: a new plate, a good dash camera, 1/500 to 1/2000 s."""
+    return Conditions(
+        look=draw_look(rng),
+        wear=PlateWear(contrast_loss=_uniform(rng, 0, 0.1), patchy_loss=_uniform(rng, 0, 0.3)),
+        shadow=Shadow(),
+        air=Air(haze=_uniform(rng, 0, 0.05)),
+        sensor=Sensor(
+            blur_px=_uniform(rng, 0.4, 0.9),
+            full_well_e=_uniform(rng, 3000, 10000),
+            read_noise_e=_uniform(rng, 2, 6),
+            gain=_uniform(rng, 0.8, 1.2),
+            white_balance=(_uniform(rng, 0.93, 1.07), 1.0, _uniform(rng, 0.93, 1.07)),
+            gamma=_uniform(rng, 2.0, 2.4),
+            shoulder=_uniform(rng, 0.6, 0.95),
+            bayer=bool(rng.random() < 0.7),
+            sharpen=_uniform(rng, 0, 0.6),
+            colour_shift_px=_uniform(rng, -0.3, 0.3),
+            readout_s=_uniform(rng, 0, 0.012),
+            jpeg_quality=int(rng.integers(85, 96)),
+        ),
+        exposure_s=1 / _uniform(rng, 500, 2000),
+        road_reflectance=_uniform(rng, 0.16, 0.32),
+    )
+
+
+def draw_stress(rng: np.random.Generator, *, night: bool = False) -> Conditions:
+    """Every degradation drawn at random, several at once.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    night : bool
+        Headlights and lit plates in place of daylight.
+    """
+    fair = draw_daylight(rng)
+    sensor = replace(
+        fair.sensor,
+        blur_px=_uniform(rng, 0.4, 1.2),
+        full_well_e=float(np.exp(rng.uniform(np.log(500), np.log(8000)))),
+        read_noise_e=_uniform(rng, 2, 8),
+        gain=_uniform(rng, 0.5, 1.5),
+        white_balance=(_uniform(rng, 0.75, 1.3), 1.0, _uniform(rng, 0.75, 1.3)),
+        sharpen=_uniform(rng, 0, 1.0),
+        colour_shift_px=_uniform(rng, -0.6, 0.6),
+        readout_s=_uniform(rng, 0, 0.025),
+    )
+    stressed = replace(
+        fair,
+        wear=_draw_wear(rng),
+        shadow=_draw_shadow(rng),
+        air=_draw_air(rng),
+        sensor=sensor,
+        exposure_s=1 / float(np.exp(rng.uniform(np.log(250), np.log(2500)))),
+    )
+    return _at_night(stressed, rng) if night else stressed
+
+
+def _draw_wear(rng: np.random.Generator) -> PlateWear:
+    return PlateWear(
+        contrast_loss=_uniform(rng, 0, 0.45),
+        patchy_loss=_uniform(rng, 0, 0.75) if rng.random() < 0.7 else 0.0,
+        patch_mm=_uniform(rng, 25, 120),
+        dirt_blobs=int(rng.integers(0, 5)),
+        dirt_mm=_uniform(rng, 6, 22),
+    )
+
+
+def _draw_shadow(rng: np.random.Generator) -> Shadow:
+    return Shadow(
+        edge_light=_uniform(rng, 0.2, 0.7) if rng.random() < 0.4 else 1.0,
+        edge_angle_deg=_uniform(rng, 0, 360),
+        edge_offset_m=_uniform(rng, -0.2, 0.2),
+        penumbra_m=_uniform(rng, 0.01, 0.08),
+        dapple_light=_uniform(rng, 0.25, 0.8) if rng.random() < 0.35 else 1.0,
+        dapple_m=_uniform(rng, 0.06, 0.4),
+        dapple_softness=_uniform(rng, 0.05, 0.4),
+        seed=int(rng.integers(1 << 31)),
+    )
+
+
+def _draw_air(rng: np.random.Generator) -> Air:
+    return Air(
+        haze=_uniform(rng, 0, 0.55) if rng.random() < 0.4 else 0.0,
+        airlight=_uniform(rng, 0.4, 0.9),
+        glare=_uniform(rng, 0.05, 0.45) if rng.random() < 0.3 else 0.0,
+        glare_at_m=(_uniform(rng, -0.2, 0.2), _uniform(rng, -0.2, 0.2)),
+        glare_size_m=(_uniform(rng, 0.05, 0.2), _uniform(rng, 0.1, 0.5)),
+    )
+
+
+def _at_night(conditions: Conditions, rng: np.random.Generator) -> Conditions:
+    look = replace(conditions.look, led=_uniform(rng, 0.15, 0.7))
+    sensor = replace(conditions.sensor, full_well_e=_uniform(rng, 150, 800), read_noise_e=_uniform(rng, 2, 6), gain=1.0)
+    night = replace(conditions, look=look, sensor=sensor, shadow=Shadow(), air=Air())
+    return replace(night, night_light=_uniform(rng, 0.01, 0.15), exposure_s=_uniform(rng, 1 / 500, 1 / 125))
+
+
+def _uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(rng.uniform(low, high))
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def draw_place(
+    camera: Camera,
+    face: Face,
+    rng: np.random.Generator,
+    rows_px: tuple[float, float],
+    rotation_deg: float | None = None,
+) -> PlacedFace:
+    """A place on the road where the whole face is in view and its image is within a range of heights.
+
+    Parameters
+    ----------
+    camera : Camera
+    face : Face
+    rng : numpy.random.Generator
+    rows_px : tuple of float
+        Least and greatest height of its image; heights in between are drawn evenly in the logarithm. [px]
+    rotation_deg : float, optional
+        Drawn from the full circle if not given.
+
+    Raises
+    ------
+    InvalidParameter
+        This camera sees no face at such a height.
+    """
+    wanted = float(np.exp(rng.uniform(*np.log(rows_px))))
+    for _ in range(200):
+        turn = _uniform(rng, 0, 360) if rotation_deg is None else rotation_deg
+        side = _uniform(rng, -0.5, 0.5)
+        low, high = 0.3, 40.0
+        for _ in range(40):  # image height falls with distance
+            ahead = (low + high) / 2
+            placed = PlacedFace(face, ahead, side * ahead, turn)
+            truth = face_truth(PlateScene(camera, (placed,)), placed)
+            low, high = (ahead, high) if not truth.height_px <= wanted else (low, ahead)
+        if truth.in_view and rows_px[0] <= truth.height_px <= rows_px[1] + 0.01:
+            return placed
+        wanted = float(np.exp(rng.uniform(*np.log(rows_px))))
+    raise InvalidParameter(f"this camera never sees a face {rows_px[0]:g} to {rows_px[1]:g} rows high", field="rows_px")
+
+
+def scene_under(
+    conditions: Conditions, camera: Camera, faces: tuple[PlacedFace, ...], speed_m_s: float, rng: np.random.Generator
+) -> PlateScene:
+    """Scene of placed faces under drawn conditions, the vehicle shaking as vehicles do."""
+    shake = rng.standard_normal(3) * (0.5, 1.5, 0.5)
+    return PlateScene(
+        camera=camera,
+        faces=faces,
+        speed_m_s=speed_m_s,
+        exposure_s=conditions.exposure_s,
+        spin_deg_s=(float(shake[0]), float(shake[1]), float(shake[2])),
+        road_reflectance=conditions.road_reflectance,
+        night_light=conditions.night_light,
+        shadow=conditions.shadow,
+        air=conditions.air,
+        sensor=conditions.sensor,
+    )
+
+
+def draw_occluder(rng: np.random.Generator) -> Occluder:
+    """Something dark or bright that hides 5 to 60 % of the plate."""
+    return Occluder(_uniform(rng, 0, 360), _uniform(rng, 0.05, 0.6), _uniform(rng, 0.01, 0.6), _uniform(rng, 0.5, 4))
+
+
+def draw_thermal(rng: np.random.Generator) -> tuple[PlateWarmth, ThermalSensor]:
+    """A heated plate and a bolometer."""
+    heat = _uniform(rng, 6, 20)
+    warmth = PlateWarmth(
+        dark_k=heat,
+        light_k=_uniform(rng, 0, 0.25) * heat,
+        gap_k=_uniform(rng, 0, 0.3) * heat,
+        marker_k=heat * _uniform(rng, 0.85, 1.15),
+        spread_mm=_uniform(rng, 2, 6),
+    )
+    sensor = ThermalSensor(
+        lag_s=_uniform(rng, 0.006, 0.012),
+        blur_px=_uniform(rng, 0.8, 1.8),
+        netd_k=_uniform(rng, 0.03, 0.12),
+        span_k=heat * _uniform(rng, 1.5, 3.0),
+        road_k=_uniform(rng, 0.3, 1.5),
+    )
+    return warmth, sensor
