@@ -1,0 +1,227 @@
+"""A selection of plates -> one ZIP: artwork, manifest and quality sheet."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import unicodedata
+import zipfile
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from typing import Any, BinaryIO
+
+from app.encoders.plate.artwork import encode_plate, encode_sheets
+from app.encoders.plate.colours import COLOURS
+from app.encoders.plate.formats import DEFAULT_DPI, ArtworkFormat, write_artwork
+from app.encoders.plate.order import ArtworkOptions, PlateOrder
+from app.encoders.plate.pdf import write_pdf
+from app.encoders.plate.proof import PlateProof, PlateReader, prove_plate
+from app.encoders.plate.quality import quality_csv, quality_sheets
+from app.errors import InvalidParameter
+
+MANIFEST_FORMAT = "waymark-artwork/1"
+ARTWORK_VERSION = "1"
+MAX_PLATES = 10_000
+_LEVEL = 1
+_PENDING = 32
+_UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
+_RESERVED = re.compile(r"(?i)^(con|prn|aux|nul|com\d|lpt\d)(\.|$)")
+_LONGEST_STEM = 60
+
+
+@dataclass(frozen=True, slots=True)
+class BundleOptions:
+    """What a bundle holds.
+
+    Parameters
+    ----------
+    formats : tuple of ArtworkFormat
+        Files of each plate.
+    artwork : ArtworkOptions
+    sheet_mm : (width, height), optional
+        Also nest the plates on sheets of this size, in the same formats. [mm]
+    dpi : float
+        Of PNG files. [1/inch]
+    """
+
+    formats: tuple[ArtworkFormat, ...] = (ArtworkFormat.PDF, ArtworkFormat.SVG)
+    artwork: ArtworkOptions = field(default_factory=ArtworkOptions)
+    sheet_mm: tuple[float, float] | None = None
+    dpi: float = DEFAULT_DPI
+
+
+def write_bundle(
+    orders: Sequence[PlateOrder],
+    target: BinaryIO,
+    *,
+    options: BundleOptions | None = None,
+    read: PlateReader | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, Any]:
+    """Write the artwork of a selection into one ZIP, proving every plate on the way.
+
+    Parameters
+    ----------
+    orders : sequence of PlateOrder
+        1 to 10,000 plates, in the order of the manifest.
+    target : binary file
+        Written from the start to the end; need not be seekable.
+    options : BundleOptions, optional
+        PDF and SVG by default.
+    read : callable, optional
+        Reader for the self-proof; without it nothing is proved, and the manifest says so.
+    progress : callable, optional
+        Told the number of plates done after each.
+
+    Returns
+    -------
+    dict
+        The manifest, as it lies in the ZIP.
+
+    Raises
+    ------
+    InvalidParameter
+        No plates, too many, no formats, or a sheet that is too small.
+    ProofFailed
+        A drawing did not read back as its own code; the ZIP is unfinished and must be thrown away.
+    """
+    options = options or BundleOptions()
+    if not 1 <= len(orders) <= MAX_PLATES:
+        raise InvalidParameter(
+            f"{len(orders)} plates were selected",
+            field="plates",
+            limit=f"1 to {MAX_PLATES} plates",
+            cure="split the selection",
+        )
+    if not options.formats:
+        raise InvalidParameter("no format was asked for", field="formats", limit="at least one of svg, pdf, dxf, png")
+    names = safe_names([f"{order.plate_id}-r{order.revision}" for order in orders])
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive, _Packer(archive) as packer:
+        plates = []
+        for done, (order, name) in enumerate(zip(orders, names, strict=True), start=1):
+            plates.append(_add_plate(packer, order, name, options, read))
+            if progress:
+                progress(done)
+        if options.sheet_mm:
+            _add_sheets(packer, orders, options)
+        packer.add("quality.pdf", write_pdf(quality_sheets(orders), compress=False))
+        packer.add("quality.csv", quality_csv(orders))
+        manifest = _manifest(plates, packer.finish(), options, proved=read is not None)
+        packer.add("manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False).encode())
+    return manifest
+
+
+def safe_names(names: Sequence[str]) -> list[str]:
+    """File names, without extension, for arbitrary texts: plain ASCII, unique also where case does not count.
+
+    No separators, no leading dot, no device names of Windows, at most 60 characters and a number where two would
+    be alike.
+    """
+    taken: set[str] = set()
+    safe = []
+    for name in names:
+        ascii_name = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+        stem = _UNSAFE.sub("_", ascii_name).strip("._-")[:_LONGEST_STEM].rstrip("._-") or "plate"
+        if _RESERVED.match(stem):
+            stem = f"plate_{stem}"
+        unique, number = stem, 2
+        while unique.lower() in taken:
+            unique, number = f"{stem}_{number}", number + 1
+        taken.add(unique.lower())
+        safe.append(unique)
+    return safe
+
+
+class _Packer:
+    """Compresses and hashes in one thread beside the drawing, which holds the interpreter; both release it."""
+
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self._archive = archive
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._pending: deque[Future[dict[str, Any]]] = deque()
+        self._entries: list[dict[str, Any]] = []
+
+    def __enter__(self) -> _Packer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            if error[0] is None:
+                self.finish()
+        finally:
+            self._pool.shutdown(cancel_futures=True)
+
+    def add(self, name: str, content: bytes) -> None:
+        """Queue a file; waits while too many are queued."""
+        self._pending.append(self._pool.submit(self._write, name, content))
+        while len(self._pending) > _PENDING:
+            self._entries.append(self._pending.popleft().result())
+
+    def finish(self) -> list[dict[str, Any]]:
+        """Wait for all that is queued. Name, size and hash of every file so far."""
+        while self._pending:
+            self._entries.append(self._pending.popleft().result())
+        return list(self._entries)
+
+    def _write(self, name: str, content: bytes) -> dict[str, Any]:
+        info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+        info.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
+        info.external_attr = 0o644 << 16
+        self._archive.writestr(info, content, compresslevel=_LEVEL)
+        return {"name": name, "size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def _add_plate(
+    packer: _Packer, order: PlateOrder, name: str, options: BundleOptions, read: PlateReader | None
+) -> dict[str, Any]:
+    drawing = encode_plate(order, options.artwork)
+    proof = prove_plate(drawing, order.code, order.geometry, read) if read else None
+    files = []
+    for form in options.formats:
+        path = f"plates/{name}.{form}"
+        packer.add(path, write_artwork(drawing, form, dpi=options.dpi, compress=False).content)
+        files.append(path)
+    return _plate_entry(order, files, proof)
+
+
+def _add_sheets(packer: _Packer, orders: Sequence[PlateOrder], options: BundleOptions) -> None:
+    assert options.sheet_mm is not None
+    width, height = options.sheet_mm
+    sheets = encode_sheets(orders, width_mm=width, height_mm=height, options=options.artwork)
+    for number, sheet in enumerate(sheets, start=1):
+        for form in options.formats:
+            content = write_artwork(sheet, form, dpi=options.dpi, compress=False).content
+            packer.add(f"sheets/sheet-{number:04d}.{form}", content)
+
+
+def _plate_entry(order: PlateOrder, files: list[str], proof: PlateProof | None) -> dict[str, Any]:
+    code, geometry = order.code, order.geometry
+    return {
+        "plate_id": order.plate_id,
+        "revision": order.revision,
+        "record_url": order.record_url,
+        "code": {"digits": code.digits, "scheme": code.scheme.value, "n": code.n, "check_digits": code.check_digits},
+        "geometry": {**asdict(geometry), "side_mm": geometry.side_mm},
+        "position": None if order.lon_deg is None else {"lon_deg": order.lon_deg, "lat_deg": order.lat_deg},
+        "crs": order.crs,
+        "proof": None if proof is None else {"read_back": proof.digits, "confidence": round(proof.confidence, 6)},
+        "files": files,
+    }
+
+
+def _manifest(
+    plates: list[dict[str, Any]], files: list[dict[str, Any]], options: BundleOptions, *, proved: bool
+) -> dict[str, Any]:
+    return {
+        "format": MANIFEST_FORMAT,
+        "artwork_version": ARTWORK_VERSION,
+        "units": "mm",
+        "proved": proved,
+        "options": {"heaters": options.artwork.heaters, "leds": options.artwork.leds, "sheet_mm": options.sheet_mm},
+        "colours": [asdict(spec) for spec in COLOURS],
+        "plates": plates,
+        "files": files,
+    }

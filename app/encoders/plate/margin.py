@@ -1,0 +1,170 @@
+"""What the sheet says round a plate: who it is, how large, which way up, where it lies, and a QR to its record.
+
+Frame: millimetres from the plate's centre, y up, so that a margin and its face move together.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import segno
+
+from app.encoders.plate.drawing import Boxes, FloatArray, Layer, Part, Shape, Stroke, Text, box_points
+from app.encoders.plate.lettering import fitted_height_mm, text_width_mm
+from app.encoders.plate.order import PlateOrder
+from app.markers.plate import PlateGeometry
+
+SIDE_MARGIN_MM = 20.0
+TOP_MARGIN_MM = 36.0
+BOTTOM_MARGIN_MM = 72.0
+BLEED_MM = 5.0
+SCALE_BAR_MM = 100.0
+QR_SIDE_MM = 26.0
+SIDE_TOLERANCE_MM = 0.5
+UNIT_TOLERANCE_MM = 0.3
+
+_CROP_FROM_MM, _CROP_TO_MM = 7.0, 15.0
+_HAIRLINE_MM = 0.2
+_LABEL_WIDTH_MM = 20.0
+_ROW_MM = 5.2
+_TEXT_MM = 2.4
+_QR_MASK = 2  # any mask reads; fixing one saves the eightfold trial
+
+
+@lru_cache(maxsize=64)
+def fixed_margin(geometry: PlateGeometry) -> tuple[Part, ...]:
+    """What the margin of every plate of a geometry shows."""
+    half = geometry.side_mm / 2
+    return (
+        Stroke(Layer.CUT, box_points(-half, -half, half, half), _HAIRLINE_MM, closed=True),
+        *_crop_marks(half),
+        *_travel_arrow(half),
+        *_dimension(half, f"{geometry.side_mm:g} mm ± {SIDE_TOLERANCE_MM:g} outer edge, border gap included"),
+        *_scale_bar(-half, -half - 66.0),
+        *_arrow(Layer.ENGRAVE, half - QR_SIDE_MM - 7.0, -half - 27.0 - QR_SIDE_MM / 2 - 6.0, 5.0, 12.0),
+        Text(Layer.NOTE, "Engrave on the back", half, -half - 61.2, 1.8, "end"),
+    )
+
+
+def plate_margin(order: PlateOrder) -> tuple[Part, ...]:
+    """What the margin says of one plate."""
+    half = order.geometry.side_mm / 2
+    room = order.geometry.side_mm / 2 - 22.0
+    id_mm = fitted_height_mm(order.plate_id, 5.0, room)
+    digits_mm = fitted_height_mm(order.grouped_digits, 5.0, room)
+    parts: list[Part] = [
+        Text(Layer.NOTE, order.plate_id, -half, half + 23.0, id_mm),
+        Text(Layer.NOTE, f"revision {order.revision}", -half, half + 17.5, _TEXT_MM),
+        Text(Layer.NOTE, order.grouped_digits, half, half + 23.0, digits_mm, "end"),
+        Text(Layer.NOTE, _scheme_line(order), half, half + 17.5, _TEXT_MM, "end"),
+        *_data_rows(order, -half, -half - 29.0),
+        *_back_mark(order, half, -half - 27.0),
+    ]
+    return tuple(parts)
+
+
+def _scheme_line(order: PlateOrder) -> str:
+    return f"{order.code.scheme}, {order.code.n} x {order.code.n} units"
+
+
+def _data_rows(order: PlateOrder, left: float, top: float) -> list[Part]:
+    geometry = order.geometry
+    position = "not placed yet"
+    if order.lon_deg is not None and order.lat_deg is not None:
+        position = f"longitude {order.lon_deg:.8f}°, latitude {order.lat_deg:.8f}°"
+    rows = (
+        ("Position", position),
+        ("CRS", order.crs or "not stated"),
+        ("Plate size", f"unit {geometry.unit_mm:g} mm, gap {geometry.gap_mm:g} mm, {geometry.thickness_mm:g} mm thick"),
+    )
+    room = geometry.side_mm - QR_SIDE_MM - 14.0 - _LABEL_WIDTH_MM
+    parts: list[Part] = []
+    for i, (label, value) in enumerate(rows):
+        y = top - i * _ROW_MM
+        parts.append(Text(Layer.NOTE, label, left, y, _TEXT_MM))
+        value_mm = fitted_height_mm(value, _TEXT_MM, room)
+        parts.append(Text(Layer.NOTE, value, left + _LABEL_WIDTH_MM, y, value_mm))
+    return parts
+
+
+def _back_mark(order: PlateOrder, right: float, top: float) -> list[Part]:
+    """Id and QR that are engraved on the back, since the face carries no text."""
+    id_mm = fitted_height_mm(order.plate_id, 2.4, QR_SIDE_MM + 10.0)
+    parts: list[Part] = [Text(Layer.ENGRAVE, order.plate_id, right, top - QR_SIDE_MM - 4.2, id_mm, "end")]
+    if order.record_url:
+        qr = Boxes(Layer.ENGRAVE, _qr_boxes(order.record_url))
+        parts.append(qr.moved(right - QR_SIDE_MM, top))
+    return parts
+
+
+def _qr_boxes(url: str) -> FloatArray:
+    """Dark modules of a QR code as runs along its rows, from its upper left corner, shape (K, 4). [mm]"""
+    code = segno.make(url, error="m", micro=False, mask=_QR_MASK, boost_error=False)
+    modules = np.array(code.matrix, dtype=np.int8)
+    edges = np.diff(np.pad(modules, ((0, 0), (1, 1))), axis=1)
+    row, start = np.nonzero(edges == 1)
+    _, stop = np.nonzero(edges == -1)
+    boxes: FloatArray = np.stack([start, -row - 1, stop, -row], axis=1) * np.float64(QR_SIDE_MM / len(modules))
+    return boxes
+
+
+def _crop_marks(half: float) -> list[Part]:
+    marks: list[Part] = []
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            for ends in (
+                [(sx * half, sy * (half + _CROP_FROM_MM)), (sx * half, sy * (half + _CROP_TO_MM))],
+                [(sx * (half + _CROP_FROM_MM), sy * half), (sx * (half + _CROP_TO_MM), sy * half)],
+            ):
+                marks.append(Stroke(Layer.CROP, np.array(ends, dtype=np.float64), _HAIRLINE_MM))
+    return marks
+
+
+def _arrow(layer: Layer, x: float, bottom: float, width: float, height: float) -> list[Part]:
+    shaft, head = width / 6, height / 2
+    outline = [
+        (x, bottom + height),
+        (x + width / 2, bottom + height - head),
+        (x + shaft, bottom + height - head),
+        (x + shaft, bottom),
+        (x - shaft, bottom),
+        (x - shaft, bottom + height - head),
+        (x - width / 2, bottom + height - head),
+    ]
+    return [Shape(layer, np.array(outline, dtype=np.float64))]
+
+
+def _travel_arrow(half: float) -> list[Part]:
+    bottom = half + 14.0
+    return [*_arrow(Layer.NOTE, 0.0, bottom, 8.0, 14.0), Text(Layer.NOTE, "travel", 0.0, bottom - 4.0, 2.0, "middle")]
+
+
+def _dimension(half: float, label: str) -> list[Part]:
+    """Dimension line under the plate, broken by its label, with arrowheads that touch the plate's edges."""
+    y, height = -half - 20.0, 2.4
+    clear = text_width_mm(label, height) / 2 + 3.0
+    parts: list[Part] = [Text(Layer.NOTE, label, 0.0, y - height / 2, height, "middle")]
+    for side in (-1.0, 1.0):
+        tip = side * half
+        parts += [
+            Stroke(Layer.NOTE, np.array([(tip - side * 3.0, y), (side * clear, y)]), _HAIRLINE_MM),
+            Shape(Layer.NOTE, np.array([(tip, y), (tip - side * 3.0, y + 0.8), (tip - side * 3.0, y - 0.8)])),
+            Stroke(Layer.NOTE, np.array([(tip, y + 2.5), (tip, y - 2.5)]), _HAIRLINE_MM),
+        ]
+    return parts
+
+
+def _scale_bar(left: float, bottom: float) -> list[Part]:
+    """100 mm in ten blocks, every other one filled."""
+    blocks = left + 20.0 * np.arange(5)
+    boxes = np.stack([blocks, np.full(5, bottom), blocks + 10.0, np.full(5, bottom + 2.5)], axis=1)
+    frame = box_points(left, bottom, left + SCALE_BAR_MM, bottom + 2.5)
+    labels = [Text(Layer.NOTE, f"{x}", left + x, bottom + 4.0, 1.8, "middle") for x in (50, 100)]
+    return [
+        Boxes(Layer.NOTE, boxes),
+        Stroke(Layer.NOTE, frame, _HAIRLINE_MM, closed=True),
+        Text(Layer.NOTE, "0", left, bottom + 4.0, 1.8, "middle"),
+        *labels,
+        Text(Layer.NOTE, "mm", left + SCALE_BAR_MM + 3.0, bottom + 0.4, 1.8),
+    ]
