@@ -99,7 +99,32 @@ class Text:
         return replace(self, x_mm=self.x_mm + x_mm, y_mm=self.y_mm + y_mm)
 
 
-Part = Boxes | Shape | Stroke | Text
+@dataclass(frozen=True, slots=True, eq=False)
+class Modules:
+    """Filled squares of a grid, as runs along its rows; rows go down from the upper left corner.
+
+    ``runs`` are (row, first column, number of squares), ``module_mm`` the side of a square, (x, y) the corner. [mm]
+    """
+
+    layer: Layer
+    runs: tuple[tuple[int, int, int], ...]
+    module_mm: float
+    x_mm: float
+    y_mm: float
+
+    def moved(self, x_mm: float, y_mm: float) -> Modules:
+        """The same squares elsewhere."""
+        return replace(self, x_mm=self.x_mm + x_mm, y_mm=self.y_mm + y_mm)
+
+    @property
+    def boxes_mm(self) -> FloatArray:
+        """The runs as left, bottom, right, top, shape (K, 4). [mm]"""
+        row, start, count = np.array(self.runs, dtype=np.float64).reshape(-1, 3).T
+        boxes: FloatArray = np.stack([start, -row - 1, start + count, -row], axis=1) * self.module_mm
+        return boxes + np.array([self.x_mm, self.y_mm, self.x_mm, self.y_mm])
+
+
+Part = Boxes | Modules | Shape | Stroke | Text
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from ezdxf.layouts.layout import Modelspace
 from shapely.geometry.base import BaseGeometry
 
 from app.encoders.plate.colours import INKS
-from app.encoders.plate.drawing import Boxes, Drawing, FloatArray, Layer, Part, Shape, Stroke, Text
+from app.encoders.plate.drawing import Boxes, Drawing, FloatArray, Layer, Modules, Part, Shape, Stroke, Text
 from app.encoders.plate.lettering import contours_mm
 
 LAYERS = (
@@ -64,7 +64,7 @@ def write_dxf(drawing: Drawing) -> bytes:
     by_layer[Layer.NOTE] = by_layer.get(Layer.NOTE, []) + by_layer.get(Layer.CROP, [])
     for layer in LAYERS:
         parts = by_layer.get(layer, [])
-        for ring in _merged_rings([p for p in parts if isinstance(p, (Boxes, Shape))]):
+        for ring in _merged_rings([p for p in parts if isinstance(p, (Boxes, Modules, Shape))]):
             space.add_lwpolyline(ring, close=True, dxfattribs={"layer": str(layer)})
         for part in parts:
             if isinstance(part, Stroke):
@@ -82,7 +82,7 @@ def _merged_rings(parts: list[Part]) -> list[list[tuple[float, float]]]:
     """Outlines and holes of the union of areas, in millimetres."""
     areas: list[BaseGeometry] = []
     for part in parts:
-        if isinstance(part, Boxes):
+        if isinstance(part, (Boxes, Modules)):
             areas += list(shapely.box(*part.boxes_mm.T))
         elif isinstance(part, Shape):
             areas.append(shapely.Polygon(part.points_mm))

@@ -8,11 +8,11 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import segno
 
-from app.encoders.plate.drawing import Boxes, FloatArray, Layer, Part, Shape, Stroke, Text, box_points
+from app.encoders.plate.drawing import Boxes, Layer, Modules, Part, Shape, Stroke, Text, box_points
 from app.encoders.plate.lettering import fitted_height_mm, text_width_mm
 from app.encoders.plate.order import PlateOrder
+from app.encoders.plate.qr import qr_modules
 from app.markers.plate import PlateGeometry
 
 SIDE_MARGIN_MM = 20.0
@@ -29,7 +29,6 @@ _HAIRLINE_MM = 0.2
 _LABEL_WIDTH_MM = 20.0
 _ROW_MM = 5.2
 _TEXT_MM = 2.4
-_QR_MASK = 2  # any mask reads; fixing one saves the eightfold trial
 
 
 @lru_cache(maxsize=64)
@@ -93,20 +92,17 @@ def _back_mark(order: PlateOrder, right: float, top: float) -> list[Part]:
     id_mm = fitted_height_mm(order.plate_id, 2.4, QR_SIDE_MM + 10.0)
     parts: list[Part] = [Text(Layer.ENGRAVE, order.plate_id, right, top - QR_SIDE_MM - 4.2, id_mm, "end")]
     if order.record_url:
-        qr = Boxes(Layer.ENGRAVE, _qr_boxes(order.record_url))
-        parts.append(qr.moved(right - QR_SIDE_MM, top))
+        parts.append(_qr(order.record_url, right - QR_SIDE_MM, top))
     return parts
 
 
-def _qr_boxes(url: str) -> FloatArray:
-    """Dark modules of a QR code as runs along its rows, from its upper left corner, shape (K, 4). [mm]"""
-    code = segno.make(url, error="m", micro=False, mask=_QR_MASK, boost_error=False)
-    modules = np.array(code.matrix, dtype=np.int8)
+def _qr(url: str, left: float, top: float) -> Modules:
+    modules = qr_modules(url).astype(np.int8)
     edges = np.diff(np.pad(modules, ((0, 0), (1, 1))), axis=1)
     row, start = np.nonzero(edges == 1)
-    _, stop = np.nonzero(edges == -1)
-    boxes: FloatArray = np.stack([start, -row - 1, stop, -row], axis=1) * np.float64(QR_SIDE_MM / len(modules))
-    return boxes
+    count = np.nonzero(edges == -1)[1] - start
+    runs = tuple(zip(row.tolist(), start.tolist(), count.tolist(), strict=True))
+    return Modules(Layer.ENGRAVE, runs, QR_SIDE_MM / len(modules), left, top)
 
 
 def _crop_marks(half: float) -> list[Part]:

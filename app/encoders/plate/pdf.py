@@ -21,6 +21,7 @@ from app.encoders.plate.drawing import (
     Boxes,
     Drawing,
     Layer,
+    Modules,
     Part,
     Shape,
     Stroke,
@@ -172,6 +173,7 @@ def _paint_layer(pieces: list[str], layer: Layer, parts: list[Part], forms: Mapp
     areas = [_area(part) for part in parts if isinstance(part, (Boxes, Shape))]
     if areas:
         pieces += [*areas, "f"]
+    pieces += [_modules(part) for part in parts if isinstance(part, Modules)]
     strokes = [_stroke(part) for part in parts if isinstance(part, Stroke)]
     if strokes:  # overprinted: a cut line must not knock a white hairline out of the inks below
         pieces += [f"q /OVER gs /{layer} CS 1 SCN", *strokes, "Q"]
@@ -185,6 +187,17 @@ def _area(part: Boxes | Shape) -> str:
         values = np.hstack([low, high - low])
         return "%.7g %.7g %.7g %.7g re\n" * len(values) % tuple(values.ravel().tolist())
     return _points(part.points_mm) + " h"
+
+
+def _modules(part: Modules) -> str:
+    scale = f"{part.module_mm:.7g}"
+    runs = "\n".join([_run(*run) for run in part.runs])
+    return f"q {scale} 0 0 -{scale} {part.x_mm:.7g} {part.y_mm:.7g} cm\n{runs}\nf Q"
+
+
+@lru_cache(maxsize=1 << 16)
+def _run(row: int, start: int, count: int) -> str:
+    return f"{start} {row} {count} 1 re"
 
 
 @lru_cache(maxsize=1024)

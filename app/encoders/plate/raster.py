@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.encoders.plate.colours import INKS
-from app.encoders.plate.drawing import Boxes, Drawing, FloatArray, Layer, Part, Shape, Stroke
+from app.encoders.plate.drawing import Boxes, Drawing, FloatArray, Layer, Modules, Part, Shape, Stroke
 from app.encoders.plate.lettering import contours_mm
 
 Image = npt.NDArray[np.uint8]
@@ -46,9 +46,10 @@ def paint(
 
 def _paint_part(image: Image, part: Part, px_per_mm: float, origin_mm: tuple[float, float]) -> None:
     bgr = INKS[part.layer].rgb[::-1]
-    if isinstance(part, Boxes):
-        left, top = _edges_px(part.boxes_mm[:, [0, 3]], px_per_mm, origin_mm).T.tolist()
-        right, bottom = _edges_px(part.boxes_mm[:, [2, 1]], px_per_mm, origin_mm).T.tolist()
+    if isinstance(part, (Boxes, Modules)):
+        boxes = part.boxes_mm
+        left, top = _edges_px(boxes[:, [0, 3]], px_per_mm, origin_mm).T.tolist()
+        right, bottom = _edges_px(boxes[:, [2, 1]], px_per_mm, origin_mm).T.tolist()
         for x0, y0, x1, y1 in zip(left, top, right, bottom, strict=True):
             image[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = bgr
     elif isinstance(part, Shape):

@@ -8,7 +8,17 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from app.encoders.plate.colours import INKS
-from app.encoders.plate.drawing import FACE_LAYERS, SHEET_LAYERS, UNDER_LAYERS, Boxes, Drawing, Part, Shape, Stroke
+from app.encoders.plate.drawing import (
+    FACE_LAYERS,
+    SHEET_LAYERS,
+    UNDER_LAYERS,
+    Boxes,
+    Drawing,
+    Modules,
+    Part,
+    Shape,
+    Stroke,
+)
 from app.encoders.plate.lettering import origin_mm, scale_mm, svg_run
 
 _ORDER = (*UNDER_LAYERS, *FACE_LAYERS, *SHEET_LAYERS)
@@ -70,12 +80,22 @@ def _line(part: Part, sheet_height_mm: float) -> str:
     if isinstance(part, Stroke):
         data = "M" + _points(part.points_mm, sheet_height_mm) + ("Z" if part.closed else "")
         return f'<path d="{data}" fill="none" stroke="{INKS[part.layer].hex}" stroke-width="{part.width_mm:.7g}"/>'
+    if isinstance(part, Modules):
+        place = (
+            f"matrix({part.module_mm:.7g} 0 0 {part.module_mm:.7g} {part.x_mm:.7g} {sheet_height_mm - part.y_mm:.7g})"
+        )
+        return f'<path transform="{place}" d="{"".join([_run(*run) for run in part.runs])}"/>'
     if isinstance(part, (Boxes, Shape)):
         raise TypeError("areas are joined into one path")
     x, y = origin_mm(part)
     scale = f"{scale_mm(part):.6g}"
     place = f"matrix({scale} 0 0 -{scale} {x:.7g} {sheet_height_mm - y:.7g})"
     return f'<path transform="{place}" d="{svg_run(part.text)}"/>'
+
+
+@lru_cache(maxsize=1 << 16)
+def _run(row: int, start: int, count: int) -> str:
+    return f"M{start} {row}h{count}v1h-{count}z"
 
 
 def _points(points: np.ndarray[tuple[int, ...], np.dtype[np.float64]], sheet_height_mm: float) -> str:
