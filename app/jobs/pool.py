@@ -75,16 +75,16 @@ class DecodePool:
         if pool is not None:
             _stop(pool)
 
-    def start(self, task: FrameTask) -> Pending[FrameResult]:
-        """Hand a frame over and return at once."""
-        return self._start(decode_frame, task)
+    def start(self, task: FrameTask, *, wait_s: float = 0.0) -> Pending[FrameResult]:
+        """Hand a frame over and return, at once or as soon as there is a place for it within `wait_s`."""
+        return self._start(decode_frame, task, wait_s)
 
     def annotate(self, task: AnnotationTask) -> bytes:
         """Picture with outlines, encoded."""
         return self._start(annotate_frame, task).result()
 
-    def _start(self, function: Callable[[Any], T], task: Any) -> Pending[T]:
-        if not self._places.acquire(blocking=False):
+    def _start(self, function: Callable[[Any], T], task: Any, wait_s: float = 0.0) -> Pending[T]:
+        if not (self._places.acquire(timeout=wait_s) if wait_s else self._places.acquire(blocking=False)):
             raise Unavailable("every decoder process is busy", cure="try again in a few seconds")
         try:
             return Pending(lambda: self._schedule(function, (task,)), self._places.release, self._limits.timeout_s)
@@ -143,7 +143,7 @@ class Pending(Generic[T]):
 
     def __init__(self, schedule: Callable[[], ProcessFuture[T]], release: Callable[[], None], timeout_s: float) -> None:
         self._schedule = schedule
-        self._release = release
+        self._releases = [release]
         self._timeout_s = timeout_s
         self._cancelled = False
         self._future = schedule()
@@ -174,10 +174,15 @@ class Pending(Generic[T]):
         except (BrokenProcessPool, CancelledError) as error:
             raise Unavailable("the decoder process was stopped", cure="try again in a few seconds") from error
         finally:
-            self._release()
+            self._release_once()
 
     def cancel(self) -> None:
         """Stop it, also when it runs already."""
         self._cancelled = True
         cancel: Callable[[], bool] = self._future.cancel
         cancel()
+        self._release_once()
+
+    def _release_once(self) -> None:
+        while self._releases:
+            self._releases.pop()()

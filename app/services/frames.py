@@ -108,14 +108,20 @@ class PendingFrame(Protocol):
         """
 
     def cancel(self) -> None:
-        """Stop it, also when it runs already."""
+        """Stop it, also when it runs already. Every frame that is started ends in `result` or here."""
 
 
 class FrameDecoder(Protocol):
     """Decoder processes, as the services see them."""
 
-    def start(self, task: FrameTask) -> PendingFrame:
-        """Hand a frame over and return at once."""
+    def start(self, task: FrameTask, *, wait_s: float = 0.0) -> PendingFrame:
+        """Hand a frame over and return, at once or as soon as there is a place for it within `wait_s`.
+
+        Raises
+        ------
+        Unavailable
+            Too many frames are waiting already.
+        """
 
     def annotate(self, task: AnnotationTask) -> bytes:
         """Picture with outlines, encoded."""

@@ -1,0 +1,175 @@
+"""Archives of frames, decoded as jobs."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import structlog
+
+from app.decoders.archives import Member, count_members, read_members
+from app.errors import Unavailable, UnreadableUpload, WaymarkError
+from app.registry import decodes as store
+from app.registry.database import Database
+from app.registry.decodes import Row
+from app.services.decode_context import DecodeContext, context_from_document
+from app.services.decode_documents import ReadFrame, error_document, result_document
+from app.services.decode_rules import DecodeRules
+from app.services.frame_reading import observations_of, read_frame, start_frame
+from app.services.frames import Blobs, FrameDecoder, PendingFrame
+from app.services.matching import NearbyPlates, find_nearby_plates
+from app.services.ports import Clock
+
+_PATIENCE_S = 60.0
+_LOG = structlog.get_logger(__name__)
+
+
+class DecodeJobs:
+    """Runs the decodes that were queued.
+
+    Parameters
+    ----------
+    database : Database
+    clock : Clock
+    blobs : Blobs
+        Where the uploads are.
+    decoder : FrameDecoder
+        Decoder processes.
+    rules : DecodeRules, optional
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        clock: Clock,
+        *,
+        blobs: Blobs,
+        decoder: FrameDecoder,
+        rules: DecodeRules | None = None,
+    ) -> None:
+        self._database = database
+        self._clock = clock
+        self._blobs = blobs
+        self._decoder = decoder
+        self._rules = rules or DecodeRules()
+
+    def run_job(self, decode_id: str) -> None:
+        """Decode a queued archive. It may be called again and at the same time: the effect happens once.
+
+        Raises
+        ------
+        Unavailable
+            The decoder processes or the stores do not answer; the job stays unfinished and can be run again.
+        """
+        with self._database.write() as connection:
+            row = store.start_decode(connection, decode_id)
+        if row is None:
+            return
+        if row["attempts"] > self._rules.max_attempts:
+            self._fail(row, _given_up(self._rules.max_attempts))
+            return
+        try:
+            frames, codebook_plates = self._read_archive(row)
+        except _Cancelled:
+            self._finish(row, {"state": "cancelled"})
+        except Unavailable:
+            raise
+        except WaymarkError as error:
+            self._fail(row, error)
+        except Exception:  # noqa: BLE001 - a defect must not leave a job that runs for ever
+            _LOG.exception("a decode job failed on a defect", decode_id=decode_id)
+            self._fail(row, WaymarkError("the job failed on a defect of the server; its log has the details"))
+        else:
+            result = result_document(frames, codebook_plates=codebook_plates)
+            self._finish(row, {"state": "done", "progress": 1.0, "result": result}, frames)
+
+    def list_unfinished(self) -> list[str]:
+        """Jobs that an earlier process left; main submits them again."""
+        with self._database.read() as connection:
+            return store.list_unfinished(connection)
+
+    def _read_archive(self, row: Row) -> tuple[list[ReadFrame], int]:
+        context = context_from_document(row["context"])
+        data = self._blobs.get(row["upload_key"])
+        total = count_members(data, self._rules.archives)
+        with self._database.read() as connection:
+            nearby = find_nearby_plates(connection, row["agency_id"], context.coarse_position)
+        frames: list[ReadFrame] = []
+        waiting: deque[tuple[Member, PendingFrame | WaymarkError]] = deque()
+        noted_at = self._clock()
+        try:
+            for member in read_members(data, self._rules.archives):
+                waiting.append((member, self._start_member(member, context, nearby)))
+                if len(waiting) >= self._rules.frames_in_flight:
+                    frames.append(self._finish_member(row["agency_id"], *waiting.popleft(), context, nearby))
+                if self._clock() - noted_at >= self._rules.progress_every:
+                    noted_at = self._clock()
+                    self._note_progress(row["id"], len(frames) / total)
+            while waiting:
+                frames.append(self._finish_member(row["agency_id"], *waiting.popleft(), context, nearby))
+        finally:
+            for _member, pending in waiting:
+                if not isinstance(pending, WaymarkError):
+                    pending.cancel()
+        return frames, len(nearby.codebook)
+
+    def _start_member(
+        self, member: Member, context: DecodeContext, nearby: NearbyPlates
+    ) -> PendingFrame | WaymarkError:
+        if member.error is not None:
+            return member.error
+        try:
+            return start_frame(self._decoder, member.data, context, nearby, self._rules.images, wait_s=_PATIENCE_S)
+        except Unavailable:
+            raise
+        except WaymarkError as error:
+            return error
+
+    def _finish_member(
+        self,
+        agency_id: str,
+        member: Member,
+        pending: PendingFrame | WaymarkError,
+        context: DecodeContext,
+        nearby: NearbyPlates,
+    ) -> ReadFrame:
+        try:
+            if isinstance(pending, WaymarkError):
+                raise pending
+            result = pending.result()
+        except Unavailable:
+            raise
+        except WaymarkError as error:
+            return ReadFrame(member.index, member.name, error=error)
+        with self._database.read() as connection:
+            return read_frame(connection, agency_id, member, result, context, nearby)
+
+    def _note_progress(self, decode_id: str, progress: float) -> None:
+        with self._database.write() as connection:
+            if store.record_progress(connection, decode_id, progress):
+                raise _Cancelled
+
+    def _fail(self, row: Row, error: WaymarkError) -> None:
+        self._finish(row, {"state": "failed", "error": error_document(error)})
+
+    def _finish(self, row: Row, values: dict[str, Any], frames: Sequence[ReadFrame] = ()) -> None:
+        now = self._clock()
+        captured_at = context_from_document(row["context"]).captured_at
+        with self._database.write() as connection:
+            if store.finish_decode(connection, row["id"], {**values, "finished_at": now}):
+                seen = observations_of(row["id"], frames, captured_at or row["created_at"])
+                store.add_observations(connection, row["agency_id"], seen)
+
+
+class _Cancelled(Exception):
+    """Somebody asked the job to stop."""
+
+
+def _given_up(attempts: int) -> WaymarkError:
+    return UnreadableUpload(
+        "the job was started again and again and never finished",
+        field="file",
+        limit=f"{attempts} attempts",
+        cure="send the frames in smaller archives",
+    )

@@ -1,0 +1,34 @@
+"""Limits of decodes that a deployment can set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import timedelta
+
+from app.decoders.archives import ArchiveLimits
+from app.decoders.images import ImageLimits
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeRules:
+    """What uploads may cost, and how patient jobs are.
+
+    Attributes
+    ----------
+    images : ImageLimits
+    archives : ArchiveLimits
+    frames_in_flight : int
+        Frames of one archive that are decoded at the same time.
+    max_attempts : int
+        How often a job is started before it is given up.
+    progress_every : timedelta
+        Least time between two notes of a job's progress.
+    idempotency_ttl : timedelta
+    """
+
+    images: ImageLimits = field(default_factory=ImageLimits)
+    archives: ArchiveLimits = field(default_factory=ArchiveLimits)
+    frames_in_flight: int = 2
+    max_attempts: int = 3
+    progress_every: timedelta = timedelta(seconds=1)
+    idempotency_ttl: timedelta = timedelta(hours=24)

@@ -1,0 +1,242 @@
+"""Uploads -> readings, matches, fixes and observations.
+
+A frame is decoded while the caller waits, an archive of frames becomes a job. Either way the decoding happens in a
+child process, and everything that an upload leaves is written in one transaction.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.decoders.archives import Member, count_members, is_archive, read_member
+from app.errors import NotFound
+from app.registry import decodes as store
+from app.registry.database import Database
+from app.registry.ids import new_id
+from app.services.access import Caller
+from app.services.decode_context import DecodeContext, context_from_document
+from app.services.decode_documents import ReadFrame, decode_document, result_document
+from app.services.decode_rules import DecodeRules
+from app.services.frame_reading import observations_of, read_frame, start_frame
+from app.services.frames import AnnotationTask, Blobs, FrameDecoder, JobQueue, Outline
+from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
+from app.services.matching import NearbyPlates, find_nearby_plates
+from app.services.ports import Clock
+from app.storage.blobs import new_blob_key
+
+FRAME, ARCHIVE = "frame", "archive"
+UPLOADS = "uploads"
+
+
+class Decodes:
+    """Use cases on decodes.
+
+    Parameters
+    ----------
+    database : Database
+    clock : Clock
+    blobs : Blobs
+        Where uploads are kept.
+    decoder : FrameDecoder
+        Decoder processes.
+    queue : JobQueue
+        Where archives wait for `DecodeJobs.run_job`.
+    rules : DecodeRules, optional
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        clock: Clock,
+        *,
+        blobs: Blobs,
+        decoder: FrameDecoder,
+        queue: JobQueue,
+        rules: DecodeRules | None = None,
+    ) -> None:
+        self._database = database
+        self._clock = clock
+        self._blobs = blobs
+        self._decoder = decoder
+        self._queue = queue
+        self._rules = rules or DecodeRules()
+
+    # --- uploads --------------------------------------------------------------------------------------------------
+
+    def decode_upload(
+        self, caller: Caller, data: bytes, context: DecodeContext, key: IdempotencyKey | None = None
+    ) -> tuple[dict[str, Any], bool]:
+        """Decode a frame now, or queue an archive of frames.
+
+        Returns
+        -------
+        decode : dict
+        replayed : bool
+            The request had been made before under the same Idempotency-Key; nothing was stored now.
+
+        Raises
+        ------
+        UnreadableUpload, UploadTooLarge, UnsupportedUpload, InvalidParameter
+            The upload or its context is refused; nothing is stored.
+        Unavailable
+            The decoder processes are busy.
+        """
+        if key is not None:
+            with self._database.read() as connection:
+                answer = find_answer(connection, caller.agency_id, key, self._clock())
+            if answer is not None:
+                return answer, True
+        if is_archive(data):
+            return self._queue_archive(caller, data, context, key)
+        return self._decode_frame(caller, data, context, key)
+
+    def _decode_frame(
+        self, caller: Caller, data: bytes, context: DecodeContext, key: IdempotencyKey | None
+    ) -> tuple[dict[str, Any], bool]:
+        created_at = self._clock()
+        with self._database.read() as connection:
+            nearby = find_nearby_plates(connection, caller.agency_id, context.coarse_position)
+        pending = start_frame(self._decoder, data, context, nearby, self._rules.images)
+        blob_key = new_blob_key(UPLOADS)
+        row = _new_row(FRAME, context, blob_key, created_at)
+        replayed = True
+        try:
+            self._blobs.put(blob_key, data)  # while the child decodes
+            result = pending.result()
+            with self._database.write() as connection:
+                document = find_answer(connection, caller.agency_id, key, created_at)
+                if document is None:
+                    replayed = False
+                    frame = read_frame(connection, caller.agency_id, Member(0, ""), result, context, nearby)
+                    document = self._store_frame(connection, caller, row, frame, context, nearby)
+                    keep_answer(connection, caller.agency_id, key, document, created_at, self._rules.idempotency_ttl)
+        except BaseException:
+            pending.cancel()
+            self._blobs.delete(blob_key)
+            raise
+        if replayed:
+            self._blobs.delete(blob_key)
+        return document, replayed
+
+    def _store_frame(
+        self,
+        connection: sa.Connection,
+        caller: Caller,
+        row: dict[str, Any],
+        frame: ReadFrame,
+        context: DecodeContext,
+        nearby: NearbyPlates,
+    ) -> dict[str, Any]:
+        row |= {
+            "state": "done",
+            "progress": 1.0,
+            "attempts": 1,
+            "result": result_document([frame], codebook_plates=len(nearby.codebook)),
+            "finished_at": self._clock(),
+        }
+        store.add_decode(connection, caller.agency_id, row)
+        seen_at = context.captured_at or row["created_at"]
+        store.add_observations(connection, caller.agency_id, observations_of(row["id"], [frame], seen_at))
+        return decode_document(row)
+
+    def _queue_archive(
+        self, caller: Caller, data: bytes, context: DecodeContext, key: IdempotencyKey | None
+    ) -> tuple[dict[str, Any], bool]:
+        created_at = self._clock()
+        count_members(data, self._rules.archives)
+        blob_key = new_blob_key(UPLOADS)
+        row = _new_row(ARCHIVE, context, blob_key, created_at)
+        replayed = True
+        try:
+            self._blobs.put(blob_key, data, durable=True)
+            with self._database.write() as connection:
+                document = find_answer(connection, caller.agency_id, key, created_at)
+                if document is None:
+                    replayed = False
+                    store.add_decode(connection, caller.agency_id, row)
+                    document = decode_document(row)
+                    keep_answer(connection, caller.agency_id, key, document, created_at, self._rules.idempotency_ttl)
+        except BaseException:
+            self._blobs.delete(blob_key)
+            raise
+        if replayed:
+            self._blobs.delete(blob_key)
+        else:
+            self._queue.submit(row["id"])
+        return document, replayed
+
+    # --- what is stored -------------------------------------------------------------------------------------------
+
+    def get(self, caller: Caller, decode_id: str) -> dict[str, Any]:
+        """One decode with its result."""
+        with self._database.read() as connection:
+            return decode_document(store.get_decode(connection, caller.agency_id, decode_id))
+
+    def page(
+        self, caller: Caller, *, state: str | None = None, before: str | None = None, limit: int = 100
+    ) -> tuple[list[dict[str, Any]], str | None]:
+        """A page of decodes without their results, newest first, and the id to continue before."""
+        with self._database.read() as connection:
+            rows = store.list_decodes(connection, caller.agency_id, state=state, before=before, limit=limit + 1)
+        page = [decode_document(row) for row in rows[:limit]]
+        return page, page[-1]["id"] if len(rows) > limit else None
+
+    def cancel(self, caller: Caller, decode_id: str) -> dict[str, Any]:
+        """Ask a job to stop; a finished one stays as it is."""
+        with self._database.write() as connection:
+            store.get_decode(connection, caller.agency_id, decode_id)
+            store.request_cancel(connection, caller.agency_id, decode_id, self._clock())
+            return decode_document(store.get_decode(connection, caller.agency_id, decode_id))
+
+    def annotated(self, caller: Caller, decode_id: str, suffix: str, frame: int = 0) -> bytes:
+        """A frame with its readings drawn over it, encoded as ``png`` or ``jpg``.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode or frame, or it is not done.
+        """
+        with self._database.read() as connection:
+            row = store.get_decode(connection, caller.agency_id, decode_id)
+        result = row["result"]
+        if result is None:
+            raise NotFound(
+                f"decode {decode_id} has no result: it is {row['state']}",
+                field="decode_id",
+                cure="wait until it is done",
+            )
+        known = next((entry for entry in result["frames"] if entry["frame"] == frame), None)
+        if known is None or known["error"] is not None:
+            raise NotFound(f"decode {decode_id} has no readable frame {frame}", field="frame")
+        data = self._blobs.get(row["upload_key"])
+        if row["kind"] == ARCHIVE:
+            data = read_member(data, frame, self._rules.archives).data
+        context = context_from_document(row["context"])
+        outlines = tuple(_outline(reading) for reading in result["readings"] if reading["frame"] == frame)
+        task = AnnotationTask(data, outlines, suffix, context.thermal, context.thermal_range, limits=self._rules.images)
+        return self._decoder.annotate(task)
+
+
+def _new_row(kind: str, context: DecodeContext, blob_key: str, created_at: datetime) -> dict[str, Any]:
+    return {
+        "id": new_id(created_at),
+        "state": "queued",
+        "kind": kind,
+        "context": context.document(),
+        "upload_key": blob_key,
+        "attempts": 0,
+        "progress": 0.0,
+        "created_at": created_at,
+        "finished_at": None,
+        "result": None,
+        "error": None,
+    }
+
+
+def _outline(reading: dict[str, Any]) -> Outline:
+    corners = tuple((float(x), float(y)) for x, y in reading["corners_px"] or ())
+    label = f"{reading['digits']} {reading['confidence']:.1%}" if reading["digits"] else reading["outcome"]
+    return Outline(corners, reading["outcome"], label)
