@@ -43,18 +43,24 @@ def get_markers(request: Request) -> MarkersService:
     return service
 
 
-async def get_idempotency_key(request: Request) -> IdempotencyKey | None:
-    """The client's Idempotency-Key with the hash of the request."""
+def checked_idempotency_key(request: Request) -> str | None:
+    """The client's Idempotency-Key, if it sent one that can be kept."""
     key = request.headers.get("idempotency-key")
-    if key is None:
-        return None
-    if not 1 <= len(key) <= MAX_IDEMPOTENCY_KEY or not key.isprintable():
+    if key is not None and (not 1 <= len(key) <= MAX_IDEMPOTENCY_KEY or not key.isprintable()):
         raise InvalidParameter(
             "the Idempotency-Key is empty, too long or not printable",
             field="Idempotency-Key",
             limit=f"1 to {MAX_IDEMPOTENCY_KEY} printable characters",
             cure="send a UUID",
         )
+    return key
+
+
+async def get_idempotency_key(request: Request) -> IdempotencyKey | None:
+    """The client's Idempotency-Key with the hash of the request."""
+    key = checked_idempotency_key(request)
+    if key is None:
+        return None
     digest = hashlib.sha256(f"{request.method} {request.url.path}\n".encode() + await request.body())
     return IdempotencyKey(key, digest.hexdigest())
 
