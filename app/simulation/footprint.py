@@ -53,7 +53,7 @@ def list_windows(scene: PlateScene, truths: tuple[FaceTruth, ...]) -> list[tuple
         window, members = _window(scene, placed, truth), [index]
         if window is None:
             continue
-        for other in [g for g in groups if g[0].overlaps(window)]:
+        while other := next((g for g in groups if g[0].overlaps(window)), None):
             groups.remove(other)
             window, members = window.union(other[0]), other[1] + members
         groups.append((window, members))
