@@ -54,6 +54,10 @@ class DecodePool:
         self._pool: ProcessPool | None = None
         self._closed = False
 
+    def warm(self) -> None:
+        """Start the processes without waiting for them; without it the first frame starts them."""
+        self._running_pool().schedule(os.getpid)
+
     def open(self) -> None:
         """Start the processes and wait until one is ready.
 

@@ -40,16 +40,27 @@ class Blobs:
 
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
+        self._url = url
         self._folder: Path | None = None
-        self._store: ObjectStore
+        self._opened: ObjectStore | None = None
         if parts.scheme == "file" and not parts.netloc and parts.path:
             self._folder = Path(unquote(parts.path))
-            self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            self._store = LocalStore(self._folder)
-        elif parts.scheme == "s3" and parts.netloc:
-            self._store = from_url(url)
-        else:
+        elif parts.scheme != "s3" or not parts.netloc:
             raise InvalidParameter(f"no blob store at {url!r}", field="blobs_url", limit=_URL)
+
+    def open(self) -> None:
+        """Create the folder, or prepare the client."""
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._opened = LocalStore(self._folder)
+        else:
+            self._opened = from_url(self._url)
+
+    @property
+    def _store(self) -> ObjectStore:
+        if self._opened is None:
+            raise Unavailable("the blob store is not open")
+        return self._opened
 
     def put(self, key: str, data: bytes, *, durable: bool = False) -> None:
         """Write a blob that does not exist yet.

@@ -18,7 +18,10 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def blobs(folder: Path) -> Blobs:
-    return Blobs(folder.as_uri())
+    store = Blobs(folder.as_uri())
+    assert not folder.exists()
+    store.open()
+    return store
 
 
 @pytest.mark.parametrize("durable", [False, True])
@@ -77,5 +80,7 @@ def test_other_urls_are_refused(url: str) -> None:
 def test_a_folder_name_with_a_percent_sign(tmp_path: Path) -> None:
     folder = tmp_path / "50%25 done"
     key = new_blob_key("uploads")
-    Blobs(folder.as_uri()).put(key, b"x")
+    blobs = Blobs(folder.as_uri())
+    blobs.open()
+    blobs.put(key, b"x")
     assert (folder / key).read_bytes() == b"x"
