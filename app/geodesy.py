@@ -62,9 +62,9 @@ _GLOBAL_DATUM = re.compile(
 )
 _GLOBAL_REALIZATION = re.compile(r"(WGS ?84|ITRF|IGS|IGb)", re.IGNORECASE)
 _EPSG_FORMS = (
-    re.compile(r"EPSG:(?P<code>\d{4,6})", re.IGNORECASE),
-    re.compile(r"urn:ogc:def:crs:EPSG:[\d.]*:(?P<code>\d{4,6})", re.IGNORECASE),
-    re.compile(r"https?://www\.opengis\.net/def/crs/EPSG/0/(?P<code>\d{4,6})", re.IGNORECASE),
+    re.compile(r"EPSG:(?P<code>[0-9]{4,6})", re.IGNORECASE),
+    re.compile(r"urn:ogc:def:crs:EPSG:[0-9.]*:(?P<code>[0-9]{4,6})", re.IGNORECASE),
+    re.compile(r"https?://www\.opengis\.net/def/crs/EPSG/0/(?P<code>[0-9]{4,6})", re.IGNORECASE),
 )
 _CRS84_FORMS = ("OGC:CRS84", "URN:OGC:DEF:CRS:OGC:1.3:CRS84", "URN:OGC:DEF:CRS:OGC::CRS84")
 _CRS_RULE = "an EPSG code or OGC:CRS84"

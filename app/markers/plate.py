@@ -73,7 +73,10 @@ class PlateGeometry:
     def __post_init__(self) -> None:
         if self.n not in SIZES:
             raise InvalidParameter(
-                f"a plate has 8, 10 or 12 units along a side, not {self.n}", field="n", limit="8, 10 or 12"
+                f"a plate has 8, 10 or 12 units along a side, not {self.n}",
+                field="n",
+                limit="8, 10 or 12",
+                cure="choose n = 8, 10 or 12",
             )
         _check_range("unit_mm", self.unit_mm, UNIT_MM, "units are 20 to 50 mm (2-5 cm)")
         _check_range("gap_mm", self.gap_mm, GAP_MM, "gaps are 2 to 10 mm (0.2-1 cm)")
@@ -241,6 +244,7 @@ class PlateCode:
                 f"a {self.n} x {self.n} plate holds {cells} digits, these are {len(self.digits)}",
                 field="digits",
                 limit=f"{cells} digits",
+                cure=f"give {cells} digits, or another size of plate",
             )
         alphabet = _DIGITS if self.scheme is PlateScheme.ID else _DIGITS[:10]
         if any(d not in alphabet for d in self.digits):
@@ -321,6 +325,7 @@ class PlateCode:
                 f"registry number {number} does not fit a {n} x {n} plate",
                 field="registry_number",
                 limit=f"0 to {16**lay.data - 1}",
+                cure="choose a smaller number or a larger plate",
             )
         data = [int(d, 16) for d in f"{number:0{lay.data}X}"]
         per_word = lay.data // lay.codewords

@@ -31,6 +31,19 @@ class Scope(StrEnum):
         return order.index(self) >= order.index(needed)
 
 
+def parse_scope(name: str) -> Scope:
+    """The scope with a name.
+
+    Raises
+    ------
+    InvalidParameter
+        There is none.
+    """
+    if name not in list(Scope):
+        raise InvalidParameter(f"there is no scope {name!r}", field="scope", limit=", ".join(Scope))
+    return Scope(name)
+
+
 @dataclass(frozen=True, slots=True)
 class Caller:
     """An authenticated caller."""

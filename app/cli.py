@@ -1,0 +1,91 @@
+"""`waymark`: the command line, a thin shell over the use cases and the codecs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from app.errors import WaymarkError
+from app.settings import Settings
+
+cli = typer.Typer(name="waymark", no_args_is_help=True, add_completion=False, pretty_exceptions_show_locals=False)
+
+HostOption = Annotated[str | None, typer.Option(help="Address to listen on; WAYMARK_HOST or 127.0.0.1 without.")]
+PortOption = Annotated[int | None, typer.Option(help="Port to listen on; WAYMARK_PORT or 8000 without.")]
+
+
+@cli.callback()
+def waymark() -> None:
+    """The registry of machine-readable roads."""
+
+
+@cli.command()
+def serve(host: HostOption = None, port: PortOption = None) -> None:
+    """Serve the API and the web UI; on a fresh machine print the first admin key."""
+    import uvicorn
+
+    from app.logs import configure_logs
+    from app.main import create_app
+
+    settings = _settings(host=host, port=port)
+    configure_logs(settings.log_format, settings.log_level)
+    uvicorn.run(
+        create_app(settings),
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=30,
+    )
+
+
+@cli.command()
+def migrate(revision: Annotated[str, typer.Argument(help="Revision to go to, up or down.")] = "head") -> None:
+    """Bring the database's schema to a revision; `serve` goes to the newest by itself."""
+    from app.registry.database import Database
+
+    database = Database(_settings().resolved_database_url)
+    database.open()
+    try:
+        database.migrate(revision)
+    finally:
+        database.close()
+    typer.echo(f"{database.path} is at revision {revision}")
+
+
+@cli.command()
+def key(
+    agency: Annotated[str, typer.Argument(help="Name of the agency; created if there is none of that name.")],
+    scope: Annotated[str, typer.Option(help="read, decode, write or admin.")] = "write",
+    label: Annotated[str, typer.Option(help="Who or what the key is for; appears in histories.")] = "key",
+) -> None:
+    """Make a key for an agency and print it once. The server must not be running."""
+    from app.main import utc_now
+    from app.registry.database import Database
+    from app.services.access import Access, parse_scope
+
+    database = Database(_settings().resolved_database_url)
+    database.open()
+    try:
+        database.migrate()
+        typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label))
+    finally:
+        database.close()
+
+
+def _settings(**given: object) -> Settings:
+    return Settings.model_validate({name: value for name, value in given.items() if value is not None})
+
+
+def main() -> None:
+    """Run the command line; an expected error is one line, not a traceback."""
+    try:
+        cli()
+    except WaymarkError as error:
+        typer.echo(f"waymark: {error.message}", err=True)
+        for name in ("limit", "cure"):
+            if value := getattr(error, name):
+                typer.echo(f"  {name}: {value}", err=True)
+        raise SystemExit(1) from None

@@ -1,0 +1,69 @@
+"""The house rules of DESIGN.md hold: imports point one way, the core is pure, nothing happens at import."""
+
+from __future__ import annotations
+
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import app
+
+ROOT = Path(__file__).resolve().parents[2]
+CORE = ("simulation", "encoders", "decoders", "markers", "sensors", "geodesy", "errors")
+
+
+def _modules(prefix: str = "app") -> list[str]:
+    return [module.name for module in pkgutil.walk_packages(app.__path__, "app.") if module.name.startswith(prefix)]
+
+
+def test_the_import_contracts_are_kept() -> None:
+    lint = Path(sys.executable).with_name("lint-imports")
+    run = subprocess.run([lint, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout + run.stderr
+    assert "0 broken" in run.stdout
+
+
+def test_the_core_imports_no_framework_and_no_database() -> None:
+    names = [name for name in _modules() if name.split(".")[1] in CORE]
+    assert len(names) > 15
+    program = (
+        f"import importlib, sys\nfor name in {names!r}: importlib.import_module(name)\n"
+        "print(sorted({m.split('.')[0] for m in sys.modules} "
+        "& {'fastapi', 'starlette', 'sqlalchemy', 'alembic', 'pydantic_settings', 'httpx', 'uvicorn', 'structlog'}))"
+    )
+    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_no_module_creates_an_app_or_reads_settings_at_import(tmp_path: Path) -> None:
+    program = f"""
+import importlib, os, sys
+sys.path.insert(0, {str(ROOT)!r})
+import fastapi, pydantic_settings, sqlalchemy
+def refuse(what):
+    def init(self, *args, **kwargs):
+        raise AssertionError(what + " at import")
+    return init
+fastapi.FastAPI.__init__ = refuse("an app")
+pydantic_settings.BaseSettings.__init__ = refuse("settings")
+sqlalchemy.create_engine = refuse("an engine")
+for name in {_modules()!r}:
+    importlib.import_module(name)
+print(sorted(os.listdir(".")))
+"""
+    run = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == "[]", "importing wrote files"
+
+
+@pytest.mark.parametrize("name", ["requirements.txt", "requirements-dev.txt"])
+def test_locked_dependencies_have_hashes_and_no_addresses(name: str) -> None:
+    text = (ROOT / name).read_text()
+    pins = [line for line in text.splitlines() if line[:1].isalnum()]
+    assert len(pins) > 40
+    assert all("==" in line and line.endswith("\\") for line in pins)
+    assert "://" not in text
+    assert "index-url" not in text.replace("--no-emit-index-url", "")
