@@ -34,7 +34,7 @@ def get_decode(connection: sa.Connection, agency_id: str, decode_id: str) -> Row
     query = sa.select(*_PUBLIC).where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
     row = connection.execute(query).mappings().one_or_none()
     if row is None:
-        raise NotFound(f"there is no decode {decode_id}", field="decode_id")
+        raise NotFound(f"there is no decode {decode_id}", field="decode_id", cure="GET /v1/decodes lists yours")
     return row
 
 

@@ -112,7 +112,8 @@ def _summary(frames: Sequence[ReadFrame]) -> dict[str, Any]:
     failed = sum(frame.error is not None for frame in frames)
     outcomes: dict[str, int] = {}
     for plate in plates:
-        outcomes[plate.reading.outcome] = outcomes.get(plate.reading.outcome, 0) + 1
+        outcome = str(plate.reading.outcome)
+        outcomes[outcome] = outcomes.get(outcome, 0) + 1
     refused = len(plates) - len(read)
     text = f"{_count(len(read), 'plate')} read" if read else "no plate read"
     text += f" in {_count(len(frames), 'frame')}, {len(matched)} of them registered" if read else ""
