@@ -121,7 +121,8 @@ class Modules:
         """The runs as left, bottom, right, top, shape (K, 4). [mm]"""
         row, start, count = np.array(self.runs, dtype=np.float64).reshape(-1, 3).T
         boxes: FloatArray = np.stack([start, -row - 1, start + count, -row], axis=1) * self.module_mm
-        return boxes + np.array([self.x_mm, self.y_mm, self.x_mm, self.y_mm])
+        boxes += np.array([self.x_mm, self.y_mm, self.x_mm, self.y_mm])
+        return boxes
 
 
 Part = Boxes | Modules | Shape | Stroke | Text

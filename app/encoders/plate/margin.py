@@ -42,7 +42,7 @@ def fixed_margin(geometry: PlateGeometry) -> tuple[Part, ...]:
         *_dimension(half, f"{geometry.side_mm:g} mm ± {SIDE_TOLERANCE_MM:g} outer edge, border gap included"),
         *_scale_bar(-half, -half - 66.0),
         *_arrow(Layer.ENGRAVE, half - QR_SIDE_MM - 7.0, -half - 27.0 - QR_SIDE_MM / 2 - 6.0, 5.0, 12.0),
-        Text(Layer.NOTE, "Engrave on the back", half, -half - 61.2, 1.8, "end"),
+        Text(Layer.NOTE, "Engrave on the back", half, -half - 62.2, 1.8, "end"),
     )
 
 
@@ -90,7 +90,7 @@ def _data_rows(order: PlateOrder, left: float, top: float) -> list[Part]:
 def _back_mark(order: PlateOrder, right: float, top: float) -> list[Part]:
     """Id and QR that are engraved on the back, since the face carries no text."""
     id_mm = fitted_height_mm(order.plate_id, 2.4, QR_SIDE_MM + 10.0)
-    parts: list[Part] = [Text(Layer.ENGRAVE, order.plate_id, right, top - QR_SIDE_MM - 4.2, id_mm, "end")]
+    parts: list[Part] = [Text(Layer.ENGRAVE, order.plate_id, right, top - QR_SIDE_MM - 5.6, id_mm, "end")]
     if order.record_url:
         parts.append(_qr(order.record_url, right - QR_SIDE_MM, top))
     return parts
