@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pydantic import ValidationError
 
-from app.errors import WaymarkError
+from app.errors import InvalidParameter, WaymarkError
 from app.settings import Settings
+
+if TYPE_CHECKING:
+    from app.registry.database import Database
 
 cli = typer.Typer(name="waymark", no_args_is_help=True, add_completion=False, pretty_exceptions_show_locals=False)
 
@@ -30,6 +36,8 @@ def serve(host: HostOption = None, port: PortOption = None) -> None:
 
     settings = _settings(host=host, port=port)
     configure_logs(settings.log_format, settings.log_level)
+    with _owned_database(settings):
+        pass  # a file that another process owns is said in one line here, not in a traceback from the server
     uvicorn.run(
         create_app(settings),
         host=settings.host,
@@ -44,14 +52,8 @@ def serve(host: HostOption = None, port: PortOption = None) -> None:
 @cli.command()
 def migrate(revision: Annotated[str, typer.Argument(help="Revision to go to, up or down.")] = "head") -> None:
     """Bring the database's schema to a revision; `serve` goes to the newest by itself."""
-    from app.registry.database import Database
-
-    database = Database(_settings().resolved_database_url)
-    database.open()
-    try:
+    with _owned_database(_settings()) as database:
         database.migrate(revision)
-    finally:
-        database.close()
     typer.echo(f"{database.path} is at revision {revision}")
 
 
@@ -63,20 +65,32 @@ def key(
 ) -> None:
     """Make a key for an agency and print it once. The server must not be running."""
     from app.main import utc_now
-    from app.registry.database import Database
     from app.services.access import Access, parse_scope
 
-    database = Database(_settings().resolved_database_url)
-    database.open()
-    try:
+    with _owned_database(_settings()) as database:
         database.migrate()
         typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label))
+
+
+@contextmanager
+def _owned_database(settings: Settings) -> Iterator[Database]:
+    from app.registry.database import Database
+
+    database = Database(settings.resolved_database_url)
+    database.open()
+    try:
+        yield database
     finally:
         database.close()
 
 
 def _settings(**given: object) -> Settings:
-    return Settings.model_validate({name: value for name, value in given.items() if value is not None})
+    try:
+        return Settings.model_validate({name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "WAYMARK_" + "_".join(str(part) for part in first["loc"]).upper()
+        raise InvalidParameter(f"{name.removesuffix('_')}: {first['msg']}", cure="see docs/settings.md") from error
 
 
 def main() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timedelta
+from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
@@ -359,7 +360,7 @@ def marker_document(row: Row | dict[str, Any]) -> dict[str, Any]:
             "scheme": row["scheme"],
             "digits": row["digits"],
             "check_digits": row["check_digits"],
-            "registry_number": plate_code(row).registry_number if row["scheme"] == "id" else None,
+            "registry_number": _registry_number(row["digits"], n) if row["scheme"] == "id" else None,
             "digits_match_position": row["digits_match_position"],
         },
         "geometry": {
@@ -392,6 +393,11 @@ def marker_document(row: Row | dict[str, Any]) -> dict[str, Any]:
         "created_at": row["created_at"],
         "updated_at": row["updated_at"],
     }
+
+
+@lru_cache(maxsize=2**16)
+def _registry_number(digits: str, n: int) -> int:
+    return PlateCode(digits, PlateScheme.ID, n).registry_number
 
 
 def _version_document(row: Row) -> dict[str, Any]:

@@ -1,0 +1,76 @@
+"""The other commands of `waymark`, in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from pydantic import SecretStr
+
+from app import cli
+from app.main import create_app
+from app.settings import Settings
+from tests.conftest import LiveServer
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def waymark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    monkeypatch.setenv("WAYMARK_DATA_DIR", str(tmp_path))
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["waymark", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        printed = capsys.readouterr()
+        return int(ended.value.code or 0), printed.out, printed.err
+
+    return run
+
+
+def test_migrate_up_and_down(waymark: Run, tmp_path: Path) -> None:
+    assert "is at revision head" in waymark("migrate")[1]
+    assert "is at revision base" in waymark("migrate", "base")[1]
+    assert (tmp_path / "waymark.sqlite3").exists()
+
+
+def test_a_key_for_another_agency(waymark: Run, tmp_path: Path) -> None:
+    status, key, _ = waymark("key", "City of Elsewhere", "--scope", "read", "--label", "map")
+    assert status == 0
+    with LiveServer(create_app(Settings(data_dir=tmp_path))) as server, server.client(key.strip()) as client:
+        assert client.get("/v1/markers").status_code == 200
+        assert client.post("/v1/markers", json={}).status_code == 403
+        status, _, error = waymark("key", "City")
+        assert status == 1
+        assert "in use by another Waymark process" in error
+    status, _, error = waymark("key", "City", "--scope", "everything")
+    assert status == 1
+    assert "read, decode, write, admin" in error
+
+
+def test_the_admin_key_of_the_environment_can_change(tmp_path: Path) -> None:
+    old, new = "an-old-admin-key-of-32-characters", "a-newer-admin-key-of-33-characters"
+    for current, other in ((old, new), (new, old), (old, new)):
+        settings = Settings(data_dir=tmp_path, admin_key=SecretStr(current))
+        with LiveServer(create_app(settings)) as server, server.client(current) as good, server.client(other) as bad:
+            assert good.get("/v1/markers").status_code == 200
+            assert bad.get("/v1/markers").status_code == 401
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("WAYMARK_PORT", "70000"), ("WAYMARK_ADMIN_KEY", "short"), ("WAYMARK_DATABASE_URL", "mysql://x/y")],
+)
+def test_wrong_settings_are_named(waymark: Run, monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    monkeypatch.setenv(name, value)
+    status, _, error = waymark("migrate")
+    assert status == 1
+    assert name.removeprefix("WAYMARK_").lower() in error.lower()
+
+
+def test_without_a_command_the_commands_are_listed(waymark: Run) -> None:
+    status, out, error = waymark()
+    assert status in (0, 2)
+    assert all(name in out + error for name in ("serve", "migrate", "key"))
