@@ -80,11 +80,9 @@ def test_markers_cover_two_units_and_their_gap(make_order: Callable[..., PlateOr
     left, top = drawing.trim_mm[0][0], drawing.height_mm - drawing.trim_mm[0][3]
     (triangle,) = _polygons(_group(root, "MARK_RED").find(f"{SVG}path").attrib["d"])
     assert sorted((triangle - [left, top]).tolist()) == [[5, 5], [5, 80], [80, 5]]  # right angle at the corner
-    squares = _polygons(_group(root, "MARK_GREEN").find(f"{SVG}path").attrib["d"])
-    bounds = sorted([*(s.min(axis=0) - [left, top]), *np.ptp(s, axis=0)] for s in squares)
-    assert np.array(bounds) == pytest.approx(
-        np.array([[5, 245, 75, 75], [245, 5, 75, 75], [245, 245, 75, 75]]), abs=1e-3
-    )
+    squares = _boxes(_group(root, "MARK_GREEN").find(f"{SVG}path").attrib["d"])
+    bounds = sorted((x - left, y - top, width, height) for x, y, width, height in squares)
+    assert np.array(bounds) == pytest.approx(np.array([[5, 245, 75, 75], [245, 5, 75, 75], [245, 245, 75, 75]]))
 
 
 def test_scale_bar_is_100_mm(make_order: Callable[..., PlateOrder]) -> None:

@@ -57,7 +57,7 @@ def fixed_face(geometry: PlateGeometry, options: ArtworkOptions) -> tuple[Part, 
     parts: list[Part] = [
         Boxes(Layer.BASE, np.array([[-half, -half, half, half]])),
         Shape(Layer.MARK_RED, triangle),
-        *(Shape(Layer.MARK_GREEN, square) for square in squares),
+        Boxes(Layer.MARK_GREEN, np.array([[*square.min(axis=0), *square.max(axis=0)] for square in squares])),
     ]
     if options.heaters:
         parts += [Shape(Layer.HEATER, _heater_loop(marker)) for marker in (triangle, *squares)]
