@@ -1,0 +1,109 @@
+"""``python -m benchmarks.plates [ITEM ...] [--short] [--seed N]``: print the tables.
+
+Items: trials, height, false, peers, speed, accuracy, all. The long mode takes three seeds, the short one a part of the
+frames of one seed, which its tables scale up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor
+
+from benchmarks.plates import tables
+from benchmarks.plates.judge import Record, judge_job
+from benchmarks.plates.sets import LEAST_ROWS, RENDERED_ROWS, Job, read_trials
+from benchmarks.plates.speed import measure_speed
+
+ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy")
+NEEDS = {
+    "trials": ("trial",),
+    "height": ("trial", "stress", "night", "thermal", "hidden"),
+    "false": ("trial", "stress", "night", "thermal", "hidden", "free"),
+    "peers": ("trial", "stress"),
+    "accuracy": ("trial",),
+}
+BATCH = 25
+# frames (drives for thermal) a seed: long, short
+COUNTS = {"stress": (400, 25), "night": (50, 8), "thermal": (12, 1), "hidden": (100, 10), "free": (1000, 50)}
+SHORT_SHARE = 0.1
+
+
+def list_jobs(items: set[str], seeds: list[int], *, short: bool) -> list[Job]:
+    """Everything that the items need to see, the longest first."""
+    sets = {name for item in items for name in NEEDS.get(item, ())}
+    jobs = []
+    for seed in seeds:
+        for name in sets:
+            peers = "peers" in items and name in NEEDS["peers"]
+            if name == "trial":
+                share = SHORT_SHARE if short else 1.0
+                jobs += [Job(name, k, seed, 0, share, peers) for k in range(len(read_trials()))]
+                continue
+            count = COUNTS[name][short]
+            if name == "thermal":
+                jobs += [Job(name, k, seed, 0) for k in range(count)]
+            else:
+                sizes = [min(BATCH, count - start) for start in range(0, count, BATCH)]
+                jobs += [Job(name, k, seed, size, peers=peers) for k, size in enumerate(sizes)]
+    order = {(10, 1): 2, (12, 1): 2, (13, 1): 0, (13, 2): 1}
+    trials = read_trials()
+    return sorted(
+        jobs,
+        key=lambda j: (
+            order.get((trials[j.index].figure, trials[j.index].trial), 3) if j.set_name == "trial" else 3,
+            j.set_name, j.seed, j.index,
+        ),
+    )  # fmt: skip
+
+
+def run_jobs(jobs: list[Job], processes: int) -> list[Record]:
+    """Records of all jobs."""
+    if not jobs:
+        return []
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return [record for records in pool.map(judge_job, jobs) for record in records]
+
+
+def main() -> None:
+    """Run the items asked for."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.plates", description=__doc__)
+    parser.add_argument("items", nargs="*", choices=[*ITEMS, "all"], default="all")
+    parser.add_argument("--short", action="store_true", help="a part of the frames of one seed, under a minute")
+    parser.add_argument("--seed", type=int, default=1, help="first seed")
+    parser.add_argument("--processes", type=int, default=2)
+    args = parser.parse_args()
+    items = set(ITEMS) if "all" in args.items else set(args.items)
+    seeds = [args.seed] if args.short else [args.seed, args.seed + 1, args.seed + 2]
+    start = time.monotonic()
+    timings = measure_speed(args.seed, 12 if args.short else 100) if "speed" in items else []
+    records = run_jobs(list_jobs(items, seeds, short=args.short), args.processes)
+    print(f"Seeds {', '.join(map(str, seeds))}; {len(records)} frames judged; {time.monotonic() - start:.0f} s.")
+    if args.short:
+        print(f"Short mode: {SHORT_SHARE:.0%} of the trials' frames, drawn at random; their counts are scaled up.")
+    _print("trials", items, tables.trials_table, records, _TRIALS_NOTE)
+    _print("height", items, tables.height_table, records, "Decode rate by the height of the plate's image.")
+    _print("false", items, tables.wrong_table, records, "Wrong digits returned as valid.")
+    _print("peers", items, tables.peers_table, records, _PEERS_NOTE)
+    if timings:
+        print(f"\n### speed\n\n{len(timings) // 2} contenders in turns on each frame.\n\n{tables.speed_table(timings)}")
+    _print("accuracy", items, tables.accuracy_table, records, "Over the frames decoded in the trials.")
+    if wrong := tables.wrong_list(records):
+        print(f"\nWrong digits:\n{wrong}")
+
+
+_TRIALS_NOTE = (
+    f"Frames a drive, mean over the seeds; in view: all corners inside, {LEAST_ROWS:g} rows and more. Frames below "
+    f"{RENDERED_ROWS:g} rows are counted as not decoded without a look. The goal must be met by every seed ('least')."
+)
+_PEERS_NOTE = "The same scenes with a tag of the plate's footprint, default parameters, one thread."
+
+
+def _print(item, items, make, records, note):  # type: ignore[no-untyped-def]
+    if item in items:
+        print(f"\n### {item}\n\n{note}\n\n{make(records)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,347 @@
+"""Sets of simulated frames: the paper's trials, stress, night, heated plates, hidden plates, no plate at all.
+
+Every set is made from a seed alone. A set comes in jobs that can be rendered apart.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.markers.plate import PlateCode, PlateGeometry
+from app.sensors.camera import Camera
+from app.simulation.camera import RenderedFrame, render_plate_scene
+from app.simulation.conditions import (
+    Conditions,
+    draw_daylight,
+    draw_occluder,
+    draw_place,
+    draw_stress,
+    draw_thermal,
+    scene_under,
+)
+from app.simulation.distractors import draw_distractor_faces, paint_distractors
+from app.simulation.drive import Drive, drive_over_plate
+from app.simulation.plate_face import Face, plate_face, warm_face
+from app.simulation.plate_scene import Air, PlacedFace, PlateScene, face_truth
+from app.simulation.road import road_background
+from app.simulation.thermal import render_thermal_scene
+
+Image = npt.NDArray[np.uint8]
+HERE = Path(__file__).parent.parent
+GEOMETRY = PlateGeometry()
+LEAST_ROWS = 4.0  # below this half a row a unit is left: such frames don't count as having the plate in view
+RENDERED_ROWS = 8.0  # below this frames are counted as not decoded without a look
+SETS = ("trial", "stress", "night", "thermal", "hidden", "free")
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A row of the paper's figures 10, 12 and 13."""
+
+    figure: int
+    trial: int
+    code: str
+    speed_kmh: float
+    fps: float
+    depression_deg: float
+    azimuth_deg: float
+    height_m: float
+    illumination: str
+    frames_detected: int
+    frames_decoded: int
+
+    @property
+    def camera(self) -> Camera:
+        """1080p; a 70 degree lens, and 85 degrees for figure 13's other camera."""
+        return Camera.from_field_of_view(
+            1920, 1080, 85.0 if self.figure == 13 else 70.0, height_m=self.height_m,
+            depression_deg=self.depression_deg, azimuth_deg=self.azimuth_deg,
+        )  # fmt: skip
+
+    @property
+    def goal(self) -> int:
+        """Frames to decode: four times the paper's in figures 10 and 12, the paper's in figure 13."""
+        return self.frames_decoded * (1 if self.figure == 13 else 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A part of a set: one trial, or a batch of frames."""
+
+    set_name: str
+    index: int
+    seed: int
+    frames: int
+    share: float = 1.0
+    peers: bool = False
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Random numbers of this job alone."""
+        return np.random.default_rng([self.seed, SETS.index(self.set_name), self.index])
+
+
+@dataclass(slots=True, eq=False)
+class Shot:
+    """A frame to judge.
+
+    Attributes
+    ----------
+    label : str
+        Where it comes from.
+    frame : RenderedFrame
+    code : PlateCode or None
+        On the first face; None where there is no plate.
+    codebook : tuple of PlateCode
+        Of plates registered near by.
+    camera : Camera
+    scene : PlateScene or None
+        To render it again with other faces, with the ``background`` and the seed of its noise.
+    conditions : Conditions or None
+    thermal : bool
+    """
+
+    label: str
+    frame: RenderedFrame
+    code: PlateCode | None
+    codebook: tuple[PlateCode, ...]
+    camera: Camera
+    scene: PlateScene | None = None
+    conditions: Conditions | None = None
+    background: Image | None = None
+    noise_seed: int = 0
+    thermal: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Unseen:
+    """A frame with the plate in view but so small that it is not rendered."""
+
+    label: str
+    height_px: float
+
+
+@lru_cache(maxsize=1)
+def read_trials() -> tuple[Trial, ...]:
+    """The paper's trials."""
+    with (HERE / "data" / "plate_trials.csv").open(newline="") as lines:
+        return tuple(
+            Trial(
+                int(row["figure"]), int(row["trial"]), row["code"], float(row["speed_kmh"]), float(row["fps"]),
+                float(row["depression_deg"]), float(row["azimuth_deg"]), float(row["height_m"]), row["illumination"],
+                int(row["frames_detected"]), int(row["frames_decoded"]),
+            )
+            for row in csv.DictReader(lines)
+        )  # fmt: skip
+
+
+@lru_cache(maxsize=1)
+def read_photos() -> tuple[Image, ...]:
+    """Real road photos."""
+    paths = sorted((HERE / "backgrounds").glob("*.jpg"))
+    return tuple(np.asarray(cv2.imread(str(path)), np.uint8) for path in paths)
+
+
+def draw_code(rng: np.random.Generator) -> PlateCode:
+    """Any twelve digits: a plain position plate."""
+    return PlateCode("".join(str(d) for d in rng.integers(0, 10, 12)))
+
+
+def draw_codebook(code: PlateCode, rng: np.random.Generator, count: int = 20) -> tuple[PlateCode, ...]:
+    """A code among those of plates within about 500 m, which share its leading decimals."""
+    lon, lat = int(code.digits[:6]), int(code.digits[6:])
+    codes = {code.digits}
+    while len(codes) < count:
+        d_lon, d_lat = (int(v) for v in rng.integers(-5000, 5001, 2))
+        codes.add(f"{(lon + d_lon) % 1_000_000:06d}{(lat + d_lat) % 1_000_000:06d}")
+    return tuple(PlateCode(digits) for digits in sorted(codes))
+
+
+def shoot(job: Job) -> Iterator[Shot | Unseen]:
+    """Frames of a job."""
+    makers = {
+        "trial": _trial, "stress": _stress, "night": _stress, "thermal": _thermal, "hidden": _hidden, "free": _free,
+    }  # fmt: skip
+    return makers[job.set_name](job)
+
+
+def _draw_background(camera: Camera, rng: np.random.Generator) -> Image:
+    photos = read_photos()
+    return road_background(photos[int(rng.integers(len(photos)))], camera, rng, grain=float(rng.uniform(0.01, 0.05)))
+
+
+def _shot(
+    label: str, scene: PlateScene, background: Image, code: PlateCode | None, codebook: tuple[PlateCode, ...],
+    conditions: Conditions, rng: np.random.Generator,
+) -> Shot:  # fmt: skip
+    noise_seed = int(rng.integers(1 << 31))
+    frame = render_plate_scene(scene, background, np.random.default_rng(noise_seed))
+    return Shot(label, frame, code, codebook, scene.camera, scene, conditions, background, noise_seed)
+
+
+# --- the paper's trials -----------------------------------------------------------------------------------------------
+
+
+def trial_drive(trial: Trial, rng: np.random.Generator) -> tuple[Drive, PlateCode, Conditions]:
+    """A drive under a trial's terms; what the paper leaves open is drawn: light, lens, plate's materials and place."""
+    code = PlateCode(trial.code) if trial.code else draw_code(rng)
+    conditions = draw_daylight(rng)
+    if trial.illumination == "bright":
+        conditions = replace(
+            conditions, sensor=replace(conditions.sensor, gain=1.4), air=Air(glare=0.1, glare_at_m=(0.1, 0.1))
+        )
+    drive = Drive(
+        camera=trial.camera,
+        face=plate_face(code, GEOMETRY, conditions.look, conditions.wear, rng),
+        speed_m_s=trial.speed_kmh / 3.6,
+        fps=trial.fps,
+        exposure_s=conditions.exposure_s,
+        left_m=float(rng.normal(0, 0.15)),
+        rotation_deg=float(rng.normal(0, 3)),
+        far_m=18.0,
+        road_reflectance=conditions.road_reflectance,
+        shadow=conditions.shadow,
+        air=conditions.air,
+        sensor=conditions.sensor,
+    )
+    return drive, code, conditions
+
+
+def _trial(job: Job) -> Iterator[Shot | Unseen]:
+    rng, trial = job.rng, read_trials()[job.index]
+    drive, code, conditions = trial_drive(trial, rng)
+    codebook, background = draw_codebook(code, rng), _draw_background(drive.camera, rng)
+    label = f"{trial.figure}/{trial.trial}"
+    for scene in drive_over_plate(drive, rng):
+        height = face_truth(scene, scene.faces[0]).height_px
+        if height < LEAST_ROWS or rng.random() >= job.share:
+            continue
+        if height < RENDERED_ROWS:
+            yield Unseen(label, height)
+        else:
+            yield _shot(label, scene, background, code, codebook, conditions, rng)
+
+
+# --- stress -----------------------------------------------------------------------------------------------------------
+
+
+def _draw_camera(rng: np.random.Generator) -> Camera:
+    return Camera.from_field_of_view(
+        1920, 1080, float(rng.uniform(60, 90)), height_m=float(rng.uniform(1.2, 2.0)),
+        depression_deg=float(rng.uniform(12, 45)), azimuth_deg=float(rng.normal(0, 8)), roll_deg=float(rng.normal(0, 1)),
+    )  # fmt: skip
+
+
+def _draw_stress_scene(job: Job, rng: np.random.Generator) -> tuple[PlateScene, Image, PlateCode, Conditions]:
+    camera, code = _draw_camera(rng), draw_code(rng)
+    conditions = draw_stress(rng, night=job.set_name == "night")
+    face = plate_face(code, GEOMETRY, conditions.look, conditions.wear, rng)
+    placed = draw_place(camera, face, rng, (24.0, 140.0))
+    extra = draw_distractor_faces(camera, rng, int(rng.integers(0, 4)), (placed,))
+    background = paint_distractors(_draw_background(camera, rng), rng, int(rng.integers(0, 6)))
+    scene = scene_under(conditions, camera, (placed, *extra), float(rng.uniform(0, 80)) / 3.6, rng)
+    return scene, background, code, conditions
+
+
+def _stress(job: Job) -> Iterator[Shot | Unseen]:
+    rng = job.rng
+    for _ in range(job.frames):
+        scene, background, code, conditions = _draw_stress_scene(job, rng)
+        yield _shot(job.set_name, scene, background, code, draw_codebook(code, rng), conditions, rng)
+
+
+def _hidden(job: Job) -> Iterator[Shot | Unseen]:
+    """Plates that are partly hidden, or half out of the image: read right or not at all."""
+    rng = job.rng
+    for k in range(job.frames):
+        scene, background, code, conditions = _draw_stress_scene(job, rng)
+        if k % 2:
+            scene = replace(scene, occluder=draw_occluder(rng))
+        else:
+            scene = _pushed_out(scene, rng)
+        yield _shot("hidden", scene, background, code, draw_codebook(code, rng), conditions, rng)
+
+
+def _pushed_out(scene: PlateScene, rng: np.random.Generator) -> PlateScene:
+    """The scene through a camera whose sensor ends within the plate."""
+    corners = face_truth(scene, scene.faces[0]).corners_px
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    cut = low + (high - low) * rng.uniform(0.1, 0.9, 2)
+    camera, axis = scene.camera, int(rng.integers(2))
+    shift = np.zeros(2)
+    edge = (0.0, float((camera.width_px, camera.height_px)[axis]))[int(rng.integers(2))]
+    shift[axis] = edge - cut[axis]
+    moved = replace(camera, cx_px=camera.cx_px + float(shift[0]), cy_px=camera.cy_px + float(shift[1]))
+    return replace(scene, camera=moved, faces=scene.faces[:1])
+
+
+# --- heated plates ----------------------------------------------------------------------------------------------------
+
+
+def _thermal(job: Job) -> Iterator[Shot | Unseen]:
+    """A drive at 10 km/h with a 640 x 512 thermal camera, from 16 rows on."""
+    rng = job.rng
+    camera, code = Camera.from_field_of_view(640, 512, 50.0), draw_code(rng)
+    warmth, sensor = draw_thermal(rng)
+    turn = float(rng.uniform(0, 360)) if job.index % 2 else float(rng.normal(0, 3))
+    drive = Drive(
+        camera, warm_face(code, GEOMETRY, warmth, rng), 10 / 3.6, 30.0, 0.01, float(rng.normal(0, 0.2)), turn, far_m=8.0
+    )
+    codebook, background = draw_codebook(code, rng), _draw_background(camera, rng)
+    for scene in drive_over_plate(drive, rng):
+        if face_truth(scene, scene.faces[0]).height_px >= 16 and rng.random() < job.share:
+            frame = render_thermal_scene(scene, sensor, background, rng)
+            yield Shot("thermal", frame, code, codebook, camera, thermal=True)
+
+
+# --- no plate ---------------------------------------------------------------------------------------------------------
+
+
+def _free(job: Job) -> Iterator[Shot | Unseen]:
+    """Roads without a plate: crops of photos as they are, mirrored, in other colours, and with distractors."""
+    rng = job.rng
+    for k in range(job.frames):
+        camera = _draw_camera(rng)
+        background = _draw_background(camera, rng) if k % 3 == 0 else _draw_crop(camera, rng)
+        if k % 2:
+            background = paint_distractors(background, rng, int(rng.integers(3, 25)))
+        faces: tuple[PlacedFace, ...] = ()
+        if k % 4 >= 2:
+            faces = draw_distractor_faces(camera, rng, int(rng.integers(1, 7)))
+        conditions = draw_stress(rng) if rng.random() < 0.5 else draw_daylight(rng)
+        scene = scene_under(conditions, camera, faces, float(rng.uniform(0, 80)) / 3.6, rng)
+        yield _shot("free", scene, background, None, draw_codebook(draw_code(rng), rng), conditions, rng)
+
+
+def _draw_crop(camera: Camera, rng: np.random.Generator) -> Image:
+    """Part of a photo at the frame's size, perhaps mirrored, with its colours changed."""
+    photos = read_photos()
+    photo = photos[int(rng.integers(len(photos)))]
+    share = float(rng.uniform(0.35, 1.0))
+    height, width = int(photo.shape[0] * share), int(photo.shape[1] * share)
+    top, left = (int(rng.integers(0, n - m + 1)) for n, m in zip(photo.shape[:2], (height, width), strict=True))
+    part = photo[top : top + height, left : left + width]
+    if rng.random() < 0.5:
+        part = part[:, ::-1]
+    part = cv2.resize(np.ascontiguousarray(part), (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR)
+    gain = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.6, 1.3)
+    table = np.clip(np.arange(256)[:, None] * gain + rng.uniform(-20, 20), 0, 255).astype(np.uint8)
+    hsv = cv2.cvtColor(cv2.LUT(part, table[:, None, :].reshape(256, 1, 3)), cv2.COLOR_BGR2HSV)
+    hsv[..., 1] = cv2.convertScaleAbs(hsv[..., 1], alpha=float(rng.uniform(0.3, 2.0)))
+    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR), np.uint8)
+
+
+def replace_face(shot: Shot, face: Face) -> RenderedFrame:
+    """The same frame with another square where the plate lies: same place, light, motion and noise."""
+    assert shot.scene is not None
+    assert shot.background is not None
+    faces = (replace(shot.scene.faces[0], face=face), *shot.scene.faces[1:])
+    return render_plate_scene(replace(shot.scene, faces=faces), shot.background, np.random.default_rng(shot.noise_seed))

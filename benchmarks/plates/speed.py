@@ -1,0 +1,84 @@
+"""Time a frame: the decoder and cv2.aruco on the same frames, in turns, in one thread."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.images import load_image
+from app.decoders.plate import decode_plates
+from benchmarks.plates.peers import FAMILIES, TagFamily, detector, tag_face
+from benchmarks.plates.sets import Job, Shot, replace_face, shoot
+
+Image = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Milliseconds a frame."""
+
+    what: str
+    frames: str
+    median_ms: float
+    mean_ms: float
+    worst_ms: float
+
+
+def measure_speed(seed: int, frames: int) -> list[Timing]:
+    """Median and mean time a frame of the decoder and the peers.
+
+    Frames with a plate come from the trials at all distances, and the peers see their tag in the plate's place; frames
+    without one are the plate-free set. Every call is timed by itself, the contenders in turns on each frame.
+    """
+    cv2.setNumThreads(1)
+    plates = [s for s in _trial_shots(seed, frames) if isinstance(s, Shot)]
+    free = [s for s in shoot(Job("free", 0, seed, frames)) if isinstance(s, Shot)]
+    return _measure("with a plate", plates, seed) + _measure("without", free, seed)
+
+
+def _trial_shots(seed: int, frames: int) -> list[Shot]:
+    shots: list[Shot] = []
+    trials = (0, 3, 6, 9)
+    for index in trials:
+        seen = [s for s in shoot(Job("trial", index, seed, 0)) if isinstance(s, Shot)]
+        step = max(len(seen) * len(trials) // frames, 1)
+        shots += seen[::step]
+    return shots[:frames]
+
+
+def _measure(name: str, shots: list[Shot], seed: int) -> list[Timing]:
+    contenders: list[tuple[str, list[Callable[[], object]]]] = [
+        ("decode_plates", [partial(decode_plates, s.frame.image) for s in shots]),
+        ("JPEG bytes to digits", [partial(_decode_bytes, s.frame.jpeg) for s in shots]),
+    ]
+    for family in FAMILIES:
+        images, find = [_tagged(s, family, seed) for s in shots], detector(family)
+        contenders.append((f"cv2.aruco {family.name}", [partial(find.detectMarkers, image) for image in images]))
+    for _, calls in contenders:
+        calls[0]()
+    times = np.empty((len(contenders), len(shots)))
+    for k in range(len(shots)):
+        for row, (_, calls) in enumerate(contenders):
+            start = time.perf_counter()
+            calls[k]()
+            times[row, k] = 1000 * (time.perf_counter() - start)
+    return [
+        Timing(what, name, float(np.median(t)), float(t.mean()), float(t.max()))
+        for (what, _), t in zip(contenders, times, strict=True)
+    ]
+
+
+def _decode_bytes(jpeg: bytes) -> object:
+    return decode_plates(load_image(jpeg).pixels)
+
+
+def _tagged(shot: Shot, family: TagFamily, seed: int) -> Image:
+    if shot.code is None or shot.conditions is None:
+        return shot.frame.image
+    return replace_face(shot, tag_face(family, 7, shot.conditions, np.random.default_rng(seed))).image

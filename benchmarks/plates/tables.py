@@ -1,0 +1,187 @@
+"""Records -> Markdown tables, each row beside the paper's figure, a peer's or a goal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from benchmarks.plates.judge import Record
+from benchmarks.plates.peers import FAMILIES
+from benchmarks.plates.sets import read_trials
+from benchmarks.plates.speed import Timing
+
+BINS = ((8, 12, None), (12, 16, 75), (16, 24, 95), (24, math.inf, 99))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Markdown table; the first column is text, the others are right-aligned."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "|".join(["---"] + ["--:"] * (len(head) - 1)) + "|"]
+    lines += ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def trials_table(records: Sequence[Record]) -> str:
+    """Frames decoded in the paper's trials, a drive's mean over the seeds."""
+    rows = []
+    for trial in read_trials():
+        mine = [r for r in records if r.set_name == "trial" and r.label == f"{trial.figure}/{trial.trial}"]
+        seeds = sorted({r.seed for r in mine})
+        if not seeds:
+            continue
+        decoded = [_scaled(r for r in mine if r.seed == s and r.decoded) for s in seeds]
+        known = [_scaled(r for r in mine if r.seed == s and r.decoded_known) for s in seeds]
+        met = "yes" if min(decoded) >= trial.goal else "**no**"
+        rows.append(
+            (
+                f"{trial.figure}/{trial.trial}: {trial.speed_kmh:g} km/h, {trial.fps:g} fps, {trial.depression_deg:g}°"
+                + (f", azimuth {trial.azimuth_deg:+g}°" if trial.azimuth_deg else "")
+                + (f", {trial.height_m:g} m" if trial.height_m != 1.57 else "")
+                + (f", {trial.illumination}" if trial.illumination != "daylight" else ""),
+                _round(_scaled(mine) / len(seeds)),
+                _round(np.mean(decoded)),
+                _round(min(decoded)),
+                sum(len(r.wrong) for r in mine),
+                _round(np.mean(known)),
+                sum(len(r.wrong_known) for r in mine),
+                f"{trial.frames_decoded} of {trial.frames_detected}",
+                f"{np.mean(decoded) / trial.frames_decoded:.1f}",
+                trial.goal,
+                met,
+            )
+        )
+    head = (
+        "figure/trial",
+        "in view",
+        "decoded",
+        "least",
+        "wrong",
+        "with codebook",
+        "wrong",
+        "paper",
+        "ratio",
+        "goal",
+        "met",
+    )
+    return table(head, rows)
+
+
+def _scaled(records: Iterable[Record]) -> float:
+    """Frames of the whole set that some of its frames stand for."""
+    return sum(1 / r.share for r in records)
+
+
+def _round(value: float) -> str:
+    return f"{value:.0f}"
+
+
+def height_table(records: Sequence[Record]) -> str:
+    """Decode rate by the plate's height in the image, and of the other sets."""
+    rows = []
+    for low, high, goal in BINS:
+        name = f"trials, {low}-{high} rows" if high < math.inf else f"trials, {low} rows and more"
+        rows.append(_rate_row(name, [r for r in records if r.set_name == "trial" and low <= r.height_px < high], goal))
+    for name, key, goal in (
+        ("stress, 24 rows and more", "stress", 90),
+        ("night with LED, 24 rows and more", "night", None),
+        ("thermal at 10 km/h, 16 rows and more", "thermal", 80),
+        ("partly hidden or out of view", "hidden", None),
+    ):
+        rows.append(_rate_row(name, [r for r in records if r.set_name == key], goal))
+    head = ("set", "frames", "decoded", "rate %", "with codebook %", "goal %", "met")
+    return table(head, [row for row in rows if row[1]])
+
+
+def _rate_row(name: str, records: Sequence[Record], goal: int | None) -> tuple[object, ...]:
+    if not records:
+        return (name, 0, 0, "-", "-", goal or "-", "-")
+    decoded = sum(r.decoded for r in records)
+    rate = 100 * decoded / len(records)
+    known = 100 * sum(r.decoded_known for r in records) / len(records)
+    met = "-" if goal is None else ("yes" if rate >= goal else "**no**")
+    return (name, len(records), decoded, f"{rate:.1f}", f"{known:.1f}", goal or "-", met)
+
+
+def wrong_table(records: Sequence[Record]) -> str:
+    """Digits returned as valid that are on no plate."""
+    rows = []
+    for name, key in (
+        ("trials", "trial"), ("stress", "stress"), ("night with LED", "night"), ("thermal", "thermal"),
+        ("partly hidden or out of view", "hidden"), ("no plate", "free"),
+    ):  # fmt: skip
+        mine = [r for r in records if r.set_name == key]
+        if mine:
+            wrong, known = sum(len(r.wrong) for r in mine), sum(len(r.wrong_known) for r in mine)
+            rows.append((name, len(mine), wrong, known, 0, "yes" if wrong + known == 0 else "**no**"))
+    return table(("set", "frames", "wrong", "wrong with codebook", "goal", "met"), rows)
+
+
+def peers_table(records: Sequence[Record]) -> str:
+    """Frames decoded beside tags in the same scenes."""
+    rows = []
+    for name, key in (("trials", "trial"), ("stress", "stress")):
+        mine = [r for r in records if r.set_name == key and r.tags is not None]
+        if not mine:
+            continue
+        ours = sum(r.decoded for r in mine)
+        for k, family in enumerate(FAMILIES):
+            theirs = sum(r.tags[k] for r in mine if r.tags is not None)
+            ratio = ours / theirs if theirs else math.inf
+            rows.append((name, family.name, len(mine), ours, theirs, f"{ratio:.2f}", 1.5, _met(ratio >= 1.5)))
+    return table(("set", "peer", "frames", "plate", "peer's tag", "ratio", "goal", "met"), rows)
+
+
+def _met(yes: bool) -> str:
+    return "yes" if yes else "**no**"
+
+
+def speed_table(timings: Sequence[Timing]) -> str:
+    """Milliseconds a frame."""
+    rows = []
+    for t in timings:
+        ours = next(o for o in timings if o.what == "decode_plates" and o.frames == t.frames)
+        if t.what == "decode_plates":
+            goal, met = "5 ms", _met(t.mean_ms <= 5)
+        elif t.what == "JPEG bytes to digits":
+            goal, met = "15 ms", _met(t.mean_ms <= 15)
+        else:
+            goal, met = "ratio 4", _met(t.mean_ms >= 4 * ours.mean_ms)
+        ratio = f"{t.mean_ms / ours.mean_ms:.1f}"
+        rows.append(
+            (f"{t.what}, {t.frames}", f"{t.median_ms:.2f}", f"{t.mean_ms:.2f}", f"{t.worst_ms:.1f}", ratio, goal, met)
+        )
+    return table(
+        ("1080p, one thread", "median ms", "mean ms", "worst ms", "ratio to decode_plates", "goal", "met"), rows
+    )
+
+
+def accuracy_table(records: Sequence[Record]) -> str:
+    """Errors over the frames decoded in the trials."""
+    mine = [r for r in records if r.set_name == "trial" and r.decoded]
+    corners = np.array([e for r in mine for e in r.corner_errors_px])
+    positions = np.array([1000 * r.position_error_m for r in mine if math.isfinite(r.position_error_m)])
+    rows = []
+    measures: tuple[tuple[str, np.ndarray, float, float, Callable[[float], str]], ...] = (
+        ("corners [px]", corners, 0.2, 0.6, lambda v: f"{v:.3f}"),
+        ("camera position [mm]", positions, 6, 20, lambda v: f"{v:.1f}"),
+    )
+    for name, errors, middle, most, show in measures:
+        if not errors.size:
+            rows.append((name, 0, "-", middle, "-", most, "**no**"))
+            continue
+        median, high = float(np.median(errors)), float(np.percentile(errors, 95))
+        rows.append(
+            (name, errors.size, show(median), middle, show(high), most, _met(median <= middle and high <= most))
+        )
+    return table(("error", "values", "median", "goal", "95 %", "goal", "met"), rows)
+
+
+def wrong_list(records: Sequence[Record]) -> str:
+    """Where wrong digits came from, to look at them again."""
+    lines = [
+        f"- {r.set_name} {r.label}, seed {r.seed}, {r.height_px:.1f} rows: {', '.join(r.wrong + r.wrong_known)}"
+        for r in records
+        if r.wrong or r.wrong_known
+    ]
+    return "\n".join(lines)
