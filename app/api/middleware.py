@@ -26,6 +26,7 @@ T = TypeVar("T")
 PROTECTED = ("/v1", "/ogc")
 _SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 _METHODS = (*_SAFE_METHODS, "POST", "PUT", "PATCH", "DELETE")
+_AUTH_THREADS = 4
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _LOG = structlog.get_logger("waymark.access")
 
@@ -120,6 +121,7 @@ class Guarded:
         self._body_limits = body_limits
         self._needed_scopes = needed_scopes
         self._body_timeout_s = body_timeout_s
+        self._threads = anyio.CapacityLimiter(_AUTH_THREADS)  # its own, or slow requests would keep new ones waiting
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
@@ -140,7 +142,7 @@ class Guarded:
         await self._app(scope, _limited(receive, limit, self._body_timeout_s), send)
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
-        caller = await to_thread.run_sync(self._authenticate, _key_in(headers))
+        caller = await to_thread.run_sync(self._authenticate, _key_in(headers), limiter=self._threads)
         scope.setdefault("state", {})["caller"] = caller
         reads = scope["method"] in _SAFE_METHODS
         caller.require(KeyScope.READ if reads else _by_prefix(self._needed_scopes, scope["path"]))

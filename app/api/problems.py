@@ -177,7 +177,9 @@ def install_problem_handlers(app: FastAPI) -> None:
     async def on_http_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         if isinstance(error, BodyRefused):
-            return problem_from(error.error, request.scope)
+            response = problem_from(error.error, request.scope)
+            response.headers["Connection"] = "close"  # what is left of the body is not worth reading
+            return response
         phrase = HTTPStatus(error.status_code).phrase
         kind = ProblemKind(error.status_code, phrase.lower().replace(" ", "-"), phrase)
         return problem(kind, _http_detail(request, error), request.scope, headers=dict(error.headers or {}))

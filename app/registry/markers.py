@@ -109,11 +109,20 @@ def find_code_near(
     lat_deg: float,
     radius_m: float,
     *,
+    mismatched_radius_m: float,
     ignoring: str | None = None,
 ) -> Row | None:
-    """A plate of any agency that carries these digits within a radius and may be on the road."""
+    """A plate of any agency that carries these digits and may be on the road.
+
+    It lies within `radius_m`, or within `mismatched_radius_m` if its digits are not those of its own position.
+    """
     query = sa.select(markers.c.id, markers.c.agency_id).where(
-        markers.c.digits == digits, markers.c.status != "retired", within_radius(lon_deg, lat_deg, radius_m)
+        markers.c.digits == digits,
+        markers.c.status != "retired",
+        sa.or_(
+            within_radius(lon_deg, lat_deg, radius_m),
+            sa.and_(markers.c.digits_match_position.is_(False), within_radius(lon_deg, lat_deg, mismatched_radius_m)),
+        ),
     )
     if ignoring is not None:
         query = query.where(markers.c.id != ignoring)

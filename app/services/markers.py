@@ -305,8 +305,17 @@ class Markers:
             other = store.find_id_code(connection, plate.code.digits, plate.code.n)
             limit = "a registry number names one plate for ever"
         else:
-            radius_m = self._rules.explicit_code_radius_m if plate.given else self._rules.position_code_radius_m
-            other = store.find_code_near(connection, plate.code.digits, lon_deg, lat_deg, radius_m, ignoring=ignoring)
+            wide_m = self._rules.explicit_code_radius_m
+            radius_m = wide_m if plate.given else self._rules.position_code_radius_m
+            other = store.find_code_near(
+                connection,
+                plate.code.digits,
+                lon_deg,
+                lat_deg,
+                radius_m,
+                mismatched_radius_m=wide_m,
+                ignoring=ignoring,
+            )
             limit = f"no two plates with the same digits within {radius_m:g} m"
         if other is None or other["id"] == ignoring:
             return

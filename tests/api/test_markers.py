@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -170,6 +171,38 @@ def test_given_digits_are_kept_apart_by_twenty_kilometres(client: httpx.Client) 
     assert "20000 m" in problem["limit"]
     assert problem["field"] == "code.digits"
     _post(client, position={"lon_deg": 60.25, "lat_deg": 40.0}, code=code)
+
+
+def test_derived_digits_keep_clear_of_given_ones(client: httpx.Client) -> None:
+    code = {"digits": "123456654321", "allow_mismatched_digits": True}
+    _post(client, position={"lon_deg": 61.2, "lat_deg": 41.7}, code=code)
+    derived = {"position": {"lon_deg": 61.123456, "lat_deg": 41.654321}}
+    _refused(client.post("/v1/markers", json=derived), 409, "code-taken")
+    _post(client, position={"lon_deg": 62.123456, "lat_deg": 41.654321})
+
+
+def test_of_many_requests_for_one_place_one_wins(client: httpx.Client, place: Place) -> None:
+    body = {"position": place()}
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(threads.map(lambda _: client.post("/v1/markers", json=body).status_code, range(16)))
+    assert sorted(answers) == [201] + [409] * 15
+    key = {"Idempotency-Key": "many"}
+    body = {"position": place()}
+    with ThreadPoolExecutor(8) as threads:
+        repeated = list(threads.map(lambda _: client.post("/v1/markers", json=body, headers=key), range(16)))
+    assert {(answer.status_code, answer.json()["id"]) for answer in repeated} == {(201, repeated[0].json()["id"])}
+
+
+def test_of_many_changes_to_one_version_one_wins(client: httpx.Client, place: Place) -> None:
+    path = f"/v1/markers/{_post(client, position=place())['id']}"
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(
+            threads.map(
+                lambda n: client.patch(path, json={"road": f"R{n}"}, headers={"If-Match": '"1"'}).status_code, range(16)
+            )
+        )
+    assert sorted(answers) == [200] + [412] * 15
+    assert client.get(path).json()["version"] == 2
 
 
 def test_an_idempotent_request_is_stored_once(client: httpx.Client, server: LiveServer, place: Place) -> None:
