@@ -59,14 +59,14 @@ class _OutlinePen(BasePen):  # type: ignore[misc]
         self.svg.append(f"l{self._relative(pt)}")
         self.contours[-1].append(pt)
 
-    def _curveToOne(self, pt1: tuple[float, float], pt2: tuple[float, float], pt3: tuple[float, float]) -> None:
-        start = np.array(self.contours[-1][-1])
-        a, b, c = np.array(pt1), np.array(pt2), np.array(pt3)
+    def _qCurveToOne(self, pt1: tuple[float, float], pt2: tuple[float, float]) -> None:
+        start, control, end = (np.array(point) for point in (self.contours[-1][-1], pt1, pt2))
         for t in np.arange(1, _CURVE_STEPS + 1) / _CURVE_STEPS:
-            point = (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * c
+            point = (1 - t) ** 2 * start + 2 * (1 - t) * t * control + t**2 * end
             self.contours[-1].append((float(point[0]), float(point[1])))
-        self.pdf.append(" ".join(f"{x:.0f} {y:.0f}" for x, y in (pt1, pt2, pt3)) + " c")
-        self.svg.append(f"c{self._relative(pt1, pt2, pt3)}")
+        cubic = (start + 2 * (control - start) / 3, end + 2 * (control - end) / 3, end)  # PDF has no quadratic curves
+        self.pdf.append(" ".join(f"{x:.0f} {y:.0f}" for x, y in cubic) + " c")
+        self.svg.append(f"q{self._relative(pt1, pt2)}")
 
     def _closePath(self) -> None:
         self.pdf.append("h")
