@@ -132,7 +132,8 @@ def main() -> int:
     middle = {name: statistics.median(values) for name, values in times.items()}
     print(f"{arguments.frames} frames of {len(frames[0]) // 1024} KiB, {arguments.registered} plates registered")
     for name, value in middle.items():
-        print(f"  {name:24s} median {value:7.2f} ms   p90 {statistics.quantiles(times[name], n=10)[-1]:7.2f} ms")
+        tenths = statistics.quantiles(times[name], n=10)
+        print(f"  {name:24s} p10 {tenths[0]:7.2f} ms   median {value:7.2f} ms   p90 {tenths[-1]:7.2f} ms")
     overhead = {name: middle[name] - middle["bare"] for name in ("form", "bare body")}
     for name, value in overhead.items():
         print(f"  overhead, {name:14s} {value:14.2f} ms   (limit {arguments.limit_ms:g} ms)")

@@ -19,6 +19,7 @@ from app.services.frames import AnnotationTask, FrameResult, FrameTask
 
 T = TypeVar("T")
 _START_S = 120.0
+_PATIENCE_S = 120.0
 
 
 class DecodePool:
@@ -127,6 +128,10 @@ class DecodePool:
         _stop(pool)
 
 
+def _cancel(future: Any) -> None:
+    future.cancel()
+
+
 def _stop(pool: Any) -> None:
     pool.stop()
     pool.join()
@@ -156,13 +161,16 @@ class Pending(Generic[T]):
         """Wait for it, once; what goes wrong in the process comes back as the domain's error."""
         try:
             try:
-                return self._future.result()
+                return self._future.result(self._timeout_s + _PATIENCE_S)
             except (ProcessExpired, BrokenProcessPool):
                 if self._cancelled:
                     raise
                 self._future = self._schedule()
-                return self._future.result()
+                return self._future.result(self._timeout_s + _PATIENCE_S)
         except (FutureTimeout, TimeoutError) as error:
+            if not self._future.done():  # nobody took it: the processes do not start, or are all busy for minutes
+                _cancel(self._future)
+                raise Unavailable("no decoder process is free", cure="try again later") from error
             raise UnreadableUpload(
                 "decoding the picture took too long and was stopped",
                 field="file",
@@ -183,8 +191,7 @@ class Pending(Generic[T]):
     def cancel(self) -> None:
         """Stop it, also when it runs already."""
         self._cancelled = True
-        cancel: Callable[[], bool] = self._future.cancel
-        cancel()
+        _cancel(self._future)
         self._release_once()
 
     def _release_once(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,6 +32,24 @@ def server(folder: Path) -> Iterator[LiveServer]:
     settings = Settings(data_dir=folder, admin_key=ADMIN_KEY, decode_timeout_s=2.0, max_archive_frames=20)
     with LiveServer(create_app(settings, decode=standin.decode)) as running:
         yield running
+
+
+@pytest.fixture(scope="session")
+def real_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
+    """A server with the decoder that is shipped."""
+    settings = Settings(data_dir=tmp_path_factory.mktemp("real") / "var", admin_key=ADMIN_KEY, warm_decoders=False)
+    with LiveServer(create_app(settings)) as running:
+        yield running
+
+
+_REAL_AGENCIES = itertools.count(1)
+
+
+@pytest.fixture
+def real_client(real_server: LiveServer) -> Iterator[httpx.Client]:
+    """A client of an agency that only this test uses, on the server with the real decoder."""
+    with real_server.agency(f"real agency {next(_REAL_AGENCIES)}") as agency:
+        yield agency
 
 
 def post_frame(

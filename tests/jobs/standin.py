@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import time
@@ -27,6 +28,8 @@ def frame_that(what: int) -> np.ndarray[Any, Any]:
 def decode(pixels: Any, *, codebook: Sequence[PlateCode] = (), **_options: Any) -> list[PlateReading]:
     """Do what the corner pixel says."""
     what = min((OBEY, SLEEP, DIE, HOG, RAISE, BUG), key=lambda known: abs(known - int(pixels[4, 4].min())))
+    if multiprocessing.parent_process() is None:  # the server's own process asks for a proof
+        return []
     if pixels.shape[0] == 480:  # the frame that warms the process
         return []
     if what == SLEEP:
