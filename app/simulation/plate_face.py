@@ -17,6 +17,7 @@ from app.markers.plate import PlateCode, PlateGeometry
 
 FloatArray = npt.NDArray[np.float32]
 Colour = tuple[float, float, float]
+_MOST_TEXELS = 800
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +185,7 @@ def grid_face(cells: npt.ArrayLike, side_m: float, wear: PlateWear, rng: np.rand
     """
     colours = np.asarray(cells, np.float32)
     count = colours.shape[0]
-    size = max(round(side_m * 1000 / count) * count, count)
+    size = max(round(min(side_m * 1000, _MOST_TEXELS) / count) * count, count)
     crisp = np.repeat(np.repeat(colours, size // count, axis=0), size // count, axis=1)
     emission = np.ascontiguousarray(crisp * (led / max(float(colours.max()), 1e-6))) if led > 0 else None
     return Face(side_m, _worn(crisp, wear, side_m * 1000, rng), emission)
@@ -309,6 +310,13 @@ def _stained(face: FloatArray, radius: float, dust: FloatArray, rng: np.random.G
     outline = np.stack([x0 + radii * np.cos(angles) * stretch, y0 + radii * np.sin(angles) / stretch], axis=1)
     mask = np.zeros((size, size), np.float32)
     cv2.fillPoly(mask, [np.round(outline).astype(np.int32)], 1.0)
-    mask = cv2.GaussianBlur(mask, (0, 0), max(radius * 0.15, 0.8)) * np.float32(rng.uniform(0.5, 1.0))
+    spread = max(radius * 0.15, 0.8)
+    low = np.clip(np.floor(outline.min(axis=0) - 4 * spread), 0, size).astype(int)
+    high = np.clip(np.ceil(outline.max(axis=0) + 4 * spread), 0, size).astype(int)
+    part = (slice(low[1], high[1]), slice(low[0], high[0]))
+    opacity = np.float32(rng.uniform(0.5, 1.0))
     colour = dust * np.float32(rng.uniform(0.15, 1.5))
-    return np.asarray(face + (colour - face) * mask[..., None], np.float32)
+    if mask[part].size:
+        soft = cv2.GaussianBlur(mask[part], (0, 0), spread) * opacity
+        face[part] += (colour - face[part]) * soft[..., None]
+    return face

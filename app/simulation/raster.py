@@ -57,21 +57,15 @@ def accumulate_face(
     count, size = samples.shape[0], reflectance.shape[0]
     glows = emission.shape[0] > 0
     weight = 1.0 / count
+    begin, end = samples[:, 2].min(), samples[:, 2].max()
     for i in range(rows):
         for j in range(cols):
+            if _misses(rays[i, j], row_time_s[i], begin, end, motion, spin, height_m, face_from_ground, size):
+                continue
             blue = green = red = hit = 0.0
             for s in range(count):
                 du, dv, t = samples[s, 0], samples[s, 1], samples[s, 2] + row_time_s[i]
-                dx = rays[i, j, 0, 0] + du * rays[i, j, 1, 0] + dv * rays[i, j, 2, 0]
-                dy = rays[i, j, 0, 1] + du * rays[i, j, 1, 1] + dv * rays[i, j, 2, 1]
-                dz = rays[i, j, 0, 2] + du * rays[i, j, 1, 2] + dv * rays[i, j, 2, 2]
-                ex = dx + t * (spin[1] * dz - spin[2] * dy)
-                ey = dy + t * (spin[2] * dx - spin[0] * dz)
-                ez = dz + t * (spin[0] * dy - spin[1] * dx)
-                if ez > -1e-6:
-                    continue
-                scale = (height_m + motion[2] * t) / -ez
-                gx, gy = ex * scale + motion[0] * t, ey * scale + motion[1] * t
+                gx, gy = _ground(rays[i, j], du, dv, t, motion, spin, height_m)
                 fx = face_from_ground[0, 0] * gx + face_from_ground[0, 1] * gy + face_from_ground[0, 2]
                 fy = face_from_ground[1, 0] * gx + face_from_ground[1, 1] * gy + face_from_ground[1, 2]
                 if fx < 0 or fy < 0 or fx >= size or fy >= size:
@@ -91,6 +85,47 @@ def accumulate_face(
                 out[i, j, 1] += green
                 out[i, j, 2] += red
                 cover[i, j] += hit
+
+
+@numba.njit(cache=True, fastmath=True, inline="always")
+def _ground(
+    ray: Any, du: float, dv: float, t: float, motion: Any, spin: Any, height_m: float
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Where a spot of a pixel looks at the road at time t; far away above the horizon."""
+    dx = ray[0, 0] + du * ray[1, 0] + dv * ray[2, 0]
+    dy = ray[0, 1] + du * ray[1, 1] + dv * ray[2, 1]
+    dz = ray[0, 2] + du * ray[1, 2] + dv * ray[2, 2]
+    ex = dx + t * (spin[1] * dz - spin[2] * dy)
+    ey = dy + t * (spin[2] * dx - spin[0] * dz)
+    ez = dz + t * (spin[0] * dy - spin[1] * dx)
+    scale = (height_m + motion[2] * t) / max(-ez, 1e-6)
+    return ex * scale + motion[0] * t, ey * scale + motion[1] * t
+
+
+@numba.njit(cache=True, fastmath=True)
+def _misses(
+    ray: Any,
+    row_time_s: float,
+    begin: float,
+    end: float,
+    motion: Any,
+    spin: Any,
+    height_m: float,
+    face_from_ground: Any,
+    size: int,
+) -> bool:  # pragma: no cover - compiled
+    """Whether the corners of a pixel's footprint at both ends of the exposure all lie beyond one side of the face."""
+    low_x = low_y = 1e30  # fastmath knows no infinity
+    high_x = high_y = -1e30
+    for du in (-0.6, 0.6):
+        for dv in (-0.6, 0.6):
+            for t in (begin, end):
+                gx, gy = _ground(ray, du, dv, row_time_s + t, motion, spin, height_m)
+                fx = face_from_ground[0, 0] * gx + face_from_ground[0, 1] * gy + face_from_ground[0, 2]
+                fy = face_from_ground[1, 0] * gx + face_from_ground[1, 1] * gy + face_from_ground[1, 2]
+                low_x, high_x = min(low_x, fx), max(high_x, fx)
+                low_y, high_y = min(low_y, fy), max(high_y, fy)
+    return high_x < 0 or high_y < 0 or low_x > size or low_y > size
 
 
 @numba.njit(cache=True, fastmath=True)

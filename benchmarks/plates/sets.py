@@ -235,9 +235,14 @@ def _trial(job: Job) -> Iterator[Shot | Unseen]:
 
 def _draw_camera(rng: np.random.Generator) -> Camera:
     return Camera.from_field_of_view(
-        1920, 1080, float(rng.uniform(60, 90)), height_m=float(rng.uniform(1.2, 2.0)),
-        depression_deg=float(rng.uniform(12, 45)), azimuth_deg=float(rng.normal(0, 8)), roll_deg=float(rng.normal(0, 1)),
-    )  # fmt: skip
+        1920,
+        1080,
+        float(rng.uniform(60, 90)),
+        height_m=float(rng.uniform(1.2, 2.0)),
+        depression_deg=float(rng.uniform(12, 45)),
+        azimuth_deg=float(rng.normal(0, 8)),
+        roll_deg=float(rng.normal(0, 1)),
+    )
 
 
 def _draw_stress_scene(job: Job, rng: np.random.Generator) -> tuple[PlateScene, Image, PlateCode, Conditions]:
