@@ -115,6 +115,7 @@ markers = sa.Table(
     _one_of("status", STATUSES),
     sa.CheckConstraint("lon_deg BETWEEN -180 AND 180 AND lat_deg BETWEEN -90 AND 90", name="position"),
     sa.Index("ix_markers_agency_id_id", "agency_id", "id"),
+    sa.Index("ix_markers_agency_id_status_id", "agency_id", "status", "id"),
     sa.Index("ix_markers_digits", "digits"),
     sqlite_autoincrement=True,
 )

@@ -21,6 +21,17 @@ SQLITE_INDEX = (
        DELETE FROM markers_rtree WHERE row = old.row; END""",
 )
 
+# Without figures SQLite takes an agency for ten markers, and reads them all instead of asking the R*Tree: on 200,000
+# markers a box of 100 takes 70 ms then, and 2 ms with these. They stand for a large registry; a small one is fast anyway.
+SQLITE_STATISTICS = (
+    ("markers", "ix_markers_agency_id_id", "1000000 100000 1"),
+    ("markers", "ix_markers_agency_id_status_id", "1000000 100000 20000 1"),
+    ("markers", "ix_markers_digits", "1000000 2"),
+    ("markers", "sqlite_autoindex_markers_1", "1000000 1"),
+    ("markers_rtree_rowid", None, "1000000"),
+    ("markers_rtree_node", None, "30000"),
+)
+
 
 def upgrade() -> None:
     op.create_table(
@@ -132,6 +143,7 @@ def upgrade() -> None:
         sqlite_autoincrement=True,
     )
     op.create_index("ix_markers_agency_id_id", "markers", ["agency_id", "id"], unique=False)
+    op.create_index("ix_markers_agency_id_status_id", "markers", ["agency_id", "status", "id"], unique=False)
     op.create_index("ix_markers_digits", "markers", ["digits"], unique=False)
     op.create_index(
         "uq_markers_id_digits",
@@ -172,6 +184,11 @@ def upgrade() -> None:
     if op.get_bind().dialect.name == "sqlite":
         for statement in SQLITE_INDEX:
             op.execute(statement)
+        op.execute("ANALYZE")
+        for table, index, figures in SQLITE_STATISTICS:
+            values = {"table": table, "index": index, "figures": figures}
+            op.execute(sa.text("INSERT INTO sqlite_stat1 VALUES (:table, :index, :figures)").bindparams(**values))
+        op.execute("ANALYZE sqlite_schema")
 
 
 def downgrade() -> None:
@@ -187,6 +204,7 @@ def downgrade() -> None:
         postgresql_where=sa.text("scheme = 'id'"),
     )
     op.drop_index("ix_markers_digits", table_name="markers")
+    op.drop_index("ix_markers_agency_id_status_id", table_name="markers")
     op.drop_index("ix_markers_agency_id_id", table_name="markers")
     op.drop_table("markers")
     op.drop_index("ix_idempotency_keys_expires_at", table_name="idempotency_keys")

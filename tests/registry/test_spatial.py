@@ -14,7 +14,7 @@ from app.registry import agencies
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, list_markers
-from app.registry.spatial import Box, box_around, within_box
+from app.registry.spatial import Box, box_around
 from app.registry.tables import markers
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
@@ -119,10 +119,42 @@ def test_a_box_around_a_small_circle_is_small() -> None:
     assert box.east_deg - box.west_deg < 0.04
 
 
-def test_the_index_is_used(store: tuple[Database, str, np.ndarray]) -> None:
-    query = sa.select(markers.c.id).where(within_box(Box(1, 1, 2, 2)))
-    with store[0].read() as connection:
-        sql = str(query.compile(connection, compile_kwargs={"literal_binds": True}))
-        plan = " ".join(str(row) for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {sql}"))
-    assert "VIRTUAL TABLE INDEX" in plan
+@pytest.mark.parametrize(
+    "narrowed", [MarkerFilter(box=Box(1, 1, 2, 2)), MarkerFilter(near=(114.0, 22.0, 500.0))], ids=["box", "circle"]
+)
+def test_the_spatial_index_goes_first(store: tuple[Database, str, np.ndarray], narrowed: MarkerFilter) -> None:
+    plan = _plan(store, narrowed)
     assert "SEARCH markers USING INTEGER PRIMARY KEY" in plan
+    assert "VIRTUAL TABLE INDEX" in plan
+
+
+@pytest.mark.parametrize(
+    ("narrowed", "index"),
+    [
+        (MarkerFilter(), "ix_markers_agency_id_id (agency_id=?)"),
+        (MarkerFilter(box=Box(-180, -90, 180, 90)), "ix_markers_agency_id_id (agency_id=?)"),
+        (MarkerFilter(status="suspect"), "ix_markers_agency_id_status_id (agency_id=? AND status=?)"),
+        (MarkerFilter(digits="0"), "ix_markers_digits (digits=?)"),
+    ],
+    ids=["all", "world", "status", "digits"],
+)
+def test_lists_use_their_index(store: tuple[Database, str, np.ndarray], narrowed: MarkerFilter, index: str) -> None:
+    assert f"USING INDEX {index}" in _plan(store, narrowed)
+
+
+def _plan(store: tuple[Database, str, np.ndarray], narrowed: MarkerFilter) -> str:
+    database, agency_id, _ = store
+    statements = []
+
+    def explain(_c: object, _cur: object, statement: str, parameters: tuple[object, ...], *_: object) -> None:
+        if not statement.startswith("EXPLAIN"):
+            statements.append((statement, parameters))
+
+    sa.event.listen(database.engine, "before_cursor_execute", explain)
+    try:
+        with database.read() as connection:
+            list_markers(connection, agency_id, narrowed, after=None, limit=10)
+            query, parameters = statements[-1]
+            return " ".join(str(row) for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {query}", parameters))
+    finally:
+        sa.event.remove(database.engine, "before_cursor_execute", explain)
