@@ -22,7 +22,7 @@ SQLITE_INDEX = (
 )
 
 # Without figures SQLite takes an agency for ten markers, and reads them all instead of asking the R*Tree: on 200,000
-# markers a box of 100 takes 70 ms then, and 2 ms with these. They stand for a large registry; a small one is fast anyway.
+# markers a box of 100 takes 70 ms then, and 2 ms with these. They stand for a large registry.
 SQLITE_STATISTICS = (
     ("markers", "ix_markers_agency_id_id", "1000000 100000 1"),
     ("markers", "ix_markers_agency_id_status_id", "1000000 100000 20000 1"),
