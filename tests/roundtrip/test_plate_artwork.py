@@ -34,6 +34,7 @@ from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading
 
 URL = "https://waymark.example/v1/markers/3f0c8a52-6a0c-7d1e-9f52-0123456789ab"
+CAMERA_PX_PER_MM = 1.0  # a plate some 1.5 m in front of a 1080p camera
 CASES = [
     (PlateCode("023792168411"), PlateGeometry()),
     (PlateCode("000000000001"), PlateGeometry()),
@@ -88,17 +89,19 @@ def test_files_are_read_by_the_decoder_through_other_renderers(kind: str, tmp_pa
     code = PlateCode.from_position(114.1793123, 22.3045678)
     drawing = encode_plate(PlateOrder("HK-000123", code, PlateGeometry(), URL))
     if kind == "png":
-        picture = write_png(drawing, dpi=40)
+        picture = write_png(drawing, dpi=150)
     elif kind == "svg":
-        picture = cairosvg.svg2png(write_svg(drawing), dpi=96, scale=0.4)
+        picture = cairosvg.svg2png(write_svg(drawing), dpi=96)
     else:
         if not (pdftoppm := shutil.which("pdftoppm")):
             pytest.skip("pdftoppm is not installed")
         (tmp_path / "plate.pdf").write_bytes(write_pdf(drawing))
-        command = [pdftoppm, "-r", "40", "-singlefile", "-png", "plate.pdf", "page"]
+        command = [pdftoppm, "-r", "150", "-singlefile", "-png", "plate.pdf", "page"]
         subprocess.run(command, cwd=tmp_path, check=True, timeout=60)
         picture = (tmp_path / "page.png").read_bytes()
-    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    sheet = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    size = (round(drawing.width_mm * CAMERA_PX_PER_MM), round(drawing.height_mm * CAMERA_PX_PER_MM))
+    image = cv2.resize(sheet, size, interpolation=cv2.INTER_AREA)
     assert _digits(image, PlateGeometry()) == [code.digits]
 
 
