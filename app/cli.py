@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -28,7 +29,7 @@ def waymark() -> None:
 
 @cli.command()
 def serve(host: HostOption = None, port: PortOption = None) -> None:
-    """Serve the API and the web UI; on a fresh machine print the first admin key."""
+    """Serve the API; on a fresh machine print the first admin key."""
     import uvicorn
 
     from app.logs import configure_logs
@@ -70,6 +71,60 @@ def key(
     with _owned_database(_settings()) as database:
         database.migrate()
         typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label))
+
+
+@cli.command()
+def encode(
+    out: Annotated[Path, typer.Option(help="Folder to write to; created if need be.")] = Path("."),
+    lon_deg: Annotated[float | None, typer.Option(help="Longitude of a position plate. [deg]")] = None,
+    lat_deg: Annotated[float | None, typer.Option(help="Latitude of a position plate. [deg]")] = None,
+    check_digits: Annotated[int, typer.Option(min=0, max=2, help="Check digits of a position plate.")] = 0,
+    registry_number: Annotated[int | None, typer.Option(help="Number of an id plate.")] = None,
+    n: Annotated[int, typer.Option(help="Units along a side: 8, 10 or 12.")] = 8,
+    unit_mm: Annotated[float, typer.Option(help="Side of a unit. [mm]")] = 35.0,
+    gap_mm: Annotated[float, typer.Option(help="Gap between units. [mm]")] = 5.0,
+    thickness_mm: Annotated[float, typer.Option(help="Thickness of the base plate. [mm]")] = 20.0,
+    form: Annotated[list[str] | None, typer.Option("--format", help="svg, pdf, dxf or png; may be repeated.")] = None,
+) -> None:
+    """Write the artwork of one plate at true size, read back before it is written."""
+    from app.decoders.plate import decode_plates
+    from app.encoders.plate import ArtworkFormat
+    from app.markers.plate import PlateGeometry
+    from app.services.plate_files import encode_plate_files, plate_code_for
+
+    unknown = sorted(set(form or ()) - set(ArtworkFormat))
+    if unknown:
+        raise InvalidParameter(f"there is no format {unknown[0]}", limit=", ".join(ArtworkFormat))
+    position = (lon_deg, lat_deg) if lon_deg is not None and lat_deg is not None else None
+    files = encode_plate_files(
+        plate_code_for(position, registry_number, n=n, check_digits=check_digits),
+        PlateGeometry(n, unit_mm, gap_mm, thickness_mm),
+        [ArtworkFormat(name) for name in form or ("svg", "pdf")],
+        position=position,
+        read=lambda image, geometry: decode_plates(image, geometries=(geometry,)),
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        (out / name).write_bytes(content)
+        typer.echo(out / name)
+
+
+@cli.command()
+def decode(
+    pictures: Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="JPEG or PNG files.")],
+    thermal: Annotated[bool, typer.Option(help="The pictures come from a thermal camera.")] = False,
+) -> None:
+    """Read the plates in pictures; prints one JSON object a picture."""
+    import orjson
+
+    from app.decoders.images import ImageLimits
+    from app.decoders.plate import decode_plates
+    from app.services.plate_files import decode_picture
+
+    limits = ImageLimits(pixels=_settings().max_image_pixels)
+    for picture in pictures:
+        found = decode_picture(picture.name, picture.read_bytes(), decode=decode_plates, limits=limits, thermal=thermal)
+        typer.echo(orjson.dumps(found, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
 @contextmanager

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
+import orjson
 import pytest
 from pydantic import SecretStr
 
@@ -74,3 +76,55 @@ def test_without_a_command_the_commands_are_listed(waymark: Run) -> None:
     status, out, error = waymark()
     assert status in (0, 2)
     assert all(name in out + error for name in ("serve", "migrate", "key"))
+
+
+def test_a_plate_is_written_and_read_back(waymark: Run, tmp_path: Path) -> None:
+    out = tmp_path / "artwork"
+    place = ("--lon-deg", "114.179203", "--lat-deg", "22.304161")
+    formats = ("--format", "png", "--format", "svg", "--format", "pdf", "--format", "dxf")
+    status, listed, error = waymark("encode", *place, *formats, "--out", str(out))
+    assert status == 0, error
+    names = {f"179203304161.{form}" for form in ("png", "svg", "pdf", "dxf")}
+    assert {Path(line).name for line in listed.split()} == names == {file.name for file in out.iterdir()}
+    seen = tmp_path / "seen.png"
+    drawn = cv2.imread(str(out / "179203304161.png"))
+    cv2.imwrite(str(seen), cv2.resize(drawn, (300, 356), interpolation=cv2.INTER_AREA))
+    status, printed, error = waymark("decode", str(seen), str(seen))
+    assert status == 0, error
+    for line in printed.splitlines():
+        assert [reading["digits"] for reading in orjson.loads(line)["readings"]] == ["179203304161"]
+
+
+def test_an_id_plate_is_written(waymark: Run, tmp_path: Path) -> None:
+    number = ("--registry-number", "3735928559", "--format", "svg")
+    status, listed, error = waymark("encode", *number, "--out", str(tmp_path))
+    assert status == 0, error
+    assert Path(listed.strip()).name.startswith("DEADBEEF")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        ((), "--registry-number"),
+        (("--lon-deg", "1", "--lat-deg", "91"), "lat_deg"),
+        (("--lon-deg", "nan", "--lat-deg", "1"), "lon_deg"),
+        (("--registry-number", "1", "--lon-deg", "1", "--lat-deg", "1"), "one of the two"),
+        (("--registry-number", "4294967296"), "4294967295"),
+        (("--registry-number", "1", "--n", "9"), "8, 10 or 12"),
+        (("--registry-number", "1", "--unit-mm", "51"), "2-5 cm"),
+        (("--registry-number", "1", "--format", "gif"), "svg, pdf, dxf, png"),
+    ],
+)
+def test_plates_that_cannot_be(waymark: Run, tmp_path: Path, arguments: tuple[str, ...], what: str) -> None:
+    status, _, error = waymark("encode", *arguments, "--out", str(tmp_path / "none"))
+    assert status == 1
+    assert what in error
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_file_that_is_no_picture(waymark: Run, tmp_path: Path) -> None:
+    file = tmp_path / "x.jpg"
+    file.write_bytes(b"ffconcat version 1.0\nfile other.avi\n")
+    status, out, error = waymark("decode", str(file))
+    assert (status, out) == (1, "")
+    assert error.startswith("waymark: ")

@@ -172,6 +172,10 @@ class _Layout:
 
 
 def _layout(n: int, scheme: PlateScheme, check_digits: int) -> _Layout:
+    if n not in SIZES:
+        raise InvalidParameter(
+            f"no plate has {n} units along a side", field="n", limit="8, 10 or 12", cure="choose n = 8, 10 or 12"
+        )
     cells = len(code_cells(n))
     if scheme is PlateScheme.ID:  # GF(16) codewords hold at most 15 symbols, so larger plates interleave two
         data, checks, words = {8: (8, 4, 1), 10: (6, 4, 2), 12: (8, 7, 2)}[n]
@@ -188,8 +192,6 @@ def plate_capacity(n: int, scheme: PlateScheme, check_digits: int = 1) -> PlateC
     -----
     The id scheme corrects, per codeword, half as many wrong cells as it has check symbols, or all of them unreadable.
     """
-    if n not in SIZES:
-        raise InvalidParameter(f"no plate has {n} units along a side", field="n", limit="8, 10 or 12")
     lay = _layout(n, scheme, check_digits)
     is_id = scheme is PlateScheme.ID
     return PlateCapacity(
