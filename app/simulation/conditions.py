@@ -123,7 +123,7 @@ def _draw_air(rng: np.random.Generator) -> Air:
     return Air(
         haze=_uniform(rng, 0, 0.55) if rng.random() < 0.4 else 0.0,
         airlight=_uniform(rng, 0.4, 0.9),
-        glare=_uniform(rng, 0.05, 0.45) if rng.random() < 0.3 else 0.0,
+        glare=_uniform(rng, 0.05, 0.35) if rng.random() < 0.3 else 0.0,
         glare_at_m=(_uniform(rng, -0.2, 0.2), _uniform(rng, -0.2, 0.2)),
         glare_size_m=(_uniform(rng, 0.05, 0.2), _uniform(rng, 0.1, 0.5)),
     )
