@@ -24,7 +24,7 @@ import numpy.typing as npt
 import reedsolo
 
 from app.errors import CodeMismatch, InvalidParameter
-from app.geodesy import check_lon_lat as check_lon_lat
+from app.geodesy import check_lon_lat
 
 SIZES = (8, 10, 12)
 UNIT_MM = (20.0, 50.0)

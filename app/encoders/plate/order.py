@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from app.errors import InvalidParameter
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, check_lon_lat
+from app.geodesy import check_lon_lat
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 
 MAX_ID_LENGTH = 64
 MAX_NOTE_LENGTH = 80
