@@ -15,12 +15,17 @@ from app.registry.tables import decodes, observations
 Row = sa.RowMapping
 UNFINISHED = ("queued", "running")
 _PUBLIC = [column for column in decodes.c if column.name != "agency_id"]
+_ADD_DECODE = sa.insert(decodes)  # built once: building a statement costs more than running it
+_ADD_OBSERVATIONS = {
+    "sqlite": sqlite.insert(observations).on_conflict_do_nothing(),
+    "postgresql": postgresql.insert(observations).on_conflict_do_nothing(),
+}
 _SHORT = [column for column in _PUBLIC if column.name != "result"]
 
 
 def add_decode(connection: sa.Connection, agency_id: str, values: Mapping[str, Any]) -> None:
     """Store a new decode."""
-    connection.execute(sa.insert(decodes).values(agency_id=agency_id, **values))
+    connection.execute(_ADD_DECODE, {**values, "agency_id": agency_id})
 
 
 def get_decode(connection: sa.Connection, agency_id: str, decode_id: str) -> Row:
@@ -98,8 +103,7 @@ def add_observations(connection: sa.Connection, agency_id: str, rows: Sequence[M
     """Store what was seen of markers; a row that is there already stays."""
     if not rows:
         return
-    insert = postgresql.insert if connection.dialect.name == "postgresql" else sqlite.insert
-    statement = insert(observations).on_conflict_do_nothing()
+    statement = _ADD_OBSERVATIONS[connection.dialect.name]
     connection.execute(statement, [{**row, "agency_id": agency_id} for row in rows])
 
 

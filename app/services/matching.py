@@ -29,17 +29,15 @@ class NearbyPlates:
     ----------
     rows : tuple of row
         Nearest first.
+    codebook : tuple of PlateCode
+        Their codes, without repetitions; empty if it is not complete.
     complete : bool
         False if there are more than a codebook may hold; then there is no codebook.
     """
 
     rows: tuple[Row, ...] = ()
+    codebook: tuple[PlateCode, ...] = ()
     complete: bool = True
-
-    @property
-    def codebook(self) -> tuple[PlateCode, ...]:
-        """Their codes, without repetitions."""
-        return tuple(dict.fromkeys(plate_code(row) for row in self.rows)) if self.complete else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +81,9 @@ def find_nearby_plates(connection: sa.Connection, agency_id: str, position: Coar
     rows = store.list_plates_near(
         connection, agency_id, position.lon_deg, position.lat_deg, position.reach_m, limit=MAX_CODEBOOK + 1
     )
-    return NearbyPlates(tuple(rows[:MAX_CODEBOOK]), len(rows) <= MAX_CODEBOOK)
+    if len(rows) > MAX_CODEBOOK:
+        return NearbyPlates(tuple(rows[:MAX_CODEBOOK]), complete=False)
+    return NearbyPlates(tuple(rows), tuple(dict.fromkeys(plate_code(row) for row in rows)))
 
 
 def match_reading(
