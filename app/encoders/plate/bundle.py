@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import unicodedata
 import zipfile
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from typing import Any, BinaryIO
+
+import orjson
 
 from app.encoders.plate.artwork import encode_plate, encode_sheets
 from app.encoders.plate.colours import COLOURS
@@ -26,7 +25,6 @@ MANIFEST_FORMAT = "waymark-artwork/1"
 ARTWORK_VERSION = "1"
 MAX_PLATES = 10_000
 _LEVEL = 1
-_PENDING = 32
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 _RESERVED = re.compile(r"(?i)^(con|prn|aux|nul|com\d|lpt\d)(\.|$)")
 _LONGEST_STEM = 60
@@ -99,18 +97,19 @@ def write_bundle(
     if not options.formats:
         raise InvalidParameter("no format was asked for", field="formats", limit="at least one of svg, pdf, dxf, png")
     names = safe_names([f"{order.plate_id}-r{order.revision}" for order in orders])
-    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive, _Packer(archive) as packer:
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        packer = _Packer(archive)
         plates = []
         for done, (order, name) in enumerate(zip(orders, names, strict=True), start=1):
             plates.append(_add_plate(packer, order, name, options, read))
             if progress:
                 progress(done)
         if options.sheet_mm:
-            _add_sheets(packer, orders, options)
+            _add_sheets(packer, orders, options, options.sheet_mm)
         packer.add("quality.pdf", write_pdf(quality_sheets(orders), compress=False))
         packer.add("quality.csv", quality_csv(orders))
-        manifest = _manifest(plates, packer.finish(), options, proved=read is not None)
-        packer.add("manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False).encode())
+        manifest = _manifest(plates, list(packer.entries), options, proved=read is not None)
+        packer.add("manifest.json", orjson.dumps(manifest, option=orjson.OPT_INDENT_2))
     return manifest
 
 
@@ -136,42 +135,21 @@ def safe_names(names: Sequence[str]) -> list[str]:
 
 
 class _Packer:
-    """Compresses and hashes in one thread beside the drawing, which holds the interpreter; both release it."""
+    """Writes files into an archive and keeps their name, size and hash.
+
+    In the caller's thread: a second one waits for the interpreter longer than the compression takes (measured).
+    """
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
-        self._pool = ThreadPoolExecutor(max_workers=1)
-        self._pending: deque[Future[dict[str, Any]]] = deque()
-        self._entries: list[dict[str, Any]] = []
-
-    def __enter__(self) -> _Packer:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        try:
-            if error[0] is None:
-                self.finish()
-        finally:
-            self._pool.shutdown(cancel_futures=True)
+        self.entries: list[dict[str, Any]] = []
 
     def add(self, name: str, content: bytes) -> None:
-        """Queue a file; waits while too many are queued."""
-        self._pending.append(self._pool.submit(self._write, name, content))
-        while len(self._pending) > _PENDING:
-            self._entries.append(self._pending.popleft().result())
-
-    def finish(self) -> list[dict[str, Any]]:
-        """Wait for all that is queued. Name, size and hash of every file so far."""
-        while self._pending:
-            self._entries.append(self._pending.popleft().result())
-        return list(self._entries)
-
-    def _write(self, name: str, content: bytes) -> dict[str, Any]:
         info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
         info.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
         info.external_attr = 0o644 << 16
         self._archive.writestr(info, content, compresslevel=_LEVEL)
-        return {"name": name, "size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+        self.entries.append({"name": name, "size": len(content), "sha256": hashlib.sha256(content).hexdigest()})
 
 
 def _add_plate(
@@ -187,9 +165,10 @@ def _add_plate(
     return _plate_entry(order, files, proof)
 
 
-def _add_sheets(packer: _Packer, orders: Sequence[PlateOrder], options: BundleOptions) -> None:
-    assert options.sheet_mm is not None
-    width, height = options.sheet_mm
+def _add_sheets(
+    packer: _Packer, orders: Sequence[PlateOrder], options: BundleOptions, sheet_mm: tuple[float, float]
+) -> None:
+    width, height = sheet_mm
     sheets = encode_sheets(orders, width_mm=width, height_mm=height, options=options.artwork)
     for number, sheet in enumerate(sheets, start=1):
         for form in options.formats:

@@ -24,7 +24,7 @@ from app.markers.reading import PlateOutcome, PlateReading
 PlateReader = Callable[[Image, PlateGeometry], Sequence[PlateReading]]
 """Reads an image, (H, W, 3) BGR, given the geometry to expect."""
 
-UNIT_PX = 10.0
+UNIT_PX = 12.0
 _ROAD_PX = 36
 _ROAD_GREY = 96
 _LENS_PX = 0.7
