@@ -6,7 +6,7 @@ travel), column 0 its left edge.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -84,8 +84,8 @@ class Face:
     """
 
     side_m: float
-    reflectance: FloatArray
-    emission: FloatArray | None = None
+    reflectance: FloatArray = field(repr=False)
+    emission: FloatArray | None = field(default=None, repr=False)
 
 
 def draw_look(rng: np.random.Generator) -> PlateLook:

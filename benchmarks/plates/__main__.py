@@ -26,8 +26,9 @@ NEEDS = {
 }
 BATCH = 25
 # frames (drives for thermal) a seed: long, short
-COUNTS = {"stress": (400, 25), "night": (50, 8), "thermal": (12, 1), "hidden": (100, 10), "free": (1000, 50)}
-SHORT_SHARE = 0.1
+COUNTS = {"stress": (400, 24), "night": (50, 6), "thermal": (12, 1), "hidden": (100, 10), "free": (1000, 40)}
+SHORT_SHARE = 0.08
+MISSED_ROWS = 16
 
 
 def list_jobs(items: set[str], seeds: list[int], *, short: bool) -> list[Job]:
@@ -73,6 +74,7 @@ def main() -> None:
     parser.add_argument("--short", action="store_true", help="a part of the frames of one seed, under a minute")
     parser.add_argument("--seed", type=int, default=1, help="first seed")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--misses", action="store_true", help="name the frames that were not decoded")
     args = parser.parse_args()
     items = set(ITEMS) if "all" in args.items else set(args.items)
     seeds = [args.seed] if args.short else [args.seed, args.seed + 1, args.seed + 2]
@@ -89,8 +91,11 @@ def main() -> None:
     if timings:
         print(f"\n### speed\n\n{len(timings) // 2} contenders in turns on each frame.\n\n{tables.speed_table(timings)}")
     _print("accuracy", items, tables.accuracy_table, records, "Over the frames decoded in the trials.")
-    if wrong := tables.wrong_list(records):
+    if wrong := tables.frame_list(r for r in records if r.wrong or r.wrong_known):
         print(f"\nWrong digits:\n{wrong}")
+    if args.misses:
+        missed = (r for r in records if r.height_px >= MISSED_ROWS and not r.decoded)
+        print(f"\nNot decoded at {MISSED_ROWS} rows and more:\n{tables.frame_list(missed)}")
 
 
 _TRIALS_NOTE = (

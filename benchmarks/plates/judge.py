@@ -25,6 +25,8 @@ class Record:
     ----------
     set_name, label, seed, share
         Where it comes from; ``share`` of that set's frames was taken.
+    index, number : int
+        Job and place in it: what ``python -m benchmarks.plates.show`` takes.
     height_px : float
         Of the plate's image; NaN where there is none.
     decoded, decoded_known : bool
@@ -43,6 +45,8 @@ class Record:
     label: str
     seed: int
     share: float
+    index: int
+    number: int
     height_px: float
     decoded: bool = False
     decoded_known: bool = False
@@ -56,12 +60,13 @@ class Record:
 def judge_job(job: Job) -> list[Record]:
     """Render and judge the frames of a job."""
     cv2.setNumThreads(1)
-    return [_judge(job, shot) for shot in shoot(job)]
+    return [_judge(job, number, shot) for number, shot in enumerate(shoot(job))]
 
 
-def _judge(job: Job, shot: Shot | Unseen) -> Record:
+def _judge(job: Job, number: int, shot: Shot | Unseen) -> Record:
     if isinstance(shot, Unseen):
-        return Record(job.set_name, shot.label, job.seed, job.share, shot.height_px, tags=_no_tags(job))
+        tags = (False,) * len(FAMILIES) if job.peers else None
+        return Record(job.set_name, shot.label, job.seed, job.share, job.index, number, shot.height_px, tags=tags)
     truth = shot.frame.truths[0] if shot.code is not None else None
     alone = decode_plates(shot.frame.image, camera=shot.camera, thermal=shot.thermal)
     known = decode_plates(shot.frame.image, camera=shot.camera, codebook=shot.codebook, thermal=shot.thermal)
@@ -72,6 +77,8 @@ def _judge(job: Job, shot: Shot | Unseen) -> Record:
         label=shot.label,
         seed=job.seed,
         share=job.share,
+        index=job.index,
+        number=number,
         height_px=truth.height_px if truth else math.nan,
         decoded=hit is not None,
         decoded_known=hit_known is not None,
@@ -117,10 +124,6 @@ def _position_error(hit: PlateReading | None, truth: FaceTruth | None) -> float:
         return math.nan
     position_m = -hit.pose.rotation.T @ hit.pose.translation_m
     return float(np.linalg.norm(position_m - truth.camera_position_m))
-
-
-def _no_tags(job: Job) -> tuple[bool, ...] | None:
-    return (False,) * len(FAMILIES) if job.peers else None
 
 
 def _judge_tags(job: Job, shot: Shot, truth: FaceTruth | None) -> tuple[bool, ...] | None:

@@ -165,6 +165,11 @@ def draw_codebook(code: PlateCode, rng: np.random.Generator, count: int = 20) ->
     return tuple(PlateCode(digits) for digits in sorted(codes))
 
 
+def find_shot(job: Job, number: int) -> Shot | Unseen:
+    """One frame of a job by its place."""
+    return next(shot for k, shot in enumerate(shoot(job)) if k == number)
+
+
 def shoot(job: Job) -> Iterator[Shot | Unseen]:
     """Frames of a job."""
     makers = {

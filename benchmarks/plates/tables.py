@@ -177,11 +177,10 @@ def accuracy_table(records: Sequence[Record]) -> str:
     return table(("error", "values", "median", "goal", "95 %", "goal", "met"), rows)
 
 
-def wrong_list(records: Sequence[Record]) -> str:
-    """Where wrong digits came from, to look at them again."""
-    lines = [
-        f"- {r.set_name} {r.label}, seed {r.seed}, {r.height_px:.1f} rows: {', '.join(r.wrong + r.wrong_known)}"
+def frame_list(records: Iterable[Record]) -> str:
+    """Frames by the names that ``python -m benchmarks.plates.show`` takes, with the wrong digits if any."""
+    return "\n".join(
+        f"- {r.set_name} {r.index} {r.number} --seed {r.seed} ({r.label}, {r.height_px:.1f} rows)"
+        + (f": {', '.join({*r.wrong, *r.wrong_known})}" if r.wrong or r.wrong_known else "")
         for r in records
-        if r.wrong or r.wrong_known
-    ]
-    return "\n".join(lines)
+    )
