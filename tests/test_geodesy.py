@@ -77,6 +77,14 @@ def test_hong_kong_1980_states_only_a_metre() -> None:
     assert placed.grade is APPROXIMATE
 
 
+def test_the_stated_accuracy_has_to_be_good_enough() -> None:
+    placed = place_position(*MICHIGAN, crs="EPSG:4269", epoch=2025.0)  # NAD83 of 1986: EPSG states 1 m
+    assert placed.grade is APPROXIMATE
+    assert "states 1 m, the limit is 0.1 m" in (placed.note or "")
+    coarse = place_position(*MICHIGAN, crs="EPSG:4269", epoch=2025.0, accuracy_m=1.0)
+    assert (coarse.grade, coarse.transform_accuracy_m) == (EXACT, 1.0)
+
+
 def test_utm_on_wgs84_is_exact() -> None:
     placed = place_position(500_000.0, 0.0, crs="EPSG:32650", projected=True)
     assert (placed.lon_deg, placed.lat_deg) == pytest.approx((117.0, 0.0), abs=1e-12)

@@ -113,6 +113,20 @@ def test_boxes_hold_exactly_what_is_inside(store: tuple[Database, str, np.ndarra
     assert _found(store, MarkerFilter(box=box)) == {tuple(spot) for spot in store[2][inside].tolist()}
 
 
+@pytest.mark.parametrize("radius_m", [1.0, 250.0, 20_000.0, 100_000.0, 3_000_000.0])
+@pytest.mark.parametrize("centre", CENTRES)
+def test_a_box_holds_the_rim_of_its_circle(centre: tuple[float, float], radius_m: float) -> None:
+    azimuths = np.arange(0.0, 360.0, 7.5)
+    same = np.ones_like(azimuths)
+    lon, lat, _ = GEOD.fwd(centre[0] * same, centre[1] * same, azimuths, radius_m * same)
+    parts = box_around(*centre, radius_m).parts
+    for x, y in zip(lon, lat, strict=True):
+        assert any(part.west_deg <= x <= part.east_deg and part.south_deg <= y <= part.north_deg for part in parts), (
+            x,
+            y,
+        )
+
+
 def test_a_box_around_a_small_circle_is_small() -> None:
     box = box_around(114.0, 60.0, 1_000.0)
     assert box.north_deg - box.south_deg < 0.019
