@@ -59,7 +59,7 @@ class LiveServer:
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
     """Settings of a server with an empty folder of its own."""
-    return Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY)
+    return Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY, warm_decoders=False)
 
 
 @pytest.fixture
@@ -86,7 +86,8 @@ def fresh_server(serve: Callable[[Settings], LiveServer], settings: Settings) ->
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
     """A server that the tests of a module share; each test has an agency of its own."""
     folder = tmp_path_factory.mktemp("server")
-    with LiveServer(create_app(Settings(data_dir=folder / "var", admin_key=ADMIN_KEY))) as running:
+    settings = Settings(data_dir=folder / "var", admin_key=ADMIN_KEY, warm_decoders=False)
+    with LiveServer(create_app(settings)) as running:
         yield running
 
 

@@ -41,7 +41,10 @@ def test_migrate_up_and_down(waymark: Run, tmp_path: Path) -> None:
 def test_a_key_for_another_agency(waymark: Run, tmp_path: Path) -> None:
     status, key, _ = waymark("key", "City of Elsewhere", "--scope", "read", "--label", "map")
     assert status == 0
-    with LiveServer(create_app(Settings(data_dir=tmp_path))) as server, server.client(key.strip()) as client:
+    with (
+        LiveServer(create_app(Settings(data_dir=tmp_path, warm_decoders=False))) as server,
+        server.client(key.strip()) as client,
+    ):
         assert client.get("/v1/markers").status_code == 200
         assert client.post("/v1/markers", json={}).status_code == 403
         status, _, error = waymark("key", "City")
@@ -55,7 +58,7 @@ def test_a_key_for_another_agency(waymark: Run, tmp_path: Path) -> None:
 def test_the_admin_key_of_the_environment_can_change(tmp_path: Path) -> None:
     old, new = "an-old-admin-key-of-32-characters", "a-newer-admin-key-of-33-characters"
     for current, other in ((old, new), (new, old), (old, new)):
-        settings = Settings(data_dir=tmp_path, admin_key=SecretStr(current))
+        settings = Settings(data_dir=tmp_path, admin_key=SecretStr(current), warm_decoders=False)
         with LiveServer(create_app(settings)) as server, server.client(current) as good, server.client(other) as bad:
             assert good.get("/v1/markers").status_code == 200
             assert bad.get("/v1/markers").status_code == 401

@@ -21,7 +21,8 @@ WAYMARK = [sys.executable, "-c", "from app.cli import main; main()"]
 
 def _environment(folder: Path, **extra: str) -> dict[str, str]:
     plain = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")}
-    return {**plain, "WAYMARK_DATA_DIR": str(folder), "PYTHONPATH": str(ROOT), **extra}
+    own = {"WAYMARK_DATA_DIR": str(folder), "WAYMARK_WARM_DECODERS": "false", "PYTHONPATH": str(ROOT)}
+    return {**plain, **own, **extra}
 
 
 def _free_port() -> int:
