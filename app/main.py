@@ -6,25 +6,49 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
+import numpy.typing as npt
 from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import markers, system
+from app.api import artwork, decodes, markers, system
 from app.api.middleware import Guarded, Observed
 from app.api.openapi import describe
 from app.api.problems import install_problem_handlers
+from app.decoders.archives import ArchiveLimits
+from app.decoders.images import ImageLimits
+from app.decoders.plate import decode_plates
+from app.encoders.plate import PlateReader
+from app.jobs.child import ChildLimits, DecodePlates
+from app.jobs.local import LocalQueue
+from app.jobs.pool import DecodePool
+from app.markers.plate import PlateGeometry
+from app.markers.reading import PlateReading
 from app.registry.database import Database
 from app.services.access import Access, Scope
+from app.services.artwork import Artworks
+from app.services.decode_jobs import DecodeJobs
+from app.services.decode_rules import DecodeRules
+from app.services.decodes import Decodes
 from app.services.markers import MarkerRules, Markers
 from app.settings import Settings
+from app.storage.blobs import Blobs
 
-ROUTERS = (system.router, markers.router)
+ROUTERS = (system.router, markers.router, artwork.router, decodes.router)
 
 
-def create_app(settings: Settings) -> FastAPI:
-    """An app with its own database, use cases, metrics and limits. Files are opened when it starts."""
+def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> FastAPI:
+    """An app with its own database, use cases, metrics and limits. Files are opened when it starts.
+
+    `decode` is imported by name in the decoder processes, so it must be a function of a module.
+    """
     database = Database(settings.resolved_database_url)
+    blobs = Blobs(settings.resolved_blobs_url)
+    pool = _decode_pool(settings, decode)
+    queue = LocalQueue()
+    rules = _decode_rules(settings)
+    jobs = DecodeJobs(database, utc_now, blobs=blobs, decoder=pool, rules=rules)
     access = Access(database, utc_now)
     metrics = CollectorRegistry()
     readiness: dict[str, Callable[[], bool]] = {"database": database.is_ready}
@@ -34,13 +58,22 @@ def create_app(settings: Settings) -> FastAPI:
         database.open()
         try:
             database.migrate()
+            blobs.open()
             _show_once(access.ensure_first_key(_admin_key(settings)))
+            if settings.warm_decoders:
+                pool.warm()
+            queue.open(jobs.run_job, jobs.list_unfinished())
             yield
         finally:
+            pool.close()
+            queue.close()
             database.close()
 
     app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
     app.state.markers = Markers(database, utc_now, _marker_rules(settings))
+    app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, rules=rules)
+    app.state.jobs = jobs
+    app.state.artworks = Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode))
     app.state.access = access
     app.state.readiness = readiness
     app.state.metrics = metrics
@@ -52,7 +85,7 @@ def create_app(settings: Settings) -> FastAPI:
         Guarded,
         authenticate=access.authenticate,
         body_limits={"": settings.max_json_bytes, "/v1/decodes": settings.max_upload_bytes},
-        needed_scopes={"": Scope.WRITE, "/v1/decodes": Scope.DECODE},
+        needed_scopes={"": Scope.WRITE, "/v1/decodes": Scope.DECODE, "/v1/artwork": Scope.READ},
         body_timeout_s=settings.body_timeout_s,
     )
     app.add_middleware(Observed, registry=metrics)
@@ -73,6 +106,33 @@ def _marker_rules(settings: Settings) -> MarkerRules:
         explicit_code_radius_m=settings.explicit_code_radius_m,
         position_code_radius_m=settings.position_code_radius_m,
         crs_accuracy_m=settings.crs_accuracy_m,
+        idempotency_ttl=timedelta(hours=settings.idempotency_ttl_h),
+    )
+
+
+def _face_reader(decode: DecodePlates) -> PlateReader:
+    """The decoder as the self-proof wants it: our own drawing is no stranger's upload, so it needs no child process."""
+
+    def read(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> list[PlateReading]:
+        return decode(image, geometries=(geometry,))
+
+    return read
+
+
+def _decode_pool(settings: Settings, decode: DecodePlates) -> DecodePool:
+    return DecodePool(
+        decode,
+        workers=settings.decode_workers,
+        limits=ChildLimits(settings.decode_memory_bytes, settings.decode_timeout_s),
+        max_pixels=settings.max_image_pixels,
+    )
+
+
+def _decode_rules(settings: Settings) -> DecodeRules:
+    return DecodeRules(
+        images=ImageLimits(pixels=settings.max_image_pixels),
+        archives=ArchiveLimits(members=settings.max_archive_frames, member_bytes=settings.max_upload_bytes),
+        frames_in_flight=settings.decode_workers,
         idempotency_ttl=timedelta(hours=settings.idempotency_ttl_h),
     )
 

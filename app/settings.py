@@ -18,6 +18,9 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(default=Path("var"), description="Folder of the embedded database and of uploads.")
     database_url: str = Field(default="", description="SQLAlchemy URL; empty means a SQLite file in the data folder.")
+    blobs_url: str = Field(
+        default="", description="file:///FOLDER or s3://BUCKET/PREFIX; empty means a folder in the data folder."
+    )
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
     public_url: str = Field(default="", description="Where clients reach the server; goes into QR codes and links.")
@@ -27,9 +30,11 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(default=32 * 1024**2, ge=1024, description="Largest upload. [byte]")
     max_image_pixels: int = Field(default=50_000_000, ge=1, description="Largest picture. [px]")
     body_timeout_s: float = Field(default=30.0, gt=0, description="Longest wait for the next part of a body. [s]")
+    max_archive_frames: int = Field(default=500, ge=1, le=10_000, description="Most frames in one archive.")
     decode_memory_bytes: int = Field(default=3 * 1024**3, ge=2**28, description="Address space of a decoder. [byte]")
     decode_timeout_s: float = Field(default=20.0, gt=0, description="Longest decode of one frame. [s]")
     decode_workers: int = Field(default=2, ge=1, le=256, description="Decoder processes.")
+    warm_decoders: bool = Field(default=True, description="Start them with the server, not with the first upload.")
 
     explicit_code_radius_m: float = Field(
         default=20_000.0, ge=0, le=1e6, description="No two plates with the same given digits within this. [m]"
@@ -62,6 +67,11 @@ class Settings(BaseSettings):
     def resolved_database_url(self) -> str:
         """Database URL with the default filled in."""
         return self.database_url or f"sqlite:///{self.data_dir / 'waymark.sqlite3'}"
+
+    @property
+    def resolved_blobs_url(self) -> str:
+        """URL of the blob store with the default filled in."""
+        return self.blobs_url or (self.data_dir.resolve() / "blobs").as_uri()
 
     @property
     def resolved_public_url(self) -> str:

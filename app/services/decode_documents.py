@@ -12,13 +12,14 @@ import sqlalchemy as sa
 
 from app import __version__
 from app.decoders.images import ImageHeader
+from app.decoders.plate import DECODER_VERSION
 from app.errors import WaymarkError
 from app.markers.plate import PlateScheme
 from app.markers.reading import PlateOutcome, PlateReading
 from app.services.fixes import Fix
 from app.services.matching import Match
 
-DECODER = f"waymark {__version__}"
+DECODER = f"waymark {__version__} {DECODER_VERSION}"
 
 
 @dataclass(frozen=True, slots=True)

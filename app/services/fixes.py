@@ -106,7 +106,7 @@ def fuse_fixes(fixes: Sequence[Fix]) -> Fix | None:
         weight = np.linalg.inv(vehicle.covariance)
         information += weight
         weighted += weight @ np.array([*enu_m, turn])
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     mean = covariance @ weighted
     lon_deg, lat_deg, height_m = wgs84_from_enu(mean[:3], origin)
     heading_deg = (first.heading_deg + math.degrees(mean[3])) % 360.0

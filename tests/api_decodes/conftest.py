@@ -16,6 +16,7 @@ from app.main import create_app
 from app.settings import Settings
 from tests.conftest import ADMIN_KEY, LiveServer
 from tests.jobs import standin
+from tests.uploads.pictures import corner_frame, png
 
 Post = Callable[..., httpx.Response]
 
@@ -39,6 +40,9 @@ def real_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer
     """A server with the decoder that is shipped."""
     settings = Settings(data_dir=tmp_path_factory.mktemp("real") / "var", admin_key=ADMIN_KEY, warm_decoders=False)
     with LiveServer(create_app(settings)) as running:
+        with running.client() as client:  # the first frame waits for the kernels, which may have to be compiled
+            client.timeout = httpx.Timeout(280)
+            assert post_frame(client, png(corner_frame())).status_code == 201
         yield running
 
 
