@@ -51,7 +51,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     jobs = DecodeJobs(database, utc_now, blobs=blobs, decoder=pool, rules=rules)
     access = Access(database, utc_now)
     metrics = CollectorRegistry()
-    readiness: dict[str, Callable[[], bool]] = {"database": database.is_ready}
+    readiness: dict[str, Callable[[], bool]] = {"database": database.is_ready, "decoders": pool.is_ready}
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:

@@ -80,6 +80,18 @@ class DecodePool:
         if pool is not None:
             _stop(pool)
 
+    def is_ready(self) -> bool:
+        """Whether frames can be handed over. A pool that was given up says so once, and is replaced on the way."""
+        with self._lock:
+            pool, closed = self._pool, self._closed
+        if closed:
+            return False
+        if pool is None or pool.active:
+            return True
+        self._discard(pool)
+        self.warm()
+        return False
+
     def start(self, task: FrameTask, *, wait_s: float = 0.0) -> Pending[FrameResult]:
         """Hand a frame over and return, at once or as soon as there is a place for it within `wait_s`."""
         return self._start(decode_frame, task, wait_s)

@@ -154,6 +154,24 @@ def broken_decode(*_args: object, **_options: object) -> list[object]:
     raise ImportError("no kernels")
 
 
+def test_a_pool_that_was_given_up_says_so_once_and_comes_back() -> None:
+    made = DecodePool(standin.decode, workers=1)
+    assert made.is_ready()
+    made.open()
+    try:
+        assert made.is_ready()
+        os.kill(child_of(made), signal.SIGKILL)
+        deadline = time.monotonic() + 20
+        while made.is_ready():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert made.is_ready()
+        assert made.start(task_that(standin.OBEY)).result().readings[0].digits == CODE.digits
+    finally:
+        made.close()
+    assert not made.is_ready()
+
+
 def test_a_closed_pool_leaves_no_process_and_takes_no_frame() -> None:
     made = DecodePool(standin.decode, workers=1)
     made.open()
