@@ -39,7 +39,7 @@ class Conditions:
 
 
 def draw_daylight(rng: np.random.Generator) -> Conditions:
-    """Fair weather: a new plate, a good dash camera, 1/500 to 1/2000 s."""
+    """Fair weather: a new plate, a good dash camera with a global or a rolling shutter, 1/500 to 1/2000 s."""
     return Conditions(
         look=draw_look(rng),
         wear=PlateWear(contrast_loss=_uniform(rng, 0, 0.1), patchy_loss=_uniform(rng, 0, 0.3)),
@@ -56,7 +56,7 @@ def draw_daylight(rng: np.random.Generator) -> Conditions:
             bayer=bool(rng.random() < 0.7),
             sharpen=_uniform(rng, 0, 0.6),
             colour_shift_px=_uniform(rng, -0.3, 0.3),
-            readout_s=_uniform(rng, 0, 0.012),
+            readout_s=_uniform(rng, 0.002, 0.012) if rng.random() < 0.5 else 0.0,
             jpeg_quality=int(rng.integers(85, 96)),
         ),
         exposure_s=1 / _uniform(rng, 500, 2000),

@@ -289,6 +289,7 @@ class FaceTruth:
     height_px, width_px : float
         Extent of the corners. [px]
     camera_from_face : ndarray, shape (3, 3)
+        When the row that shows its centre is exposed, as are the next two.
     translation_m : ndarray, shape (3,)
         Its centre in the camera frame. [m]
     camera_position_m : ndarray, shape (3,)
@@ -313,9 +314,18 @@ def face_truth(scene: PlateScene, placed: PlacedFace) -> FaceTruth:
     inside = whole & bool(((corners >= -0.5) & (corners <= size - 0.5)).all())
     partly = whole and bool(((corners.max(axis=0) > -0.5) & (corners.min(axis=0) < size - 0.5)).all())
     extent = corners.max(axis=0) - corners.min(axis=0) if whole else np.full(2, np.nan)
-    rotation = scene.camera_from_ground @ placed.ground_from_face
-    centre = np.array([placed.ahead_m, placed.left_m, -scene.camera.height_m])
-    translation = scene.camera_from_ground @ centre
+    rotation, translation = _pose_when_exposed(scene, placed)
     return FaceTruth(
         corners, inside, partly, float(extent[1]), float(extent[0]), rotation, translation, -rotation.T @ translation
     )
+
+
+def _pose_when_exposed(scene: PlateScene, placed: PlacedFace) -> tuple[Matrix, Matrix]:
+    """camera_from_face at the mid-exposure of the row that shows the face's centre."""
+    centre = np.array([[placed.ahead_m, placed.left_m, 0.0]])
+    row = np.nan_to_num(scene.project(centre)[0, 1], nan=0.0)
+    time_s = float(scene.row_time_s(np.clip(row, 0, scene.camera.height_px - 1)))
+    turn = cv2.Rodrigues(-time_s * np.radians(scene.spin_deg_s))[0]
+    camera_from_ground = scene.camera_from_ground @ turn
+    offset = centre[0] - (time_s * scene.speed_m_s, 0.0, scene.camera.height_m)
+    return camera_from_ground @ placed.ground_from_face, camera_from_ground @ offset

@@ -9,11 +9,12 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 
 from benchmarks.plates import tables
 from benchmarks.plates.judge import Record, judge_job
-from benchmarks.plates.sets import LEAST_ROWS, RENDERED_ROWS, Job, read_trials
+from benchmarks.plates.sets import LEAST_ROWS, RENDERED_ROWS, SETS, Job, read_trials
 from benchmarks.plates.speed import measure_speed
 
 ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy")
@@ -31,9 +32,9 @@ SHORT_SHARE = 0.08
 MISSED_ROWS = 16
 
 
-def list_jobs(items: set[str], seeds: list[int], *, short: bool) -> list[Job]:
-    """Everything that the items need to see, the longest first."""
-    sets = {name for item in items for name in NEEDS.get(item, ())}
+def list_jobs(items: set[str], seeds: list[int], *, short: bool, only: Sequence[str] = SETS) -> list[Job]:
+    """Everything that the items need to see, of the sets in ``only``, the longest first."""
+    sets = {name for item in items for name in NEEDS.get(item, ()) if name in only}
     jobs = []
     for seed in seeds:
         for name in sets:
@@ -74,13 +75,14 @@ def main() -> None:
     parser.add_argument("--short", action="store_true", help="a part of the frames of one seed, under a minute")
     parser.add_argument("--seed", type=int, default=1, help="first seed")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS, help="leave the other sets of frames out")
     parser.add_argument("--misses", action="store_true", help="name the frames that were not decoded")
     args = parser.parse_args()
     items = set(ITEMS) if "all" in args.items else set(args.items)
     seeds = [args.seed] if args.short else [args.seed, args.seed + 1, args.seed + 2]
     start = time.monotonic()
     timings = measure_speed(args.seed, 12 if args.short else 100) if "speed" in items else []
-    records = run_jobs(list_jobs(items, seeds, short=args.short), args.processes)
+    records = run_jobs(list_jobs(items, seeds, short=args.short, only=args.sets), args.processes)
     print(f"Seeds {', '.join(map(str, seeds))}; {len(records)} frames judged; {time.monotonic() - start:.0f} s.")
     if args.short:
         print(f"Short mode: {SHORT_SHARE:.0%} of the trials' frames, drawn at random; their counts are scaled up.")

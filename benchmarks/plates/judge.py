@@ -37,6 +37,8 @@ class Record:
         Distance of each corner to the truth, where decoded.
     position_error_m : float
         Distance of the camera's position to the truth, where decoded; else NaN.
+    rolling : bool
+        The camera has a rolling shutter.
     tags : tuple of bool or None
         Whether each peer's tag was read in the same scene.
     """
@@ -54,6 +56,7 @@ class Record:
     wrong_known: tuple[str, ...] = ()
     corner_errors_px: tuple[float, ...] = ()
     position_error_m: float = math.nan
+    rolling: bool = False
     tags: tuple[bool, ...] | None = None
 
 
@@ -86,6 +89,7 @@ def _judge(job: Job, number: int, shot: Shot | Unseen) -> Record:
         wrong_known=wrong_known,
         corner_errors_px=_corner_errors(hit, truth),
         position_error_m=_position_error(hit, truth),
+        rolling=shot.scene is not None and shot.scene.sensor.readout_s > 0,
         tags=_judge_tags(job, shot, truth),
     )
 
