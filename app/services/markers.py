@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timedelta
-from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
@@ -21,6 +20,7 @@ from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, Row
 from app.services.access import Caller
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
+from app.services.marker_documents import marker_document, version_document
 from app.services.ports import Clock
 
 PLANNED = "planned"
@@ -230,7 +230,7 @@ class Markers:
         with self._database.read() as connection:
             store.get_marker(connection, caller.agency_id, marker_id)
             rows = store.list_versions(connection, caller.agency_id, marker_id, after=after, limit=limit + 1)
-        page = [_version_document(row) for row in rows[:limit]]
+        page = [version_document(row) for row in rows[:limit]]
         return page, page[-1]["version"] if len(rows) > limit else None
 
     def _place(self, given: GivenPosition) -> PlacedPosition:
@@ -355,68 +355,6 @@ def plate_code(row: Row | dict[str, Any]) -> PlateCode:
 def plate_geometry(row: Row | dict[str, Any]) -> PlateGeometry:
     """Geometry of a plate's row."""
     return PlateGeometry(row["n"], row["unit_mm"], row["gap_mm"], row["thickness_mm"])
-
-
-def marker_document(row: Row | dict[str, Any]) -> dict[str, Any]:
-    """A marker as clients see it. Built by hand: pages of a thousand go through here."""
-    n, unit_mm, gap_mm = row["n"], row["unit_mm"], row["gap_mm"]
-    return {
-        "id": row["id"],
-        "family": row["family"],
-        "status": row["status"],
-        "version": row["version"],
-        "code": {
-            "scheme": row["scheme"],
-            "digits": row["digits"],
-            "check_digits": row["check_digits"],
-            "registry_number": _registry_number(row["digits"], n) if row["scheme"] == "id" else None,
-            "digits_match_position": row["digits_match_position"],
-        },
-        "geometry": {
-            "n": n,
-            "unit_mm": unit_mm,
-            "gap_mm": gap_mm,
-            "thickness_mm": row["thickness_mm"],
-            "side_mm": n * unit_mm + (n + 1) * gap_mm,
-        },
-        "position": {
-            "lon_deg": row["lon_deg"],
-            "lat_deg": row["lat_deg"],
-            "height_m": row["height_m"],
-            "crs": row["crs"],
-            "realization": row["realization"],
-            "epoch": row["epoch"],
-            "vertical_datum": row["vertical_datum"],
-            "horizontal_rmse_m": row["horizontal_rmse_m"],
-            "vertical_rmse_m": row["vertical_rmse_m"],
-            "survey_method": row["survey_method"],
-            "localization_grade": row["localization_grade"],
-            "transform_note": row["transform_note"],
-            "original": row["original"],
-        },
-        "heading_deg": row["heading_deg"],
-        "heading_rmse_deg": row["heading_rmse_deg"],
-        "road": row["road"],
-        "measure_m": row["measure_m"],
-        "offset_m": row["offset_m"],
-        "created_at": row["created_at"],
-        "updated_at": row["updated_at"],
-    }
-
-
-@lru_cache(maxsize=2**16)
-def _registry_number(digits: str, n: int) -> int:
-    return PlateCode(digits, PlateScheme.ID, n).registry_number
-
-
-def _version_document(row: Row) -> dict[str, Any]:
-    return {
-        "version": row["version"],
-        "at": row["at"],
-        "who": row["who"],
-        "why": row["why"],
-        "marker": marker_document(row["marker"]),
-    }
 
 
 def _check_code_request(given: GivenCode) -> None:
