@@ -53,6 +53,7 @@ class DecodePool:
         self._places = threading.BoundedSemaphore(max_waiting)
         self._lock = threading.Lock()
         self._pool: ProcessPool | None = None
+        self._pending: set[Pending[Any]] = set()
         self._closed = False
 
     def warm(self) -> None:
@@ -77,6 +78,9 @@ class DecodePool:
         with self._lock:
             self._closed = True
             pool, self._pool = self._pool, None
+            pending = list(self._pending)
+        for waiting in pending:  # Pebble forgets the tasks of a pool that is stopped; their callers would wait for ever
+            waiting.cancel()
         if pool is not None:
             _stop(pool)
 
@@ -104,10 +108,21 @@ class DecodePool:
         if not (self._places.acquire(timeout=wait_s) if wait_s else self._places.acquire(blocking=False)):
             raise Unavailable("every decoder process is busy", cure="try again in a few seconds")
         try:
-            return Pending(lambda: self._schedule(function, (task,)), self._places.release, self._limits.timeout_s)
+            pending = Pending(lambda: self._schedule(function, (task,)), self._release, self._limits.timeout_s)
         except BaseException:
             self._places.release()
             raise
+        with self._lock:
+            self._pending.add(pending)
+            closed = self._closed
+        if closed:
+            pending.cancel()
+        return pending
+
+    def _release(self, pending: Pending[Any]) -> None:
+        with self._lock:
+            self._pending.discard(pending)
+        self._places.release()
 
     def _schedule(self, function: Callable[..., T], args: tuple[Any, ...]) -> ProcessFuture[T]:
         for _attempt in range(2):
@@ -157,12 +172,14 @@ class Pending(Generic[T]):
     schedule : callable
         Hands the task over. It is called again once if the process dies: that can be another's fault.
     release : callable
-        Called once when the task is over.
+        Called once, with this, when the task is over.
     timeout_s : float
         For the message only. [s]
     """
 
-    def __init__(self, schedule: Callable[[], ProcessFuture[T]], release: Callable[[], None], timeout_s: float) -> None:
+    def __init__(
+        self, schedule: Callable[[], ProcessFuture[T]], release: Callable[[Pending[T]], None], timeout_s: float
+    ) -> None:
         self._schedule = schedule
         self._releases = [release]
         self._timeout_s = timeout_s
@@ -208,4 +225,4 @@ class Pending(Generic[T]):
 
     def _release_once(self) -> None:
         while self._releases:
-            self._releases.pop()()
+            self._releases.pop()(self)

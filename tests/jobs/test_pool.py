@@ -183,6 +183,18 @@ def test_a_closed_pool_leaves_no_process_and_takes_no_frame() -> None:
         made.start(task_that(standin.OBEY))
 
 
+def test_closing_the_pool_ends_the_waiting_for_its_frames() -> None:
+    made = DecodePool(standin.decode, workers=1, limits=ChildLimits(timeout_s=60))
+    made.open()
+    running, queued = made.start(task_that(standin.SLEEP)), made.start(task_that(standin.OBEY))
+    threading.Timer(0.3, made.close).start()
+    began = time.monotonic()
+    for pending in (running, queued):
+        with pytest.raises(Unavailable):
+            pending.result()
+    assert time.monotonic() - began < 10
+
+
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 def test_annotation(pool: DecodePool, suffix: str) -> None:
     import cv2
