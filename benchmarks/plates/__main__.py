@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 
 from benchmarks.plates import tables
@@ -107,7 +107,9 @@ _TRIALS_NOTE = (
 _PEERS_NOTE = "The same scenes with a tag of the plate's footprint, default parameters, one thread."
 
 
-def _print(item, items, make, records, note):  # type: ignore[no-untyped-def]
+def _print(
+    item: str, items: set[str], make: Callable[[Sequence[Record]], str], records: list[Record], note: str
+) -> None:
     if item in items:
         print(f"\n### {item}\n\n{note}\n\n{make(records)}")
 

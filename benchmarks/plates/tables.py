@@ -33,7 +33,7 @@ def trials_table(records: Sequence[Record]) -> str:
             continue
         decoded = [_scaled(r for r in mine if r.seed == s and r.decoded) for s in seeds]
         known = [_scaled(r for r in mine if r.seed == s and r.decoded_known) for s in seeds]
-        met = "yes" if min(decoded) >= trial.goal else "**no**"
+        met = _met(min(decoded) >= trial.goal) if mine[0].share == 1 else "-"  # a sample says too little
         rows.append(
             (
                 f"{trial.figure}/{trial.trial}: {trial.speed_kmh:g} km/h, {trial.fps:g} fps, {trial.depression_deg:g}°"
@@ -100,7 +100,7 @@ def _rate_row(name: str, records: Sequence[Record], goal: int | None) -> tuple[o
     decoded = sum(r.decoded for r in records)
     rate = 100 * decoded / len(records)
     known = 100 * sum(r.decoded_known for r in records) / len(records)
-    met = "-" if goal is None else ("yes" if rate >= goal else "**no**")
+    met = "-" if goal is None else _met(rate >= goal)
     return (name, len(records), decoded, f"{rate:.1f}", f"{known:.1f}", goal or "-", met)
 
 
@@ -114,7 +114,7 @@ def wrong_table(records: Sequence[Record]) -> str:
         mine = [r for r in records if r.set_name == key]
         if mine:
             wrong, known = sum(len(r.wrong) for r in mine), sum(len(r.wrong_known) for r in mine)
-            rows.append((name, len(mine), wrong, known, 0, "yes" if wrong + known == 0 else "**no**"))
+            rows.append((name, len(mine), wrong, known, 0, _met(wrong + known == 0)))
     return table(("set", "frames", "wrong", "wrong with codebook", "goal", "met"), rows)
 
 
