@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -82,8 +82,3 @@ def drive_over_plate(drive: Drive, rng: np.random.Generator, *, partly: bool = F
         if truth.in_view or (partly and truth.partly_in_view):
             yield scene
         ahead_m -= step_m
-
-
-def with_sensor(scene: PlateScene, sensor: Sensor) -> PlateScene:
-    """The same scene through another lens and sensor."""
-    return replace(scene, sensor=sensor)
