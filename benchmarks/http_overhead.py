@@ -1,8 +1,8 @@
 """What an upload over HTTP costs beyond the decoder: the same frames bare and through a real server.
 
 Bare is JPEG bytes to readings in one warm thread. Over HTTP the same bytes go through a kept-alive connection to
-uvicorn, the key check, the form, a decoder process, the registry and one durable transaction. The two alternate frame
-by frame, so that a busy machine slows both; the difference of the medians is the overhead.
+`waymark serve`: key check, form, decoder process, registry, one durable transaction. The two alternate frame by frame,
+so that a busy machine slows both; the difference of the medians is the overhead.
 
 Run: python -m benchmarks.http_overhead [--frames N] [--registered N] [--limit-ms 5]
 """
@@ -10,37 +10,39 @@ Run: python -m benchmarks.http_overhead [--frames N] [--registered N] [--limit-m
 from __future__ import annotations
 
 import argparse
-import asyncio
+import http.client
 import json
-import logging
+import os
+import socket
 import statistics
+import subprocess
+import sys
 import tempfile
-import threading
 import time
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import cv2
-import httpx
 import numpy as np
-import structlog
-import uvicorn
 
 from app.decoders.images import load_image
 from app.decoders.plate import decode_plates
-from app.main import create_app
 from app.markers.plate import PlateCode
-from app.settings import Settings
+from app.sensors.camera import Camera
 
 KEY = "benchmark-key-that-is-long-enough"
 LON_DEG, LAT_DEG = 8.412345, 49.012345
+CAMERA = Camera.from_field_of_view(1920, 1080, 70.0)
+STEP_DEG = 0.000271
+WARM_UP = 8
 
 
 def frame_1080p(seed: int, code: PlateCode) -> bytes:
     """JPEG of asphalt with one plate flat to the camera: the decoder's share does not matter here."""
     rng = np.random.default_rng(seed)
     frame = rng.normal(100, 6, (1080, 1920, 3)).clip(0, 255).astype(np.uint8)
-    frame = cv2.GaussianBlur(frame, (0, 0), 1.2)
+    frame = np.asarray(cv2.GaussianBlur(frame, (0, 0), 1.2), np.uint8)
     pitch, gap = 16, 2
     side = code.n * pitch + gap
     plate = np.full((side, side, 3), 230, np.uint8)
@@ -57,43 +59,71 @@ def frame_1080p(seed: int, code: PlateCode) -> bytes:
 
 
 class Server:
-    """uvicorn in a thread, as `waymark serve` runs it."""
+    """`waymark serve` in a process of its own, on a free port."""
 
     def __init__(self, folder: Path) -> None:
-        structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
-        settings = Settings(data_dir=folder, admin_key=KEY, log_level="ERROR")
-        config = uvicorn.Config(
-            create_app(settings), host="127.0.0.1", port=0, log_level="error", access_log=False, loop="uvloop"
-        )
-        self.server = uvicorn.Server(config)
-        self.thread = threading.Thread(target=lambda: asyncio.run(self.server.serve()), daemon=True)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self._environment = os.environ | {
+            "WAYMARK_DATA_DIR": str(folder),
+            "WAYMARK_ADMIN_KEY": KEY,
+            "WAYMARK_LOG_FORMAT": "json",
+        }
 
-    def __enter__(self) -> str:
-        self.thread.start()
-        while not self.server.started:
-            time.sleep(0.01)
-        return f"http://127.0.0.1:{self.server.servers[0].sockets[0].getsockname()[1]}"
+    def __enter__(self) -> http.client.HTTPConnection:
+        command = [sys.executable, "-c", "from app.cli import main; main()", "serve", "--port", str(self.port)]
+        self._log = tempfile.TemporaryFile()
+        self._process = subprocess.Popen(command, env=self._environment, stdout=self._log, stderr=self._log)
+        self._connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=300)
+        deadline = time.monotonic() + 120
+        while True:
+            try:
+                self._connection.connect()
+                return self._connection
+            except ConnectionRefusedError:
+                if time.monotonic() > deadline or self._process.poll() is not None:
+                    raise
+                time.sleep(0.05)
 
     def __exit__(self, *_: object) -> None:
-        self.server.should_exit = True
-        self.thread.join()
+        self._connection.close()
+        self._process.terminate()
+        self._process.wait(60)
+        self._log.close()
 
 
-def register(client: httpx.Client, count: int) -> None:
+def request(connection: http.client.HTTPConnection, path: str, body: bytes, headers: dict[str, str]) -> dict[str, Any]:
+    """Post and read the answer, on the connection that stays open."""
+    connection.request("POST", path, body, headers | {"Authorization": f"Bearer {KEY}"})
+    answer = connection.getresponse()
+    content = answer.read()
+    if answer.status != 201:
+        raise SystemExit(f"{path} answered {answer.status}: {content[:500]!r}")
+    document: dict[str, Any] = json.loads(content)
+    return document
+
+
+def register(connection: http.client.HTTPConnection, count: int) -> None:
     """Plates along a road, 20 m apart; the first is the one in the frames."""
     for k in range(count):
-        position = {"lon_deg": LON_DEG + k * 0.000271, "lat_deg": LAT_DEG, "horizontal_rmse_m": 0.01}
-        answer = client.post("/v1/markers", json={"position": position, "heading_deg": 90.0, "status": "surveyed"})
-        answer.raise_for_status()
+        position = {"lon_deg": LON_DEG + k * STEP_DEG, "lat_deg": LAT_DEG, "horizontal_rmse_m": 0.01}
+        body = json.dumps({"position": position, "heading_deg": 90.0, "status": "surveyed"}).encode()
+        request(connection, "/v1/markers", body, {"Content-Type": "application/json"})
 
 
-def post(client: httpx.Client, data: bytes, context: dict[str, Any], bare_body: bool) -> httpx.Response:
-    """One upload."""
-    text = json.dumps(context)
-    if bare_body:
-        headers = {"Content-Type": "image/jpeg", "Waymark-Context": text}
-        return client.post("/v1/decodes", content=data, headers=headers)
-    return client.post("/v1/decodes", files={"file": ("f.jpg", data), "context": (None, text)})
+def uploads(data: bytes, context: dict[str, Any]) -> dict[str, tuple[bytes, dict[str, str]]]:
+    """Body and headers of both ways to upload a frame, made before the clock runs."""
+    text, edge = json.dumps(context), "frame-boundary"
+    form = (
+        f'--{edge}\r\nContent-Disposition: form-data; name="context"\r\n\r\n{text}\r\n--{edge}\r\n'
+        'Content-Disposition: form-data; name="file"; filename="f.jpg"\r\nContent-Type: image/jpeg\r\n\r\n'
+    ).encode() + data
+    form += f"\r\n--{edge}--\r\n".encode()
+    return {
+        "form": (form, {"Content-Type": f"multipart/form-data; boundary={edge}"}),
+        "bare body": (data, {"Content-Type": "image/jpeg", "Waymark-Context": text}),
+    }
 
 
 def main() -> int:
@@ -104,31 +134,29 @@ def main() -> int:
     parser.add_argument("--limit-ms", type=float, default=5.0)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    code = PlateCode.from_position(LON_DEG, LAT_DEG)
-    frames = [frame_1080p(seed, code) for seed in range(4)]
+    codebook = [PlateCode.from_position(LON_DEG + k * STEP_DEG, LAT_DEG) for k in range(arguments.registered)]
+    frames = [frame_1080p(seed, codebook[0]) for seed in range(4)]
     camera = {"horizontal_fov_deg": 70.0, "width_px": 1920, "height_px": 1080}
     context = {"coarse_position": {"lon_deg": LON_DEG, "lat_deg": LAT_DEG, "accuracy_m": 15.0}, "camera": camera}
-    times: dict[str, list[float]] = {"bare": [], "server: load + decode": [], "form": [], "bare body": []}
-    with tempfile.TemporaryDirectory() as folder, Server(Path(folder)) as url:
-        headers = {"Authorization": f"Bearer {KEY}"}
-        with httpx.Client(base_url=url, headers=headers, timeout=120, trust_env=False) as client:
-            register(client, arguments.registered)
-            for k in range(arguments.frames + 6):
-                data = frames[k % len(frames)]
-                took = {}
+    times: dict[str, list[float]] = defaultdict(list)
+    with tempfile.TemporaryDirectory() as folder, Server(Path(folder)) as connection:
+        register(connection, arguments.registered)
+        for k in range(arguments.frames + WARM_UP):
+            data = frames[k % len(frames)]
+            took = {}
+            began = time.perf_counter()
+            decode_plates(load_image(data).pixels, codebook=codebook, camera=CAMERA)
+            took["bare"] = time.perf_counter() - began
+            for name, (body, headers) in uploads(data, context).items():
                 began = time.perf_counter()
-                decode_plates(load_image(data).pixels, codebook=(code,))
-                took["bare"] = time.perf_counter() - began
-                for name, bare_body in (("form", False), ("bare body", True)):
-                    began = time.perf_counter()
-                    answer = post(client, data, context, bare_body)
-                    took[name] = time.perf_counter() - began
-                    answer.raise_for_status()
-                told = answer.json()["frames"][0]
+                answer = request(connection, "/v1/decodes", body, headers)
+                took[name] = time.perf_counter() - began
+                told = answer["frames"][0]
                 took["server: load + decode"] = (told["load_ms"] + told["decode_ms"]) / 1e3
-                if k >= 6:
-                    for name, seconds in took.items():
-                        times[name].append(1e3 * seconds)
+                took[f"{name}, without them"] = took[name] - took["server: load + decode"]
+            if k >= WARM_UP:
+                for name, seconds in took.items():
+                    times[name].append(1e3 * seconds)
     middle = {name: statistics.median(values) for name, values in times.items()}
     print(f"{arguments.frames} frames of {len(frames[0]) // 1024} KiB, {arguments.registered} plates registered")
     for name, value in middle.items():
