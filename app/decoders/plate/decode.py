@@ -1,0 +1,377 @@
+"""Unit values -> symbols -> code: the most likely digits, and how sure they are.
+
+The logarithm of a unit's light is a smooth illumination, minus one contrast where the unit is dark, plus noise whose
+covariance the fit gives: neighbours that share pixels share their error. Illumination is a Gaussian process, so the cost
+of any pattern of units is a quadratic form, and margins come from exact differences of it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.plate.fit import PlateFit
+from app.markers.plate import PlateCode, PlateScheme, correct_symbols, is_codeword, unit_index
+
+Array = npt.NDArray[np.float64]
+
+CONTRAST = 2.0  # of the logarithm after haze is taken off; its spread:
+CONTRAST_SPREAD = 0.4
+LIGHT_SPREAD = 0.45  # of the illumination's logarithm, over a few units
+LIGHT_LENGTH = 4.0  # units
+WEAR = 0.16  # what units differ by themselves
+EVEN_SPREAD, EVEN_WEAR = 0.1, 0.1  # the same two of the light that has been evened out, as shares of it
+FLOOR = 0.05  # of the light level
+SCATTER_PRIOR = (8.0, 0.6)  # weight in units, expected scatter against the model
+TEMPER = 0.35  # share of a cost difference that is believed: the model is not the road
+FULL_TRUST_PX = 1.6  # size of a unit in the image from which it is not believed less
+LEAST_CODEWORD = 0.05  # probability of the symbols, as read, from which a check that holds is no chance
+LETTERS_OUT_OF_REACH = 12.0  # cost of reading letters as digits up to which a plate may be a decimal one
+_DARK_SHARE = 0.12
+
+
+@dataclass(frozen=True, slots=True)
+class UnitEvidence:
+    """What a fit says about the symbols.
+
+    Attributes
+    ----------
+    cell_costs : ndarray, shape (cells, 16)
+        Cost of each symbol above the best pattern of all units, the other cells as in that pattern.
+    best : ndarray of int, shape (cells,)
+        Most likely symbols, any of sixteen.
+    dark : ndarray of bool, shape (units,)
+        The best pattern, in the order of the symbols' units.
+    weight, residual : ndarray
+        Quadratic form of the costs and its vector at the best pattern, for other patterns.
+    contrast : float
+        Between light and dark units, the light level being about 1.
+    disputed : ndarray of bool, shape (cells,)
+        Where the two classifiers differ.
+    scatter : float
+        Mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model.
+    span : float
+        Light of the light units above the dark ones. [linear, 1 = saturation]
+    """
+
+    cell_costs: Array
+    best: npt.NDArray[np.intp]
+    dark: npt.NDArray[np.bool_]
+    disputed: npt.NDArray[np.bool_]
+    weight: Array
+    residual: Array
+    contrast: float
+    scatter: float
+    span: float
+
+
+    @property
+    def cell_margin(self) -> Array:
+        """Cost of the second best symbol of each cell, shape (cells,)."""
+        margin: Array = np.partition(self.cell_costs, 1, axis=1)[:, 1]
+        return margin
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedSymbols:
+    """A code with its probabilities, or the reason why there is none.
+
+    `confirmed` means that a plate with this code is in the codebook.
+    """
+
+    code: PlateCode | None
+    confidence: float
+    cell_confidence: tuple[float, ...]
+    corrected: tuple[int, ...] = ()
+    from_codebook: bool = False
+    confirmed: bool = False
+    reason: str = ""
+
+
+@lru_cache
+def _smooth(n: int, spread: float) -> Array:
+    """Covariance of a smooth field between units, in symbol order; its mean is left open."""
+    flat = unit_index(n).reshape(-1)
+    position = np.stack([flat // n, flat % n], axis=1).astype(float)
+    distance = np.linalg.norm(position[:, None] - position[None], axis=2)
+    covariance: Array = spread**2 * np.exp(-distance / (LIGHT_LENGTH * n / 8)) + 4.0
+    return covariance
+
+
+@lru_cache
+def _slot_order(n: int) -> npt.NDArray[np.intp]:
+    """Where each symbol's units stand among the fitted units."""
+    corner = np.zeros((n, n), dtype=bool)
+    corner[np.ix_([0, 1, n - 2, n - 1], [0, 1, n - 2, n - 1])] = True
+    slot = np.cumsum(~corner.reshape(-1)) - 1
+    return slot[unit_index(n).reshape(-1)]
+
+
+_PATTERNS = np.array(list(itertools.product((0, 1), repeat=4)), dtype=float)  # row k holds the bits of k
+
+
+def weigh_units(fit: PlateFit) -> UnitEvidence | None:
+    """Costs of all symbols; None when the units do not differ by more than their noise.
+
+    Two classifiers in turn: the first on logarithms, where any illumination is a sum, gives the light that falls on
+    each unit; the second on the light so evened out, where the noise is even.
+    """
+    n = fit.units.shape[0]
+    order = _slot_order(n)
+    values = fit.units.reshape(-1)[unit_index(n).reshape(-1)]
+    covariance = fit.units_covariance[np.ix_(order, order)]
+    ranked = np.sort(values)
+    tail = max(len(values) // 8, 1)
+    dark_level, light_level = float(ranked[:tail].mean()), float(ranked[-tail:].mean())
+    noise = math.sqrt(float(np.median(np.diag(covariance))))
+    if light_level - dark_level < 4 * noise or light_level < 1e-4:
+        return None
+    haze = max(0.0, (dark_level - _DARK_SHARE * light_level) / (1 - _DARK_SHARE))
+    light, first = _even_light(values - haze, covariance, light_level - haze, n)
+    even = (values - haze) / light
+    total = _smooth(n, EVEN_SPREAD) + covariance / np.outer(light, light)
+    total[np.diag_indices_from(total)] += EVEN_WEAR**2
+    weight = np.linalg.inv(total)
+    dark = first.copy()
+    step = _levels_apart(even, dark)
+    residual, contrast = _settle(weight, even - even.mean(), dark, step, 0.3 * step)
+    # how well this plate follows the model scales what a difference means
+    scatter = float(residual @ weight @ residual)
+    weight /= (scatter + SCATTER_PRIOR[0] * SCATTER_PRIOR[1]) / (len(residual) + SCATTER_PRIOR[0])
+    weight *= min(1.0, (fit.unit_px / FULL_TRUST_PX) ** 4)
+    costs = _cell_costs(weight, residual, dark, contrast, _PATTERNS)
+    best = np.argmin(costs, axis=1)
+    disputed = (first != dark).reshape(-1, 4).any(axis=1)
+    return UnitEvidence(
+        costs - costs.min(axis=1, keepdims=True), best, dark > 0.5, disputed, weight, residual, contrast,
+        scatter / len(residual), light_level - dark_level,
+    )  # fmt: skip
+
+
+def _even_light(values: Array, covariance: Array, light_level: float, n: int) -> tuple[Array, Array]:
+    """Light on each unit relative to the brightest level, and which units are dark, from the values' logarithms."""
+    floor = FLOOR * light_level
+    lifted = np.maximum(values, -0.6 * floor) + floor
+    logs = np.log(lifted)
+    slope = 1 / np.maximum(lifted, 2 * floor)
+    smooth = _smooth(n, LIGHT_SPREAD)
+    total = smooth + covariance * np.outer(slope, slope)
+    total[np.diag_indices_from(total)] += WEAR**2
+    weight = np.linalg.inv(total)
+    dark = (lifted < 0.6 * 0.5 * (light_level + 2 * floor)).astype(float)
+    residual, _ = _settle(weight, logs - logs.mean(), dark, CONTRAST, CONTRAST_SPREAD)
+    illumination: Array = np.exp(smooth @ (weight @ residual) + logs.mean())
+    return illumination, dark
+
+
+def _levels_apart(values: Array, dark: Array) -> float:
+    """Distance between the levels of light and dark units; 0.8 of the light level when one of them is missing."""
+    if 0 < dark.sum() < len(dark):
+        return max(float(values[dark < 0.5].mean() - values[dark > 0.5].mean()), 0.1)
+    return 0.8
+
+
+@nb.njit(cache=True, nogil=True)
+def _best_flip(weight, slope, dark, contrast):  # type: ignore[no-untyped-def]
+    """The unit whose flip lowers the cost most, or, when none does, the pair; -1 for none."""
+    m = dark.shape[0]
+    single = np.empty(m)
+    best = -1e-9
+    bi = -1
+    bj = -1
+    for i in range(m):
+        d = contrast * (1.0 - 2.0 * dark[i])
+        single[i] = 2.0 * d * slope[i] + d * d * weight[i, i]
+        if single[i] < best:
+            best = single[i]
+            bi = i
+    if bi >= 0:
+        return bi, bj
+    for i in range(m):
+        if single[i] > 60.0:
+            continue
+        di = contrast * (1.0 - 2.0 * dark[i])
+        for j in range(i):
+            dj = contrast * (1.0 - 2.0 * dark[j])
+            cost = single[i] + single[j] + 2.0 * di * dj * weight[i, j]
+            if cost < best:
+                best = cost
+                bi = i
+                bj = j
+    return bi, bj
+
+
+@nb.njit(cache=True, nogil=True)
+def _settle(weight, logs, dark, prior, spread):  # type: ignore[no-untyped-def]
+    """Flip units, alone and in pairs, while that lowers the cost; the contrast follows. `dark` changes in place."""
+    m = logs.shape[0]
+    contrast = prior
+    residual = logs + contrast * dark
+    for _ in range(12):
+        wd = weight @ dark
+        wl = weight @ logs
+        down = 1.0 / (spread * spread)
+        contrast = (prior * down - dark @ wl) / (down + dark @ wd)
+        contrast = max(contrast, 0.25 * prior)
+        residual = logs + contrast * dark
+        slope = weight @ residual
+        changed = False
+        for _flip in range(2 * m):
+            bi, bj = _best_flip(weight, slope, dark, contrast)
+            if bi < 0:
+                break
+            changed = True
+            for k in (bi, bj):
+                if k < 0:
+                    continue
+                d = contrast * (1.0 - 2.0 * dark[k])
+                dark[k] = 1.0 - dark[k]
+                residual[k] += d
+                slope += d * weight[:, k]
+        if not changed:
+            break
+    return residual, contrast
+
+
+@nb.njit(cache=True, nogil=True)
+def _cell_costs(weight, residual, dark, contrast, patterns):  # type: ignore[no-untyped-def]
+    cells = dark.shape[0] // 4
+    costs = np.empty((cells, 16))
+    slope = weight @ residual
+    delta = np.empty(4)
+    for c in range(cells):
+        for p in range(16):
+            total = 0.0
+            for i in range(4):
+                delta[i] = contrast * (patterns[p, i] - dark[4 * c + i])
+                total += 2.0 * delta[i] * slope[4 * c + i]
+            for i in range(4):
+                for j in range(4):
+                    total += delta[i] * delta[j] * weight[4 * c + i, 4 * c + j]
+            costs[c, p] = total
+    return costs
+
+
+def pattern_cost(evidence: UnitEvidence, code: PlateCode) -> float:
+    """Cost of a code above the best pattern of all units."""
+    dark = code.units.reshape(-1)[unit_index(code.n).reshape(-1)].astype(float)
+    delta = evidence.contrast * (dark - evidence.dark)
+    return float(delta @ evidence.weight @ (2 * evidence.residual + delta))
+
+
+def decode_symbols(evidence: UnitEvidence, n: int, codebook: Sequence[PlateCode], sure: float) -> DecodedSymbols:
+    """Most likely code: read as it is, corrected, or taken from the codebook, in this order.
+
+    Parameters
+    ----------
+    evidence : UnitEvidence
+    n : int
+        Units along a side.
+    codebook : sequence of PlateCode
+        Codes of the plates that are registered near by.
+    sure : float
+        Least probability at which digits are given out.
+    """
+    read = _decode_alone(evidence, n, sure)
+    known = [code for code in codebook if code.n == n]
+    if read.code is not None:
+        same = next((code for code in known if code.digits == read.code.digits), None)
+        return replace(read, code=same or read.code, confirmed=same is not None)
+    chosen = _decode_with_codebook(evidence, known, sure) if known else None
+    return chosen or read
+
+
+def _softmax_confidence(costs: Array, chosen: Sequence[int]) -> Array:
+    likelihood = np.exp(-0.5 * TEMPER * (costs - costs.min(axis=1, keepdims=True)))
+    share: Array = likelihood[np.arange(len(costs)), np.asarray(chosen)] / likelihood.sum(axis=1)
+    return share
+
+
+def _decode_alone(evidence: UnitEvidence, n: int, sure: float) -> DecodedSymbols:
+    costs = evidence.cell_costs
+    any_symbol = tuple(int(s) for s in evidence.best)
+    cells = _softmax_confidence(costs, any_symbol)
+    if is_codeword(any_symbol, PlateScheme.ID, n) and float(np.prod(cells)) >= LEAST_CODEWORD:
+        code = PlateCode.from_symbols(any_symbol, PlateScheme.ID, n)
+        return DecodedSymbols(code, _checked(float(np.prod(cells)), sure), _floats(cells))
+    decimal = np.argmin(costs[:, :10], axis=1)
+    if float(costs[np.arange(len(costs)), decimal].sum()) < LETTERS_OUT_OF_REACH:
+        cells = _softmax_confidence(costs[:, :10], decimal)
+        confidence = float(np.prod(cells))
+        if is_codeword(tuple(decimal), PlateScheme.POSITION, n) and confidence >= sure:
+            code = PlateCode.from_symbols(tuple(int(s) for s in decimal), PlateScheme.POSITION, n)
+            return DecodedSymbols(code, confidence, _floats(cells))
+        doubtful = ", ".join(str(i) for i in np.flatnonzero(cells < 1 - (1 - sure) / len(cells)))
+        return DecodedSymbols(None, confidence, _floats(cells), reason=f"cells in doubt: {doubtful}")
+    corrected = _correct(evidence, n, any_symbol, cells)
+    if corrected is not None:
+        return corrected
+    return DecodedSymbols(None, float(np.prod(cells)), _floats(cells), reason="no scheme has these symbols")
+
+
+def _floats(values: Array) -> tuple[float, ...]:
+    return tuple(float(v) for v in values)
+
+
+def _checked(confidence: float, sure: float) -> float:
+    """Confidence in symbols that satisfy a check of 16 bits: chance alone does that once in 65,536 times."""
+    return max(confidence, min(1 - (1 - confidence) / 65536 * 10, 1.0), sure)
+
+
+def _correct(evidence: UnitEvidence, n: int, symbols: tuple[int, ...], cells: Array) -> DecodedSymbols | None:
+    """Reed-Solomon on the symbols as read, then with the doubtful cells erased.
+
+    Any word is within two symbols of a codeword with probability 0.23, so a correction counts only when letters remain
+    among the cells that it leaves alone: a position plate has none.
+    """
+    doubtful = [int(i) for i in np.argsort(cells, kind="stable") if cells[i] < 0.9999]
+    for erasures in ([], *(doubtful[:k] for k in range(1, min(len(doubtful), 4) + 1))):
+        fixed = correct_symbols(symbols, n, erasures)
+        if fixed is None:
+            continue
+        changed = tuple(i for i, (a, b) in enumerate(zip(symbols, fixed, strict=True)) if a != b)
+        wrong = [i for i in changed if i not in erasures]
+        spent = 2 * len(wrong) + len(erasures)
+        kept = [i for i in range(len(symbols)) if i not in changed and i not in erasures]
+        letters = sum(symbols[i] > 9 and cells[i] > 0.999 for i in kept)
+        unsure = sum(cells[i] < 0.99 for i in kept)
+        if letters < (1 if spent < 4 else 2) or unsure > 0:
+            continue
+        confidence = float(np.prod(cells[kept])) * (0.9999 if spent < 4 else 0.999)
+        shown = cells.copy()
+        shown[list(changed)] = confidence
+        return DecodedSymbols(
+            PlateCode.from_symbols(fixed, PlateScheme.ID, n), confidence, tuple(float(c) for c in shown), changed
+        )
+    return None
+
+
+def _decode_with_codebook(evidence: UnitEvidence, known: list[PlateCode], sure: float) -> DecodedSymbols | None:
+    """The registered plate that explains the units, if it beats the others and what chance would give."""
+    costs = np.array([pattern_cost(evidence, code) for code in known])
+    first = int(np.argmin(costs))
+    others = np.delete(costs, first)
+    log_chance = float(
+        np.log(np.exp(-0.5 * TEMPER * evidence.cell_costs).mean(axis=1)).sum()
+    )  # mean likelihood of a random code against the best pattern
+    log_first = -0.5 * TEMPER * costs[first]
+    share = 1 / (1 + float(np.exp(np.clip(-0.5 * TEMPER * (others - costs[first]), -700, 700)).sum()))
+    chance = 1 / (1 + math.exp(min(log_chance + CHANCE_CODES - log_first, 700)))
+    confidence = share * chance
+    if confidence < sure:
+        return None
+    code = known[first]
+    symbols = np.array(code.symbols)
+    cells = _softmax_confidence(evidence.cell_costs, code.symbols)
+    corrected = tuple(int(i) for i in np.flatnonzero(symbols != evidence.best))
+    return DecodedSymbols(code, confidence, tuple(float(c) for c in cells), corrected, from_codebook=True, confirmed=True)
+
+
+CHANCE_CODES = math.log(1e6)  # how many look-alikes a codebook's match must beat

@@ -1,0 +1,198 @@
+"""Corners and camera -> pose of the plate -> position and heading of the vehicle.
+
+IPPE gives the pose of a square in closed form (Collins and Bartoli, IJCV 109, 2014); a few Gauss-Newton steps weigh the
+corners by their covariance and the mount's height and level by what springs leave of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.geodesy import enu_from_heading, wgs84_from_enu
+from app.markers.plate import PlateGeometry
+from app.markers.reading import PlatePose
+from app.sensors.camera import Camera
+
+Array = npt.NDArray[np.float64]
+
+LEVEL_SPREAD_RAD = math.radians(0.6)  # of a vehicle's roll and pitch against the road
+HEIGHT_SPREAD_M = 0.03  # of a camera's height: springs, load
+CORNER_FLOOR_PX = 0.05  # of a corner: what the fit's covariance leaves out
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleFix:
+    """Position and heading of a vehicle's reference point.
+
+    Attributes
+    ----------
+    lon_deg, lat_deg : float
+        [deg]
+    height_m : float
+        Of the road below the reference point, in the datum of the plate's height. [m]
+    heading_deg : float
+        Clockwise from true north. [deg]
+    covariance : ndarray, shape (4, 4)
+        Of east, north, up [m] and heading [rad].
+    """
+
+    lon_deg: float
+    lat_deg: float
+    height_m: float
+    heading_deg: float
+    covariance: Array
+
+
+def locate_plate(
+    corners_px: Array, covariance_px2: Array, geometry: PlateGeometry, camera: Camera
+) -> PlatePose | None:
+    """Pose of a plate from its outer corners.
+
+    Parameters
+    ----------
+    corners_px : ndarray, shape (4, 2)
+        Clockwise from the triangle's. [px]
+    covariance_px2 : ndarray, shape (8, 8)
+        Of the flattened corners. [px2]
+    geometry : PlateGeometry
+    camera : Camera
+
+    Returns
+    -------
+    PlatePose or None
+        None when no pose in front of the camera projects to the corners.
+    """
+    object_m = np.column_stack([geometry.corners_mm / 1000, np.zeros(4)])
+    distortion = np.array(camera.distortion or (0.0,) * 4)
+    found, rotations, translations, _ = cv2.solvePnPGeneric(
+        object_m, corners_px.reshape(4, 1, 2), camera.matrix, distortion, flags=cv2.SOLVEPNP_IPPE
+    )
+    if not found:
+        return None
+    weight = np.linalg.inv(covariance_px2 + CORNER_FLOOR_PX**2 * np.eye(8))
+    best: tuple[float, Array, Array] | None = None
+    for rotation, translation in zip(rotations, translations, strict=True):
+        pose = np.concatenate([rotation.ravel(), translation.ravel()])
+        refined = _refine(pose, corners_px, weight, object_m, camera, distortion)
+        if refined is not None and (best is None or refined[0] < best[0]):
+            best = refined
+    if best is None:
+        return None
+    _, pose, information = best
+    projected = cv2.projectPoints(object_m, pose[:3], pose[3:], camera.matrix, distortion)[0].reshape(4, 2)
+    return PlatePose(
+        rotation=cv2.Rodrigues(pose[:3])[0],
+        translation_m=pose[3:].copy(),
+        covariance=np.linalg.inv(information),
+        reprojection_rms_px=float(np.sqrt(np.mean(np.sum((projected - corners_px) ** 2, axis=1)))),
+    )
+
+
+def _refine(
+    pose: Array, corners_px: Array, weight: Array, object_m: Array, camera: Camera, distortion: Array
+) -> tuple[float, Array, Array] | None:
+    """Gauss-Newton on corners and mount: cost, pose (rotation vector left of the first, translation), information."""
+    cost, information = math.inf, np.eye(6)
+    for _ in range(6):
+        rotation = cv2.Rodrigues(pose[:3])[0]
+        if pose[5] <= 0.05:
+            return None
+        in_camera = object_m @ rotation.T
+        projected, jacobian = cv2.projectPoints(in_camera, np.zeros(3), pose[3:], camera.matrix, distortion)
+        by_pose = jacobian[:, :6]
+        residual = corners_px.reshape(8) - projected.reshape(8)
+        mount, by_mount, mount_weight = _mount_residual(rotation, pose[3:], camera)
+        information = by_pose.T @ weight @ by_pose + by_mount.T @ mount_weight @ by_mount
+        step = np.linalg.solve(information, by_pose.T @ weight @ residual - by_mount.T @ mount_weight @ mount)
+        cost = float(residual @ weight @ residual + mount @ mount_weight @ mount)
+        pose = np.concatenate([cv2.Rodrigues(cv2.Rodrigues(step[:3])[0] @ rotation)[0].ravel(), pose[3:] + step[3:]])
+        if np.abs(step).max() < 1e-7:
+            break
+    return (cost, pose, information) if math.isfinite(cost) else None
+
+
+def _mount_residual(rotation: Array, translation: Array, camera: Camera) -> tuple[Array, Array, Array]:
+    """How far the plate is from lying on the road as the mount sees it: two tilts [rad] and a height [m].
+
+    The derivative is by a small rotation about the camera's axes and the translation.
+    """
+    vehicle_from_camera = camera.camera_from_vehicle.T
+    normal = vehicle_from_camera @ rotation[:, 2]
+    height = -float(rotation[:, 2] @ translation)
+    residual = np.array([normal[0], normal[1], height - camera.height_m])
+    derivative = np.zeros((3, 6))
+    turn = -_cross(rotation[:, 2])  # of the plate's normal in the camera frame
+    derivative[:2, :3] = (vehicle_from_camera @ turn)[:2]
+    derivative[2, :3] = -translation @ turn
+    derivative[2, 3:] = -rotation[:, 2]
+    weight = np.diag([1 / LEVEL_SPREAD_RAD**2, 1 / LEVEL_SPREAD_RAD**2, 1 / HEIGHT_SPREAD_M**2])
+    return residual, derivative, weight
+
+
+def _cross(v: Array) -> Array:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def camera_position_m(pose: PlatePose) -> Array:
+    """Optical centre in the plate frame (x right, y travel, z up), shape (3,). [m]"""
+    position: Array = -pose.rotation.T @ pose.translation_m
+    return position
+
+
+def fix_vehicle(
+    pose: PlatePose,
+    camera: Camera,
+    *,
+    lon_deg: float,
+    lat_deg: float,
+    height_m: float,
+    heading_deg: float,
+    horizontal_rmse_m: float,
+    vertical_rmse_m: float,
+    heading_rmse_deg: float,
+) -> VehicleFix:
+    """Where the vehicle is, from a plate whose survey is known.
+
+    Parameters
+    ----------
+    pose : PlatePose
+        As seen by the camera.
+    camera : Camera
+    lon_deg, lat_deg, height_m : float
+        Surveyed centre of the plate. [deg, m]
+    heading_deg : float
+        Of the plate's up direction, clockwise from true north. [deg]
+    horizontal_rmse_m, vertical_rmse_m, heading_rmse_deg : float
+        Accuracy of the survey; the horizontal one is radial. [m, m, deg]
+
+    Returns
+    -------
+    VehicleFix
+    """
+    enu_from_plate = enu_from_heading(heading_deg)
+
+    def vehicle(rotation: Array, translation: Array) -> Array:
+        """East, north, up from the plate's centre [m] and heading against the plate's [rad]."""
+        plate_from_vehicle = rotation.T @ camera.camera_from_vehicle
+        position = -rotation.T @ translation - plate_from_vehicle @ camera.position_vehicle_m
+        forward = plate_from_vehicle[:, 0]
+        return np.append(enu_from_plate @ position, math.atan2(forward[0], forward[1]))
+
+    state = vehicle(pose.rotation, pose.translation_m)
+    jacobian = np.empty((4, 6))
+    for k in range(6):
+        step = np.zeros(6)
+        step[k] = 1e-6
+        moved = vehicle(cv2.Rodrigues(step[:3])[0] @ pose.rotation, pose.translation_m + step[3:])
+        jacobian[:, k] = (moved - state) / 1e-6
+    covariance = jacobian @ pose.covariance @ jacobian.T
+    by_heading = np.array([state[1], -state[0], 0.0, 1.0])  # clockwise turn of the plate about its centre
+    covariance += np.diag([horizontal_rmse_m**2 / 2, horizontal_rmse_m**2 / 2, vertical_rmse_m**2, 0.0])
+    covariance += math.radians(heading_rmse_deg) ** 2 * np.outer(by_heading, by_heading)
+    lon, lat, height = wgs84_from_enu(state[:3], (lon_deg, lat_deg, height_m))
+    return VehicleFix(lon, lat, height, (heading_deg + math.degrees(state[3])) % 360.0, covariance)

@@ -1,0 +1,233 @@
+"""Frame -> readings: detect, fit, weigh, decode, judge; vivid colours first, faint ones where those give nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.plate.decode import DecodedSymbols, decode_symbols, weigh_units
+from app.decoders.plate.detect import (
+    MARKER_RATIO,
+    MarkerQuad,
+    MarkerSignal,
+    detect_marker_quads,
+    faint_signal,
+    half_frame,
+    marker_margins,
+    vivid_signal,
+)
+from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids, unit_centres
+from app.decoders.plate.grade import grade_plate
+from app.decoders.plate.pose import locate_plate
+from app.errors import InvalidParameter
+from app.markers.plate import PlateCode, PlateGeometry
+from app.markers.reading import PlateOutcome, PlateReading
+from app.sensors.camera import Camera
+
+DECODER_VERSION = "plate/1"
+DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
+SURE = 0.999  # least probability at which digits are given out
+MOST_FITS = 3  # candidates that are fitted in one pass
+LEAST_EXPLAINED = 0.75  # share of the pixels' variance, below which nothing is a plate
+LEAST_EXPLAINED_ALONE = 0.85  # the same for digits that no registry confirms
+STRONG_RANK = 11.0  # of a candidate that deserves a second geometry when the first explains nothing
+LEAST_MARGIN = 1.0  # colour margin of a marker that is there
+LEAST_SIDE_PX = 24
+Frame = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """What is the same for all candidates of a frame."""
+
+    luma: Frame
+    camera: Camera | None
+    codebook: Sequence[PlateCode]
+    geometries: Sequence[PlateGeometry]
+
+
+def decode_plates(
+    image: Frame,
+    *,
+    camera: Camera | None = None,
+    codebook: Sequence[PlateCode] = (),
+    thermal: bool = False,
+    geometries: Sequence[PlateGeometry] = DEFAULT_GEOMETRIES,
+) -> list[PlateReading]:
+    """Plates in a frame.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (H, W, 3) or (H, W)
+        Blue, green, red; or grey levels of a thermal camera.
+    camera : Camera, optional
+        Gives every reading a pose.
+    codebook : sequence of PlateCode
+        Codes of the plates registered near by; they decide where the frame alone is in doubt.
+    thermal : bool
+        Dark units are warm, that is bright, and there are no colours.
+    geometries : sequence of PlateGeometry
+        Plates that may occur, the likeliest first.
+
+    Returns
+    -------
+    list of PlateReading
+        Read plates first; candidates that look like plates but were refused follow with their outcome. Nothing there
+        is an empty list.
+
+    Raises
+    ------
+    InvalidParameter
+        The image is not of this type, or not of the camera's size.
+    """
+    _check(image, camera, thermal, geometries)
+    if thermal:
+        raise NotImplementedError
+    task = _Task(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), camera, codebook, geometries)
+    small = half_frame(image)
+    readings: list[PlateReading] = []
+    for signal_of in (vivid_signal, faint_signal):
+        signal = signal_of(small)
+        for quad in detect_marker_quads(signal)[:MOST_FITS]:
+            if not any(_covers(reading, quad) for reading in readings):
+                readings += _read(task, signal, quad)
+        if any(reading.code for reading in readings):
+            break
+    return sorted(_without_shadows(readings), key=lambda reading: reading.code is None)
+
+
+def _check(image: Frame, camera: Camera | None, thermal: bool, geometries: Sequence[PlateGeometry]) -> None:
+    if image.dtype != np.uint8 or image.ndim != (2 if thermal else 3) or (image.ndim == 3 and image.shape[2] != 3):
+        wanted = "(H, W) grey levels" if thermal else "(H, W, 3) blue, green, red"
+        raise InvalidParameter(f"a frame is uint8 {wanted}, not {image.dtype} {image.shape}", field="image")
+    if min(image.shape[:2]) < LEAST_SIDE_PX:
+        raise InvalidParameter("the frame is too small", field="image", limit=f"at least {LEAST_SIDE_PX} px a side")
+    if camera is not None and (camera.height_px, camera.width_px) != image.shape[:2]:
+        raise InvalidParameter(
+            f"the camera gives {camera.width_px} x {camera.height_px} px, the frame has "
+            f"{image.shape[1]} x {image.shape[0]}",
+            field="camera.width_px",
+            cure="give the camera of this frame, or scale its intrinsics",
+        )
+    if not geometries:
+        raise InvalidParameter("no plate geometry to look for", field="geometries", limit="at least one")
+
+
+def _covers(reading: PlateReading, quad: MarkerQuad) -> bool:
+    return reading.code is not None and _inside(quad.centroids_px.mean(axis=0), reading)
+
+
+def _inside(point_px: Array, reading: PlateReading) -> bool:
+    if reading.corners_px is None:
+        return False
+    low, high = reading.corners_px.min(axis=0), reading.corners_px.max(axis=0)
+    return bool(((point_px > low) & (point_px < high)).all())
+
+
+def _without_shadows(readings: list[PlateReading]) -> Iterator[PlateReading]:
+    """Drop refused candidates that lie on a plate which was read."""
+    read = [reading for reading in readings if reading.code is not None]
+    for reading in readings:
+        centre = None if reading.corners_px is None else reading.corners_px.mean(axis=0)
+        if reading.code is not None or centre is None or not any(_inside(centre, other) for other in read):
+            yield reading
+
+
+def _likely_geometries(quad: MarkerQuad, geometries: Sequence[PlateGeometry]) -> list[PlateGeometry]:
+    """Geometries whose markers may be as large as the candidate's, close ones first; blur widens small markers."""
+    misfit = {g: abs(math.log(quad.size_ratio / (0.95 * MARKER_RATIO[g.n]))) for g in geometries}
+    possible = [g for g in geometries if misfit[g] < 0.75] or [min(geometries, key=lambda g: misfit[g])]
+    return sorted(possible, key=lambda g: misfit[g] > 0.4)
+
+
+def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateReading]:
+    """The candidate's best reading under the geometries that fit it; empty when it is no plate."""
+    best: PlateReading | None = None
+    for geometry in _likely_geometries(quad, task.geometries):
+        fit = fit_plate(task.luma, quad.centroids_px, geometry)
+        if fit is None or fit.explained < LEAST_EXPLAINED:
+            if quad.rank < STRONG_RANK:
+                break
+            continue
+        margins = marker_margins(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
+        if np.sort(margins)[1] < LEAST_MARGIN:
+            continue
+        reading = _judge(task, quad, fit, geometry, margins)
+        if reading.code is not None:
+            return [reading]
+        if best is None or reading.confidence > best.confidence:
+            best = reading
+    return [best] if best else []
+
+
+def _judge(task: _Task, quad: MarkerQuad, fit: PlateFit, geometry: PlateGeometry, margins: Array) -> PlateReading:
+    """Reading of a fitted candidate, or the reason why there is none."""
+    extent = np.ptp(fit.corners_px, axis=0)
+    reading = PlateReading(
+        PlateOutcome.CELLS_UNDECODABLE,
+        fit.corners_px,
+        fit.corners_covariance_px2,
+        geometry=geometry,
+        width_px=float(extent[0]),
+        height_px=float(extent[1]),
+    )
+    missing = _missing_parts(task.luma.shape, quad, fit, geometry, margins)
+    evidence = weigh_units(fit)
+    if evidence is None:
+        outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
+        return replace(reading, outcome=outcome, reason=reason)
+    decoded = decode_symbols(evidence, geometry.n, task.codebook, SURE)
+    reading = replace(
+        reading,
+        confidence=decoded.confidence,
+        cell_confidence=decoded.cell_confidence,
+        corrected_cells=decoded.corrected,
+        from_codebook=decoded.from_codebook,
+    )
+    if decoded.code is None:
+        outcome, reason = missing or _undecoded(decoded)
+        return replace(reading, outcome=outcome, reason=reason)
+    if not decoded.confirmed and (missing or fit.explained < LEAST_EXPLAINED_ALONE):
+        outcome, reason = missing or (PlateOutcome.UNSURE, "the plate's pattern explains too little of the image")
+        return replace(reading, outcome=outcome, reason=reason)
+    return replace(
+        reading,
+        outcome=PlateOutcome.READ,
+        code=decoded.code,
+        grade=grade_plate(fit, evidence, decoded, float(margins.min())),
+        pose=_pose(task, fit, geometry),
+    )
+
+
+def _undecoded(decoded: DecodedSymbols) -> tuple[PlateOutcome, str]:
+    sure_cells = bool(decoded.cell_confidence) and min(decoded.cell_confidence) > 0.9
+    return (PlateOutcome.UNSURE if sure_cells else PlateOutcome.CELLS_UNDECODABLE), decoded.reason
+
+
+def _missing_parts(
+    shape: tuple[int, ...], quad: MarkerQuad, fit: PlateFit, geometry: PlateGeometry, margins: Array
+) -> tuple[PlateOutcome, str] | None:
+    """Which of the cases that the paper filters out this is, if any (PolyU, section II-D4)."""
+    if (fit.corners_px < -0.5).any() or (fit.corners_px > np.array([shape[1], shape[0]]) - 0.5).any():
+        return PlateOutcome.FEWER_THAN_FOUR_VERTICES, "a corner is out of view"
+    if margins[0] < LEAST_MARGIN:
+        return PlateOutcome.RED_MARKER_MISSING, "no red triangle where it should be"
+    if margins[1:].min() < LEAST_MARGIN:
+        return PlateOutcome.GREEN_MARKER_MISSING, "a green square is not where it should be"
+    homogeneous = np.column_stack([marker_centroids(geometry), np.ones(4)]) @ np.linalg.inv(fit.plate_from_image).T
+    moved = np.abs(homogeneous[:, :2] / homogeneous[:, 2:] - quad.centroids_px).max(axis=0)
+    if (moved > 0.15 * np.ptp(fit.corners_px, axis=0) + 1.5).any():
+        return PlateOutcome.VERTICES_BEYOND_MARKERS, "the grid's corners are not where the markers are"
+    return None
+
+
+def _pose(task: _Task, fit: PlateFit, geometry: PlateGeometry):  # type: ignore[no-untyped-def]
+    if task.camera is None:
+        return None
+    return locate_plate(fit.corners_px, fit.corners_covariance_px2, geometry, task.camera)
