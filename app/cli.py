@@ -51,6 +51,18 @@ def serve(host: HostOption = None, port: PortOption = None) -> None:
 
 
 @cli.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder to write to; created if need be.")] = Path("demo-out"),
+    serve: Annotated[bool, typer.Option("--serve", help="Leave the server running to look around in.")] = False,
+) -> None:
+    """Register plates on a real lane, write their artwork, decode a simulated drive over them; one table."""
+    from app.demo import run_demo
+
+    if not run_demo(out, say=lambda line: typer.echo(line), keep_serving=serve):
+        raise typer.Exit(1)
+
+
+@cli.command()
 def migrate(revision: Annotated[str, typer.Argument(help="Revision to go to, up or down.")] = "head") -> None:
     """Bring the database's schema to a revision; `serve` goes to the newest by itself."""
     with _owned_database(_settings()) as database:

@@ -1,0 +1,86 @@
+"""`waymark serve` in a process of its own, on a free loopback port, with a folder of its own."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+
+import httpx
+
+from app.errors import Unavailable
+
+_START_TIMEOUT_S = 180.0
+
+
+class LocalServer:
+    """A server while the block runs.
+
+    Attributes
+    ----------
+    url, key : str
+        Where it listens, and its admin key.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.key = secrets.token_urlsafe(32)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._port = probe.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self._port}"
+
+    def __enter__(self) -> LocalServer:
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")}
+        environment = inherited | {"WAYMARK_DATA_DIR": str(self._folder), "WAYMARK_ADMIN_KEY": self.key}
+        command = [sys.executable, "-c", "from app.cli import main; main()", "serve", "--port", str(self._port)]
+        self._log_path = self._folder / "server.log"
+        with self._log_path.open("wb") as log:
+            self._process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+        try:
+            self._wait()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(40)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def wait(self) -> None:
+        """Until the server ends or the user interrupts."""
+        try:
+            self._process.wait()
+        except KeyboardInterrupt:
+            return
+
+    def client(self) -> httpx.Client:
+        """A client that sends the key; one connection is kept open."""
+        headers = {"Authorization": f"Bearer {self.key}"}
+        return httpx.Client(base_url=self.url, headers=headers, timeout=120, trust_env=False)
+
+    def _wait(self) -> None:
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        with self.client() as client:
+            while True:
+                try:
+                    if client.get("/readyz").status_code == 200:
+                        return
+                except httpx.TransportError:
+                    pass  # not listening yet
+                if self._process.poll() is not None or time.monotonic() > deadline:
+                    last = self._log_path.read_text(errors="replace")[-2000:]
+                    raise Unavailable(f"the demo's server did not start:\n{last}", cure="see the log above")
+                time.sleep(0.1)
