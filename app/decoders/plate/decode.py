@@ -305,8 +305,8 @@ def _decode_alone(evidence: UnitEvidence, n: int, sure: float) -> DecodedSymbols
     if float(costs[np.arange(len(costs)), decimal].sum()) < LETTERS_OUT_OF_REACH:
         cells = _softmax_confidence(costs[:, :10], decimal)
         confidence = float(np.prod(cells))
-        if is_codeword(tuple(decimal), PlateScheme.POSITION, n) and confidence >= sure:
-            code = PlateCode.from_symbols(tuple(int(s) for s in decimal), PlateScheme.POSITION, n)
+        code = _decimal_code(tuple(int(s) for s in decimal), n)
+        if code is not None and confidence >= sure:
             return DecodedSymbols(code, confidence, _floats(cells))
         doubtful = ", ".join(str(i) for i in np.flatnonzero(cells < 1 - (1 - sure) / len(cells)))
         return DecodedSymbols(None, confidence, _floats(cells), reason=f"cells in doubt: {doubtful}")
@@ -314,6 +314,14 @@ def _decode_alone(evidence: UnitEvidence, n: int, sure: float) -> DecodedSymbols
     if corrected is not None:
         return corrected
     return DecodedSymbols(None, float(np.prod(cells)), _floats(cells), reason="no scheme has these symbols")
+
+
+def _decimal_code(symbols: tuple[int, ...], n: int) -> PlateCode | None:
+    """The position code that has these digits; without check digits if that is possible, as the digits cannot tell."""
+    for scheme, checks in ((PlateScheme.POSITION, 1), (PlateScheme.POSITION_CHECK, 1), (PlateScheme.POSITION_CHECK, 2)):
+        if is_codeword(symbols, scheme, n, checks):
+            return PlateCode.from_symbols(symbols, scheme, n, checks)
+    return None
 
 
 def _floats(values: Array) -> tuple[float, ...]:

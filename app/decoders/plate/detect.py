@@ -26,7 +26,6 @@ FAINT_LEVELS = ((6, 0), (12, 0), (24, 0))
 _LOG = np.rint(128 * np.log(np.arange(256) + 12.0)).astype(np.int16)
 NOISE_FACTOR = 3.5
 LEAST_INTERIOR = 2.5
-LEAST_RANK = 7.5
 MAX_QUADS = 400
 MAX_CANDIDATES = 8
 # distance between marker centres over the side of a marker: 3.2, 4.27, 5.33 for 8, 10, 12 units of 35 / 5 mm
@@ -84,8 +83,11 @@ class MarkerQuad:
 
     @property
     def rank(self) -> float:
-        """How likely it is a plate; larger is better."""
-        return self.score + 2 * math.log(self.colour_margin)
+        """How likely it is a plate: above 0 worth a fit; large markers must look the part better than small ones."""
+        right, down = self.centroids_px[1] - self.centroids_px[0], self.centroids_px[3] - self.centroids_px[0]
+        area = max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0)
+        wanted = min(max(5.0 + 4.5 * math.log10(area / 250), 5.0), 8.7)
+        return self.score + 2 * math.log(self.colour_margin) - wanted
 
 
 def half_frame(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -104,14 +106,12 @@ def vivid_signal(small: npt.NDArray[np.uint8]) -> MarkerSignal:
 
 def faint_signal(small: npt.NDArray[np.uint8]) -> MarkerSignal:
     """The ratio of red to green against the neighbourhood's: weak colours in haze, glare or a colour cast."""
-    blue, green, red = cv2.split(small)
-    opponent = np.empty(blue.shape, np.int16)
-    luma = np.empty(blue.shape, np.uint8)
-    rows, columns = _blocks(blue.shape)
-    level = np.zeros((rows, columns), np.int32)
-    _ratio(blue, green, red, _LOG, opponent, luma, level)
+    green, red = small[..., 1], small[..., 2]
+    opponent = cv2.subtract(cv2.LUT(red, _LOG), cv2.LUT(green, _LOG))
+    rows, columns = _blocks(opponent.shape)
+    level = cv2.resize(opponent.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
     _flatten(opponent, level)
-    return _signal(opponent, luma, FAINT_LEVELS)
+    return _signal(opponent, cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), FAINT_LEVELS)
 
 
 def _blocks(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -140,7 +140,7 @@ def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
         MarkerQuad(2 * row[:8].reshape(4, 2) + 0.5, int(row[9]), float(row[8]), float(row[11]), float(row[10]))
         for row in (quads[k] for k in kept)
     ]
-    return sorted((q for q in found_quads if q.rank > LEAST_RANK), key=lambda q: -q.rank)
+    return sorted((q for q in found_quads if q.rank > 0), key=lambda q: -q.rank)
 
 
 def marker_margins(
@@ -199,17 +199,6 @@ def _vivid(blue, green, red, opponent, luma):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _ratio(blue, green, red, log, opponent, luma, level):  # type: ignore[no-untyped-def]
-    for y in range(opponent.shape[0]):
-        for x in range(opponent.shape[1]):
-            opponent[y, x] = log[red[y, x]] - log[green[y, x]]
-            luma[y, x] = np.uint8((np.int16(red[y, x]) + 2 * np.int16(green[y, x]) + np.int16(blue[y, x])) >> 2)
-        row = y // BLOCK
-        for x in range(opponent.shape[1]):
-            level[row, x // BLOCK] += opponent[y, x]
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _flatten(opponent, level):  # type: ignore[no-untyped-def]
     """Take off the level of the neighbourhood: the median of nine blocks around."""
     rows, cols = level.shape
@@ -222,9 +211,7 @@ def _flatten(opponent, level):  # type: ignore[no-untyped-def]
                 for j in (-2, 0, 2):
                     rr = min(max(r + i, 0), rows - 1)
                     cc = min(max(c + j, 0), cols - 1)
-                    tall = min(opponent.shape[0], (rr + 1) * BLOCK) - rr * BLOCK
-                    wide = min(opponent.shape[1], (cc + 1) * BLOCK) - cc * BLOCK
-                    near[k] = level[rr, cc] / (tall * wide)
+                    near[k] = level[rr, cc]
                     k += 1
             near.sort()
             base[r, c] = np.int16(round(near[4]))
@@ -544,7 +531,6 @@ def _green_triples(blobs, greens, opponent, quads):  # type: ignore[no-untyped-d
                     - 0.5 * abs(np.log(g1[7] / g2[7]))
                     - abs(np.log(g1[12] / g2[12]))
                     + 0.5 * np.log(max(red, 0.1 * amplitude) * amplitude)
-                    + 0.3 * np.log(area)
                     - (3.5 if pale else 0.5)
                 )
                 q[9] = 7
@@ -680,7 +666,6 @@ def _quads(blobs, opponent):  # type: ignore[no-untyped-def]
                         - 0.3 * red_shape
                         - 0.5 * similar
                         + 0.5 * np.log(red[12] * np.sqrt(g1[12] * g2[12]))
-                        + 0.3 * np.log(area)
                     )
                     if complete:
                         score -= 6.0 * best

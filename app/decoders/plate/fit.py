@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
+import cv2
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -27,11 +29,13 @@ MOTION_PRIOR = (0.03, 0.06)  # length of the motion blur [plate sides], and its 
 UPRIGHT_SINE = 0.35  # of the angle between line of sight and plate columns up to which blur is along the plate's axes
 HOPELESS = (0.6, 0.7)  # share of the pixels' variance that one and two steps explain on anything that is a plate
 MAX_STEPS = 7
+LARGE_UNIT_PX = 5.0  # a unit of twice this size is averaged down
 LOST_PX = 1.5  # a plate's corners move less after four steps
 REST_PX, NEAR_PX = 0.08, 0.4  # the corners rest, or are near rest, when they move less in one step
 COARSE_PIXELS, FINE_PIXELS = 4.5, 9.0  # pixels looked at for each unknown, where the image has more
 _LEVELS = np.linspace(0.0, 1.0, 256)
 LINEAR_LIGHT = _LEVELS**GAMMA
+_LIGHT = LINEAR_LIGHT.astype(np.float32)
 _SLOPE = GAMMA * np.maximum(_LEVELS, 0.18) ** (GAMMA - 1)
 WEIGHT = 1.0 / _SLOPE**2  # noise is about even on the camera's output scale
 
@@ -91,12 +95,14 @@ class PlateFit:
         return float(shorter) / len(self.units)
 
 
+@lru_cache
 def unit_edges(geometry: PlateGeometry) -> Array:
     """Low and high edge of every unit along a side, in plate sides, shape (n, 2)."""
     low = (geometry.gap_mm + np.arange(geometry.n) * geometry.pitch_mm) / geometry.side_mm
     return np.stack([low, low + geometry.unit_mm / geometry.side_mm], axis=1)
 
 
+@lru_cache
 def marker_centroids(geometry: PlateGeometry) -> Array:
     """Centroids of the triangle and the three squares, clockwise, in plate sides, shape (4, 2)."""
     edges = unit_edges(geometry)
@@ -112,6 +118,7 @@ _Z = np.arange(-_TABLE_REACH, _TABLE_REACH + 2.5 / _TABLE_DENSITY, 1 / _TABLE_DE
 NORMAL_TABLE = np.stack([ndtr(_Z), np.exp(-0.5 * _Z**2) / math.sqrt(2 * math.pi)], axis=1)
 
 
+@lru_cache
 def unit_centres(geometry: PlateGeometry) -> Array:
     """Centres of the units that carry the code, in plate sides, shape (units, 2)."""
     middle = unit_edges(geometry).mean(axis=1)
@@ -422,12 +429,13 @@ def blur_minor(ux, uy, vx, vy):  # type: ignore[no-untyped-def]
     return math.sqrt(max(0.5 * (t - math.sqrt(max(t * t - 4.0 * d * d, 0.0))), 1e-18))
 
 
-def fit_plate(luma: npt.NDArray[np.uint8], centroids_px: Array, geometry: PlateGeometry) -> PlateFit | None:
+def fit_plate(image: npt.NDArray[np.uint8], centroids_px: Array, geometry: PlateGeometry) -> PlateFit | None:
     """Fit a plate whose marker centroids are roughly known.
 
     Parameters
     ----------
-    luma : ndarray of uint8, shape (H, W)
+    image : ndarray of uint8, shape (H, W, 3) or (H, W)
+        Blue, green, red, of which the luma counts; or grey levels.
     centroids_px : ndarray, shape (4, 2)
         Triangle and squares, clockwise. [px]
     geometry : PlateGeometry
@@ -437,24 +445,52 @@ def fit_plate(luma: npt.NDArray[np.uint8], centroids_px: Array, geometry: PlateG
     PlateFit or None
         None when the steps leave the image, the plate degenerates, or it explains too little of what is there.
     """
-    edges = unit_edges(geometry)
-    centre = centroids_px.mean(axis=0)
-    frame = np.array([centre[0], centre[1], max(float(np.ptp(centroids_px, axis=0).max()), 4.0)])
-    source = (centroids_px - centre) / frame[2]
+    luma, origin_px, scale = _patch(image, centroids_px, geometry.n)
+    if min(luma.shape) < 4:
+        return None
+    points = (centroids_px - origin_px) / scale
+    centre = points.mean(axis=0)
+    frame = np.array([centre[0], centre[1], max(float(np.ptp(points, axis=0).max()), 4.0)])
+    edges, slot = unit_edges(geometry), _slots(geometry.n)
     try:
-        pose = np.concatenate([_homography(source, marker_centroids(geometry)), [BLUR_PRIOR[0], MOTION_PRIOR[0]]])
-        slot = _slots(geometry.n)
+        start = _homography((points - centre) / frame[2], marker_centroids(geometry))
+        pose = np.concatenate([start, [BLUR_PRIOR[0], MOTION_PRIOR[0]]])
         coef = _sample_shapes(luma, pose, frame, edges, slot)
+        normal = np.empty((len(coef) + POSE, len(coef) + POSE))
+        ok, variance, explained, pixels = _gauss_newton(
+            luma, LINEAR_LIGHT, WEIGHT, NORMAL_TABLE, frame, pose, edges, slot, coef, normal
+        )
+        if not ok:
+            return None
+        covariance = np.linalg.inv(normal) * variance
     except np.linalg.LinAlgError:
         return None
-    size = len(coef) + POSE
-    normal = np.empty((size, size))
-    ok, variance, explained, pixels = _gauss_newton(
-        luma, LINEAR_LIGHT, WEIGHT, NORMAL_TABLE, frame, pose, edges, slot, coef, normal
-    )
-    if not ok:
-        return None
-    return _result(frame, pose, edges, slot, coef, normal, variance, explained, pixels)
+    frame[:2] = frame[:2] * scale + origin_px
+    frame[2] *= scale
+    pose[8] += math.log(scale)
+    return _result(frame, pose, slot, coef, covariance, math.sqrt(variance), explained, pixels)
+
+
+def _patch(image: npt.NDArray[np.uint8], centroids_px: Array, n: int) -> tuple[npt.NDArray[np.uint8], Array, int]:
+    """Luma around a plate, where in the image its pixel (0, 0) lies [px], and how many pixels a side make one of it.
+
+    A large plate is averaged down: its edges are sharp against the distance between the pixels that are looked at.
+    """
+    low, high = centroids_px.min(axis=0), centroids_px.max(axis=0)
+    scale = max(int((high - low).min() / (0.75 * n * LARGE_UNIT_PX)), 1)
+    pad = 0.8 * (high - low) + 12
+    x0, y0 = (int(v) for v in np.maximum(low - pad, 0))
+    x1, y1 = (int(v) for v in np.minimum(high + pad, [image.shape[1], image.shape[0]]))
+    wide, tall = max(x1 - x0, 0) // scale, max(y1 - y0, 0) // scale
+    patch = image[y0 : y0 + tall * scale, x0 : x0 + wide * scale]
+    if min(wide, tall) < 4:
+        return np.empty((0, 0), np.uint8), np.zeros(2), 1
+    luma = cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY) if patch.ndim == 3 else np.ascontiguousarray(patch)
+    if scale > 1:
+        light = cv2.resize(cv2.LUT(luma, _LIGHT), (wide, tall), interpolation=cv2.INTER_AREA)
+        light = cv2.GaussianBlur(light, (5, 5), 0.8)
+        luma = np.rint(255 * light ** (1 / GAMMA)).astype(np.uint8)
+    return luma, np.array([x0, y0]) + (scale - 1) / 2, scale
 
 
 def _homography(source: Array, target: Array) -> Array:
@@ -467,6 +503,7 @@ def _homography(source: Array, target: Array) -> Array:
     return solution
 
 
+@lru_cache
 def _slots(n: int) -> npt.NDArray[np.int64]:
     """Column of every unit in the normal equations, row by row; -1 in the corner cells, shape (n, n)."""
     corner = np.zeros((n, n), dtype=bool)
@@ -696,14 +733,10 @@ def _gauss_newton(luma, levels, weights, table, frame, pose, edges, slot, coef, 
 
 
 def _result(
-    frame: Array, pose: Array, edges: Array, slot: npt.NDArray[np.int64], coef: Array, normal: Array,
-    variance: float, explained: float, pixels: int,
-) -> PlateFit | None:  # fmt: skip
-    n, shapes = len(edges), len(coef)
-    try:
-        covariance = np.linalg.inv(normal) * variance
-    except np.linalg.LinAlgError:
-        return None
+    frame: Array, pose: Array, slot: npt.NDArray[np.int64], coef: Array, covariance: Array,
+    residual: float, explained: float, pixels: int,
+) -> PlateFit:  # fmt: skip
+    n, shapes = len(slot), len(coef)
     units = np.full((n, n), np.nan)
     order = np.flatnonzero(slot.reshape(-1) >= 0)
     units.reshape(-1)[order] = coef[: len(order)]
@@ -720,7 +753,7 @@ def _result(
         road=float(coef[shapes - 4 :].mean()),
         corners_px=corners,
         corners_covariance_px2=jacobian @ covariance[shapes : shapes + 8, shapes : shapes + 8] @ jacobian.T,
-        residual=math.sqrt(variance),
+        residual=residual,
         explained=explained,
         blur_px=math.exp(pose[8]),
         motion=float(pose[9]),

@@ -35,7 +35,7 @@ SURE = 0.999  # least probability at which digits are given out
 MOST_FITS = 3  # candidates that are fitted in one pass
 LEAST_EXPLAINED = 0.75  # share of the pixels' variance, below which nothing is a plate
 LEAST_EXPLAINED_ALONE = 0.85  # the same for digits that no registry confirms
-STRONG_RANK = 11.0  # of a candidate that deserves a second geometry when the first explains nothing
+STRONG_RANK = 2.0  # of a candidate that deserves a second geometry when the first explains nothing
 LEAST_MARGIN = 1.0  # colour margin of a marker that is there
 LEAST_SIDE_PX = 24
 Frame = npt.NDArray[np.uint8]
@@ -46,7 +46,7 @@ Array = npt.NDArray[np.float64]
 class _Task:
     """What is the same for all candidates of a frame."""
 
-    luma: Frame
+    image: Frame
     camera: Camera | None
     codebook: Sequence[PlateCode]
     geometries: Sequence[PlateGeometry]
@@ -89,7 +89,7 @@ def decode_plates(
     _check(image, camera, thermal, geometries)
     if thermal:
         raise NotImplementedError
-    task = _Task(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), camera, codebook, geometries)
+    task = _Task(image, camera, codebook, geometries)
     small = half_frame(image)
     readings: list[PlateReading] = []
     for signal_of in (vivid_signal, faint_signal):
@@ -150,7 +150,7 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
     """The candidate's best reading under the geometries that fit it; empty when it is no plate."""
     best: PlateReading | None = None
     for geometry in _likely_geometries(quad, task.geometries):
-        fit = fit_plate(task.luma, quad.centroids_px, geometry)
+        fit = fit_plate(task.image, quad.centroids_px, geometry)
         if fit is None or fit.explained < LEAST_EXPLAINED:
             if quad.rank < STRONG_RANK:
                 break
@@ -177,7 +177,7 @@ def _judge(task: _Task, quad: MarkerQuad, fit: PlateFit, geometry: PlateGeometry
         width_px=float(extent[0]),
         height_px=float(extent[1]),
     )
-    missing = _missing_parts(task.luma.shape, quad, fit, geometry, margins)
+    missing = _missing_parts(task.image.shape, quad, fit, geometry, margins)
     evidence = weigh_units(fit)
     if evidence is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
