@@ -71,7 +71,6 @@ class UnitEvidence:
     scatter: float
     span: float
 
-
     @property
     def cell_margin(self) -> Array:
         """Cost of the second best symbol of each cell, shape (cells,)."""
@@ -379,7 +378,9 @@ def _decode_with_codebook(evidence: UnitEvidence, known: list[PlateCode], sure: 
     symbols = np.array(code.symbols)
     cells = _softmax_confidence(evidence.cell_costs, code.symbols)
     corrected = tuple(int(i) for i in np.flatnonzero(symbols != evidence.best))
-    return DecodedSymbols(code, confidence, tuple(float(c) for c in cells), corrected, from_codebook=True, confirmed=True)
+    return DecodedSymbols(
+        code, confidence, tuple(float(c) for c in cells), corrected, from_codebook=True, confirmed=True
+    )
 
 
 CHANCE_CODES = math.log(1e6)  # how many look-alikes a codebook's match must beat

@@ -504,7 +504,9 @@ def _green_triples(blobs, greens, opponent, quads):  # type: ignore[no-untyped-d
                 pyy = (py * py + qy * qy) * scale + 0.3
                 pxy = (px * py + qx * qy) * scale
                 shape = max(
-                    _shape_error(g1, pxx, pxy, pyy), _shape_error(g2, pxx, pxy, pyy), _shape_error(corner, pxx, pxy, pyy)
+                    _shape_error(g1, pxx, pxy, pyy),
+                    _shape_error(g2, pxx, pxy, pyy),
+                    _shape_error(corner, pxx, pxy, pyy),
                 )
                 if shape > 1.8:
                     continue

@@ -85,7 +85,6 @@ class PlateFit:
     motion: float
     pixels: int
 
-
     @property
     def unit_px(self) -> float:
         """Size of a unit in the image across its shorter direction. [px]"""
@@ -265,9 +264,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
             a_gap = 0.0
             a_road = 0.0
             for corner in range(4):
-                f = (bilinear_u if corner % 2 else 1.0 - bilinear_u) * (
-                    bilinear_v if corner >= 2 else 1.0 - bilinear_v
-                )
+                f = (bilinear_u if corner % 2 else 1.0 - bilinear_u) * (bilinear_v if corner >= 2 else 1.0 - bilinear_v)
                 a_gap += f * coef[base + 5 + corner]
                 a_road += f * coef[base + 9 + corner]
             for q in range(nodes.shape[0]):
@@ -429,7 +426,9 @@ def blur_minor(ux, uy, vx, vy):  # type: ignore[no-untyped-def]
     return math.sqrt(max(0.5 * (t - math.sqrt(max(t * t - 4.0 * d * d, 0.0))), 1e-18))
 
 
-def fit_plate(image: npt.NDArray[np.uint8], centroids_px: Array, geometry: PlateGeometry) -> PlateFit | None:
+def fit_plate(
+    image: npt.NDArray[np.uint8], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
+) -> PlateFit | None:
     """Fit a plate whose marker centroids are roughly known.
 
     Parameters
@@ -439,6 +438,8 @@ def fit_plate(image: npt.NDArray[np.uint8], centroids_px: Array, geometry: Plate
     centroids_px : ndarray, shape (4, 2)
         Triangle and squares, clockwise. [px]
     geometry : PlateGeometry
+    linear : bool
+        The levels are proportional to what is seen, as a thermal camera's; else they are gamma encoded.
 
     Returns
     -------
@@ -452,13 +453,14 @@ def fit_plate(image: npt.NDArray[np.uint8], centroids_px: Array, geometry: Plate
     centre = points.mean(axis=0)
     frame = np.array([centre[0], centre[1], max(float(np.ptp(points, axis=0).max()), 4.0)])
     edges, slot = unit_edges(geometry), _slots(geometry.n)
+    levels, weights = (_LEVELS, np.ones(256)) if linear else (LINEAR_LIGHT, WEIGHT)
     try:
         start = _homography((points - centre) / frame[2], marker_centroids(geometry))
         pose = np.concatenate([start, [BLUR_PRIOR[0], MOTION_PRIOR[0]]])
-        coef = _sample_shapes(luma, pose, frame, edges, slot)
+        coef = _sample_shapes(luma, levels, pose, frame, edges, slot)
         normal = np.empty((len(coef) + POSE, len(coef) + POSE))
         ok, variance, explained, pixels = _gauss_newton(
-            luma, LINEAR_LIGHT, WEIGHT, NORMAL_TABLE, frame, pose, edges, slot, coef, normal
+            luma, levels, weights, NORMAL_TABLE, frame, pose, edges, slot, coef, normal
         )
         if not ok:
             return None
@@ -528,7 +530,7 @@ def _project(matrix: Array, points: Array) -> Array:
 
 
 def _sample_shapes(
-    luma: npt.NDArray[np.uint8], pose: Array, frame: Array, edges: Array, slot: npt.NDArray[np.int64]
+    luma: npt.NDArray[np.uint8], levels: Array, pose: Array, frame: Array, edges: Array, slot: npt.NDArray[np.int64]
 ) -> Array:
     """First values of all shapes: the pixels at their middles."""
     n = len(edges)
@@ -547,7 +549,7 @@ def _sample_shapes(
     )
     points = np.rint(_project(np.linalg.inv(_matrix(pose, frame)), plate)).astype(int)
     height, width = luma.shape
-    values: Array = LINEAR_LIGHT[luma[np.clip(points[:, 1], 0, height - 1), np.clip(points[:, 0], 0, width - 1)]]
+    values: Array = levels[luma[np.clip(points[:, 1], 0, height - 1), np.clip(points[:, 0], 0, width - 1)]]
     return values
 
 
@@ -727,7 +729,7 @@ def _gauss_newton(luma, levels, weights, table, frame, pose, edges, slot, coef, 
             break
         if k >= 3 and shift > LOST_PX:
             return False, variance, explained, pixels
-        if k >= 1 and shift < NEAR_PX or k >= 3:
+        if (k >= 1 and shift < NEAR_PX) or k >= 3:
             coarse = False
     return True, variance, explained, pixels
 

@@ -22,9 +22,7 @@ def _step(value: float, limits: tuple[float, float, float, float]) -> float:
     return float(np.searchsorted(limits, value, side="right"))
 
 
-def grade_plate(
-    fit: PlateFit, evidence: UnitEvidence, decoded: DecodedSymbols, weakest_marker: float
-) -> PlateGrade:
+def grade_plate(fit: PlateFit, evidence: UnitEvidence, decoded: DecodedSymbols, weakest_marker: float) -> PlateGrade:
     """Grade of a plate that was read.
 
     Parameters

@@ -48,9 +48,7 @@ class VehicleFix:
     covariance: Array
 
 
-def locate_plate(
-    corners_px: Array, covariance_px2: Array, geometry: PlateGeometry, camera: Camera
-) -> PlatePose | None:
+def locate_plate(corners_px: Array, covariance_px2: Array, geometry: PlateGeometry, camera: Camera) -> PlatePose | None:
     """Pose of a plate from its outer corners.
 
     Parameters

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -24,9 +23,10 @@ from app.decoders.plate.detect import (
 from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids, unit_centres
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.pose import locate_plate
+from app.decoders.plate.thermal import ORIENTATION_EVIDENCE, fit_warm_plates
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
-from app.markers.reading import PlateOutcome, PlateReading
+from app.markers.reading import PlateOutcome, PlatePose, PlateReading
 from app.sensors.camera import Camera
 
 DECODER_VERSION = "plate/1"
@@ -87,9 +87,13 @@ def decode_plates(
         The image is not of this type, or not of the camera's size.
     """
     _check(image, camera, thermal, geometries)
-    if thermal:
-        raise NotImplementedError
     task = _Task(image, camera, codebook, geometries)
+    readings = _decode_thermal(task) if thermal else _decode_colour(task)
+    return sorted(_without_shadows(readings), key=lambda reading: reading.code is None)
+
+
+def _decode_colour(task: _Task) -> list[PlateReading]:
+    image = task.image
     small = half_frame(image)
     readings: list[PlateReading] = []
     for signal_of in (vivid_signal, faint_signal):
@@ -99,7 +103,37 @@ def decode_plates(
                 readings += _read(task, signal, quad)
         if any(reading.code for reading in readings):
             break
-    return sorted(_without_shadows(readings), key=lambda reading: reading.code is None)
+    return readings
+
+
+def _decode_thermal(task: _Task) -> list[PlateReading]:
+    readings: list[PlateReading] = []
+    for geometry in task.geometries:
+        for fits, evidence in fit_warm_plates(task.image, geometry):
+            centre = fits[0].corners_px.mean(axis=0)
+            if fits[0].explained >= LEAST_EXPLAINED and not any(_inside(centre, r) for r in readings):
+                readings.append(_judge_orientations(task, fits, geometry, evidence))
+        if any(reading.code for reading in readings):
+            break
+    return readings
+
+
+def _judge_orientations(task: _Task, fits: list[PlateFit], geometry: PlateGeometry, evidence: float) -> PlateReading:
+    """Reading of the likeliest orientation; of another one only when the codebook confirms it."""
+    unsure = PlateOutcome.RED_MARKER_MISSING, "nothing tells the triangle from the squares"
+    first: PlateReading | None = None
+    for fit in fits:
+        missing = _out_of_view(task.image.shape, fit)
+        if missing is None and (first is not None or evidence < ORIENTATION_EVIDENCE):
+            missing = unsure
+        reading = _judge(task, fit, geometry, missing)
+        if reading.code is not None:
+            return reading
+        first = first or reading
+        if not task.codebook:
+            break
+    assert first is not None
+    return first
 
 
 def _check(image: Frame, camera: Camera | None, thermal: bool, geometries: Sequence[PlateGeometry]) -> None:
@@ -158,7 +192,8 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
         margins = marker_margins(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
         if np.sort(margins)[1] < LEAST_MARGIN:
             continue
-        reading = _judge(task, quad, fit, geometry, margins)
+        missing = _missing_parts(task.image.shape, quad, fit, geometry, margins)
+        reading = _judge(task, fit, geometry, missing, weakest_marker=float(margins.min()))
         if reading.code is not None:
             return [reading]
         if best is None or reading.confidence > best.confidence:
@@ -166,7 +201,13 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
     return [best] if best else []
 
 
-def _judge(task: _Task, quad: MarkerQuad, fit: PlateFit, geometry: PlateGeometry, margins: Array) -> PlateReading:
+def _judge(
+    task: _Task,
+    fit: PlateFit,
+    geometry: PlateGeometry,
+    missing: tuple[PlateOutcome, str] | None,
+    weakest_marker: float = math.inf,
+) -> PlateReading:
     """Reading of a fitted candidate, or the reason why there is none."""
     extent = np.ptp(fit.corners_px, axis=0)
     reading = PlateReading(
@@ -177,7 +218,6 @@ def _judge(task: _Task, quad: MarkerQuad, fit: PlateFit, geometry: PlateGeometry
         width_px=float(extent[0]),
         height_px=float(extent[1]),
     )
-    missing = _missing_parts(task.image.shape, quad, fit, geometry, margins)
     evidence = weigh_units(fit)
     if evidence is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
@@ -200,7 +240,7 @@ def _judge(task: _Task, quad: MarkerQuad, fit: PlateFit, geometry: PlateGeometry
         reading,
         outcome=PlateOutcome.READ,
         code=decoded.code,
-        grade=grade_plate(fit, evidence, decoded, float(margins.min())),
+        grade=grade_plate(fit, evidence, decoded, weakest_marker),
         pose=_pose(task, fit, geometry),
     )
 
@@ -214,8 +254,9 @@ def _missing_parts(
     shape: tuple[int, ...], quad: MarkerQuad, fit: PlateFit, geometry: PlateGeometry, margins: Array
 ) -> tuple[PlateOutcome, str] | None:
     """Which of the cases that the paper filters out this is, if any (PolyU, section II-D4)."""
-    if (fit.corners_px < -0.5).any() or (fit.corners_px > np.array([shape[1], shape[0]]) - 0.5).any():
-        return PlateOutcome.FEWER_THAN_FOUR_VERTICES, "a corner is out of view"
+    outside = _out_of_view(shape, fit)
+    if outside is not None:
+        return outside
     if margins[0] < LEAST_MARGIN:
         return PlateOutcome.RED_MARKER_MISSING, "no red triangle where it should be"
     if margins[1:].min() < LEAST_MARGIN:
@@ -227,7 +268,13 @@ def _missing_parts(
     return None
 
 
-def _pose(task: _Task, fit: PlateFit, geometry: PlateGeometry):  # type: ignore[no-untyped-def]
+def _out_of_view(shape: tuple[int, ...], fit: PlateFit) -> tuple[PlateOutcome, str] | None:
+    if (fit.corners_px < -0.5).any() or (fit.corners_px > np.array([shape[1], shape[0]]) - 0.5).any():
+        return PlateOutcome.FEWER_THAN_FOUR_VERTICES, "a corner is out of view"
+    return None
+
+
+def _pose(task: _Task, fit: PlateFit, geometry: PlateGeometry) -> PlatePose | None:
     if task.camera is None:
         return None
     return locate_plate(fit.corners_px, fit.corners_covariance_px2, geometry, task.camera)

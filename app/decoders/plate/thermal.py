@@ -1,0 +1,112 @@
+"""Where heated plates may be in a thermal frame: warm quadrangles on a cooler road.
+
+There are no colours, so nothing tells the triangle's corner before the fit: each candidate comes with its four
+possible orientations, and the fit says which one explains the pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids
+from app.markers.plate import PlateGeometry
+
+Frame = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.float64]
+
+MOST_QUADS = 8
+LEAST_EXTENT_PX = 8.0
+LEAST_FILL = 0.45  # of a quadrangle by the warm region that it surrounds
+LEAST_CONTRAST = 6.0  # grey levels
+SHARES = (0.3, 0.5)  # of the strongest warmth around, at which regions are cut out
+CLOSINGS = (1, 3, 7, 15, 27)  # px, from unit to unit
+ORIENTATION_EVIDENCE = 12.0  # log likelihood by which the best orientation must beat the next
+
+
+def fit_warm_plates(image: Frame, geometry: PlateGeometry) -> Iterator[tuple[list[PlateFit], float]]:
+    """Fits of each warm quadrangle on the inverted frame, best orientation first, with the evidence for that one."""
+    inverted = cv2.bitwise_not(image)
+    for corners in detect_warm_quads(image):
+        centroids = _centroids(corners, geometry)
+        fits = []
+        for turn in range(4):
+            fit = fit_plate(inverted, np.roll(centroids, turn, axis=0), geometry, linear=True)
+            if fit is not None:
+                fits.append(fit)
+        if not fits:
+            continue
+        fits.sort(key=lambda fit: -fit.explained)
+        second = fits[1].explained if len(fits) > 1 else 0.0
+        evidence = 0.5 * fits[0].pixels * float(np.log((1 - second) / max(1 - fits[0].explained, 1e-6)))
+        yield fits, evidence
+
+
+def _centroids(corners_px: Array, geometry: PlateGeometry) -> Array:
+    """Where the squares' centroids would be if all four markers were squares."""
+    near = float(marker_centroids(geometry)[3, 0])
+    square = np.array([(near, near), (1 - near, near), (1 - near, 1 - near), (near, 1 - near)], np.float32)
+    unit = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    homography = cv2.getPerspectiveTransform(unit, corners_px.astype(np.float32))
+    return cv2.perspectiveTransform(square[None], homography)[0].astype(float)
+
+
+def detect_warm_quads(image: Frame) -> list[Array]:
+    """Corners of warm quadrangles, clockwise in the image, shape (4, 2) each. [px]"""
+    height, width = image.shape
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
+    reach = max(height, width) // 3 | 1
+    small = cv2.resize(smooth, (max(width // 8, 1), max(height // 8, 1)), interpolation=cv2.INTER_AREA)
+    level = cv2.medianBlur(np.clip(small, 0, 255).astype(np.uint8), min(reach // 8 | 1, 31))
+    warmth = smooth - cv2.resize(level, (width, height), interpolation=cv2.INTER_LINEAR)
+    strongest = float(warmth.max())
+    quads: list[tuple[float, Array]] = []
+    if strongest < LEAST_CONTRAST:
+        return []
+    for share in SHARES:
+        mask = (warmth > max(share * strongest, LEAST_CONTRAST / 2)).astype(np.uint8)
+        for size in CLOSINGS:
+            kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+            closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel) if size > 1 else mask
+            for contour in cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
+                quad = _quad_around(contour)
+                if quad is not None:
+                    quads.append(quad)
+    return _distinct(quads)
+
+
+def _quad_around(contour: npt.NDArray[np.int32]) -> tuple[float, Array] | None:
+    """Quadrangle around a region and how well the region fills it; None when it is none."""
+    extent = np.ptp(contour[:, 0], axis=0)
+    if extent.min() < LEAST_EXTENT_PX or len(contour) < 12:
+        return None
+    hull = cv2.convexHull(contour)
+    area = cv2.contourArea(hull)
+    corners = cv2.approxPolyN(hull, 4, ensure_convex=True).reshape(-1, 2).astype(float)
+    if len(corners) != 4 or area < 40:
+        return None
+    fill = area / max(cv2.contourArea(corners.astype(np.float32)), 1.0)
+    if not LEAST_FILL < fill < 1.6:
+        return None
+    if _turns(corners) < 0:
+        corners = corners[::-1]
+    solid = cv2.contourArea(contour) / area
+    return float(np.sqrt(area)) * solid, corners
+
+
+def _turns(corners: Array) -> float:
+    following = np.roll(corners, -1, axis=0)
+    return float(np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]))
+
+
+def _distinct(quads: list[tuple[float, Array]]) -> list[Array]:
+    kept: list[Array] = []
+    for _, corners in sorted(quads, key=lambda item: -item[0]):
+        size = np.ptp(corners, axis=0).max()
+        if all(np.abs(corners.mean(axis=0) - k.mean(axis=0)).max() > 0.1 * size or
+               abs(np.ptp(k, axis=0).max() / size - 1) > 0.2 for k in kept):  # fmt: skip
+            kept.append(corners)
+    return kept[:MOST_QUADS]
