@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import artwork, decodes, markers, system
+from app.api import artwork, decodes, markers, system, ui
 from app.api.middleware import Guarded, Observed
 from app.api.openapi import describe
 from app.api.problems import install_problem_handlers
@@ -35,7 +35,7 @@ from app.services.markers import MarkerRules, Markers
 from app.settings import Settings
 from app.storage.blobs import Blobs
 
-ROUTERS = (system.router, markers.router, artwork.router, decodes.router)
+ROUTERS = (ui.router, system.router, markers.router, artwork.router, decodes.router)
 
 
 def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> FastAPI:
@@ -79,6 +79,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.metrics = metrics
     for router in ROUTERS:
         app.include_router(router)
+    ui.mount_static(app)
     install_problem_handlers(app)
     describe(app)
     app.add_middleware(

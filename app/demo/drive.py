@@ -40,7 +40,7 @@ _CODES: tuple[dict[str, Any], ...] = (
     {"scheme": "position-check", "check_digits": 2},
     {"digits": PAPER_DIGITS, "allow_mismatched_digits": True},
     {},
-    {"scheme": "id"},
+    {"scheme": "id", "registry_number": 0xC0FFEE42},
     {},
 )
 

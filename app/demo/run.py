@@ -23,7 +23,7 @@ from app.geodesy import enu_from_wgs84
 
 _SEED = 7
 _FORMATS = ("svg", "pdf", "dxf", "png")
-_SHOWN_ROWS = 60.0  # the annotated picture is the frame whose plate is about so many rows high
+_SHOWN_ROWS = 110.0  # the annotated picture is the frame whose plate is about so many rows high
 Say = Callable[[str], None]
 
 
@@ -65,7 +65,7 @@ def run_demo(out: Path, *, say: Say, keep_serving: bool = False) -> bool:
     """
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="waymark-demo-", ignore_cleanup_errors=True) as folder:
-        say("Starting a server with an empty registry ...")
+        say("Starting a server with an empty registry (the very first start compiles the decoder) ...")
         with LocalServer(Path(folder)) as server, server.client() as client:
             passes, written = _demonstrate(client, out, say)
             say("")
@@ -175,8 +175,8 @@ def _summary(passes: list[Pass], written: list[str], seconds: float) -> list[str
     bad = [p.name for p in passes if not p.is_good]
     verdict = f"FAILED: plate {', '.join(bad)}" if bad else "All plates were read, matched and gave a position."
     return [
-        f"In view: the whole plate is in the picture, {LEAST_ROWS:g} rows high or more. The frames are simulated",
-        "before real road photos; the paper drove on a road. Errors: medians over the frames with a fix, survey included.",
+        f"In view: the whole plate is in the picture, {LEAST_ROWS:g} rows high or more. Frames are simulated before",
+        "real road photos; the paper drove on a road. Errors: medians over the frames with a fix, survey included.",
         "",
         *(f"- {line}" for line in written),
         "",

@@ -37,7 +37,11 @@ class LocalServer:
 
     def __enter__(self) -> LocalServer:
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")}
-        environment = inherited | {"WAYMARK_DATA_DIR": str(self._folder), "WAYMARK_ADMIN_KEY": self.key}
+        environment = inherited | {
+            "WAYMARK_DATA_DIR": str(self._folder),
+            "WAYMARK_ADMIN_KEY": self.key,
+            "WAYMARK_DECODE_WORKERS": "1",  # frames come one at a time
+        }
         command = [sys.executable, "-c", "from app.cli import main; main()", "serve", "--port", str(self._port)]
         self._log_path = self._folder / "server.log"
         with self._log_path.open("wb") as log:

@@ -1,0 +1,78 @@
+// The API: one way to ask, one way to fail.
+
+const KEY = "waymark-key";
+
+export class Problem extends Error {
+  constructor(document) {
+    super(document.detail || document.title);
+    this.document = document;
+  }
+}
+
+export const key = {
+  get: () => sessionStorage.getItem(KEY) || "",
+  set: (value) => sessionStorage.setItem(KEY, value),
+  forget: () => sessionStorage.removeItem(KEY),
+};
+
+async function ask(path, options = {}) {
+  const headers = { ...options.headers, Authorization: `Bearer ${key.get()}` };
+  let answer;
+  try {
+    answer = await fetch(path, { ...options, headers, cache: "no-store" });
+  } catch {
+    throw new Problem({ title: "The server does not answer", detail: "The request did not get through.", cure: "see whether the server is running, and try again" });
+  }
+  if (answer.ok) return answer;
+  const document = await answer.json().catch(() => ({ title: `HTTP ${answer.status}`, detail: answer.statusText }));
+  throw new Problem(document);
+}
+
+const json = (body) => ({ method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } });
+
+const MOST_MARKERS = 5000;
+
+export async function listMarkers() {
+  const items = [];
+  let path = "/v1/markers?limit=1000";
+  while (path && items.length < MOST_MARKERS) {
+    const answer = await ask(path);
+    items.push(...(await answer.json()).items);
+    const next = /<([^>]+)>; rel="next"/.exec(answer.headers.get("Link") || "");
+    path = next && new URL(next[1], location.href).pathname + new URL(next[1], location.href).search;
+  }
+  return { items, more: Boolean(path) };
+}
+
+export async function registerMarker(body) {
+  return (await ask("/v1/markers", json(body))).json();
+}
+
+export async function fetchArtwork(id, form) {
+  const answer = await ask(`/v1/markers/${id}/artwork.${form}`);
+  return { blob: await answer.blob(), proof: answer.headers.get("Waymark-Proof") || "" };
+}
+
+export async function fetchBundle(ids, formats) {
+  const answer = await ask("/v1/artwork", json({ marker_ids: ids, formats }));
+  return { blob: await answer.blob(), proof: answer.headers.get("Waymark-Proof") || "" };
+}
+
+export async function decode(file, context) {
+  const form = new FormData();
+  form.append("file", file, file.name);
+  form.append("context", JSON.stringify(context));
+  return (await ask("/v1/decodes", { method: "POST", body: form })).json();
+}
+
+export async function fetchPicture(path) {
+  return (await ask(path)).blob();
+}
+
+export function save(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}

@@ -1,0 +1,169 @@
+// Decode a frame: the picture with outlines, each reading with its cells, the vehicle's position.
+
+import * as api from "./api.js";
+import { drawMap } from "./map.js";
+import { $, attempt, facts, fillForm, make, readForm, say } from "./page.js";
+
+let pictureUrl = null;
+let frame = null;
+
+export function startDecode() {
+  const form = $("#decode-form");
+  const drop = $("#drop");
+  $("#file").addEventListener("change", (event) => take(event.target.files[0]));
+  for (const name of ["dragenter", "dragover"]) {
+    drop.addEventListener(name, (event) => {
+      event.preventDefault();
+      drop.classList.add("over");
+    });
+  }
+  drop.addEventListener("dragleave", () => drop.classList.remove("over"));
+  drop.addEventListener("drop", (event) => {
+    event.preventDefault();
+    drop.classList.remove("over");
+    take(event.dataTransfer.files[0]);
+  });
+  $("#context").addEventListener("input", (event) => {
+    try {
+      fillForm(form, JSON.parse(event.target.value));
+      event.target.removeAttribute("aria-invalid");
+    } catch {
+      event.target.setAttribute("aria-invalid", "true");
+    }
+  });
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    attempt(form.querySelector("button"), form, () => upload(form));
+  });
+}
+
+function take(file) {
+  frame = file || null;
+  $("#file-name").textContent = file ? `${file.name}, ${Math.ceil(file.size / 1024)} kB` : "";
+}
+
+async function upload(form) {
+  if (!frame) throw new api.Problem({ title: "There is no frame", detail: "Choose a picture first.", field: "file", limit: "JPEG or PNG", cure: "drop one on the dashed field" });
+  say("Decoding …");
+  const decoded = await api.decode(frame, contextOf(form));
+  await show(decoded);
+  say(decoded.summary.text);
+  $("#decoded").scrollIntoView({ block: "start" });
+}
+
+// The fields, and what only the JSON can say (intrinsics, time); the fields win.
+function contextOf(form) {
+  let context = {};
+  try {
+    context = JSON.parse($("#context").value || "{}");
+  } catch {
+    throw new api.Problem({ title: "The context cannot be read", detail: "It is not JSON.", field: "context", cure: "correct it or empty the field" });
+  }
+  const fields = readForm(form);
+  for (const part of ["coarse_position", "camera"]) {
+    if (context[part] || fields[part]) context[part] = { ...context[part], ...fields[part] };
+  }
+  if (fields.heading_deg !== undefined) context.heading_deg = fields.heading_deg;
+  if (fields.thermal) context.thermal = true;
+  return context;
+}
+
+async function show(decoded) {
+  $("#decoded").hidden = false;
+  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.frames[0].decode_ms.toFixed(1)} ms, ${decoded.codebook_plates} registered plates within reach.`;
+  $("#readings").replaceChildren(...(decoded.readings.length ? decoded.readings.map(drawReading) : [make("p", { class: "empty" }, "No plate in this frame.")]));
+  drawFix(decoded);
+  const picture = await api.fetchPicture(decoded.links.annotated);
+  if (pictureUrl) URL.revokeObjectURL(pictureUrl);
+  pictureUrl = URL.createObjectURL(picture);
+  const image = $("#annotated");
+  image.src = pictureUrl;
+  await image.decode();
+  drawCrops(decoded.readings, image);
+  image.alt = `The frame with what was found in it: ${decoded.summary.text}`;
+}
+
+function drawReading(reading) {
+  const level = reading.outcome === "read" ? "read" : reading.outcome === "unsure" ? "unsure" : "refused";
+  const { match, grade } = reading;
+  return make(
+    "div",
+    { class: "reading" },
+    make("h3", {}, make("span", { class: level }, reading.outcome), " ", make("span", { class: "digits" }, reading.digits || "")),
+    facts([
+      ["Why", reading.reason],
+      ["Confidence", `${(100 * reading.confidence).toFixed(3)} %${reading.from_codebook ? ", with the registry as codebook" : ""}`],
+      ["Scheme", reading.scheme],
+      ["Height", `${reading.height_px} px`],
+      ["Grade", grade && `${grade.letter} (${grade.overall.toFixed(1)})`],
+      ["Match", match && (match.registered ? `marker ${match.marker_id}, ${match.distance_m} m away` : "not registered here")],
+      ["Note", match && match.note],
+    ]),
+    make("div", { class: "parts" }, drawCells(reading), reading.corners_px && make("canvas", { width: 280, height: 200, role: "img", "aria-label": "The plate in the frame" })),
+  );
+}
+
+// Each reading's part of the frame, enlarged.
+function drawCrops(readings, image) {
+  const canvases = document.querySelectorAll("#readings canvas");
+  readings.filter((reading) => reading.corners_px).forEach((reading, k) => {
+    const [xs, ys] = [0, 1].map((axis) => reading.corners_px.map((corner) => corner[axis]));
+    const canvas = canvases[k];
+    const width = Math.max((Math.max(...xs) - Math.min(...xs)) * 1.3, ((Math.max(...ys) - Math.min(...ys)) * 1.3 * canvas.width) / canvas.height);
+    const height = (width * canvas.height) / canvas.width;
+    const [x, y] = [xs, ys].map((values) => (Math.max(...values) + Math.min(...values)) / 2);
+    canvas.getContext("2d").drawImage(image, x - width / 2, y - height / 2, width, height, 0, 0, canvas.width, canvas.height);
+  });
+}
+
+function drawCells(reading) {
+  if (!reading.digits || !reading.geometry) return null;
+  const across = reading.geometry.n / 2;
+  const grid = make("div", { class: "cells", role: "img", "aria-label": `Confidence per cell: ${reading.cell_confidence.map((c) => Math.round(100 * c)).join(", ")} percent` });
+  grid.style.gridTemplateColumns = `repeat(${across}, max-content)`;
+  let k = 0;
+  for (let row = 0; row < across; row += 1) {
+    for (let column = 0; column < across; column += 1) {
+      const edge = (row === 0 || row === across - 1) && (column === 0 || column === across - 1);
+      if (edge) {
+        grid.append(make("span", { class: row === 0 && column === 0 ? "triangle" : "square" }));
+        continue;
+      }
+      const sure = reading.cell_confidence[k];
+      const cell = make("span", { class: reading.corrected_cells.includes(k) ? "corrected" : null }, make("b", {}, reading.digits[k]));
+      if (sure !== undefined) {
+        cell.append(`${(100 * sure).toFixed(sure > 0.999 ? 0 : 1)} %`);
+        cell.style.backgroundColor = `hsl(${Math.round(130 * Math.max(0, 2 * sure - 1))} 55% 72%)`;
+      }
+      grid.append(cell);
+      k += 1;
+    }
+  }
+  return grid;
+}
+
+function drawFix(decoded) {
+  const { fix } = decoded;
+  $("#fix-map").toggleAttribute("hidden", !fix);
+  if (!fix) {
+    $("#fix").replaceChildren(make("p", { class: "empty" }, "No position: it takes a matched plate, a camera and a coarse position."));
+    return;
+  }
+  const { sigma } = fix;
+  $("#fix").replaceChildren(facts([
+    ["Longitude", `${fix.lon_deg.toFixed(8)}°`],
+    ["Latitude", `${fix.lat_deg.toFixed(8)}°`],
+    ["Height", fix.height_m === null ? null : `${fix.height_m.toFixed(3)} m`],
+    ["Heading", `${fix.heading_deg.toFixed(2)}° ± ${sigma.heading_deg.toFixed(2)}°`],
+    ["± east, north", `${(100 * sigma.east_m).toFixed(1)} cm, ${(100 * sigma.north_m).toFixed(1)} cm`],
+    ["Grade", fix.localization_grade],
+    ["Notes", fix.notes.join("; ")],
+  ]));
+  const places = decoded.readings.filter((reading) => reading.match && reading.match.lon_deg !== null).map((reading) => ({
+    lon_deg: reading.match.lon_deg,
+    lat_deg: reading.match.lat_deg,
+    heading_deg: null,
+    label: reading.digits,
+  }));
+  drawMap($("#fix-map"), places, fix);
+}

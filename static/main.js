@@ -1,0 +1,53 @@
+// Views, and the key that every request needs.
+
+import { key } from "./api.js";
+import { startDecode } from "./decode.js";
+import { showMarkers, startMarkers } from "./markers.js";
+import { $, clearProblem, say } from "./page.js";
+import { startRegister } from "./register.js";
+
+const VIEWS = ["markers", "register", "decode"];
+
+function showView() {
+  const [asked, id] = location.hash.slice(1).split("/");
+  const name = VIEWS.includes(asked) ? asked : "markers";
+  for (const view of VIEWS) $(`#view-${view}`).hidden = view !== name;
+  for (const link of document.querySelectorAll(".bar nav a")) {
+    if (link.getAttribute("href") === `#${name}`) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  clearProblem();
+  if (!key.get()) {
+    say("Enter a key: the server printed an admin key at its first start, and `waymark key` makes more.");
+    $("#key").focus();
+  } else if (name === "markers") {
+    showMarkers(id);
+  }
+}
+
+function showKey() {
+  $("#forget").hidden = !key.get();
+  $("#key").value = key.get();
+}
+
+$("#key-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  key.set($("#key").value.trim());
+  say("");
+  showKey();
+  showView();
+});
+$("#forget").addEventListener("click", () => {
+  key.forget();
+  location.reload();
+});
+window.addEventListener("hashchange", () => {
+  if (key.get()) say("");
+  showView();
+});
+
+startMarkers();
+startRegister();
+startDecode();
+showKey();
+showView();

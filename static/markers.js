@@ -1,0 +1,144 @@
+// The list of markers, their plot, one marker's artwork, a ZIP of many.
+
+import * as api from "./api.js";
+import { drawMap } from "./map.js";
+import { $, attempt, facts, make, say } from "./page.js";
+
+const FORMATS = ["svg", "pdf", "dxf", "png"];
+const state = { markers: [], selected: new Set(), chosen: null };
+let previewUrl = null;
+
+export function startMarkers() {
+  $("#select-all").addEventListener("change", (event) => {
+    state.selected = new Set(event.target.checked ? state.markers.map((marker) => marker.id) : []);
+    drawRows();
+  });
+  $("#bundle-form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    saveBundle(event.currentTarget);
+  });
+  window.addEventListener("resize", () => drawPlaces());
+}
+
+export async function showMarkers(chosenId = null) {
+  await attempt(null, null, async () => {
+    const { items, more } = await api.listMarkers();
+    state.markers = items;
+    state.selected = new Set([...state.selected].filter((id) => items.some((marker) => marker.id === id)));
+    $("#no-markers").hidden = items.length > 0;
+    $("#map-caption").textContent = items.length
+      ? `${items.length}${more ? " and more" : ""} markers; ticks point in the direction of travel, amber is not for localization.`
+      : "";
+    const chosen = items.find((marker) => marker.id === (chosenId || state.chosen)) || null;
+    state.chosen = chosen && chosen.id;
+    drawRows();
+    drawPlaces();
+    if (chosen) await showDetail(chosen);
+  });
+}
+
+function drawRows() {
+  const rows = state.markers.map((marker) => {
+    const box = make("input", { type: "checkbox", "aria-label": `Select ${marker.code.digits}`, onchange: (event) => select(marker.id, event.target.checked) });
+    box.checked = state.selected.has(marker.id);
+    const open = make("button", { type: "button", class: "link", onclick: () => choose(marker) }, marker.code.digits);
+    const { lon_deg, lat_deg } = marker.position;
+    return make(
+      "tr",
+      { class: marker.id === state.chosen ? "chosen" : null },
+      make("td", {}, box),
+      make("td", { class: "digits" }, open),
+      make("td", {}, marker.code.scheme),
+      make("td", {}, marker.status),
+      make("td", { class: "number" }, lon_deg.toFixed(6)),
+      make("td", { class: "number" }, lat_deg.toFixed(6)),
+    );
+  });
+  $("#marker-rows").replaceChildren(...rows);
+  showCount();
+}
+
+function showCount() {
+  const count = state.selected.size;
+  $("#selected-count").textContent = `${count} selected`;
+  $("#bundle-form button").disabled = count === 0;
+  $("#select-all").checked = count > 0 && count === state.markers.length;
+}
+
+function select(id, on) {
+  if (on) state.selected.add(id);
+  else state.selected.delete(id);
+  showCount();
+}
+
+function drawPlaces() {
+  if ($("#view-markers").hidden) return;
+  drawMap($("#map"), state.markers.map((marker) => ({
+    lon_deg: marker.position.lon_deg,
+    lat_deg: marker.position.lat_deg,
+    heading_deg: marker.heading_deg,
+    label: `${marker.code.digits}, ${marker.status}`,
+    kind: kindOf(marker),
+    choose: () => choose(marker),
+  })));
+}
+
+function kindOf(marker) {
+  if (marker.id === state.chosen) return "chosen";
+  if (marker.status === "retired") return "retired";
+  return marker.position.localization_grade === "exact" ? "" : "approximate";
+}
+
+function choose(marker) {
+  state.chosen = marker.id;
+  drawRows();
+  drawPlaces();
+  attempt(null, null, () => showDetail(marker));
+}
+
+async function showDetail(marker) {
+  const { position, geometry, code } = marker;
+  const picture = make("img", { class: "preview", alt: `Artwork of the plate ${code.digits}` });
+  const proof = make("p", { class: "hint" });
+  const buttons = FORMATS.map((form) => {
+    const button = make("button", { type: "button", class: "quiet" }, form.toUpperCase());
+    button.addEventListener("click", () => attempt(button, null, async () => {
+      const artwork = await api.fetchArtwork(marker.id, form);
+      api.save(artwork.blob, `${code.digits}.${form}`);
+    }));
+    return button;
+  });
+  $("#detail").replaceChildren(
+    make("h2", { class: "digits" }, code.digits),
+    picture,
+    proof,
+    make("div", { class: "buttons", role: "group", "aria-label": "Download the artwork" }, ...buttons),
+    facts([
+      ["Scheme", code.scheme + (code.registry_number === null ? "" : `, number ${code.registry_number}`)],
+      ["Status", `${marker.status}, version ${marker.version}`],
+      ["Position", `${position.lon_deg.toFixed(8)}, ${position.lat_deg.toFixed(8)}`],
+      ["Height", position.height_m === null ? null : `${position.height_m.toFixed(3)} m`],
+      ["Accuracy", position.horizontal_rmse_m === null ? "not stated" : `${position.horizontal_rmse_m} m horizontal`],
+      ["Grade", position.localization_grade],
+      ["Heading", marker.heading_deg === null ? null : `${marker.heading_deg.toFixed(2)}°`],
+      ["Plate", `${geometry.n} × ${geometry.n} units, ${geometry.side_mm} mm square`],
+      ["Road", marker.road],
+      ["Id", marker.id],
+    ]),
+  );
+  const artwork = await api.fetchArtwork(marker.id, "svg");
+  if (previewUrl) URL.revokeObjectURL(previewUrl);
+  previewUrl = URL.createObjectURL(artwork.blob);
+  picture.src = previewUrl;
+  proof.textContent = `Read back by the decoder before it was sent: ${artwork.proof}`;
+}
+
+function saveBundle(form) {
+  const formats = [...form.querySelectorAll("[name=formats]:checked")].map((box) => box.value);
+  attempt(form.querySelector("button"), form, async () => {
+    say("Making the artwork …");
+    const bundle = await api.fetchBundle([...state.selected], formats);
+    api.save(bundle.blob, "waymark-artwork.zip");
+    say(`Artwork ready: ${bundle.proof}`);
+  }).then(showCount);
+}
