@@ -1,0 +1,122 @@
+"""The web UI as a visitor meets it: in a real browser against a real server with the real decoder."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from app.demo.drive import drive_over, list_plates, registered_code
+from tests.browser import Browser
+from tests.conftest import ADMIN_KEY, LiveServer
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def page(server: LiveServer, tmp_path: Path) -> Iterator[Browser]:
+    """The page with the admin's key entered."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        if os.environ.get("CI"):
+            pytest.fail("chromium is not installed")
+        pytest.skip("chromium is not installed")
+    with Browser(chromium, tmp_path / "profile") as browser:
+        browser.open(f"{server.url}/")
+        assert "Enter a key" in browser.until("document.querySelector('#status').textContent")
+        browser.fill("#key", ADMIN_KEY)
+        browser.click("#key-form button")
+        browser.until("sessionStorage.getItem('waymark-key')")
+        browser.complaints.clear()
+        yield browser
+
+
+def test_the_page_lets_nothing_in_from_elsewhere(server: LiveServer) -> None:
+    with server.client(None) as client:
+        answer = client.get("/")
+        assert answer.headers["content-type"].startswith("text/html")
+        names = re.findall(r'(?:src|href)="(/static/[^"]+)"', answer.text)
+        assert len(names) >= 3
+        for name in ["/", *names]:
+            answer = client.get(name)
+            assert answer.status_code == 200, name
+            policy = answer.headers["content-security-policy"]
+            assert "default-src 'none'" in policy
+            assert "unsafe" not in policy
+        for outside in ("/static/../pyproject.toml", "/static/none.js"):
+            assert client.get(outside).status_code == 404
+    for file in (ROOT / "static").iterdir():
+        text = file.read_text()
+        assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text), file.name
+        assert not re.search(r"<script(?![^>]*src=)|\son\w+=\"|\sstyle=\"|innerHTML|insertAdjacentHTML|eval\(", text), (
+            file.name
+        )
+
+
+def test_a_refused_plate_is_explained(page: Browser) -> None:
+    page.click("a[href='#register']")
+    page.fill("[name='position.lon_deg']", "22.304")
+    page.fill("[name='position.lat_deg']", "114.179")
+    page.click("#register-form button")
+    told = page.until("!document.querySelector('#problem').hidden && document.querySelector('#problem').innerText")
+    for part in ("lat_deg is 114.179", "position.lat_deg", "-90 to 90 deg", "swapped axes"):
+        assert part in told
+    assert page.run("document.querySelector('[aria-invalid]').name") == "position.lat_deg"
+
+
+def test_a_plate_is_registered_and_its_artwork_shown(page: Browser) -> None:
+    page.click("a[href='#register']")
+    page.fill("[name='position.lon_deg']", "12.345678")
+    page.fill("[name='position.lat_deg']", "45.678912")
+    page.fill("[name='geometry.gap_mm']", "6")
+    assert page.run("document.querySelector('#side').textContent") == "334 mm"
+    page.click("#register-form button")
+    detail = page.until(
+        "/Read back/.test(document.querySelector('#detail').innerText) && document.querySelector('#detail').innerText"
+    )
+    assert "345678678912" in detail
+    assert "334 mm square" in detail
+    assert page.until("document.querySelector('.preview').naturalWidth") > 100
+    assert page.run("document.querySelectorAll('#map .marker').length") >= 1
+    assert page.run("document.querySelector('#bundle-form button').disabled")
+    page.click("#marker-rows input")
+    assert not page.run("document.querySelector('#bundle-form button').disabled")
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_a_frame_is_decoded_and_the_vehicle_shown(page: Browser, server: LiveServer, tmp_path: Path) -> None:
+    plate = list_plates(np.random.default_rng(1))[0]
+    with server.client() as client:
+        client.timeout = httpx.Timeout(280)
+        marker = client.post("/v1/markers", json=plate.body).json()
+        frames = list(drive_over(plate.place, registered_code(marker), np.random.default_rng(1)))
+        frame = min(frames, key=lambda frame: abs(frame.rows - 60))
+        # the first frame waits for the decoder, which may have to be compiled
+        assert client.post("/v1/decodes", files={"file": ("frame.jpg", frame.jpeg)}).status_code == 201
+    (tmp_path / "frame.jpg").write_bytes(frame.jpeg)
+    page.click("a[href='#decode']")
+    page.click("#decode-form button")
+    assert "Choose a picture" in page.until("document.querySelector('#problem').innerText")
+    page.choose_file("#file", tmp_path / "frame.jpg")
+    page.run("document.querySelector('#file').dispatchEvent(new Event('change'))")
+    for part, value in (
+        ("coarse_position.lon_deg", frame.context["coarse_position"]["lon_deg"]),
+        ("coarse_position.lat_deg", frame.context["coarse_position"]["lat_deg"]),
+        ("coarse_position.accuracy_m", 10),
+        ("camera.horizontal_fov_deg", 70),
+    ):
+        page.fill(f"[name='{part}']", str(value))
+    page.click("#decode-form button")
+    assert page.until("document.querySelector('#annotated').naturalWidth") == 1920
+    assert marker["code"]["digits"] in page.run("document.querySelector('#readings').innerText")
+    assert page.run("document.querySelectorAll('.cells b').length") == 12
+    assert "exact" in page.run("document.querySelector('#fix').innerText")
+    assert page.run("document.querySelectorAll('#fix-map .vehicle').length") == 1
+    assert page.complaints == []
