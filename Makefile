@@ -14,6 +14,7 @@ $(VENV)/.runtime: requirements.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install --quiet --require-hashes -r requirements.txt
 	$(PIP) install --quiet --no-deps -e .
+	$(BIN)/waymark decode docs/images/frame.jpg > /dev/null  # compiles the decoder's kernels, once
 	@touch $@
 
 $(VENV)/.dev: requirements-dev.txt $(VENV)/.runtime

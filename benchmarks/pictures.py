@@ -1,0 +1,78 @@
+"""``python -m benchmarks.pictures``: make the README's pictures in docs/images. Needs Chromium for the page's."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+
+from app.demo.drive import drive_over, list_plates, registered_code
+from app.demo.server import LocalServer
+from tests.browser import Browser
+
+IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
+_SEED = 3
+_FRAME_ROWS = 75.0
+_CHOSEN = 2  # the plate with the paper's digits
+
+
+def main() -> None:
+    """Make them all."""
+    argparse.ArgumentParser(prog="python -m benchmarks.pictures", description=__doc__).parse_args()
+    IMAGES.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder, LocalServer(Path(folder)) as server, server.client() as client:
+        plates = list_plates(np.random.default_rng(_SEED))
+        markers = [client.post("/v1/markers", json=plate.body).raise_for_status().json() for plate in plates]
+        _write_plate(client, markers[_CHOSEN]["id"])
+        code = registered_code(markers[0])
+        frames = list(drive_over(plates[0].place, code, np.random.default_rng(_SEED)))
+        frame = min(frames, key=lambda frame: abs(frame.rows - _FRAME_ROWS))
+        small = _recoded(frame.jpeg, 1.0, 62)
+        (IMAGES / "frame.jpg").write_bytes(small)
+        (IMAGES / "frame.json").write_text(json.dumps(frame.context, indent=2) + "\n")
+        parts = {"file": ("frame.jpg", small, "image/jpeg"), "context": ("c", json.dumps(frame.context).encode())}
+        decode = client.post("/v1/decodes", files=parts).raise_for_status().json()
+        print(decode["summary"]["text"], markers[0]["position"], markers[0]["heading_deg"])
+        annotated = client.get(decode["links"]["annotated"]).raise_for_status().content
+        (IMAGES / "drive.jpg").write_bytes(_recoded(annotated, 0.5, 85))
+        _write_page(server, Path(folder))
+
+
+def _recoded(jpeg: bytes, scale: float, quality: int) -> bytes:
+    pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    smaller = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", smaller, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+
+
+def _write_plate(client: httpx.Client, marker_id: str) -> None:
+    png = client.get(f"/v1/markers/{marker_id}/artwork.png", params={"resolution_dpi": 72}).raise_for_status().content
+    pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    scale = 640 / pixels.shape[0]
+    smaller = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(IMAGES / "plate.png"), smaller)
+
+
+def _write_page(server: LocalServer, folder: Path) -> None:
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        print("there is no chromium here: the picture of the page stays as it is")
+        return
+    with Browser(chromium, folder / "profile", (1200, 860)) as page:
+        page.open(f"{server.url}/")
+        page.fill("#key", server.key)
+        page.click("#key-form button")
+        page.until("document.querySelectorAll('#marker-rows button').length")
+        page.run(f"document.querySelectorAll('#marker-rows button')[{_CHOSEN}].click()")
+        page.until("document.querySelector('.preview') && document.querySelector('.preview').naturalWidth > 0")
+        page.until("/Read back/.test(document.querySelector('#detail').innerText)")
+        (IMAGES / "page.png").write_bytes(page.screenshot())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""``python -m benchmarks.readme FILE``: put the tables that the benchmarks printed into the README.
+
+A section ``### NAME`` of the file replaces what stands between ``<!-- bench:NAME -->`` and ``<!-- /bench -->``; blocks
+without a section stay as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+_BLOCK = re.compile(r"(<!-- bench:(?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
+
+
+def read_sections(text: str) -> dict[str, str]:
+    """Sections of a benchmark's output by name."""
+    parts = re.split(r"^### ([\w-]+)\n", text, flags=re.MULTILINE)
+    return {name: _without_lists(body) for name, body in zip(parts[1::2], parts[2::2], strict=True)}
+
+
+def fill_blocks(readme: str, sections: dict[str, str]) -> str:
+    """The README with its blocks filled."""
+
+    def fill(block: re.Match[str]) -> str:
+        body = sections.get(block["name"])
+        return block[0] if body is None else f"{block[1]}\n{body}\n\n{block[4]}"
+
+    return _BLOCK.sub(fill, readme)
+
+
+def _without_lists(body: str) -> str:
+    """The section up to the lists of single frames that may follow the last table."""
+    return re.split(r"^(?:Wrong digits:|Not decoded at )", body, flags=re.MULTILINE)[0].strip()
+
+
+def main() -> None:
+    """Fill the README."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.readme", description=__doc__)
+    parser.add_argument("file", type=Path, nargs="+", help="output of the benchmarks")
+    sections: dict[str, str] = {}
+    for path in parser.parse_args().file:
+        sections |= read_sections(path.read_text())
+    text = README.read_text()
+    filled = fill_blocks(text, sections)
+    README.write_text(filled)
+    wanted = [block["name"] for block in _BLOCK.finditer(text)]
+    print(f"filled: {', '.join(name for name in wanted if name in sections) or 'nothing'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""The README's tour is run as it stands, against a real server, and must print what the README says it prints."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.readme import fill_blocks, read_sections
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+TOUR = README.split("## Five minutes")[1].split("\n## ")[0]
+BLOCKS = re.findall(r"^```sh\n(.*?)^```\n+(?:^```text\n(.*?)^```)", TOUR, re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"(?<![\w.])-?\d+\.\d+")
+END = "=== end of block ==="
+
+
+def require(name: str) -> None:
+    """Skip without a program; on CI fail."""
+    if shutil.which(name) is None:
+        if os.environ.get("CI"):
+            pytest.fail(f"{name} is not installed")
+        pytest.skip(f"{name} is not installed")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.slow
+def test_the_tour_prints_what_it_says(tmp_path: Path) -> None:
+    require("curl")
+    require("bash")
+    assert len(BLOCKS) == len(re.findall(r"^```sh$", README, re.MULTILINE)) >= 6
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "waymark").write_text(f'#!/bin/sh\nexec {sys.executable} -c "from app.cli import main; main()" "$@"\n')
+    (programs / "waymark").chmod(0o755)
+    script = f"\necho '{END}'\n".join(commands for commands, _ in BLOCKS)
+    script = script.replace("WAYMARK_PORT=8000", f"WAYMARK_PORT={free_port()}")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")} | {
+        "PATH": f"{programs}:{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+        "no_proxy": "127.0.0.1",
+    }
+    stop = "trap 'kill $(jobs -p) 2> /dev/null || true; wait' EXIT\n"
+    done = subprocess.run(
+        ["bash", "-c", f"set -euo pipefail\n{stop}{script}"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=280,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    printed = done.stdout.split(f"{END}\n")
+    for (commands, expected), got in zip(BLOCKS, printed, strict=True):
+        assert_same(got.strip(), expected.strip(), commands)
+
+
+def assert_same(got: str, expected: str, commands: str) -> None:
+    """Texts are equal but for the last digits of measured numbers."""
+    assert NUMBER.sub("#", got) == NUMBER.sub("#", expected), commands
+    for mine, told in zip(NUMBER.findall(got), NUMBER.findall(expected), strict=True):
+        assert float(mine) == pytest.approx(float(told), abs=0.02), f"{mine} in place of {told}: {commands}"
+
+
+@pytest.mark.parametrize("name", re.findall(r"python -m ([\w.]+)", README))
+def test_documented_modules_can_be_run(name: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", name, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "usage" in done.stdout
+
+
+def test_pictures_are_small() -> None:
+    pictures = [*(ROOT / "docs" / "images").glob("*.jpg"), *(ROOT / "docs" / "images").glob("*.png")]
+    assert len(pictures) >= 4
+    for picture in pictures:
+        assert picture.stat().st_size < 300_000, picture.name
+        assert picture.name in README, f"{picture.name} is not shown"
+
+
+def test_benchmark_blocks_are_filled_by_name_and_nothing_else_changes() -> None:
+    readme = "a\n<!-- bench:one -->\nold\n<!-- /bench -->\nb\n<!-- bench:two -->\nkept\n<!-- /bench -->\n"
+    output = "Seeds 1\n\n### one\n\nnote\n\n| x |\n|---|\n| 1 |\n\nWrong digits:\n- frame\n\n### three\n\n| y |\n"
+    filled = fill_blocks(readme, read_sections(output))
+    assert filled == readme.replace("\nold\n", "\n\nnote\n\n| x |\n|---|\n| 1 |\n\n")
+    assert fill_blocks(filled, read_sections(output)) == filled
+
+
+def test_every_benchmark_has_its_block() -> None:
+    from benchmarks.plates.__main__ import ITEMS
+
+    assert re.findall(r"<!-- bench:([\w-]+) -->", README) == ["demo", "run", *ITEMS, "bundle", "http"]
