@@ -31,7 +31,9 @@ EVEN_SPREAD, EVEN_WEAR = 0.1, 0.1  # the same two of the light that has been eve
 FLOOR = 0.05  # of the light level
 SCATTER_PRIOR = (8.0, 0.6)  # weight in units, expected scatter against the model
 TEMPER = 0.35  # share of a cost difference that is believed: the model is not the road
+USUAL_BLUR_PX = 1.0
 FULL_TRUST_PX = 1.6  # size of a unit in the image from which it is not believed less
+STRAY, STRAY_TRUST = 0.23, 0.97  # share of the contrast from which a unit is no sure reading, worn or stained
 LEAST_CODEWORD = 0.05  # probability of the symbols, as read, from which a check that holds is no chance
 LETTERS_OUT_OF_REACH = 12.0  # cost of reading letters as digits up to which a plate may be a decimal one
 _DARK_SHARE = 0.12
@@ -55,6 +57,8 @@ class UnitEvidence:
         Between light and dark units, the light level being about 1.
     disputed : ndarray of bool, shape (cells,)
         Where the two classifiers differ.
+    stray : ndarray, shape (cells,)
+        Distance of each cell's worst unit from the level that it was given, as a share of the contrast.
     scatter : float
         Mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model.
     span : float
@@ -65,6 +69,7 @@ class UnitEvidence:
     best: npt.NDArray[np.intp]
     dark: npt.NDArray[np.bool_]
     disputed: npt.NDArray[np.bool_]
+    stray: Array
     weight: Array
     residual: Array
     contrast: float
@@ -144,14 +149,25 @@ def weigh_units(fit: PlateFit) -> UnitEvidence | None:
     # how well this plate follows the model scales what a difference means
     scatter = float(residual @ weight @ residual)
     weight /= (scatter + SCATTER_PRIOR[0] * SCATTER_PRIOR[1]) / (len(residual) + SCATTER_PRIOR[0])
-    weight *= min(1.0, (fit.unit_px / FULL_TRUST_PX) ** 4)
+    resolved_px = fit.unit_px / max(fit.blur_px, USUAL_BLUR_PX) * USUAL_BLUR_PX
+    weight *= min(1.0, (resolved_px / FULL_TRUST_PX) ** 4) * min(1.0, (2 * USUAL_BLUR_PX / fit.blur_px) ** 2)
     costs = _cell_costs(weight, residual, dark, contrast, _PATTERNS)
     best = np.argmin(costs, axis=1)
     disputed = (first != dark).reshape(-1, 4).any(axis=1)
+    stray = _level_distance(even, dark, contrast).reshape(-1, 4).max(axis=1)
     return UnitEvidence(
-        costs - costs.min(axis=1, keepdims=True), best, dark > 0.5, disputed, weight, residual, contrast,
+        costs - costs.min(axis=1, keepdims=True), best, dark > 0.5, disputed, stray, weight, residual, contrast,
         scatter / len(residual), light_level - dark_level,
     )  # fmt: skip
+
+
+def _level_distance(even: Array, dark: Array, contrast: float) -> Array:
+    """How far units are from the middle of their level towards the other one, as a share of the contrast."""
+    distance = np.zeros(len(even))
+    for level, towards in ((dark < 0.5, -1.0), (dark > 0.5, 1.0)):
+        if level.any():
+            distance[level] = towards * (even[level] - np.median(even[level])) / contrast
+    return distance
 
 
 def _even_light(values: Array, covariance: Array, light_level: float, n: int) -> tuple[Array, Array]:
@@ -265,7 +281,9 @@ def pattern_cost(evidence: UnitEvidence, code: PlateCode) -> float:
     return float(delta @ evidence.weight @ (2 * evidence.residual + delta))
 
 
-def decode_symbols(evidence: UnitEvidence, n: int, codebook: Sequence[PlateCode], sure: float) -> DecodedSymbols:
+def decode_symbols(
+    evidence: UnitEvidence, n: int, codebook: Sequence[PlateCode], sure: float, *, clean: bool = True
+) -> DecodedSymbols:
     """Most likely code: read as it is, corrected, or taken from the codebook, in this order.
 
     Parameters
@@ -277,14 +295,23 @@ def decode_symbols(evidence: UnitEvidence, n: int, codebook: Sequence[PlateCode]
         Codes of the plates that are registered near by.
     sure : float
         Least probability at which digits are given out.
+    clean : bool
+        The image looks so much like a plate that wrong cells may be corrected without a registry.
     """
-    read = _decode_alone(evidence, n, sure)
+    read = _decode_alone(evidence, n, sure, clean=clean)
     known = [code for code in codebook if code.n == n]
-    if read.code is not None:
-        same = next((code for code in known if code.digits == read.code.digits), None)
-        return replace(read, code=same or read.code, confirmed=same is not None)
-    chosen = _decode_with_codebook(evidence, known, sure) if known else None
-    return chosen or read
+    if not known:
+        return read
+    same = next((code for code in known if read.code is not None and code.digits == read.code.digits), None)
+    if same is not None:
+        return replace(read, code=same, confirmed=True)
+    chosen = _decode_with_codebook(evidence, known, sure)
+    if chosen is not None:
+        return chosen
+    near = min(known, key=lambda code: pattern_cost(evidence, code))
+    if read.code is not None and sum(a != b for a, b in zip(near.digits, read.code.digits, strict=True)) <= n // 2:
+        return replace(read, code=None, reason=f"close to the registered {near.digits}, but not the same")
+    return read
 
 
 def _softmax_confidence(costs: Array, chosen: Sequence[int]) -> Array:
@@ -293,23 +320,24 @@ def _softmax_confidence(costs: Array, chosen: Sequence[int]) -> Array:
     return share
 
 
-def _decode_alone(evidence: UnitEvidence, n: int, sure: float) -> DecodedSymbols:
+def _decode_alone(evidence: UnitEvidence, n: int, sure: float, *, clean: bool) -> DecodedSymbols:
     costs = evidence.cell_costs
     any_symbol = tuple(int(s) for s in evidence.best)
-    cells = _softmax_confidence(costs, any_symbol)
+    trust = np.where(evidence.stray > STRAY, STRAY_TRUST, 1.0)
+    cells = _softmax_confidence(costs, any_symbol) * trust
     if is_codeword(any_symbol, PlateScheme.ID, n) and float(np.prod(cells)) >= LEAST_CODEWORD:
         code = PlateCode.from_symbols(any_symbol, PlateScheme.ID, n)
         return DecodedSymbols(code, _checked(float(np.prod(cells)), sure), _floats(cells))
     decimal = np.argmin(costs[:, :10], axis=1)
     if float(costs[np.arange(len(costs)), decimal].sum()) < LETTERS_OUT_OF_REACH:
-        cells = _softmax_confidence(costs[:, :10], decimal)
+        cells = _softmax_confidence(costs[:, :10], decimal) * trust
         confidence = float(np.prod(cells))
         code = _decimal_code(tuple(int(s) for s in decimal), n)
         if code is not None and confidence >= sure:
             return DecodedSymbols(code, confidence, _floats(cells))
         doubtful = ", ".join(str(i) for i in np.flatnonzero(cells < 1 - (1 - sure) / len(cells)))
         return DecodedSymbols(None, confidence, _floats(cells), reason=f"cells in doubt: {doubtful}")
-    corrected = _correct(evidence, n, any_symbol, cells)
+    corrected = _correct(n, any_symbol, cells) if clean else None
     if corrected is not None:
         return corrected
     return DecodedSymbols(None, float(np.prod(cells)), _floats(cells), reason="no scheme has these symbols")
@@ -332,7 +360,7 @@ def _checked(confidence: float, sure: float) -> float:
     return max(confidence, min(1 - (1 - confidence) / 65536 * 10, 1.0), sure)
 
 
-def _correct(evidence: UnitEvidence, n: int, symbols: tuple[int, ...], cells: Array) -> DecodedSymbols | None:
+def _correct(n: int, symbols: tuple[int, ...], cells: Array) -> DecodedSymbols | None:
     """Reed-Solomon on the symbols as read, then with the doubtful cells erased.
 
     Any word is within two symbols of a codeword with probability 0.23, so a correction counts only when letters remain
@@ -349,7 +377,7 @@ def _correct(evidence: UnitEvidence, n: int, symbols: tuple[int, ...], cells: Ar
         kept = [i for i in range(len(symbols)) if i not in changed and i not in erasures]
         letters = sum(symbols[i] > 9 and cells[i] > 0.999 for i in kept)
         unsure = sum(cells[i] < 0.99 for i in kept)
-        if letters < (1 if spent < 4 else 2) or unsure > 0:
+        if letters < (1 if spent < 4 else 3) or unsure > 0:
             continue
         confidence = float(np.prod(cells[kept])) * (0.9999 if spent < 4 else 0.999)
         shown = cells.copy()

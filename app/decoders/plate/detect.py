@@ -8,7 +8,7 @@ has them; size and shape of the blobs must agree with the affine map that their 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numba as nb
@@ -23,6 +23,7 @@ MAX_NEAR = 10
 # a red marker beside brown soil needs a high threshold to stand alone, a small one far away a low one to be seen at all
 VIVID_LEVELS = ((6, 2), (10, 5), (20, 11))
 FAINT_LEVELS = ((6, 0), (12, 0), (24, 0))
+FAINTEST_LEVELS = ((3, 0), (5, 0), (9, 0))
 _LOG = np.rint(128 * np.log(np.arange(256) + 12.0)).astype(np.int16)
 NOISE_FACTOR = 3.5
 LEAST_INTERIOR = 2.5
@@ -48,6 +49,8 @@ class MarkerSignal:
         What stands above the roughness around a block.
     levels : tuple of (int, int)
         Thresholds to look at: strength, and share of the brightness in 32nds.
+    scale : int
+        Pixels of the frame that make one of the signal, along a side.
     """
 
     opponent: npt.NDArray[np.int16]
@@ -55,6 +58,7 @@ class MarkerSignal:
     peak: npt.NDArray[np.int16]
     threshold: npt.NDArray[np.int16]
     levels: tuple[tuple[int, int], ...]
+    scale: int = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +118,12 @@ def faint_signal(small: npt.NDArray[np.uint8]) -> MarkerSignal:
     return _signal(opponent, cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), FAINT_LEVELS)
 
 
+def faintest_signal(small: npt.NDArray[np.uint8]) -> MarkerSignal:
+    """The same at a quarter of the frame's resolution, where noise is less: large plates in thick haze."""
+    tiny = cv2.resize(small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    return replace(faint_signal(tiny), levels=FAINTEST_LEVELS, scale=4)
+
+
 def _blocks(shape: tuple[int, ...]) -> tuple[int, int]:
     return (shape[0] + BLOCK - 1) // BLOCK, (shape[1] + BLOCK - 1) // BLOCK
 
@@ -128,6 +138,11 @@ def _signal(
     return MarkerSignal(opponent, luma, peak, _thresholds(rough), levels)
 
 
+def _full_px(points: npt.NDArray[np.float64], scale: int) -> npt.NDArray[np.float64]:
+    """Pixels of the frame from those of a signal; pixel centres are at integers in both."""
+    return scale * points + (scale - 1) / 2
+
+
 def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     """Marker quadruples of a frame, best first, overlapping ones suppressed."""
     blobs, count = np.empty((MAX_BLOBS, 13)), 0
@@ -137,7 +152,7 @@ def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     order = np.argsort(-quads[:found, 8], kind="stable")
     kept = _suppress(signal.opponent, signal.luma, quads, order, MAX_CANDIDATES)
     found_quads = [
-        MarkerQuad(2 * row[:8].reshape(4, 2) + 0.5, int(row[9]), float(row[8]), float(row[11]), float(row[10]))
+        MarkerQuad(_full_px(row[:8].reshape(4, 2), signal.scale), int(row[9]), float(row[8]), float(row[11]), float(row[10]))
         for row in (quads[k] for k in kept)
     ]
     return sorted((q for q in found_quads if q.rank > 0), key=lambda q: -q.rank)
@@ -180,7 +195,7 @@ def _signal_at(
     signal: MarkerSignal, image_from_plate: npt.NDArray[np.float64], points: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
     projected = points @ image_from_plate[:, :2].T + image_from_plate[:, 2]
-    half = (projected[:, :2] / projected[:, 2:] - 0.5) / 2
+    half = (projected[:, :2] / projected[:, 2:] - (signal.scale - 1) / 2) / signal.scale
     height, width = signal.opponent.shape
     columns = np.clip(np.rint(half[:, 0]), 0, width - 1).astype(int)
     rows = np.clip(np.rint(half[:, 1]), 0, height - 1).astype(int)

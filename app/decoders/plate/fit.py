@@ -27,10 +27,11 @@ _EXTRA = 13  # triangle, its other half, three squares, four of the gap, four of
 BLUR_PRIOR = (math.log(0.7), 0.35)  # log of the lens blur [px], and its spread
 MOTION_PRIOR = (0.03, 0.06)  # length of the motion blur [plate sides], and its spread
 UPRIGHT_SINE = 0.35  # of the angle between line of sight and plate columns up to which blur is along the plate's axes
-HOPELESS = (0.6, 0.7)  # share of the pixels' variance that one and two steps explain on anything that is a plate
+HOPELESS = (0.3, 0.45)  # share of the pixels' variance that one and two steps explain on anything that is a plate
 MAX_STEPS = 7
+FIRST_BLUR = 0.2  # units
 LARGE_UNIT_PX = 5.0  # a unit of twice this size is averaged down
-LOST_PX = 1.5  # a plate's corners move less after four steps
+LOST_PX = 2.5  # a plate's corners move less after four steps
 REST_PX, NEAR_PX = 0.08, 0.4  # the corners rest, or are near rest, when they move less in one step
 COARSE_PIXELS, FINE_PIXELS = 4.5, 9.0  # pixels looked at for each unknown, where the image has more
 _LEVELS = np.linspace(0.0, 1.0, 256)
@@ -200,7 +201,7 @@ def _profiles(x, s, motion, edges, table, out, span):  # type: ignore[no-untyped
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _accumulate(  # type: ignore[no-untyped-def]
-    image, table, weight_table, normal_table, box, stride, frame, pose, edges, slot, coef, nodes, node_weights, direction, margin,
+    image, table, weight_table, normal_table, box, stride, frame, pose, edges, slot, coef, nodes, node_weights, direction, by_spread, margin,
     normal, cross, inner, rhs, rhs_pose,
 ):  # fmt: skip
     """Add every pixel's row to the normal equations of (shape values, pose); returns sums for the residual.
@@ -223,6 +224,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
     sum_t = 0.0
     sum_tt = 0.0
     count = 0
+    inside = 0
     low = edges[0, 0]
     leg = edges[1, 1] - low
     sigma = math.exp(pose[8])
@@ -383,8 +385,8 @@ def _accumulate(  # type: ignore[no-untyped-def]
             both = -(du * u0 + dv * v0)
             jac[6] = both * px
             jac[7] = both * py
-            jac[8] = isu * s_u + isv * s_v
-            jac[9] = inode if many else im
+            jac[8] = isu * s_u + isv * s_v + inode * by_spread[0]
+            jac[9] = inode * by_spread[1] if many else im
             level = image[y, x]
             target = table[level]
             wt = weight_table[level]
@@ -393,11 +395,15 @@ def _accumulate(  # type: ignore[no-untyped-def]
                 j = index[e]
                 model += coef[j] * value[j]
             res = target - model
-            sum_r += wt * res * res
-            sum_w += wt
-            sum_t += wt * target
-            sum_tt += wt * target * target
             count += 1
+            if 0.0 <= u0 <= 1.0 and 0.0 <= v0 <= 1.0:
+                inside += 1
+                sum_r += wt * res * res
+                sum_w += wt
+                sum_t += wt * target
+                sum_tt += wt * target * target
+            else:  # the road around may hold anything
+                wt *= 0.3
             for e in range(entries):
                 j = index[e]
                 b = wt * value[j]
@@ -415,7 +421,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
             for e in range(entries):
                 value[index[e]] = 0.0
     flat = sum_tt - sum_t * sum_t / max(sum_w, 1e-300)
-    return sum_r, flat, count
+    return sum_r / max(inside, 1), flat / max(inside, 1), count
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -456,7 +462,7 @@ def fit_plate(
     levels, weights = (_LEVELS, np.ones(256)) if linear else (LINEAR_LIGHT, WEIGHT)
     try:
         start = _homography((points - centre) / frame[2], marker_centroids(geometry))
-        pose = np.concatenate([start, [BLUR_PRIOR[0], MOTION_PRIOR[0]]])
+        pose = np.concatenate([start, [math.log(_first_blur(points, geometry.n)), MOTION_PRIOR[0]]])
         coef = _sample_shapes(luma, levels, pose, frame, edges, slot)
         normal = np.empty((len(coef) + POSE, len(coef) + POSE))
         ok, variance, explained, pixels = _gauss_newton(
@@ -471,6 +477,13 @@ def fit_plate(
     frame[2] *= scale
     pose[8] += math.log(scale)
     return _result(frame, pose, slot, coef, covariance, math.sqrt(variance), explained, pixels)
+
+
+def _first_blur(points_px: Array, n: int) -> float:
+    """Blur to begin with: wide enough that an edge is felt from half a unit away. [px]"""
+    right, down = points_px[1] - points_px[0], points_px[3] - points_px[0]
+    unit = math.sqrt(max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0)) / (0.75 * n)
+    return float(np.clip(FIRST_BLUR * unit, 0.7, 2.5))
 
 
 def _patch(image: npt.NDArray[np.uint8], centroids_px: Array, n: int) -> tuple[npt.NDArray[np.uint8], Array, int]:
@@ -587,7 +600,7 @@ def _corners(pose, frame, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _blur_nodes(pose, frame):  # type: ignore[no-untyped-def]
+def _blur_nodes(pose, frame, most):  # type: ignore[no-untyped-def]
     """Quadrature for a blur that is not along the plate's axes: nodes, weights, direction in the plate.
 
     A round blur in the image is an ellipse in the plate, long along the line of sight; so is the motion's. An upright
@@ -606,11 +619,12 @@ def _blur_nodes(pose, frame):  # type: ignore[no-untyped-def]
     angle = 0.5 * math.atan2(2.0 * b, a - d)
     direction = np.array([math.cos(angle), math.sin(angle)])
     if long2 < 1.69 * short2 or (abs(direction[0]) < UPRIGHT_SINE):
-        return np.zeros(1), np.ones(1), np.array([0.0, 1.0])
+        return np.zeros(1), np.ones(1), np.array([0.0, 1.0]), np.zeros(2)
     sigma = math.exp(pose[8])
-    spread = math.sqrt((long2 - short2) * sigma * sigma + pose[9] * pose[9] / 12.0)
-    half = int(math.ceil(1.6 * spread / (math.sqrt(short2) * sigma)))
-    half = min(max(half, 1), 5)
+    motion = max(pose[9], 0.02)
+    spread = math.sqrt((long2 - short2) * sigma * sigma + motion * motion / 12.0)
+    half = int(math.ceil(1.2 * spread / (math.sqrt(short2) * sigma)))
+    half = min(max(half, 1), most)
     nodes = np.empty(2 * half + 1)
     weights = np.empty(2 * half + 1)
     total = 0.0
@@ -622,11 +636,12 @@ def _blur_nodes(pose, frame):  # type: ignore[no-untyped-def]
     second = 0.0
     for k in range(2 * half + 1):
         second += weights[k] * nodes[k] * nodes[k]
-    return nodes * (spread / math.sqrt(second)), weights, direction
+    by_spread = np.array([1.0 - motion * motion / (12.0 * spread * spread), motion / (12.0 * spread * spread)])
+    return nodes * (spread / math.sqrt(second)), weights, direction, by_spread
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _hold_open_ends(normal, rhs, pose, coef, variance, rotated):  # type: ignore[no-untyped-def]
+def _hold_open_ends(normal, rhs, pose, coef, variance):  # type: ignore[no-untyped-def]
     """Mirror the normal matrix and hold what the pixels leave open: values near their mean, blur near the usual."""
     size = normal.shape[0]
     shapes = coef.shape[0]
@@ -647,8 +662,6 @@ def _hold_open_ends(normal, rhs, pose, coef, variance, rotated):  # type: ignore
     normal[shapes + 8, shapes + 8] += hold
     rhs[shapes + 8] += hold * (BLUR_PRIOR[0] - pose[8])
     hold = variance / (MOTION_PRIOR[1] * MOTION_PRIOR[1])
-    if rotated:
-        hold *= 1e6
     normal[shapes + 9, shapes + 9] += hold
     rhs[shapes + 9] += hold * (MOTION_PRIOR[0] - pose[9])
 
@@ -698,24 +711,24 @@ def _gauss_newton(luma, levels, weights, table, frame, pose, edges, slot, coef, 
         stride[0] = max(int(math.sqrt(both) * lean + 0.5), 1)
         stride[1] = max(int(both / stride[0] + 0.5), 1)
         stride[0] = max(int(both / stride[1] + 0.5), 1)
-        nodes, node_weights, direction = _blur_nodes(pose, frame)
+        nodes, node_weights, direction, by_spread = _blur_nodes(pose, frame, 2 if coarse else 4)
         normal[:] = 0.0
         cross[:] = 0.0
         inner[:] = 0.0
         rhs[:] = 0.0
         total, flat, pixels = _accumulate(
             luma, levels, weights, table, box, stride, frame, pose, edges, slot, coef,
-            nodes, node_weights, direction, margin, normal, cross, inner, rhs[:shapes], rhs[shapes:],
+            nodes, node_weights, direction, by_spread, margin, normal, cross, inner, rhs[:shapes], rhs[shapes:],
         )  # fmt: skip
         normal[shapes:, :shapes] = cross.T
         normal[shapes:, shapes:] = inner
         if pixels < shapes:
             return False, variance, explained, pixels
-        variance = max(total / pixels, (1.0 / 255) ** 2)
+        variance = max(total, (1.0 / 255) ** 2)
         explained = 1.0 - total / max(flat, 1e-12)
         if (k == 1 and explained < HOPELESS[0]) or (k == 2 and explained < HOPELESS[1]):
             return False, variance, explained, pixels
-        _hold_open_ends(normal, rhs, pose, coef, variance, nodes.shape[0] > 1)
+        _hold_open_ends(normal, rhs, pose, coef, variance)
         solution = np.linalg.solve(normal, rhs)
         coef[:] = solution[:shapes]
         for i in range(10):

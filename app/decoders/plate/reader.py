@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from app.decoders.plate.detect import (
     MarkerSignal,
     detect_marker_quads,
     faint_signal,
+    faintest_signal,
     half_frame,
     marker_margins,
     vivid_signal,
@@ -33,10 +34,12 @@ DECODER_VERSION = "plate/1"
 DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
 SURE = 0.999  # least probability at which digits are given out
 MOST_FITS = 3  # candidates that are fitted in one pass
-LEAST_EXPLAINED = 0.75  # share of the pixels' variance, below which nothing is a plate
-LEAST_EXPLAINED_ALONE = 0.85  # the same for digits that no registry confirms
+LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
+LEAST_EXPLAINED_ALONE = 0.83
+CLEAN_EXPLAINED = 0.93  # from which a word may be corrected without a registry  # the same for digits that no registry confirms
 STRONG_RANK = 2.0  # of a candidate that deserves a second geometry when the first explains nothing
 LEAST_MARGIN = 1.0  # colour margin of a marker that is there
+LEAST_MARGIN_ALONE, LEAST_MARGIN_SHARE = 2.2, 0.25  # the same without a registry, and against the median marker
 LEAST_SIDE_PX = 24
 Frame = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.float64]
@@ -44,12 +47,24 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """What is the same for all candidates of a frame."""
+    """What is the same for all candidates of a frame, and the good fits so far."""
 
     image: Frame
     camera: Camera | None
     codebook: Sequence[PlateCode]
     geometries: Sequence[PlateGeometry]
+    fits: list[tuple[PlateGeometry, PlateFit]] = field(default_factory=list)
+
+    def fit(self, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
+        """Fit of a candidate; a good one of the same place from an earlier pass serves again."""
+        centre = quad.centroids_px.mean(axis=0)
+        for known, fit in self.fits:
+            if known == geometry and np.abs(fit.corners_px.mean(axis=0) - centre).max() < 0.1 * fit.unit_px * geometry.n:
+                return fit
+        fit = fit_plate(self.image, quad.centroids_px, geometry)
+        if fit is not None and fit.explained > CLEAN_EXPLAINED:
+            self.fits.append((geometry, fit))
+        return fit
 
 
 def decode_plates(
@@ -96,7 +111,7 @@ def _decode_colour(task: _Task) -> list[PlateReading]:
     image = task.image
     small = half_frame(image)
     readings: list[PlateReading] = []
-    for signal_of in (vivid_signal, faint_signal):
+    for signal_of in (vivid_signal, faint_signal, faintest_signal):
         signal = signal_of(small)
         for quad in detect_marker_quads(signal)[:MOST_FITS]:
             if not any(_covers(reading, quad) for reading in readings):
@@ -184,7 +199,7 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
     """The candidate's best reading under the geometries that fit it; empty when it is no plate."""
     best: PlateReading | None = None
     for geometry in _likely_geometries(quad, task.geometries):
-        fit = fit_plate(task.image, quad.centroids_px, geometry)
+        fit = task.fit(quad, geometry)
         if fit is None or fit.explained < LEAST_EXPLAINED:
             if quad.rank < STRONG_RANK:
                 break
@@ -193,11 +208,14 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
         if np.sort(margins)[1] < LEAST_MARGIN:
             continue
         missing = _missing_parts(task.image.shape, quad, fit, geometry, margins)
+        missing = missing or _pale_marker(margins)
         reading = _judge(task, fit, geometry, missing, weakest_marker=float(margins.min()))
         if reading.code is not None:
             return [reading]
         if best is None or reading.confidence > best.confidence:
             best = reading
+        if fit.explained > CLEAN_EXPLAINED:
+            break
     return [best] if best else []
 
 
@@ -222,7 +240,7 @@ def _judge(
     if evidence is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
         return replace(reading, outcome=outcome, reason=reason)
-    decoded = decode_symbols(evidence, geometry.n, task.codebook, SURE)
+    decoded = decode_symbols(evidence, geometry.n, task.codebook, SURE, clean=fit.explained > CLEAN_EXPLAINED)
     reading = replace(
         reading,
         confidence=decoded.confidence,
@@ -266,6 +284,15 @@ def _missing_parts(
     if (moved > 0.15 * np.ptp(fit.corners_px, axis=0) + 1.5).any():
         return PlateOutcome.VERTICES_BEYOND_MARKERS, "the grid's corners are not where the markers are"
     return None
+
+
+def _pale_marker(margins: Array) -> tuple[PlateOutcome, str] | None:
+    """A marker that may be one, but too pale to be believed without a registry: a look-alike or a worn plate."""
+    if margins.min() >= max(LEAST_MARGIN_ALONE, LEAST_MARGIN_SHARE * float(np.median(margins))):
+        return None
+    if int(margins.argmin()) == 0:
+        return PlateOutcome.RED_MARKER_MISSING, "what stands for the red triangle is hardly red"
+    return PlateOutcome.GREEN_MARKER_MISSING, "what stands for a green square is hardly green"
 
 
 def _out_of_view(shape: tuple[int, ...], fit: PlateFit) -> tuple[PlateOutcome, str] | None:
