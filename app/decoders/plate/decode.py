@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.fit import PlateFit
+from app.decoders.plate.linear import invert
 from app.markers.plate import PlateCode, PlateScheme, correct_symbols, is_codeword, unit_index
 
 Array = npt.NDArray[np.float64]
@@ -142,7 +143,7 @@ def weigh_units(fit: PlateFit) -> UnitEvidence | None:
     even = (values - haze) / light
     total = _smooth(n, EVEN_SPREAD) + covariance / np.outer(light, light)
     total[np.diag_indices_from(total)] += EVEN_WEAR**2
-    weight = np.linalg.inv(total)
+    weight = invert(total)
     dark = first.copy()
     step = _levels_apart(even, dark)
     residual, contrast = _settle(weight, even - even.mean(), dark, step, 0.3 * step)
@@ -179,7 +180,7 @@ def _even_light(values: Array, covariance: Array, light_level: float, n: int) ->
     smooth = _smooth(n, LIGHT_SPREAD)
     total = smooth + covariance * np.outer(slope, slope)
     total[np.diag_indices_from(total)] += WEAR**2
-    weight = np.linalg.inv(total)
+    weight = invert(total)
     dark = (lifted < 0.6 * 0.5 * (light_level + 2 * floor)).astype(float)
     residual, _ = _settle(weight, logs - logs.mean(), dark, CONTRAST, CONTRAST_SPREAD)
     illumination: Array = np.exp(smooth @ (weight @ residual) + logs.mean())

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from app.decoders.plate.linear import factorize, invert, solve_factorized
 from app.markers.plate import PlateGeometry
 
 Array = npt.NDArray[np.float64]
@@ -470,8 +471,10 @@ def fit_plate(
         )
         if not ok:
             return None
-        covariance = np.linalg.inv(normal) * variance
     except np.linalg.LinAlgError:
+        return None
+    covariance = invert(normal) * variance
+    if not covariance.size:
         return None
     frame[:2] = frame[:2] * scale + origin_px
     frame[2] *= scale
@@ -642,12 +645,8 @@ def _blur_nodes(pose, frame, most):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _hold_open_ends(normal, rhs, pose, coef, variance):  # type: ignore[no-untyped-def]
-    """Mirror the normal matrix and hold what the pixels leave open: values near their mean, blur near the usual."""
-    size = normal.shape[0]
+    """Hold what the pixels leave open: values near their mean, blur near the usual."""
     shapes = coef.shape[0]
-    for i in range(size):
-        for j in range(i):
-            normal[j, i] = normal[i, j]
     mean = 0.0
     for i in range(shapes - 13):
         mean += coef[i]
@@ -729,7 +728,10 @@ def _gauss_newton(luma, levels, weights, table, frame, pose, edges, slot, coef, 
         if (k == 1 and explained < HOPELESS[0]) or (k == 2 and explained < HOPELESS[1]):
             return False, variance, explained, pixels
         _hold_open_ends(normal, rhs, pose, coef, variance)
-        solution = np.linalg.solve(normal, rhs)
+        factor = factorize(normal)
+        if factor.shape[0] == 0:
+            return False, variance, explained, pixels
+        solution = solve_factorized(factor, rhs)
         coef[:] = solution[:shapes]
         for i in range(10):
             limit = 0.15 if i < 6 else (0.1 if i < 8 else (0.4 if i == 8 else 0.08))

@@ -1,0 +1,75 @@
+"""Small symmetric positive definite systems on one thread.
+
+LAPACK would do, but its threads cost more than they give at this size, and a caller cannot turn them off per call.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+
+@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def factorize(matrix):  # type: ignore[no-untyped-def]
+    """Cholesky factor, lower triangle, of a symmetric matrix, of which the lower triangle is read; empty if not positive."""
+    n = matrix.shape[0]
+    factor = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return np.empty((0, 0))
+                factor[i, i] = math.sqrt(total)
+            else:
+                factor[i, j] = total / factor[j, j]
+    return factor
+
+
+@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def solve_factorized(factor, rhs):  # type: ignore[no-untyped-def]
+    """Solution of the system whose factor this is, shape (n,)."""
+    n = factor.shape[0]
+    solution = rhs.copy()
+    for i in range(n):
+        total = solution[i]
+        for k in range(i):
+            total -= factor[i, k] * solution[k]
+        solution[i] = total / factor[i, i]
+    for i in range(n - 1, -1, -1):
+        solution[i] /= factor[i, i]
+        value = solution[i]
+        for k in range(i):
+            solution[k] -= factor[i, k] * value
+    return solution
+
+
+@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def invert(matrix):  # type: ignore[no-untyped-def]
+    """Inverse of a symmetric positive definite matrix; empty if it is not positive."""
+    factor = factorize(matrix)
+    n = factor.shape[0]
+    inverse = np.zeros((n, n))
+    lower = np.zeros((n, n))
+    for i in range(n):
+        for k in range(i):
+            scale = factor[i, k]
+            for j in range(k + 1):
+                lower[i, j] -= scale * lower[k, j]
+        down = 1.0 / factor[i, i]
+        for j in range(i):
+            lower[i, j] *= down
+        lower[i, i] = down
+    for k in range(n):
+        for i in range(k + 1):
+            scale = lower[k, i]
+            for j in range(i + 1):
+                inverse[i, j] += scale * lower[k, j]
+    for i in range(n):
+        for j in range(i):
+            inverse[j, i] = inverse[i, j]
+    return inverse
