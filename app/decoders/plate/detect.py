@@ -90,7 +90,7 @@ class MarkerQuad:
         """How likely it is a plate: above 0 worth a fit; large markers must look the part better than small ones."""
         right, down = self.centroids_px[1] - self.centroids_px[0], self.centroids_px[3] - self.centroids_px[0]
         area = max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0)
-        wanted = min(max(5.0 + 4.5 * math.log10(area / 250), 5.0), 8.7)
+        wanted = min(max(5.0 + 4.5 * math.log10(area / 250), 5.0), 8.7 + max(math.log10(area / 3000), 0.0))
         return self.score + 2 * math.log(self.colour_margin) - wanted
 
 

@@ -37,7 +37,7 @@ MOST_FITS = 3  # candidates that are fitted in one pass
 LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
 LEAST_EXPLAINED_ALONE = 0.83
 CLEAN_EXPLAINED = 0.93  # from which a word may be corrected without a registry  # the same for digits that no registry confirms
-STRONG_RANK = 2.0  # of a candidate that deserves a second geometry when the first explains nothing
+STRONG_RANK = 3.5  # of a candidate that deserves a second geometry when the first explains nothing
 LEAST_MARGIN = 1.0  # colour margin of a marker that is there
 LEAST_MARGIN_ALONE, LEAST_MARGIN_SHARE = 2.2, 0.25  # the same without a registry, and against the median marker
 LEAST_SIDE_PX = 24
@@ -191,7 +191,7 @@ def _without_shadows(readings: list[PlateReading]) -> Iterator[PlateReading]:
 def _likely_geometries(quad: MarkerQuad, geometries: Sequence[PlateGeometry]) -> list[PlateGeometry]:
     """Geometries whose markers may be as large as the candidate's, close ones first; blur widens small markers."""
     misfit = {g: abs(math.log(quad.size_ratio / (0.95 * MARKER_RATIO[g.n]))) for g in geometries}
-    possible = [g for g in geometries if misfit[g] < 0.75] or [min(geometries, key=lambda g: misfit[g])]
+    possible = [g for g in geometries if misfit[g] < 0.55] or [min(geometries, key=lambda g: misfit[g])]
     return sorted(possible, key=lambda g: misfit[g] > 0.4)
 
 
