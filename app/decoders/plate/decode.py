@@ -1,8 +1,8 @@
 """Unit values -> symbols -> code: the most likely digits, and how sure they are.
 
 The logarithm of a unit's light is a smooth illumination, minus one contrast where the unit is dark, plus noise whose
-covariance the fit gives: neighbours that share pixels share their error. Illumination is a Gaussian process, so the cost
-of any pattern of units is a quadratic form, and margins come from exact differences of it.
+covariance the fit gives: neighbours that share pixels share their error. Illumination is a Gaussian process, so the
+cost of any pattern of units is a quadratic form, and margins come from exact differences of it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -21,7 +22,7 @@ from app.decoders.plate.fit import PlateFit
 from app.decoders.plate.linear import invert
 from app.markers.plate import PlateCode, PlateScheme, correct_symbols, is_codeword, unit_index
 
-Array = npt.NDArray[np.float64]
+Array = npt.NDArray[Any]
 
 CONTRAST = 2.0  # of the logarithm after haze is taken off; its spread:
 CONTRAST_SPREAD = 0.4
@@ -333,9 +334,9 @@ def _decode_alone(evidence: UnitEvidence, n: int, sure: float, *, clean: bool) -
     if float(costs[np.arange(len(costs)), decimal].sum()) < LETTERS_OUT_OF_REACH:
         cells = _softmax_confidence(costs[:, :10], decimal) * trust
         confidence = float(np.prod(cells))
-        code = _decimal_code(tuple(int(s) for s in decimal), n)
-        if code is not None and confidence >= sure:
-            return DecodedSymbols(code, confidence, _floats(cells))
+        digits = _decimal_code(tuple(int(s) for s in decimal), n)
+        if digits is not None and confidence >= sure:
+            return DecodedSymbols(digits, confidence, _floats(cells))
         doubtful = ", ".join(str(i) for i in np.flatnonzero(cells < 1 - (1 - sure) / len(cells)))
         return DecodedSymbols(None, confidence, _floats(cells), reason=f"cells in doubt: {doubtful}")
     corrected = _correct(n, any_symbol, cells) if clean else None

@@ -1,14 +1,17 @@
 """Where plates may be: red and green blobs at half resolution, joined into marker quadruples.
 
-The search works on how far red stands above green and blue, or green above red and blue: neutral surfaces, sky and lamps
-give nothing, a cast gives less than the share of the brightness that is taken off. A candidate is a red triangle with at least two green squares in the places where a plate
-has them; size and shape of the blobs must agree with the affine map that their centres imply.
+The search works on how far red stands above green and blue, or green above red and blue: neutral surfaces, sky and
+lamps give nothing, a cast gives less than the share of the brightness that is taken off. Where that finds no plate, it
+works on the ratio of red to green against the neighbourhood's. A candidate is a red triangle with at least two green
+squares in the places where a plate has them; size and shape of the blobs must agree with the affine map that their
+centres imply.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numba as nb
@@ -18,13 +21,12 @@ import numpy.typing as npt
 BLOCK = 16  # side of a block of the background grid, in half-resolution pixels
 MAX_BLOBS = 6000
 MAX_REDS = 150
-MAX_GREENS = 220
-MAX_NEAR = 10
+MAX_GREENS = 160
+MAX_NEAR = 8
 # a red marker beside brown soil needs a high threshold to stand alone, a small one far away a low one to be seen at all
 VIVID_LEVELS = ((6, 2), (10, 5), (20, 11))
-FAINT_LEVELS = ((6, 0), (12, 0), (24, 0))
-FAINTEST_LEVELS = ((3, 0), (5, 0), (9, 0))
-_LOG = np.rint(128 * np.log(np.arange(256) + 12.0)).astype(np.int16)
+FAINT_LEVELS = ((6, 0), (14, 0))
+FAINTEST_LEVELS = ((3, 0), (7, 0))
 NOISE_FACTOR = 3.5
 LEAST_INTERIOR = 2.5
 MAX_QUADS = 400
@@ -53,10 +55,10 @@ class MarkerSignal:
         Pixels of the frame that make one of the signal, along a side.
     """
 
-    opponent: npt.NDArray[np.int16]
-    luma: npt.NDArray[np.uint8]
-    peak: npt.NDArray[np.int16]
-    threshold: npt.NDArray[np.int16]
+    opponent: npt.NDArray[Any]
+    luma: npt.NDArray[Any]
+    peak: npt.NDArray[Any]
+    threshold: npt.NDArray[Any]
     levels: tuple[tuple[int, int], ...]
     scale: int = 2
 
@@ -79,7 +81,7 @@ class MarkerQuad:
         Distance between marker centres over the side of a marker; tells 8 from 10 from 12 units.
     """
 
-    centroids_px: npt.NDArray[np.float64]
+    centroids_px: npt.NDArray[Any]
     found: int
     score: float
     colour_margin: float
@@ -94,12 +96,12 @@ class MarkerQuad:
         return self.score + 2 * math.log(self.colour_margin) - wanted
 
 
-def half_frame(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def half_frame(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """A BGR frame, shape (H, W, 3), at half resolution."""
     return cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
-def vivid_signal(small: npt.NDArray[np.uint8]) -> MarkerSignal:
+def vivid_signal(small: npt.NDArray[Any]) -> MarkerSignal:
     """How far red stands above green and blue, or green above red and blue: strong colours, whatever is around."""
     blue, green, red = cv2.split(small)
     opponent = np.empty(blue.shape, np.int16)
@@ -108,17 +110,22 @@ def vivid_signal(small: npt.NDArray[np.uint8]) -> MarkerSignal:
     return _signal(opponent, luma, VIVID_LEVELS)
 
 
-def faint_signal(small: npt.NDArray[np.uint8]) -> MarkerSignal:
-    """The ratio of red to green against the neighbourhood's: weak colours in haze, glare or a colour cast."""
-    green, red = small[..., 1], small[..., 2]
-    opponent = cv2.subtract(cv2.LUT(red, _LOG), cv2.LUT(green, _LOG))
-    rows, columns = _blocks(opponent.shape)
-    level = cv2.resize(opponent.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
-    _flatten(opponent, level)
+def faint_signal(small: npt.NDArray[Any]) -> MarkerSignal:
+    """The ratio of red to green against the neighbourhood's: weak colours in haze, glare or a colour cast.
+
+    About 128 times the ratio's logarithm, less in the dark.
+    """
+    green, red = (np.ascontiguousarray(small[..., k]) for k in (1, 2))
+    opponent: npt.NDArray[Any] = np.empty(small.shape[:2], np.int16)
+    _ratio(green.reshape(-1), red.reshape(-1), opponent.reshape(-1))
+    height, width = opponent.shape
+    tiny = (max(width // BLOCK, 1), max(height // BLOCK, 1))
+    level = cv2.medianBlur(cv2.resize(opponent, tiny, interpolation=cv2.INTER_AREA), 5)
+    opponent = cv2.subtract(opponent, cv2.resize(level, (width, height), interpolation=cv2.INTER_LINEAR))
     return _signal(opponent, cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), FAINT_LEVELS)
 
 
-def faintest_signal(small: npt.NDArray[np.uint8]) -> MarkerSignal:
+def faintest_signal(small: npt.NDArray[Any]) -> MarkerSignal:
     """The same at a quarter of the frame's resolution, where noise is less: large plates in thick haze."""
     tiny = cv2.resize(small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA)
     return replace(faint_signal(tiny), levels=FAINTEST_LEVELS, scale=4)
@@ -128,9 +135,7 @@ def _blocks(shape: tuple[int, ...]) -> tuple[int, int]:
     return (shape[0] + BLOCK - 1) // BLOCK, (shape[1] + BLOCK - 1) // BLOCK
 
 
-def _signal(
-    opponent: npt.NDArray[np.int16], luma: npt.NDArray[np.uint8], levels: tuple[tuple[int, int], ...]
-) -> MarkerSignal:
+def _signal(opponent: npt.NDArray[Any], luma: npt.NDArray[Any], levels: tuple[tuple[int, int], ...]) -> MarkerSignal:
     rows, columns = _blocks(opponent.shape)
     peak = np.zeros((opponent.shape[0], columns), np.int16)
     rough = np.zeros((rows, columns), np.int32)
@@ -138,7 +143,7 @@ def _signal(
     return MarkerSignal(opponent, luma, peak, _thresholds(rough), levels)
 
 
-def _full_px(points: npt.NDArray[np.float64], scale: int) -> npt.NDArray[np.float64]:
+def _full_px(points: npt.NDArray[Any], scale: int) -> npt.NDArray[Any]:
     """Pixels of the frame from those of a signal; pixel centres are at integers in both."""
     return scale * points + (scale - 1) / 2
 
@@ -152,16 +157,18 @@ def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     order = np.argsort(-quads[:found, 8], kind="stable")
     kept = _suppress(signal.opponent, signal.luma, quads, order, MAX_CANDIDATES)
     found_quads = [
-        MarkerQuad(_full_px(row[:8].reshape(4, 2), signal.scale), int(row[9]), float(row[8]), float(row[11]), float(row[10]))
+        MarkerQuad(
+            _full_px(row[:8].reshape(4, 2), signal.scale), int(row[9]), float(row[8]), float(row[11]), float(row[10])
+        )
         for row in (quads[k] for k in kept)
     ]
     return sorted((q for q in found_quads if q.rank > 0), key=lambda q: -q.rank)
 
 
 def marker_margins(
-    signal: MarkerSignal, plate_from_image: npt.NDArray[np.float64], centroids: npt.NDArray[np.float64],
-    units: npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:  # fmt: skip
+    signal: MarkerSignal, plate_from_image: npt.NDArray[Any], centroids: npt.NDArray[Any],
+    units: npt.NDArray[Any],
+) -> npt.NDArray[Any]:  # fmt: skip
     """How far each marker's colour stands out of the units', in their spreads; for a fitted plate.
 
     Parameters
@@ -183,7 +190,7 @@ def marker_margins(
     spots = (centroids[:, None] + _SPOTS[None]).reshape(-1, 2)
     inside = _signal_at(signal, image_from_plate, spots).reshape(4, -1).mean(axis=1)
     between = _signal_at(signal, image_from_plate, units)
-    margins: npt.NDArray[np.float64] = (inside - between.mean()) / (between.std() + 1.0)
+    margins: npt.NDArray[Any] = (inside - between.mean()) / (between.std() + 1.0)
     margins[1:] *= -1
     return margins
 
@@ -191,15 +198,14 @@ def marker_margins(
 _SPOTS = np.array([(x, y) for x in (-0.03, 0.0, 0.03) for y in (-0.03, 0.0, 0.03)])
 
 
-def _signal_at(
-    signal: MarkerSignal, image_from_plate: npt.NDArray[np.float64], points: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def _signal_at(signal: MarkerSignal, image_from_plate: npt.NDArray[Any], points: npt.NDArray[Any]) -> npt.NDArray[Any]:
     projected = points @ image_from_plate[:, :2].T + image_from_plate[:, 2]
     half = (projected[:, :2] / projected[:, 2:] - (signal.scale - 1) / 2) / signal.scale
     height, width = signal.opponent.shape
     columns = np.clip(np.rint(half[:, 0]), 0, width - 1).astype(int)
     rows = np.clip(np.rint(half[:, 1]), 0, height - 1).astype(int)
-    return signal.opponent[rows, columns].astype(float)
+    values: npt.NDArray[Any] = signal.opponent[rows, columns].astype(float)
+    return values
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -213,28 +219,12 @@ def _vivid(blue, green, red, opponent, luma):  # type: ignore[no-untyped-def]
             luma[y, x] = np.uint8((r + 2 * g + b) >> 2)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _flatten(opponent, level):  # type: ignore[no-untyped-def]
-    """Take off the level of the neighbourhood: the median of nine blocks around."""
-    rows, cols = level.shape
-    base = np.empty((rows, cols), np.int16)
-    near = np.empty(9)
-    for r in range(rows):
-        for c in range(cols):
-            k = 0
-            for i in (-2, 0, 2):
-                for j in (-2, 0, 2):
-                    rr = min(max(r + i, 0), rows - 1)
-                    cc = min(max(c + j, 0), cols - 1)
-                    near[k] = level[rr, cc]
-                    k += 1
-            near.sort()
-            base[r, c] = np.int16(round(near[4]))
-    for y in range(opponent.shape[0]):
-        for c in range(cols):
-            b = base[y // BLOCK, c]
-            for x in range(c * BLOCK, min(opponent.shape[1], (c + 1) * BLOCK)):
-                opponent[y, x] -= b
+@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _ratio(green, red, opponent):  # type: ignore[no-untyped-def]
+    for k in range(opponent.shape[0]):
+        r = np.float32(red[k])
+        g = np.float32(green[k])
+        opponent[k] = np.int16(np.int32(np.float32(256.0) * (r - g) / (r + g + np.float32(24.0))))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -656,7 +646,7 @@ def _quads(blobs, opponent):  # type: ignore[no-untyped-def]
                     best = 1.0e9
                     fourth = -1
                     for m2 in range(k):
-                        if m2 == i or m2 == j:
+                        if m2 in (i, j):
                             continue
                         g3 = blobs[near[m2]]
                         ex = g3[2] - fx

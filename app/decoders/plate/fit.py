@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numba as nb
@@ -20,7 +21,7 @@ from scipy.special import ndtr
 from app.decoders.plate.linear import factorize, invert, solve_factorized
 from app.markers.plate import PlateGeometry
 
-Array = npt.NDArray[np.float64]
+Array = npt.NDArray[Any]
 
 GAMMA = 2.2
 POSE = 10  # eight of the homography, log of the blur, length of the motion
@@ -30,11 +31,12 @@ MOTION_PRIOR = (0.03, 0.06)  # length of the motion blur [plate sides], and its 
 UPRIGHT_SINE = 0.35  # of the angle between line of sight and plate columns up to which blur is along the plate's axes
 HOPELESS = (0.3, 0.45)  # share of the pixels' variance that one and two steps explain on anything that is a plate
 MAX_STEPS = 7
+CORNER_SCATTER = 3.0  # of the corners against what even, independent noise would give: JPEG, optics, worn edges
 FIRST_BLUR = 0.2  # units
 LARGE_UNIT_PX = 5.0  # a unit of twice this size is averaged down
 LOST_PX = 2.5  # a plate's corners move less after four steps
 REST_PX, NEAR_PX = 0.08, 0.4  # the corners rest, or are near rest, when they move less in one step
-COARSE_PIXELS, FINE_PIXELS = 4.5, 9.0  # pixels looked at for each unknown, where the image has more
+COARSE_PIXELS, FINE_PIXELS = 3.5, 7.0  # pixels looked at for each unknown, where the image has more
 _LEVELS = np.linspace(0.0, 1.0, 256)
 LINEAR_LIGHT = _LEVELS**GAMMA
 _LIGHT = LINEAR_LIGHT.astype(np.float32)
@@ -179,8 +181,8 @@ def _profiles(x, s, motion, edges, table, out, span):  # type: ignore[no-untyped
     n = edges.shape[0]
     reach = 3.5 * s + 0.5 * motion
     pitch = edges[1, 0] - edges[0, 0]
-    first = max(int(math.floor((x - reach - edges[0, 1]) / pitch)) + 1, 0)
-    last = min(int(math.floor((x + reach - edges[0, 0]) / pitch)), n - 1)
+    first = max(math.floor((x - reach - edges[0, 1]) / pitch) + 1, 0)
+    last = min(math.floor((x + reach - edges[0, 0]) / pitch), n - 1)
     span[0] = first
     span[1] = last
     for i in range(first, last + 1):
@@ -202,7 +204,8 @@ def _profiles(x, s, motion, edges, table, out, span):  # type: ignore[no-untyped
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _accumulate(  # type: ignore[no-untyped-def]
-    image, table, weight_table, normal_table, box, stride, frame, pose, edges, slot, coef, nodes, node_weights, direction, by_spread, margin,
+    image, table, weight_table, normal_table, box, stride, frame, pose, edges, slot, coef,
+    nodes, node_weights, direction, by_spread, margin,
     normal, cross, inner, rhs, rhs_pose,
 ):  # fmt: skip
     """Add every pixel's row to the normal equations of (shape values, pose); returns sums for the residual.
@@ -434,7 +437,7 @@ def blur_minor(ux, uy, vx, vy):  # type: ignore[no-untyped-def]
 
 
 def fit_plate(
-    image: npt.NDArray[np.uint8], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
+    image: npt.NDArray[Any], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
 ) -> PlateFit | None:
     """Fit a plate whose marker centroids are roughly known.
 
@@ -489,7 +492,7 @@ def _first_blur(points_px: Array, n: int) -> float:
     return float(np.clip(FIRST_BLUR * unit, 0.7, 2.5))
 
 
-def _patch(image: npt.NDArray[np.uint8], centroids_px: Array, n: int) -> tuple[npt.NDArray[np.uint8], Array, int]:
+def _patch(image: npt.NDArray[Any], centroids_px: Array, n: int) -> tuple[npt.NDArray[Any], Array, int]:
     """Luma around a plate, where in the image its pixel (0, 0) lies [px], and how many pixels a side make one of it.
 
     A large plate is averaged down: its edges are sharp against the distance between the pixels that are looked at.
@@ -546,7 +549,7 @@ def _project(matrix: Array, points: Array) -> Array:
 
 
 def _sample_shapes(
-    luma: npt.NDArray[np.uint8], levels: Array, pose: Array, frame: Array, edges: Array, slot: npt.NDArray[np.int64]
+    luma: npt.NDArray[Any], levels: Array, pose: Array, frame: Array, edges: Array, slot: npt.NDArray[np.int64]
 ) -> Array:
     """First values of all shapes: the pixels at their middles."""
     n = len(edges)
@@ -626,7 +629,7 @@ def _blur_nodes(pose, frame, most):  # type: ignore[no-untyped-def]
     sigma = math.exp(pose[8])
     motion = max(pose[9], 0.02)
     spread = math.sqrt((long2 - short2) * sigma * sigma + motion * motion / 12.0)
-    half = int(math.ceil(1.2 * spread / (math.sqrt(short2) * sigma)))
+    half = math.ceil(1.2 * spread / (math.sqrt(short2) * sigma))
     half = min(max(half, 1), most)
     nodes = np.empty(2 * half + 1)
     weights = np.empty(2 * half + 1)
@@ -671,7 +674,6 @@ def _gauss_newton(luma, levels, weights, table, frame, pose, edges, slot, coef, 
 
     Returns whether there is a plate, the residual's variance, the share of variance explained, and the pixels used.
     """
-    n = edges.shape[0]
     shapes = coef.shape[0]
     rhs = np.empty(shapes + 10)
     cross = np.empty((shapes, 10))
@@ -769,7 +771,8 @@ def _result(
         gap=float(coef[shapes - 8 : shapes - 4].mean()),
         road=float(coef[shapes - 4 :].mean()),
         corners_px=corners,
-        corners_covariance_px2=jacobian @ covariance[shapes : shapes + 8, shapes : shapes + 8] @ jacobian.T,
+        corners_covariance_px2=CORNER_SCATTER
+        * (jacobian @ covariance[shapes : shapes + 8, shapes : shapes + 8] @ jacobian.T),
         residual=residual,
         explained=explained,
         blur_px=math.exp(pose[8]),

@@ -13,7 +13,7 @@ import numpy as np
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def factorize(matrix):  # type: ignore[no-untyped-def]
-    """Cholesky factor, lower triangle, of a symmetric matrix, of which the lower triangle is read; empty if not positive."""
+    """Cholesky factor of the symmetric matrix with this lower triangle; empty if it is not positive."""
     n = matrix.shape[0]
     factor = np.zeros((n, n))
     for i in range(n):

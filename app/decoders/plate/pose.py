@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,10 +19,10 @@ from app.markers.plate import PlateGeometry
 from app.markers.reading import PlatePose
 from app.sensors.camera import Camera
 
-Array = npt.NDArray[np.float64]
+Array = npt.NDArray[Any]
 
-LEVEL_SPREAD_RAD = math.radians(0.6)  # of a vehicle's roll and pitch against the road
-HEIGHT_SPREAD_M = 0.03  # of a camera's height: springs, load
+LEVEL_SPREAD_RAD = math.radians(0.4)  # of a vehicle's roll and pitch against the road
+HEIGHT_SPREAD_M = 0.02  # of a camera's height: springs, load
 CORNER_FLOOR_PX = 0.05  # of a corner: what the fit's covariance leaves out
 
 
@@ -84,7 +85,7 @@ def locate_plate(corners_px: Array, covariance_px2: Array, geometry: PlateGeomet
     _, pose, information = best
     projected = cv2.projectPoints(object_m, pose[:3], pose[3:], camera.matrix, distortion)[0].reshape(4, 2)
     return PlatePose(
-        rotation=cv2.Rodrigues(pose[:3])[0],
+        rotation=np.asarray(cv2.Rodrigues(pose[:3])[0], dtype=float),
         translation_m=pose[3:].copy(),
         covariance=np.linalg.inv(information),
         reprojection_rms_px=float(np.sqrt(np.mean(np.sum((projected - corners_px) ** 2, axis=1)))),

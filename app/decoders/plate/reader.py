@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -36,13 +37,15 @@ SURE = 0.999  # least probability at which digits are given out
 MOST_FITS = 3  # candidates that are fitted in one pass
 LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
 LEAST_EXPLAINED_ALONE = 0.83
-CLEAN_EXPLAINED = 0.93  # from which a word may be corrected without a registry  # the same for digits that no registry confirms
+CLEAN_EXPLAINED = (
+    0.93  # from which a word may be corrected without a registry  # the same for digits that no registry confirms
+)
 STRONG_RANK = 3.5  # of a candidate that deserves a second geometry when the first explains nothing
 LEAST_MARGIN = 1.0  # colour margin of a marker that is there
 LEAST_MARGIN_ALONE, LEAST_MARGIN_SHARE = 2.2, 0.25  # the same without a registry, and against the median marker
 LEAST_SIDE_PX = 24
-Frame = npt.NDArray[np.uint8]
-Array = npt.NDArray[np.float64]
+Frame = npt.NDArray[Any]
+Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +58,13 @@ class _Task:
     geometries: Sequence[PlateGeometry]
     fits: list[tuple[PlateGeometry, PlateFit]] = field(default_factory=list)
 
-    def fit(self, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
+    def fit_candidate(self, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
         """Fit of a candidate; a good one of the same place from an earlier pass serves again."""
         centre = quad.centroids_px.mean(axis=0)
-        for known, fit in self.fits:
-            if known == geometry and np.abs(fit.corners_px.mean(axis=0) - centre).max() < 0.1 * fit.unit_px * geometry.n:
-                return fit
+        for known, earlier in self.fits:
+            reach_px = 0.1 * earlier.unit_px * geometry.n
+            if known == geometry and np.abs(earlier.corners_px.mean(axis=0) - centre).max() < reach_px:
+                return earlier
         fit = fit_plate(self.image, quad.centroids_px, geometry)
         if fit is not None and fit.explained > CLEAN_EXPLAINED:
             self.fits.append((geometry, fit))
@@ -199,7 +203,7 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
     """The candidate's best reading under the geometries that fit it; empty when it is no plate."""
     best: PlateReading | None = None
     for geometry in _likely_geometries(quad, task.geometries):
-        fit = task.fit(quad, geometry)
+        fit = task.fit_candidate(quad, geometry)
         if fit is None or fit.explained < LEAST_EXPLAINED:
             if quad.rank < STRONG_RANK:
                 break

@@ -7,6 +7,7 @@ possible orientations, and the fit says which one explains the pixels.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,8 +16,8 @@ import numpy.typing as npt
 from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids
 from app.markers.plate import PlateGeometry
 
-Frame = npt.NDArray[np.uint8]
-Array = npt.NDArray[np.float64]
+Frame = npt.NDArray[Any]
+Array = npt.NDArray[Any]
 
 MOST_QUADS = 8
 LEAST_EXTENT_PX = 8.0
@@ -51,7 +52,8 @@ def _centroids(corners_px: Array, geometry: PlateGeometry) -> Array:
     square = np.array([(near, near), (1 - near, near), (1 - near, 1 - near), (near, 1 - near)], np.float32)
     unit = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
     homography = cv2.getPerspectiveTransform(unit, corners_px.astype(np.float32))
-    return cv2.perspectiveTransform(square[None], homography)[0].astype(float)
+    centroids: Array = cv2.perspectiveTransform(square[None], homography)[0].astype(float)
+    return centroids
 
 
 def detect_warm_quads(image: Frame) -> list[Array]:
@@ -78,7 +80,7 @@ def detect_warm_quads(image: Frame) -> list[Array]:
     return _distinct(quads)
 
 
-def _quad_around(contour: npt.NDArray[np.int32]) -> tuple[float, Array] | None:
+def _quad_around(contour: npt.NDArray[Any]) -> tuple[float, Array] | None:
     """Quadrangle around a region and how well the region fills it; None when it is none."""
     extent = np.ptp(contour[:, 0], axis=0)
     if extent.min() < LEAST_EXTENT_PX or len(contour) < 12:
