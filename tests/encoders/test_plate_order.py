@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from app.encoders.plate import BundleOptions, PlateOrder, encode_sheets, write_bundle
-from app.errors import InvalidParameter
+from app.errors import CodeMismatch, InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 
 
@@ -85,3 +85,9 @@ def test_a_bundle_needs_plates_and_formats(make_order: Callable[..., PlateOrder]
 def test_position_plates_group_their_digits_by_axis(make_order: Callable[..., PlateOrder]) -> None:
     assert make_order().grouped_digits == "023792 168411"
     assert make_order(PlateCode.from_registry_number(0x12345678)).grouped_digits.startswith("1234 5678 ")
+
+
+def test_blank_faces_are_refused() -> None:
+    with pytest.raises(CodeMismatch, match="no unit is dark") as caught:
+        PlateOrder(PlateCode("0" * 12), PlateGeometry(), plate_id="blank")
+    assert caught.value.field == "digits"

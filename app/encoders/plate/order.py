@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from app.errors import InvalidParameter
+from app.errors import CodeMismatch, InvalidParameter
 from app.geodesy import check_lon_lat
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 
@@ -55,6 +55,13 @@ class PlateOrder:
                 field="geometry.n",
                 limit=f"{self.code.n}",
                 cure="give the code and the plate the same number of units along a side",
+            )
+        if not self.code.units.any():
+            raise CodeMismatch(
+                f"the face of {self.code.digits} is blank: no unit is dark, a bare plate looks the same",
+                field="digits",
+                limit="at least one dark unit",
+                cure="move the plate by a micro-degree, add check digits, or use the scheme id with another number",
             )
         _check_text("plate_id", self.plate_id, 1, MAX_ID_LENGTH)
         _check_text("crs", self.crs, 0, MAX_NOTE_LENGTH)
