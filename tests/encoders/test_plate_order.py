@@ -89,5 +89,5 @@ def test_position_plates_group_their_digits_by_axis(make_order: Callable[..., Pl
 
 def test_blank_faces_are_refused() -> None:
     with pytest.raises(CodeMismatch, match="no unit is dark") as caught:
-        PlateOrder(PlateCode("0" * 12), PlateGeometry(), plate_id="blank")
+        PlateOrder("blank", PlateCode("0" * 12), PlateGeometry())
     assert caught.value.field == "digits"
