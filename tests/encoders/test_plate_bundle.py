@@ -38,7 +38,7 @@ class Pipe(io.RawIOBase):
 
 
 def _orders(make_order: Callable[..., PlateOrder], count: int, **fields: object) -> list[PlateOrder]:
-    return [make_order(PlateCode(f"{k * 7919:012d}"), **({"plate_id": f"K-{k}"} | fields)) for k in range(count)]
+    return [make_order(PlateCode(f"{(k + 1) * 7919:012d}"), **({"plate_id": f"K-{k}"} | fields)) for k in range(count)]
 
 
 def _bundle(orders: list[PlateOrder], **arguments: Any) -> tuple[zipfile.ZipFile, dict[str, Any]]:

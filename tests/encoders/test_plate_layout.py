@@ -88,7 +88,7 @@ def test_the_quality_sheet_is_uncluttered(make_order: Callable[..., PlateOrder])
 
 
 def test_sheets_hold_every_plate_once_and_apart(make_order: Callable[..., PlateOrder]) -> None:
-    codes = [PlateCode.from_registry_number(k) for k in range(7)]
+    codes = [PlateCode.from_registry_number(k) for k in range(1, 8)]
     orders = [make_order(code, plate_id=f"P{k}") for k, code in enumerate(codes)]
     sheets = encode_sheets(orders, width_mm=800, height_mm=900, options=ArtworkOptions(leds=True))
     assert [len(sheet.trim_mm) for sheet in sheets] == [4, 3]
