@@ -1,0 +1,39 @@
+"""Heated plates in thermal frames, which show no colours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.decoders.plate import decode_plates
+from app.markers.plate import PlateCode
+from app.markers.reading import PlateOutcome
+from tests.decoders.plate.scenes import PAPER, THERMAL_CAMERA, shoot_warm
+
+CODES = [PAPER, PlateCode.from_registry_number(0xDEADBEEF)]
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 270.0, 37.0])
+@pytest.mark.parametrize("code", CODES, ids=lambda code: code.digits)
+def test_a_heated_plate_is_read_at_any_turn(code: PlateCode, turn_deg: float) -> None:
+    frame = shoot_warm(code, turn_deg)
+    assert frame.image.ndim == 2
+    readings = decode_plates(frame.image, camera=THERMAL_CAMERA, thermal=True)
+    read = [r for r in readings if r.outcome is PlateOutcome.READ]
+    assert [r.digits for r in read] == [code.digits]
+    assert read[0].corners_px is not None
+    errors_px = np.linalg.norm(read[0].corners_px - frame.truths[0].corners_px, axis=1)
+    assert errors_px.max() < 1.0  # clockwise from the triangle's, which only the pattern tells
+    assert read[0].pose is not None
+
+
+def test_a_cold_road_gives_nothing() -> None:
+    road = np.clip(85 + 4 * np.random.default_rng(0).standard_normal((512, 640)), 0, 255).astype(np.uint8)
+    assert decode_plates(road, thermal=True) == []
+    assert [r for r in decode_plates(road, thermal=True, codebook=CODES) if r.outcome is PlateOutcome.READ] == []
+
+
+def test_warm_and_cold_are_not_exchanged() -> None:
+    inverted = 255 - shoot_warm(PAPER, 0.0).image
+    readings = decode_plates(inverted, thermal=True)
+    assert [r.digits for r in readings if r.outcome is PlateOutcome.READ] == []
