@@ -425,3 +425,7 @@ def test_check_digits_cost_decimals_not_truth(checks: int, places: tuple[int, in
     found = resolve_position(code, -77.2, -38.7)
     assert found.lon_deg == pytest.approx(-77.036530, abs=0.51 * 10 ** -places[0])
     assert found.lat_deg == pytest.approx(-38.897676, abs=0.51 * 10 ** -places[1])
+
+
+def test_the_antimeridian_has_one_name() -> None:
+    assert resolve_position(PlateCode.from_position(-180.0, 10.0), -179.9, 10.0).lon_deg == 180.0
