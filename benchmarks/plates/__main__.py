@@ -1,4 +1,4 @@
-"""``python -m benchmarks.plates [ITEM ...] [--short] [--seed N]``: print the tables.
+"""``python -m benchmarks.plates [ITEM ...] [--short] [--seed N] [--seeds M]``: print the tables.
 
 Items: trials, height, false, peers, speed, accuracy, all. The long mode takes three seeds, the short one a part of the
 frames of one seed, which its tables scale up.
@@ -74,12 +74,13 @@ def main() -> None:
     parser.add_argument("items", nargs="*", choices=[*ITEMS, "all"], default="all")
     parser.add_argument("--short", action="store_true", help="a part of the frames of one seed, under a minute")
     parser.add_argument("--seed", type=int, default=1, help="first seed")
+    parser.add_argument("--seeds", type=int, default=3, help="how many seeds the long mode takes")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS, help="leave the other sets of frames out")
     parser.add_argument("--misses", action="store_true", help="name the frames that were not decoded")
     args = parser.parse_args()
     items = set(ITEMS) if "all" in args.items else set(args.items)
-    seeds = [args.seed] if args.short else [args.seed, args.seed + 1, args.seed + 2]
+    seeds = [args.seed + k for k in range(1 if args.short else args.seeds)]
     start = time.monotonic()
     timings = measure_speed(args.seed, 12 if args.short else 100) if "speed" in items else []
     records = run_jobs(list_jobs(items, seeds, short=args.short, only=args.sets), args.processes)
