@@ -35,6 +35,8 @@ SCATTER_PRIOR = (8.0, 0.6)  # weight in units, expected scatter against the mode
 TEMPER = 0.35  # share of a cost difference that is believed: the model is not the road
 USUAL_BLUR_PX = 1.0
 FULL_TRUST_PX = 1.6  # size of a unit in the image from which it is not believed less
+REGISTERED_TRUST = 0.9999  # in a registered plate that corrections reach
+FLAT_LIGHT = (0.65, 1.5)  # light on a cell of one level against that around, beyond which it may be a stain
 STRAY, STRAY_TRUST = 0.23, 0.97  # share of the contrast from which a unit is no sure reading, worn or stained
 LEAST_CODEWORD = 0.05  # probability of the symbols, as read, from which a check that holds is no chance
 LETTERS_OUT_OF_REACH = 12.0  # cost of reading letters as digits up to which a plate may be a decimal one
@@ -157,10 +159,27 @@ def weigh_units(fit: PlateFit) -> UnitEvidence | None:
     best = np.argmin(costs, axis=1)
     disputed = (first != dark).reshape(-1, 4).any(axis=1)
     stray = _level_distance(even, dark, contrast).reshape(-1, 4).max(axis=1)
+    stray = np.where(_flat_patches(light, dark, n), 1.0, stray)
     return UnitEvidence(
         costs - costs.min(axis=1, keepdims=True), best, dark > 0.5, disputed, stray, weight, residual, contrast,
         scatter / len(residual), light_level - dark_level,
     )  # fmt: skip
+
+
+def _flat_patches(light: Array, dark: Array, n: int) -> npt.NDArray[np.bool_]:
+    """Cells of one level whose light differs from that around: a stain over a whole cell looks like a shadow."""
+    flat = unit_index(n)
+    position = np.stack([flat.reshape(-1) // n, flat.reshape(-1) % n], axis=1)
+    patches = np.zeros(len(flat), dtype=bool)
+    for cell in range(len(flat)):
+        own = slice(4 * cell, 4 * cell + 4)
+        if 0 < dark[own].sum() < 4:
+            continue
+        away = np.abs(position - position[own].mean(axis=0)).max(axis=1)
+        around = (away > 1) & (away < 4)
+        ratio = float(np.median(light[own]) / np.median(light[around]))
+        patches[cell] = not FLAT_LIGHT[0] < ratio < FLAT_LIGHT[1]
+    return patches
 
 
 def _level_distance(even: Array, dark: Array, contrast: float) -> Array:
@@ -307,13 +326,35 @@ def decode_symbols(
     same = next((code for code in known if read.code is not None and code.digits == read.code.digits), None)
     if same is not None:
         return replace(read, code=same, confirmed=True)
-    chosen = _decode_with_codebook(evidence, known, sure)
+    chosen = _decode_with_codebook(evidence, known, sure) or _correct_to_registered(evidence, known)
     if chosen is not None:
         return chosen
+    if read.corrected:
+        return replace(read, code=None, reason="corrected digits that no registered plate near by has")
     near = min(known, key=lambda code: pattern_cost(evidence, code))
     if read.code is not None and sum(a != b for a, b in zip(near.digits, read.code.digits, strict=True)) <= n // 2:
         return replace(read, code=None, reason=f"close to the registered {near.digits}, but not the same")
     return read
+
+
+def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> DecodedSymbols | None:
+    """A registered id plate within the correction capacity of what was read: two wrong cells or four in doubt.
+
+    A word that is not this plate's comes so near to its code with probability 5e-11 (8 x 8).
+    """
+    cells = _softmax_confidence(evidence.cell_costs, evidence.best.tolist())
+    doubtful = (cells < 0.99) | (evidence.stray > STRAY)
+    for code in known:
+        if code.scheme is not PlateScheme.ID:
+            continue
+        changed = np.asarray(code.symbols) != evidence.best
+        if 2 * int((changed & ~doubtful).sum()) + int((changed & doubtful).sum()) <= 4:
+            shown = np.where(changed, REGISTERED_TRUST, cells)
+            corrected = tuple(int(i) for i in np.flatnonzero(changed))
+            return DecodedSymbols(
+                code, REGISTERED_TRUST, _floats(shown), corrected, from_codebook=True, confirmed=True
+            )  # fmt: skip
+    return None
 
 
 def _softmax_confidence(costs: Array, chosen: Sequence[int]) -> Array:
@@ -339,7 +380,7 @@ def _decode_alone(evidence: UnitEvidence, n: int, sure: float, *, clean: bool) -
             return DecodedSymbols(digits, confidence, _floats(cells))
         doubtful = ", ".join(str(i) for i in np.flatnonzero(cells < 1 - (1 - sure) / len(cells)))
         return DecodedSymbols(None, confidence, _floats(cells), reason=f"cells in doubt: {doubtful}")
-    corrected = _correct(n, any_symbol, cells) if clean else None
+    corrected = _correct(n, any_symbol, cells, evidence.stray > STRAY) if clean else None
     if corrected is not None:
         return corrected
     return DecodedSymbols(None, float(np.prod(cells)), _floats(cells), reason="no scheme has these symbols")
@@ -362,7 +403,7 @@ def _checked(confidence: float, sure: float) -> float:
     return max(confidence, min(1 - (1 - confidence) / 65536 * 10, 1.0), sure)
 
 
-def _correct(n: int, symbols: tuple[int, ...], cells: Array) -> DecodedSymbols | None:
+def _correct(n: int, symbols: tuple[int, ...], cells: Array, damaged: npt.NDArray[np.bool_]) -> DecodedSymbols | None:
     """Reed-Solomon on the symbols as read, then with the doubtful cells erased.
 
     Any word is within two symbols of a codeword with probability 0.23, so a correction counts only when letters remain
@@ -379,8 +420,10 @@ def _correct(n: int, symbols: tuple[int, ...], cells: Array) -> DecodedSymbols |
         kept = [i for i in range(len(symbols)) if i not in changed and i not in erasures]
         letters = sum(symbols[i] > 9 and cells[i] > 0.999 for i in kept)
         unsure = sum(cells[i] < 0.99 for i in kept)
-        if letters < (1 if spent < 4 else 3) or unsure > 0:
+        if letters < (1 if spent < 4 else 3) or unsure > 0 or damaged[kept].any():
             continue
+        if spent > 2 and not all(damaged[i] or cells[i] < 0.99 for i in changed):
+            continue  # a full correction of cells that look sound is as likely a chance as damage
         confidence = float(np.prod(cells[kept])) * (0.9999 if spent < 4 else 0.999)
         shown = cells.copy()
         shown[list(changed)] = confidence

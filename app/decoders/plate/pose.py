@@ -194,4 +194,4 @@ def fix_vehicle(
     covariance += np.diag([horizontal_rmse_m**2 / 2, horizontal_rmse_m**2 / 2, vertical_rmse_m**2, 0.0])
     covariance += math.radians(heading_rmse_deg) ** 2 * np.outer(by_heading, by_heading)
     lon, lat, height = wgs84_from_enu(state[:3], (lon_deg, lat_deg, height_m))
-    return VehicleFix(lon, lat, height, (heading_deg + math.degrees(state[3])) % 360.0, covariance)
+    return VehicleFix(lon, lat, height, (heading_deg + math.degrees(state[3])) % 360.0 % 360.0, covariance)

@@ -108,7 +108,7 @@ def decode_plates(
     _check(image, camera, thermal, geometries)
     task = _Task(image, camera, codebook, geometries)
     readings = _decode_thermal(task) if thermal else _decode_colour(task)
-    return sorted(_without_shadows(readings), key=lambda reading: reading.code is None)
+    return list(_without_shadows(readings))
 
 
 def _decode_colour(task: _Task) -> list[PlateReading]:
@@ -184,11 +184,12 @@ def _inside(point_px: Array, reading: PlateReading) -> bool:
 
 
 def _without_shadows(readings: list[PlateReading]) -> Iterator[PlateReading]:
-    """Drop refused candidates that lie on a plate which was read."""
-    read = [reading for reading in readings if reading.code is not None]
-    for reading in readings:
+    """Of candidates in one place only the read one, or the surest of those that were refused."""
+    kept: list[PlateReading] = []
+    for reading in sorted(readings, key=lambda r: (r.code is None, -r.confidence)):
         centre = None if reading.corners_px is None else reading.corners_px.mean(axis=0)
-        if reading.code is not None or centre is None or not any(_inside(centre, other) for other in read):
+        if centre is None or not any(_inside(centre, other) for other in kept):
+            kept.append(reading)
             yield reading
 
 
