@@ -366,7 +366,7 @@ def _softmax_confidence(costs: Array, chosen: Sequence[int]) -> Array:
 def _decode_alone(evidence: UnitEvidence, n: int, sure: float, *, clean: bool) -> DecodedSymbols:
     costs = evidence.cell_costs
     any_symbol = tuple(int(s) for s in evidence.best)
-    trust = np.where(evidence.stray > STRAY, STRAY_TRUST, 1.0)
+    trust = np.where((evidence.stray > STRAY) | evidence.disputed, STRAY_TRUST, 1.0)
     cells = _softmax_confidence(costs, any_symbol) * trust
     if is_codeword(any_symbol, PlateScheme.ID, n) and float(np.prod(cells)) >= LEAST_CODEWORD:
         code = PlateCode.from_symbols(any_symbol, PlateScheme.ID, n)

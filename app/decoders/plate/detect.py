@@ -458,6 +458,21 @@ def _red_at(opponent, x, y, px, py, qx, qy, ratio):  # type: ignore[no-untyped-d
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
+def _keep_nearest(near, merit, count, blob, misfit):  # type: ignore[no-untyped-def]
+    """Insert a blob into the list of the best, lowest misfit first; returns how many it holds."""
+    j = min(count, MAX_NEAR - 1)
+    if count >= MAX_NEAR and misfit >= merit[j]:
+        return count
+    while j > 0 and merit[j - 1] > misfit:
+        merit[j] = merit[j - 1]
+        near[j] = near[j - 1]
+        j -= 1
+    merit[j] = misfit
+    near[j] = blob
+    return min(count + 1, MAX_NEAR)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _green_triples(blobs, greens, opponent, quads):  # type: ignore[no-untyped-def]
     """Quadruples from three green squares with something red where the triangle should be."""
     found = 0
@@ -477,16 +492,7 @@ def _green_triples(blobs, greens, opponent, quads):  # type: ignore[no-untyped-d
             m = abs(np.log(other[7] / corner[7]))
             if m > 1.3 or abs(np.log(other[12] / corner[12])) > 1.3:
                 continue
-            j = k if k < MAX_NEAR else MAX_NEAR - 1
-            if k >= MAX_NEAR and m >= merit[j]:
-                continue
-            while j > 0 and merit[j - 1] > m:
-                merit[j] = merit[j - 1]
-                near[j] = near[j - 1]
-                j -= 1
-            merit[j] = m
-            near[j] = greens[b]
-            k = min(k + 1, MAX_NEAR)
+            k = _keep_nearest(near, merit, k, greens[b], m)
         for i in range(k):
             for j in range(k):
                 if i == j:
@@ -582,16 +588,7 @@ def _quads(blobs, opponent):  # type: ignore[no-untyped-def]
             if ratio < 0.4 or ratio > 14.0 or green[12] < 0.12 * red[12]:
                 continue
             m = abs(np.log(ratio / 2.0)) - 0.5 * np.log(green[12])
-            j = k if k < MAX_NEAR else MAX_NEAR - 1
-            if k >= MAX_NEAR and m >= merit[j]:
-                continue
-            while j > 0 and merit[j - 1] > m:
-                merit[j] = merit[j - 1]
-                near[j] = near[j - 1]
-                j -= 1
-            merit[j] = m
-            near[j] = greens[gi]
-            k = min(k + 1, MAX_NEAR)
+            k = _keep_nearest(near, merit, k, greens[gi], m)
         best_found = 0
         for i in range(k):
             for j in range(k):
