@@ -168,10 +168,10 @@ class InformationTag:
     def __post_init__(self) -> None:
         object.__setattr__(self, "polarities", tuple(_polarity(p) for p in self.polarities))
         object.__setattr__(self, "positions", tuple(self.positions))
-        object.__setattr__(self, "length_m", float(self.length_m))
-        object.__setattr__(self, "segment_m", float(self.segment_m))
         check_magnet_count(self.magnet_count, "polarities")
         n = segments_in(self.length_m, self.segment_m)
+        object.__setattr__(self, "length_m", rounded_m(self.length_m, "length_m"))
+        object.__setattr__(self, "segment_m", rounded_m(self.segment_m, "segment_m"))
         if len(self.positions) != self.magnet_count - 2:
             raise InvalidParameter(
                 f"{self.magnet_count} magnets have {self.magnet_count - 2} between the first and the last, "
@@ -376,6 +376,11 @@ def ticks_from_m(value_m: float, field: str) -> int:
             cure="round it to 0.0001 m",
         )
     return round(scaled)
+
+
+def rounded_m(value_m: float, field: str) -> float:
+    """The float next to a length in tenths of a millimetre, so that equal lengths compare equal. [m]"""
+    return ticks_from_m(value_m, field) / _TICKS_PER_M
 
 
 def _check_length(field: str, value_m: float, limits: tuple[float, float]) -> None:
