@@ -1,0 +1,202 @@
+"""A bar of magnetometers on a vehicle, and the trace that it records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from app.errors import InvalidParameter
+
+Floats = npt.NDArray[np.float64]
+
+MAX_SENSORS = 64
+
+
+class SensorRole(StrEnum):
+    """What a magnetometer is there for."""
+
+    ARRAY = "array"
+    REFERENCE = "reference"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MagnetometerBar:
+    """Where the magnetometers of a vehicle sit and how they are turned.
+
+    Parameters
+    ----------
+    positions_m : array_like, shape (S, 3)
+        In the vehicle frame (ISO 8855: x forward, y left, z up). The origin is the point that moves along the heading
+        (the middle of the rear axle; the bar itself if it is not known). Only differences of z count: the clearance
+        is not declared. [m]
+    roles : tuple of SensorRole, length S
+        Array sensors look for magnets, reference sensors listen to the wheels.
+    vehicle_from_sensor : ndarray, shape (S, 3, 3)
+        Rotation of each chip; the identity if left out.
+    axis_delay_s : tuple of float
+        Times after the time stamp at which x, y and z are converted. [s]
+
+    Raises
+    ------
+    InvalidParameter
+        Fewer than three array sensors, positions that are not finite, or lengths that differ.
+    """
+
+    positions_m: Floats
+    roles: tuple[SensorRole, ...]
+    vehicle_from_sensor: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
+    axis_delay_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        positions = np.array(self.positions_m, float)
+        if positions.ndim != 2 or positions.shape[1:] != (3,) or not np.isfinite(positions).all():
+            raise InvalidParameter(
+                "each sensor has a finite position x, y, z", field="bar.positions_m", limit="finite metres, S x 3"
+            )
+        roles = tuple(SensorRole(r) for r in self.roles)
+        if len(roles) != len(positions) or len(roles) > MAX_SENSORS:
+            raise InvalidParameter(
+                f"{len(positions)} positions and {len(roles)} roles",
+                field="bar.roles",
+                limit=f"as many as sensors, {MAX_SENSORS} at most",
+            )
+        if roles.count(SensorRole.ARRAY) < 3:
+            raise InvalidParameter("a bar has three or more array sensors", field="bar.roles", limit=">= 3 array")
+        turns = np.array(self.vehicle_from_sensor, float)
+        if not turns.size:
+            turns = np.tile(np.eye(3), (len(roles), 1, 1))
+        if turns.shape != (len(roles), 3, 3) or not np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6):
+            raise InvalidParameter(
+                "each sensor has a rotation matrix", field="bar.vehicle_from_sensor", limit="S rotations, 3 x 3"
+            )
+        delays = tuple(float(d) for d in self.axis_delay_s)
+        if len(delays) != 3 or not all(abs(d) <= 0.01 for d in delays):
+            raise InvalidParameter("three delays", field="bar.axis_delay_s", limit="-0.01 to 0.01 s")
+        object.__setattr__(self, "positions_m", positions)
+        object.__setattr__(self, "roles", roles)
+        object.__setattr__(self, "vehicle_from_sensor", turns)
+        object.__setattr__(self, "axis_delay_s", delays)
+
+    @classmethod
+    def metro(cls, *, forward_m: float = 0.0, references: bool = True) -> MagnetometerBar:
+        """METRO's bar: twelve sensors 16 cm apart, and one in each wheel well.
+
+        The order is the array's own: 0-5 the left half outwards, 6 the left reference, 7-12 the right half outwards,
+        13 the right reference (reference/formats of the firmware). The references' places are those of a compact car.
+
+        Parameters
+        ----------
+        forward_m : float
+            Of the bar, ahead of the point that moves along the heading. [m]
+        references : bool
+            With the two reference sensors.
+        """
+        half = [(forward_m, 0.08 + 0.16 * i, 0.0) for i in range(6)]
+        reference = [(forward_m - 0.62, 0.72, 0.52)] if references else []
+        left = half + reference
+        positions = np.array(left + [(x, -y, z) for x, y, z in left])
+        roles = ([SensorRole.ARRAY] * 6 + [SensorRole.REFERENCE] * len(reference)) * 2
+        return cls(positions, tuple(roles))
+
+    @property
+    def sensor_count(self) -> int:
+        """S."""
+        return len(self.roles)
+
+    @property
+    def array(self) -> npt.NDArray[np.intp]:
+        """Indices of the array sensors."""
+        return np.array([i for i, role in enumerate(self.roles) if role is SensorRole.ARRAY], np.intp)
+
+    @property
+    def references(self) -> npt.NDArray[np.intp]:
+        """Indices of the reference sensors."""
+        return np.array([i for i, role in enumerate(self.roles) if role is SensorRole.REFERENCE], np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MagnetTrace:
+    """What a bar and its vehicle recorded, whole or a piece of it.
+
+    Parameters
+    ----------
+    t_s : ndarray, shape (T,)
+        Monotonic time of each sample. [s]
+    field_ut : ndarray, shape (T, S, 3)
+        In vehicle axes (ISO 8855); NaN where nothing was read. [uT]
+    speed_t_s, speed_m_s : ndarray, shape (V,)
+        Speed over ground and its times. [s, m/s]
+    heading_t_s, heading_deg : ndarray, shape (H,), or None
+        Heading, clockwise from north, and its times. [s, deg]
+
+    Raises
+    ------
+    InvalidParameter
+        Shapes that do not fit, time that stands still or runs backwards, speeds or headings that are not finite.
+    """
+
+    t_s: Floats
+    field_ut: npt.NDArray[np.floating]
+    speed_t_s: Floats
+    speed_m_s: Floats
+    heading_t_s: Floats | None = None
+    heading_deg: Floats | None = None
+
+    def __post_init__(self) -> None:
+        t, b = np.asarray(self.t_s, float), np.asarray(self.field_ut)
+        if b.ndim != 3 or b.shape[2] != 3 or len(b) != len(t):
+            raise InvalidParameter(
+                f"{len(t)} times and a field of shape {b.shape}", field="trace.field_ut", limit="shape (T, S, 3)"
+            )
+        _check_times(t, "trace.t_s")
+        object.__setattr__(self, "t_s", t)
+        object.__setattr__(self, "field_ut", b)
+        self._check_series("speed_t_s", "speed_m_s")
+        if (self.heading_t_s is None) != (self.heading_deg is None):
+            raise InvalidParameter("headings come with their times", field="trace.heading_t_s", limit="both or none")
+        if self.heading_t_s is not None:
+            self._check_series("heading_t_s", "heading_deg")
+
+    def _check_series(self, times: str, values: str) -> None:
+        t, v = np.asarray(getattr(self, times), float), np.asarray(getattr(self, values), float)
+        _check_times(t, f"trace.{times}")
+        if t.shape != v.shape or not np.isfinite(v).all():
+            raise InvalidParameter(
+                f"{values} is one finite value for each time", field=f"trace.{values}", limit="finite"
+            )
+        object.__setattr__(self, times, t)
+        object.__setattr__(self, values, v)
+
+    @property
+    def rate_hz(self) -> float:
+        """Median sample rate; 0 for fewer than two samples. [Hz]"""
+        return float(1 / np.median(np.diff(self.t_s))) if len(self.t_s) > 1 else 0.0
+
+    def between(self, start_s: float, end_s: float) -> MagnetTrace:
+        """The piece with start <= t < end of every series."""
+
+        def cut(t: Floats) -> slice:
+            return slice(*(int(i) for i in np.searchsorted(t, (start_s, end_s))))
+
+        at, speed = cut(self.t_s), cut(self.speed_t_s)
+        heading = None if self.heading_t_s is None else cut(self.heading_t_s)
+        return MagnetTrace(
+            self.t_s[at], self.field_ut[at], self.speed_t_s[speed], self.speed_m_s[speed],
+            None if self.heading_t_s is None or heading is None else self.heading_t_s[heading],
+            None if self.heading_deg is None or heading is None else self.heading_deg[heading],
+        )  # fmt: skip
+
+
+def _check_times(t: Floats, name: str) -> None:
+    if t.ndim != 1 or not np.isfinite(t).all():
+        raise InvalidParameter("times are one row of finite seconds", field=name, limit="finite")
+    if t.size > 1 and (bad := np.flatnonzero(np.diff(t) <= 0)).size:
+        raise InvalidParameter(
+            f"time does not rise from row {bad[0]} ({t[bad[0]]:.6f} s) to the next ({t[bad[0] + 1]:.6f} s)",
+            field=name,
+            limit="rising",
+            cure="sort the rows, or cut the trace where the clock was set",
+        )
