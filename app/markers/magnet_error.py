@@ -205,7 +205,7 @@ def separation(u: FloatArray, covariance: FloatArray, others_u: FloatArray) -> F
     if not len(u):
         return np.zeros(len(others_u))
     delta = others_u - u
-    distance: FloatArray = np.sqrt(np.einsum("ki,ki->k", delta, np.linalg.solve(covariance, delta.T).T))
+    distance: FloatArray = np.sqrt(np.sum(delta * np.linalg.solve(covariance, delta.T).T, axis=1))
     return distance
 
 

@@ -1,0 +1,1 @@
+"""Magnet tag -> what is built: codebooks, layouts, drilling sheets."""

@@ -1,0 +1,255 @@
+"""Giving codes to meanings, so far apart that a decoder does not take one for another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from app.errors import Conflict, InvalidParameter
+from app.markers.magnet import InformationTag, Polarity
+from app.markers.magnet_codebook import Codebook, Meaning
+from app.markers.magnet_design import TagDesign
+from app.markers.magnet_error import (
+    MAX_PLACEMENTS,
+    ReadingConditions,
+    covariance_of,
+    placements_of,
+    separation,
+    separation_for,
+)
+
+FloatArray = npt.NDArray[np.float64]
+_Pattern = tuple[Polarity, ...]
+
+
+class CodebookFull(Conflict):
+    """No further code keeps the distance to the others that the rules ask for."""
+
+
+@dataclass(frozen=True, slots=True)
+class CodebookRules:
+    """How far apart codes are kept.
+
+    Parameters
+    ----------
+    conditions : ReadingConditions
+        The worst under which the codes must be read.
+    confusion : float
+        Most probability with which a code may be taken for another one, the polarities being read right.
+    wrong_way_safe : bool
+        No code is the reverse of another one, nor its own, nor too near to it: so every reading tells the direction.
+    survive_missing : bool
+        A code is told even when any one of its magnets is missed; from four magnets on.
+    """
+
+    conditions: ReadingConditions = field(default_factory=ReadingConditions)
+    confusion: float = 0.001
+    wrong_way_safe: bool = False
+    survive_missing: bool = False
+
+    def __post_init__(self) -> None:
+        separation_for(self.confusion)
+
+
+def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookRules) -> Codebook:
+    """Give codes to further meanings; codes given before stay as they are.
+
+    Parameters
+    ----------
+    book : Codebook
+        May be empty.
+    meanings : sequence of Meaning
+        New ones.
+    rules : CodebookRules
+
+    Returns
+    -------
+    Codebook
+        With the meanings added in their order. The same book, meanings and rules always give the same codes.
+
+    Raises
+    ------
+    CodebookFull
+        Not all of them fit; the message says how many were asked for, how many fit, and what limits them.
+    Conflict
+        A meaning is in the book already, or occurs twice.
+    InvalidParameter
+        The rules cannot be met by any tag of this design.
+    """
+    if rules.survive_missing and book.design.magnets < 4:
+        raise InvalidParameter(
+            f"tags of {book.design.magnets} magnets do not survive the loss of one: two magnets have no ratio",
+            field="survive_missing",
+            limit="4 magnets or more",
+            cure="choose a design of 4 to 7 magnets",
+        )
+    space = _CodeSpace(book.design, rules)
+    for tag in book.tags:
+        space.take(tag)
+    free = space.list_free()
+    given: list[tuple[InformationTag, Meaning]] = []
+    for meaning in meanings:
+        chosen = next(free, None)
+        if chosen is None:
+            raise _full(book, len(meanings), len(given), rules)
+        space.take(chosen)
+        given.append((chosen, meaning))
+    return Codebook(book.name, book.design, (*book.entries, *given))
+
+
+def codebook_capacity(design: TagDesign, rules: CodebookRules, *, most: int = 100_000) -> int:
+    """Codes that an empty book of a design takes under these rules, counted up to `most`."""
+    space = _CodeSpace(design, rules)
+    count = 0
+    for tag in space.list_free():
+        space.take(tag)
+        count += 1
+        if count == most:
+            break
+    return count
+
+
+def list_conflicts(book: Codebook, rules: CodebookRules) -> list[tuple[InformationTag, InformationTag]]:
+    """Pairs of codes of a book that stand nearer than the rules ask for; a tag with itself if it is its own reverse.
+
+    For books that were made by other means, or for stricter rules.
+    """
+    space = _CodeSpace(book.design, rules)
+    tags = book.tags
+    return [(a, b) for i, a in enumerate(tags) for b in tags[: i + 1] if space.conflict(a, b)]
+
+
+def _full(book: Codebook, asked: int, fit: int, rules: CodebookRules) -> CodebookFull:
+    design, at = book.design, rules.conditions
+    safe = design.wrong_way_safe_capacity if rules.wrong_way_safe else design.coupled_capacity
+    extra = [
+        name
+        for name, on in (("wrong-way safe", rules.wrong_way_safe), ("one magnet may be missed", rules.survive_missing))
+        if on
+    ]
+    rule = ", ".join(
+        (f"confusion at most {rules.confusion:g} at {at.speed_mps:g} m/s and {at.clearance_m:g} m clearance", *extra)
+    )
+    return CodebookFull(
+        f"{asked} codes were asked for, {fit} more fit beside the {len(book.entries)} in the book",
+        field="meanings",
+        limit=f"{rule}; the design itself has {safe} codes of {design.magnets} magnets on {design.length_m:g} m "
+        f"in segments of {design.segment_m:g} m",
+        cure="take more magnets, a longer tag, a lower speed or clearance, or fewer meanings",
+    )
+
+
+class _CodeSpace:
+    """The codes of a design, and which of them are still free.
+
+    Codes are pairs of polarities and a placement. Only codes with the same polarities can be confused, so each
+    pattern of polarities has its own row of placements that are blocked.
+    """
+
+    def __init__(self, design: TagDesign, rules: CodebookRules) -> None:
+        self._design, self._rules = design, rules
+        self._limit = separation_for(rules.confusion)
+        self._steps = placements_of(design, MAX_PLACEMENTS)
+        self._gaps_m = self._steps.astype(np.float64) * design.segment_m
+        self._inverse = self._inverses(self._gaps_m)
+        self._blocked: dict[_Pattern, npt.NDArray[np.bool_]] = {}
+        self._partial: dict[_Pattern, list[FloatArray]] = {}
+
+    def take(self, tag: InformationTag) -> None:
+        """Block what is too near to a tag and, on a wrong-way-safe book, to its reverse."""
+        for seen in self._seen_as(tag):
+            row = self._row(seen.polarities)
+            row |= self._near(np.array(seen.gaps_m), self._gaps_m, self._inverse)
+            for pattern, gaps_m in self._remains(seen):
+                self._partial.setdefault(pattern, []).append(gaps_m)
+
+    def list_free(self) -> Iterator[InformationTag]:
+        """Free codes, by placement and then by polarities; what is taken meanwhile is left out."""
+        for k in range(len(self._steps)):
+            steps = [int(s) for s in self._steps[k]]
+            for polarities in product(Polarity, repeat=self._design.magnets):
+                if self._row(polarities)[k]:
+                    continue
+                tag = InformationTag.from_gaps(polarities, self._design.segment_m, steps)
+                if not self._own_conflict(tag) and not self._remains_conflict(tag):
+                    yield tag
+
+    def conflict(self, a: InformationTag, b: InformationTag) -> bool:
+        """Whether two codes may be confused; of a code with itself, whether it may be confused with its reverse."""
+        if a == b:
+            return self._own_conflict(a)
+        if any(self._confusable(seen.polarities, np.array(seen.gaps_m), b) for seen in self._seen_as(a)):
+            return True
+        return any(
+            pattern == other and self._near(gaps_m, others_m[None])[0]
+            for seen in self._seen_as(a)
+            for pattern, gaps_m in self._remains(seen)
+            for other, others_m in self._remains(b)
+        )
+
+    def _confusable(self, pattern: _Pattern, gaps_m: FloatArray, other: InformationTag) -> bool:
+        return pattern == other.polarities and bool(self._near(gaps_m, np.array([other.gaps_m]))[0])
+
+    def _seen_as(self, tag: InformationTag) -> tuple[InformationTag, ...]:
+        return (tag, tag.reversed_wrong_way()) if self._rules.wrong_way_safe else (tag,)
+
+    def _row(self, pattern: _Pattern) -> npt.NDArray[np.bool_]:
+        if pattern not in self._blocked:
+            self._blocked[pattern] = np.zeros(len(self._steps), dtype=bool)
+        return self._blocked[pattern]
+
+    def _near(
+        self, gaps_m: FloatArray, others_m: FloatArray, others_inverse: FloatArray | None = None
+    ) -> npt.NDArray[np.bool_]:
+        """Whether gaps of shape (K, M - 1) are nearer to a code's than the rules allow, as seen from either side."""
+        if len(gaps_m) < 2:  # two magnets have no ratio
+            return np.ones(len(others_m), dtype=bool)
+        if others_inverse is None:
+            others_inverse = self._inverses(others_m)
+        own = covariance_of(gaps_m[None], self._rules.conditions)[0]
+        u, others_u = _places(gaps_m[None])[0], _places(others_m)
+        delta = others_u - u
+        seen_from_there = np.sqrt((delta[:, None, :] @ others_inverse @ delta[:, :, None])[:, 0, 0])
+        near: npt.NDArray[np.bool_] = np.minimum(separation(u, own, others_u), seen_from_there) < self._limit
+        return near
+
+    def _inverses(self, gaps_m: FloatArray) -> FloatArray:
+        """Inverse covariances of codes, shape (K, M - 2, M - 2)."""
+        return np.asarray(np.linalg.inv(covariance_of(gaps_m, self._rules.conditions)), dtype=np.float64)
+
+    def _own_conflict(self, tag: InformationTag) -> bool:
+        if not self._rules.wrong_way_safe:
+            return False
+        back = tag.reversed_wrong_way()
+        if self._confusable(back.polarities, np.array(back.gaps_m), tag):
+            return True
+        return any(
+            pattern == other and self._near(gaps_m, others_m[None])[0]
+            for pattern, gaps_m in self._remains(back)
+            for other, others_m in self._remains(tag)
+        )
+
+    def _remains(self, tag: InformationTag) -> Iterator[tuple[_Pattern, FloatArray]]:
+        """What is left of a tag when one magnet is missed: polarities and gaps, for each of its magnets."""
+        if not self._rules.survive_missing:
+            return
+        offsets = np.array(tag.offsets_m)
+        for i in range(tag.magnet_count):
+            yield tag.polarities[:i] + tag.polarities[i + 1 :], np.diff(np.delete(offsets, i))
+
+    def _remains_conflict(self, tag: InformationTag) -> bool:
+        return any(
+            self._near(taken_m, gaps_m[None])[0]
+            for pattern, gaps_m in self._remains(tag)
+            for taken_m in self._partial.get(pattern, ())
+        )
+
+
+def _places(gaps_m: FloatArray) -> FloatArray:
+    """Middle magnets' places over the tag's length, shape (K, M - 2), of gaps of shape (K, M - 1)."""
+    places: FloatArray = np.cumsum(gaps_m, axis=1)
+    return places[:, :-1] / places[:, -1:]
