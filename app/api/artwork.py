@@ -89,7 +89,7 @@ class ArtworkIn(BaseModel):
         )
 
 
-def get_artworks(request: Request) -> Artworks:
+async def get_artworks(request: Request) -> Artworks:
     """Use cases on artwork."""
     service: Artworks = request.app.state.artworks
     return service

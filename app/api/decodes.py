@@ -56,7 +56,7 @@ _BODY: dict[str, Any] = {
 }
 
 
-def get_decodes(request: Request) -> DecodesService:
+async def get_decodes(request: Request) -> DecodesService:
     """Use cases on decodes."""
     service: DecodesService = request.app.state.decodes
     return service

@@ -29,7 +29,7 @@ Text = Annotated[str, AfterValidator(_plain_text)]
 Identifier = Annotated[str, Field(pattern=r"^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$")]
 
 
-def get_caller(request: Request) -> CallerValue:
+async def get_caller(request: Request) -> CallerValue:  # async: a plain function would cost a hop to a thread
     """The caller that the middleware authenticated."""
     caller = request.scope.get("state", {}).get("caller")
     if not isinstance(caller, CallerValue):
@@ -37,7 +37,7 @@ def get_caller(request: Request) -> CallerValue:
     return caller
 
 
-def get_markers(request: Request) -> MarkersService:
+async def get_markers(request: Request) -> MarkersService:
     """Use cases on markers."""
     service: MarkersService = request.app.state.markers
     return service
@@ -65,7 +65,7 @@ async def get_idempotency_key(request: Request) -> IdempotencyKey | None:
     return IdempotencyKey(key, digest.hexdigest())
 
 
-def get_version(request: Request) -> int | None:
+async def get_version(request: Request) -> int | None:
     """The version named by If-Match; None for `*`.
 
     Raises

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
+import os
 import resource
 import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 from typing import Any
 
 import cv2
@@ -22,6 +27,13 @@ from app.services.frames import AnnotationTask, FrameResult, FrameTask
 
 DecodePlates = Callable[..., list[PlateReading]]
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+READY = "ready"
+# glibc's mallopt: keep freed memory for the next frame, or the kernel clears every page of every frame anew
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_KEPT_BYTES = 256 * 1024**2
+_KEPT_BLOCK_BYTES = 32 * 1024**2  # the most that glibc takes
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +56,52 @@ class _State:
     decode: DecodePlates | None = None
 
 
+def serve_tasks(connection: Connection, decode: DecodePlates, limits: ChildLimits) -> None:
+    """Warm up, say so, and answer tasks until the server hangs up.
+
+    A task comes as (function, argument); the answer is (whether it succeeded, result or exception).
+    """
+    warm_child(decode, limits)
+    connection.send(READY)
+    while True:
+        try:
+            function, task = connection.recv()
+        except EOFError:
+            return
+        try:
+            answer = (True, function(task))
+        except Exception as error:  # noqa: BLE001 - raised again in the server
+            answer = (False, ExceptionWithTraceback(error, error.__traceback__))
+        connection.send(answer)
+        del function, task, answer  # a frame's memory is free before the next frame comes
+
+
 def warm_child(decode: DecodePlates, limits: ChildLimits) -> None:
     """Prepare a fresh process: one thread, compiled kernels loaded, then the address space closed."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a decoder stuck in native code must still die at once
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which then stops its children
     cv2.setNumThreads(1)
     cv2.ocl.setUseOpenCL(False)
+    keep_memory()
     _State.decode = decode
     decode(_warm_frame(), camera=None, codebook=(), thermal=False)
+    gc.collect()
+    gc.freeze()  # the libraries' objects stay for good: no collection need walk through them
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (limits.memory_bytes, limits.memory_bytes))
+
+
+def keep_memory() -> None:
+    """Have this process reuse the memory of earlier frames; without glibc nothing changes."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _KEPT_BLOCK_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+def process_id(_task: None) -> int:
+    """Proof that the process answers."""
+    return os.getpid()
 
 
 def decode_frame(task: FrameTask) -> FrameResult:

@@ -12,6 +12,7 @@ from app.registry.ids import new_id
 from app.registry.tables import agencies, api_keys
 
 Row = sa.RowMapping
+_KEY = sa.select(api_keys).where(api_keys.c.sha256 == sa.bindparam("sha256"))  # built once: every request asks
 
 
 def key_sha256(key: str) -> str:
@@ -63,8 +64,7 @@ def add_key(
 
 def find_key(connection: sa.Connection, key: str) -> Row | None:
     """The stored row of a key as it was sent."""
-    query = sa.select(api_keys).where(api_keys.c.sha256 == key_sha256(key))
-    return connection.execute(query).mappings().one_or_none()
+    return connection.execute(_KEY, {"sha256": key_sha256(key)}).mappings().one_or_none()
 
 
 def touch_key(connection: sa.Connection, key_id: str, now: datetime) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from app.errors import InvalidParameter, Unavailable, UnreadableUpload
+from app.jobs import keeper
 from app.jobs.child import ChildLimits
 from app.jobs.pool import DecodePool
 from app.markers.plate import PlateCode
@@ -145,8 +146,10 @@ def test_more_frames_than_places_are_refused_as_busy() -> None:
 
 def test_a_decoder_that_cannot_start_is_unavailable() -> None:
     broken = DecodePool(broken_decode, workers=1)
-    with pytest.raises(Unavailable):
-        broken.open()
+    for _attempt in range(2):
+        with pytest.raises(Unavailable, match="could be started"):
+            broken.open()
+    assert not broken.is_ready()
     broken.close()
 
 
@@ -154,22 +157,39 @@ def broken_decode(*_args: object, **_options: object) -> list[object]:
     raise ImportError("no kernels")
 
 
-def test_a_pool_that_was_given_up_says_so_once_and_comes_back() -> None:
+def test_a_killed_idle_process_is_replaced_before_a_frame_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keeper, "_CHECK_S", 3.0)
     made = DecodePool(standin.decode, workers=1)
     assert made.is_ready()
     made.open()
     try:
-        assert made.is_ready()
-        os.kill(child_of(made), signal.SIGKILL)
+        victim = child_of(made)
+        os.kill(victim, signal.SIGKILL)
+        os.waitid(os.P_PID, victim, os.WEXITED | os.WNOWAIT)
+        assert not made.is_ready()
         deadline = time.monotonic() + 20
-        while made.is_ready():
+        while not made.is_ready():
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        assert made.is_ready()
-        assert made.start(task_that(standin.OBEY)).result().readings[0].digits == CODE.digits
+        assert child_of(made) != victim
     finally:
         made.close()
     assert not made.is_ready()
+
+
+def test_a_cancelled_frame_that_waits_never_runs() -> None:
+    made = DecodePool(slow_decode, workers=1, max_waiting=2)
+    made.open()
+    try:
+        running, waiting = made.start(task_that(standin.OBEY)), made.start(task_that(standin.DIE))
+        waiting.cancel()
+        made.start(task_that(standin.OBEY)).cancel()  # its place is free again
+        with pytest.raises(Unavailable):
+            waiting.result()
+        pid = int(running.result().readings[0].reason)
+        assert int(made.start(task_that(standin.OBEY)).result().readings[0].reason) == pid
+    finally:
+        made.close()
 
 
 def test_a_closed_pool_leaves_no_process_and_takes_no_frame() -> None:

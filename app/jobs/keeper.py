@@ -1,0 +1,231 @@
+"""A thread that keeps one decoder process: starts it, feeds it frames, stops it at its limits, replaces it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, Generic, TypeVar
+
+import structlog
+
+from app.errors import Unavailable, UnreadableUpload
+from app.jobs.child import READY, ChildLimits, DecodePlates, serve_tasks
+
+T = TypeVar("T")
+_START_S = 120.0
+_PATIENCE_S = 120.0
+_CHECK_S = 1.0
+_RETRY_S = 30.0
+_LOG = structlog.get_logger(__name__)
+
+
+class Pending(Generic[T]):
+    """A task on its way through a decoder process.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module: it is imported by name in the process.
+    task : object
+        Its only argument.
+    interrupt : callable
+        Stops the process that works on this, if one does.
+    timeout_s : float
+        Longest time in the process. [s]
+    """
+
+    def __init__(
+        self, function: Callable[[Any], T], task: Any, interrupt: Callable[[Pending[Any]], None], timeout_s: float
+    ) -> None:
+        self.call = (function, task)
+        self.future: Future[T] = Future()
+        self.timeout_s = timeout_s
+        self.stopped = False
+        self._interrupt = interrupt
+
+    def result(self) -> T:
+        """Wait for it; what goes wrong in the process comes back as the domain's error."""
+        try:
+            return self.future.result(self.timeout_s + _PATIENCE_S)
+        except CancelledError as error:
+            raise _was_stopped() from error
+        except FutureTimeout as error:
+            if self.future.done():
+                raise
+            self.cancel()
+            raise Unavailable("no decoder process is free", cure="try again later") from error
+
+    def cancel(self) -> None:
+        """Stop it, also when it runs already."""
+        self.stopped = True
+        if not self.future.cancel():
+            self._interrupt(self)
+
+
+class Keeper(threading.Thread):
+    """Runs tasks one after the other in a process of its own.
+
+    Parameters
+    ----------
+    tasks : SimpleQueue of Pending or None
+        Shared with the other keepers; None ends one of them.
+    decode : callable
+        `decode_plates`, imported by name in the process.
+    limits : ChildLimits
+    """
+
+    def __init__(
+        self, tasks: queue.SimpleQueue[Pending[Any] | None], decode: DecodePlates, limits: ChildLimits
+    ) -> None:
+        super().__init__(name="decoder-keeper", daemon=True)
+        self._tasks = tasks
+        self._decode = decode
+        self._limits = limits
+        self._lock = threading.Lock()
+        self._process: BaseProcess | None = None
+        self._connection: Connection | None = None
+        self._current: Pending[Any] | None = None
+        self._closing = False
+        self._failed_at: float | None = None
+
+    @property
+    def is_up(self) -> bool:
+        """Whether its process runs or is being started."""
+        with self._lock:
+            return self._failed_at is None and (self._process is None or self._process.is_alive())
+
+    def interrupt(self, pending: Pending[Any]) -> None:
+        """Kill the process if it works on this task."""
+        with self._lock:
+            if self._current is pending and self._process is not None:
+                self._process.kill()
+
+    def close(self) -> None:
+        """Kill the process and refuse what comes; the thread ends at the next None."""
+        with self._lock:
+            self._closing = True
+            if self._process is not None:
+                self._process.kill()
+
+    def run(self) -> None:
+        """Serve until a None comes."""
+        self._start_early()
+        while True:
+            try:
+                pending = self._tasks.get(timeout=_CHECK_S)
+            except queue.Empty:
+                self._start_early()
+                continue
+            if pending is None:
+                break
+            if pending.future.set_running_or_notify_cancel():
+                try:
+                    answer = self._run_in_process(pending)
+                except BaseException as error:  # noqa: BLE001 - whoever waits for the task must hear of it
+                    pending.future.set_exception(error)
+                else:
+                    pending.future.set_result(answer)
+        self._drop()
+
+    # --- one task ---------------------------------------------------------------------------------------------------
+
+    def _run_in_process(self, pending: Pending[Any]) -> Any:
+        """Run a task; once more if the process dies, which can be another's fault: memory may have run short."""
+        for _attempt in range(2):
+            connection = self._connection if self._is_alive() else self._start()
+            if connection is None:
+                raise Unavailable("no decoder process could be started", cure="try again in a few seconds")
+            try:
+                succeeded, answer = self._exchange(connection, pending)
+            except (EOFError, OSError):
+                self._drop()
+                if self._closing or pending.stopped:
+                    raise _was_stopped() from None
+                continue
+            if succeeded:
+                return answer
+            raise answer
+        raise UnreadableUpload(
+            "the picture stopped the decoder process, twice",
+            field="file",
+            cure="send the frame as the camera wrote it; if it is, report it as a defect",
+        )
+
+    def _exchange(self, connection: Connection, pending: Pending[Any]) -> tuple[bool, Any]:
+        with self._lock:
+            if self._closing or pending.stopped:
+                raise _was_stopped()
+            self._current = pending
+        try:
+            connection.send(pending.call)
+            if connection.poll(pending.timeout_s):
+                answer: tuple[bool, Any] = connection.recv()
+                return answer
+        finally:
+            with self._lock:
+                self._current = None
+        self._drop()
+        raise UnreadableUpload(
+            "decoding the picture took too long and was stopped",
+            field="file",
+            limit=f"{pending.timeout_s:g} s a frame",
+            cure="send the frame as the camera wrote it; if it is, report it as a defect",
+        )
+
+    # --- the process ------------------------------------------------------------------------------------------------
+
+    def _is_alive(self) -> bool:
+        return self._process is not None and self._process.is_alive()
+
+    def _start_early(self) -> None:
+        """Have a process ready before a task needs it; where none starts, try again now and then."""
+        if self._closing or self._is_alive():
+            return
+        if self._failed_at is None or time.monotonic() - self._failed_at > _RETRY_S:
+            self._start()
+
+    def _start(self) -> Connection | None:
+        """Start a process and wait until it is warm."""
+        self._drop()
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=serve_tasks, args=(theirs, self._decode, self._limits), daemon=True)
+        process.start()
+        theirs.close()
+        with self._lock:
+            self._process, self._connection = process, ours
+            if self._closing:
+                process.kill()
+        try:
+            if ours.poll(_START_S) and ours.recv() == READY:
+                self._failed_at = None
+                return ours
+        except (EOFError, OSError):
+            pass
+        self._drop()
+        self._failed_at = time.monotonic()
+        if not self._closing:
+            _LOG.error("a decoder process did not start")
+        return None
+
+    def _drop(self) -> None:
+        """Kill the process, if there is one, and forget it."""
+        with self._lock:
+            process, connection = self._process, self._connection
+            self._process = self._connection = None
+        if connection is not None:
+            connection.close()
+        if process is not None:
+            process.kill()
+            process.join()
+
+
+def _was_stopped() -> Unavailable:
+    return Unavailable("the decoder process was stopped", cure="try again in a few seconds")
