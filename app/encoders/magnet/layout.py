@@ -1,0 +1,267 @@
+"""A tag on a lane -> holes to drill: where each magnet goes, and which way its north pole points.
+
+A tag is laid out straight, its first and its last magnet on the lane's line and the others between them: the distances
+that carry the code are those of equation 1 in the direction of the tag, on a bend as on a straight (METRO section 4.2,
+figure 4). A line of magnets follows the painted line.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from app.encoders.magnet.lane import FloatArray, LaneLine, bearing_deg, left_of
+from app.errors import InvalidParameter
+from app.markers.magnet import (
+    MAX_LINE_SPACING_M,
+    InformationTag,
+    LineStyle,
+    LineTag,
+    Orientation,
+    Polarity,
+    Tag,
+)
+from app.markers.magnet_codebook import Meaning, check_name
+
+MAX_HOLES = 10_000
+MAX_OFFSET_M = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class Hole:
+    """One magnet to be set.
+
+    Attributes
+    ----------
+    number : int
+        From 1, in the direction of travel.
+    along_m : float
+        From the first magnet: along the tag, or along the line for line tags. [m]
+    chainage_m, offset_m : float
+        Along the lane's line, and from it, left positive. [m]
+    lon_deg, lat_deg : float
+        WGS 84. [deg]
+    east_m, north_m, up_m : float
+        In the lane's local frame. [m]
+    polarity : Polarity
+    orientation : Orientation
+    north_pole_bearing_deg : float or None
+        Clockwise from true north; None for upright magnets. [deg]
+    """
+
+    number: int
+    along_m: float
+    chainage_m: float
+    offset_m: float
+    lon_deg: float
+    lat_deg: float
+    east_m: float
+    north_m: float
+    up_m: float
+    polarity: Polarity
+    orientation: Orientation
+    north_pole_bearing_deg: float | None
+
+    @property
+    def north_pole(self) -> str:
+        """Where the north pole points, for the crew: up, down, forward or backward."""
+        ways = ("up", "down") if self.orientation is Orientation.UP else ("forward", "backward")
+        return ways[self.polarity is Polarity.S]
+
+    @property
+    def point_enu_m(self) -> FloatArray:
+        """Place in the lane's local frame, shape (3,). [m]"""
+        return np.array([self.east_m, self.north_m, self.up_m])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MagnetLayout:
+    """The holes of one tag, or of one line of tags.
+
+    Attributes
+    ----------
+    name : str
+        The agency's name for it.
+    tag : InformationTag or LineTag
+    lane : LaneLine
+    holes : tuple of Hole
+        In the direction of travel.
+    bearing_deg : float
+        Of the tag, or of the line at its first magnet; clockwise from true north. [deg]
+    meaning : Meaning or None
+    """
+
+    name: str
+    tag: Tag
+    lane: LaneLine
+    holes: tuple[Hole, ...]
+    bearing_deg: float
+    meaning: Meaning | None = None
+
+    @property
+    def length_m(self) -> float:
+        """From the first hole to the last. [m]"""
+        return self.holes[-1].along_m
+
+    @property
+    def gaps_m(self) -> FloatArray:
+        """Straight distances between neighbours, shape (holes - 1,). [m]"""
+        points = np.array([hole.point_enu_m for hole in self.holes]).reshape(-1, 3)
+        return np.asarray(np.linalg.norm(np.diff(points, axis=0), axis=1), dtype=np.float64)
+
+
+def place_tag(
+    lane: LaneLine,
+    tag: InformationTag,
+    chainage_m: float,
+    *,
+    name: str,
+    offset_m: float = 0.0,
+    meaning: Meaning | None = None,
+) -> MagnetLayout:
+    """Lay out an information tag.
+
+    Parameters
+    ----------
+    lane : LaneLine
+        The lane's centre line, in the direction of legal travel.
+    tag : InformationTag
+    chainage_m : float
+        Of the first magnet. [m]
+    name : str
+    offset_m : float
+        Of the whole tag from the line, left positive. [m]
+    meaning : Meaning, optional
+
+    Raises
+    ------
+    InvalidParameter
+        The tag does not lie on the lane.
+    """
+    check_name("name", name)
+    _check_chainage("chainage_m", chainage_m, lane)
+    if not abs(offset_m) <= MAX_OFFSET_M:
+        raise InvalidParameter(f"offset_m is {offset_m}", field="offset_m", limit=f"within {MAX_OFFSET_M:g} m")
+    first, last = lane.at(chainage_m), _point_ahead(lane, chainage_m, tag.length_m)
+    direction = (last - first) / float(np.linalg.norm(last - first))
+    start = first + offset_m * left_of(direction)
+    bearing = bearing_deg(direction)
+    holes = []
+    for number, magnet in enumerate(tag.magnets, start=1):
+        point = start + magnet.along_m * direction
+        holes.append(_hole(lane, number, magnet.along_m, point, magnet.polarity, bearing))
+    return MagnetLayout(name, tag, lane, tuple(holes), bearing, meaning)
+
+
+def place_line(
+    line: LaneLine,
+    style: LineStyle,
+    *,
+    name: str,
+    from_m: float = 0.0,
+    to_m: float | None = None,
+    spacing_m: float = MAX_LINE_SPACING_M,
+) -> MagnetLayout:
+    """Lay out line tags along a painted line, at equal distances along it.
+
+    Parameters
+    ----------
+    line : LaneLine
+        The painted line.
+    style : LineStyle
+    name : str
+    from_m, to_m : float
+        Chainages of the first and the last magnet; to the end of the line without. [m]
+    spacing_m : float
+        Most that neighbours may be apart; it is shortened so that the last magnet falls on `to_m`. [m]
+
+    Raises
+    ------
+    InvalidParameter
+        The section does not lie on the line, the spacing is not positive, or there would be more than 10,000 holes.
+    """
+    check_name("name", name)
+    end_m = line.length_m if to_m is None else to_m
+    _check_chainage("from_m", from_m, line)
+    _check_chainage("to_m", end_m, line)
+    if not (0 < spacing_m < math.inf and from_m < end_m):
+        raise InvalidParameter(
+            f"no line of magnets goes from {from_m:g} m to {end_m:g} m in steps of {spacing_m:g} m",
+            field="spacing_m" if from_m < end_m else "to_m",
+            limit="a spacing above 0, and an end behind the beginning",
+        )
+    steps = max(math.ceil((end_m - from_m) / spacing_m - 1e-9), 1)
+    if steps + 1 > MAX_HOLES:
+        raise InvalidParameter(
+            f"the line takes {steps + 1} magnets",
+            field="spacing_m",
+            limit=f"{MAX_HOLES} magnets",
+            cure="lay it out in sections",
+        )
+    tag = LineTag.of_style(style)
+    along_m = np.linspace(0.0, end_m - from_m, steps + 1)
+    points = line.at(from_m + along_m)
+    holes = [
+        _hole(line, i + 1, float(along), point, tag.polarity, None)
+        for i, (along, point) in enumerate(zip(along_m, points, strict=True))
+    ]
+    return MagnetLayout(name, tag, line, tuple(holes), bearing_deg(line.direction_at(from_m)))
+
+
+def _check_chainage(field: str, chainage_m: float, lane: LaneLine) -> None:
+    if not 0 <= chainage_m <= lane.length_m:
+        raise InvalidParameter(
+            f"{field} is {chainage_m:g} m, the line is {lane.length_m:.2f} m long",
+            field=field,
+            limit=f"0 to {lane.length_m:.2f} m",
+            cure="choose a chainage on the line",
+        )
+
+
+def _point_ahead(lane: LaneLine, chainage_m: float, length_m: float) -> FloatArray:
+    """The place on the lane that is `length_m` away in a straight line, shape (3,). [m]"""
+    start = lane.at(chainage_m)
+    room_m = lane.length_m - chainage_m
+
+    def beyond(arc_m: float) -> float:
+        return float(np.linalg.norm(lane.at(chainage_m + arc_m) - start)) - length_m
+
+    reach_m = length_m  # the chord is never longer than the arc, so the place lies behind this
+    while beyond(min(reach_m, room_m)) < -1e-9:
+        if reach_m >= room_m or reach_m > 2 * length_m:
+            raise InvalidParameter(
+                f"a tag of {length_m:g} m at chainage {chainage_m:g} m leaves the line of {lane.length_m:.2f} m",
+                field="chainage_m",
+                limit=f"at most {max(lane.length_m - length_m, 0):.2f} m, where the line does not turn back",
+                cure="choose a smaller chainage or a shorter tag",
+            )
+        reach_m *= 1.05
+    reach_m = min(reach_m, room_m)
+    arc_m = brentq(beyond, 0.0, reach_m, xtol=1e-10) if beyond(reach_m) > 0 else reach_m
+    return lane.at(chainage_m + arc_m)
+
+
+def _hole(
+    lane: LaneLine, number: int, along_m: float, point: FloatArray, polarity: Polarity, forward_deg: float | None
+) -> Hole:
+    """A hole at a point; upright without the bearing of the tag."""
+    chainage_m, offset_m = lane.locate(point)
+    lon_deg, lat_deg = lane.lon_lat(point)
+    turned = 0.0 if polarity is Polarity.N else 180.0
+    return Hole(
+        number=number,
+        along_m=along_m,
+        chainage_m=chainage_m,
+        offset_m=offset_m,
+        lon_deg=lon_deg,
+        lat_deg=lat_deg,
+        east_m=float(point[0]),
+        north_m=float(point[1]),
+        up_m=float(point[2]),
+        polarity=polarity,
+        orientation=Orientation.UP if forward_deg is None else Orientation.FORWARD,
+        north_pole_bearing_deg=None if forward_deg is None else (forward_deg + turned) % 360.0,
+    )
