@@ -1,0 +1,1 @@
+"""Magnetometer traces -> magnets, line crossings and tags."""

@@ -1,0 +1,171 @@
+"""What a trace says: magnets, line crossings, tags, and what was noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
+
+
+class Side(StrEnum):
+    """Side of the vehicle on which a line lies: the side to which it leaves its lane."""
+
+    LEFT = "left"
+    RIGHT = "right"
+
+
+class NoiseKind(StrEnum):
+    """Why something in the trace is no magnet."""
+
+    FERROUS = "ferrous-object"
+    WRONG_MOMENT = "moment-unlike-a-magnet"
+    WRONG_HEIGHT = "not-on-the-road-surface"
+    SKEW = "neither-upright-nor-forward"
+    WEAK = "too-weak-to-be-sure"
+    BESIDE = "beside-the-bar"
+    GAP = "gap-in-the-trace"
+    SENSOR = "sensor-fault"
+
+
+@dataclass(frozen=True, slots=True)
+class MagnetReading:
+    """A magnet that was passed.
+
+    Attributes
+    ----------
+    t_s : float
+        When the bar was over it. [s]
+    odometer_m : float
+        Distance driven since the trace began, by the vehicle's speed. [m]
+    lateral_cm : float
+        On the bar, from its middle, left positive. [cm]
+    polarity : Polarity
+        As driven over: of a forward magnet (phi = 0) the other one if the vehicle is on the wrong way.
+    orientation : Orientation
+    confidence : float
+        Probability that polarity and orientation are right, 0 to 1.
+    clearance_cm : float
+        Of the bar above the magnet. [cm]
+    moment_am2 : tuple of float
+        Fitted moment in vehicle axes. [A m2]
+    along_std_m : float
+        Standard error of its place along the drive. [m]
+    snr : float
+        Root of the energy that the magnet explains, in standard deviations of the noise.
+    """
+
+    t_s: float
+    odometer_m: float
+    lateral_cm: float
+    polarity: Polarity
+    orientation: Orientation
+    confidence: float
+    clearance_cm: float = 0.0
+    moment_am2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    along_std_m: float = 0.0
+    snr: float = 0.0
+
+    @property
+    def phi_deg(self) -> int:
+        """Angle between the magnet's axis and the road, 0 or 90. [deg]"""
+        return int(self.orientation)
+
+
+@dataclass(frozen=True, slots=True)
+class LineCrossing:
+    """The bar came over a line: a lane departure unless it was meant.
+
+    Attributes
+    ----------
+    t_s, odometer_m : float
+        When and where the first magnet of the line was passed. [s, m]
+    style : LineStyle
+        Solid or dashed.
+    side : Side
+        Side on which the line lies.
+    lateral_cm : float
+        Of the first magnet, left positive. [cm]
+    confidence : float
+        Of the first magnet.
+    """
+
+    t_s: float
+    odometer_m: float
+    style: LineStyle
+    side: Side
+    lateral_cm: float
+    confidence: float
+
+
+@dataclass(frozen=True, slots=True)
+class TagReading:
+    """An information tag that was passed.
+
+    Attributes
+    ----------
+    start_s, end_s : float
+        When its first and last magnet were passed. [s]
+    polarities : tuple of Polarity
+        As met.
+    gaps_m : tuple of float
+        Distances from each magnet to the next, as measured. [m]
+    gap_std_m : tuple of float
+        Their standard errors. [m]
+    length_m : float
+        First magnet to last, as measured. [m]
+    ratios, ratio_std : tuple of float
+        d_2/d_1 .. d_(M-1)/d_1 and their standard errors.
+    lateral_cm : float
+        Mean place on the bar, left positive. [cm]
+    tag : InformationTag or None
+        The design that it is, where designs or a format are known.
+    wrong_way : bool
+        It is that design met from behind: the vehicle drives against the legal direction.
+    missing, extra : int
+        Magnets of the design that were not seen, and seen magnets that are not of it.
+    confidence : float
+        Probability that it is that tag (without designs: that all polarities are right).
+    magnets : tuple of MagnetReading
+    """
+
+    start_s: float
+    end_s: float
+    polarities: tuple[Polarity, ...]
+    gaps_m: tuple[float, ...]
+    gap_std_m: tuple[float, ...]
+    length_m: float
+    ratios: tuple[float, ...]
+    ratio_std: tuple[float, ...]
+    lateral_cm: float
+    tag: InformationTag | None
+    wrong_way: bool
+    missing: int
+    extra: int
+    confidence: float
+    magnets: tuple[MagnetReading, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseFinding:
+    """Something that stood out and is not taken for a magnet, or a part of the trace that could not be used.
+
+    Attributes
+    ----------
+    t_s, odometer_m : float
+        When and where. [s, m]
+    lateral_cm : float
+        On the bar, left positive. [cm]
+    kind : NoiseKind
+    reason : str
+        For people, with the figures.
+    """
+
+    t_s: float
+    odometer_m: float
+    lateral_cm: float
+    kind: NoiseKind
+    reason: str
+
+
+Finding = MagnetReading | LineCrossing | TagReading | NoiseFinding
