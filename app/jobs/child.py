@@ -18,12 +18,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from app.decoders.images import load_image
+from app.decoders.images import Frame, load_image
 from app.errors import UnreadableUpload
 from app.jobs.annotate import draw_outlines
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateReading
-from app.services.frames import AnnotationTask, FrameResult, FrameTask
+from app.services.frames import AnnotationTask, FrameResult, FrameTask, PlateSearch
 
 DecodePlates = Callable[..., list[PlateReading]]
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
@@ -59,21 +59,26 @@ class _State:
 def serve_tasks(connection: Connection, decode: DecodePlates, limits: ChildLimits) -> None:
     """Warm up, say so, and answer tasks until the server hangs up.
 
-    A task comes as (function, argument); the answer is (whether it succeeded, result or exception).
+    A task comes in steps: (function, argument, whether it is the last). Each is called with its argument and the result
+    of the step before it. The answer is (whether all succeeded, result or exception).
     """
     warm_child(decode, limits)
     connection.send(READY)
+    answer: tuple[bool, Any] = (True, None)
     while True:
         try:
-            function, task = connection.recv()
+            function, argument, is_last = connection.recv()
         except EOFError:
             return
-        try:
-            answer = (True, function(task))
-        except Exception as error:  # noqa: BLE001 - raised again in the server
-            answer = (False, ExceptionWithTraceback(error, error.__traceback__))
-        connection.send(answer)
-        del function, task, answer  # a frame's memory is free before the next frame comes
+        if answer[0]:
+            try:
+                answer = (True, function(argument, answer[1]))
+            except Exception as error:  # noqa: BLE001 - raised again in the server
+                answer = (False, ExceptionWithTraceback(error, error.__traceback__))
+        if is_last:
+            connection.send(answer)
+            answer = (True, None)
+        del function, argument  # a frame's memory is free before the next frame comes
 
 
 def warm_child(decode: DecodePlates, limits: ChildLimits) -> None:
@@ -99,28 +104,44 @@ def keep_memory() -> None:
         mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
-def process_id(_task: None) -> int:
+def process_id(_argument: None, _before: None) -> int:
     """Proof that the process answers."""
     return os.getpid()
 
 
-def decode_frame(task: FrameTask) -> FrameResult:
-    """Load one frame and decode its plates."""
-    if _State.decode is None:
-        raise RuntimeError("the decoder process was not warmed")
-    options = {"geometries": task.geometries} if task.geometries else {}
+@dataclass(frozen=True, slots=True)
+class LoadedFrame:
+    """A frame between the two steps of its decoding."""
+
+    frame: Frame
+    thermal: bool
+    load_ms: float
+
+
+def load_frame(task: FrameTask, _before: None) -> LoadedFrame:
+    """First step: the picture's codec."""
     with _memory_is_the_limit():
         began = time.perf_counter()
         frame = load_image(task.data, task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
-        loaded = time.perf_counter()
+        return LoadedFrame(frame, task.thermal, 1e3 * (time.perf_counter() - began))
+
+
+def find_plates(search: PlateSearch, loaded: LoadedFrame) -> FrameResult:
+    """Second step: the plates in it."""
+    if _State.decode is None:
+        raise RuntimeError("the decoder process was not warmed")
+    options = {"geometries": search.geometries} if search.geometries else {}
+    frame = loaded.frame
+    with _memory_is_the_limit():
+        began = time.perf_counter()
         readings = _State.decode(
-            frame.pixels, camera=task.camera, codebook=task.codebook, thermal=task.thermal, **options
+            frame.pixels, camera=search.camera, codebook=search.codebook, thermal=loaded.thermal, **options
         )
-        done = time.perf_counter()
-    return FrameResult(frame.header, tuple(readings), 1e3 * (loaded - began), 1e3 * (done - loaded))
+        decode_ms = 1e3 * (time.perf_counter() - began)
+    return FrameResult(frame.header, tuple(readings), loaded.load_ms, decode_ms)
 
 
-def annotate_frame(task: AnnotationTask) -> bytes:
+def annotate_frame(task: AnnotationTask, _before: None) -> bytes:
     """Draw outlines over a frame and encode it."""
     with _memory_is_the_limit():
         frame = load_image(task.data, task.limits, thermal=task.thermal, thermal_range=task.thermal_range)

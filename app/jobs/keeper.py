@@ -19,6 +19,7 @@ from app.errors import Unavailable, UnreadableUpload
 from app.jobs.child import READY, ChildLimits, DecodePlates, serve_tasks
 
 T = TypeVar("T")
+Step = tuple[Callable[[Any, Any], Any], Any]
 _START_S = 120.0
 _PATIENCE_S = 120.0
 _CHECK_S = 1.0
@@ -31,20 +32,17 @@ class Pending(Generic[T]):
 
     Parameters
     ----------
-    function : callable
-        Of a module: it is imported by name in the process.
-    task : object
-        Its only argument.
+    steps : tuple of (callable, argument)
+        Functions of a module, imported by name in the process; each is called with its argument and the result of the
+        one before. An argument may be a Future that the caller still fills.
     interrupt : callable
         Stops the process that works on this, if one does.
     timeout_s : float
         Longest time in the process. [s]
     """
 
-    def __init__(
-        self, function: Callable[[Any], T], task: Any, interrupt: Callable[[Pending[Any]], None], timeout_s: float
-    ) -> None:
-        self.call = (function, task)
+    def __init__(self, steps: tuple[Step, ...], interrupt: Callable[[Pending[Any]], None], timeout_s: float) -> None:
+        self.steps = steps
         self.future: Future[T] = Future()
         self.timeout_s = timeout_s
         self.stopped = False
@@ -65,6 +63,9 @@ class Pending(Generic[T]):
     def cancel(self) -> None:
         """Stop it, also when it runs already."""
         self.stopped = True
+        for _function, argument in self.steps:
+            if isinstance(argument, Future):
+                argument.cancel()
         if not self.future.cancel():
             self._interrupt(self)
 
@@ -164,7 +165,10 @@ class Keeper(threading.Thread):
                 raise _was_stopped()
             self._current = pending
         try:
-            connection.send(pending.call)
+            for step, (function, argument) in enumerate(pending.steps, 1):
+                if isinstance(argument, Future):
+                    argument = self._wait_for(argument)
+                connection.send((function, argument, step == len(pending.steps)))
             if connection.poll(pending.timeout_s):
                 answer: tuple[bool, Any] = connection.recv()
                 return answer
@@ -178,6 +182,13 @@ class Keeper(threading.Thread):
             limit=f"{pending.timeout_s:g} s a frame",
             cure="send the frame as the camera wrote it; if it is, report it as a defect",
         )
+
+    def _wait_for(self, argument: Future[Any]) -> Any:
+        try:
+            return argument.result(self._limits.timeout_s)
+        except (CancelledError, FutureTimeout) as error:
+            self._drop()  # it is in the middle of the task
+            raise _was_stopped() from error
 
     # --- the process ------------------------------------------------------------------------------------------------
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 import queue
 import threading
-from collections.abc import Callable
-from typing import Any, TypeVar
+from concurrent.futures import Future
+from typing import Any
 
 from app.errors import Unavailable
-from app.jobs.child import ONE_THREAD, ChildLimits, DecodePlates, annotate_frame, decode_frame, process_id
-from app.jobs.keeper import Keeper, Pending
-from app.services.frames import AnnotationTask, FrameResult, FrameTask
-
-T = TypeVar("T")
+from app.jobs.child import ONE_THREAD, ChildLimits, DecodePlates, annotate_frame, find_plates, load_frame, process_id
+from app.jobs.keeper import Keeper, Pending, Step
+from app.services.frames import AnnotationTask, FrameResult, FrameTask, PlateSearch
 
 
 class DecodePool:
@@ -63,7 +61,7 @@ class DecodePool:
         Unavailable
             None could be started.
         """
-        self._start(process_id, None).result()
+        self._start(((process_id, None),)).result()
 
     def close(self) -> None:
         """Stop the processes, also in the middle of a frame."""
@@ -82,18 +80,22 @@ class DecodePool:
         with self._lock:
             return not self._closed and (not self._keepers or any(keeper.is_up for keeper in self._keepers))
 
-    def start(self, task: FrameTask, *, wait_s: float = 0.0) -> Pending[FrameResult]:
-        """Hand a frame over and return, at once or as soon as there is a place for it within `wait_s`."""
-        return self._start(decode_frame, task, wait_s)
+    def start(self, task: FrameTask, search: Future[PlateSearch], *, wait_s: float = 0.0) -> Pending[FrameResult]:
+        """Hand a frame over and return, at once or as soon as there is a place for it within `wait_s`.
+
+        The picture is loaded while the caller still finds out what to look for, and fills `search`.
+        """
+        return self._start(((load_frame, task), (find_plates, search)), wait_s)
 
     def annotate(self, task: AnnotationTask) -> bytes:
         """Picture with outlines, encoded."""
-        return self._start(annotate_frame, task).result()
+        drawn: bytes = self._start(((annotate_frame, task),)).result()
+        return drawn
 
-    def _start(self, function: Callable[[Any], T], task: Any, wait_s: float = 0.0) -> Pending[T]:
+    def _start(self, steps: tuple[Step, ...], wait_s: float = 0.0) -> Pending[Any]:
         if not (self._places.acquire(timeout=wait_s) if wait_s else self._places.acquire(blocking=False)):
             raise Unavailable("every decoder process is busy", cure="try again in a few seconds")
-        pending = Pending(function, task, self._interrupt, self._limits.timeout_s)
+        pending: Pending[Any] = Pending(steps, self._interrupt, self._limits.timeout_s)
         pending.future.add_done_callback(lambda _future: self._places.release())
         with self._lock:
             if self._closed:

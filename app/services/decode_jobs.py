@@ -120,7 +120,9 @@ class DecodeJobs:
         if member.error is not None:
             return member.error
         try:
-            return start_frame(self._decoder, member.data, context, nearby, self._rules.images, wait_s=_PATIENCE_S)
+            started = start_frame(self._decoder, member.data, context, self._rules.images, wait_s=_PATIENCE_S)
+            started.look_for(nearby)
+            return started.pending
         except Unavailable:
             raise
         except WaymarkError as error:

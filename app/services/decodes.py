@@ -97,15 +97,16 @@ class Decodes:
         self, caller: Caller, data: bytes, context: DecodeContext, key: IdempotencyKey | None
     ) -> tuple[dict[str, Any], bool]:
         created_at = self._clock()
-        with self._database.read() as connection:
-            nearby = find_nearby_plates(connection, caller.agency_id, context.coarse_position)
-        pending = start_frame(self._decoder, data, context, nearby, self._rules.images)
+        started = start_frame(self._decoder, data, context, self._rules.images)
         blob_key = new_blob_key(UPLOADS)
-        row = _new_row(FRAME, context, blob_key, created_at)
         replayed = True
         try:
-            self._blobs.put(blob_key, data)  # while the child decodes
-            result = pending.result()
+            with self._database.read() as connection:  # while the child loads the picture
+                nearby = find_nearby_plates(connection, caller.agency_id, context.coarse_position)
+            started.look_for(nearby)
+            row = _new_row(FRAME, context, blob_key, created_at)  # while it decodes
+            self._blobs.put(blob_key, data)
+            result = started.pending.result()
             with self._database.write() as connection:
                 document = find_answer(connection, caller.agency_id, key, created_at)
                 if document is None:
@@ -114,7 +115,7 @@ class Decodes:
                     document = self._store_frame(connection, caller, row, frame, context, nearby)
                     keep_answer(connection, caller.agency_id, key, document, created_at, self._rules.idempotency_ttl)
         except BaseException:
-            pending.cancel()
+            started.pending.cancel()
             self._blobs.delete(blob_key)
             raise
         if replayed:

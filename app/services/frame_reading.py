@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -11,25 +13,34 @@ import sqlalchemy as sa
 from app.decoders.archives import Member
 from app.decoders.images import ImageLimits, inspect_image
 from app.markers.plate import PlateGeometry
+from app.sensors.camera import Camera
 from app.services.decode_context import DecodeContext
 from app.services.decode_documents import ReadFrame, ReadPlate
 from app.services.fixes import fix_from_match, fuse_fixes
-from app.services.frames import FrameDecoder, FrameResult, FrameTask, PendingFrame, distinct_geometries
+from app.services.frames import FrameDecoder, FrameResult, FrameTask, PendingFrame, PlateSearch, distinct_geometries
 from app.services.markers import plate_geometry
 from app.services.matching import Match, NearbyPlates, match_reading
 
 DEFAULT_GEOMETRIES = tuple(PlateGeometry(n=n) for n in (8, 10, 12))
 
 
+@dataclass(frozen=True, slots=True)
+class StartedFrame:
+    """A frame in a decoder process, which loads it and then waits to be told what to look for."""
+
+    camera: Camera | None
+    pending: PendingFrame
+    _search: Future[PlateSearch]
+
+    def look_for(self, nearby: NearbyPlates) -> None:
+        """Say what the registry has near by."""
+        geometries = distinct_geometries([*DEFAULT_GEOMETRIES, *(plate_geometry(row) for row in nearby.rows)])
+        self._search.set_result(PlateSearch(self.camera, nearby.codebook, geometries))
+
+
 def start_frame(
-    decoder: FrameDecoder,
-    data: bytes,
-    context: DecodeContext,
-    nearby: NearbyPlates,
-    limits: ImageLimits,
-    *,
-    wait_s: float = 0.0,
-) -> PendingFrame:
+    decoder: FrameDecoder, data: bytes, context: DecodeContext, limits: ImageLimits, *, wait_s: float = 0.0
+) -> StartedFrame:
     """Hand a frame to a decoder process, after checking what its header says against the limits and the camera.
 
     Raises
@@ -40,16 +51,10 @@ def start_frame(
         The decoder processes are busy.
     """
     header = inspect_image(data, limits, thermal=context.thermal)
-    task = FrameTask(
-        data=data,
-        thermal=context.thermal,
-        thermal_range=context.thermal_range,
-        camera=context.camera.camera_for(header) if context.camera else None,
-        codebook=nearby.codebook,
-        geometries=distinct_geometries([*DEFAULT_GEOMETRIES, *(plate_geometry(row) for row in nearby.rows)]),
-        limits=limits,
-    )
-    return decoder.start(task, wait_s=wait_s)
+    camera = context.camera.camera_for(header) if context.camera else None
+    search: Future[PlateSearch] = Future()
+    pending = decoder.start(FrameTask(data, context.thermal, context.thermal_range, limits), search, wait_s=wait_s)
+    return StartedFrame(camera, pending, search)
 
 
 def read_frame(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -23,21 +24,31 @@ class FrameTask:
     thermal : bool
     thermal_range : (float, float) or None
         Counts that become 0 and 255 in a 16-bit thermal frame. [counts]
-    camera : Camera or None
-    codebook : tuple of PlateCode
-        Plates that the registry knows near by.
-    geometries : tuple of PlateGeometry
-        Dimensions to look for.
     limits : ImageLimits
     """
 
     data: bytes
     thermal: bool = False
     thermal_range: tuple[float, float] | None = None
+    limits: ImageLimits = field(default_factory=ImageLimits)
+
+
+@dataclass(frozen=True, slots=True)
+class PlateSearch:
+    """What to look for in a frame.
+
+    Attributes
+    ----------
+    camera : Camera or None
+    codebook : tuple of PlateCode
+        Plates that the registry knows near by.
+    geometries : tuple of PlateGeometry
+        Dimensions to look for; the decoder's own where there are none.
+    """
+
     camera: Camera | None = None
     codebook: tuple[PlateCode, ...] = ()
     geometries: tuple[PlateGeometry, ...] = ()
-    limits: ImageLimits = field(default_factory=ImageLimits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +125,10 @@ class PendingFrame(Protocol):
 class FrameDecoder(Protocol):
     """Decoder processes, as the services see them."""
 
-    def start(self, task: FrameTask, *, wait_s: float = 0.0) -> PendingFrame:
+    def start(self, task: FrameTask, search: Future[PlateSearch], *, wait_s: float = 0.0) -> PendingFrame:
         """Hand a frame over and return, at once or as soon as there is a place for it within `wait_s`.
+
+        The picture is loaded while the caller still finds out what to look for, and fills `search`.
 
         Raises
         ------

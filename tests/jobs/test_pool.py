@@ -7,16 +7,18 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 
 import pytest
 
 from app.errors import InvalidParameter, Unavailable, UnreadableUpload
 from app.jobs import keeper
 from app.jobs.child import ChildLimits
+from app.jobs.keeper import Pending
 from app.jobs.pool import DecodePool
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
-from app.services.frames import AnnotationTask, FrameTask, Outline
+from app.services.frames import AnnotationTask, FrameResult, FrameTask, Outline, PlateSearch
 from tests.jobs import standin
 from tests.uploads.pictures import huge_png, jpeg, lying_png, png
 
@@ -31,16 +33,22 @@ def pool() -> Iterator[DecodePool]:
     made.close()
 
 
-def task_that(what: int) -> FrameTask:
-    return FrameTask(png(standin.frame_that(what)), codebook=(CODE,))
+def known(search: PlateSearch) -> Future[PlateSearch]:
+    future: Future[PlateSearch] = Future()
+    future.set_result(search)
+    return future
+
+
+def start(pool: DecodePool, what: int) -> Pending[FrameResult]:
+    return pool.start(FrameTask(png(standin.frame_that(what))), known(PlateSearch(codebook=(CODE,))))
 
 
 def child_of(pool: DecodePool) -> int:
-    return int(pool.start(task_that(standin.OBEY)).result().readings[0].reason.split()[0])
+    return int(start(pool, standin.OBEY).result().readings[0].reason.split()[0])
 
 
 def test_a_frame_goes_there_and_back(pool: DecodePool) -> None:
-    result = pool.start(task_that(standin.OBEY)).result()
+    result = start(pool, standin.OBEY).result()
     assert (result.header.width_px, result.header.height_px) == (96, 64)
     assert result.readings[0].outcome is PlateOutcome.READ
     assert result.readings[0].digits == CODE.digits
@@ -51,19 +59,19 @@ def test_a_frame_goes_there_and_back(pool: DecodePool) -> None:
 
 def test_a_refusal_keeps_its_field_limit_and_cure(pool: DecodePool) -> None:
     with pytest.raises(InvalidParameter) as caught:
-        pool.start(task_that(standin.RAISE)).result()
+        start(pool, standin.RAISE).result()
     assert (caught.value.message, caught.value.field, caught.value.limit, caught.value.cure) == ("no", "a.b", "c", "d")
 
 
 def test_a_defect_stays_a_defect(pool: DecodePool) -> None:
     with pytest.raises(ZeroDivisionError):
-        pool.start(task_that(standin.BUG)).result()
+        start(pool, standin.BUG).result()
 
 
 def test_a_killed_process_loses_only_its_own_frame(pool: DecodePool) -> None:
-    good = [pool.start(task_that(standin.OBEY)) for _ in range(4)]
-    bad = pool.start(task_that(standin.DIE))
-    more = [pool.start(task_that(standin.OBEY)) for _ in range(4)]
+    good = [start(pool, standin.OBEY) for _ in range(4)]
+    bad = start(pool, standin.DIE)
+    more = [start(pool, standin.OBEY) for _ in range(4)]
     assert [p.result().readings[0].digits for p in good] == [CODE.digits] * 4
     with pytest.raises(UnreadableUpload, match="stopped the decoder process"):
         bad.result()
@@ -73,9 +81,9 @@ def test_a_killed_process_loses_only_its_own_frame(pool: DecodePool) -> None:
 def test_killing_idle_processes_costs_no_frame(pool: DecodePool) -> None:
     for _round in range(2):
         os.kill(child_of(pool), signal.SIGKILL)
-        assert pool.start(task_that(standin.OBEY)).result().readings[0].digits == CODE.digits
+        assert start(pool, standin.OBEY).result().readings[0].digits == CODE.digits
         time.sleep(0.5)
-        assert pool.start(task_that(standin.OBEY)).result().readings[0].digits == CODE.digits
+        assert start(pool, standin.OBEY).result().readings[0].digits == CODE.digits
 
 
 def test_a_process_killed_from_outside_is_tried_again(pool: DecodePool) -> None:
@@ -83,8 +91,8 @@ def test_a_process_killed_from_outside_is_tried_again(pool: DecodePool) -> None:
     slow = DecodePool(slow_decode, workers=1, limits=ChildLimits(timeout_s=30))
     slow.open()
     try:
-        victim = int(slow.start(task_that(standin.OBEY)).result().readings[0].reason)
-        pending = slow.start(task_that(standin.OBEY))
+        victim = int(start(slow, standin.OBEY).result().readings[0].reason)
+        pending = start(slow, standin.OBEY)
         time.sleep(0.2)
         os.kill(victim, signal.SIGKILL)
         assert int(pending.result().readings[0].reason) != victim
@@ -100,14 +108,14 @@ def slow_decode(pixels: object, **_options: object) -> list[object]:
 def test_a_frame_that_takes_too_long_is_stopped(pool: DecodePool) -> None:
     began = time.monotonic()
     with pytest.raises(UnreadableUpload, match="too long") as caught:
-        pool.start(task_that(standin.SLEEP)).result()
+        start(pool, standin.SLEEP).result()
     assert 1.9 < time.monotonic() - began < 8
     assert caught.value.limit == "2 s a frame"
     assert child_of(pool)
 
 
 def test_a_running_frame_can_be_cancelled(pool: DecodePool) -> None:
-    pending = pool.start(task_that(standin.SLEEP))
+    pending = start(pool, standin.SLEEP)
     threading.Timer(0.3, pending.cancel).start()
     began = time.monotonic()
     with pytest.raises(Unavailable):
@@ -118,7 +126,7 @@ def test_a_running_frame_can_be_cancelled(pool: DecodePool) -> None:
 
 def test_memory_has_a_limit(pool: DecodePool) -> None:
     with pytest.raises(UnreadableUpload, match="more memory") as caught:
-        pool.start(task_that(standin.HOG)).result()
+        start(pool, standin.HOG).result()
     assert caught.value.limit == f"{3 * 1024**3} bytes"
     assert child_of(pool)
 
@@ -126,7 +134,7 @@ def test_memory_has_a_limit(pool: DecodePool) -> None:
 @pytest.mark.parametrize("data", [lying_png(), huge_png(), b"", b"no picture", jpeg()[:-400]])
 def test_bad_pictures_are_refused_in_the_child_too(pool: DecodePool, data: bytes) -> None:
     with pytest.raises(UnreadableUpload) as caught:
-        pool.start(FrameTask(data)).result()
+        pool.start(FrameTask(data), known(PlateSearch())).result()
     assert caught.value.field == "file"
 
 
@@ -134,12 +142,12 @@ def test_more_frames_than_places_are_refused_as_busy() -> None:
     small = DecodePool(slow_decode, workers=1, max_waiting=2)
     small.open()
     try:
-        waiting = [small.start(task_that(standin.OBEY)) for _ in range(2)]
+        waiting = [start(small, standin.OBEY) for _ in range(2)]
         with pytest.raises(Unavailable, match="busy"):
-            small.start(task_that(standin.OBEY))
+            start(small, standin.OBEY)
         for pending in waiting:
             pending.result()
-        small.start(task_that(standin.OBEY)).result()
+        start(small, standin.OBEY).result()
     finally:
         small.close()
 
@@ -155,6 +163,27 @@ def test_a_decoder_that_cannot_start_is_unavailable() -> None:
 
 def broken_decode(*_args: object, **_options: object) -> list[object]:
     raise ImportError("no kernels")
+
+
+def test_the_picture_is_loaded_before_the_search_is_known(pool: DecodePool) -> None:
+    search: Future[PlateSearch] = Future()
+    pending = pool.start(FrameTask(png(standin.frame_that(standin.OBEY))), search)
+    time.sleep(0.2)
+    assert not pending.future.done()
+    search.set_result(PlateSearch(codebook=(CODE,)))
+    assert pending.result().readings[0].digits == CODE.digits
+
+
+@pytest.mark.parametrize("data", [png(standin.frame_that(standin.OBEY)), b"no picture"])
+def test_a_frame_cancelled_before_its_search_is_known_leaves_nothing_behind(pool: DecodePool, data: bytes) -> None:
+    before = [pool.start(FrameTask(data), Future()) for _ in range(4)]
+    time.sleep(0.2)
+    for pending in before:
+        pending.cancel()
+    for pending in before:
+        with pytest.raises(Unavailable):
+            pending.result()
+    assert start(pool, standin.OBEY).result().readings[0].digits == CODE.digits
 
 
 def test_a_killed_idle_process_is_replaced_before_a_frame_asks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,13 +210,13 @@ def test_a_cancelled_frame_that_waits_never_runs() -> None:
     made = DecodePool(slow_decode, workers=1, max_waiting=2)
     made.open()
     try:
-        running, waiting = made.start(task_that(standin.OBEY)), made.start(task_that(standin.DIE))
+        running, waiting = start(made, standin.OBEY), start(made, standin.DIE)
         waiting.cancel()
-        made.start(task_that(standin.OBEY)).cancel()  # its place is free again
+        start(made, standin.OBEY).cancel()  # its place is free again
         with pytest.raises(Unavailable):
             waiting.result()
         pid = int(running.result().readings[0].reason)
-        assert int(made.start(task_that(standin.OBEY)).result().readings[0].reason) == pid
+        assert int(start(made, standin.OBEY).result().readings[0].reason) == pid
     finally:
         made.close()
 
@@ -195,18 +224,18 @@ def test_a_cancelled_frame_that_waits_never_runs() -> None:
 def test_a_closed_pool_leaves_no_process_and_takes_no_frame() -> None:
     made = DecodePool(standin.decode, workers=1)
     made.open()
-    child = int(made.start(task_that(standin.OBEY)).result().readings[0].reason.split()[0])
+    child = int(start(made, standin.OBEY).result().readings[0].reason.split()[0])
     made.close()
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
     with pytest.raises(Unavailable):
-        made.start(task_that(standin.OBEY))
+        start(made, standin.OBEY)
 
 
 def test_closing_the_pool_ends_the_waiting_for_its_frames() -> None:
     made = DecodePool(standin.decode, workers=1, limits=ChildLimits(timeout_s=60))
     made.open()
-    running, queued = made.start(task_that(standin.SLEEP)), made.start(task_that(standin.OBEY))
+    running, queued = start(made, standin.SLEEP), start(made, standin.OBEY)
     threading.Timer(0.3, made.close).start()
     began = time.monotonic()
     for pending in (running, queued):
