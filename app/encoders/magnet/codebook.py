@@ -69,7 +69,8 @@ def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookR
     Returns
     -------
     Codebook
-        With the meanings added in their order. The same book, meanings and rules always give the same codes.
+        With the meanings added in their order. The same book, meanings and rules always give the same codes. Of
+        designs with more than 4000 placements, that many at equal ranks are given out.
 
     Raises
     ------
@@ -118,9 +119,8 @@ def list_conflicts(book: Codebook, rules: CodebookRules) -> list[tuple[Informati
 
     For books that were made by other means, or for stricter rules.
     """
-    space = _CodeSpace(book.design, rules)
-    tags = book.tags
-    return [(a, b) for i, a in enumerate(tags) for b in tags[: i + 1] if space.conflict(a, b)]
+    pairs = _CodeSpace(book.design, rules).list_near_pairs(book.tags)
+    return [(book.tags[later], book.tags[earlier]) for later, earlier in pairs]
 
 
 def _full(book: Codebook, asked: int, fit: int, rules: CodebookRules) -> CodebookFull:
@@ -157,15 +157,18 @@ class _CodeSpace:
         self._gaps_m = self._steps.astype(np.float64) * design.segment_m
         self._inverse = self._inverses(self._gaps_m)
         self._blocked: dict[_Pattern, npt.NDArray[np.bool_]] = {}
-        self._partial: dict[_Pattern, list[FloatArray]] = {}
+        self._near_rows: dict[tuple[int, ...], npt.NDArray[np.bool_]] = {}
+        self._lost_rows: dict[tuple[int, ...], list[npt.NDArray[np.bool_]]] = {}
+        self._lost = [_without(self._gaps_m, i) for i in range(design.magnets)] if rules.survive_missing else []
+        self._lost_inverses = [self._inverses(gaps_m) for gaps_m in self._lost]
 
     def take(self, tag: InformationTag) -> None:
         """Block what is too near to a tag and, on a wrong-way-safe book, to its reverse."""
         for seen in self._seen_as(tag):
             row = self._row(seen.polarities)
-            row |= self._near(np.array(seen.gaps_m), self._gaps_m, self._inverse)
+            row |= self._near_placements(seen)
             for pattern, gaps_m in self._remains(seen):
-                self._partial.setdefault(pattern, []).append(gaps_m)
+                self._block_remains(pattern, gaps_m)
 
     def list_free(self) -> Iterator[InformationTag]:
         """Free codes, by placement and then by polarities; what is taken meanwhile is left out."""
@@ -175,24 +178,29 @@ class _CodeSpace:
                 if self._row(polarities)[k]:
                     continue
                 tag = InformationTag.from_gaps(polarities, self._design.segment_m, steps)
-                if not self._own_conflict(tag) and not self._remains_conflict(tag):
+                own_reverse = self._rules.wrong_way_safe and self.list_near_pairs((tag,))
+                if not own_reverse:
                     yield tag
 
-    def conflict(self, a: InformationTag, b: InformationTag) -> bool:
-        """Whether two codes may be confused; of a code with itself, whether it may be confused with its reverse."""
-        if a == b:
-            return self._own_conflict(a)
-        if any(self._confusable(seen.polarities, np.array(seen.gaps_m), b) for seen in self._seen_as(a)):
-            return True
-        return any(
-            pattern == other and self._near(gaps_m, others_m[None])[0]
-            for seen in self._seen_as(a)
-            for pattern, gaps_m in self._remains(seen)
-            for other, others_m in self._remains(b)
-        )
-
-    def _confusable(self, pattern: _Pattern, gaps_m: FloatArray, other: InformationTag) -> bool:
-        return pattern == other.polarities and bool(self._near(gaps_m, np.array([other.gaps_m]))[0])
+    def list_near_pairs(self, tags: Sequence[InformationTag]) -> list[tuple[int, int]]:
+        """Indices (later, earlier) of tags that may be confused; twice the same where a tag reads as its reverse."""
+        pairs: set[tuple[int, int]] = set()
+        for views in (_whole, self._remains):
+            by_pattern: dict[_Pattern, list[tuple[int, FloatArray]]] = {}
+            for i, tag in enumerate(tags):
+                for pattern, gaps_m in views(tag):
+                    by_pattern.setdefault(pattern, []).append((i, gaps_m))
+            for i, tag in enumerate(tags):
+                for way, seen in enumerate(self._seen_as(tag)):
+                    for pattern, gaps_m in views(seen):
+                        rivals = by_pattern.get(pattern, [])
+                        near = self._near(gaps_m, np.array([g for _, g in rivals])) if rivals else ()
+                        pairs |= {
+                            (max(i, k), min(i, k))
+                            for (k, _), hit in zip(rivals, near, strict=True)
+                            if hit and (k != i or way == 1)
+                        }
+        return sorted(pairs)
 
     def _seen_as(self, tag: InformationTag) -> tuple[InformationTag, ...]:
         return (tag, tag.reversed_wrong_way()) if self._rules.wrong_way_safe else (tag,)
@@ -201,6 +209,13 @@ class _CodeSpace:
         if pattern not in self._blocked:
             self._blocked[pattern] = np.zeros(len(self._steps), dtype=bool)
         return self._blocked[pattern]
+
+    def _near_placements(self, tag: InformationTag) -> npt.NDArray[np.bool_]:
+        """Which placements are too near to a tag's, shape (K,); the same for all polarities, so kept."""
+        if tag.gap_steps not in self._near_rows:
+            near = self._near(np.array(tag.gaps_m), self._gaps_m, self._inverse)
+            self._near_rows[tag.gap_steps] = near
+        return self._near_rows[tag.gap_steps]
 
     def _near(
         self, gaps_m: FloatArray, others_m: FloatArray, others_inverse: FloatArray | None = None
@@ -221,32 +236,35 @@ class _CodeSpace:
         """Inverse covariances of codes, shape (K, M - 2, M - 2)."""
         return np.asarray(np.linalg.inv(covariance_of(gaps_m, self._rules.conditions)), dtype=np.float64)
 
-    def _own_conflict(self, tag: InformationTag) -> bool:
-        if not self._rules.wrong_way_safe:
-            return False
-        back = tag.reversed_wrong_way()
-        if self._confusable(back.polarities, np.array(back.gaps_m), tag):
-            return True
-        return any(
-            pattern == other and self._near(gaps_m, others_m[None])[0]
-            for pattern, gaps_m in self._remains(back)
-            for other, others_m in self._remains(tag)
-        )
-
     def _remains(self, tag: InformationTag) -> Iterator[tuple[_Pattern, FloatArray]]:
         """What is left of a tag when one magnet is missed: polarities and gaps, for each of its magnets."""
         if not self._rules.survive_missing:
             return
-        offsets = np.array(tag.offsets_m)
+        gaps_m = np.array([tag.gaps_m])
         for i in range(tag.magnet_count):
-            yield tag.polarities[:i] + tag.polarities[i + 1 :], np.diff(np.delete(offsets, i))
+            yield tag.polarities[:i] + tag.polarities[i + 1 :], _without(gaps_m, i)[0]
 
-    def _remains_conflict(self, tag: InformationTag) -> bool:
-        return any(
-            self._near(taken_m, gaps_m[None])[0]
-            for pattern, gaps_m in self._remains(tag)
-            for taken_m in self._partial.get(pattern, ())
-        )
+    def _block_remains(self, pattern: _Pattern, gaps_m: FloatArray) -> None:
+        """Block every code that, one magnet missed, is too near to what is left of a code."""
+        key = tuple(np.round(gaps_m / self._design.segment_m).astype(int).tolist())
+        if key not in self._lost_rows:
+            pairs = zip(self._lost, self._lost_inverses, strict=True)
+            self._lost_rows[key] = [self._near(gaps_m, lost_m, inverse) for lost_m, inverse in pairs]
+        for i, near in enumerate(self._lost_rows[key]):
+            for polarity in Polarity:
+                row = self._row((*pattern[:i], polarity, *pattern[i:]))
+                row |= near
+
+
+def _whole(tag: InformationTag) -> Iterator[tuple[_Pattern, FloatArray]]:
+    """A tag with none of its magnets missed: polarities and gaps."""
+    yield tag.polarities, np.array(tag.gaps_m)
+
+
+def _without(gaps_m: FloatArray, missed: int) -> FloatArray:
+    """Gaps, shape (K, M - 2), of tags whose gaps are (K, M - 1), when one of their magnets is missed. [m]"""
+    offsets_m = np.concatenate([np.zeros((len(gaps_m), 1)), np.cumsum(gaps_m, axis=1)], axis=1)
+    return np.diff(np.delete(offsets_m, missed, axis=1), axis=1)
 
 
 def _places(gaps_m: FloatArray) -> FloatArray:
