@@ -2,10 +2,11 @@
 
 Bare is JPEG bytes to readings in one warm thread that keeps its memory as the decoder processes do. Over HTTP the same
 bytes go through a kept-alive connection to `waymark serve`: key check, form, decoder process, registry, one durable
-transaction. They alternate frame by frame, so that a busy machine slows all; the difference of the medians is the
-overhead. What the disk alone costs stands beside it: the same transaction size through sqlite3 on the same disk.
+transaction. They take turns in changing order, frame by frame: a busy machine slows all, and who comes after the bare
+decoder finds the caches full of its pixels. The difference of the medians is the overhead. What durability alone costs
+stands below: one row of the same size through sqlite3, committed in a file on the same disk.
 
-Run: python -m benchmarks.http_overhead [--frames N] [--registered N] [--photo FILE] [--limit-ms 5]
+Run: python -m benchmarks.http_overhead [--frames N] [--registered N] [--limit-ms 5]
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import http.client
 import json
 import os
 import socket
+import sqlite3
 import statistics
 import subprocess
 import sys
@@ -128,6 +130,61 @@ def uploads(data: bytes, context: dict[str, Any]) -> dict[str, tuple[bytes, dict
     }
 
 
+class Durable:
+    """One row in one transaction, as SQLite makes it durable (WAL, synchronous FULL), without anything of ours."""
+
+    def __init__(self, folder: Path) -> None:
+        self._connection = sqlite3.connect(folder / "durable.sqlite3", isolation_level=None)
+        self._connection.execute("PRAGMA journal_mode = WAL")
+        self._connection.execute("PRAGMA synchronous = FULL")
+        self._connection.execute("CREATE TABLE result (content TEXT)")
+
+    def commit(self) -> None:
+        """Write it."""
+        self._connection.execute("BEGIN IMMEDIATE")
+        self._connection.execute("INSERT INTO result VALUES (?)", ("x" * 4000,))
+        self._connection.execute("COMMIT")
+
+
+def measure(folder: Path, frames: int, registered: int) -> dict[str, list[float]]:
+    """Times of each way by name. [ms]"""
+    codebook = [PlateCode.from_position(LON_DEG + k * STEP_DEG, LAT_DEG) for k in range(registered)]
+    pictures = [frame_1080p(seed, codebook[0]) for seed in range(4)]
+    camera = {"horizontal_fov_deg": 70.0, "width_px": 1920, "height_px": 1080}
+    context = {"coarse_position": {"lon_deg": LON_DEG, "lat_deg": LAT_DEG, "accuracy_m": 15.0}, "camera": camera}
+    print(f"{frames} frames of {len(pictures[0]) // 1024} KiB, {registered} plates registered")
+
+    def decode_bare(data: bytes) -> None:
+        decode_plates(load_image(data).pixels, codebook=codebook, camera=CAMERA, geometries=DEFAULT_GEOMETRIES)
+
+    decode_bare(pictures[0])  # compiles the kernels, if need be, before the server waits for a request
+    durable, times = Durable(folder), defaultdict(list)
+    with Server(folder) as connection:
+        register(connection, registered)
+        for k in range(frames + WARM_UP):
+            data, took, told = pictures[k % len(pictures)], {}, []
+            sent = uploads(data, context)
+            ways = [("bare", None), *sent.items()]
+            for name, upload in ways[k % 3 :] + ways[: k % 3]:
+                began = time.perf_counter()
+                if upload is None:
+                    decode_bare(data)
+                    took[name] = time.perf_counter() - began
+                else:
+                    answer = request(connection, "/v1/decodes", *upload)
+                    took[name] = time.perf_counter() - began
+                    frame = json.loads(answer)["frames"][0]
+                    told.append((frame["load_ms"] + frame["decode_ms"]) / 1e3)
+            took["server: load + decode"] = statistics.mean(told)
+            began = time.perf_counter()
+            durable.commit()
+            took["one durable row alone"] = time.perf_counter() - began
+            if k >= WARM_UP:
+                for name, seconds in took.items():
+                    times[name].append(1e3 * seconds)
+    return times
+
+
 def main() -> int:
     """Print one table; the exit status says whether the limit was kept."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -137,38 +194,19 @@ def main() -> int:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     keep_memory()
-    codebook = [PlateCode.from_position(LON_DEG + k * STEP_DEG, LAT_DEG) for k in range(arguments.registered)]
-    frames = [frame_1080p(seed, codebook[0]) for seed in range(4)]
-    camera = {"horizontal_fov_deg": 70.0, "width_px": 1920, "height_px": 1080}
-    context = {"coarse_position": {"lon_deg": LON_DEG, "lat_deg": LAT_DEG, "accuracy_m": 15.0}, "camera": camera}
-    times: dict[str, list[float]] = defaultdict(list)
-    with tempfile.TemporaryDirectory() as folder, Server(Path(folder)) as connection:
-        register(connection, arguments.registered)
-        for k in range(arguments.frames + WARM_UP):
-            data = frames[k % len(frames)]
-            took = {}
-            began = time.perf_counter()
-            decode_plates(load_image(data).pixels, codebook=codebook, camera=CAMERA, geometries=DEFAULT_GEOMETRIES)
-            took["bare"] = time.perf_counter() - began
-            for name, (body, headers) in uploads(data, context).items():
-                began = time.perf_counter()
-                answer = request(connection, "/v1/decodes", body, headers)
-                took[name] = time.perf_counter() - began
-                told = json.loads(answer)["frames"][0]
-                took["server: load + decode"] = (told["load_ms"] + told["decode_ms"]) / 1e3
-                took[f"{name}, without them"] = took[name] - took["server: load + decode"]
-            if k >= WARM_UP:
-                for name, seconds in took.items():
-                    times[name].append(1e3 * seconds)
-    middle = {name: statistics.median(values) for name, values in times.items()}
-    print(f"{arguments.frames} frames of {len(frames[0]) // 1024} KiB, {arguments.registered} plates registered")
-    for name, value in middle.items():
-        tenths = statistics.quantiles(times[name], n=10)
-        print(f"  {name:24s} p10 {tenths[0]:7.2f} ms   median {value:7.2f} ms   p90 {tenths[-1]:7.2f} ms")
-    overhead = {name: middle[name] - middle["bare"] for name in ("form", "bare body")}
-    for name, value in overhead.items():
-        print(f"  overhead, {name:14s} {value:14.2f} ms   (limit {arguments.limit_ms:g} ms)")
-    return 0 if max(overhead.values()) <= arguments.limit_ms else 1
+    with tempfile.TemporaryDirectory() as folder:
+        times = measure(Path(folder), arguments.frames, arguments.registered)
+    tenths = {name: statistics.quantiles(values, n=10) for name, values in times.items()}
+    for name in ("bare", "form", "bare body", "server: load + decode", "one durable row alone"):
+        low, middle, high = tenths[name][0], statistics.median(times[name]), tenths[name][-1]
+        print(f"  {name:24s} p10 {low:7.2f} ms   median {middle:7.2f} ms   p90 {high:7.2f} ms")
+    kept = True
+    for name in ("form", "bare body"):
+        low = tenths[name][0] - tenths["bare"][0]
+        middle = statistics.median(times[name]) - statistics.median(times["bare"])
+        kept &= middle <= arguments.limit_ms
+        print(f"  overhead, {name:14s} p10 {low:7.2f} ms   median {middle:7.2f} ms   (limit {arguments.limit_ms:g} ms)")
+    return 0 if kept else 1
 
 
 if __name__ == "__main__":
