@@ -175,3 +175,24 @@ def test_conditions_outside_the_limits_are_refused_by_name(make: object, field: 
         make()  # type: ignore[operator]
     assert caught.value.field == field
     assert caught.value.limit
+
+
+def test_places_follow_the_physics() -> None:
+    noise = MagnetErrorModel(placement_m=0.0, timing_s=0.0)
+    # 15.8 uT over a lying magnet at 25 cm (half the 32 uT of an upright one), 26 samples of 1.5 uT in a pulse of 25 cm
+    assert noise.position_std_m(13.4, 0.25) == pytest.approx(0.25 * 1.5 / 15.8 / math.sqrt(26.1), rel=0.01)
+    assert noise.position_std_m(13.4, 0.32) / noise.position_std_m(13.4, 0.16) == pytest.approx(2**3.5)
+    assert noise.position_std_m(40.0, 0.2) / noise.position_std_m(10.0, 0.2) == pytest.approx(2.0)
+    timing = MagnetErrorModel(placement_m=0.0, noise_ut=0.0, timing_s=0.001)
+    assert timing.position_std_m(20.0, 0.3) == pytest.approx(0.02)
+    assert MagnetErrorModel(placement_m=0.003, noise_ut=0.0, timing_s=0.0).position_std_m(20.0, 0.3) == 0.003
+
+
+def test_the_odometer_errs_by_its_steps_and_by_its_drift() -> None:
+    rng = np.random.default_rng(5)
+    speeds = rng.uniform(9.0, 11.0, (100_000, 3))  # three speeds a gap of 3 m: 10 a second, in steps of 0.1 m/s
+    errors = ((np.round(speeds / 0.1) * 0.1 - speeds) / 10.0).sum(axis=1)
+    steps = OdometerError(quantum_mps=0.1, drift=0.0)
+    assert steps.gap_std_m(np.array([3.0]), 10.0)[0] == pytest.approx(errors.std(), rel=0.02)
+    drift = OdometerError(quantum_mps=0.0, drift=0.01)
+    np.testing.assert_allclose(drift.gap_std_m(np.array([1.0, 3.0]), 10.0), [0.01, 0.03])
