@@ -1,8 +1,8 @@
 """What a picture's header says, and whether its parts are what they claim, before a codec sees a byte.
 
 The kind is told by its magic (never by a name or a declared type), the dimensions are held against the limits, the
-lengths of the parts against the bytes that are there. What is not part of the picture (metadata, trailing bytes) is left
-out.
+lengths of the parts against the bytes that are there. What is not part of the picture (metadata, trailing bytes) is
+left out.
 
 Sources: PNG specification (3rd edition) sections 5 and 11, ITU-T T.81 annex B, CIPA DC-008 (EXIF) tag 0x0112.
 """
