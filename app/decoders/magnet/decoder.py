@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from app.decoders.magnet.assemble import Assembler, PlacedMagnet
 from app.decoders.magnet.bins import Bins
+from app.decoders.magnet.book import TagBook
 from app.decoders.magnet.front import Blocks, FrontEnd
-from app.decoders.magnet.judge import ClearanceTracker, is_sure, judge_dipole
-from app.decoders.magnet.readings import Finding, MagnetReading, NoiseFinding, NoiseKind
-from app.decoders.magnet.region import Dipole, RegionFitter
+from app.decoders.magnet.judge import ClearanceTracker, Verdict, is_sure, judge_region
+from app.decoders.magnet.path import Path
+from app.decoders.magnet.readings import Finding, MagnetReading, NoiseFinding
+from app.decoders.magnet.region import Dipole, Expectation, RegionFitter
 from app.decoders.magnet.search import BIN_M, HALF_BINS, HOLE_BINS, MAX_BINS, make_search_bank, scan_bins
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
@@ -25,11 +28,13 @@ class MagnetDecoder:
     ----------
     bar : MagnetometerBar
         That recorded it.
+    book : TagBook
+        Tags that may be on the road.
     moment_am2 : float
         Of the magnets on the road. [A m2]
     """
 
-    def __init__(self, bar: MagnetometerBar, *, moment_am2: float = MOMENT_AM2) -> None:
+    def __init__(self, bar: MagnetometerBar, *, book: TagBook | None = None, moment_am2: float = MOMENT_AM2) -> None:
         self.bar = bar
         self._front = FrontEnd(bar)
         positions = bar.positions_m[bar.array].copy()
@@ -37,6 +42,9 @@ class MagnetDecoder:
         self._middle_y = float(positions[:, 1].max() + positions[:, 1].min()) / 2
         self._half_width = float(positions[:, 1].max() - positions[:, 1].min()) / 2
         self._bins = Bins(positions)
+        self._path = Path(float(positions[:, 0].min()))
+        self._assembler = Assembler(book or TagBook())
+        self._unplaced: list[MagnetReading] = []
         positions[:, 0] -= positions[:, 0].min()
         self._blocks = Blocks(bar.sensor_count)
         bank = make_search_bank(positions)
@@ -66,7 +74,10 @@ class MagnetDecoder:
         self._bins.append(self._blocks.s[count:], self._blocks.x[count:][:, self.bar.array])
         self._findings += self._front.findings
         self._front.findings = []
+        self._path.append(self._blocks.s[count:], self._blocks.t[count:], self._front.headings, final=final)
+        self._front.headings = np.empty((0, 2))
         self._search(final)
+        self._assemble(final)
         self._forget()
         out, self._findings = self._findings, []
         return out
@@ -97,20 +108,22 @@ class MagnetDecoder:
         last = min(last, self._next - 1)
         at = slice(first - self._score_start, last + 1 - self._score_start)
         expected = self._clearance.expected
-        dipoles, residual = self._fitter.fit(
+        dipoles = self._fitter.fit(
             self._blocks, self._bins, first, last, self._score[at], self._cell[at], self._variance, expected, _THRESHOLD
         )
-        for dipole in sorted(dipoles, key=lambda d: float(d.params[0])):
-            self._findings.append(self._judge(dipole, dipoles, residual))
+        dipoles.sort(key=lambda d: float(d.params[0]))
+        for dipole, verdict in zip(dipoles, judge_region(dipoles, expected, self._half_width), strict=True):
+            reading = self._reading(dipole, verdict, expected)
+            self._findings.append(reading)
+            if isinstance(reading, MagnetReading):
+                self._unplaced.append(reading)
 
-    def _judge(self, dipole: Dipole, dipoles: list[Dipole], residual: float) -> MagnetReading | NoiseFinding:
-        expected = self._clearance.expected
-        verdict = judge_dipole(dipole, dipoles, expected, self._half_width, residual)
+    def _reading(self, dipole: Dipole, verdict: Verdict, expected: Expectation) -> MagnetReading | NoiseFinding:
         s, y, h = (float(p) for p in dipole.params[:3])
         t = float(np.interp(s, self._blocks.s, self._blocks.t))
         lateral = 100 * (y - self._middle_y)
-        if isinstance(verdict[0], NoiseKind):
-            return NoiseFinding(t, s, lateral, verdict[0], str(verdict[1]))
+        if len(verdict) == 2:
+            return NoiseFinding(t, s, lateral, *verdict)
         orientation, polarity, confidence = verdict
         if is_sure(dipole, expected):
             self._clearance.learn(dipole)
@@ -120,19 +133,33 @@ class MagnetDecoder:
             float(np.sqrt(max(dipole.covariance[0, 0], 0.0))), float(np.sqrt(max(dipole.explained, 0.0))),
         )  # fmt: skip
 
+    def _assemble(self, final: bool) -> None:
+        """Group the magnets up to where both the path and the search have come."""
+        while self._unplaced and (final or self._unplaced[0].odometer_m <= self._path.reach_m):
+            magnet = self._unplaced.pop(0)
+            self._findings += self._assembler.add(
+                PlacedMagnet(magnet, self._path.place(magnet.odometer_m, magnet.lateral_cm / 100))
+            )
+        searched = (self._next - int(self._state[2])) * BIN_M - 0.5
+        if not self._unplaced:
+            self._findings += self._assembler.pass_by(searched)
+        if final:
+            self._findings += self._assembler.finish()
+
     def _forget(self) -> None:
         keep = self._next - int(self._state[2]) - 2 * HALF_BINS - 40
         self._bins.forget(keep)
         self._blocks.forget(keep * BIN_M)
+        self._path.forget(min([keep * BIN_M, *(m.odometer_m - 1 for m in self._unplaced)]))
         drop = keep - self._score_start
         if drop > 400:
             self._score, self._cell = self._score[drop:].copy(), self._cell[drop:].copy()
             self._score_start += drop
 
 
-def decode_trace(trace: MagnetTrace, bar: MagnetometerBar) -> list[Finding]:
+def decode_trace(trace: MagnetTrace, bar: MagnetometerBar, *, book: TagBook | None = None) -> list[Finding]:
     """Findings of a whole trace."""
-    decoder = MagnetDecoder(bar)
+    decoder = MagnetDecoder(bar, book=book)
     found: list[Finding] = []
     step = 4096
     for i in range(0, len(trace.t_s), step):

@@ -187,7 +187,7 @@ def fit_dipoles(s, data, weight, delays, positions, basis, alpha, start, kinds, 
     data (S, 3, K): whitened, background removed; kinds (n,) and prior as in `prior_terms`. If the last start has no
     moment, moments are first solved for with the places as they are.
     Returns params (n, 6), covariance (n, 6, 6) of each magnet, explained (n,): energy lost without it, local (n, 2):
-    weighted residual energy and rows about it, prior costs (n,), whole cost.
+    weighted residual energy and rows about it, prior costs (n,).
     """
     n = start.shape[0]
     sensors, k_n = data.shape[0], data.shape[2]
@@ -304,6 +304,13 @@ def fit_dipoles(s, data, weight, delays, positions, basis, alpha, start, kinds, 
     prior_costs = np.empty(n)
     for i in range(n):
         prior_costs[i] = prior_terms(params[i], kinds[i], prior, scrap_g, scrap_h, PARAMETERS * i)
-    # energies under the same weights, whatever the fit: what is left is compared between kinds of magnet
-    whole_cost = _robust_cost(residual, size, weight) + prior_costs.sum()
-    return params, covariance, explained, local, prior_costs, whole_cost
+    return params, covariance, explained, local, prior_costs
+
+
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def residual_cost(s, data, weight, delays, positions, basis, alpha, params):  # type: ignore[no-untyped-def]
+    """-2 log likelihood (Huber's) of what magnets (n, 6) leave of the data; arguments as of `fit_dipoles`."""
+    columns = np.empty((7, data.shape[0], 3, data.shape[2]))
+    total = np.empty(data.shape)
+    size = _model(params, s, positions, delays, weight, basis, alpha, columns, np.empty((0, 0)), total, False)
+    return _robust_cost(data - total, size, weight)

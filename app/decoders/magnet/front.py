@@ -106,7 +106,18 @@ class FrontEnd:
         s, v = self._odometer(t[:ready])
         out_s, out_x = np.empty((ready + 1, 3)), np.empty((ready + 1, raw.shape[1], 4))
         n = _mend_and_block(
-            raw, t, s, v, self._neighbours, self._previous, self._first, self._stale, self._sum, self._open, out_s, out_x
+            raw,
+            t,
+            s,
+            v,
+            self._neighbours,
+            self._previous,
+            self._first,
+            self._stale,
+            self._sum,
+            self._open,
+            out_s,
+            out_x,
         )
         good = out_x[:n, :, 3]
         blocks.append(out_s[:n, 0], out_s[:n, 1], out_s[:n, 2], out_x[:n, :, :3], good)

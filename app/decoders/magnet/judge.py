@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.readings import MagnetReading, NoiseFinding, NoiseKind
-from app.decoders.magnet.region import MOMENT_SPREAD, Dipole, Expectation
+from app.decoders.magnet.readings import NoiseKind
+from app.decoders.magnet.region import LIMIT_MISFIT, LIMIT_PRIOR, MOMENT_SPREAD, Dipole, Expectation
 from app.markers.magnet import Orientation, Polarity
 
 Floats = npt.NDArray[np.float64]
 
 LEAST_ENERGY = 40.0
 """chi-squared that a magnet explains; noise alone reaches it less than once in 1000 km."""
-_MISFIT = 0.12
-_PRIOR_COST = 18.0
 _LEAST_MARGIN = 5.0
-_NEAREST_M = 0.25
+_NEAREST_M = 0.4
+_CROWD_M = 0.8
+_MIXED_M = 0.9
+"""Lines and tags keep apart by more than this. [m]"""
+_CROWD_ENERGY = 60.0
+_CROWD_SHARE = 0.1
 _BEYOND_M = 0.10
 
 
@@ -43,43 +47,62 @@ class ClearanceTracker:
         self._seen.append(float(dipole.params[2]))
 
 
-def judge_dipole(
-    dipole: Dipole, neighbours: list[Dipole], expected: Expectation, half_width_m: float, residual: float
-) -> tuple[Orientation, Polarity, float] | tuple[NoiseKind, str]:
-    """Orientation, polarity and confidence of a magnet, or why it is none.
+Verdict = tuple[Orientation, Polarity, float] | tuple[NoiseKind, str]
+
+
+def judge_region(dipoles: Sequence[Dipole], expected: Expectation, half_width_m: float) -> list[Verdict]:
+    """Orientation, polarity and confidence of each dipole of a region that is a magnet, or why it is none.
 
     Parameters
     ----------
-    dipole : Dipole
-    neighbours : list of Dipole
-        The others of its region.
+    dipoles : sequence of Dipole
     expected : Expectation
     half_width_m : float
         Of the array. [m]
-    residual : float
-        Largest statistic left in the region.
+
+    Notes
+    -----
+    Iron seldom has one pole. So what stands close to other poles is iron: nearer than two magnets are ever placed, or
+    beside something that is clearly no magnet.
     """
-    s, y, h = dipole.params[:3]
-    moment = dipole.params[3:]
+    return [_crowded(d, dipoles) or _judge(d, expected, half_width_m) for d in dipoles]
+
+
+def _crowded(dipole: Dipole, dipoles: Sequence[Dipole]) -> Verdict | None:
+    reach = max(_CROWD_M, 3 * float(dipole.params[2]))
+    for other in dipoles:
+        if other is dipole or other.explained < max(_CROWD_ENERGY, _CROWD_SHARE * dipole.explained):
+            continue
+        along, across = abs(dipole.params[:2] - other.params[:2])
+        apart = math.hypot(along, across)
+        if apart > reach:
+            continue
+        mixed = other.kind != dipole.kind and apart < _MIXED_M
+        in_row = across < 0.15 and along > _NEAREST_M
+        unlike = other.misfit > 2 * LIMIT_MISFIT or other.prior_cost > 2.5 * LIMIT_PRIOR if in_row else other.unlike
+        if unlike or mixed or along < _NEAREST_M or (across > 0.3 and apart < _CROWD_M):
+            return NoiseKind.FERROUS, f"another pole {100 * apart:.0f} cm away that no magnet has"
+    return None
+
+
+def _judge(dipole: Dipole, expected: Expectation, half_width_m: float) -> Verdict:
+    y, moment = float(dipole.params[1]), dipole.params[3:]
     size = float(np.linalg.norm(moment))
     snr = math.sqrt(max(dipole.explained, 0.0))
     if dipole.explained < LEAST_ENERGY:
         return NoiseKind.WEAK, f"explains {dipole.explained:.0f} of {LEAST_ENERGY:.0f} noise variances"
     if abs(y) > half_width_m + _BEYOND_M:
         return NoiseKind.BESIDE, f"{100 * (abs(y) - half_width_m):.0f} cm beyond the bar"
-    if dipole.misfit > _MISFIT:
-        return NoiseKind.FERROUS, f"{dipole.misfit:.0%} of its field is not that of a dipole, {_MISFIT:.0%} may be"
-    crowd = [d for d in neighbours if d is not dipole and math.hypot(d.params[0] - s, d.params[1] - y) < _NEAREST_M]
-    if crowd:
-        return NoiseKind.FERROUS, f"{len(crowd) + 1} poles within {100 * _NEAREST_M:.0f} cm"
-    if dipole.prior_cost > _PRIOR_COST or not 0.5 < size / expected.moment_am2 < 1.7:
+    if dipole.misfit > LIMIT_MISFIT:
+        return NoiseKind.FERROUS, f"{dipole.misfit:.0%} of its field is not that of a dipole, {LIMIT_MISFIT:.0%} may be"
+    if dipole.prior_cost > LIMIT_PRIOR or not 0.5 < size / expected.moment_am2 < 1.7:
         return _why_unlike(dipole, expected)
     orientation = Orientation.UP if dipole.kind == 2 else Orientation.FORWARD
     polarity = Polarity.N if moment[dipole.kind] > 0 else Polarity.S
     if dipole.margin < _LEAST_MARGIN:
         return NoiseKind.SKEW, f"upright and forward fit alike: {dipole.margin:.1f} apart, {_LEAST_MARGIN:g} are needed"
     doubt = math.exp(-dipole.margin / 2) + math.exp(-0.5 * max(snr - 4.5, 0.0))
-    doubt += 0.02 * dipole.prior_cost / _PRIOR_COST + 0.2 * dipole.misfit
+    doubt += 0.02 * dipole.prior_cost / LIMIT_PRIOR + 0.2 * dipole.misfit
     return orientation, polarity, float(min(max(1 - doubt, 0.05), 0.9999))
 
 
@@ -101,6 +124,3 @@ def is_sure(dipole: Dipole, expected: Expectation) -> bool:
     """Whether the clearance may be learnt from it."""
     size = float(np.linalg.norm(dipole.params[3:]))
     return dipole.explained > 150 and dipole.misfit < 0.06 and abs(size / expected.moment_am2 - 1) < 0.3
-
-
-Judged = MagnetReading | NoiseFinding

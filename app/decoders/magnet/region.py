@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.magnet.bins import Bins
-from app.decoders.magnet.fit import PARAMETERS, background_basis, fit_dipoles, remove_background
+from app.decoders.magnet.fit import PARAMETERS, background_basis, fit_dipoles, remove_background, residual_cost
 from app.decoders.magnet.front import Blocks
 from app.decoders.magnet.search import BIN_M, DISTANCES_M, HALF_BINS, SearchBank, search_bins
 
@@ -20,7 +20,13 @@ YAW_SPREAD = 0.14
 """Of a forward magnet's axis against the heading: lanes are changed at a few degrees."""
 _STOP_SHARE = 0.015
 """What is left of a strong magnet's energy by a model that is not quite right."""
-_MAX_MAGNETS = 24
+_MAX_MAGNETS = 16
+_PER_MAGNET = 30.0
+_TOO_CLOSE = 30.0
+_CLUSTER_M = 1.2
+_ENOUGH = 4
+LIMIT_MISFIT = 0.12
+LIMIT_PRIOR = 13.0
 _TOGETHER_M = 1.1
 _SAME_M = 0.3
 _MAX_TOGETHER = 4
@@ -55,6 +61,11 @@ class Dipole:
     kind: int
     margin: float
 
+    @property
+    def unlike(self) -> bool:
+        """Whether it is no magnet on the road: not a dipole, or with another moment, clearance or axis."""
+        return self.misfit > LIMIT_MISFIT or self.prior_cost > LIMIT_PRIOR
+
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
@@ -68,9 +79,7 @@ class Expectation:
     def prior(self) -> Floats:
         """As `fit_dipoles` takes it."""
         m = self.moment_am2
-        return np.array(
-            [m, MOMENT_SPREAD * m, self.clearance_m, self.clearance_std_m, TILT_SPREAD * m, YAW_SPREAD * m]
-        )
+        return np.array([m, MOMENT_SPREAD * m, self.clearance_m, self.clearance_std_m, TILT_SPREAD * m, YAW_SPREAD * m])
 
 
 @dataclass(slots=True, eq=False)
@@ -95,65 +104,101 @@ class RegionFitter:
     def fit(
         self, blocks: Blocks, bins: Bins, first: int, last: int, score: Floats, cell: npt.NDArray[np.int64],
         variance: npt.NDArray[np.float32], expected: Expectation, threshold: float,
-    ) -> tuple[list[Dipole], float]:  # fmt: skip
-        """Dipoles of the bins first..last (numbers), and the largest share of the statistic left about one of them.
+    ) -> list[Dipole]:  # fmt: skip
+        """Dipoles of the bins first..last (numbers); score and cell are those bins' from the search.
 
-        score, cell : of these bins, from the search.
+        Lines and tags keep apart, so one kind of magnet alone is tried first; both together if neither fits.
         """
-        low = first - bins.start - HALF_BINS
-        x = bins.x[low : last - bins.start + HALF_BINS + 1].copy()
-        left, left_cell = score.astype(np.float32), cell.copy()
-        window = _Window(self, blocks, first * BIN_M - 1.6, (last + 1) * BIN_M + 1.6, variance, bins.alpha)
+        low = first - HALF_BINS
+        x = bins.x[low - bins.start : last - bins.start + HALF_BINS + 1]
+        window = _Window(self, blocks, first * BIN_M - 1.6, (last + 1) * BIN_M + 1.6, variance, bins.alpha, expected)
+        region = _Region(window, x, low, bins.alpha, score, cell, variance, expected, threshold)
+        found = self._explain(region, (0, 2), [])
+        for cluster in _clusters(found):
+            if len(cluster) > 1:
+                found = self._rekind(region, found, cluster)
+        return found
+
+    def _rekind(self, region: _Region, found: list[Dipole], cluster: list[Dipole]) -> list[Dipole]:
+        """Explain a cluster by magnets of one kind, if that is as likely."""
+        others = [d for d in found if all(d is not c for c in cluster)]
+        places = [float(d.params[0]) for d in cluster]
+        part = region.between(min(places) - 0.6, max(places) + 0.6)
+        span = min(places), max(places)
+        costs = [(region.window.cost(found, *span) + _penalty(found), found)]
+        for kind in (0, 2):
+            if any(d.kind != kind for d in cluster):
+                whole = others + self._explain(part, (kind,), others)
+                costs.append((region.window.cost(whole, *span) + _penalty(whole), whole))
+        costs.sort(key=lambda c: c[0])
+        best = costs[0][1]
+        if len(costs) > 1 and best is not found:
+            margin = costs[1][0] - costs[0][0]
+            best = [d if any(d is o for o in others) else replace(d, margin=margin) for d in best]
+        return best
+
+    def _explain(self, region: _Region, kinds: tuple[int, ...], known: list[Dipole]) -> list[Dipole]:
+        """Magnets of some kinds that explain what known ones leave of a region, the strongest first."""
+        x, left, left_cell = region.x.copy(), region.score.astype(np.float32), region.cell
+        if known:
+            self._subtract(x, region.low, region.alpha, [d.params for d in known], [])
+            left, left_cell = self._score(x, region)
+        columns = [0 if kind == 0 else 1 for kind in kinds]
         found: list[Dipole] = []
-        strongest = remains = 0.0
+        strongest = 0.0
         while len(found) < _MAX_MAGNETS:
-            k = int(np.argmax(left.max(axis=1)))
-            best = float(left[k].max())
+            k = int(np.argmax(left[:, columns].max(axis=1)))
+            best = float(left[k, columns].max())
             strongest = max(strongest, best)
-            if best < max(threshold, _STOP_SHARE * strongest):
+            if best < max(region.threshold, _STOP_SHARE * strongest):
                 break
-            starts = self._starts(first, k, left, left_cell, expected)
-            start = starts[int(np.argmax(left[k]))]
+            starts = {
+                kind: self._start(region, k, column, left, left_cell)
+                for kind, column in zip(kinds, columns, strict=True)
+            }
+            start = starts[kinds[int(np.argmax(left[k, columns]))]]
             if any(_apart_m(d.params, start) < _SAME_M for d in found):
-                remains = max(remains, best / strongest)
                 left[max(k - 2, 0) : k + 3] = 0  # what the model of that dipole missed
                 continue
             near = sorted(range(len(found)), key=lambda i: abs(found[i].params[0] - start[0]))[: _MAX_TOGETHER - 1]
             group = [i for i in near if abs(found[i].params[0] - start[0]) < _TOGETHER_M]
-            others = [d.params for i, d in enumerate(found) if i not in group]
-            before = [found[i].params for i in group]
-            fitted = window.fit_kinds(before, [found[i].kind for i in group], starts, others, expected)
+            others = [d for i, d in enumerate(found) if i not in group] + known
+            before = [found[i] for i in group]
+            fitted = region.window.fit_kinds(before, starts, others, region.expected)
             if fitted is None:
                 left[k] = 0
                 continue
             added = fitted[-1]
-            if added.explained < threshold / 2 or any(_apart_m(d.params, added.params) < _SAME_M for d in fitted[:-1]):
+            if added.explained < region.threshold / 2 or any(
+                _apart_m(d.params, added.params) < _SAME_M for d in fitted[:-1]
+            ):
                 left[max(k - 3, 0) : k + 4] = 0  # the fit does not bear out what the filters saw
                 continue
             for i, dipole in zip(group, fitted, strict=False):
                 found[i] = replace(dipole, margin=found[i].margin)
             found.append(added)
-            self._subtract(x, low + bins.start, bins.alpha, [d.params for d in fitted], before)
-            left, left_cell = self._score(x, variance)
-        return found, remains
+            if len(found) >= _ENOUGH and 2 * sum(d.unlike for d in found) > len(found):
+                break  # iron: more poles would only take time
+            self._subtract(x, region.low, region.alpha, [d.params for d in fitted], [d.params for d in before])
+            left, left_cell = self._score(x, region)
+        return found
 
-    def _starts(
-        self, first: int, k: int, score: npt.NDArray[np.float32], cell: npt.NDArray[np.int64], expected: Expectation
-    ) -> tuple[Floats, Floats]:
-        """Where a forward and an upright magnet fit best near bin k."""
-        starts = []
+    def _start(
+        self, region: _Region, k: int, column: int, score: npt.NDArray[np.float32], cell: npt.NDArray[np.int64]
+    ) -> Floats:
+        """Where a magnet of a kind fits best near bin k."""
         low = max(k - 8, 0)
-        for kind in (0, 1):
-            at = low + int(np.argmax(score[low : k + 9, kind])) if score[k, kind] < score[k].max() else k
-            start = np.zeros(PARAMETERS)
-            start[0] = (first + at + 0.5) * BIN_M
-            start[1] = self.bank.lateral_m[cell[at, kind]]
-            tracked = expected.clearance_std_m < 0.08
-            start[2] = expected.clearance_m if tracked else self.bank.height_m[cell[at, kind]]
-            starts.append(start)
-        return starts[0], starts[1]
+        at = low + int(np.argmax(score[low : k + 9, column])) if score[k, column] < score[k].max() else k
+        start = np.zeros(PARAMETERS)
+        start[0] = (region.low + HALF_BINS + at + 0.5) * BIN_M
+        start[1] = self.bank.lateral_m[cell[at, column]]
+        tracked = region.expected.clearance_std_m < 0.08
+        start[2] = region.expected.clearance_m if tracked else self.bank.height_m[cell[at, column]]
+        return start
 
-    def _subtract(self, x: npt.NDArray[np.float32], start: int, alpha: Floats, add: list[Floats], undo: list[Floats]) -> None:
+    def _subtract(
+        self, x: npt.NDArray[np.float32], start: int, alpha: Floats, add: list[Floats], undo: list[Floats]
+    ) -> None:
         """Take fields out of the bins x, whose first has the number start, and put earlier ones back."""
         middles = (start + np.arange(len(x)) + 0.5) * BIN_M
         for sign, magnets in ((1, add), (-1, undo)):
@@ -164,13 +209,15 @@ class RegionFitter:
                     field -= alpha * field.mean(axis=1, keepdims=True)
                     x[near] -= np.float32(sign) * field.reshape(near.size, -1).astype(np.float32)
 
-    def _score(self, x: npt.NDArray[np.float32], variance: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    def _score(
+        self, x: npt.NDArray[np.float32], region: _Region
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
         n = len(x) - 2 * HALF_BINS
         score, cell = np.zeros((n, 2), np.float32), np.zeros((n, 2), np.int64)
         b = self.bank
         search_bins(
             x, HALF_BINS, HALF_BINS + n, b.kernels, b.taps, b.products, b.first, b.sensor, b.distance, b.geometry,
-            variance, score, cell,
+            region.variance, score, cell,
         )  # fmt: skip
         return score, cell
 
@@ -179,7 +226,14 @@ class _Window:
     """The blocks about a region, cut and whitened for each fit."""
 
     def __init__(
-        self, fitter: RegionFitter, blocks: Blocks, start_m: float, end_m: float, variance: npt.NDArray[np.float32], alpha: Floats
+        self,
+        fitter: RegionFitter,
+        blocks: Blocks,
+        start_m: float,
+        end_m: float,
+        variance: npt.NDArray[np.float32],
+        alpha: Floats,
+        expected: Expectation,
     ) -> None:
         low, high = (int(i) for i in np.searchsorted(blocks.s, (start_m, end_m)))
         self._fitter = fitter
@@ -189,59 +243,123 @@ class _Window:
         self._v = blocks.v[low:high]
         self._variance = variance
         self._alpha = alpha
+        self._height_m = expected.clearance_m
 
     def fit_kinds(
-        self, known: list[Floats], kinds: list[int], new: tuple[Floats, Floats], others: list[Floats], expected: Expectation
+        self, known: list[Dipole], starts: dict[int, Floats], others: list[Dipole], expected: Expectation
     ) -> list[Dipole] | None:
-        """Fit known magnets and a new one together, the new one (its starts as a forward and as an upright one) as
-        the kind that it fits better; None if there are too few blocks."""
+        """Fit known magnets and a new one together, the new one as the kind that it fits better, from its start as
+        that kind; None if there are too few blocks."""
         fits = []
-        span = np.array([*known, *new])  # costs compare over the same blocks only
-        for kind, start in zip((0, 2), new, strict=True):
-            fit = self.fit([*known, start], [*kinds, kind], others, expected, span)
+        places = [float(p[0]) for p in (*(d.params for d in known), *starts.values())]
+        span = min(places), max(places)  # costs compare over the same blocks only
+        for kind, start in starts.items():
+            fit = self._fit([*(d.params for d in known), start], [*(d.kind for d in known), kind], others, expected)
             if fit is None:
                 return None
-            fits.append(fit)
-        forward, up = fits
-        _, best = min(up, forward, key=lambda f: f[0])
-        best[-1] = replace(best[-1], margin=abs(up[0] - forward[0]))
+            cost = self.cost([*others, *fit], span[0], span[1]) if len(starts) > 1 else 0.0
+            fits.append((cost, fit))
+        fits.sort(key=lambda f: f[0])
+        best = fits[0][1]
+        if len(fits) > 1:
+            best[-1] = replace(best[-1], margin=fits[1][0] - fits[0][0])
         return best
 
-    def fit(
-        self, starts: list[Floats], kinds: list[int], others: list[Floats], expected: Expectation, span: Floats
-    ) -> tuple[float, list[Dipole]] | None:
-        """Cost and dipoles of magnets of given kinds, fitted together with the others as they are; over the span of places."""
+    def _fit(
+        self, starts: list[Floats], kinds: list[int], others: list[Dipole], expected: Expectation
+    ) -> list[Dipole] | None:
+        """Magnets of given kinds, fitted together with the others as they are; None if there are too few blocks."""
         start = np.array(starts)
-        height = float(span[:, 2].max())
-        reach = 2.2 * height + 0.25
-        low, high = (int(i) for i in np.searchsorted(self._s, (span[:, 0].min() - reach, span[:, 0].max() + reach)))
+        height = float(start[:, 2].max())
+        reach = 2.4 * height + 0.3
+        low, high = (int(i) for i in np.searchsorted(self._s, (start[:, 0].min() - reach, start[:, 0].max() + reach)))
         if high - low < 6:
             return None
-        s = self._s[low:high]
-        spacing = np.clip(np.gradient(s), 1e-3, 1.0)
-        d = int(np.argmin(abs(np.log(DISTANCES_M / (1.2 * height)))))
-        scale = np.sqrt(spacing / BIN_M)
-        weight = scale / np.sqrt(self._variance[d].astype(float))[None, :, None] * self._w[:, None, low:high]
-        delays = np.array(self._fitter.axis_delay_s)[:, None] * self._v[low:high]
-        x = self._x[:, :, low:high]
-        for p in others:
-            x = x - _field(p, s, self._fitter.positions_m).transpose(1, 2, 0)
-        data = x * weight
-        basis = background_basis(s, scale, 2 if s[-1] - s[0] < 2.5 else 4)
-        remove_background(data, basis, self._alpha)
-        params, covariance, explained, local, prior_costs, cost = fit_dipoles(
+        s, data, weight, delays, basis = self._whitened(low, high, height, [d.params for d in others])
+        params, covariance, explained, local, prior_costs = fit_dipoles(
             s, data, weight, delays, self._fitter.positions_m, basis, self._alpha, start, np.array(kinds),
             expected.prior, 14,
         )  # fmt: skip
         if not np.isfinite(params).all():
             return None
-        return cost, [
+        return [
             Dipole(
                 params[i], covariance[i], explained[i], max(local[i, 0] - local[i, 1], 0.0) / max(explained[i], 1.0),
                 prior_costs[i], kinds[i], 0.0,
             )
             for i in range(len(params))
         ]  # fmt: skip
+
+    def _whitened(
+        self, low: int, high: int, height: float, others: list[Floats]
+    ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """Places, data with background removed, weights, delays and background of some blocks."""
+        s = self._s[low:high]
+        d = int(np.argmin(abs(np.log(DISTANCES_M / (1.2 * height)))))
+        scale = np.sqrt(np.clip(np.gradient(s), 1e-3, 1.0) / BIN_M)
+        weight = scale / np.sqrt(self._variance[d].astype(float))[None, :, None] * self._w[:, None, low:high]
+        delays = np.array(self._fitter.axis_delay_s)[:, None] * self._v[low:high]
+        x = self._x[:, :, low:high]
+        for p in others:
+            x = x - _field(p, s, self._fitter.positions_m).transpose(1, 2, 0)
+        data = x * weight
+        basis = background_basis(s, scale, 2 + max(0, int((s[-1] - s[0] - 2.0) / 1.5)))
+        remove_background(data, basis, self._alpha)
+        return s, data, weight, delays, basis
+
+    def cost(self, dipoles: list[Dipole], start_m: float, end_m: float) -> float:
+        """-2 log likelihood of the blocks about a stretch of road, but for a constant."""
+        height = self._height_m
+        reach = 2.4 * min(max(height, 0.12), 0.45) + 0.3
+        low, high = (int(i) for i in np.searchsorted(self._s, (start_m - reach, end_m + reach)))
+        if high - low < 6:
+            return 0.0
+        s, data, weight, delays, basis = self._whitened(low, high, height, [])
+        params = np.array([d.params for d in dipoles]).reshape(-1, PARAMETERS)
+        left = residual_cost(s, data, weight, delays, self._fitter.positions_m, basis, self._alpha, params)
+        return float(left) + sum(d.prior_cost for d in dipoles)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Region:
+    """What the search saw: bins from the number `low` on, scores and cells of those that count."""
+
+    window: _Window
+    x: npt.NDArray[np.float32]
+    low: int
+    alpha: Floats
+    score: Floats
+    cell: npt.NDArray[np.int64]
+    variance: npt.NDArray[np.float32]
+    expected: Expectation
+    threshold: float
+
+    def between(self, start_m: float, end_m: float) -> _Region:
+        """The part between two distances."""
+        first = self.low + HALF_BINS
+        a = min(max(int(start_m / BIN_M) - first, 0), len(self.score) - 1)
+        b = min(max(int(end_m / BIN_M) - first, a), len(self.score) - 1)
+        return replace(
+            self, x=self.x[a : b + 1 + 2 * HALF_BINS], low=self.low + a, score=self.score[a : b + 1],
+            cell=self.cell[a : b + 1],
+        )  # fmt: skip
+
+
+def _clusters(dipoles: list[Dipole]) -> list[list[Dipole]]:
+    """Groups of dipoles with less than `_CLUSTER_M` from each to the next."""
+    groups: list[list[Dipole]] = []
+    for dipole in sorted(dipoles, key=lambda d: float(d.params[0])):
+        if groups and dipole.params[0] - groups[-1][-1].params[0] < _CLUSTER_M:
+            groups[-1].append(dipole)
+        else:
+            groups.append([dipole])
+    return groups
+
+
+def _penalty(dipoles: list[Dipole]) -> float:
+    """What so many magnets must explain more than fewer, and what magnets cost that stand too close."""
+    places = np.sort([float(d.params[0]) for d in dipoles])
+    return _PER_MAGNET * len(dipoles) + _TOO_CLOSE * int(np.sum(np.diff(places) < 0.42))
 
 
 def _apart_m(a: Floats, b: Floats) -> float:

@@ -185,9 +185,7 @@ _D2 = (DISTANCES_M**2).astype(np.float32)
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def search_bins(
-    x, start, stop, kernels, taps, products, first, sensor, distance, geometry, variance, score, cell
-):  # type: ignore[no-untyped-def]
+def search_bins(x, start, stop, kernels, taps, products, first, sensor, distance, geometry, variance, score, cell):  # type: ignore[no-untyped-def]
     """Score bins start..stop of x (bins, 3 S), each with HALF_BINS neighbours on both sides."""
     n_d = taps.size
     even = np.empty((taps.max() + 1, x.shape[1]), np.float32)

@@ -113,17 +113,18 @@ def tag_magnets(tags: Sequence[PlacedTag]) -> list[RoadMagnet]:
     ]
 
 
-def line_magnets(
-    start_m: float, end_m: float, spacing_m: float, left_m: float, polarity: Polarity
-) -> list[RoadMagnet]:
+def line_magnets(start_m: float, end_m: float, spacing_m: float, left_m: float, polarity: Polarity) -> list[RoadMagnet]:
     """Magnets of a line, from start to before end."""
-    return [
-        RoadMagnet(float(at), left_m, polarity, Orientation.UP) for at in np.arange(start_m, end_m, spacing_m)
-    ]
+    return [RoadMagnet(float(at), left_m, polarity, Orientation.UP) for at in np.arange(start_m, end_m, spacing_m)]
 
 
 def place_magnets(
-    magnets: Sequence[RoadMagnet], road: Road, spread: Spread, rng: np.random.Generator, *, moment_am2: float = MOMENT_AM2
+    magnets: Sequence[RoadMagnet],
+    road: Road,
+    spread: Spread,
+    rng: np.random.Generator,
+    *,
+    moment_am2: float = MOMENT_AM2,
 ) -> tuple[Floats, Floats]:
     """Dipoles of magnets as they lie: (N, 6) place and moment in the world (east, north, up), and their chainage."""
     n = len(magnets)

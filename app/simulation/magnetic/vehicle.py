@@ -190,9 +190,7 @@ def _band(t: Floats, low_hz: float, high_hz: float, std: float, rng: np.random.G
     return np.asarray(filtered[lead:] * std / max(float(filtered.std()), 1e-12))
 
 
-def wheel_field_ut(
-    vehicle: Vehicle, motion: Motion, yaw_rate: Floats, t_s: Floats, rng: np.random.Generator
-) -> Floats:
+def wheel_field_ut(vehicle: Vehicle, motion: Motion, yaw_rate: Floats, t_s: Floats, rng: np.random.Generator) -> Floats:
     """Field of the wheels at each sensor, in vehicle axes; t_s has shape (T, 3), one time for each axis. [uT]"""
     out = np.zeros((len(t_s), vehicle.bar.sensor_count, 3))
     for wheel in vehicle.wheels:
