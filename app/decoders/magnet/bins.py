@@ -25,7 +25,8 @@ class Bins:
         self.ready = 0
         """Bins from `start` that are complete."""
         self.x = np.zeros((int(ahead.max()) + 1, 3 * sensors), np.float32)
-        self.alpha = np.zeros(3)
+        self.alpha = np.zeros((len(self.x), 3))
+        """Share of the common signal that was taken out of each bin."""
         self._common = np.array([[1.0, 1.0]] * 3)  # mean squares of the common bend and of the rest
         self._sum = np.zeros((sensors, 3))
         self._state = np.zeros(4)  # number of the open bin, blocks in it, previous block's s, 1 once begun
@@ -42,6 +43,9 @@ class Bins:
             grown = np.zeros((need + 256, self.x.shape[1]), np.float32)
             grown[: len(self.x)] = self.x
             self.x = grown
+            alpha = np.zeros((len(grown), 3))
+            alpha[: len(self.alpha)] = self.alpha
+            self.alpha = alpha
         done = _bin_blocks(
             s, x, self.shift, self.x, self.start, self.alpha, self._common, self._sum, self._state, self._previous,
             self._recent,
@@ -52,7 +56,7 @@ class Bins:
         """Drop bins before a number, in large pieces."""
         n = min(before - self.start, self.ready)
         if n > 400:
-            self.x = self.x[n:].copy()
+            self.x, self.alpha = self.x[n:].copy(), self.alpha[n:].copy()
             self.start += n
             self.ready -= n
 
@@ -77,11 +81,12 @@ def _write(number, value, shift, x, start, alpha, common, recent):  # type: igno
         common[axis, 1] += 0.01 * (rest - common[axis, 1])
         common[axis, 0] += 0.01 * (min(mean_bend * mean_bend, 9 * common[axis, 0]) - common[axis, 0])
         alone = common[axis, 1] / sensors
-        alpha[axis] = max(0.0, 1 - 1.5 * alone / max(common[axis, 0], 1e-9))
+        share = max(0.0, 1 - 1.5 * alone / max(common[axis, 0], 1e-9))
         mean = 0.0
         for j in range(sensors):
             mean += value[j, axis]
-        mean *= alpha[axis] / sensors
+        mean *= share / sensors
+        alpha[number - start, axis] = share
         for j in range(sensors):
             x[number - start + shift[j], 3 * j + axis] = value[j, axis] - mean
 

@@ -72,12 +72,10 @@ class MagnetDecoder:
         count = self._blocks.s.size
         self._front.take(self._blocks, final=final)
         self._bins.append(self._blocks.s[count:], self._blocks.x[count:][:, self.bar.array])
-        self._findings += self._front.findings
-        self._front.findings = []
         self._path.append(self._blocks.s[count:], self._blocks.t[count:], self._front.headings, final=final)
         self._front.headings = np.empty((0, 2))
         self._search(final)
-        self._assemble(final)
+        self._pass(final)
         self._forget()
         out, self._findings = self._findings, []
         return out
@@ -104,19 +102,23 @@ class MagnetDecoder:
         length, quiet = int(self._state[2]), int(self._state[3])
         self._state[1:] = 0
         first, last = self._next - length - 4, self._next - quiet + 3
+        self._pass(final=False, until_m=first * BIN_M)
         first = max(first, self._score_start, self._bins.start + HALF_BINS)
         last = min(last, self._next - 1)
         at = slice(first - self._score_start, last + 1 - self._score_start)
         expected = self._clearance.expected
+        until_m = min((last + 1) * BIN_M + 1.6, (self._next + HALF_BINS - 1) * BIN_M)
         dipoles = self._fitter.fit(
-            self._blocks, self._bins, first, last, self._score[at], self._cell[at], self._variance, expected, _THRESHOLD
-        )
+            self._blocks, self._bins, first, last, self._score[at], self._cell[at], self._variance, expected,
+            _THRESHOLD, until_m,
+        )  # fmt: skip
         dipoles.sort(key=lambda d: float(d.params[0]))
         for dipole, verdict in zip(dipoles, judge_region(dipoles, expected, self._half_width), strict=True):
             reading = self._reading(dipole, verdict, expected)
             self._findings.append(reading)
             if isinstance(reading, MagnetReading):
                 self._unplaced.append(reading)
+        self._assemble()
 
     def _reading(self, dipole: Dipole, verdict: Verdict, expected: Expectation) -> MagnetReading | NoiseFinding:
         s, y, h = (float(p) for p in dipole.params[:3])
@@ -133,18 +135,22 @@ class MagnetDecoder:
             float(np.sqrt(max(dipole.covariance[0, 0], 0.0))), float(np.sqrt(max(dipole.explained, 0.0))),
         )  # fmt: skip
 
-    def _assemble(self, final: bool) -> None:
-        """Group the magnets up to where both the path and the search have come."""
-        while self._unplaced and (final or self._unplaced[0].odometer_m <= self._path.reach_m):
+    def _assemble(self) -> None:
+        """Group the magnets up to where the path is known."""
+        while self._unplaced and self._unplaced[0].odometer_m <= self._path.reach_m:
             magnet = self._unplaced.pop(0)
-            self._findings += self._assembler.add(
-                PlacedMagnet(magnet, self._path.place(magnet.odometer_m, magnet.lateral_cm / 100))
-            )
-        searched = (self._next - int(self._state[2])) * BIN_M - 0.5
-        if not self._unplaced:
-            self._findings += self._assembler.pass_by(searched)
-        if final:
-            self._findings += self._assembler.finish()
+            place = self._path.place(magnet.odometer_m, magnet.lateral_cm / 100)
+            self._findings += self._assembler.add(PlacedMagnet(magnet, place))
+
+    def _pass(self, final: bool, until_m: float | None = None) -> None:
+        """Report what is complete because the search has come so far; the order is the road's."""
+        if until_m is None:
+            until_m = np.inf if final else (self._next - int(self._state[2]) - 5) * BIN_M
+        gaps = self._front.findings
+        while gaps and gaps[0].odometer_m < until_m:
+            self._findings.append(gaps.pop(0))
+        self._assemble()
+        self._findings += self._assembler.finish() if final else self._assembler.pass_by(until_m)
 
     def _forget(self) -> None:
         keep = self._next - int(self._state[2]) - 2 * HALF_BINS - 40

@@ -103,16 +103,18 @@ class RegionFitter:
 
     def fit(
         self, blocks: Blocks, bins: Bins, first: int, last: int, score: Floats, cell: npt.NDArray[np.int64],
-        variance: npt.NDArray[np.float32], expected: Expectation, threshold: float,
+        variance: npt.NDArray[np.float32], expected: Expectation, threshold: float, until_m: float,
     ) -> list[Dipole]:  # fmt: skip
-        """Dipoles of the bins first..last (numbers); score and cell are those bins' from the search.
+        """Dipoles of the bins first..last (numbers); score and cell are those bins' from the search;
+        blocks count up to until_m.
 
         Lines and tags keep apart, so one kind of magnet alone is tried first; both together if neither fits.
         """
         low = first - HALF_BINS
         x = bins.x[low - bins.start : last - bins.start + HALF_BINS + 1]
-        window = _Window(self, blocks, first * BIN_M - 1.6, (last + 1) * BIN_M + 1.6, variance, bins.alpha, expected)
-        region = _Region(window, x, low, bins.alpha, score, cell, variance, expected, threshold)
+        alpha = bins.alpha[last - bins.start].copy()
+        window = _Window(self, blocks, first * BIN_M - 1.6, until_m, variance, alpha, expected)
+        region = _Region(window, x, low, alpha, score, cell, variance, expected, threshold)
         found = self._explain(region, (0, 2), [])
         for cluster in _clusters(found):
             if len(cluster) > 1:
