@@ -1,8 +1,8 @@
 """Analysis by synthesis: the homography, the blur and the value of every unit that best explain a plate's pixels.
 
-The plate is a sum of blurred shapes (units, markers, gaps, the road around), each with a free value: linear. Where they
-lie and how they are blurred is not: plate_from_image (8 parameters), the lens blur and the length of the motion blur.
-Gauss-Newton runs on both at once; every pixel touches only the few shapes near it, so the normal equations are cheap.
+The plate is a sum of blurred shapes, each with a free value: linear. Where they lie and how they are blurred is not:
+plate_from_image (8 parameters), the lens blur and the length of the motion blur. Gauss-Newton runs on both at once,
+first on an image of two or three pixels a unit, then on one of more.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ import cv2
 import numba as nb
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
-from app.decoders.plate.linear import factorize, invert, solve_factorized
+from app.decoders.plate.linear import factorize, invert, solve_factorized, substitute
+from app.decoders.plate.synthesis import NORMAL_TABLE, POSE, SINGLES, accumulate, blur_nodes
 from app.markers.plate import PlateGeometry
 
 Array = npt.NDArray[Any]
 
 GAMMA = 2.2
-POSE = 10  # eight of the homography, log of the blur, length of the motion
-_EXTRA = 13  # triangle, its other half, three squares, four of the gap, four of the road
 BLUR_PRIOR = (math.log(0.7), 0.35)  # log of the lens blur [px], and its spread
-MOTION_PRIOR = (0.03, 0.06)  # length of the motion blur [plate sides], and its spread
-UPRIGHT_SINE = 0.35  # of the angle between line of sight and plate columns up to which blur is along the plate's axes
-HOPELESS = (0.3, 0.45)  # share of the pixels' variance that one and two steps explain on anything that is a plate
-MAX_STEPS = 7
-CORNER_SCATTER = 3.0  # of the corners against what even, independent noise would give: JPEG, optics, worn edges
+MOTION_PRIOR = (0.001, 0.0045)  # square of the motion blur's length [plate sides^2], and its spread
 FIRST_BLUR = 0.2  # units
-LARGE_UNIT_PX = 5.0  # a unit of twice this size is averaged down
-LOST_PX = 2.5  # a plate's corners move less after four steps
-REST_PX, NEAR_PX = 0.08, 0.4  # the corners rest, or are near rest, when they move less in one step
-COARSE_PIXELS, FINE_PIXELS = 3.5, 7.0  # pixels looked at for each unknown, where the image has more
+# share of the pixels' variance that shapes of the best values explain in the first steps on anything that is a plate
+HOPELESS = (0.73, 0.74, 0.8, 0.83, 0.85, 0.85)
+LEAST_FINE = 0.7  # the same of the values and the pose found, from the second fine step on
+COARSE_STEPS, FINE_STEPS = 6, 4
+COARSE_PX, FINE_PX = 1.8, 2.8  # pixels a unit, where the image has more
+LEAST_STEP = 1.25  # px, below which averaging gives nothing
+COARSE_NODES, FINE_NODES = 1, 3  # quadrature on each side of the middle
+MOST_STEP = 0.06  # of the plate's image: how far a step may move a corner
+NEAR, LOST = 0.02, 0.03  # of the plate's image: corners that move less are near rest, that move more are lost
+REST_PX = 0.25  # corners rest when they move less in one step
+CORNER_SCATTER = 3.0  # of the corners against what even, independent noise would give: JPEG, optics, worn edges
 _LEVELS = np.linspace(0.0, 1.0, 256)
-LINEAR_LIGHT = _LEVELS**GAMMA
-_LIGHT = LINEAR_LIGHT.astype(np.float32)
-_SLOPE = GAMMA * np.maximum(_LEVELS, 0.18) ** (GAMMA - 1)
-WEIGHT = 1.0 / _SLOPE**2  # noise is about even on the camera's output scale
+_LIGHT = (_LEVELS**GAMMA).astype(np.float32)
+_LINEAR = _LEVELS.astype(np.float32)
+_WEIGHTS = ((GAMMA * np.maximum(_LEVELS ** (1 / GAMMA), 0.18) ** (GAMMA - 1)) ** -2.0).astype(np.float32)  # by light
 
 
 @dataclass(slots=True)
@@ -115,12 +115,6 @@ def marker_centroids(geometry: PlateGeometry) -> Array:
     return np.array([(tip, tip), (far, near), (far, far), (near, far)])
 
 
-_TABLE_REACH = 4.25
-_TABLE_DENSITY = 128
-_Z = np.arange(-_TABLE_REACH, _TABLE_REACH + 2.5 / _TABLE_DENSITY, 1 / _TABLE_DENSITY)
-NORMAL_TABLE = np.stack([ndtr(_Z), np.exp(-0.5 * _Z**2) / math.sqrt(2 * math.pi)], axis=1)
-
-
 @lru_cache
 def unit_centres(geometry: PlateGeometry) -> Array:
     """Centres of the units that carry the code, in plate sides, shape (units, 2)."""
@@ -129,311 +123,13 @@ def unit_centres(geometry: PlateGeometry) -> Array:
     return np.stack([middle[columns], middle[rows]], axis=1)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy", inline="always")
-def _normal(z, table):  # type: ignore[no-untyped-def]
-    """Cumulative and density of the standard normal distribution, from the table."""
-    if z >= 4.25:
-        return 1.0, 0.0
-    if z <= -4.25:
-        return 0.0, 0.0
-    t = (z + 4.25) * 128.0
-    i = int(t)
-    f = t - i
-    return table[i, 0] + f * (table[i + 1, 0] - table[i, 0]), table[i, 1] + f * (table[i + 1, 1] - table[i, 1])
+@dataclass(frozen=True, slots=True)
+class _Patch:
+    """Linear light around a plate, its weights, and the grid of its pixels in the frame (`synthesis.accumulate`)."""
 
-
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _step(x, s, motion, table):  # type: ignore[no-untyped-def]
-    """Unit step at 0, blurred by a Gaussian and a box, at x: value and its derivatives by x, s and motion."""
-    reach = 4.0 * s + 0.5 * motion
-    if x > reach:
-        return 1.0, 0.0, 0.0, 0.0
-    if x < -reach:
-        return 0.0, 0.0, 0.0, 0.0
-    if motion < 0.3 * s:  # a short motion only widens the blur
-        wide = s if motion == 0.0 else math.sqrt(s * s + motion * motion / 12.0)
-        z = x / wide
-        c, p = _normal(z, table)
-        slope = p / wide
-        return c, slope, -z * slope * s / wide, -z * slope * motion / (12.0 * wide)
-    a = (x + 0.5 * motion) / s
-    b = (x - 0.5 * motion) / s
-    ca, pa = _normal(a, table)
-    cb, pb = _normal(b, table)
-    value = (a * ca + pa - b * cb - pb) * s / motion
-    return value, (ca - cb) / motion, (pa - pb) / motion, (0.5 * (ca + cb) - value) / motion
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _box(low, high, x, s, motion, table, out):  # type: ignore[no-untyped-def]
-    """Blurred box at x: value and derivatives as `_step`."""
-    a = _step(x - low, s, motion, table)
-    b = _step(x - high, s, motion, table)
-    out[0] = a[0] - b[0]
-    out[1] = a[1] - b[1]
-    out[2] = a[2] - b[2]
-    out[3] = a[3] - b[3]
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _profiles(x, s, motion, edges, table, out, span):  # type: ignore[no-untyped-def]
-    """Blurred boxes along one axis at x, rows: units 0..n-1, low marker, high marker, plate."""
-    n = edges.shape[0]
-    reach = 3.5 * s + 0.5 * motion
-    pitch = edges[1, 0] - edges[0, 0]
-    first = max(math.floor((x - reach - edges[0, 1]) / pitch) + 1, 0)
-    last = min(math.floor((x + reach - edges[0, 0]) / pitch), n - 1)
-    span[0] = first
-    span[1] = last
-    for i in range(first, last + 1):
-        _box(edges[i, 0], edges[i, 1], x, s, motion, table, out[i])
-    if first <= 1:
-        _box(edges[0, 0], edges[1, 1], x, s, motion, table, out[n])
-    else:
-        out[n, :] = 0.0
-    if last >= n - 2:
-        _box(edges[n - 2, 0], edges[n - 1, 1], x, s, motion, table, out[n + 1])
-    else:
-        out[n + 1, :] = 0.0
-    if first <= 0 or last >= n - 1:
-        _box(0.0, 1.0, x, s, motion, table, out[n + 2])
-    else:
-        out[n + 2, 0] = 1.0
-        out[n + 2, 1:] = 0.0
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _accumulate(  # type: ignore[no-untyped-def]
-    image, table, weight_table, normal_table, box, stride, frame, pose, edges, slot, coef,
-    nodes, node_weights, direction, by_spread, margin,
-    normal, cross, inner, rhs, rhs_pose,
-):  # fmt: skip
-    """Add every pixel's row to the normal equations of (shape values, pose); returns sums for the residual.
-
-    frame: origin x, y and scale of the normalised pixel coordinates. slot: column of each unit, -1 in the corners.
-    nodes, node_weights, direction: quadrature along a line in the plate for blurs that are not along its axes.
-    """
-    n = edges.shape[0]
-    shapes = coef.shape[0]
-    base = shapes - 13
-    pu = np.zeros((n + 3, 4))
-    pv = np.zeros((n + 3, 4))
-    su = np.zeros(2, np.int64)
-    sv = np.zeros(2, np.int64)
-    index = np.empty(160, np.int64)
-    value = np.zeros(shapes)
-    jac = np.empty(10)
-    sum_w = 0.0
-    sum_r = 0.0
-    sum_t = 0.0
-    sum_tt = 0.0
-    count = 0
-    inside = 0
-    low = edges[0, 0]
-    leg = edges[1, 1] - low
-    sigma = math.exp(pose[8])
-    motion = pose[9]
-    many = nodes.shape[0] > 1
-    for y in range(box[1], box[3], stride[1]):
-        py = (y - frame[1]) / frame[2]
-        for x in range(box[0], box[2], stride[0]):
-            px = (x - frame[0]) / frame[2]
-            w = pose[6] * px + pose[7] * py + 1.0
-            if w <= 0.05:
-                continue
-            iw = 1.0 / w
-            u0 = (pose[0] * px + pose[1] * py + pose[2]) * iw
-            v0 = (pose[3] * px + pose[4] * py + pose[5]) * iw
-            if u0 < -margin[0] or u0 > 1.0 + margin[0] or v0 < -margin[1] or v0 > 1.0 + margin[1]:
-                continue
-            k = 1.0 / frame[2]
-            ux = (pose[0] - u0 * pose[6]) * iw * k
-            uy = (pose[1] - u0 * pose[7]) * iw * k
-            vx = (pose[3] - v0 * pose[6]) * iw * k
-            vy = (pose[4] - v0 * pose[7]) * iw * k
-            if many:
-                s = sigma * blur_minor(ux, uy, vx, vy)
-                s_u = s
-                s_v = s
-            else:
-                s_u = sigma * math.sqrt(ux * ux + uy * uy)
-                s_v = sigma * math.sqrt(vx * vx + vy * vy)
-            entries = 0
-            iu = 0.0
-            iv = 0.0
-            isu = 0.0
-            isv = 0.0
-            im = 0.0
-            inode = 0.0
-            bilinear_u = min(max(u0, 0.0), 1.0)
-            bilinear_v = min(max(v0, 0.0), 1.0)
-            a_gap = 0.0
-            a_road = 0.0
-            for corner in range(4):
-                f = (bilinear_u if corner % 2 else 1.0 - bilinear_u) * (bilinear_v if corner >= 2 else 1.0 - bilinear_v)
-                a_gap += f * coef[base + 5 + corner]
-                a_road += f * coef[base + 9 + corner]
-            for q in range(nodes.shape[0]):
-                wq = node_weights[q]
-                u = u0 + nodes[q] * direction[0]
-                v = v0 + nodes[q] * direction[1]
-                _profiles(u, s_u, 0.0, edges, normal_table, pu, su)
-                _profiles(v, s_v, 0.0 if many else motion, edges, normal_table, pv, sv)
-                gu = 0.0
-                gv = 0.0
-                units = 0.0
-                for r in range(sv[0], sv[1] + 1):
-                    for c in range(su[0], su[1] + 1):
-                        j = slot[r, c]
-                        if j < 0:
-                            continue
-                        b = pv[r, 0] * pu[c, 0]
-                        if b < 1e-5:
-                            continue
-                        units += b
-                        if value[j] == 0.0:
-                            index[entries] = j
-                            entries += 1
-                            value[j] = 1e-300
-                        value[j] += wq * b
-                        a = coef[j] - a_gap
-                        gu += a * pv[r, 0] * pu[c, 1]
-                        gv += a * pv[r, 1] * pu[c, 0]
-                        isu += wq * a * pv[r, 0] * pu[c, 2]
-                        isv += wq * a * pv[r, 2] * pu[c, 0]
-                        im += wq * a * pv[r, 3] * pu[c, 0]
-                # markers: 0 top-left, 1 top-right, 2 bottom-right, 3 bottom-left
-                marks = 0.0
-                for m in range(4):
-                    mu = n + (1 if (m == 1 or m == 2) else 0)
-                    mv = n + (1 if m >= 2 else 0)
-                    b = pv[mv, 0] * pu[mu, 0]
-                    if b < 1e-6:
-                        continue
-                    bu = pv[mv, 0] * pu[mu, 1]
-                    bv = pv[mv, 1] * pu[mu, 0]
-                    marks += b
-                    if m == 0:
-                        sd = math.sqrt(s_u * s_u + s_v * s_v + (0.0 if many else motion * motion / 12.0))
-                        z = (leg + 2.0 * low - u - v) / sd
-                        t, dt = _normal(z, normal_table)
-                        dt = -dt / sd
-                        for half in range(2):
-                            j = base + half
-                            f = t if half == 0 else 1.0 - t
-                            df = dt if half == 0 else -dt
-                            if value[j] == 0.0:
-                                index[entries] = j
-                                entries += 1
-                                value[j] = 1e-300
-                            value[j] += wq * b * f
-                            a = coef[j] - a_gap
-                            gu += a * (bu * f + b * df)
-                            gv += a * (bv * f + b * df)
-                            isu += wq * a * pv[mv, 0] * pu[mu, 2] * f
-                            isv += wq * a * pv[mv, 2] * pu[mu, 0] * f
-                            im += wq * a * pv[mv, 3] * pu[mu, 0] * f
-                    else:
-                        j = base + 1 + m
-                        if value[j] == 0.0:
-                            index[entries] = j
-                            entries += 1
-                            value[j] = 1e-300
-                        value[j] += wq * b
-                        a = coef[j] - a_gap
-                        gu += a * bu
-                        gv += a * bv
-                        isu += wq * a * pv[mv, 0] * pu[mu, 2]
-                        isv += wq * a * pv[mv, 2] * pu[mu, 0]
-                        im += wq * a * pv[mv, 3] * pu[mu, 0]
-                plate = pv[n + 2, 0] * pu[n + 2, 0]
-                plate_u = pv[n + 2, 0] * pu[n + 2, 1]
-                plate_v = pv[n + 2, 1] * pu[n + 2, 0]
-                gap = plate - units - marks
-                road = 1.0 - plate
-                for corner in range(4):
-                    f = (bilinear_u if corner % 2 else 1.0 - bilinear_u) * (
-                        bilinear_v if corner >= 2 else 1.0 - bilinear_v
-                    )
-                    if gap > 1e-4:
-                        j = base + 5 + corner
-                        if value[j] == 0.0:
-                            index[entries] = j
-                            entries += 1
-                            value[j] = 1e-300
-                        value[j] += wq * gap * f
-                    if road > 1e-4:
-                        j = base + 9 + corner
-                        if value[j] == 0.0:
-                            index[entries] = j
-                            entries += 1
-                            value[j] = 1e-300
-                        value[j] += wq * road * f
-                a = a_gap - a_road
-                gu += a * plate_u
-                gv += a * plate_v
-                isu += wq * a * pv[n + 2, 0] * pu[n + 2, 2]
-                isv += wq * a * pv[n + 2, 2] * pu[n + 2, 0]
-                im += wq * a * pv[n + 2, 3] * pu[n + 2, 0]
-                iu += wq * gu
-                iv += wq * gv
-                inode += wq * nodes[q] * (gu * direction[0] + gv * direction[1])
-            du = iu * iw
-            dv = iv * iw
-            jac[0] = du * px
-            jac[1] = du * py
-            jac[2] = du
-            jac[3] = dv * px
-            jac[4] = dv * py
-            jac[5] = dv
-            both = -(du * u0 + dv * v0)
-            jac[6] = both * px
-            jac[7] = both * py
-            jac[8] = isu * s_u + isv * s_v + inode * by_spread[0]
-            jac[9] = inode * by_spread[1] if many else im
-            level = image[y, x]
-            target = table[level]
-            wt = weight_table[level]
-            model = 0.0
-            for e in range(entries):
-                j = index[e]
-                model += coef[j] * value[j]
-            res = target - model
-            count += 1
-            if 0.0 <= u0 <= 1.0 and 0.0 <= v0 <= 1.0:
-                inside += 1
-                sum_r += wt * res * res
-                sum_w += wt
-                sum_t += wt * target
-                sum_tt += wt * target * target
-            else:  # the road around may hold anything
-                wt *= 0.3
-            for e in range(entries):
-                j = index[e]
-                b = wt * value[j]
-                rhs[j] += b * target
-                for f2 in range(e + 1):
-                    i = index[f2]
-                    normal[max(i, j), min(i, j)] += b * value[i]
-                for p in range(10):
-                    cross[j, p] += b * jac[p]
-            for p in range(10):
-                b = wt * jac[p]
-                rhs_pose[p] += b * target
-                for p2 in range(10):
-                    inner[p, p2] += b * jac[p2]
-            for e in range(entries):
-                value[index[e]] = 0.0
-    flat = sum_tt - sum_t * sum_t / max(sum_w, 1e-300)
-    return sum_r / max(inside, 1), flat / max(inside, 1), count
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def blur_minor(ux, uy, vx, vy):  # type: ignore[no-untyped-def]
-    """Smaller singular value of the Jacobian plate from image."""
-    t = ux * ux + uy * uy + vx * vx + vy * vy
-    d = ux * vy - uy * vx
-    return math.sqrt(max(0.5 * (t - math.sqrt(max(t * t - 4.0 * d * d, 0.0))), 1e-18))
+    light: Array
+    weights: Array
+    grid: Array
 
 
 def fit_plate(
@@ -456,32 +152,37 @@ def fit_plate(
     PlateFit or None
         None when the steps leave the image, the plate degenerates, or it explains too little of what is there.
     """
-    luma, origin_px, scale = _patch(image, centroids_px, geometry.n)
-    if min(luma.shape) < 4:
-        return None
-    points = (centroids_px - origin_px) / scale
-    centre = points.mean(axis=0)
-    frame = np.array([centre[0], centre[1], max(float(np.ptp(points, axis=0).max()), 4.0)])
+    centre = centroids_px.mean(axis=0)
+    frame = np.array([centre[0], centre[1], max(float(np.ptp(centroids_px, axis=0).max()), 4.0)])
     edges, slot = unit_edges(geometry), _slots(geometry.n)
-    levels, weights = (_LEVELS, np.ones(256)) if linear else (LINEAR_LIGHT, WEIGHT)
     try:
-        start = _homography((points - centre) / frame[2], marker_centroids(geometry))
-        pose = np.concatenate([start, [math.log(_first_blur(points, geometry.n)), MOTION_PRIOR[0]]])
-        coef = _sample_shapes(luma, levels, pose, frame, edges, slot)
-        normal = np.empty((len(coef) + POSE, len(coef) + POSE))
-        ok, variance, explained, pixels = _gauss_newton(
-            luma, levels, weights, NORMAL_TABLE, frame, pose, edges, slot, coef, normal
-        )
-        if not ok:
-            return None
+        start = _homography((centroids_px - centre) / frame[2], marker_centroids(geometry))
     except np.linalg.LinAlgError:
         return None
+    pose = np.concatenate([start, [math.log(_first_blur(centroids_px, geometry.n)), MOTION_PRIOR[0]]])
+    coef = np.zeros(geometry.n**2 - 16 + SINGLES)
+    normal = np.empty((len(coef) + POSE, len(coef) + POSE))
+    corners = np.empty((4, 2))
+    variance, explained, pixels = 0.0, 0.0, 0
+    for px_per_unit, most_nodes, steps, first in (
+        (COARSE_PX, COARSE_NODES, COARSE_STEPS, True), (FINE_PX, FINE_NODES, FINE_STEPS, False),
+    ):  # fmt: skip
+        if not _corners(pose, frame, corners):
+            return None
+        patch = _cut_patch(image, corners, geometry.n * px_per_unit, linear)
+        if patch is None:
+            return None
+        if first:
+            coef[:] = patch.light.mean()
+        ok, variance, explained, pixels = _gauss_newton(
+            patch.light, patch.weights, patch.grid, NORMAL_TABLE, frame, pose, edges, slot, coef, normal,
+            most_nodes, steps, first,
+        )  # fmt: skip
+        if not ok:
+            return None
     covariance = invert(normal) * variance
     if not covariance.size:
         return None
-    frame[:2] = frame[:2] * scale + origin_px
-    frame[2] *= scale
-    pose[8] += math.log(scale)
     return _result(frame, pose, slot, coef, covariance, math.sqrt(variance), explained, pixels)
 
 
@@ -492,26 +193,30 @@ def _first_blur(points_px: Array, n: int) -> float:
     return float(np.clip(FIRST_BLUR * unit, 0.7, 2.5))
 
 
-def _patch(image: npt.NDArray[Any], centroids_px: Array, n: int) -> tuple[npt.NDArray[Any], Array, int]:
-    """Luma around a plate, where in the image its pixel (0, 0) lies [px], and how many pixels a side make one of it.
-
-    A large plate is averaged down: its edges are sharp against the distance between the pixels that are looked at.
-    """
-    low, high = centroids_px.min(axis=0), centroids_px.max(axis=0)
-    scale = max(int((high - low).min() / (0.75 * n * LARGE_UNIT_PX)), 1)
-    pad = 0.8 * (high - low) + 12
+def _cut_patch(image: npt.NDArray[Any], corners_px: Array, wanted_px: float, linear: bool) -> _Patch | None:
+    """The image around a plate, averaged down to about this many pixels along its sides; None outside the image."""
+    low, high = corners_px.min(axis=0), corners_px.max(axis=0)
+    extent = high - low
+    if not (extent > 3.0).all() or not (extent < 2 * max(image.shape)).all():
+        return None
+    turned = math.sqrt(float(extent.prod()) / max(cv2.contourArea(corners_px.astype(np.float32)), 1.0))
+    step = extent / (wanted_px * min(turned, 1.5))
+    pad = 0.15 * extent + 2 * step
     x0, y0 = (int(v) for v in np.maximum(low - pad, 0))
-    x1, y1 = (int(v) for v in np.minimum(high + pad, [image.shape[1], image.shape[0]]))
-    wide, tall = max(x1 - x0, 0) // scale, max(y1 - y0, 0) // scale
-    patch = image[y0 : y0 + tall * scale, x0 : x0 + wide * scale]
+    x1, y1 = (int(v) for v in np.minimum(high + pad + 1, [image.shape[1], image.shape[0]]))
+    wide, tall = ((far - near if s < LEAST_STEP else round((far - near) / s))
+                  for near, far, s in ((x0, x1, step[0]), (y0, y1, step[1])))  # fmt: skip
     if min(wide, tall) < 4:
-        return np.empty((0, 0), np.uint8), np.zeros(2), 1
+        return None
+    step = np.array([(x1 - x0) / wide, (y1 - y0) / tall])
+    patch = image[y0:y1, x0:x1]
     luma = cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY) if patch.ndim == 3 else np.ascontiguousarray(patch)
-    if scale > 1:
-        light = cv2.resize(cv2.LUT(luma, _LIGHT), (wide, tall), interpolation=cv2.INTER_AREA)
-        light = cv2.GaussianBlur(light, (5, 5), 0.8)
-        luma = np.rint(255 * light ** (1 / GAMMA)).astype(np.uint8)
-    return luma, np.array([x0, y0]) + (scale - 1) / 2, scale
+    light = cv2.LUT(luma, _LINEAR if linear else _LIGHT)
+    if (tall, wide) != light.shape:
+        light = cv2.resize(light, (wide, tall), interpolation=cv2.INTER_AREA)
+    weights = np.ones_like(light) if linear else _WEIGHTS[(light * 255 + 0.5).astype(np.uint8)]
+    grid = np.array([x0 + (step[0] - 1) / 2, y0 + (step[1] - 1) / 2, step[0], step[1]])
+    return _Patch(light, weights, grid)
 
 
 def _homography(source: Array, target: Array) -> Array:
@@ -548,30 +253,6 @@ def _project(matrix: Array, points: Array) -> Array:
     return projected
 
 
-def _sample_shapes(
-    luma: npt.NDArray[Any], levels: Array, pose: Array, frame: Array, edges: Array, slot: npt.NDArray[np.int64]
-) -> Array:
-    """First values of all shapes: the pixels at their middles."""
-    n = len(edges)
-    middle = edges.mean(axis=1)
-    rows, columns = np.nonzero(slot >= 0)
-    a, b = (edges[0, 0] + edges[1, 1]) / 2, (edges[n - 2, 0] + edges[n - 1, 1]) / 2
-    t, f = 0.66 * edges[0, 0] + 0.34 * edges[1, 1], 0.2 * edges[0, 0] + 0.8 * edges[1, 1]
-    g = 0.5 * (edges[n // 2 - 1, 1] + edges[n // 2, 0])
-    plate = np.concatenate(
-        [
-            np.stack([middle[columns], middle[rows]], axis=1),
-            [(t, t), (f, f), (b, a), (b, b), (a, b)],
-            [(g, g)] * 4,
-            [(-0.08, -0.08), (1.08, -0.08), (-0.08, 1.08), (1.08, 1.08)],
-        ]
-    )
-    points = np.rint(_project(np.linalg.inv(_matrix(pose, frame)), plate)).astype(int)
-    height, width = luma.shape
-    values: Array = levels[luma[np.clip(points[:, 1], 0, height - 1), np.clip(points[:, 0], 0, width - 1)]]
-    return values
-
-
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _inverse(pose):  # type: ignore[no-untyped-def]
     """Inverse of the homography with these eight entries, up to scale."""
@@ -606,47 +287,6 @@ def _corners(pose, frame, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _blur_nodes(pose, frame, most):  # type: ignore[no-untyped-def]
-    """Quadrature for a blur that is not along the plate's axes: nodes, weights, direction in the plate.
-
-    A round blur in the image is an ellipse in the plate, long along the line of sight; so is the motion's. An upright
-    plate has that line along its columns, where the shapes' profiles are exact, and needs no quadrature.
-    """
-    ux = (pose[0] - pose[2] * pose[6]) / frame[2]
-    uy = (pose[1] - pose[2] * pose[7]) / frame[2]
-    vx = (pose[3] - pose[5] * pose[6]) / frame[2]
-    vy = (pose[4] - pose[5] * pose[7]) / frame[2]
-    a = ux * ux + uy * uy
-    b = ux * vx + uy * vy
-    d = vx * vx + vy * vy
-    root = math.sqrt(0.25 * (a - d) * (a - d) + b * b)
-    long2 = 0.5 * (a + d) + root
-    short2 = max(0.5 * (a + d) - root, 1e-18)
-    angle = 0.5 * math.atan2(2.0 * b, a - d)
-    direction = np.array([math.cos(angle), math.sin(angle)])
-    if long2 < 1.69 * short2 or (abs(direction[0]) < UPRIGHT_SINE):
-        return np.zeros(1), np.ones(1), np.array([0.0, 1.0]), np.zeros(2)
-    sigma = math.exp(pose[8])
-    motion = max(pose[9], 0.02)
-    spread = math.sqrt((long2 - short2) * sigma * sigma + motion * motion / 12.0)
-    half = math.ceil(1.2 * spread / (math.sqrt(short2) * sigma))
-    half = min(max(half, 1), most)
-    nodes = np.empty(2 * half + 1)
-    weights = np.empty(2 * half + 1)
-    total = 0.0
-    for k in range(2 * half + 1):
-        nodes[k] = -2.2 + 2.2 * k / half
-        weights[k] = math.exp(-0.5 * nodes[k] * nodes[k])
-        total += weights[k]
-    weights /= total
-    second = 0.0
-    for k in range(2 * half + 1):
-        second += weights[k] * nodes[k] * nodes[k]
-    by_spread = np.array([1.0 - motion * motion / (12.0 * spread * spread), motion / (12.0 * spread * spread)])
-    return nodes * (spread / math.sqrt(second)), weights, direction, by_spread
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _hold_open_ends(normal, rhs, pose, coef, variance):  # type: ignore[no-untyped-def]
     """Hold what the pixels leave open: values near their mean, blur near the usual."""
     shapes = coef.shape[0]
@@ -668,86 +308,116 @@ def _hold_open_ends(normal, rhs, pose, coef, variance):  # type: ignore[no-untyp
     rhs[shapes + 9] += hold * (MOTION_PRIOR[0] - pose[9])
 
 
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _move(pose, step, frame, corners, moved, extents):  # type: ignore[no-untyped-def]
+    """Add a step to the pose, shortened where it carries the corners too far; how far they went, inf for nowhere."""
+    start = pose.copy()
+    pose[8] += min(max(step[8], -0.4), 0.4)
+    pose[9] = min(max(pose[9] + step[9], 0.0), pose[9] + 0.01)
+    share = 1.0
+    for _ in range(6):
+        for i in range(8):
+            pose[i] = start[i] + share * step[i]
+        if np.isfinite(pose.sum()) and _corners(pose, frame, moved):
+            shift = np.abs(moved - corners)
+            far = max(shift[:, 0].max() / extents[0], shift[:, 1].max() / extents[1])
+            if far < MOST_STEP * 1.01:
+                return shift.max()
+            share *= max(MOST_STEP / far, 0.25)
+        else:
+            share *= 0.25
+    return np.inf
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _box_around(corners, grid, shape, box, margin, extents):  # type: ignore[no-untyped-def]
+    """Pixels of the patch around these corners, and how far around the plate they count; False when there are none."""
+    for axis in range(2):
+        low = corners[:, axis].min()
+        high = corners[:, axis].max()
+        extents[axis] = high - low
+        if not (3.0 < extents[axis] < 1.0e5):
+            return False
+        step = grid[2 + axis]
+        reach = 0.03 * extents[axis] + 2.0 * step
+        margin[axis] = 0.03 + 2.0 * step / extents[axis]
+        size = shape[1 - axis]
+        box[axis] = min(max(int((low - reach - grid[axis]) / step), 0), size)
+        box[axis + 2] = min(max(int((high + reach - grid[axis]) / step) + 2, 0), size)
+    return True
+
+
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _gauss_newton(luma, levels, weights, table, frame, pose, edges, slot, coef, normal):  # type: ignore[no-untyped-def]
-    """Move pose and shape values until the corners rest: coarse steps on few pixels, then fine ones on more.
+def _gauss_newton(  # type: ignore[no-untyped-def]
+    light, weights, grid, table, frame, pose, edges, slot, coef, normal, most_nodes, steps, first,
+):  # fmt: skip
+    """Move pose and shape values until the corners rest.
 
     Returns whether there is a plate, the residual's variance, the share of variance explained, and the pixels used.
     """
     shapes = coef.shape[0]
-    rhs = np.empty(shapes + 10)
-    cross = np.empty((shapes, 10))
-    inner = np.empty((10, 10))
+    rhs = np.empty(shapes + POSE)
+    cross = np.empty((shapes, POSE))
+    inner = np.empty((POSE, POSE))
     corners = np.empty((4, 2))
     moved = np.empty((4, 2))
     box = np.empty(4, np.int64)
-    stride = np.empty(2, np.int64)
     margin = np.empty(2)
     extents = np.empty(2)
+    sums = np.empty(8)
     variance = 0.0
     explained = 0.0
     pixels = 0
-    coarse = True
-    for k in range(MAX_STEPS):
-        if not _corners(pose, frame, corners):
+    for k in range(steps):
+        if not _corners(pose, frame, corners) or not _box_around(corners, grid, light.shape, box, margin, extents):
             return False, variance, explained, pixels
-        for axis in range(2):
-            low = corners[:, axis].min()
-            high = corners[:, axis].max()
-            extent = high - low
-            size = luma.shape[1 - axis]
-            if not (3.0 < extent < 2.0 * size):
-                return False, variance, explained, pixels
-            box[axis] = max(int(low - 0.12 * extent - 2), 0)
-            box[axis + 2] = min(int(high + 0.12 * extent + 3), size)
-            extents[axis] = extent
-            margin[axis] = 0.03 + 2.0 / extent
-        area = 1.15 * abs(
-            (corners[2, 0] - corners[0, 0]) * (corners[3, 1] - corners[1, 1])
-            - (corners[2, 1] - corners[0, 1]) * (corners[3, 0] - corners[1, 0])
-        )  # twice the quadrangle's, and its surroundings
-        wanted = (COARSE_PIXELS if coarse else FINE_PIXELS) * (shapes + 10)
-        both = max(0.5 * area / wanted, 1.0)  # pixels to pass over for each one that is looked at
-        lean = math.sqrt(extents[0] / extents[1])
-        stride[0] = max(int(math.sqrt(both) * lean + 0.5), 1)
-        stride[1] = max(int(both / stride[0] + 0.5), 1)
-        stride[0] = max(int(both / stride[1] + 0.5), 1)
-        nodes, node_weights, direction, by_spread = _blur_nodes(pose, frame, 2 if coarse else 4)
+        nodes, node_weights, direction, by_spread = blur_nodes(pose, frame, grid, most_nodes)
         normal[:] = 0.0
         cross[:] = 0.0
         inner[:] = 0.0
         rhs[:] = 0.0
-        total, flat, pixels = _accumulate(
-            luma, levels, weights, table, box, stride, frame, pose, edges, slot, coef,
-            nodes, node_weights, direction, by_spread, margin, normal, cross, inner, rhs[:shapes], rhs[shapes:],
+        accumulate(
+            light, weights, grid, box, frame, pose, edges, slot, coef, nodes, node_weights, direction, by_spread,
+            margin, table, normal, cross, inner, rhs[:shapes], rhs[shapes:], sums,
         )  # fmt: skip
         normal[shapes:, :shapes] = cross.T
         normal[shapes:, shapes:] = inner
+        pixels = int(sums[0])
         if pixels < shapes:
             return False, variance, explained, pixels
+        inside = max(sums[1], 1.0)
+        total = sums[3] / inside
         variance = max(total, (1.0 / 255) ** 2)
+        flat = (sums[5] - sums[4] * sums[4] / max(sums[2], 1e-300)) / inside
         explained = 1.0 - total / max(flat, 1e-12)
-        if (k == 1 and explained < HOPELESS[0]) or (k == 2 and explained < HOPELESS[1]):
+        blind = first and k == 0  # no values yet: nothing says how they move with the pose
+        spread = flat if blind else variance
+        _hold_open_ends(normal, rhs, pose, coef, 0.02 * spread if blind else variance)
+        if blind:
+            for i in range(shapes, shapes + POSE):
+                normal[i, i] = 1e6 * (1.0 + normal[i, i])
+        if not first and k > 0 and explained < LEAST_FINE:
             return False, variance, explained, pixels
-        _hold_open_ends(normal, rhs, pose, coef, variance)
         factor = factorize(normal)
         if factor.shape[0] == 0:
             return False, variance, explained, pixels
-        solution = solve_factorized(factor, rhs)
+        half = substitute(factor, rhs)
+        best = 1.0 - (sums[7] - (half[:shapes] ** 2).sum()) / max(sums[6], 1e-12)
+        if first and k < len(HOPELESS) and best < HOPELESS[k]:
+            return False, variance, explained, pixels
+        solution = solve_factorized(factor, half, -pose[9])
         coef[:] = solution[:shapes]
-        for i in range(10):
-            limit = 0.15 if i < 6 else (0.1 if i < 8 else (0.4 if i == 8 else 0.08))
-            pose[i] += min(max(solution[shapes + i], -limit), limit)
-        pose[9] = max(pose[9], 0.0)
-        if not np.isfinite(pose.sum()) or not _corners(pose, frame, moved):
+        if blind:
+            continue
+        shift = _move(pose, solution[shapes:], frame, corners, moved, extents)
+        far = max(np.abs(moved[:, 0] - corners[:, 0]).max() / extents[0],
+                  np.abs(moved[:, 1] - corners[:, 1]).max() / extents[1])  # fmt: skip
+        if not np.isfinite(shift):
             return False, variance, explained, pixels
-        shift = np.abs(moved - corners).max()
-        if not coarse and shift < REST_PX:
+        if shift < REST_PX or (first and far < NEAR):
             break
-        if k >= 3 and shift > LOST_PX:
+        if first and k == steps - 1 and far > LOST:
             return False, variance, explained, pixels
-        if (k >= 1 and shift < NEAR_PX) or k >= 3:
-            coarse = False
     return True, variance, explained, pixels
 
 
@@ -767,7 +437,7 @@ def _result(
         units=units,
         units_covariance=covariance[: len(order), : len(order)],
         unit_order=order,
-        markers=coef[shapes - _EXTRA : shapes - 8],
+        markers=coef[shapes - SINGLES : shapes - 8],
         gap=float(coef[shapes - 8 : shapes - 4].mean()),
         road=float(coef[shapes - 4 :].mean()),
         corners_px=corners,
@@ -776,7 +446,7 @@ def _result(
         residual=residual,
         explained=explained,
         blur_px=math.exp(pose[8]),
-        motion=float(pose[9]),
+        motion=math.sqrt(pose[9]),
         pixels=pixels,
     )
 

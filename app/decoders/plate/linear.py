@@ -31,15 +31,24 @@ def factorize(matrix):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def solve_factorized(factor, rhs):  # type: ignore[no-untyped-def]
-    """Solution of the system whose factor this is, shape (n,)."""
+def substitute(factor, rhs):  # type: ignore[no-untyped-def]
+    """Forward half of the solution, shape (n,): its squares are what the unknowns up to each one take off a sum."""
     n = factor.shape[0]
-    solution = rhs.copy()
+    half = rhs.copy()
     for i in range(n):
-        total = solution[i]
+        total = half[i]
         for k in range(i):
-            total -= factor[i, k] * solution[k]
-        solution[i] = total / factor[i, i]
+            total -= factor[i, k] * half[k]
+        half[i] = total / factor[i, i]
+    return half
+
+
+@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def solve_factorized(factor, half, least_last):  # type: ignore[no-untyped-def]
+    """Solution of the system whose factor this is, shape (n,); the last unknown is held at `least_last` or above."""
+    n = factor.shape[0]
+    solution = half.copy()
+    solution[n - 1] = max(solution[n - 1], least_last * factor[n - 1, n - 1])
     for i in range(n - 1, -1, -1):
         solution[i] /= factor[i, i]
         value = solution[i]

@@ -10,21 +10,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.decode import DecodedSymbols, decode_symbols, weigh_units
-from app.decoders.plate.detect import (
-    MARKER_RATIO,
-    MarkerQuad,
+from app.decoders.plate.colour import (
+    MarkerColours,
     MarkerSignal,
-    detect_marker_quads,
     faint_signal,
     faintest_signal,
-    half_frame,
-    marker_margins,
+    half_planes,
+    marker_colours,
     vivid_signal,
 )
+from app.decoders.plate.decode import DecodedSymbols, decode_symbols, weigh_units
 from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids, unit_centres
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.pose import locate_plate
+from app.decoders.plate.quads import MARKER_RATIO, MarkerQuad, detect_marker_quads
 from app.decoders.plate.thermal import ORIENTATION_EVIDENCE, fit_warm_plates
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
@@ -34,40 +33,43 @@ from app.sensors.camera import Camera
 DECODER_VERSION = "plate/1"
 DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
 SURE = 0.999  # least probability at which digits are given out
-MOST_FITS = 3  # candidates that are fitted in one pass
+MOST_FITS = 4  # candidates that are fitted in one pass
 LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
-LEAST_EXPLAINED_ALONE = 0.83
-CLEAN_EXPLAINED = (
-    0.93  # from which a word may be corrected without a registry  # the same for digits that no registry confirms
-)
+LEAST_EXPLAINED_ALONE = 0.83  # the same for digits that no registry confirms
+CLEAN_EXPLAINED = 0.93  # from which a word may be corrected without a registry
 STRONG_RANK = 3.5  # of a candidate that deserves a second geometry when the first explains nothing
 LEAST_MARGIN = 1.0  # colour margin of a marker that is there
-LEAST_MARGIN_ALONE, LEAST_MARGIN_SHARE = 2.2, 0.25  # the same without a registry, and against the median marker
+LEAST_MARGIN_ALONE = 2.2  # the same without a registry
+LEAST_TINT_ALONE = 0.25  # red or green of a marker against the median square, the same
 LEAST_SIDE_PX = 24
+SAME_MARKER = 0.03  # distance of two candidates' markers, as a share of the plate, up to which one fit serves both
 Frame = npt.NDArray[Any]
 Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """What is the same for all candidates of a frame, and the good fits so far."""
+    """What is the same for all candidates of a frame, and the candidates fitted so far, good and bad."""
 
     image: Frame
     camera: Camera | None
     codebook: Sequence[PlateCode]
     geometries: Sequence[PlateGeometry]
-    fits: list[tuple[PlateGeometry, PlateFit]] = field(default_factory=list)
+    fits: list[tuple[PlateGeometry, Array, PlateFit | None]] = field(default_factory=list)
 
     def fit_candidate(self, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
-        """Fit of a candidate; a good one of the same place from an earlier pass serves again."""
-        centre = quad.centroids_px.mean(axis=0)
-        for known, earlier in self.fits:
-            reach_px = 0.1 * earlier.unit_px * geometry.n
-            if known == geometry and np.abs(earlier.corners_px.mean(axis=0) - centre).max() < reach_px:
+        """Fit of a candidate; that of about the same markers in an earlier pass serves again."""
+        reach_px = SAME_MARKER * np.ptp(quad.centroids_px, axis=0) + 0.5
+        for known, centroids_px, earlier in self.fits:
+            apart_px = np.abs(centroids_px - quad.centroids_px)
+            if known == geometry and (apart_px < reach_px).all():
                 return earlier
         fit = fit_plate(self.image, quad.centroids_px, geometry)
+        self.fits.append((geometry, quad.centroids_px, fit))
         if fit is not None and fit.explained > CLEAN_EXPLAINED:
-            self.fits.append((geometry, fit))
+            image_from_plate = np.linalg.inv(fit.plate_from_image)
+            homogeneous = np.column_stack([marker_centroids(geometry), np.ones(4)]) @ image_from_plate.T
+            self.fits.append((geometry, homogeneous[:, :2] / homogeneous[:, 2:], fit))
         return fit
 
 
@@ -113,10 +115,10 @@ def decode_plates(
 
 def _decode_colour(task: _Task) -> list[PlateReading]:
     image = task.image
-    small = half_frame(image)
+    planes = half_planes(image)
     readings: list[PlateReading] = []
     for signal_of in (vivid_signal, faint_signal, faintest_signal):
-        signal = signal_of(small)
+        signal = signal_of(planes)
         for quad in detect_marker_quads(signal)[:MOST_FITS]:
             if not any(_covers(reading, quad) for reading in readings):
                 readings += _read(task, signal, quad)
@@ -209,17 +211,16 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
             if quad.rank < STRONG_RANK:
                 break
             continue
-        margins = marker_margins(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
-        if np.sort(margins)[1] < LEAST_MARGIN:
+        colours = marker_colours(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
+        if np.sort(colours.margins)[1] < LEAST_MARGIN:
             continue
-        missing = _missing_parts(task.image.shape, quad, fit, geometry, margins)
-        missing = missing or _pale_marker(margins)
-        reading = _judge(task, fit, geometry, missing, weakest_marker=float(margins.min()))
+        missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins) or _pale_marker(colours)
+        reading = _judge(task, fit, geometry, missing, weakest_marker=float(colours.margins.min()))
         if reading.code is not None:
             return [reading]
         if best is None or reading.confidence > best.confidence:
             best = reading
-        if fit.explained > CLEAN_EXPLAINED:
+        if fit.explained > CLEAN_EXPLAINED or quad.rank < STRONG_RANK:
             break
     return [best] if best else []
 
@@ -291,13 +292,14 @@ def _missing_parts(
     return None
 
 
-def _pale_marker(margins: Array) -> tuple[PlateOutcome, str] | None:
+def _pale_marker(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
     """A marker that may be one, but too pale to be believed without a registry: a look-alike or a worn plate."""
-    if margins.min() >= max(LEAST_MARGIN_ALONE, LEAST_MARGIN_SHARE * float(np.median(margins))):
-        return None
-    if int(margins.argmin()) == 0:
+    pale = (colours.margins < LEAST_MARGIN_ALONE) | (colours.tints < LEAST_TINT_ALONE)
+    if pale[0]:
         return PlateOutcome.RED_MARKER_MISSING, "what stands for the red triangle is hardly red"
-    return PlateOutcome.GREEN_MARKER_MISSING, "what stands for a green square is hardly green"
+    if pale.any():
+        return PlateOutcome.GREEN_MARKER_MISSING, "what stands for a green square is hardly green"
+    return None
 
 
 def _out_of_view(shape: tuple[int, ...], fit: PlateFit) -> tuple[PlateOutcome, str] | None:
