@@ -13,6 +13,7 @@ from app.decoders.magnet.path import Path
 from app.decoders.magnet.readings import Finding, MagnetReading, NoiseFinding
 from app.decoders.magnet.region import Dipole, Expectation, RegionFitter
 from app.decoders.magnet.search import BIN_M, HALF_BINS, HOLE_BINS, MAX_BINS, make_search_bank, scan_bins
+from app.decoders.magnet.wheels import WheelCanceller
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
 VERSION = "matched-1"
@@ -47,6 +48,7 @@ class MagnetDecoder:
         self._unplaced: list[MagnetReading] = []
         positions[:, 0] -= positions[:, 0].min()
         self._blocks = Blocks(bar.sensor_count)
+        self._wheels = WheelCanceller(bar.references, bar.sensor_count)
         bank = make_search_bank(positions)
         self._bank = bank
         self._fitter = RegionFitter(bank, positions, bar.array, bar.axis_delay_s)
@@ -71,6 +73,7 @@ class MagnetDecoder:
     def _advance(self, *, final: bool) -> list[Finding]:
         count = self._blocks.s.size
         self._front.take(self._blocks, final=final)
+        self._wheels.clean(self._blocks.s[count:], self._blocks.x[count:])
         self._bins.append(self._blocks.s[count:], self._blocks.x[count:][:, self.bar.array])
         self._path.append(self._blocks.s[count:], self._blocks.t[count:], self._front.headings, final=final)
         self._front.headings = np.empty((0, 2))

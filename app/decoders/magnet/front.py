@@ -22,6 +22,7 @@ _FIELD_LIMIT_UT = 50_000.0
 _SPIKE_UT = 25.0
 _SPIKE_RATIO = 4.0
 _SPIKE_MISMATCH = 0.15
+_SURE_SPIKE_UT, _SURE_MISMATCH = 60.0, 0.05
 """A sample is a spike if it bends the row of samples so much, and so much more than its neighbours on the bar, and if
 the bend of the sample before it is minus half of its own but for this share: one sample alone is off."""
 
@@ -238,7 +239,8 @@ def _mend_and_block(raw, t, s, v, neighbours, previous, first, stale, total, ope
                     if neighbours[j, q] >= 0:
                         around = max(around, bend[neighbours[j, q]])
                 alone = mismatch < (_SPIKE_MISMATCH * bend[j]) ** 2 + 9
-                good = not (alone and bend[j] > _SPIKE_RATIO * around)
+                single = bend[j] > _SURE_SPIKE_UT and mismatch < (_SURE_MISMATCH * bend[j] + 6) ** 2
+                good = not (single or (alone and bend[j] > _SPIKE_RATIO * around))
             stale[j] = 0 if good else stale[j] + 1
             for a in range(3):
                 previous[2, j, a] = previous[0, j, a]

@@ -17,7 +17,7 @@ Floats = npt.NDArray[np.float64]
 
 LEAST_ENERGY = 40.0
 """chi-squared that a magnet explains; noise alone reaches it less than once in 1000 km."""
-_LEAST_MARGIN = 5.0
+_LEAST_MARGIN = 4.0
 _NEAREST_M = 0.4
 _CROWD_M = 0.8
 _MIXED_M = 0.9

@@ -70,7 +70,7 @@ def decode_trace_metro(
         for axis, orientation in enumerate((Orientation.FORWARD, Orientation.UP)):
             at, slope = steps.find_zero_crossings(derivative[:, j, axis])
             limit = steps.slope_threshold(slope)
-            amplitude = steps.amplitude_steps(smooth[:, j, axis], at)
+            amplitude = steps.amplitude_steps(smooth[:, j, axis], at, trace.rate_hz)
             for k in np.flatnonzero((np.abs(slope) > limit) & (amplitude >= settings.amplitude_ut)):
                 peak = slope[k] < 0
                 # straight above a forward magnet the field points backward

@@ -58,12 +58,10 @@ def slope_threshold(slopes: Floats, *, first: int = 50, factor: float = 1.5) -> 
     return float(factor * np.max(np.abs(slopes[:first]), initial=0.0))
 
 
-def amplitude_steps(x: Floats, crossings: Indices) -> Floats:
-    """Step 3: how far each extremum of x (T,) stands out from the extrema before and after it, whichever is nearer."""
-    value = x[crossings]
-    before = np.abs(np.diff(value, prepend=value[:1]))
-    after = np.abs(np.diff(value, append=value[-1:]))
-    return np.asarray(np.maximum(before, after))
+def amplitude_steps(x: Floats, crossings: Indices, rate_hz: float) -> Floats:
+    """Step 3: how far x (T,) is at each crossing from what is usual there, its mean over a second."""
+    usual = ndimage.uniform_filter1d(x, max(int(rate_hz), 3), mode="nearest")
+    return np.asarray(np.abs(x - usual)[crossings])
 
 
 def align_reference(reference: Floats, vehicle_from_sensor: Floats) -> Floats:
@@ -89,7 +87,6 @@ def cancel_wheel_noise(front, reference, taps=LMS_TAPS, rate=LMS_RATE, window=LM
     """
     out = front.copy()
     weights = np.zeros(taps)
-    weights[0] = 1.0
     for start in range(0, front.size, window):
         stop = min(start + window, front.size)
         low = max(start - window, 0)

@@ -24,6 +24,8 @@ _MAX_MAGNETS = 16
 _PER_MAGNET = 30.0
 _TOO_CLOSE = 30.0
 _CLUSTER_M = 1.2
+_POLISH = 6
+"""Most magnets that are fitted together."""
 _ENOUGH = 4
 LIMIT_MISFIT = 0.12
 LIMIT_PRIOR = 13.0
@@ -119,7 +121,7 @@ class RegionFitter:
         for cluster in _clusters(found):
             if len(cluster) > 1:
                 found = self._rekind(region, found, cluster)
-        return found
+        return self._polish(region, found)
 
     def _rekind(self, region: _Region, found: list[Dipole], cluster: list[Dipole]) -> list[Dipole]:
         """Explain a cluster by magnets of one kind, if that is as likely."""
@@ -134,10 +136,25 @@ class RegionFitter:
                 costs.append((region.window.cost(whole, *span) + _penalty(whole), whole))
         costs.sort(key=lambda c: c[0])
         best = costs[0][1]
-        if len(costs) > 1 and best is not found:
-            margin = costs[1][0] - costs[0][0]
-            best = [d if any(d is o for o in others) else replace(d, margin=margin) for d in best]
-        return best
+        mine = [d for d in best if all(d is not o for o in others)]
+        if len(costs) == 1 or len({d.kind for d in mine}) > 1:
+            return best
+        margin = costs[1][0] - costs[0][0]  # of the kind that they share
+        return others + [replace(d, margin=max(d.margin, margin)) for d in mine]
+
+    def _polish(self, region: _Region, found: list[Dipole]) -> list[Dipole]:
+        """Fit the magnets of each cluster together: those found first did not know of the others."""
+        for cluster in _clusters(found):
+            for k in range(0, len(cluster), _POLISH):
+                part = cluster[k : k + _POLISH]
+                if len(cluster) < 2:
+                    break
+                others = [d for d in found if all(d is not p for p in part)]
+                fitted = region.window.fit([d.params for d in part], [d.kind for d in part], others, region.expected)
+                if fitted:
+                    renewed = [replace(f, margin=d.margin) for f, d in zip(fitted, part, strict=True)]
+                    found = others + renewed
+        return found
 
     def _explain(self, region: _Region, kinds: tuple[int, ...], known: list[Dipole]) -> list[Dipole]:
         """Magnets of some kinds that explain what known ones leave of a region, the strongest first."""
@@ -180,7 +197,9 @@ class RegionFitter:
                 found[i] = replace(dipole, margin=found[i].margin)
             found.append(added)
             if len(found) >= _ENOUGH and 2 * sum(d.unlike for d in found) > len(found):
-                break  # iron: more poles would only take time
+                found = self._polish(region, found)
+                if 2 * sum(d.unlike for d in found) > len(found):
+                    break  # iron: more poles would only take time
             self._subtract(x, region.low, region.alpha, [d.params for d in fitted], [d.params for d in before])
             left, left_cell = self._score(x, region)
         return found
@@ -256,7 +275,7 @@ class _Window:
         places = [float(p[0]) for p in (*(d.params for d in known), *starts.values())]
         span = min(places), max(places)  # costs compare over the same blocks only
         for kind, start in starts.items():
-            fit = self._fit([*(d.params for d in known), start], [*(d.kind for d in known), kind], others, expected)
+            fit = self.fit([*(d.params for d in known), start], [*(d.kind for d in known), kind], others, expected)
             if fit is None:
                 return None
             cost = self.cost([*others, *fit], span[0], span[1]) if len(starts) > 1 else 0.0
@@ -267,7 +286,7 @@ class _Window:
             best[-1] = replace(best[-1], margin=fits[1][0] - fits[0][0])
         return best
 
-    def _fit(
+    def fit(
         self, starts: list[Floats], kinds: list[int], others: list[Dipole], expected: Expectation
     ) -> list[Dipole] | None:
         """Magnets of given kinds, fitted together with the others as they are; None if there are too few blocks."""
