@@ -36,6 +36,7 @@ TEMPER = 0.35  # share of a cost difference that is believed: the model is not t
 USUAL_BLUR_PX = 1.0
 FULL_TRUST_PX = 1.6  # size of a unit in the image from which it is not believed less
 REGISTERED_TRUST = 0.9999  # in a registered plate that corrections reach
+RIVAL_CELLS = 3  # by which every other registered position plate must differ more from what was read
 FLAT_LIGHT = (0.65, 1.5)  # light on a cell of one level against that around, beyond which it may be a stain
 STRAY, STRAY_TRUST = 0.23, 0.97  # share of the contrast from which a unit is no sure reading, worn or stained
 LEAST_CODEWORD = 0.05  # probability of the symbols, as read, from which a check that holds is no chance
@@ -338,17 +339,24 @@ def decode_symbols(
 
 
 def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> DecodedSymbols | None:
-    """A registered id plate within the correction capacity of what was read: two wrong cells or four in doubt.
+    """The registered plate that differs from what was read only where the plate is damaged.
 
-    A word that is not this plate's comes so near to its code with probability 5e-11 (8 x 8).
+    An id plate may differ within its correction capacity, in two wrong cells or four in doubt: a word that is not this
+    plate's comes so near with probability 5e-11 (8 x 8). A position plate's neighbours share most of its digits: it may
+    differ in three cells, each of which is in doubt or shows what no digit looks like, and no other registered plate
+    may be nearly as near.
     """
     cells = _softmax_confidence(evidence.cell_costs, evidence.best.tolist())
-    doubtful = (cells < 0.99) | (evidence.stray > STRAY)
-    for code in known:
-        if code.scheme is not PlateScheme.ID:
-            continue
-        changed = np.asarray(code.symbols) != evidence.best
-        if 2 * int((changed & ~doubtful).sum()) + int((changed & doubtful).sum()) <= 4:
+    doubtful = (cells < 0.99) | (evidence.stray > STRAY) | evidence.disputed
+    changes = np.array([np.asarray(code.symbols) != evidence.best for code in known])
+    for code, changed in zip(known, changes, strict=True):
+        if code.scheme is PlateScheme.ID:
+            near = 2 * int((changed & ~doubtful).sum()) + int((changed & doubtful).sum()) <= 4
+        else:
+            damaged = doubtful | (evidence.best > 9)
+            rivals = int((changes.sum(axis=1) < changed.sum() + RIVAL_CELLS).sum()) - 1
+            near = changed.sum() <= 3 and not (changed & ~damaged).any() and rivals == 0
+        if near:
             shown = np.where(changed, REGISTERED_TRUST, cells)
             corrected = tuple(int(i) for i in np.flatnonzero(changed))
             return DecodedSymbols(

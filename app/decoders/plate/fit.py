@@ -30,10 +30,7 @@ FIRST_BLUR = 0.2  # units
 # share of the pixels' variance that shapes of the best values explain in the first steps on anything that is a plate
 HOPELESS = (0.73, 0.74, 0.8, 0.83, 0.85, 0.85)
 LEAST_FINE = 0.7  # the same of the values and the pose found, from the second fine step on
-COARSE_STEPS, FINE_STEPS = 6, 4
-COARSE_PX, FINE_PX = 1.8, 2.8  # pixels a unit, where the image has more
 LEAST_STEP = 1.25  # px, below which averaging gives nothing
-COARSE_NODES, FINE_NODES = 1, 3  # quadrature on each side of the middle
 MOST_STEP = 0.06  # of the plate's image: how far a step may move a corner
 NEAR, LOST = 0.02, 0.03  # of the plate's image: corners that move less are near rest, that move more are lost
 REST_PX = 0.25  # corners rest when they move less in one step
@@ -132,6 +129,19 @@ class _Patch:
     grid: Array
 
 
+@dataclass(frozen=True, slots=True)
+class _Stage:
+    """Pixels a unit, where the image has more; quadrature nodes on each side of the middle; most steps."""
+
+    unit_px: float
+    nodes: int
+    steps: int
+
+
+_QUICK = (_Stage(1.8, 1, 6), _Stage(2.8, 4, 4))
+_THOROUGH = (_Stage(2.4, 2, 6), _Stage(3.5, 4, 4))  # a thermal camera's plates are few and faint
+
+
 def fit_plate(
     image: npt.NDArray[Any], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
 ) -> PlateFit | None:
@@ -164,19 +174,18 @@ def fit_plate(
     normal = np.empty((len(coef) + POSE, len(coef) + POSE))
     corners = np.empty((4, 2))
     variance, explained, pixels = 0.0, 0.0, 0
-    for px_per_unit, most_nodes, steps, first in (
-        (COARSE_PX, COARSE_NODES, COARSE_STEPS, True), (FINE_PX, FINE_NODES, FINE_STEPS, False),
-    ):  # fmt: skip
+    for number, stage in enumerate(_THOROUGH if linear else _QUICK):
+        first = number == 0
         if not _corners(pose, frame, corners):
             return None
-        patch = _cut_patch(image, corners, geometry.n * px_per_unit, linear)
+        patch = _cut_patch(image, corners, geometry.n * stage.unit_px, linear)
         if patch is None:
             return None
         if first:
             coef[:] = patch.light.mean()
         ok, variance, explained, pixels = _gauss_newton(
             patch.light, patch.weights, patch.grid, NORMAL_TABLE, frame, pose, edges, slot, coef, normal,
-            most_nodes, steps, first,
+            stage.nodes, stage.steps, first,
         )  # fmt: skip
         if not ok:
             return None

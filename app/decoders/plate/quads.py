@@ -21,7 +21,7 @@ MAX_REDS = 150
 MAX_GREENS = 160
 MAX_NEAR = 8
 MAX_QUADS = 400
-MAX_CANDIDATES = 8
+MAX_CANDIDATES = 12
 LEAST_INTERIOR = 2.5
 ALL_SQUARES = 7
 # distance between marker centres over the side of a marker: 3.2, 4.27, 5.33 for 8, 10, 12 units of 35 / 5 mm
@@ -57,13 +57,13 @@ class MarkerQuad:
         """How likely it is a plate: above 0 worth a fit.
 
         With all squares seen it is the logarithm of the odds, by regression over 3,600 candidates in simulated frames,
-        and 2.5; with one missing, hardly any candidate is a plate, and only a strong one counts.
+        and 3.0; with one missing, hardly any candidate is a plate, and only a strong one counts.
         """
         right, down = self.centroids_px[1] - self.centroids_px[0], self.centroids_px[3] - self.centroids_px[0]
         size = math.log10(max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0))
         margin = math.log(self.colour_margin)
         if self.found == ALL_SQUARES:
-            return 1.14 * self.score + 1.86 * margin + 1.99 * size - 0.51 * size**2 - 9.5
+            return 1.14 * self.score + 1.86 * margin + 1.99 * size - 0.51 * size**2 - 9.0
         wanted = min(max(4.5 * size - 5.8, 5.0), 8.7 + max(size - 3.5, 0.0))
         return self.score + 2 * margin - wanted
 

@@ -33,7 +33,7 @@ from app.sensors.camera import Camera
 DECODER_VERSION = "plate/1"
 DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
 SURE = 0.999  # least probability at which digits are given out
-MOST_FITS = 4  # candidates that are fitted in one pass
+MOST_FITS = 5  # candidates that are fitted in one pass
 LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
 LEAST_EXPLAINED_ALONE = 0.83  # the same for digits that no registry confirms
 CLEAN_EXPLAINED = 0.93  # from which a word may be corrected without a registry
@@ -196,10 +196,10 @@ def _without_shadows(readings: list[PlateReading]) -> Iterator[PlateReading]:
 
 
 def _likely_geometries(quad: MarkerQuad, geometries: Sequence[PlateGeometry]) -> list[PlateGeometry]:
-    """Geometries whose markers may be as large as the candidate's, close ones first; blur widens small markers."""
-    misfit = {g: abs(math.log(quad.size_ratio / (0.95 * MARKER_RATIO[g.n]))) for g in geometries}
-    possible = [g for g in geometries if misfit[g] < 0.55] or [min(geometries, key=lambda g: misfit[g])]
-    return sorted(possible, key=lambda g: misfit[g] > 0.4)
+    """Geometries whose markers may be as large as the candidate's, close ones first; wear makes markers smaller."""
+    misfit = {g: math.log(quad.size_ratio / (0.95 * MARKER_RATIO[g.n])) for g in geometries}
+    possible = [g for g in geometries if -0.4 < misfit[g] < 0.55] or [min(geometries, key=lambda g: abs(misfit[g]))]
+    return sorted(possible, key=lambda g: abs(misfit[g]) > 0.4)
 
 
 def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateReading]:
