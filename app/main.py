@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import artwork, decodes, markers, system, ui
+from app.api import artwork, codebooks, decodes, layouts, markers, system, ui
 from app.api.middleware import Guarded, Observed
 from app.api.openapi import describe
 from app.api.problems import install_problem_handlers
@@ -28,14 +28,25 @@ from app.markers.reading import PlateReading
 from app.registry.database import Database
 from app.services.access import Access, Scope
 from app.services.artwork import Artworks
+from app.services.codebooks import Codebooks
 from app.services.decode_jobs import DecodeJobs
 from app.services.decode_rules import DecodeRules
 from app.services.decodes import Decodes
-from app.services.markers import MarkerRules, Markers
+from app.services.layouts import Layouts
+from app.services.marker_rules import MarkerRules
+from app.services.markers import Markers
 from app.settings import Settings
 from app.storage.blobs import Blobs
 
-ROUTERS = (ui.router, system.router, markers.router, artwork.router, decodes.router)
+ROUTERS = (
+    ui.router,
+    system.router,
+    markers.router,
+    artwork.router,
+    layouts.router,
+    codebooks.router,
+    decodes.router,
+)
 
 
 def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> FastAPI:
@@ -71,6 +82,8 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
 
     app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
     app.state.markers = Markers(database, utc_now, _marker_rules(settings))
+    app.state.layouts = Layouts(database)
+    app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)
     app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, rules=rules)
     app.state.jobs = jobs
     app.state.artworks = Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode))

@@ -10,8 +10,8 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
 from app.api.dependencies import Caller, Identifier, Number
-from app.api.markers import MarkerId, Status
 from app.api.problems import problem_responses
+from app.api.schemas_markers import MarkerId, Status
 from app.api.strict_json import StrictRoute
 from app.encoders.plate import ArtworkFormat, ArtworkOptions, BundleOptions
 from app.errors import InvalidParameter

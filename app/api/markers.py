@@ -4,216 +4,64 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Discriminator, RootModel, Tag, model_validator
 
-from app.api.dependencies import (
-    Caller,
-    Idempotency,
-    Identifier,
-    Markers,
-    Number,
-    Text,
-    Version,
-    Whole,
-    json_response,
-    next_link,
-)
-from app.api.problems import problem_responses
+from app.api.dependencies import Caller, Idempotency, Identifier, Markers, Text, Version, json_response, next_link
+from app.api.problems import UNION_TAG, problem_responses
+from app.api.schemas_magnets import MAGNET_EXAMPLES, MagnetMarkerIn, MagnetMarkerOut, MagnetMarkerSummary
+from app.api.schemas_markers import PLATE_EXAMPLES, GeometryIn, MarkerId, MarkerIn, MarkerOut, MarkerPatch, Status
 from app.api.strict_json import StrictRoute
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.markers.plate import PlateGeometry, PlateScheme
 from app.registry.markers import MarkerFilter
 from app.registry.spatial import Box
-from app.services.markers import GivenCode, GivenPosition, MarkerChange, NewPlate, naming
+from app.services.markers import MarkerChange
+from app.services.plate_markers import GivenCode, NewPlate
+from app.services.positions import GivenPosition, naming
 
 router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
 
 MAX_PAGE = 1000
 MAX_RADIUS_M = 100_000.0
-Status = Literal["planned", "built", "surveyed", "active", "suspect", "retired"]
-Heading = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, lt=360)]
-Accuracy = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6)]
-Metres = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e8, le=1e8)]
-Height = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-12_000, le=100_000)]
-MarkerId = Annotated[Identifier, Path(description="Id of the marker.")]
+FAMILIES = ("plate", "magnet")
 
 
-class PositionIn(BaseModel):
-    """Longitude and latitude, or easting and northing of a projected CRS, with where they come from."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    lon_deg: Number | None = Field(None, description="Longitude, -180 to 180. [deg]")
-    lat_deg: Number | None = Field(None, description="Latitude, -90 to 90. [deg]")
-    easting_m: Metres | None = Field(None, description="Easting in a projected CRS. [m]")
-    northing_m: Metres | None = Field(None, description="Northing in a projected CRS. [m]")
-    height_m: Height | None = Field(None, description="Height above the vertical datum. [m]")
-    crs: Text | None = Field(None, max_length=100, description="EPSG code or URN; WGS 84 if left out.")
-    realization: Text | None = Field(None, min_length=1, max_length=64, description="Reference frame, e.g. ITRF2014.")
-    epoch: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1900, le=2200)] | None = Field(
-        None, description="Coordinate epoch. [decimal year]"
-    )
-    vertical_datum: Text | None = Field(
-        None,
-        min_length=1,
-        max_length=64,
-        description="`ellipsoid` (default) or the datum of the height, e.g. EPSG:5703.",
-    )
-    horizontal_rmse_m: Accuracy | None = Field(None, description="Horizontal accuracy, RMSE. [m]")
-    vertical_rmse_m: Accuracy | None = Field(None, description="Vertical accuracy, RMSE. [m]")
-    survey_method: Text | None = Field(None, min_length=1, max_length=200, description="How it was surveyed.")
+def _family_tag(body: Any) -> str:
+    family = body.get("family", "plate") if isinstance(body, dict) else getattr(body, "family", "plate")
+    return f"{UNION_TAG}{family}"
 
 
-class CodeIn(BaseModel):
-    """The plate's code; without digits they follow from the position or the registry number."""
+class NewMarkerIn(
+    RootModel[
+        Annotated[
+            Annotated[MarkerIn, Tag(f"{UNION_TAG}plate")] | Annotated[MagnetMarkerIn, Tag(f"{UNION_TAG}magnet")],
+            Discriminator(_family_tag),
+        ]
+    ]
+):
+    """A marker to register: a plate, or magnets where the family says so."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(json_schema_extra={"examples": [*PLATE_EXAMPLES, *MAGNET_EXAMPLES]})
 
-    scheme: Literal["position", "position-check", "id"] = "position"
-    digits: Text | None = Field(None, min_length=1, max_length=64, description="Digits to use instead of derived ones.")
-    check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] | None = Field(
-        None, description="For `position-check`: 1 (default) or 2."
-    )
-    registry_number: Annotated[int, Field(strict=True, ge=0, lt=2**64)] | None = Field(
-        None, description="For `id`: the number; allocated if left out."
-    )
-    allow_mismatched_digits: Annotated[bool, Field(strict=True)] = Field(
-        False, description="Store digits that do not fit the position; such a plate is found through the registry only."
-    )
-
-
-class GeometryIn(BaseModel):
-    """Dimensions of the plate."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    n: Whole = Field(8, description="Units along a side: 8, 10 or 12.")
-    unit_mm: Number = Field(35.0, description="Side of a unit, 20 to 50. [mm]")
-    gap_mm: Number = Field(5.0, description="Gap between units and round the border, 2 to 10. [mm]")
-    thickness_mm: Number = Field(20.0, description="Thickness of the base plate, 5 to 50. [mm]")
-
-
-class _Placement(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    heading_deg: Heading | None = Field(None, description="Direction of travel, clockwise from true north. [deg]")
-    heading_rmse_deg: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=180)] | None = None
-    road: Text | None = Field(None, min_length=1, max_length=200, description="Road's name or number.")
-    measure_m: Metres | None = Field(None, description="Chainage along the road. [m]")
-    offset_m: Metres | None = Field(None, description="Offset from the road's axis, left positive. [m]")
-    reason: Text | None = Field(None, min_length=1, max_length=500, description="Why; goes into the history.")
-
-
-_POSITION_EXAMPLE: dict[str, JsonValue] = {
-    "lon_deg": 114.179203,
-    "lat_deg": 22.304161,
-    "height_m": 5.21,
-    "realization": "ITRF2014",
-    "epoch": 2025.4,
-    "horizontal_rmse_m": 0.012,
-    "vertical_rmse_m": 0.02,
-    "survey_method": "GNSS RTK, two occupations",
-}
-_NEW_EXAMPLES: list[JsonValue] = [
-    {"position": _POSITION_EXAMPLE, "heading_deg": 78.5, "status": "surveyed", "road": "Cheong Wan Road"},
-    {"position": _POSITION_EXAMPLE, "code": {"scheme": "position-check", "check_digits": 2}, "geometry": {"n": 10}},
-    {"position": _POSITION_EXAMPLE, "code": {"scheme": "id"}},
-    {"position": _POSITION_EXAMPLE, "code": {"digits": "023792168411", "allow_mismatched_digits": True}},
-]
-
-
-class MarkerIn(_Placement):
-    """A plate to register."""
-
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": _NEW_EXAMPLES})
-
-    family: Literal["plate"] = "plate"
-    status: Status = "planned"
-    position: PositionIn
-    code: CodeIn = Field(default_factory=CodeIn)
-    geometry: GeometryIn = Field(default_factory=GeometryIn)
-
-
-class MarkerPatch(_Placement):
-    """Members to change; a member that is null is cleared, one that is left out stays."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "examples": [
-                {"status": "surveyed", "position": _POSITION_EXAMPLE, "reason": "as-built survey"},
-                {"status": "retired", "reason": "resurfaced"},
-            ]
-        },
-    )
-
-    status: Status = Field("planned", description="New status.")
-    position: PositionIn = Field(default_factory=PositionIn, description="New position; replaces the whole of the old.")
-
-
-class CodeOut(BaseModel):
-    """A plate's code."""
-
-    scheme: str
-    digits: str
-    check_digits: int | None
-    registry_number: int | None
-    digits_match_position: bool | None
-
-
-class GeometryOut(BaseModel):
-    """Dimensions of a plate."""
-
-    n: int
-    unit_mm: float
-    gap_mm: float
-    thickness_mm: float
-    side_mm: float
-
-
-class PositionOut(BaseModel):
-    """A position in WGS 84 / ITRF, and `original` as it was given."""
-
-    lon_deg: float
-    lat_deg: float
-    height_m: float | None
-    crs: str
-    realization: str | None
-    epoch: float | None
-    vertical_datum: str | None
-    horizontal_rmse_m: float | None
-    vertical_rmse_m: float | None
-    survey_method: str | None
-    localization_grade: Literal["exact", "approximate, not for localization"]
-    transform_note: str | None
-    original: dict[str, Any]
-
-
-class MarkerOut(BaseModel):
-    """A marker."""
-
-    id: str
-    family: str
-    status: Status
-    version: int
-    code: CodeOut
-    geometry: GeometryOut
-    position: PositionOut
-    heading_deg: float | None
-    heading_rmse_deg: float | None
-    road: str | None
-    measure_m: float | None
-    offset_m: float | None
-    created_at: str
-    updated_at: str
+    @model_validator(mode="before")
+    @classmethod
+    def _known_family(cls, body: Any) -> Any:
+        if isinstance(body, dict) and body.get("family", "plate") not in FAMILIES:
+            raise InvalidParameter(
+                f"there is no family {str(body['family'])[:40]!r}",
+                field="family",
+                limit=f"one of {', '.join(FAMILIES)}",
+                cure="leave it out for a plate",
+            )
+        return body
 
 
 class MarkerPage(BaseModel):
     """A page of markers; the Link header leads to the next one."""
 
-    items: list[MarkerOut]
+    items: list[MarkerOut | MagnetMarkerSummary]
 
 
 class VersionOut(BaseModel):
@@ -223,7 +71,7 @@ class VersionOut(BaseModel):
     at: str
     who: str
     why: str | None
-    marker: MarkerOut
+    marker: MarkerOut | MagnetMarkerSummary
 
 
 class VersionPage(BaseModel):
@@ -236,11 +84,15 @@ class VersionPage(BaseModel):
     "",
     status_code=201,
     response_class=Response,
-    responses={201: {"model": MarkerOut, "description": "Registered"}, **problem_responses(409)},
+    responses={201: {"model": MarkerOut | MagnetMarkerOut, "description": "Registered"}, **problem_responses(409)},
 )
-def post_marker(marker: MarkerIn, caller: Caller, markers: Markers, idempotency: Idempotency) -> Response:
-    """Register a plate. With an Idempotency-Key a repeated request gets the first answer again."""
-    document, replayed = markers.register_plate(caller, _new_plate(marker), idempotency)
+def post_marker(marker: NewMarkerIn, caller: Caller, markers: Markers, idempotency: Idempotency) -> Response:
+    """Register a plate or magnets. With an Idempotency-Key a repeated request gets the first answer again."""
+    new = marker.root
+    if isinstance(new, MagnetMarkerIn):
+        document, replayed = markers.register_magnets(caller, new.given(), idempotency)
+    else:
+        document, replayed = markers.register_plate(caller, _new_plate(new), idempotency)
     headers = {"Location": f"/v1/markers/{document['id']}", "ETag": _etag(document)}
     if replayed:
         headers["Idempotency-Replayed"] = "true"
@@ -254,23 +106,34 @@ def list_markers(
     markers: Markers,
     bbox: Annotated[Text | None, Query(max_length=200, examples=["114.1,22.2,114.3,22.4"])] = None,
     near: Annotated[Text | None, Query(max_length=200, examples=["114.179,22.304,500"])] = None,
-    code: Annotated[Text | None, Query(min_length=1, max_length=64, description="All digits of a plate.")] = None,
+    code: Annotated[
+        Text | None, Query(min_length=1, max_length=64, description="All digits of a plate, or the text of a tag.")
+    ] = None,
     status: Status | None = None,
+    family: Literal["plate", "magnet"] | None = None,
     limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100,
     after: Annotated[Identifier | None, Query(description="Last id of the page before.")] = None,
 ) -> Response:
-    """Markers in the order they were registered. `bbox` is west,south,east,north; `near` is lon,lat,radius_m."""
+    """Markers in the order they were registered. `bbox` is west,south,east,north; `near` is lon,lat,radius_m.
+
+    Magnets are where their first one lies; lists leave out their lanes, magnets, checks and costs.
+    """
     narrowed = MarkerFilter(
         box=_box(bbox) if bbox is not None else None,
         near=_circle(near) if near is not None else None,
         digits=code,
         status=status,
+        family=family,
     )
     page, last = markers.page(caller, narrowed, after=after, limit=limit)
     return json_response({"items": page}, headers=next_link(request, after=last) if last else None)
 
 
-@router.get("/{marker_id}", response_class=Response, responses={200: {"model": MarkerOut}, **problem_responses(404)})
+@router.get(
+    "/{marker_id}",
+    response_class=Response,
+    responses={200: {"model": MarkerOut | MagnetMarkerOut}, **problem_responses(404)},
+)
 def get_marker(marker_id: MarkerId, request: Request, caller: Caller, markers: Markers) -> Response:
     """One marker, with its version as ETag."""
     document = markers.get(caller, marker_id)
@@ -283,7 +146,7 @@ def get_marker(marker_id: MarkerId, request: Request, caller: Caller, markers: M
 @router.patch(
     "/{marker_id}",
     response_class=Response,
-    responses={200: {"model": MarkerOut}, **problem_responses(404, 409, 412, 428)},
+    responses={200: {"model": MarkerOut | MagnetMarkerOut}, **problem_responses(404, 409, 412, 428)},
 )
 def patch_marker(
     marker_id: MarkerId, patch: MarkerPatch, caller: Caller, markers: Markers, version: Version

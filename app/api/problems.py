@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
 from app import errors
+from app.encoders.magnet import CodebookFull
 
 MEDIA_TYPE = "application/problem+json"
 _LOG = structlog.get_logger(__name__)
@@ -37,6 +38,7 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     errors.NotAllowed: ProblemKind(403, "not-allowed", "The key's scope does not cover this"),
     errors.NotFound: ProblemKind(404, "not-found", "There is no such thing"),
     errors.Conflict: ProblemKind(409, "conflict", "The request contradicts what is stored"),
+    CodebookFull: ProblemKind(409, "codebook-full", "No further code keeps its distance"),
     errors.CodeTaken: ProblemKind(409, "code-taken", "The code is taken"),
     errors.IdempotencyConflict: ProblemKind(409, "idempotency-conflict", "The Idempotency-Key is taken"),
     errors.StaleVersion: ProblemKind(412, "stale-version", "The marker was changed meanwhile"),
@@ -50,6 +52,8 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     errors.ProofFailed: ProblemKind(500, "proof-failed", "The artwork did not read back"),
     errors.Unavailable: ProblemKind(503, "unavailable", "Try again later"),
 }
+UNION_TAG = "one-of:"
+"""How a member of a union is named in the path of an error; it is no part of the body."""
 VALIDATION = ProblemKind(422, "invalid-parameter", "A value is not allowed")
 
 
@@ -210,7 +214,7 @@ _CONSTRAINTS = {
 
 
 def _field_error(item: dict[str, Any]) -> FieldError:
-    location = [str(part) for part in item["loc"]]
+    location = [str(part) for part in item["loc"] if not str(part).startswith(UNION_TAG)]
     path = ".".join(location[1:] if len(location) > 1 else location)
     context = item.get("ctx") or {}
     limits = [text.format(context[name]) for name, text in _CONSTRAINTS.items() if name in context]

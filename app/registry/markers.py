@@ -26,6 +26,7 @@ class MarkerFilter:
     near: tuple[float, float, float] | None = None
     digits: str | None = None
     status: str | None = None
+    family: str | None = None
 
 
 def get_marker(connection: sa.Connection, agency_id: str, marker_id: str) -> Row:
@@ -82,6 +83,8 @@ def _conditions(narrowed: MarkerFilter) -> list[sa.ColumnElement[bool]]:
         conditions.append(markers.c.digits == narrowed.digits)
     if narrowed.status is not None:
         conditions.append(markers.c.status == narrowed.status)
+    if narrowed.family is not None:
+        conditions.append(markers.c.family == narrowed.family)
     return conditions
 
 

@@ -109,6 +109,7 @@ markers = sa.Table(
     sa.Column("road", sa.String(200)),
     sa.Column("measure_m", sa.Double),
     sa.Column("offset_m", sa.Double),
+    sa.Column("spec", sa.JSON(none_as_null=True)),  # what a family keeps besides: the lane and the layout of magnets
     sa.Column("version", sa.Integer, nullable=False),
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("updated_at", UtcTime, nullable=False),
@@ -116,6 +117,7 @@ markers = sa.Table(
     sa.CheckConstraint("lon_deg BETWEEN -180 AND 180 AND lat_deg BETWEEN -90 AND 90", name="position"),
     sa.Index("ix_markers_agency_id_id", "agency_id", "id"),
     sa.Index("ix_markers_agency_id_status_id", "agency_id", "status", "id"),
+    sa.Index("ix_markers_agency_id_family_id", "agency_id", "family", "id"),
     sa.Index("ix_markers_digits", "digits"),
     sqlite_autoincrement=True,
 )
@@ -139,6 +141,39 @@ marker_versions = sa.Table(
     sa.Column("who", sa.String(200), nullable=False),
     sa.Column("why", sa.String(500)),
     sa.Column("marker", sa.JSON, nullable=False),
+)
+
+# where the magnets of magnet markers lie: what follows from their layouts, kept for searches
+magnets = sa.Table(
+    "magnets",
+    metadata,
+    sa.Column("row", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), primary_key=True, autoincrement=True),
+    sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), nullable=False),
+    sa.Column("number", sa.Integer, nullable=False),
+    _agency(),
+    sa.Column("lon_deg", sa.Double, nullable=False),
+    sa.Column("lat_deg", sa.Double, nullable=False),
+    sa.Column("polarity", sa.String(1), nullable=False),
+    sa.Column("phi_deg", sa.Integer, nullable=False),
+    sa.UniqueConstraint("marker_id", "number"),
+    sqlite_autoincrement=True,
+)
+
+codebooks = sa.Table(
+    "codebooks",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    _agency(),
+    sa.Column("name", sa.String(80), nullable=False),
+    sa.Column("design", sa.JSON, nullable=False),
+    sa.Column("rules", sa.JSON, nullable=False),
+    sa.Column("figures", sa.JSON, nullable=False),
+    sa.Column("entries", sa.JSON, nullable=False),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.UniqueConstraint("agency_id", "name"),
+    sa.Index("ix_codebooks_agency_id_id", "agency_id", "id"),
 )
 
 decodes = sa.Table(

@@ -6,7 +6,7 @@ import hashlib
 import tempfile
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import IO, Any
 
 from app.encoders.plate import (
@@ -30,7 +30,7 @@ from app.registry import markers as store
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter, Row
 from app.services.access import Caller
-from app.services.markers import plate_code, plate_geometry
+from app.services.plate_markers import plate_code, plate_geometry
 
 MAX_PLATES = 5_000
 _BUNDLES_AT_ONCE = 2
@@ -162,7 +162,11 @@ class Artworks:
                 rows = store.get_markers(connection, caller.agency_id, list(selection.marker_ids))
             else:
                 rows = store.list_markers(
-                    connection, caller.agency_id, selection.narrowed, after=None, limit=MAX_PLATES + 1
+                    connection,
+                    caller.agency_id,
+                    replace(selection.narrowed, family="plate"),
+                    after=None,
+                    limit=MAX_PLATES + 1,
                 )
         plates = [row for row in rows if row["family"] == "plate"]
         if len(plates) > MAX_PLATES:

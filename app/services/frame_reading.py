@@ -18,8 +18,8 @@ from app.services.decode_context import DecodeContext
 from app.services.decode_documents import ReadFrame, ReadPlate
 from app.services.fixes import fix_from_match, fuse_fixes
 from app.services.frames import FrameDecoder, FrameResult, FrameTask, PendingFrame, PlateSearch, distinct_geometries
-from app.services.markers import plate_geometry
 from app.services.matching import Match, NearbyPlates, match_reading
+from app.services.plate_markers import plate_geometry
 
 DEFAULT_GEOMETRIES = tuple(PlateGeometry(n=n) for n in (8, 10, 12))
 

@@ -15,7 +15,7 @@ from app.registry import markers as store
 from app.registry.markers import MarkerFilter, Row
 from app.registry.spatial import distance_m
 from app.services.decode_context import CoarsePosition
-from app.services.markers import plate_code
+from app.services.plate_markers import plate_code
 
 MAX_CODEBOOK = 500
 _M_PER_DEG = 111_000.0

@@ -1,0 +1,141 @@
+"""Where magnets lie, and what migration 0002 does to a registry that has some."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+
+from app.encoders.magnet import CodebookRules
+from app.errors import StaleVersion
+from app.markers.magnet_design import TagDesign
+from app.registry import agencies, codebooks
+from app.registry.database import Database
+from app.registry.magnets import list_magnets_in
+from app.registry.markers import MarkerFilter, list_markers, list_plates_near
+from app.registry.spatial import Box, box_around
+from app.services.access import Caller, Scope
+from app.services.codebooks import Codebooks
+from app.services.magnet_layouts import GivenLane, PlacedTag
+from app.services.magnet_markers import GivenTag, NewMagnets
+from app.services.markers import MarkerChange, Markers
+from app.services.plate_markers import NewPlate
+from app.services.positions import GivenPosition
+
+NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Iterator[Database]:
+    database = Database(f"sqlite:///{tmp_path / 'waymark.sqlite3'}")
+    database.open()
+    database.migrate()
+    yield database
+    database.close()
+
+
+@pytest.fixture
+def caller(database: Database) -> Caller:
+    with database.write() as connection:
+        return Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.WRITE)
+
+
+def _register(database: Database, caller: Caller, lon_deg: float = 7.0) -> dict[str, Any]:
+    end_deg = (lon_deg + 0.001 + 180.0) % 360.0 - 180.0
+    lane = GivenLane(((lon_deg, 1.0), (end_deg, 1.0)), False, "geometry.coordinates")
+    new = NewMagnets(lane, GivenTag(PlacedTag(10.0), "SNS_4_0.1_10-30"))
+    return Markers(database, lambda: NOW).register_magnets(caller, new)[0]
+
+
+def _numbers(database: Database, box: Box, **narrowed: Any) -> list[int]:
+    with database.read() as connection:
+        return sorted(row["number"] for row in list_magnets_in(connection, box, **narrowed))
+
+
+def test_every_magnet_is_found_where_it_lies(database: Database, caller: Caller) -> None:
+    marker = _register(database, caller)
+    for magnet in marker["magnets"]:
+        assert _numbers(database, box_around(magnet["lon_deg"], magnet["lat_deg"], 0.3)) == [magnet["number"]]
+    around = box_around(marker["position"]["lon_deg"], marker["position"]["lat_deg"], 20.0)
+    assert _numbers(database, around) == [1, 2, 3]
+    assert _numbers(database, around, ignoring=marker["id"]) == []
+    Markers(database, lambda: NOW).change(caller, marker["id"], MarkerChange({"status": "retired"}), 1)
+    assert _numbers(database, around) == []
+
+
+def test_magnets_over_the_antimeridian(database: Database, caller: Caller) -> None:
+    marker = _register(database, caller, lon_deg=179.99989)
+    assert _signs(marker) == [1, 1, -1]
+    assert _numbers(database, Box(179.9, 0.9, -179.9, 1.1)) == [1, 2, 3]
+    lane = GivenLane(((179.99989, 1.0), (-179.99911, 1.0)), False, "geometry.coordinates")
+    beside = NewMagnets(lane, GivenTag(PlacedTag(10.0, offset_m=1.0), "SNS_4_0.1_10-30"))
+    checks = Markers(database, lambda: NOW).register_magnets(caller, beside)[0]["checks"]
+    assert next(c for c in checks if c["name"] == "neighbour-tag")["figure"] == pytest.approx(1.0, abs=1e-3)
+
+
+def _signs(marker: dict[str, Any]) -> list[int]:
+    return [1 if magnet["lon_deg"] > 0 else -1 for magnet in marker["magnets"]]
+
+
+def test_migration_0002_down_and_up_keeps_plates(database: Database, caller: Caller) -> None:
+    plate = NewPlate(GivenPosition(lon_deg=7.0, lat_deg=1.0))
+    plate_id = Markers(database, lambda: NOW).register_plate(caller, plate)[0]["id"]
+    _register(database, caller)
+    Codebooks(database, lambda: NOW).make(caller, "b", TagDesign(3, 4.0, 0.1), CodebookRules(), [("arrow", "left")])
+    database.migrate("0001")
+    with database.read() as connection:
+        names = set(sa.inspect(connection).get_table_names())
+        assert not {name for name in names if "magnet" in name or "codebook" in name}
+        assert connection.exec_driver_sql("SELECT id FROM markers").scalars().all() == [plate_id]
+        assert connection.exec_driver_sql("SELECT marker_id FROM marker_versions").scalars().all() == [plate_id]
+        assert connection.exec_driver_sql("SELECT count(*) FROM markers_rtree").scalar() == 1
+        assert connection.exec_driver_sql("PRAGMA foreign_key_check").all() == []
+    database.migrate()
+    with database.read() as connection:
+        (row,) = list_markers(connection, caller.agency_id, MarkerFilter(), after=None, limit=10)
+    assert (row["id"], row["spec"]) == (plate_id, None)
+    _register(database, caller)
+
+
+def test_a_codebook_is_replaced_at_its_version_only(database: Database, caller: Caller) -> None:
+    made, _ = Codebooks(database, lambda: NOW).make(caller, "b", TagDesign(3, 4.0, 0.1), CodebookRules())
+    with database.write() as connection:
+        change = {"version": 1, "now": NOW}
+        assert codebooks.replace_entries(connection, caller.agency_id, made["id"], [], **change)["version"] == 2
+        with pytest.raises(StaleVersion):
+            codebooks.replace_entries(connection, caller.agency_id, made["id"], [], **change)
+        with pytest.raises(StaleVersion):
+            codebooks.replace_entries(connection, "another agency", made["id"], [], version=2, now=NOW)
+
+
+def test_lists_of_a_family_and_searches_use_their_index(database: Database, caller: Caller) -> None:
+    agency_id = caller.agency_id
+    by_family = MarkerFilter(family="magnet")
+    plan = _plan(database, lambda c: list_markers(c, agency_id, by_family, after=None, limit=10))
+    assert "ix_markers_agency_id_family_id (agency_id=? AND family=?)" in plan
+    plates = _plan(database, lambda c: list_plates_near(c, agency_id, 7.0, 1.0, 50.0))
+    assert "SEARCH markers USING INTEGER PRIMARY KEY" in plates
+    magnets = _plan(database, lambda c: list_magnets_in(c, box_around(7.0, 1.0, 2.0)))
+    assert "SEARCH magnets USING INTEGER PRIMARY KEY" in magnets
+    assert "VIRTUAL TABLE INDEX" in magnets
+
+
+def _plan(database: Database, ask: Any) -> str:
+    statements: list[tuple[str, Any]] = []
+
+    def keep(_c: object, _cur: object, statement: str, parameters: Any, *_: object) -> None:
+        statements.append((statement, parameters))
+
+    sa.event.listen(database.engine, "before_cursor_execute", keep)
+    try:
+        with database.read() as connection:
+            ask(connection)
+    finally:
+        sa.event.remove(database.engine, "before_cursor_execute", keep)
+    with database.read() as connection:
+        query, parameters = statements[-1]
+        return " ".join(str(row) for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {query}", parameters))
