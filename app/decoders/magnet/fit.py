@@ -78,33 +78,55 @@ def dipole_columns(p, s, positions, delays, weight, out, derivatives):  # type: 
         y = positions[j, 1] - p[1]
         z = positions[j, 2] + p[2]
         for axis in range(3):
+            # 1 for the axis, 0 for the others: no branches in the loops
+            ex, ey, ez = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
+            m = ex * mx + ey * my + ez * mz
+            w, delay = weight[j, axis], delays[axis]
+            ahead = positions[j, 0] - p[0]
+            field = out[6, j, axis]
+            if not derivatives:
+                for k in range(k_n):
+                    x = s[k] + delay[k] + ahead
+                    r2 = x * x + y * y + z * z
+                    f = 0.1 * w[k] / (r2 * r2 * math.sqrt(r2))
+                    field[k] = f * (3 * (ex * x + ey * y + ez * z) * (mx * x + my * y + mz * z) - m * r2)
+                continue
+            d0, d1, d2 = out[0, j, axis], out[1, j, axis], out[2, j, axis]
+            d3, d4, d5 = out[3, j, axis], out[4, j, axis], out[5, j, axis]
             for k in range(k_n):
-                x = s[k] + delays[axis, k] + positions[j, 0] - p[0]
-                i2 = 1 / (x * x + y * y + z * z)
-                i5 = 0.1 * i2 * i2 * math.sqrt(i2)
-                w = weight[j, axis, k]
+                x = s[k] + delay[k] + ahead
+                r2 = x * x + y * y + z * z
+                f = 0.1 * w[k] / (r2 * r2 * math.sqrt(r2))
                 along = mx * x + my * y + mz * z
-                r = x if axis == 0 else (y if axis == 1 else z)
-                m = mx if axis == 0 else (my if axis == 1 else mz)
-                r2 = 1 / i2
-                out[6, j, axis, k] = w * i5 * (3 * r * along - m * r2)
-                if derivatives:
-                    c = 15 * r * along * i2 - 3 * m
-                    gx = i5 * (3 * r * mx - c * x)
-                    gy = i5 * (3 * r * my - c * y)
-                    gz = i5 * (3 * r * mz - c * z)
-                    if axis == 0:
-                        gx += 3 * i5 * along
-                    elif axis == 1:
-                        gy += 3 * i5 * along
-                    else:
-                        gz += 3 * i5 * along
-                    out[0, j, axis, k] = -w * gx
-                    out[1, j, axis, k] = -w * gy
-                    out[2, j, axis, k] = w * gz
-                    out[3, j, axis, k] = w * i5 * (3 * r * x - (r2 if axis == 0 else 0.0))
-                    out[4, j, axis, k] = w * i5 * (3 * r * y - (r2 if axis == 1 else 0.0))
-                    out[5, j, axis, k] = w * i5 * (3 * r * z - (r2 if axis == 2 else 0.0))
+                r = ex * x + ey * y + ez * z
+                c = 15 * r * along / r2 - 3 * m
+                field[k] = f * (3 * r * along - m * r2)
+                d0[k] = -f * (3 * (r * mx + along * ex) - c * x)
+                d1[k] = -f * (3 * (r * my + along * ey) - c * y)
+                d2[k] = f * (3 * (r * mz + along * ez) - c * z)
+                d3[k] = f * (3 * r * x - r2 * ex)
+                d4[k] = f * (3 * r * y - r2 * ey)
+                d5[k] = f * (3 * r * z - r2 * ez)
+
+
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _normal_equations(jacobian, rows, residual, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Weighted J r and J J' of J (P, R): by hand, so that the sums don't depend on a library's threads."""
+    weighted = np.empty(rows.size)
+    for a in range(jacobian.shape[0]):
+        ja = jacobian[a]
+        g = 0.0
+        for i in range(rows.size):
+            weighted[i] = ja[i] * rows[i]
+            g += weighted[i] * residual[i]
+        gradient[a] = g
+        for b in range(a, jacobian.shape[0]):
+            jb = jacobian[b]
+            h = 0.0
+            for i in range(rows.size):
+                h += weighted[i] * jb[i]
+            hessian[a, b] = h
+            hessian[b, a] = h
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
@@ -209,22 +231,7 @@ def fit_dipoles(s, data, weight, delays, positions, basis, alpha, start, kinds, 
         if not linear:
             rows = _row_weights(residual, size, weight)
         cost = (rows * residual * residual).sum()
-        flat_r, flat_w = residual.ravel(), rows.ravel()
-        weighted = np.empty(data.size)
-        for a in range(size_p):
-            ja = jacobian[a]
-            g = 0.0
-            for i in range(data.size):
-                weighted[i] = ja[i] * flat_w[i]
-                g += weighted[i] * flat_r[i]
-            gradient[a] = g
-            for b in range(a, size_p):
-                jb = jacobian[b]
-                h = 0.0
-                for i in range(data.size):
-                    h += weighted[i] * jb[i]
-                hessian[a, b] = h
-                hessian[b, a] = h
+        _normal_equations(jacobian, rows.ravel(), residual.ravel(), gradient, hessian)
         if linear:
             for i in range(n):  # places stay, moments are solved for
                 for q in range(3):

@@ -76,9 +76,7 @@ def decode_trace_metro(
                 # straight above a forward magnet the field points backward
                 polarity = Polarity.N if peak == (orientation is Orientation.UP) else Polarity.S
                 i = int(at[k])
-                reading = MagnetReading(
-                    float(trace.t_s[i]), float(odometer[i]), lateral_cm, polarity, orientation, 0.5
-                )
+                reading = MagnetReading(float(trace.t_s[i]), float(odometer[i]), lateral_cm, polarity, orientation, 0.5)
                 found.append((float(amplitude[k]), reading))
     magnets = steps.merge_detections(found, 0.125 * 10 / 3.6)
     return [*magnets, *_lines(magnets), *_tags(magnets, trace.t_s, speed, heading, settings)]
@@ -139,8 +137,7 @@ def _tag(row: list[MagnetReading], t_s: Floats, speed: Floats, heading: Floats |
     at = [int(np.searchsorted(t_s, m.t_s)) for m in row]
     start = float(heading[at[0]]) if heading is not None else 0.0
     gaps = tuple(
-        max(steps.segment_distance_m(t_s, speed, heading, a, b, start), 1e-6)
-        for a, b in zip(at, at[1:], strict=False)
+        max(steps.segment_distance_m(t_s, speed, heading, a, b, start), 1e-6) for a, b in zip(at, at[1:], strict=False)
     )
     ratios = tuple(g / gaps[0] for g in gaps[1:])
     return TagReading(

@@ -20,7 +20,7 @@ YAW_SPREAD = 0.14
 """Of a forward magnet's axis against the heading: lanes are changed at a few degrees."""
 _STOP_SHARE = 0.015
 """What is left of a strong magnet's energy by a model that is not quite right."""
-_MAX_MAGNETS = 16
+_MAX_MAGNETS = 12
 _PER_MAGNET = 30.0
 _TOO_CLOSE = 30.0
 _CLUSTER_M = 1.2
@@ -119,7 +119,7 @@ class RegionFitter:
         region = _Region(window, x, low, alpha, score, cell, variance, expected, threshold)
         found = self._explain(region, (0, 2), [])
         for cluster in _clusters(found):
-            if len(cluster) > 1:
+            if len(cluster) > 1 and 2 * sum(d.unlike for d in cluster) <= len(cluster):
                 found = self._rekind(region, found, cluster)
         return self._polish(region, found)
 
@@ -144,11 +144,9 @@ class RegionFitter:
 
     def _polish(self, region: _Region, found: list[Dipole]) -> list[Dipole]:
         """Fit the magnets of each cluster together: those found first did not know of the others."""
-        for cluster in _clusters(found):
+        for cluster in (c for c in _clusters(found) if len(c) > 1):
             for k in range(0, len(cluster), _POLISH):
                 part = cluster[k : k + _POLISH]
-                if len(cluster) < 2:
-                    break
                 others = [d for d in found if all(d is not p for p in part)]
                 fitted = region.window.fit([d.params for d in part], [d.kind for d in part], others, region.expected)
                 if fitted:
@@ -196,7 +194,7 @@ class RegionFitter:
             for i, dipole in zip(group, fitted, strict=False):
                 found[i] = replace(dipole, margin=found[i].margin)
             found.append(added)
-            if len(found) >= _ENOUGH and 2 * sum(d.unlike for d in found) > len(found):
+            if len(found) in (_ENOUGH, 2 * _ENOUGH) and 2 * sum(d.unlike for d in found) > len(found):
                 found = self._polish(region, found)
                 if 2 * sum(d.unlike for d in found) > len(found):
                     break  # iron: more poles would only take time
@@ -297,10 +295,14 @@ class _Window:
         if high - low < 6:
             return None
         s, data, weight, delays, basis = self._whitened(low, high, height, [d.params for d in others])
+        positions, alpha = self._fitter.positions_m, self._alpha
+        near = np.flatnonzero(abs(positions[:, 1, None] - start[:, 1]).min(axis=1) < 2.4 * height + 0.2)
+        if near.size < len(positions):  # the others see next to nothing
+            data, weight = np.ascontiguousarray(data[near]), np.ascontiguousarray(weight[near])
+            alpha = alpha * near.size / len(positions)
         params, covariance, explained, local, prior_costs = fit_dipoles(
-            s, data, weight, delays, self._fitter.positions_m, basis, self._alpha, start, np.array(kinds),
-            expected.prior, 14,
-        )  # fmt: skip
+            s, data, weight, delays, positions[near], basis, alpha, start, np.array(kinds), expected.prior, 14
+        )
         if not np.isfinite(params).all():
             return None
         return [
