@@ -23,7 +23,7 @@ from app.sensors.magnetometer_bar import MagnetTrace
 from app.simulation.magnetic.drive import SimulatedDrive
 from app.simulation.magnetic.vehicle import Course, Vehicle
 from benchmarks.magnets import scenes
-from benchmarks.magnets.judge import Tally, TagTally, judge_magnets, judge_tags
+from benchmarks.magnets.judge import TagTally, Tally, judge_magnets, judge_tags
 
 ITEMS = ("recall", "lateral", "tags", "ratio", "wheel", "false", "speed")
 REFERENCE = Path(__file__).parents[1] / "reference"

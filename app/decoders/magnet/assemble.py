@@ -66,9 +66,7 @@ class Assembler:
         while self._row:
             match = self._book.best_match(self._row) if self._book else None
             if match is None:
-                if not self._book and len(self._row) > 1:
-                    found.append(make_reading(self._row, None))
-                elif self._book and len(self._row) > 1 and not found:
+                if len(self._row) > 1 and not found:
                     found.append(make_reading(self._row, None))
                 self._row = []
             else:

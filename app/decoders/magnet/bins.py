@@ -93,7 +93,7 @@ def _write(number, value, shift, x, start, alpha, common, recent):  # type: igno
 
 @nb.njit(cache=True, nogil=True)
 def _bin_blocks(s, blocks, shift, x, start, alpha, common, total, state, previous, recent):  # type: ignore[no-untyped-def]
-    """Fill bins from blocks: the mean of two or more, else interpolated at the middle; returns the next bin's number."""
+    """Fill bins from blocks: the mean of two or more, else interpolated; returns the next bin's number."""
     for i in range(s.size):
         number = int(s[i] / BIN_M)
         if state[3] == 0:

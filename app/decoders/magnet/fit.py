@@ -68,7 +68,7 @@ def remove_background(v, basis, alpha):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
 def dipole_columns(p, s, positions, delays, weight, out, derivatives):  # type: ignore[no-untyped-def]
-    """Field of a magnet p (6,) in whitened units: out[6] the field, out[0..5] its derivatives (if wanted), (7, S, 3, K).
+    """Field of a magnet p (6,), whitened: out[6] the field, out[0..5] its derivatives (if wanted), (7, S, 3, K).
 
     weight (S, 3, K): 1 / noise, 0 where a sample is missing; delays (3, K): distance driven before an axis is read.
     """
@@ -226,7 +226,7 @@ def fit_dipoles(s, data, weight, delays, positions, basis, alpha, start, kinds, 
     size = _model(params, s, positions, delays, weight, basis, alpha, columns, jacobian, total, True)
     linear = params[n - 1, 3] == 0 and params[n - 1, 5] == 0
     scrap_g, scrap_h = np.zeros(size_p), np.zeros((size_p, size_p))
-    for iteration in range(iterations):
+    for _ in range(iterations):
         residual = data - total
         if not linear:
             rows = _row_weights(residual, size, weight)

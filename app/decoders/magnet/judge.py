@@ -1,4 +1,4 @@
-"""Which fitted dipoles are magnets of ours, and why the others are not; the vehicle's clearance is learnt on the way."""
+"""Which fitted dipoles are magnets of ours, and why the others are not; the clearance is learnt on the way."""
 
 from __future__ import annotations
 

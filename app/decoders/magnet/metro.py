@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 Floats = npt.NDArray[np.float64]
 
 VERSION = "metro-1"
+_SPIKE_UT = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +85,15 @@ def decode_trace_metro(
 
 
 def _filled(field: Floats) -> Floats:
-    """NaN replaced by the sample before."""
+    """NaN replaced by the sample before; single samples far off by the median of three: faults of the readout."""
     bad = ~np.isfinite(field)
-    if not bad.any():
-        return field
-    at = np.where(~bad, np.arange(len(field))[:, None, None], 0)
-    at = np.maximum.accumulate(at, axis=0)
-    return np.nan_to_num(np.take_along_axis(field, at, axis=0))
+    if bad.any():
+        at = np.maximum.accumulate(np.where(~bad, np.arange(len(field))[:, None, None], 0), axis=0)
+        field = np.nan_to_num(np.take_along_axis(field, at, axis=0))
+    middle = np.median(np.stack([field[:-2], field[1:-1], field[2:]]), axis=0)
+    far = np.linalg.norm(field[1:-1] - middle, axis=2) > _SPIKE_UT
+    field[1:-1][far] = middle[far]
+    return field
 
 
 def _cancel(field: Floats, bar: MagnetometerBar, rate_hz: float) -> Floats:
@@ -136,9 +140,7 @@ def _tags(
 def _tag(row: list[MagnetReading], t_s: Floats, speed: Floats, heading: Floats | None) -> TagReading:
     at = [int(np.searchsorted(t_s, m.t_s)) for m in row]
     start = float(heading[at[0]]) if heading is not None else 0.0
-    gaps = tuple(
-        max(steps.segment_distance_m(t_s, speed, heading, a, b, start), 1e-6) for a, b in zip(at, at[1:], strict=False)
-    )
+    gaps = tuple(max(steps.segment_distance_m(t_s, speed, heading, a, b, start), 1e-6) for a, b in pairwise(at))
     ratios = tuple(g / gaps[0] for g in gaps[1:])
     return TagReading(
         start_s=row[0].t_s,

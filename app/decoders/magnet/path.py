@@ -1,4 +1,4 @@
-"""Where magnets lie on the plane: speed integrated along the heading, and the place on the bar (equation 1, both axes)."""
+"""Where magnets lie on the plane: speed integrated along the heading, and the place on the bar (equation 1)."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ class RegionFitter:
     axis_delay_s: tuple[float, float, float]
 
     def fit(
-        self, blocks: Blocks, bins: Bins, first: int, last: int, score: Floats, cell: npt.NDArray[np.int64],
+        self, blocks: Blocks, bins: Bins, first: int, last: int, score: npt.NDArray[np.float32], cell: npt.NDArray[np.int64],
         variance: npt.NDArray[np.float32], expected: Expectation, threshold: float, until_m: float,
     ) -> list[Dipole]:  # fmt: skip
         """Dipoles of the bins first..last (numbers); score and cell are those bins' from the search;
@@ -219,7 +219,7 @@ class RegionFitter:
         self, x: npt.NDArray[np.float32], start: int, alpha: Floats, add: list[Floats], undo: list[Floats]
     ) -> None:
         """Take fields out of the bins x, whose first has the number start, and put earlier ones back."""
-        middles = (start + np.arange(len(x)) + 0.5) * BIN_M
+        middles: Floats = (start + np.arange(len(x), dtype=float) + 0.5) * BIN_M
         for sign, magnets in ((1, add), (-1, undo)):
             for p in magnets:
                 near = np.flatnonzero(abs(middles - p[0]) < 2.0)
@@ -351,7 +351,7 @@ class _Region:
     x: npt.NDArray[np.float32]
     low: int
     alpha: Floats
-    score: Floats
+    score: npt.NDArray[np.float32]
     cell: npt.NDArray[np.int64]
     variance: npt.NDArray[np.float32]
     expected: Expectation
@@ -389,7 +389,7 @@ def _apart_m(a: Floats, b: Floats) -> float:
     return float(np.hypot(a[0] - b[0], a[1] - b[1]))
 
 
-def _field(p: Floats, s: Floats, positions: Floats) -> Floats:
+def _field(p: Floats, s: npt.NDArray[np.floating], positions: Floats) -> Floats:
     """Field of magnet p at sensors when the bar is at s, shape (N, A, 3). [uT]"""
     r = np.empty((len(s), len(positions), 3))
     r[:, :, 0] = s[:, None] + positions[:, 0] - p[0]

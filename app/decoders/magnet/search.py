@@ -198,9 +198,9 @@ def search_bins(x, start, stop, kernels, taps, products, first, sensor, distance
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def scan_bins(
+def scan_bins(  # type: ignore[no-untyped-def]
     x, start, stop, kernels, taps, products, first, sensor, distance, geometry, variance, state, threshold, score, cell
-):  # type: ignore[no-untyped-def]
+):
     """Like `search_bins` while the noise is learnt, until a region is complete; returns the number of bins scored.
 
     variance (nD, 3) is carried on. state (4,): bins seen so far, 1 in an open region, its bins, its bins since one

@@ -71,7 +71,9 @@ class WheelCanceller:
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
-def _clean(s, x, references, lengths, bank, power, phase, pending, length, weights, base, error, strength, state, locked):  # type: ignore[no-untyped-def]
+def _clean(  # type: ignore[no-untyped-def]
+    s, x, references, lengths, bank, power, phase, pending, length, weights, base, error, strength, state, locked
+):
     wheels, sensors = references.size, x.shape[1]
     regressors = np.zeros(weights.shape[2])
     miss = np.empty((sensors, 3))

@@ -46,7 +46,7 @@ def _cover(rng: np.random.Generator) -> Floats:
     angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     rings = [(0.3, angle), (0.18, angle[::2]), (0.05, angle[::4])]
     place = np.concatenate([np.stack([r * np.cos(a), r * np.sin(a), np.full(a.size, -0.03)], 1) for r, a in rings])
-    common = rng.normal(0, 0.4, 3) + (0, 0, -0.3)
+    common = rng.normal((0.0, 0.0, -0.3), 0.4)
     return np.hstack([place, common + rng.normal(0, 0.35, place.shape)])
 
 

@@ -77,7 +77,7 @@ def add_static_field(out, points, axes, chainage, dipoles, at, reach):  # type: 
     """Add what dipoles in the road give along one axis of each sensor.
 
     out (T, S): field along the axis [uT]; points (T, S, 3): sensors [m]; axes (T, S, 3): unit vectors; chainage (T,):
-    of the vehicle [m]; dipoles (D, 6): place and moment; at (D,): their chainage, rising [m]; reach: ignored beyond [m].
+    of the bar [m]; dipoles (D, 6): place and moment; at (D,): their chainage, rising [m]; reach: of the field [m].
     """
     low = 0
     limit = reach * reach

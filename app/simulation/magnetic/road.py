@@ -44,11 +44,11 @@ class Road:
         self._north = np.concatenate([[0], np.cumsum(np.sin(mid)) * _STEP_M])
         self.length_m = length_m
 
-    def yaw_rad(self, chainage_m: npt.ArrayLike) -> Floats:
+    def yaw_rad(self, chainage_m: Floats) -> Floats:
         """Direction of the lane, anticlockwise from east. [rad]"""
         return np.asarray(np.interp(chainage_m, self._at, self._yaw))
 
-    def world_m(self, chainage_m: npt.ArrayLike, left_m: npt.ArrayLike = 0.0) -> Floats:
+    def world_m(self, chainage_m: Floats, left_m: Floats | float = 0.0) -> Floats:
         """East and north of points beside the lane, shape (N, 2). [m]"""
         yaw = self.yaw_rad(chainage_m)
         east = np.interp(chainage_m, self._at, self._east) - np.asarray(left_m) * np.sin(yaw)

@@ -1,0 +1,203 @@
+"""The default decoder on simulated drives: what is there, what is not, and the same for any chunking."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from app.decoders.magnet.book import TagBook, TagFormat
+from app.decoders.magnet.decoder import MagnetDecoder, decode_trace
+from app.decoders.magnet.readings import Finding, LineCrossing, MagnetReading, NoiseFinding, NoiseKind, Side, TagReading
+from app.errors import InvalidParameter
+from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
+from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
+from app.simulation.magnetic.clutter import town_clutter
+from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
+from app.simulation.magnetic.readout import Chip
+from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, line_magnets
+from app.simulation.magnetic.vehicle import MPH, Course, Vehicle
+
+BAR = Vehicle.compact().bar
+
+
+def magnets_drive(seed: int, clearance_m: float, mph: float, count: int = 30) -> SimulatedDrive:
+    rng = np.random.default_rng(seed)
+    magnets = [
+        RoadMagnet(
+            30 + 3 * i, float(rng.uniform(-0.8, 0.8)), list(Polarity)[i % 2], list(Orientation)[i // 2 % 2]
+        )
+        for i in range(count)
+    ]  # fmt: skip
+    vehicle = Vehicle.compact(clearance_m=clearance_m)
+    return simulate_drive(Scene(Road(50 + 3 * count), vehicle, Course(mph * MPH), lines=magnets), rng)
+
+
+def right_and_other(drive: SimulatedDrive, findings: Sequence[Finding]) -> tuple[int, int]:
+    readings = [f for f in findings if isinstance(f, MagnetReading)]
+    right = sum(
+        any(
+            abs(r.t_s - m.t_s) * m.speed_m_s < 0.15
+            and abs(r.lateral_cm - m.lateral_cm) < 8
+            and (r.polarity, r.orientation) == (m.polarity, m.orientation)
+            for r in readings
+        )
+        for m in drive.magnets
+    )
+    return right, len(readings) - right
+
+
+@pytest.mark.parametrize(("clearance_m", "mph"), [(0.16, 15), (0.16, 70), (0.30, 30), (0.30, 70)])
+def test_finds_every_magnet_up_to_30_cm(clearance_m: float, mph: float) -> None:
+    drive = magnets_drive(11, clearance_m, mph)
+    assert right_and_other(drive, decode_trace(drive.trace, BAR)) == (30, 0)
+
+
+def test_nothing_there_is_a_result() -> None:
+    drive = simulate_drive(Scene(Road(300), Vehicle.compact()), np.random.default_rng(12))
+    assert not [f for f in decode_trace(drive.trace, BAR) if isinstance(f, MagnetReading | TagReading | LineCrossing)]
+
+
+def test_town_iron_is_named_not_read() -> None:
+    rng = np.random.default_rng(13)
+    lines = line_magnets(20, 60, 6, 0.2, Polarity.N)
+    scene = Scene(Road(1000), Vehicle.compact(), Course(25 * MPH), lines=lines, clutter=town_clutter(80, 1000, rng))
+    drive = simulate_drive(scene, rng)
+    findings = decode_trace(drive.trace, BAR)
+    assert right_and_other(drive, findings) == (7, 0)
+    iron = [f for f in findings if isinstance(f, NoiseFinding) and f.kind is NoiseKind.FERROUS]
+    assert iron
+    assert all("%" in f.reason or "cm" in f.reason for f in iron)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_any_chunking_gives_the_same(seed: int) -> None:
+    drive = tags_drive(14, [InformationTag.from_gaps("SNS", 1.0, (1, 3))] * 3, 25.0)
+    book = TagBook(formats=[TagFormat()])
+    whole = decode_trace(drive.trace, BAR, book=book)
+    rng = np.random.default_rng(seed)
+    decoder = MagnetDecoder(BAR, book=book)
+    pieces: list[Finding] = []
+    t = -1.0
+    while t < drive.trace.t_s[-1]:
+        step = float(rng.choice([0.002, 0.02, 0.3, 2.0]))
+        pieces += decoder.feed(drive.trace.between(t, t + step))
+        t += step
+    assert pieces + decoder.finish() == whole
+    assert sum(isinstance(f, TagReading) for f in whole) == 3
+
+
+def tags_drive(
+    seed: int, tags: Sequence[InformationTag], pitch_m: float, *, wrong_way: bool = False, drop: tuple[int, int] | None = None,
+    extra: Sequence[RoadMagnet] = (),
+) -> SimulatedDrive:  # fmt: skip
+    """Tags one after the other; drop: number of a tag and of its magnet that is missing on the road."""
+    placed = [PlacedTag(tag, 30 + pitch_m * i) for i, tag in enumerate(tags)]
+    lines = list(extra)
+    if drop:
+        gone = placed.pop(drop[0])
+        lines += [
+            RoadMagnet(gone.chainage_m + m.along_m, 0, m.polarity, m.orientation)
+            for k, m in enumerate(gone.tag.magnets)
+            if k != drop[1]
+        ]
+    scene = Scene(Road(60 + pitch_m * len(tags)), Vehicle.compact(), tags=placed, lines=lines, wrong_way=wrong_way)
+    return simulate_drive(scene, np.random.default_rng(seed))
+
+
+TAGS = [
+    InformationTag.from_gaps(p, 1.0, g) for p, g in (("NNS", (1, 3)), ("SNS", (3, 1)), ("SSN", (2, 2)), ("NSS", (1, 3)))
+]
+
+
+@pytest.mark.parametrize("known", ["formats", "designs"])
+def test_reads_tags(known: str) -> None:
+    drive = tags_drive(15, TAGS, 15.0)
+    book = TagBook(formats=[TagFormat()]) if known == "formats" else TagBook(TAGS)
+    tags = [f for f in decode_trace(drive.trace, BAR, book=book) if isinstance(f, TagReading)]
+    assert [t.tag for t in tags] == TAGS
+    assert not any(t.wrong_way or t.missing or t.extra for t in tags)
+    for reading in tags:
+        assert reading.tag is not None
+        for ratio, std, true in zip(reading.ratios, reading.ratio_std, reading.tag.ratios, strict=True):
+            assert abs(ratio - true) < 4 * std + 0.01 * true
+
+
+@pytest.mark.parametrize("magnet", [0, 1, 2])
+def test_a_missing_magnet_costs_only_its_own_tag(magnet: int) -> None:
+    drive = tags_drive(16, TAGS, 9.0, drop=(1, magnet))
+    tags = [f for f in decode_trace(drive.trace, BAR, book=TagBook(TAGS)) if isinstance(f, TagReading)]
+    whole = [t.tag for t in tags if not t.missing]
+    assert [t for t in whole if t is not None] == [TAGS[0], TAGS[2], TAGS[3]]
+
+
+def test_an_extra_magnet_costs_nothing() -> None:
+    more = [RoadMagnet(30 + 9 + 2.0, 0.0, Polarity.N, Orientation.FORWARD)]
+    drive = tags_drive(17, TAGS, 9.0, extra=more)
+    tags = [f for f in decode_trace(drive.trace, BAR, book=TagBook(TAGS)) if isinstance(f, TagReading)]
+    assert [t.tag for t in tags] == TAGS
+    assert [t.extra for t in tags] == [0, 1, 0, 0]
+
+
+def test_the_wrong_way_is_recognised() -> None:
+    tags = [InformationTag.from_gaps("NNN", 1.0, (1, 3)), InformationTag.from_gaps("NSN", 1.0, (3, 1))]
+    drive = tags_drive(18, tags, 15.0, wrong_way=True)
+    readings = [f for f in decode_trace(drive.trace, BAR, book=TagBook(tags)) if isinstance(f, TagReading)]
+    assert [r.tag for r in readings] == tags
+    assert all(r.wrong_way for r in readings)
+
+
+def test_a_line_crossing_says_which_line_and_side() -> None:
+    lines = line_magnets(20, 90, 6, 1.2, Polarity.N)
+    course = Course(lefts=[(0, 0.0), (30, 0.0), (60, 0.9)], weave_m=0)
+    drive = simulate_drive(Scene(Road(100), Vehicle.compact(), course, lines=lines), np.random.default_rng(19))
+    crossings = [f for f in decode_trace(drive.trace, BAR) if isinstance(f, LineCrossing)]
+    assert [(c.style, c.side) for c in crossings] == [(LineStyle.SOLID, Side.LEFT)]
+
+
+def test_other_bars_and_rates() -> None:
+    positions = np.array([[0.0, y, 0.0] for y in np.arange(-0.8, 0.81, 0.2)])
+    bar = MagnetometerBar(positions, ("array",) * 9)  # type: ignore[arg-type]
+    rng = np.random.default_rng(20)
+    magnets = [
+        RoadMagnet(20 + 3.0 * i, 0.1 * (i % 9 - 4), list(Polarity)[i % 2], Orientation.FORWARD) for i in range(12)
+    ]
+    scene = Scene(
+        Road(65),
+        Vehicle.compact(bar=bar, wheel_moment_am2=0),
+        Course(20 * MPH),
+        lines=magnets,
+        chip=Chip(rate_hz=100.0),
+    )
+    drive = simulate_drive(scene, rng)
+    assert right_and_other(drive, decode_trace(drive.trace, bar)) == (12, 0)
+
+
+def test_missing_samples_and_a_gap_are_survived_and_told() -> None:
+    drive = magnets_drive(21, 0.16, 30)
+    t, field = drive.trace.t_s, drive.trace.field_ut.copy()
+    field[:, 4] = np.nan  # a dead sensor
+    middle = (drive.magnets[10].t_s + drive.magnets[11].t_s) / 2
+    keep = np.abs(t - middle) > 0.06
+    cut = MagnetTrace(t[keep], field[keep], drive.trace.speed_t_s, drive.trace.speed_m_s)
+    findings = decode_trace(cut, BAR)
+    right, other = right_and_other(drive, findings)
+    assert right >= 29
+    assert other == 0
+    gaps = [f for f in findings if isinstance(f, NoiseFinding) and f.kind is NoiseKind.GAP]
+    assert len(gaps) == 1
+    assert gaps[0].t_s == pytest.approx(middle, abs=0.1)
+
+
+def test_bad_input_is_named() -> None:
+    field = np.zeros((3, 14, 3))
+    t = np.array([0.0, 0.1, 0.2])
+    with pytest.raises(InvalidParameter, match="time does not rise"):
+        MagnetTrace(np.array([0.0, 0.2, 0.1]), field, t, t)
+    with pytest.raises(InvalidParameter, match="no speed"):
+        decode_trace(MagnetTrace(t, field, np.empty(0), np.empty(0)), BAR)
+    with pytest.raises(InvalidParameter, match="3 sensors"):
+        decode_trace(MagnetTrace(t, field[:, :3], t, t), BAR)
+    with pytest.raises(InvalidParameter, match="finite"):
+        MagnetTrace(t, field, t, np.array([1, np.nan, 2]))
