@@ -93,7 +93,8 @@ def run_recall(seed: int, short: bool) -> Result:
                 f"{clearance_cm} cm", all_.true, f"{ours[Orientation.FORWARD].recall:.4f}",
                 f"{ours[Orientation.UP].recall:.4f}", all_.wrong, f"{all_.precision:.4f}", goal,
                 _met(recall >= goal and all_.precision >= 0.995 and (all_.wrong == 0 or goal < 1)),
-                " / ".join(f"{metro[o].recall:.2f}" for o in Orientation), _paper("14b", f"clearance {clearance_cm} cm"),
+                " / ".join(f"{metro[o].recall:.2f}" for o in Orientation),
+                _paper("14b", f"clearance {clearance_cm} cm"),
             )
         )  # fmt: skip
     head = ("clearance", "magnets", "recall 0°", "recall 90°", "wrong", "precision", "goal", "met", "metro", "paper")
@@ -166,7 +167,7 @@ def run_ratio(seed: int, short: bool) -> Result:
         ("16 cm, rough", form, {"roughness": 3.0, "gaps": (1, 3)}, 0.006, "1.0164, 0.9632, 0.9652"),
         ("16 cm, braking", form, {"course": Course(speeds=stops), "gaps": (1, 3)}, 0.006, "-"),
         ("16 cm, weaving", form, {"course": weave, "gaps": (3, 1)}, 0.006, "-"),
-        ("16 cm, curve of 15 m, 10 mph", bend, {"speed_mph": 10, "bends": curve, "gaps": (3, 3)}, 0.006, "0.965 ± 0.044"),
+        ("16 cm, bends of 15 m, 10 mph", bend, {"speed_mph": 10, "bends": curve, "gaps": (3, 3)}, 0.006, "0.965±0.044"),
         ("30 cm", form, {"clearance_m": 0.30, "gaps": (1, 3)}, 0.015, "-"),
         ("30 cm, 60 mph", form, {"clearance_m": 0.30, "speed_mph": 60, "gaps": (2, 2)}, 0.015, "-"),
     ]  # fmt: skip

@@ -104,7 +104,8 @@ class RegionFitter:
     axis_delay_s: tuple[float, float, float]
 
     def fit(
-        self, blocks: Blocks, bins: Bins, first: int, last: int, score: npt.NDArray[np.float32], cell: npt.NDArray[np.int64],
+        self, blocks: Blocks, bins: Bins, first: int, last: int, score: npt.NDArray[np.float32],
+        cell: npt.NDArray[np.int64],
         variance: npt.NDArray[np.float32], expected: Expectation, threshold: float, until_m: float,
     ) -> list[Dipole]:  # fmt: skip
         """Dipoles of the bins first..last (numbers); score and cell are those bins' from the search;
@@ -196,7 +197,7 @@ class RegionFitter:
             found.append(added)
             if len(found) in (_ENOUGH, 2 * _ENOUGH) and 2 * sum(d.unlike for d in found) > len(found):
                 found = self._polish(region, found)
-                if 2 * sum(d.unlike for d in found) > len(found):
+                if 2 * sum(d.unlike for d in found) > len(found) and not _in_a_row(found):
                     break  # iron: more poles would only take time
             self._subtract(x, region.low, region.alpha, [d.params for d in fitted], [d.params for d in before])
             left, left_cell = self._score(x, region)
@@ -377,6 +378,12 @@ def _clusters(dipoles: list[Dipole]) -> list[list[Dipole]]:
         else:
             groups.append([dipole])
     return groups
+
+
+def _in_a_row(dipoles: list[Dipole]) -> bool:
+    """Whether they stand like the magnets of a tag, apart and one behind the other."""
+    places = np.array([d.params[:2] for d in dipoles])
+    return bool(np.ptp(places[:, 1]) < 0.15 and np.diff(np.sort(places[:, 0])).min(initial=np.inf) > 0.42)
 
 
 def _penalty(dipoles: list[Dipole]) -> float:

@@ -89,8 +89,8 @@ def test_any_chunking_gives_the_same(seed: int) -> None:
 
 
 def tags_drive(
-    seed: int, tags: Sequence[InformationTag], pitch_m: float, *, wrong_way: bool = False, drop: tuple[int, int] | None = None,
-    extra: Sequence[RoadMagnet] = (),
+    seed: int, tags: Sequence[InformationTag], pitch_m: float, *, wrong_way: bool = False,
+    drop: tuple[int, int] | None = None, extra: Sequence[RoadMagnet] = (),
 ) -> SimulatedDrive:  # fmt: skip
     """Tags one after the other; drop: number of a tag and of its magnet that is missing on the road."""
     placed = [PlacedTag(tag, 30 + pitch_m * i) for i, tag in enumerate(tags)]
