@@ -48,6 +48,22 @@ export async function registerMarker(body) {
   return (await ask("/v1/markers", json(body))).json();
 }
 
+export async function getMarker(id) {
+  return (await ask(`/v1/markers/${id}`)).json();
+}
+
+export async function fetchLayout(id, form) {
+  return (await ask(`/v1/markers/${id}/layout.${form}`)).blob();
+}
+
+export async function listCodebooks() {
+  return (await (await ask("/v1/codebooks")).json()).items;
+}
+
+export async function listEntries(id) {
+  return (await (await ask(`/v1/codebooks/${id}/entries`)).json()).items;
+}
+
 export async function fetchArtwork(id, form) {
   const answer = await ask(`/v1/markers/${id}/artwork.${form}`);
   return { blob: await answer.blob(), proof: answer.headers.get("Waymark-Proof") || "" };

@@ -2,11 +2,12 @@
 
 import { key } from "./api.js";
 import { startDecode } from "./decode.js";
+import { showMagnets, startMagnets } from "./magnets.js";
 import { showMarkers, startMarkers } from "./markers.js";
 import { $, clearProblem, say } from "./page.js";
 import { startRegister } from "./register.js";
 
-const VIEWS = ["markers", "register", "decode"];
+const VIEWS = ["markers", "register", "magnets", "decode"];
 
 function showView() {
   const [asked, id] = location.hash.slice(1).split("/");
@@ -22,6 +23,8 @@ function showView() {
     $("#key").focus();
   } else if (name === "markers") {
     showMarkers(id);
+  } else if (name === "magnets") {
+    showMagnets();
   }
 }
 
@@ -48,6 +51,7 @@ window.addEventListener("hashchange", () => {
 
 startMarkers();
 startRegister();
+startMagnets();
 startDecode();
 showKey();
 showView();

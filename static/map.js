@@ -17,9 +17,9 @@ const turn = (degrees) => ((degrees + 540) % 360) - 180;
 
 /**
  * places: [{lon_deg, lat_deg, heading_deg, label, kind, choose}], kind is a class of the style sheet.
- * vehicle: {lon_deg, lat_deg, heading_deg, covariance} or null.
+ * vehicle: {lon_deg, lat_deg, heading_deg, covariance} or null. least: metres that the plot shows at least.
  */
-export function drawMap(svg, places, vehicle = null) {
+export function drawMap(svg, places, vehicle = null, least = vehicle ? 4 : 20) {
   svg.replaceChildren();
   const height = Math.max(120, Math.round((WIDTH * svg.clientHeight) / Math.max(svg.clientWidth, 1)) || 400);
   svg.setAttribute("viewBox", `0 0 ${WIDTH} ${height}`);
@@ -32,7 +32,6 @@ export function drawMap(svg, places, vehicle = null) {
   ];
   const points = all.map(flat);
   const [low, high] = [Math.min, Math.max].map((pick) => [0, 1].map((k) => points.reduce((best, point) => pick(best, point[k]), points[0][k])));
-  const least = vehicle ? 4 : 20;
   const span = [0, 1].map((k) => Math.max(high[k] - low[k], least));
   const scale = Math.min((WIDTH - 2 * MARGIN) / span[0], (height - 2 * MARGIN) / span[1]);
   const middle = [0, 1].map((k) => (low[k] + high[k]) / 2);

@@ -1,6 +1,7 @@
-// The list of markers, their plot, one marker's artwork, a ZIP of many.
+// The list of markers, their plot, one marker's artwork or layout, a ZIP of many.
 
 import * as api from "./api.js";
+import { drawMagnets } from "./magnets.js";
 import { drawMap } from "./map.js";
 import { $, attempt, facts, make, say } from "./page.js";
 
@@ -10,7 +11,7 @@ let previewUrl = null;
 
 export function startMarkers() {
   $("#select-all").addEventListener("change", (event) => {
-    state.selected = new Set(event.target.checked ? state.markers.map((marker) => marker.id) : []);
+    state.selected = new Set(event.target.checked ? plates().map((marker) => marker.id) : []);
     drawRows();
   });
   $("#bundle-form").addEventListener("submit", (event) => {
@@ -19,6 +20,9 @@ export function startMarkers() {
   });
   window.addEventListener("resize", () => drawPlaces());
 }
+
+const plates = () => state.markers.filter((marker) => marker.family === "plate");
+const codeOf = (marker) => marker.code.digits || marker.code.text;
 
 export async function showMarkers(chosenId = null) {
   await attempt(null, null, async () => {
@@ -39,9 +43,12 @@ export async function showMarkers(chosenId = null) {
 
 function drawRows() {
   const rows = state.markers.map((marker) => {
-    const box = make("input", { type: "checkbox", "aria-label": `Select ${marker.code.digits}`, onchange: (event) => select(marker.id, event.target.checked) });
-    box.checked = state.selected.has(marker.id);
-    const open = make("button", { type: "button", class: "link", onclick: () => choose(marker) }, marker.code.digits);
+    let box = null; // magnets have no artwork to select
+    if (marker.family === "plate") {
+      box = make("input", { type: "checkbox", "aria-label": `Select ${codeOf(marker)}`, onchange: (event) => select(marker.id, event.target.checked) });
+      box.checked = state.selected.has(marker.id);
+    }
+    const open = make("button", { type: "button", class: "link", onclick: () => choose(marker) }, codeOf(marker));
     const { lon_deg, lat_deg } = marker.position;
     return make(
       "tr",
@@ -62,7 +69,7 @@ function showCount() {
   const count = state.selected.size;
   $("#selected-count").textContent = `${count} selected`;
   $("#bundle-form button").disabled = count === 0;
-  $("#select-all").checked = count > 0 && count === state.markers.length;
+  $("#select-all").checked = count > 0 && count === plates().length;
 }
 
 function select(id, on) {
@@ -77,7 +84,7 @@ function drawPlaces() {
     lon_deg: marker.position.lon_deg,
     lat_deg: marker.position.lat_deg,
     heading_deg: marker.heading_deg,
-    label: `${marker.code.digits}, ${marker.status}`,
+    label: `${codeOf(marker)}, ${marker.status}`,
     kind: kindOf(marker),
     choose: () => choose(marker),
   })));
@@ -97,6 +104,13 @@ function choose(marker) {
 }
 
 async function showDetail(marker) {
+  if (marker.family === "plate") return showPlate(marker);
+  const whole = await api.getMarker(marker.id);
+  if (state.chosen === marker.id) drawMagnets($("#detail"), whole);
+  return undefined;
+}
+
+async function showPlate(marker) {
   const { position, geometry, code } = marker;
   const picture = make("img", { class: "preview", alt: `Artwork of the plate ${code.digits}` });
   const proof = make("p", { class: "hint" });

@@ -11,7 +11,7 @@ from app.api.middleware import is_protected
 from app.api.problems import Problem
 
 DESCRIPTION = """The registry of machine-readable roads: coded plates, from a coordinate to a plate to print
-to a decoded frame.
+to a decoded frame, and magnet tags, from a meaning to holes to drill.
 
 Send your key as `Authorization: Bearer KEY` or `X-API-Key: KEY`. Every error is an RFC 9457 problem document that names
 the field, the limit and the cure. Positions are longitude, latitude in degrees; headings are clockwise from true north.

@@ -73,6 +73,9 @@ def _list_near(connection: sa.Connection, layout: MagnetLayout, ignoring: str) -
 def _box(around_deg: float, places: list[tuple[float, float]]) -> Box:
     """Box around a few places near each other, over the antimeridian too."""
     boxes = [box_around(lon, lat, NEAR_M) for lon, lat in places]
+    south, north = min(box.south_deg for box in boxes), max(box.north_deg for box in boxes)
+    if any(box.east_deg - box.west_deg == 360.0 for box in boxes):  # at a pole
+        return Box(-180.0, south, 180.0, north)
 
     def turned(lon_deg: float) -> float:
         return (lon_deg - around_deg + 180.0) % 360.0 - 180.0
@@ -80,4 +83,4 @@ def _box(around_deg: float, places: list[tuple[float, float]]) -> Box:
     west = min(turned(box.west_deg) for box in boxes) + around_deg
     east = max(turned(box.east_deg) for box in boxes) + around_deg
     wrapped = [(lon + 180.0) % 360.0 - 180.0 for lon in (west, east)]
-    return Box(wrapped[0], min(b.south_deg for b in boxes), wrapped[1], max(b.north_deg for b in boxes))
+    return Box(wrapped[0], south, wrapped[1], north)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import json
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -16,6 +19,7 @@ from pyproj import Geod, Transformer
 from app.services.access import Scope
 from tests.conftest import LiveServer
 
+ROOT = Path(__file__).resolve().parents[2]
 GEOD = Geod(ellps="WGS84")
 Lane = Callable[..., dict[str, Any]]
 _LANES = itertools.count()
@@ -489,3 +493,14 @@ def test_the_documented_examples_and_members(client: httpx.Client) -> None:
     assert set(line["layout"]) == set(schemas["LinePlaceOut"]["properties"])
     for item in client.get("/v1/markers").json()["items"]:
         assert set(item) == set(schemas["MagnetMarkerSummary"]["properties"])
+
+
+def test_the_guide_is_accepted(fresh_server: LiveServer) -> None:
+    blocks = re.findall(r"```json\n(.*?)```", (ROOT / "docs/magnets.md").read_text(), re.S)
+    book, *markers = (json.loads(block) for block in blocks)
+    assert len(markers) == 2
+    with fresh_server.client() as client:
+        answer = client.post("/v1/codebooks", json=book)
+        assert answer.status_code == 201, answer.text
+        for marker in markers:
+            _post(client, marker)

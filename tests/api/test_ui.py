@@ -90,6 +90,44 @@ def test_a_plate_is_registered_and_its_artwork_shown(page: Browser) -> None:
     assert page.complaints == []
 
 
+def test_a_tag_is_planned_from_a_meaning_and_its_layout_shown(page: Browser, server: LiveServer) -> None:
+    book = {
+        "name": "Page",
+        "design": {"magnets": 3, "length_m": 4, "segment_m": 0.1},
+        "meanings": [{"kind": "arrow", "value": "left"}, {"kind": "bend-right", "value": 125}],
+    }
+    with server.client() as client:
+        entry = client.post("/v1/codebooks", json=book).json()["entries"][1]
+    page.click("a[href='#magnets']")
+    page.until("document.querySelectorAll(\"[name='tag.meaning'] option\").length === 2")
+    page.run("document.querySelector(\"[name='tag.meaning']\").value = 1")
+    page.fill("[name='tag.chainage_m']", "60")
+    page.fill("[name='lane.geometry']", "-84.48, 42.7263\n-84.4776, 42.7263")
+    page.fill("[name='site.design_speed_mps']", "200")
+    page.click("#magnets-form button")
+    told = page.until("!document.querySelector('#problem').hidden && document.querySelector('#problem').innerText")
+    assert "0.5 to 70 m/s" in told
+    assert page.run("document.querySelector('[aria-invalid]').name") == "site.design_speed_mps"
+    page.complaints.clear()  # the browser itself complains of the 422
+    page.fill("[name='site.design_speed_mps']", "13.4")
+    page.fill("[name='site.stop_line_chainage_m']", "100")
+    page.click("#magnets-form button")
+    detail = page.until(
+        "/Checks/.test(document.querySelector('#detail').innerText) && document.querySelector('#detail').innerText"
+    )
+    for part in (entry["code"], "bend right 125 deg", "warning reaction-distance: 36 >= 59.9059 m", "3.00 USD"):
+        assert part in detail
+    assert page.run("document.querySelectorAll('#detail .map .marker').length") == 3
+    assert page.run("[...document.querySelectorAll('#detail .buttons button')].map((b) => b.textContent).join()") == (
+        "PDF,CSV,GEOJSON"
+    )
+    assert page.run("document.querySelectorAll('#marker-rows tr.chosen input').length") == 0
+    page.run("window.saved = []; HTMLAnchorElement.prototype.click = function () { window.saved.push(this.download); }")
+    page.click("#detail .buttons button")
+    assert page.until("window.saved[0]").endswith("-r1.pdf")
+    assert page.complaints == []
+
+
 @pytest.mark.slow
 def test_a_frame_is_decoded_and_the_vehicle_shown(page: Browser, server: LiveServer, tmp_path: Path) -> None:
     plate = list_plates(np.random.default_rng(1))[0]
