@@ -28,6 +28,9 @@ class Bins:
         self.alpha = np.zeros((len(self.x), 3))
         """Share of the common signal that was taken out of each bin."""
         self._common = np.array([[1.0, 1.0]] * 3)  # mean squares of the common bend and of the rest
+        self.loudness = np.ones((len(self.x), sensors, 3), np.float32)
+        """Variance of each channel against the others of its axis, 1 or more."""
+        self._channel = np.ones((sensors, 3))
         self._sum = np.zeros((sensors, 3))
         self._state = np.zeros(4)  # number of the open bin, blocks in it, previous block's s, 1 once begun
         self._previous = np.zeros((sensors, 3))
@@ -46,9 +49,12 @@ class Bins:
             alpha = np.zeros((len(grown), 3))
             alpha[: len(self.alpha)] = self.alpha
             self.alpha = alpha
+            loudness = np.ones((len(grown), *self.loudness.shape[1:]), np.float32)
+            loudness[: len(self.loudness)] = self.loudness
+            self.loudness = loudness
         done = _bin_blocks(
-            s, x, self.shift, self.x, self.start, self.alpha, self._common, self._sum, self._state, self._previous,
-            self._recent,
+            s, x, self.shift, self.x, self.start, self.alpha, self.loudness, self._channel, self._common, self._sum,
+            self._state, self._previous, self._recent,
         )  # fmt: skip
         self.ready = int(done) - self.start
 
@@ -57,12 +63,13 @@ class Bins:
         n = min(before - self.start, self.ready)
         if n > 400:
             self.x, self.alpha = self.x[n:].copy(), self.alpha[n:].copy()
+            self.loudness = self.loudness[n:].copy()
             self.start += n
             self.ready -= n
 
 
 @nb.njit(cache=True, nogil=True)
-def _write(number, value, shift, x, start, alpha, common, recent):  # type: ignore[no-untyped-def]
+def _write(number, value, shift, x, start, alpha, loudness, channel, common, recent):  # type: ignore[no-untyped-def]
     """One bin: track how much of the noise is common, take that share out, store."""
     sensors = value.shape[0]
     for k in range(recent.shape[0] - 1):
@@ -77,7 +84,12 @@ def _write(number, value, shift, x, start, alpha, common, recent):  # type: igno
         for j in range(sensors):
             bend = recent[_LAG, j, axis] - (recent[0, j, axis] + recent[-1, j, axis]) / 2 - mean_bend
             rest += min(bend * bend, 9 * common[axis, 1])
+            channel[j, axis] += 0.01 * (min(bend * bend, 9 * channel[j, axis]) - channel[j, axis])
         rest /= sensors - 1
+        usual = np.median(channel[:, axis])
+        for j in range(sensors):
+            # up to twice the usual is chance, or the magnets themselves
+            loudness[number - start, j, axis] = max(1.0, 0.5 * channel[j, axis] / max(usual, 1e-9))
         common[axis, 1] += 0.01 * (rest - common[axis, 1])
         common[axis, 0] += 0.01 * (min(mean_bend * mean_bend, 9 * common[axis, 0]) - common[axis, 0])
         alone = common[axis, 1] / sensors
@@ -92,7 +104,7 @@ def _write(number, value, shift, x, start, alpha, common, recent):  # type: igno
 
 
 @nb.njit(cache=True, nogil=True)
-def _bin_blocks(s, blocks, shift, x, start, alpha, common, total, state, previous, recent):  # type: ignore[no-untyped-def]
+def _bin_blocks(s, blocks, shift, x, start, alpha, loudness, channel, common, total, state, previous, recent):  # type: ignore[no-untyped-def]
     """Fill bins from blocks: the mean of two or more, else interpolated; returns the next bin's number."""
     for i in range(s.size):
         number = int(s[i] / BIN_M)
@@ -108,7 +120,7 @@ def _bin_blocks(s, blocks, shift, x, start, alpha, common, total, state, previou
             else:
                 u = min(max((middle - state[2]) / max(s[i] - state[2], 1e-9), 0.0), 1.0)
                 value = previous + u * (blocks[i] - previous)
-            _write(int(state[0]), value, shift, x, start, alpha, common, recent)
+            _write(int(state[0]), value, shift, x, start, alpha, loudness, channel, common, recent)
             state[0] += 1
             state[1] = 0
             total[:] = 0

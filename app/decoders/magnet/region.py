@@ -116,7 +116,8 @@ class RegionFitter:
         low = first - HALF_BINS
         x = bins.x[low - bins.start : last - bins.start + HALF_BINS + 1]
         alpha = bins.alpha[last - bins.start].copy()
-        window = _Window(self, blocks, first * BIN_M - 1.6, until_m, variance, alpha, expected)
+        quiet = 1 / np.sqrt(bins.loudness[last - bins.start].astype(float))
+        window = _Window(self, blocks, first * BIN_M - 1.6, until_m, variance, alpha, quiet, expected)
         region = _Region(window, x, low, alpha, score, cell, variance, expected, threshold)
         found = self._explain(region, (0, 2), [])
         for cluster in _clusters(found):
@@ -253,6 +254,7 @@ class _Window:
         end_m: float,
         variance: npt.NDArray[np.float32],
         alpha: Floats,
+        quiet: Floats,
         expected: Expectation,
     ) -> None:
         low, high = (int(i) for i in np.searchsorted(blocks.s, (start_m, end_m)))
@@ -263,6 +265,7 @@ class _Window:
         self._v = blocks.v[low:high]
         self._variance = variance
         self._alpha = alpha
+        self._quiet = quiet[:, :, None]
         self._height_m = expected.clearance_m
 
     def fit_kinds(
@@ -302,7 +305,7 @@ class _Window:
             data, weight = np.ascontiguousarray(data[near]), np.ascontiguousarray(weight[near])
             alpha = alpha * near.size / len(positions)
         params, covariance, explained, local, prior_costs = fit_dipoles(
-            s, data, weight, delays, positions[near], basis, alpha, start, np.array(kinds), expected.prior, 14
+            s, data, weight, delays, positions[near], basis, alpha, start, np.array(kinds), expected.prior, 9
         )
         if not np.isfinite(params).all():
             return None
@@ -321,7 +324,9 @@ class _Window:
         s = self._s[low:high]
         d = int(np.argmin(abs(np.log(DISTANCES_M / (1.2 * height)))))
         scale = np.sqrt(np.clip(np.gradient(s), 1e-3, 1.0) / BIN_M)
-        weight = scale / np.sqrt(self._variance[d].astype(float))[None, :, None] * self._w[:, None, low:high]
+        weight = (
+            scale / np.sqrt(self._variance[d].astype(float))[None, :, None] * self._w[:, None, low:high] * self._quiet
+        )
         delays = np.array(self._fitter.axis_delay_s)[:, None] * self._v[low:high]
         x = self._x[:, :, low:high]
         for p in others:

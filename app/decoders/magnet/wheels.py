@@ -25,7 +25,7 @@ _RENEW_M = 0.1
 _LEARN_M, _FIRST_M = 25.0, 3.0
 """Distance over which harmonics are learnt, in the long run and at first. [m]"""
 _BASE_M = 6.0
-_PERIODIC = 0.35
+_PERIODIC = 0.2
 """Share of a reference's signal that repeats with the turns, from which on a wheel counts as noisy."""
 _CLIP = 3.0
 _WORTH = 0.1
