@@ -6,7 +6,6 @@ the blobs must agree with the affine map that their centres imply.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from app.decoders.plate.colour import MarkerSignal
 MAX_REDS = 150
 MAX_GREENS = 160
 MAX_NEAR = 8
-MAX_QUADS = 400
+MAX_QUADS = 1000
 MAX_CANDIDATES = 12
 LEAST_INTERIOR = 2.5
 ALL_SQUARES = 7
@@ -38,49 +37,28 @@ class MarkerQuad:
         Red triangle, then the green squares clockwise; full-resolution pixels.
     found : int
         Bits 1, 2, 4: which of the three green squares were seen; the others are implied by the affine map.
-    score : float
-        Larger is better.
-    colour_margin : float
-        How far the weakest markers' colour stands out of what lies between the markers, in its spreads.
+    rank : float
+        How likely it is a plate: above 0 worth a fit.
     size_ratio : float
         Distance between marker centres over the side of a marker; tells 8 from 10 from 12 units.
     """
 
     centroids_px: npt.NDArray[Any]
     found: int
-    score: float
-    colour_margin: float
+    rank: float
     size_ratio: float
-
-    @property
-    def rank(self) -> float:
-        """How likely it is a plate: above 0 worth a fit.
-
-        With all squares seen it is the logarithm of the odds, by regression over 3,600 candidates in simulated frames,
-        and 3.0; with one missing, hardly any candidate is a plate, and only a strong one counts.
-        """
-        right, down = self.centroids_px[1] - self.centroids_px[0], self.centroids_px[3] - self.centroids_px[0]
-        size = math.log10(max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0))
-        margin = math.log(self.colour_margin)
-        if self.found == ALL_SQUARES:
-            return 1.14 * self.score + 1.86 * margin + 1.99 * size - 0.51 * size**2 - 9.0
-        wanted = min(max(4.5 * size - 5.8, 5.0), 8.7 + max(size - 3.5, 0.0))
-        return self.score + 2 * margin - wanted
 
 
 def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     """Marker quadruples of a frame, best first, overlapping ones suppressed."""
     quads = np.empty((MAX_QUADS, 12))
     found = _join_quads(find_blobs(signal), signal.opponent, quads)
-    order = np.argsort(-quads[:found, 8], kind="stable")
-    kept = _suppress(signal.opponent, signal.planes.luma, quads, order, MAX_CANDIDATES)
-    candidates = [
-        MarkerQuad(
-            _full_px(row[:8].reshape(4, 2), signal.scale), int(row[9]), float(row[8]), float(row[11]), float(row[10])
-        )
-        for row in quads[kept]
+    _rank(quads[:found], signal.opponent, signal.planes.luma, signal.scale)
+    order = np.argsort(-quads[:found, 11], kind="stable")
+    return [
+        MarkerQuad(_full_px(row[:8].reshape(4, 2), signal.scale), int(row[9]), float(row[11]), float(row[10]))
+        for row in quads[_suppress(quads, order, MAX_CANDIDATES)]
     ]
-    return sorted((q for q in candidates if q.rank > 0), key=lambda q: -q.rank)
 
 
 def _full_px(points: npt.NDArray[Any], scale: int) -> npt.NDArray[Any]:
@@ -89,11 +67,38 @@ def _full_px(points: npt.NDArray[Any], scale: int) -> npt.NDArray[Any]:
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _suppress(opponent, luma, quads, order, most):  # type: ignore[no-untyped-def]
+def _rank(quads, opponent, luma, scale):  # type: ignore[no-untyped-def]
+    """Set the last column: how likely each is a plate.
+
+    With all squares seen it is the logarithm of the odds, by regression over 3,600 candidates in simulated frames, and
+    2.6; with one missing, hardly any candidate is a plate, and only a strong one counts.
+    """
+    for q in quads:
+        most = 1.14 * q[8] - 5.0 if q[9] == ALL_SQUARES else q[8]  # with a colour margin and a size of the best
+        q[11] = -1.0
+        if most < -1.0:
+            continue
+        margin = _interior_score(opponent, luma, q)
+        if margin < LEAST_INTERIOR:
+            continue
+        area = abs((q[2] - q[0]) * (q[7] - q[1]) - (q[3] - q[1]) * (q[6] - q[0]))
+        size = np.log10(max(area * scale * scale, 1.0))
+        if q[9] == ALL_SQUARES:
+            q[11] = 1.14 * q[8] + 1.86 * np.log(margin) + 1.99 * size - 0.51 * size**2 - 9.4
+        else:
+            wanted = min(max(4.5 * size - 5.8, 5.0), 8.7 + max(size - 3.5, 0.0))
+            q[11] = q[8] + 2.0 * np.log(margin) - wanted
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _suppress(quads, order, most):  # type: ignore[no-untyped-def]
+    """The best that are worth a fit, and of those in about one place the best only."""
     kept = np.empty(most, np.int64)
     count = 0
     for k in order:
         q = quads[k]
+        if q[11] <= 0.0 or count == most:
+            break
         cx = (q[0] + q[2] + q[4] + q[6]) / 4
         cy = (q[1] + q[3] + q[5] + q[7]) / 4
         size = 0.0
@@ -107,14 +112,9 @@ def _suppress(opponent, luma, quads, order, most):  # type: ignore[no-untyped-de
             if max(abs(px - cx), abs(py - cy)) < 0.25 * size:
                 fresh = False
                 break
-        if not fresh:
-            continue
-        q[11] = _interior_score(opponent, luma, q)
-        if q[11] > LEAST_INTERIOR:
+        if fresh:
             kept[count] = k
             count += 1
-            if count == most:
-                break
     return kept[:count]
 
 
@@ -346,7 +346,7 @@ def _quads_of_red(blobs, red, near, quads, found):  # type: ignore[no-untyped-de
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _join_quads(blobs, opponent, quads):  # type: ignore[no-untyped-def]
-    """Fill rows: four centroids (x, y), score, bits of the green squares found, size ratio; how many."""
+    """Fill rows: four centroids (x, y), score, bits of the green squares found, size ratio, rank; how many."""
     n = blobs.shape[0]
     strength = np.empty(n)
     for i in range(n):

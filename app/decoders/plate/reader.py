@@ -32,7 +32,7 @@ from app.sensors.camera import Camera
 
 DECODER_VERSION = "plate/1"
 DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
-SURE = 0.999  # least probability at which digits are given out
+SURE = 0.9995  # least probability at which digits are given out
 MOST_FITS = 5  # candidates that are fitted in one pass
 LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
 LEAST_EXPLAINED_ALONE = 0.83  # the same for digits that no registry confirms
@@ -257,13 +257,15 @@ def _judge(
     if decoded.code is None:
         outcome, reason = missing or _undecoded(decoded)
         return replace(reading, outcome=outcome, reason=reason)
-    if not decoded.confirmed and (missing or fit.explained < LEAST_EXPLAINED_ALONE):
+    weak = missing is not None or fit.explained < LEAST_EXPLAINED_ALONE
+    if weak and not decoded.confirmed:
         outcome, reason = missing or (PlateOutcome.UNSURE, "the plate's pattern explains too little of the image")
         return replace(reading, outcome=outcome, reason=reason)
     return replace(
         reading,
         outcome=PlateOutcome.READ,
         code=decoded.code,
+        from_codebook=decoded.from_codebook or weak,
         grade=grade_plate(fit, evidence, decoded, weakest_marker),
         pose=_pose(task, fit, geometry),
     )
