@@ -110,7 +110,7 @@ def magnet_detail(row: Row | dict[str, Any], sheet: DrillingSheet) -> dict[str, 
     summary, spec = written["waymark"], row["spec"]
     magnets = [
         {
-            **{name: value for name, value in hole["properties"].items() if name not in _OF_THE_SHEET},
+            **{name: _plain(value) for name, value in hole["properties"].items() if name not in _OF_THE_SHEET},
             "number": hole["id"],
             "lon_deg": hole["geometry"]["coordinates"][0],
             "lat_deg": hole["geometry"]["coordinates"][1],
@@ -150,6 +150,11 @@ def _tag_document(spec: dict[str, Any]) -> dict[str, Any]:
         "codebook_id": spec["codebook_id"],
         "meaning": meaning_document(Meaning(**spec["meaning"])) if spec["meaning"] is not None else None,
     }
+
+
+def _plain(value: Any) -> Any:
+    """The value without a negative zero."""
+    return 0.0 if value == 0 and isinstance(value, float) else value
 
 
 def meaning_document(meaning: Meaning) -> dict[str, Any]:

@@ -84,6 +84,7 @@ def test_a_tag_on_a_lane_becomes_magnets(client: httpx.Client, lane: Lane) -> No
     assert [magnet["polarity"] for magnet in magnets] == ["S", "N", "S"]
     assert [magnet["north_pole"] for magnet in magnets] == ["backward", "forward", "backward"]
     assert [magnet["phi_deg"] for magnet in magnets] == [0, 0, 0]
+    assert "-0.0" not in response.text
     assert [_distance_m(magnets[0], magnet) for magnet in magnets] == pytest.approx([0, 1, 4], abs=1e-4)
     start = dict(zip(("lon_deg", "lat_deg"), given["geometry"]["coordinates"][0], strict=True))
     assert _distance_m(start, marker["position"]) == pytest.approx(50.0, abs=1e-3)
@@ -248,6 +249,14 @@ def test_a_line_keeps_clear_of_what_lies_along_it(client: httpx.Client, lane: La
     check = _checks(beside)["neighbour-magnet"]
     assert (check["figure"], check["passed"]) == (pytest.approx(1.25**0.5, abs=1e-3), True)
     assert "neighbour-magnet" not in _checks(_post(client, _tag(given, 121.0, offset_m=-1.8)))
+
+
+def test_a_long_line_looks_for_others_along_all_of_it(client: httpx.Client, lane: Lane) -> None:
+    given = lane()
+    tag = _post(client, _tag(given, 235.8))
+    problem = _refused(client.post("/v1/markers", json=_line(given, from_m=0, to_m=240)), 409, "conflict")
+    assert tag["id"] in problem["detail"]
+    assert "0.200 m" in problem["detail"]
 
 
 def test_of_many_requests_for_one_place_one_wins(client: httpx.Client, lane: Lane) -> None:
