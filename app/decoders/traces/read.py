@@ -99,6 +99,11 @@ def _read_part(
     if kind is TraceFormat.STREAM:
         reader = StreamReader(part.content(), part.name, declaration.sensors, declaration.rate_hz, limits, report)
         t, values = reader.read(declaration.interval_extra_us)
+        if not declaration.interval_extra_us:
+            report.warn(
+                f"the intervals in {part.name} leave out the time of the serial write: its clock may run slow; "
+                "declare that time, or ratios of distances are right and distances too short"
+            )
         _set_field(found, part.name, t + shift, values, metro=True)
     elif kind is TraceFormat.RECORDER_FIELD:
         t, values = read_raw_data(part, declaration.sensors, limits, report)
@@ -180,8 +185,13 @@ def _assemble(found: _Found, declaration: TraceDeclaration, limits: TraceLimits,
             report.clock_offsets_s[name] = declaration.clock_offsets_s.get(name, 0.0) - origin
     check_sampling(t, found.field_part, limits, report)
     values = convert_field(values, found.field_part, declaration, found.metro, report)
-    speeds = [clean_speed(Series(s.part, s.t_s - origin, s.value), u, limits, report) for s, u in found.speeds]
-    headings = [clean_heading(Series(s.part, s.t_s - origin, s.value), u, limits, report) for s, u in found.headings]
+
+    def placed(series: Series) -> Series:
+        kept = rows if series.part == found.field_part else slice(None)
+        return Series(series.part, series.t_s[kept] - origin, series.value[kept])
+
+    speeds = [clean_speed(placed(s), u, limits, report) for s, u in found.speeds]
+    headings = [clean_heading(placed(s), u, limits, report) for s, u in found.headings]
     _add_can(found, t, values, declaration, limits, report, speeds, headings)
     speed = _choose_speed(t, speeds, declaration, report)
     heading = _choose(headings, "heading", report)

@@ -142,7 +142,7 @@ def _table(blocks: Iterator[Floats], wanted: list[str], sensors: int, columns: T
     for rows in blocks:
         t.append(rows[:, 0])
         with np.errstate(over="ignore"):
-            field.append(rows[:, 1 : 1 + 3 * sensors].astype(np.float32).reshape(-1, sensors, 3))
+            field.append(rows[:, 1 : 1 + 3 * sensors].astype(np.float32).reshape(len(rows), sensors, 3))
         rest.append(rows[:, 1 + 3 * sensors :].copy())
     times = np.concatenate(t) if t else np.empty(0)
     others = np.concatenate(rest) if rest else np.empty((0, len(wanted) - 1 - 3 * sensors))

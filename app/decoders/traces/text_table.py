@@ -122,7 +122,7 @@ def read_rows(
         More rows than the limit.
     """
     line, rows = 2, 0
-    for block in _lines(part):
+    for block in _lines(part, report):
         count = block.count(b"\n")
         values = None if convert_first else _parse_fast(block, width, dialect)
         if values is None:
@@ -141,8 +141,8 @@ def read_rows(
         yield values
 
 
-def _lines(part: Part) -> Iterator[bytes]:
-    """Blocks of whole lines after the header, each ending with a line feed."""
+def _lines(part: Part, report: TraceReport) -> Iterator[bytes]:
+    """Blocks of whole lines after the header; a last line that does not end may be cut within a number."""
     rest, first = b"", True
     for block in part.blocks():
         rest += block
@@ -159,7 +159,7 @@ def _lines(part: Part) -> Iterator[bytes]:
             yield rest[:end]
             rest = rest[end:]
     if not first and rest.strip():
-        yield rest + b"\n"
+        report.leave_out(part.name, "row-cut-short", 1, "the last line does not end: it may be cut within a number")
 
 
 def _parse_fast(block: bytes, width: int, dialect: Dialect) -> Floats | None:
