@@ -137,7 +137,7 @@ def _decode_pool(settings: Settings, decode: DecodePlates) -> DecodePool:
     return DecodePool(
         decode,
         workers=settings.decode_workers,
-        limits=ChildLimits(settings.decode_memory_bytes, settings.decode_timeout_s),
+        limits=ChildLimits(settings.decode_memory_bytes, settings.decode_timeout_s, settings.trace_timeout_s),
         max_pixels=settings.max_image_pixels,
     )
 

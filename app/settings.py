@@ -33,6 +33,7 @@ class Settings(BaseSettings):
     max_archive_frames: int = Field(default=500, ge=1, le=10_000, description="Most frames in one archive.")
     decode_memory_bytes: int = Field(default=3 * 1024**3, ge=2**28, description="Address space of a decoder. [byte]")
     decode_timeout_s: float = Field(default=20.0, gt=0, description="Longest decode of one frame. [s]")
+    trace_timeout_s: float = Field(default=300.0, gt=0, description="Longest decode of one recording. [s]")
     decode_workers: int = Field(default=2, ge=1, le=256, description="Decoder processes.")
     warm_decoders: bool = Field(default=True, description="Start them with the server, not with the first upload.")
 

@@ -1,4 +1,4 @@
-"""/v1/decodes: upload frames, read what was found in them."""
+"""/v1/decodes: upload frames and traces, read what was found in them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,11 @@ _BODY: dict[str, Any] = {
                     "type": "object",
                     "required": ["file"],
                     "properties": {
-                        "file": {"type": "string", "format": "binary", "description": "JPEG, PNG, or a ZIP of them."},
+                        "file": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "JPEG, PNG, or a ZIP of them; a trace.",
+                        },
                         "context": _inlined(ContextIn.model_json_schema()),
                     },
                 },
@@ -72,12 +76,15 @@ Decodes = Annotated[DecodesService, Depends(get_decodes)]
     openapi_extra=_BODY,
     responses={
         201: {"model": DecodeOut, "description": "Decoded"},
-        202: {"model": DecodeOut, "description": "An archive, queued; Location leads to its progress"},
+        202: {"model": DecodeOut, "description": "Queued; Location leads to its progress"},
         **problem_responses(409, 415),
     },
 )
 def post_decode(caller: Caller, upload: Upload, decodes: Decodes) -> Response:
-    """Decode a frame (answered at once) or a ZIP of frames (queued).
+    """Decode a frame or a magnetometer trace (answered at once), or a ZIP of frames or a long trace (queued).
+
+    A trace is announced by `trace` in its context; its file is METRO's stream, the recorder's or plain CSV, Parquet, or
+    a ZIP of the files of one recording, CAN logs with them.
 
     The context comes as the form's part `context`, or beside a bare file in the header `Waymark-Context`, as JSON. With
     an Idempotency-Key a repeated request gets the first answer again. No plate is a result: an empty list.
@@ -119,6 +126,20 @@ def get_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Respons
 def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
     """Ask a queued or running decode to stop; a finished one stays as it is."""
     return json_response(decodes.cancel(caller, decode_id))
+
+
+@router.get(
+    "/{decode_id}/plot.svg",
+    response_class=Response,
+    responses={200: {"content": {"image/svg+xml": {}}}, **problem_responses(404)},
+)
+def get_plot(decode_id: DecodeId, request: Request, caller: Caller, decodes: Decodes) -> Response:
+    """A trace with the magnets, tags, line crossings and disturbances that were found in it."""
+    headers = {"ETag": f'"{decode_id}-plot"', "Cache-Control": "private, max-age=86400"}
+    plot = decodes.plot(caller, decode_id)
+    if request.headers.get("if-none-match") == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    return Response(plot, headers=headers, media_type="image/svg+xml")
 
 
 @router.get(

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, JsonValue
 
 from app.api.dependencies import Number, Whole
+from app.api.schemas_traces import CrossingOut, MagnetOut, NoiseOut, ReportOut, TagFixOut, TagOut, TraceIn
 from app.services.decode_context import CameraSetup, CoarsePosition, DecodeContext
 
 Flag = Annotated[bool, Field(strict=True)]
@@ -69,7 +70,8 @@ class ContextIn(BaseModel):
     thermal_range: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = Field(
         None, description="Counts of 16-bit thermal frames that become 0 and 255."
     )
-    captured_at: AwareDatetime | None = Field(None, description="When the frame was taken.")
+    captured_at: AwareDatetime | None = Field(None, description="When the frame was taken, or the trace began.")
+    trace: TraceIn | None = Field(None, description="The file is a magnetometer trace; {} for METRO's own formats.")
 
     def domain(self) -> DecodeContext:
         """The context as the use cases know it."""
@@ -81,6 +83,7 @@ class ContextIn(BaseModel):
             thermal=self.thermal,
             thermal_range=(counts[0], counts[1]) if counts else None,
             captured_at=self.captured_at,
+            trace=self.trace.model_dump(exclude_none=True, exclude_unset=True) if self.trace is not None else None,
         )
 
 
@@ -160,7 +163,7 @@ class DecodeOut(BaseModel):
 
     id: str
     state: State
-    kind: Literal["frame", "archive"]
+    kind: Literal["frame", "archive", "trace"]
     progress: float
     attempts: int
     created_at: str
@@ -172,8 +175,14 @@ class DecodeOut(BaseModel):
     codebook_plates: int | None = None
     summary: dict[str, Any] | None = None
     readings: list[ReadingOut] | None = None
-    fix: FixOut | None = None
+    fix: FixOut | TagFixOut | None = None
     frames: list[FrameOut] | None = None
+    codebook_tags: int | None = None
+    report: ReportOut | None = None
+    tags: list[TagOut] | None = None
+    crossings: list[CrossingOut] | None = None
+    magnets: list[MagnetOut] | None = None
+    noise: list[NoiseOut] | None = None
 
 
 class DecodePage(BaseModel):

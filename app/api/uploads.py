@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
@@ -20,7 +20,10 @@ from app.services.idempotency import IdempotencyKey
 
 CONTEXT_HEADER = "waymark-context"
 MAX_CONTEXT_BYTES = 64 * 1024
-RAW_TYPES = ("image/jpeg", "image/png", "application/zip", "application/octet-stream")
+RAW_TYPES = (
+    "image/jpeg", "image/png", "application/zip", "application/octet-stream", "text/csv",
+    "application/vnd.apache.parquet",
+)  # fmt: skip
 _FORM = "multipart/form-data"
 _CURE = "send multipart/form-data with the parts file and context"
 
@@ -48,9 +51,9 @@ async def get_upload(request: Request) -> UploadedFile:
     """
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == _FORM:
-        data, text = await _read_form(request)
+        data, text, name = await _read_form(request)
     elif media_type in RAW_TYPES:
-        data = await request.body()
+        data, name = await request.body(), ""
         # headers arrive as Latin-1; the bytes themselves are the JSON text
         text = request.headers.get(CONTEXT_HEADER, "").encode("latin-1")
     else:
@@ -62,7 +65,14 @@ async def get_upload(request: Request) -> UploadedFile:
         )
     if len(text) > MAX_CONTEXT_BYTES:
         raise MalformedRequest("the context is too long", field="context", limit=f"{MAX_CONTEXT_BYTES} bytes")
-    return UploadedFile(data, _read_context(text), _idempotency_of(request, data, text))
+    return UploadedFile(data, _named(_read_context(text), name), _idempotency_of(request, data, text))
+
+
+def _named(context: DecodeContext, name: str) -> DecodeContext:
+    """A trace's context with the name of its file: its suffix tells kinds of text apart."""
+    if context.trace is None or not name:
+        return context
+    return replace(context, trace={**context.trace, "file_name": name[:120]})
 
 
 def _idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKey | None:
@@ -76,7 +86,7 @@ def _idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKe
     return IdempotencyKey(key, digest.hexdigest())
 
 
-async def _read_form(request: Request) -> tuple[bytes, bytes]:
+async def _read_form(request: Request) -> tuple[bytes, bytes, str]:
     async with request.form(max_files=2, max_fields=2, max_part_size=MAX_CONTEXT_BYTES) as form:
         _check_parts(form)
         file, context = form.get("file"), form.get("context", "")
@@ -89,7 +99,7 @@ async def _read_form(request: Request) -> tuple[bytes, bytes]:
             )
         data = await file.read()
         text = await context.read() if isinstance(context, UploadFile) else context.encode()
-    return data, text
+    return data, text, file.filename or ""
 
 
 def _check_parts(form: FormData) -> None:

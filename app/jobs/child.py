@@ -45,11 +45,14 @@ class ChildLimits:
     memory_bytes : int
         Its whole address space, libraries included. [byte]
     timeout_s : float
-        Longest time on one task. [s]
+        Longest time on one frame. [s]
+    trace_timeout_s : float
+        Longest time on one recording. [s]
     """
 
     memory_bytes: int = 3 * 1024**3
     timeout_s: float = 20.0
+    trace_timeout_s: float = 300.0
 
 
 class _State:

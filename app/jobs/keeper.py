@@ -154,7 +154,7 @@ class Keeper(threading.Thread):
                 return answer
             raise answer
         raise UnreadableUpload(
-            "the picture stopped the decoder process, twice",
+            "the file stopped the decoder process, twice",
             field="file",
             cure="send the frame as the camera wrote it; if it is, report it as a defect",
         )
@@ -177,10 +177,10 @@ class Keeper(threading.Thread):
                 self._current = None
         self._drop()
         raise UnreadableUpload(
-            "decoding the picture took too long and was stopped",
+            "decoding took too long and was stopped",
             field="file",
-            limit=f"{pending.timeout_s:g} s a frame",
-            cure="send the frame as the camera wrote it; if it is, report it as a defect",
+            limit=f"{pending.timeout_s:g} s a file",
+            cure="send the frame as the camera wrote it, or a shorter recording; if it is, report it as a defect",
         )
 
     def _wait_for(self, argument: Future[Any]) -> Any:

@@ -11,7 +11,9 @@ from typing import Any
 from app.errors import Unavailable
 from app.jobs.child import ONE_THREAD, ChildLimits, DecodePlates, annotate_frame, find_plates, load_frame, process_id
 from app.jobs.keeper import Keeper, Pending, Step
+from app.jobs.trace_child import decode_recording
 from app.services.frames import AnnotationTask, FrameResult, FrameTask, PlateSearch
+from app.services.traces import TraceResult, TraceTask
 
 
 class DecodePool:
@@ -87,15 +89,19 @@ class DecodePool:
         """
         return self._start(((load_frame, task), (find_plates, search)), wait_s)
 
+    def start_trace(self, task: TraceTask, *, wait_s: float = 0.0) -> Pending[TraceResult]:
+        """Hand a recording over and return, at once or as soon as there is a place for it within `wait_s`."""
+        return self._start(((decode_recording, task),), wait_s, self._limits.trace_timeout_s)
+
     def annotate(self, task: AnnotationTask) -> bytes:
         """Picture with outlines, encoded."""
         drawn: bytes = self._start(((annotate_frame, task),)).result()
         return drawn
 
-    def _start(self, steps: tuple[Step, ...], wait_s: float = 0.0) -> Pending[Any]:
+    def _start(self, steps: tuple[Step, ...], wait_s: float = 0.0, timeout_s: float | None = None) -> Pending[Any]:
         if not (self._places.acquire(timeout=wait_s) if wait_s else self._places.acquire(blocking=False)):
             raise Unavailable("every decoder process is busy", cure="try again in a few seconds")
-        pending: Pending[Any] = Pending(steps, self._interrupt, self._limits.timeout_s)
+        pending: Pending[Any] = Pending(steps, self._interrupt, timeout_s or self._limits.timeout_s)
         pending.future.add_done_callback(lambda _future: self._places.release())
         with self._lock:
             if self._closed:

@@ -11,6 +11,7 @@ from app.decoders.images import ImageHeader, check_thermal_range
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.sensors.camera import Camera
+from app.services.traces import trace_terms
 
 VIEW_RANGE_M = 100.0
 MAX_ACCURACY_M = 20_000.0
@@ -165,6 +166,8 @@ class DecodeContext:
         Counts that become 0 and 255 in 16-bit thermal frames. [counts]
     captured_at : datetime, optional
         Aware.
+    trace : dict, optional
+        The upload is a magnetometer trace, declared like this (`app.services.traces.trace_terms`).
     """
 
     coarse_position: CoarsePosition | None = None
@@ -173,8 +176,11 @@ class DecodeContext:
     thermal: bool = False
     thermal_range: tuple[float, float] | None = None
     captured_at: datetime | None = None
+    trace: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
+        if self.trace is not None:
+            trace_terms(self.trace)
         if self.heading_deg is not None and not 0 <= self.heading_deg <= 360:
             raise InvalidParameter(
                 f"heading_deg is {self.heading_deg:g}",
@@ -201,7 +207,9 @@ class DecodeContext:
 
     def document(self) -> dict[str, Any]:
         """The context as it is stored: what was given and nothing else."""
-        return {name: value for name, value in _given(asdict(self)).items() if value is not False}
+        given = _given(asdict(replace(self, trace=None)))
+        document = {name: value for name, value in given.items() if value is not False}
+        return document if self.trace is None else {**document, "trace": self.trace}
 
 
 def context_from_document(document: dict[str, Any]) -> DecodeContext:
@@ -214,6 +222,7 @@ def context_from_document(document: dict[str, Any]) -> DecodeContext:
         thermal=document.get("thermal", False),
         thermal_range=(counts[0], counts[1]) if counts else None,
         captured_at=datetime.fromisoformat(captured_at) if isinstance(captured_at, str) else captured_at,
+        trace=document.get("trace"),
     )
     if camera:
         setup = CameraSetup(**{**camera, "distortion": tuple(camera.get("distortion", ()))})

@@ -60,7 +60,9 @@ def decode_document(row: Mapping[str, Any] | sa.RowMapping) -> dict[str, Any]:
         "context": row["context"],
         "error": row["error"],
         **result,
-        "links": {"self": head, "annotated": f"{head}/annotated.jpg"},
+        "links": {"self": head, "plot": f"{head}/plot.svg"}
+        if row["kind"] == "trace"
+        else {"self": head, "annotated": f"{head}/annotated.jpg"},
     }
 
 

@@ -1,4 +1,4 @@
-"""Archives of frames, decoded as jobs."""
+"""Archives of frames and long recordings, decoded as jobs."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from app.services.frame_reading import observations_of, read_frame, start_frame
 from app.services.frames import Blobs, FrameDecoder, PendingFrame
 from app.services.matching import NearbyPlates, find_nearby_plates
 from app.services.ports import Clock
+from app.services.trace_decodes import TRACE, finished_columns, start_trace, store_observations
 
 _PATIENCE_S = 60.0
 _LOG = structlog.get_logger(__name__)
@@ -55,7 +56,7 @@ class DecodeJobs:
         self._rules = rules or DecodeRules()
 
     def run_job(self, decode_id: str) -> None:
-        """Decode a queued archive. It may be called again and at the same time: the effect happens once.
+        """Decode a queued upload. It may be called again and at the same time: the effect happens once.
 
         Raises
         ------
@@ -70,6 +71,9 @@ class DecodeJobs:
             self._fail(row, _given_up(self._rules.max_attempts))
             return
         try:
+            if row["kind"] == TRACE:
+                self._run_trace(row)
+                return
             frames, codebook_plates = self._read_archive(row)
         except _Cancelled:
             self._finish(row, {"state": "cancelled"})
@@ -88,6 +92,21 @@ class DecodeJobs:
         """Jobs that an earlier process left; main submits them again."""
         with self._database.read() as connection:
             return store.list_unfinished(connection)
+
+    def _run_trace(self, row: Row) -> None:
+        context = context_from_document(row["context"])
+        data = self._blobs.get(row["upload_key"])
+        agency_id = row["agency_id"]
+        with self._database.read() as connection:
+            started = start_trace(
+                connection, agency_id, self._decoder, data, context, self._rules, wait_s=_PATIENCE_S
+            )  # fmt: skip
+        done, trace = finished_columns(row["id"], started.pending.result(), started, context, self._blobs)
+        with self._database.write() as connection:
+            if store.finish_decode(connection, row["id"], {**done, "finished_at": self._clock()}):
+                store_observations(connection, agency_id, row["id"], trace, context.captured_at or row["created_at"])
+                return
+        self._blobs.delete(done["picture_key"])
 
     def _read_archive(self, row: Row) -> tuple[list[ReadFrame], int]:
         context = context_from_document(row["context"])

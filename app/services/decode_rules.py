@@ -7,6 +7,7 @@ from datetime import timedelta
 
 from app.decoders.archives import ArchiveLimits
 from app.decoders.images import ImageLimits
+from app.decoders.traces.declaration import TraceLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,6 +18,9 @@ class DecodeRules:
     ----------
     images : ImageLimits
     archives : ArchiveLimits
+    traces : TraceLimits
+    trace_at_once_bytes : int
+        Recordings up to this size are decoded while the caller waits, larger ones become jobs. [byte]
     frames_in_flight : int
         Frames of one archive that are decoded at the same time.
     max_attempts : int
@@ -28,6 +32,8 @@ class DecodeRules:
 
     images: ImageLimits = field(default_factory=ImageLimits)
     archives: ArchiveLimits = field(default_factory=ArchiveLimits)
+    traces: TraceLimits = field(default_factory=TraceLimits)
+    trace_at_once_bytes: int = 8 * 1024**2
     frames_in_flight: int = 2
     max_attempts: int = 3
     progress_every: timedelta = timedelta(seconds=1)

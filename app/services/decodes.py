@@ -1,7 +1,7 @@
 """Uploads -> readings, matches, fixes and observations.
 
-A frame is decoded while the caller waits, an archive of frames becomes a job. Either way the decoding happens in a
-child process, and everything that an upload leaves is written in one transaction.
+A frame or a short recording is decoded while the caller waits, an archive of frames or a long one becomes a job. Either
+way the decoding happens in a child process, and everything that an upload leaves is written in one transaction.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from app.decoders.archives import Member, count_members, is_archive, read_member
-from app.errors import NotFound
+from app.errors import NotFound, UnreadableUpload
 from app.registry import decodes as store
 from app.registry.database import Database
 from app.registry.ids import new_id
@@ -25,6 +25,7 @@ from app.services.frames import AnnotationTask, Blobs, FrameDecoder, JobQueue, O
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
 from app.services.matching import NearbyPlates, find_nearby_plates
 from app.services.ports import Clock
+from app.services.trace_decodes import TRACE, finished_columns, start_trace, store_observations
 from app.storage.blobs import new_blob_key
 
 FRAME, ARCHIVE = "frame", "archive"
@@ -69,7 +70,7 @@ class Decodes:
     def decode_upload(
         self, caller: Caller, data: bytes, context: DecodeContext, key: IdempotencyKey | None = None
     ) -> tuple[dict[str, Any], bool]:
-        """Decode a frame now, or queue an archive of frames.
+        """Decode a frame or a short recording now, or queue an archive of frames or a long recording.
 
         Returns
         -------
@@ -89,8 +90,15 @@ class Decodes:
                 answer = find_answer(connection, caller.agency_id, key, self._clock())
             if answer is not None:
                 return answer, True
+        if context.trace is not None:
+            if not data:
+                raise UnreadableUpload("the file is empty", field="file", cure="send the recording again, whole")
+            if len(data) <= self._rules.trace_at_once_bytes:
+                return self._decode_trace(caller, data, context, key)
+            return self._put_in_queue(caller, TRACE, data, context, key)
         if is_archive(data):
-            return self._queue_archive(caller, data, context, key)
+            count_members(data, self._rules.archives)
+            return self._put_in_queue(caller, ARCHIVE, data, context, key)
         return self._decode_frame(caller, data, context, key)
 
     def _decode_frame(
@@ -143,13 +151,45 @@ class Decodes:
         store.add_observations(connection, caller.agency_id, observations_of(row["id"], [frame], seen_at))
         return decode_document(row)
 
-    def _queue_archive(
+    def _decode_trace(
         self, caller: Caller, data: bytes, context: DecodeContext, key: IdempotencyKey | None
     ) -> tuple[dict[str, Any], bool]:
         created_at = self._clock()
-        count_members(data, self._rules.archives)
+        with self._database.read() as connection:
+            started = start_trace(connection, caller.agency_id, self._decoder, data, context, self._rules)
+        row = _new_row(TRACE, context, new_blob_key(UPLOADS), created_at)
+        kept = [row["upload_key"]]
+        replayed = True
+        try:
+            self._blobs.put(row["upload_key"], data)
+            done, trace = finished_columns(row["id"], started.pending.result(), started, context, self._blobs)
+            kept.append(done["picture_key"])
+            with self._database.write() as connection:
+                document = find_answer(connection, caller.agency_id, key, created_at)
+                if document is None:
+                    replayed = False
+                    row |= done | {"attempts": 1, "finished_at": self._clock()}
+                    store.add_decode(connection, caller.agency_id, row)
+                    seen_at = context.captured_at or created_at
+                    store_observations(connection, caller.agency_id, row["id"], trace, seen_at)
+                    document = decode_document(row)
+                    keep_answer(connection, caller.agency_id, key, document, created_at, self._rules.idempotency_ttl)
+        except BaseException:
+            started.pending.cancel()
+            for blob_key in kept:
+                self._blobs.delete(blob_key)
+            raise
+        if replayed:
+            for blob_key in kept:
+                self._blobs.delete(blob_key)
+        return document, replayed
+
+    def _put_in_queue(
+        self, caller: Caller, kind: str, data: bytes, context: DecodeContext, key: IdempotencyKey | None
+    ) -> tuple[dict[str, Any], bool]:
+        created_at = self._clock()
         blob_key = new_blob_key(UPLOADS)
-        row = _new_row(ARCHIVE, context, blob_key, created_at)
+        row = _new_row(kind, context, blob_key, created_at)
         replayed = True
         try:
             self._blobs.put(blob_key, data, durable=True)
@@ -209,7 +249,7 @@ class Decodes:
                 field="decode_id",
                 cure="wait until it is done",
             )
-        known = next((entry for entry in result["frames"] if entry["frame"] == frame), None)
+        known = next((entry for entry in result.get("frames", ()) if entry["frame"] == frame), None)
         if known is None or known["error"] is not None:
             raise NotFound(f"decode {decode_id} has no readable frame {frame}", field="frame")
         data = self._blobs.get(row["upload_key"])
@@ -219,6 +259,24 @@ class Decodes:
         outlines = tuple(_outline(reading) for reading in result["readings"] if reading["frame"] == frame)
         task = AnnotationTask(data, outlines, suffix, context.thermal, context.thermal_range, limits=self._rules.images)
         return self._decoder.annotate(task)
+
+    def plot(self, caller: Caller, decode_id: str) -> bytes:
+        """Plot of a trace with what was found in it, SVG.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode, it is of frames, or it is not done.
+        """
+        with self._database.read() as connection:
+            row = store.get_decode(connection, caller.agency_id, decode_id)
+        if row["picture_key"] is None:
+            raise NotFound(
+                f"decode {decode_id} has no plot: it is {row['state']}, of kind {row['kind']}",
+                field="decode_id",
+                cure="wait until it is done" if row["kind"] == TRACE else "frames have annotated.png and annotated.jpg",
+            )
+        return self._blobs.get(row["picture_key"])
 
 
 def _new_row(kind: str, context: DecodeContext, blob_key: str, created_at: datetime) -> dict[str, Any]:
@@ -233,6 +291,7 @@ def _new_row(kind: str, context: DecodeContext, blob_key: str, created_at: datet
         "created_at": created_at,
         "finished_at": None,
         "result": None,
+        "picture_key": None,
         "error": None,
     }
 

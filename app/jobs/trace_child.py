@@ -1,0 +1,71 @@
+"""A recording, read and decoded inside a decoder process."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from app.decoders.magnet.book import TagBook
+from app.decoders.magnet.decoder import VERSION, MagnetDecoder
+from app.decoders.magnet.metro import VERSION as METRO_VERSION
+from app.decoders.magnet.metro import decode_trace_metro
+from app.decoders.magnet.readings import Finding
+from app.decoders.traces.read import read_trace
+from app.errors import UnreadableUpload
+from app.jobs.trace_plot import plot_trace
+from app.markers.magnet import InformationTag, parse_tag
+from app.sensors.magnetometer_bar import MagnetTrace
+from app.services.traces import TraceResult, TraceTask, TraceTerms, trace_terms
+
+_CHUNK = 4096  # samples
+
+
+def decode_recording(task: TraceTask, _before: None) -> TraceResult:
+    """Read the files of a recording and decode their trace."""
+    try:
+        return _decode_recording(task)
+    except MemoryError as error:
+        raise UnreadableUpload(
+            "decoding the recording takes more memory than a decoder process has",
+            field="file",
+            cure="cut the recording into shorter ones",
+        ) from error
+
+
+def _decode_recording(task: TraceTask) -> TraceResult:
+    began = time.perf_counter()
+    terms = trace_terms(task.declared)
+    file = read_trace({task.name: task.data}, terms.declaration, task.limits)
+    loaded = time.perf_counter()
+    trace = file.trace
+    findings = _decode(task, terms, trace)
+    decoded = time.perf_counter()
+    return TraceResult(
+        tuple(findings),
+        file.report,
+        _driven_m(trace),
+        METRO_VERSION if terms.method == "metro" else VERSION,
+        plot_trace(trace, terms.bar, findings).encode(),
+        1e3 * (loaded - began),
+        1e3 * (decoded - loaded),
+    )
+
+
+def _decode(task: TraceTask, terms: TraceTerms, trace: MagnetTrace) -> list[Finding]:
+    if terms.method == "metro":
+        return decode_trace_metro(trace, terms.bar)
+    tags = [tag for text in task.tags if isinstance(tag := parse_tag(text), InformationTag)]
+    book = TagBook(designs=tags) if tags else TagBook(formats=terms.formats or task.formats)
+    decoder = MagnetDecoder(terms.bar, book=book)
+    found: list[Finding] = []
+    for start in range(0, len(trace.t_s), _CHUNK):
+        end_s = trace.t_s[start + _CHUNK] if start + _CHUNK < len(trace.t_s) else np.inf
+        found += decoder.feed(trace.between(trace.t_s[start] if start else -np.inf, end_s))
+    return found + decoder.finish()
+
+
+def _driven_m(trace: MagnetTrace) -> float:
+    """Length of the drive by the vehicle's speed. [m]"""
+    speed = np.interp(trace.t_s, trace.speed_t_s, trace.speed_m_s)
+    return float(np.sum(np.diff(trace.t_s) * (speed[1:] + speed[:-1]) / 2))

@@ -1,0 +1,164 @@
+"""Decoded traces as clients see them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from app import __version__
+from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFinding, TagReading
+from app.services.trace_reading import ReadTag, ReadTrace, TagFix, TagMatch
+from app.services.traces import TraceResult
+
+MAX_NOISE = 500
+
+
+def trace_document(result: TraceResult, trace: ReadTrace, *, codebook_tags: int) -> dict[str, Any]:
+    """What a decode of a trace found, as it is stored."""
+    report = result.report
+    fixes = [tag.fix for tag in trace.tags if tag.fix is not None]
+    return {
+        "decoder": f"waymark {__version__} magnet/{result.version}",
+        "codebook_tags": codebook_tags,
+        "summary": _summary(result, trace),
+        "report": {
+            "formats": {name: str(kind) for name, kind in report.formats.items()},
+            "samples": report.samples,
+            "rate_hz": round(report.rate_hz, 3),
+            "duration_s": round(report.duration_s, 3),
+            "driven_m": round(result.length_m, 2),
+            "gaps": [asdict(gap) for gap in report.gaps],
+            "gap_count": report.gap_count,
+            "left_out": [asdict(entry) for entry in report.left_out],
+            "clock_offsets_s": dict(report.clock_offsets_s),
+            "speed_coverage": round(report.speed_coverage, 4),
+            "heading_coverage": round(report.heading_coverage, 4),
+            "warnings": list(report.warnings),
+            "load_ms": round(result.load_ms, 1),
+            "decode_ms": round(result.decode_ms, 1),
+        },
+        "tags": [_tag(tag) for tag in trace.tags],
+        "crossings": [_crossing(crossing) for crossing in trace.crossings],
+        "magnets": [_magnet(magnet) for magnet in trace.magnets],
+        "noise": [_noise(finding) for finding in trace.noise[:MAX_NOISE]],
+        "fix": tag_fix_document(fixes[-1]) if fixes else None,
+    }
+
+
+def _summary(result: TraceResult, trace: ReadTrace) -> dict[str, Any]:
+    matched = sum(tag.match is not None and tag.match.row is not None for tag in trace.tags)
+    wrong_way = sum(tag.reading.wrong_way for tag in trace.tags)
+    solid = sum(crossing.style.value == "solid" for crossing in trace.crossings)
+    text = f"{len(trace.magnets)} magnets over {result.length_m:.0f} m: {len(trace.tags)} tags, {matched} registered"
+    text += f"; {len(trace.crossings)} line crossings, {solid} solid" if trace.crossings else ""
+    text += f"; WRONG WAY at {wrong_way} tags" if wrong_way else ""
+    text += f"; {len(trace.noise)} disturbances left out" if trace.noise else ""
+    kinds: dict[str, int] = {}
+    for finding in trace.noise:
+        kinds[str(finding.kind)] = kinds.get(str(finding.kind), 0) + 1
+    return {
+        "text": text,
+        "magnets": len(trace.magnets),
+        "tags": len(trace.tags),
+        "tags_matched": matched,
+        "wrong_way": wrong_way,
+        "crossings": len(trace.crossings),
+        "fixes": sum(tag.fix is not None for tag in trace.tags),
+        "noise": kinds,
+    }
+
+
+def _tag(tag: ReadTag) -> dict[str, Any]:
+    reading: TagReading = tag.reading
+    return {
+        "start_s": round(reading.start_s, 4),
+        "end_s": round(reading.end_s, 4),
+        "tag": reading.tag.text if reading.tag is not None else None,
+        "tuple": reading.tag.tuple_text if reading.tag is not None else None,
+        "polarities": "".join(str(polarity) for polarity in reading.polarities),
+        "gaps_m": [round(gap, 4) for gap in reading.gaps_m],
+        "gap_std_m": [round(gap, 4) for gap in reading.gap_std_m],
+        "length_m": round(reading.length_m, 4),
+        "ratios": [round(ratio, 5) for ratio in reading.ratios],
+        "ratio_std": [round(ratio, 5) for ratio in reading.ratio_std],
+        "lateral_cm": round(reading.lateral_cm, 2),
+        "direction": "wrong-way" if reading.wrong_way else ("legal" if reading.tag is not None else "unknown"),
+        "missing": reading.missing,
+        "extra": reading.extra,
+        "confidence": float(reading.confidence),
+        "match": _match(tag.match),
+        "fix": tag_fix_document(tag.fix),
+    }
+
+
+def _match(match: TagMatch | None) -> dict[str, Any] | None:
+    if match is None:
+        return None
+    row = match.row
+    meaning = row["spec"].get("meaning") if row is not None else None
+    return {
+        "registered": row is not None,
+        "marker_id": row["id"] if row is not None else None,
+        "status": row["status"] if row is not None else None,
+        "localization_grade": row["localization_grade"] if row is not None else None,
+        "meaning": meaning,
+        "ambiguous": bool(match.others),
+        "other_marker_ids": list(match.others),
+        "note": match.note or None,
+    }
+
+
+def tag_fix_document(fix: TagFix | None) -> dict[str, Any] | None:
+    """A vehicle's position at a tag; the covariance is of east, north [m] and heading [rad]."""
+    if fix is None:
+        return None
+    return {
+        "t_s": round(fix.t_s, 4),
+        "lon_deg": fix.lon_deg,
+        "lat_deg": fix.lat_deg,
+        "heading_deg": fix.heading_deg,
+        "covariance": fix.covariance.tolist(),
+        "sigma": {
+            "along_m": fix.along_std_m,
+            "across_m": fix.across_std_m,
+            "heading_deg": float(np.degrees(np.sqrt(fix.covariance[2, 2]))),
+        },
+        "across_m": round(fix.across_m, 4),
+        "localization_grade": str(fix.grade),
+        "notes": list(fix.notes),
+    }
+
+
+def _crossing(crossing: LineCrossing) -> dict[str, Any]:
+    return {
+        "t_s": round(crossing.t_s, 4),
+        "odometer_m": round(crossing.odometer_m, 3),
+        "style": str(crossing.style),
+        "side": str(crossing.side),
+        "lateral_cm": round(crossing.lateral_cm, 2),
+        "confidence": float(crossing.confidence),
+    }
+
+
+def _magnet(magnet: MagnetReading) -> dict[str, Any]:
+    return {
+        "t_s": round(magnet.t_s, 4),
+        "odometer_m": round(magnet.odometer_m, 3),
+        "lateral_cm": round(magnet.lateral_cm, 2),
+        "polarity": str(magnet.polarity),
+        "phi_deg": magnet.phi_deg,
+        "clearance_cm": round(magnet.clearance_cm, 2),
+        "confidence": float(magnet.confidence),
+    }
+
+
+def _noise(finding: NoiseFinding) -> dict[str, Any]:
+    return {
+        "t_s": round(finding.t_s, 4),
+        "odometer_m": round(finding.odometer_m, 3),
+        "lateral_cm": round(finding.lateral_cm, 2),
+        "kind": str(finding.kind),
+        "reason": finding.reason,
+    }
