@@ -19,6 +19,7 @@ _RAW_UT = (8.0, 2000.0)
 _AGREE = 0.2
 """Sensors whose means differ by less than this share are calibrated, declared so or not."""
 _CHECKED = 20_000
+_BLOCK = 1 << 16
 _VEHICLE_FROM = {AxisConvention.ISO8855: (1, 1, 1), AxisConvention.FLU: (1, 1, 1), AxisConvention.FRD: (1, -1, -1)}
 
 
@@ -46,25 +47,25 @@ def convert_field(field: Field, part: str, declaration: TraceDeclaration, metro:
             limit=", ".join(a.value for a in AxisConvention),
             cure="declare them, or the rotation of each sensor",
         )
-    field *= np.float32(UT_PER_UNIT[unit])
-    if declaration.offsets_ut is not None:
-        field -= declaration.offsets_ut.astype(np.float32)
-    _check_unit(field, part, unit, declaration)
-    empty = ~np.isfinite(field).all(2)
-    with np.errstate(invalid="ignore"):
-        wild = ~empty & ~(np.abs(field) <= FIELD_LIMIT_UT).all(2)
-    report.leave_out(
-        part, "values-missing", int(empty.sum()), "samples of a sensor that are empty or not finite numbers"
-    )
-    report.leave_out(part, "values-damaged", int(wild.sum()), f"samples of a sensor beyond {FIELD_LIMIT_UT:g} uT")
-    field[empty | wild] = np.nan
-    if declaration.vehicle_from_sensor is not None:
-        turn = declaration.vehicle_from_sensor.astype(np.float32)
-        for i in range(field.shape[1]):
-            field[:, i] = field[:, i] @ turn[i].T
-    else:
-        assert axes is not None
-        field *= np.array(_VEHICLE_FROM[axes], np.float32)
+    scale = np.float32(UT_PER_UNIT[unit])
+    offsets = np.float32(0) if declaration.offsets_ut is None else declaration.offsets_ut.astype(np.float32)
+    some = field[:: max(len(field) // _CHECKED, 1)] * scale - offsets
+    _check_unit(some, part, unit, declaration)
+    turns = declaration.vehicle_from_sensor
+    signs = np.array(_VEHICLE_FROM[axes] if axes else (1, 1, 1), np.float32)
+    empty = wild = 0
+    for at in range(0, len(field), _BLOCK):  # an hour's trace is not copied
+        piece = field[at : at + _BLOCK]
+        piece *= scale
+        piece -= offsets
+        missing = ~np.isfinite(piece).all(2)
+        with np.errstate(invalid="ignore"):
+            beyond = ~missing & ~(np.abs(piece) <= FIELD_LIMIT_UT).all(2)
+        empty, wild = empty + int(missing.sum()), wild + int(beyond.sum())
+        piece[missing | beyond] = np.nan
+        piece[:] = piece * signs if turns is None else np.einsum("sij,tsj->tsi", turns.astype(np.float32), piece)
+    report.leave_out(part, "values-missing", empty, "samples of a sensor, empty or not finite")
+    report.leave_out(part, "values-damaged", wild, f"samples of a sensor beyond {FIELD_LIMIT_UT:g} uT")
     _warn_dead_sensors(field, part, report)
     return field
 
@@ -73,7 +74,7 @@ def _check_unit(field: Field, part: str, unit: FieldUnit, declaration: TraceDecl
     """Refuse a unit in which the earth's field, which every magnetometer sees, would be impossible."""
     if declaration.background_removed:
         return
-    some = field[:: max(len(field) // _CHECKED, 1)].astype(float)
+    some = field.astype(float)
     some[~np.isfinite(some)] = np.nan
     some = some[:, np.isfinite(some).any((0, 2))]
     some = some[np.isfinite(some).all((1, 2))]

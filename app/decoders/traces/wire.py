@@ -130,10 +130,11 @@ class StreamReader:
             near = (np.abs(fields - sync.template.astype(np.float32)) <= _NEAR_UT).sum(1)
             usual = sync.interval_us
             timed = (interval >= usual / 4) & (interval <= max(8 * usual, _INTERVALS_US[1]))
-            # an interval among the fields, and none in its place: the words are shifted
-            odd = ~((interval >= usual / 2) & (interval <= 1.6 * usual))
-            like = (fields >= usual / 2) & (fields <= 1.6 * usual) & (sync.template < 0.4 * usual)
-            shifted = odd & like.any(1)
+            # an interval among the fields, and a field in its place: the words are shifted
+            large = sync.template[sync.template > usual / 4 - 2 * _NEAR_UT]
+            field_there = (np.abs(interval[:, None] - large) <= 2 * _NEAR_UT).any(1)
+            interval_there = (fields >= usual / 2) & (fields <= 1.6 * usual) & (sync.template < 0.4 * usual)
+            shifted = field_there & interval_there.any(1)
         fine = (wild <= _MEND_WORDS) & (near >= (self._words - 1) // 2) & ~shifted
         return np.where(fine & timed, _GOOD, np.where(fine, _ODD_INTERVAL, _BAD)).astype(np.int8)
 
@@ -185,12 +186,18 @@ class StreamReader:
         )
         if not taken.size:
             return
-        self._kept.append(samples[taken, :-1])
+        fields = samples[taken, :-1]
+        with np.errstate(invalid="ignore"):
+            wild = ~(np.abs(fields).reshape(taken.size, -1, 3) <= FIELD_LIMIT_UT).all(2)
+        if wild.any():
+            fields.reshape(taken.size, -1, 3)[wild] = np.nan
+            self._report.leave_out(
+                self._name, "values-damaged", int(wild.sum()), f"fields beyond {FIELD_LIMIT_UT:g} uT or not a number"
+            )
+        self._kept.append(fields)
         self._intervals.append(interval)
         self._count += taken.size
-        last = samples[taken[-256:], :-1].astype(float)
-        with np.errstate(invalid="ignore"):
-            last[~(np.abs(last) <= FIELD_LIMIT_UT)] = np.nan
+        last = fields[-256:].astype(float)
         if taken.size >= 16:
             middle = np.nanmedian(last, axis=0) if np.isfinite(last).any(0).all() else sync.template
             sync.template = middle
@@ -288,23 +295,26 @@ class StreamReader:
                 continue
             fields = np.median(samples[fine, :-1].astype(float), axis=0)
             sync = _Sync(fields, usual)
+            whole = float((interval[timed] == np.round(interval[timed])).mean())
+            if whole < 0.9 and self._holds_interval(samples[fine, :-1], fields):
+                continue
             if np.isfinite(fields).all() and (self._judge(samples, sync) == _GOOD).mean() >= 0.8:
-                found.append((phase, sync, float((interval[timed] == np.round(interval[timed])).mean())))
+                found.append((phase, sync, whole))
         return found
+
+    def _holds_interval(self, samples: Words, middle: Floats) -> bool:
+        """Whether a word among the fields counts whole microseconds, as intervals do."""
+        with np.errstate(invalid="ignore"):
+            whole = (samples == np.round(samples)).mean(0) >= 0.8
+        return bool((whole & (middle >= self._medians_us[0]) & (middle <= self._medians_us[1])).any())
 
     def _assemble(self, extra_us: float) -> tuple[Floats, npt.NDArray[np.float32]]:
         if not self._count:
             raise UnreadableUpload(f"{self._name} holds no whole sample", field=self._name, limit="one or more")
         words = np.concatenate(self._kept)
+        self._kept.clear()
         interval_s = (np.concatenate(self._intervals) + extra_us) / 1e6
         fields = words.reshape(len(words), -1, 3)
-        with np.errstate(invalid="ignore"):
-            wild = ~(np.abs(fields) <= FIELD_LIMIT_UT).all(2)
-        if wild.any():
-            fields[wild] = np.nan
-            self._report.leave_out(
-                self._name, "values-damaged", int(wild.sum()), f"fields beyond {FIELD_LIMIT_UT:g} uT or not a number"
-            )
         usual_s = float(np.median(interval_s))
         step = interval_s.copy()
         gaps: dict[int, tuple[float, int]] = {}

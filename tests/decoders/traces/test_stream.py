@@ -83,6 +83,17 @@ def test_a_cut_is_found_and_reported(cut: int) -> None:
     assert 0 < gap.lost_s < 6 / 350
 
 
+def test_a_field_as_large_as_an_interval_does_not_take_its_place() -> None:
+    trace = make_trace(2000, offset_ut=5.0)
+    trace.field_ut[:, 0, 0] += 1500
+    stream = write_array_stream(trace)
+    at = 1001 * SAMPLE - 4  # an interval is cut out: the next word is the first sensor's x
+    result = read(stream[:at] + stream[at + 4 :])
+    origin = origin_of(trace.field_ut.reshape(2000, -1), result.trace.field_ut.reshape(-1, 42))
+    assert (origin >= 0).all()
+    assert len(origin) > 1990
+
+
 def test_a_stream_that_starts_within_a_sample() -> None:
     trace = make_trace(1000)
     result = read(write_array_stream(trace)[61:])
