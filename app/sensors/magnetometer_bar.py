@@ -13,6 +13,7 @@ from app.errors import InvalidParameter
 Floats = npt.NDArray[np.float64]
 
 MAX_SENSORS = 64
+MIN_WIDTH_M = 0.1
 
 
 class SensorRole(StrEnum):
@@ -42,7 +43,7 @@ class MagnetometerBar:
     Raises
     ------
     InvalidParameter
-        Fewer than three array sensors, positions that are not finite, or lengths that differ.
+        Fewer than three array sensors or two in one place, positions that are not finite, or lengths that differ.
     """
 
     positions_m: Floats
@@ -65,6 +66,14 @@ class MagnetometerBar:
             )
         if roles.count(SensorRole.ARRAY) < 3:
             raise InvalidParameter("a bar has three or more array sensors", field="bar.roles", limit=">= 3 array")
+        array = positions[[role is SensorRole.ARRAY for role in roles]]
+        if len(np.unique(array, axis=0)) < len(array) or np.ptp(array[:, 1]) < MIN_WIDTH_M:
+            raise InvalidParameter(
+                "array sensors have places of their own, across the vehicle",
+                field="bar.positions_m",
+                limit=f"no two alike, {MIN_WIDTH_M:g} m or more from the leftmost to the rightmost",
+                cure="give each sensor's place: forward, left, up, in metres",
+            )
         turns = np.array(self.vehicle_from_sensor, float)
         if not turns.size:
             turns = np.tile(np.eye(3), (len(roles), 1, 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -29,10 +30,10 @@ def trace_document(result: TraceResult, trace: ReadTrace, *, codebook_tags: int)
             "rate_hz": round(report.rate_hz, 3),
             "duration_s": round(report.duration_s, 3),
             "driven_m": round(result.length_m, 2),
-            "gaps": [asdict(gap) for gap in report.gaps],
+            "gaps": [_plain(asdict(gap)) for gap in report.gaps],
             "gap_count": report.gap_count,
-            "left_out": [asdict(entry) for entry in report.left_out],
-            "clock_offsets_s": dict(report.clock_offsets_s),
+            "left_out": [_plain(asdict(entry)) for entry in report.left_out],
+            "clock_offsets_s": _plain(report.clock_offsets_s),
             "speed_coverage": round(report.speed_coverage, 4),
             "heading_coverage": round(report.heading_coverage, 4),
             "warnings": list(report.warnings),
@@ -45,6 +46,11 @@ def trace_document(result: TraceResult, trace: ReadTrace, *, codebook_tags: int)
         "noise": [_noise(finding) for finding in trace.noise[:MAX_NOISE]],
         "fix": tag_fix_document(fixes[-1]) if fixes else None,
     }
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values without numpy's types."""
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
 
 
 def _summary(result: TraceResult, trace: ReadTrace) -> dict[str, Any]:
