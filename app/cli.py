@@ -139,6 +139,34 @@ def decode(
         typer.echo(orjson.dumps(found, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
+@cli.command()
+def decode_trace(
+    recording: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A file, or a ZIP of one recording.")],
+    declared: Annotated[str, typer.Option(help="What is declared of it, JSON; see docs/magnets.md.")] = "{}",
+    plot: Annotated[Path | None, typer.Option(help="SVG to write.")] = None,
+) -> None:
+    """Read the magnets and tags in a magnetometer trace; prints one JSON object."""
+    import orjson
+
+    from app.jobs.trace_child import decode_recording
+    from app.services.trace_documents import trace_document
+    from app.services.trace_reading import NearbyTags, match_tags
+    from app.services.traces import TraceTask, trace_terms
+
+    try:
+        terms: object = orjson.loads(declared)
+    except orjson.JSONDecodeError as error:
+        raise InvalidParameter(f"--declared is not JSON: {error}", field="declared", cure="send {} at least") from error
+    if not isinstance(terms, dict):
+        raise InvalidParameter("--declared is no JSON object", field="declared", cure="send {} at least")
+    result = decode_recording(TraceTask(recording.name, recording.read_bytes(), terms), None)
+    trace = match_tags(result.findings, NearbyTags(), trace_terms(terms).bar)
+    if plot is not None:
+        plot.write_bytes(result.plot)
+    document = trace_document(result, trace, codebook_tags=0)
+    typer.echo(orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY))
+
+
 @contextmanager
 def _owned_database(settings: Settings) -> Iterator[Database]:
     from app.registry.database import Database

@@ -81,6 +81,10 @@ export async function decode(file, context) {
   return (await ask("/v1/decodes", { method: "POST", body: form })).json();
 }
 
+export async function getDecode(id) {
+  return (await ask(`/v1/decodes/${id}`)).json();
+}
+
 export async function fetchPicture(path) {
   return (await ask(path)).blob();
 }

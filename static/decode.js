@@ -1,8 +1,9 @@
-// Decode a frame: the picture with outlines, each reading with its cells, the vehicle's position.
+// Decode a frame or a trace: its picture, each reading, the vehicle's position.
 
 import * as api from "./api.js";
 import { drawMap } from "./map.js";
 import { $, attempt, facts, fillForm, make, readForm, say } from "./page.js";
+import { drawTagFix, drawTags, isTrace, waitFor } from "./traces.js";
 
 let pictureUrl = null;
 let frame = null;
@@ -43,10 +44,12 @@ function take(file) {
 }
 
 async function upload(form) {
-  if (!frame) throw new api.Problem({ title: "There is no frame", detail: "Choose a picture first.", field: "file", limit: "JPEG or PNG", cure: "drop one on the dashed field" });
+  if (!frame) throw new api.Problem({ title: "There is no file", detail: "Choose a picture or a recording first.", field: "file", limit: "JPEG, PNG; a recording", cure: "drop one on the dashed field" });
   say("Decoding …");
-  const decoded = await api.decode(frame, contextOf(form));
-  await show(decoded);
+  const context = contextOf(form);
+  if (isTrace(frame)) context.trace ??= {};
+  const decoded = await waitFor(await api.decode(frame, context));
+  await (decoded.kind === "trace" ? showTrace(decoded) : show(decoded));
   say(decoded.summary.text);
   $("#decoded").scrollIntoView({ block: "start" });
 }
@@ -73,14 +76,27 @@ async function show(decoded) {
   $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.frames[0].decode_ms.toFixed(1)} ms, ${decoded.codebook_plates} registered plates within reach.`;
   $("#readings").replaceChildren(...(decoded.readings.length ? decoded.readings.map(drawReading) : [make("p", { class: "empty" }, "No plate in this frame.")]));
   drawFix(decoded);
-  const picture = await api.fetchPicture(decoded.links.annotated);
+  const text = `The frame with what was found in it: ${decoded.summary.text}`;
+  drawCrops(decoded.readings, await showPicture(decoded.links.annotated, text));
+}
+
+async function showTrace(decoded) {
+  $("#decoded").hidden = false;
+  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.report.decode_ms.toFixed(0)} ms, ${decoded.codebook_tags} registered tags within reach.`;
+  $("#readings").replaceChildren(...drawTags(decoded));
+  $("#fix").replaceChildren(drawTagFix(decoded));
+  await showPicture(decoded.links.plot, `The trace with what was found in it: ${decoded.summary.text}`);
+}
+
+async function showPicture(path, text) {
+  const picture = await api.fetchPicture(path);
   if (pictureUrl) URL.revokeObjectURL(pictureUrl);
   pictureUrl = URL.createObjectURL(picture);
   const image = $("#annotated");
   image.src = pictureUrl;
+  image.alt = text;
   await image.decode();
-  drawCrops(decoded.readings, image);
-  image.alt = `The frame with what was found in it: ${decoded.summary.text}`;
+  return image;
 }
 
 function drawReading(reading) {
