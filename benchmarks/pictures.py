@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import shutil
 import tempfile
+import zipfile
 from pathlib import Path
 
 import cv2
@@ -14,6 +16,13 @@ import numpy as np
 
 from app.demo.drive import drive_over, list_plates, registered_code
 from app.demo.server import LocalServer
+from app.jobs.trace_child import decode_recording
+from app.markers.magnet import InformationTag, Polarity, parse_tag
+from app.services.traces import TraceTask
+from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.recorder import write_recorder_files
+from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
+from app.simulation.magnetic.vehicle import Course, Vehicle
 from tests.browser import Browser
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
@@ -42,6 +51,25 @@ def main() -> None:
         annotated = client.get(decode["links"]["annotated"]).raise_for_status().content
         (IMAGES / "drive.jpg").write_bytes(_recoded(annotated, 0.5, 85))
         _write_page(server, Path(folder))
+    _write_trace()
+
+
+def _write_trace() -> None:
+    """A drive of four seconds over one tag and a dashed line, as METRO's recorder writes it, and its plot."""
+    tag = parse_tag("SNS_4_0.1_10-30")
+    assert isinstance(tag, InformationTag)
+    line = line_magnets(50.0, 58.0, 4.0, 0.7, Polarity.S)
+    scene = Scene(
+        Road(60.0), Vehicle.compact(), Course(speed_m_s=15.0), tags=[PlacedTag(tag, 42.0)], lines=line
+    )  # fmt: skip
+    drive = simulate_drive(scene, np.random.default_rng(_SEED))
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for name, data in write_recorder_files(drive.trace).items():
+            archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
+    (IMAGES / "drive.zip").write_bytes(packed.getvalue())
+    result = decode_recording(TraceTask("drive.zip", packed.getvalue(), {}, (tag.text,)), None)
+    (IMAGES / "trace.svg").write_bytes(result.plot)
 
 
 def _recoded(jpeg: bytes, scale: float, quality: int) -> bytes:

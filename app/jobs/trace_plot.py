@@ -49,7 +49,7 @@ def _title(findings: Sequence[Finding], length_m: float, trace: MagnetTrace) -> 
     tags = sum(isinstance(f, TagReading) for f in findings)
     lines = sum(isinstance(f, LineCrossing) for f in findings)
     seconds = float(trace.t_s[-1] - trace.t_s[0])
-    return f"{magnets} magnets, {tags} tags, {lines} line crossings in {length_m:.0f} m and {seconds:.1f} s"
+    return f"Magnets: {magnets}, tags: {tags}, line crossings: {lines}; {length_m:.0f} m in {seconds:.1f} s"
 
 
 def _x(odometer_m: float, length_m: float) -> float:

@@ -57,10 +57,11 @@ def _summary(result: TraceResult, trace: ReadTrace) -> dict[str, Any]:
     matched = sum(tag.match is not None and tag.match.row is not None for tag in trace.tags)
     wrong_way = sum(tag.reading.wrong_way for tag in trace.tags)
     solid = sum(crossing.style.value == "solid" for crossing in trace.crossings)
-    text = f"{len(trace.magnets)} magnets over {result.length_m:.0f} m: {len(trace.tags)} tags, {matched} registered"
-    text += f"; {len(trace.crossings)} line crossings, {solid} solid" if trace.crossings else ""
-    text += f"; WRONG WAY at {wrong_way} tags" if wrong_way else ""
-    text += f"; {len(trace.noise)} disturbances left out" if trace.noise else ""
+    text = f"{_count(len(trace.magnets), 'magnet')} over {result.length_m:.0f} m: {_count(len(trace.tags), 'tag')}"
+    text += f", {matched} registered" if trace.tags else ""
+    text += f"; {_count(len(trace.crossings), 'line crossing')}, {solid} solid" if trace.crossings else ""
+    text += f"; WRONG WAY at {_count(wrong_way, 'tag')}" if wrong_way else ""
+    text += f"; {_count(len(trace.noise), 'disturbance')} left out" if trace.noise else ""
     kinds: dict[str, int] = {}
     for finding in trace.noise:
         kinds[str(finding.kind)] = kinds.get(str(finding.kind), 0) + 1
@@ -74,6 +75,10 @@ def _summary(result: TraceResult, trace: ReadTrace) -> dict[str, Any]:
         "fixes": sum(tag.fix is not None for tag in trace.tags),
         "noise": kinds,
     }
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _tag(tag: ReadTag) -> dict[str, Any]:
