@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, JsonValue
 
 from app.api.dependencies import Number, Whole
-from app.api.schemas_traces import CrossingOut, MagnetOut, NoiseOut, ReportOut, TagFixOut, TagOut, TraceIn
+from app.api.schemas_traces import CrossingOut, MagnetReadingOut, NoiseOut, ReportOut, TagFixOut, TagOut, TraceIn
 from app.services.decode_context import CameraSetup, CoarsePosition, DecodeContext
 
 Flag = Annotated[bool, Field(strict=True)]
@@ -181,7 +181,7 @@ class DecodeOut(BaseModel):
     report: ReportOut | None = None
     tags: list[TagOut] | None = None
     crossings: list[CrossingOut] | None = None
-    magnets: list[MagnetOut] | None = None
+    magnets: list[MagnetReadingOut] | None = None
     noise: list[NoiseOut] | None = None
 
 

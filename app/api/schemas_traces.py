@@ -142,7 +142,7 @@ class ReportOut(BaseModel):
     decode_ms: float
 
 
-class MagnetOut(BaseModel):
+class MagnetReadingOut(BaseModel):
     """A magnet that was passed."""
 
     t_s: float

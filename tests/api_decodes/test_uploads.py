@@ -331,6 +331,8 @@ def test_openapi_describes_uploads(client: httpx.Client) -> None:
         "image/png",
         "application/zip",
         "application/octet-stream",
+        "text/csv",
+        "application/vnd.apache.parquet",
     }
     context = body["multipart/form-data"]["schema"]["properties"]["context"]
     assert "horizontal_fov_deg" in json.dumps(context)

@@ -110,7 +110,7 @@ def test_a_frame_that_takes_too_long_is_stopped(pool: DecodePool) -> None:
     with pytest.raises(UnreadableUpload, match="too long") as caught:
         start(pool, standin.SLEEP).result()
     assert 1.9 < time.monotonic() - began < 8
-    assert caught.value.limit == "2 s a frame"
+    assert caught.value.limit == "2 s a file"
     assert child_of(pool)
 
 
