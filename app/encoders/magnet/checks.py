@@ -11,7 +11,7 @@ from importlib import resources
 from typing import Literal
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from app.encoders.magnet.layout import MagnetLayout
 from app.errors import InvalidParameter
@@ -237,10 +237,10 @@ def _reaction(layout: MagnetLayout, stop_line_m: float, speed_mps: float, site: 
 
 def _clearance(vehicle: str, readable_m: float) -> Check:
     mean_m, std_m = vehicle_clearances()[vehicle]
-    share = float(norm.cdf((readable_m - mean_m) / std_m))
+    share = float(ndtr((readable_m - mean_m) / std_m))
     return _at_most(
         f"clearance-{vehicle.replace(' ', '-')}",
-        mean_m + float(norm.ppf(_SERVED)) * std_m,
+        mean_m + float(ndtri(_SERVED)) * std_m,
         readable_m,
         "m",
         "METRO figure 14a, section 7.3",
