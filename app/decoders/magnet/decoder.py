@@ -8,12 +8,14 @@ from app.decoders.magnet.assemble import Assembler, PlacedMagnet
 from app.decoders.magnet.bins import Bins
 from app.decoders.magnet.book import TagBook
 from app.decoders.magnet.front import Blocks, FrontEnd
+from app.decoders.magnet.iron import FORGET_M
 from app.decoders.magnet.judge import ClearanceTracker, Verdict, is_sure, judge_region
 from app.decoders.magnet.path import Path
 from app.decoders.magnet.readings import Finding, MagnetReading, NoiseFinding
-from app.decoders.magnet.region import Dipole, Expectation, RegionFitter
+from app.decoders.magnet.region import RegionFitter
 from app.decoders.magnet.search import BIN_M, HALF_BINS, HOLE_BINS, MAX_BINS, make_search_bank, scan_bins
 from app.decoders.magnet.wheels import WheelCanceller
+from app.decoders.magnet.window import Dipole, Expectation
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
 VERSION = "matched-1"
@@ -59,6 +61,7 @@ class MagnetDecoder:
         self._score = np.empty((0, 2), np.float32)
         self._cell = np.empty((0, 2), np.int64)
         self._score_start = HALF_BINS
+        self._before: list[Dipole] = []  # of the last regions
         self._findings: list[Finding] = []
 
     def feed(self, chunk: MagnetTrace) -> list[Finding]:
@@ -116,7 +119,9 @@ class MagnetDecoder:
             _THRESHOLD, until_m,
         )  # fmt: skip
         dipoles.sort(key=lambda d: float(d.params[0]))
-        for dipole, verdict in zip(dipoles, judge_region(dipoles, expected, self._half_width), strict=True):
+        verdicts = judge_region(dipoles, self._before, expected, self._half_width)
+        self._before = [d for d in (*self._before, *dipoles) if d.params[0] > first * BIN_M - FORGET_M]
+        for dipole, verdict in zip(dipoles, verdicts, strict=True):
             reading = self._reading(dipole, verdict, expected)
             self._findings.append(reading)
             if isinstance(reading, MagnetReading):

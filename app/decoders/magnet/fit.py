@@ -279,11 +279,10 @@ def fit_dipoles(s, data, weight, delays, positions, basis, alpha, start, kinds, 
             damping = max(damping * 8, 1e-4)
         if not moved:
             break
-        done = cost - trial_cost < 1e-3 * cost + 0.01
-        size = _model(params, s, positions, delays, weight, basis, alpha, columns, jacobian, total, True)
-        if done:
+        if cost - trial_cost < 1e-3 * cost + 0.01:
             break
-    size = _model(params, s, positions, delays, weight, basis, alpha, columns, jacobian, total, True)
+        size = _model(params, s, positions, delays, weight, basis, alpha, columns, jacobian, total, True)
+    size = _model(params, s, positions, delays, weight, basis, alpha, columns, jacobian, total, False)
     residual = data - total
     rows = _row_weights(residual, size, weight)
     covariance = np.zeros((n, PARAMETERS, PARAMETERS))

@@ -25,6 +25,8 @@ _SPIKE_MISMATCH = 0.15
 _SURE_SPIKE_UT, _SURE_MISMATCH = 60.0, 0.05
 """A sample is a spike if it bends the row of samples so much, and so much more than its neighbours on the bar, and if
 the bend of the sample before it is minus half of its own but for this share: one sample alone is off."""
+_AHEAD = 2
+"""Samples that are looked at ahead: the next one may be a repeat."""
 
 
 class Blocks:
@@ -101,10 +103,10 @@ class FrontEnd:
             if final:
                 self._close(blocks)
             return
-        t, raw = self._t[: ready + 1], self._x[: ready + 1]
-        if len(t) == ready:  # the very last sample has no neighbour
-            t, raw = np.append(t, t[-1] + 1e-3), np.concatenate((raw, raw[-1:]))
-        s, v = self._odometer(t[:ready])
+        t, raw = self._t[:ready], self._x[: ready + _AHEAD]
+        if lacking := ready + _AHEAD - len(raw):  # the very last samples have no neighbour
+            raw = np.concatenate((raw, np.repeat(raw[-1:], lacking, axis=0)))
+        s, v = self._odometer(t)
         out_s, out_x = np.empty((ready + 1, 3)), np.empty((ready + 1, raw.shape[1], 4))
         n = _mend_and_block(
             raw,
@@ -129,15 +131,15 @@ class FrontEnd:
             self._close(blocks)
 
     def _ready(self, final: bool) -> int:
-        """Samples that can be used: their speed is known, and so is the sample after them."""
+        """Samples that can be used: their speed is known, and so are the samples after them."""
         if final:
             return self._t.size
         if not self._t.size or not self._speed_t.size:
             return 0
         until = self._speed_t[-1]
         if self._t[-1] > until + _HOLD_S:
-            return self._t.size - 1
-        return min(int(np.searchsorted(self._t, until, side="right")), self._t.size - 1)
+            return self._t.size - _AHEAD
+        return min(int(np.searchsorted(self._t, until, side="right")), self._t.size - _AHEAD)
 
     def _odometer(self, t: Floats) -> tuple[Floats, Floats]:
         """Distance and speed at times."""
@@ -189,16 +191,18 @@ def _neighbours(bar: MagnetometerBar) -> npt.NDArray[np.int64]:
 
 @nb.njit(cache=True, nogil=True)
 def _mend_and_block(raw, t, s, v, neighbours, previous, first, stale, total, open_, out_s, out_x):  # type: ignore[no-untyped-def]
-    """Mend samples 0..len(s)-1 of raw (one more is there to look at) and average them; returns the blocks closed."""
+    """Mend samples 0..len(s)-1 of raw (`_AHEAD` more are there to look at) and average them; returns the blocks
+    closed."""
     n_sensors = raw.shape[1]
     bend = np.empty(n_sensors)
     fine = np.empty(n_sensors, np.bool_)
     next_fine = np.empty(n_sensors, np.bool_)
+    told = np.empty((n_sensors, 3))  # what the samples before and after say
     blocks = 0
     for i in range(s.size):
         for j in range(n_sensors):
             fine[j] = _plausible(raw[i, j])
-            next_fine[j] = _plausible(raw[i + 1, j])
+            ahead = 1 if _plausible(raw[i + 1, j]) and not (raw[i + 1, j] == raw[i, j]).all() else 2
             if fine[j] and np.isnan(first[j, 0]):
                 first[j] = raw[i, j]
                 previous[0, j] = 0
@@ -206,10 +210,17 @@ def _mend_and_block(raw, t, s, v, neighbours, previous, first, stale, total, ope
             elif fine[j] and (raw[i, j] == previous[1, j]).all():
                 fine[j] = False
             previous[1, j] = raw[i, j]
+            if not fine[j] and ahead == 1 and _plausible(raw[i + 2, j]):
+                one = two = 0.0  # a spike may follow: the flatter way on is the likelier
+                for a in range(3):
+                    one += (raw[i + 1, j, a] - first[j, a] - previous[0, j, a]) ** 2
+                    two += (raw[i + 2, j, a] - first[j, a] - previous[0, j, a]) ** 2
+                ahead = 2 if one > two / 4 else 1
+            next_fine[j] = _plausible(raw[i + ahead, j])
             square = 0.0
             for a in range(3):
-                d = raw[i, j, a] - first[j, a] - (previous[0, j, a] + raw[i + 1, j, a] - first[j, a]) / 2
-                square += d * d
+                told[j, a] = (ahead * previous[0, j, a] + raw[i + ahead, j, a] - first[j, a]) / (ahead + 1)
+                square += (raw[i, j, a] - first[j, a] - told[j, a]) ** 2
             bend[j] = np.sqrt(square) if fine[j] and next_fine[j] else 0.0
         if open_[0] > 0 and s[i] - open_[1] > BLOCK_M:
             count = open_[0]
@@ -231,9 +242,7 @@ def _mend_and_block(raw, t, s, v, neighbours, previous, first, stale, total, ope
             if good and bend[j] > _SPIKE_UT and neighbours[j, 0] >= 0:
                 mismatch = 0.0
                 for a in range(3):
-                    now = raw[i, j, a] - first[j, a]
-                    d = now - (previous[0, j, a] + raw[i + 1, j, a] - first[j, a]) / 2
-                    mismatch += (previous[0, j, a] - (previous[2, j, a] + now) / 2 + d / 2) ** 2
+                    mismatch += (previous[0, j, a] - (previous[2, j, a] + told[j, a]) / 2) ** 2
                 around = 4.0
                 for q in range(2):
                     if neighbours[j, q] >= 0:
@@ -247,7 +256,7 @@ def _mend_and_block(raw, t, s, v, neighbours, previous, first, stale, total, ope
                 if good:
                     previous[0, j, a] = raw[i, j, a] - first[j, a]
                 elif next_fine[j] and not np.isnan(first[j, 0]):
-                    previous[0, j, a] = (previous[0, j, a] + raw[i + 1, j, a] - first[j, a]) / 2
+                    previous[0, j, a] = told[j, a]
                 total[j, a] += previous[0, j, a]
             total[j, 3] += good
     return blocks

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from app.decoders.magnet.iron import BEYOND_M, why_iron
 from app.decoders.magnet.readings import NoiseKind
-from app.decoders.magnet.region import LIMIT_MISFIT, LIMIT_PRIOR, MOMENT_SPREAD, Dipole, Expectation
+from app.decoders.magnet.window import LIMIT_MISFIT, MOMENT_SPREAD, Dipole, Expectation
 from app.markers.magnet import Orientation, Polarity
 
 Floats = npt.NDArray[np.float64]
@@ -18,13 +19,8 @@ Floats = npt.NDArray[np.float64]
 LEAST_ENERGY = 40.0
 """chi-squared that a magnet explains; noise alone reaches it less than once in 1000 km."""
 _LEAST_MARGIN = 4.0
-_NEAREST_M = 0.4
-_CROWD_M = 0.8
-_MIXED_M = 0.9
-"""Lines and tags keep apart by more than this. [m]"""
-_CROWD_ENERGY = 60.0
-_CROWD_SHARE = 0.1
-_BEYOND_M = 0.10
+_LIMIT_UNLIKE, _LIMIT_SHAPE = 12.0, 8.0
+"""How unlike a magnet's its clearance, moment and axis may be, and the latter two alone."""
 
 
 class ClearanceTracker:
@@ -40,7 +36,10 @@ class ClearanceTracker:
         if len(self._seen) < 3:
             return Expectation(self._moment)
         clearance = float(np.median(self._seen))
-        return Expectation(self._moment, clearance, 0.025 if len(self._seen) >= 6 else 0.04)
+        if len(self._seen) < 6:
+            return Expectation(self._moment, clearance, 0.04)
+        spread = 1.5 * float(np.median(np.abs(np.array(self._seen) - clearance))) / 0.6745
+        return Expectation(self._moment, clearance, min(max(spread, 0.025), 0.04))
 
     def learn(self, dipole: Dipole) -> None:
         """Take a sure magnet into account."""
@@ -50,59 +49,50 @@ class ClearanceTracker:
 Verdict = tuple[Orientation, Polarity, float] | tuple[NoiseKind, str]
 
 
-def judge_region(dipoles: Sequence[Dipole], expected: Expectation, half_width_m: float) -> list[Verdict]:
+def judge_region(
+    dipoles: Sequence[Dipole], before: Sequence[Dipole], expected: Expectation, half_width_m: float
+) -> list[Verdict]:
     """Orientation, polarity and confidence of each dipole of a region that is a magnet, or why it is none.
 
     Parameters
     ----------
-    dipoles : sequence of Dipole
+    dipoles, before : sequence of Dipole
+        Of the region, and of those before it.
     expected : Expectation
     half_width_m : float
         Of the array. [m]
-
-    Notes
-    -----
-    Iron seldom has one pole. So what stands close to other poles is iron: nearer than two magnets are ever placed, or
-    beside something that is clearly no magnet.
     """
-    return [_crowded(d, dipoles) or _judge(d, expected, half_width_m) for d in dipoles]
-
-
-def _crowded(dipole: Dipole, dipoles: Sequence[Dipole]) -> Verdict | None:
-    reach = max(_CROWD_M, 3 * float(dipole.params[2]))
-    for other in dipoles:
-        if other is dipole or other.explained < max(_CROWD_ENERGY, _CROWD_SHARE * dipole.explained):
-            continue
-        along, across = abs(dipole.params[:2] - other.params[:2])
-        apart = math.hypot(along, across)
-        if apart > reach:
-            continue
-        mixed = other.kind != dipole.kind and apart < _MIXED_M
-        in_row = across < 0.15 and along > _NEAREST_M
-        unlike = other.misfit > 2 * LIMIT_MISFIT or other.prior_cost > 2.5 * LIMIT_PRIOR if in_row else other.unlike
-        if unlike or mixed or along < _NEAREST_M or (across > 0.3 and apart < _CROWD_M):
-            return NoiseKind.FERROUS, f"another pole {100 * apart:.0f} cm away that no magnet has"
-    return None
+    around = [*before, *dipoles]
+    verdicts: list[Verdict] = []
+    for dipole in dipoles:
+        iron = why_iron(dipole, around, half_width_m)
+        verdicts.append((NoiseKind.FERROUS, iron) if iron else _judge(dipole, expected, half_width_m))
+    return verdicts
 
 
 def _judge(dipole: Dipole, expected: Expectation, half_width_m: float) -> Verdict:
     y, moment = float(dipole.params[1]), dipole.params[3:]
     size = float(np.linalg.norm(moment))
     snr = math.sqrt(max(dipole.explained, 0.0))
+    off_height = (float(dipole.params[2]) - expected.clearance_m) / expected.clearance_std_m
     if dipole.explained < LEAST_ENERGY:
         return NoiseKind.WEAK, f"explains {dipole.explained:.0f} of {LEAST_ENERGY:.0f} noise variances"
-    if abs(y) > half_width_m + _BEYOND_M:
+    if abs(y) > half_width_m + BEYOND_M:
         return NoiseKind.BESIDE, f"{100 * (abs(y) - half_width_m):.0f} cm beyond the bar"
     if dipole.misfit > LIMIT_MISFIT:
         return NoiseKind.FERROUS, f"{dipole.misfit:.0%} of its field is not that of a dipole, {LIMIT_MISFIT:.0%} may be"
-    if dipole.prior_cost > LIMIT_PRIOR or not 0.5 < size / expected.moment_am2 < 1.7:
+    if (
+        dipole.prior_cost > _LIMIT_UNLIKE
+        or dipole.prior_cost - off_height**2 > _LIMIT_SHAPE
+        or not 0.5 < size / expected.moment_am2 < 1.7
+    ):
         return _why_unlike(dipole, expected)
     orientation = Orientation.UP if dipole.kind == 2 else Orientation.FORWARD
     polarity = Polarity.N if moment[dipole.kind] > 0 else Polarity.S
     if dipole.margin < _LEAST_MARGIN:
         return NoiseKind.SKEW, f"upright and forward fit alike: {dipole.margin:.1f} apart, {_LEAST_MARGIN:g} are needed"
     doubt = math.exp(-dipole.margin / 2) + math.exp(-0.5 * max(snr - 4.5, 0.0))
-    doubt += 0.02 * dipole.prior_cost / LIMIT_PRIOR + 0.2 * dipole.misfit
+    doubt += 0.02 * dipole.prior_cost / _LIMIT_UNLIKE + 0.2 * dipole.misfit
     return orientation, polarity, float(min(max(1 - doubt, 0.05), 0.9999))
 
 
