@@ -8,8 +8,6 @@ import numpy as np
 
 from app.decoders.magnet.book import TagBook
 from app.decoders.magnet.decoder import VERSION, MagnetDecoder
-from app.decoders.magnet.metro import VERSION as METRO_VERSION
-from app.decoders.magnet.metro import decode_trace_metro
 from app.decoders.magnet.readings import Finding
 from app.decoders.traces.read import read_trace
 from app.errors import UnreadableUpload
@@ -39,22 +37,25 @@ def _decode_recording(task: TraceTask) -> TraceResult:
     file = read_trace({task.name: task.data}, terms.declaration, task.limits)
     loaded = time.perf_counter()
     trace = file.trace
-    findings = _decode(task, terms, trace)
+    findings, version = _decode(task, terms, trace)
     decoded = time.perf_counter()
     return TraceResult(
         tuple(findings),
         file.report,
         _driven_m(trace),
-        METRO_VERSION if terms.method == "metro" else VERSION,
+        version,
         plot_trace(trace, terms.bar, findings).encode(),
         1e3 * (loaded - began),
         1e3 * (decoded - loaded),
     )
 
 
-def _decode(task: TraceTask, terms: TraceTerms, trace: MagnetTrace) -> list[Finding]:
+def _decode(task: TraceTask, terms: TraceTerms, trace: MagnetTrace) -> tuple[list[Finding], str]:
+    """Findings, and the decoder's version."""
     if terms.method == "metro":
-        return decode_trace_metro(trace, terms.bar)
+        from app.decoders.magnet import metro  # only here: scipy.signal takes most of a second to load
+
+        return metro.decode_trace_metro(trace, terms.bar), metro.VERSION
     tags = [tag for text in task.tags if isinstance(tag := parse_tag(text), InformationTag)]
     book = TagBook(designs=tags) if tags else TagBook(formats=terms.formats or task.formats)
     decoder = MagnetDecoder(terms.bar, book=book)
@@ -62,7 +63,7 @@ def _decode(task: TraceTask, terms: TraceTerms, trace: MagnetTrace) -> list[Find
     for start in range(0, len(trace.t_s), _CHUNK):
         end_s = trace.t_s[start + _CHUNK] if start + _CHUNK < len(trace.t_s) else np.inf
         found += decoder.feed(trace.between(trace.t_s[start] if start else -np.inf, end_s))
-    return found + decoder.finish()
+    return found + decoder.finish(), VERSION
 
 
 def _driven_m(trace: MagnetTrace) -> float:
