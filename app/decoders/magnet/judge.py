@@ -19,8 +19,9 @@ Floats = npt.NDArray[np.float64]
 LEAST_ENERGY = 40.0
 """chi-squared that a magnet explains; noise alone reaches it less than once in 1000 km."""
 _LEAST_MARGIN = 4.0
-_LIMIT_UNLIKE, _LIMIT_SHAPE = 12.0, 8.0
-"""How unlike a magnet's its clearance, moment and axis may be, and the latter two alone."""
+_LIMIT_UNLIKE, _LIMIT_DEEP, _LIMIT_SHAPE = 12.0, 7.5, 8.0
+"""How unlike a magnet's its clearance, moment and axis may be; where it lies deeper than the road, as iron that is too
+weak does; and its moment and axis alone."""
 
 
 class ClearanceTracker:
@@ -72,20 +73,14 @@ def judge_region(
 
 def _judge(dipole: Dipole, expected: Expectation, half_width_m: float) -> Verdict:
     y, moment = float(dipole.params[1]), dipole.params[3:]
-    size = float(np.linalg.norm(moment))
     snr = math.sqrt(max(dipole.explained, 0.0))
-    off_height = (float(dipole.params[2]) - expected.clearance_m) / expected.clearance_std_m
     if dipole.explained < LEAST_ENERGY:
         return NoiseKind.WEAK, f"explains {dipole.explained:.0f} of {LEAST_ENERGY:.0f} noise variances"
     if abs(y) > half_width_m + BEYOND_M:
         return NoiseKind.BESIDE, f"{100 * (abs(y) - half_width_m):.0f} cm beyond the bar"
     if dipole.misfit > LIMIT_MISFIT:
         return NoiseKind.FERROUS, f"{dipole.misfit:.0%} of its field is not that of a dipole, {LIMIT_MISFIT:.0%} may be"
-    if (
-        dipole.prior_cost > _LIMIT_UNLIKE
-        or dipole.prior_cost - off_height**2 > _LIMIT_SHAPE
-        or not 0.5 < size / expected.moment_am2 < 1.7
-    ):
+    if _is_unlike(dipole, expected):
         return _why_unlike(dipole, expected)
     orientation = Orientation.UP if dipole.kind == 2 else Orientation.FORWARD
     polarity = Polarity.N if moment[dipole.kind] > 0 else Polarity.S
@@ -94,6 +89,14 @@ def _judge(dipole: Dipole, expected: Expectation, half_width_m: float) -> Verdic
     doubt = math.exp(-dipole.margin / 2) + math.exp(-0.5 * max(snr - 4.5, 0.0))
     doubt += 0.02 * dipole.prior_cost / _LIMIT_UNLIKE + 0.2 * dipole.misfit
     return orientation, polarity, float(min(max(1 - doubt, 0.05), 0.9999))
+
+
+def _is_unlike(dipole: Dipole, expected: Expectation) -> bool:
+    off_height = (float(dipole.params[2]) - expected.clearance_m) / expected.clearance_std_m
+    if dipole.prior_cost > (_LIMIT_DEEP if off_height > 0 else _LIMIT_UNLIKE):
+        return True
+    size = float(np.linalg.norm(dipole.params[3:])) / expected.moment_am2
+    return dipole.prior_cost - off_height**2 > _LIMIT_SHAPE or not 0.5 < size < 1.7
 
 
 def _why_unlike(dipole: Dipole, expected: Expectation) -> tuple[NoiseKind, str]:
