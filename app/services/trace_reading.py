@@ -189,8 +189,11 @@ def fix_from_tag(reading: TagReading, row: Row, layout: MagnetLayout, bar: Magne
     heading = math.radians(bearing_deg) + turn
     forward = np.array([math.sin(heading), math.cos(heading)])
     left = np.array([-forward[1], forward[0]])
+    # the tag's own length takes the scale of the vehicle's speed out
+    span_m = abs(holes[chosen[-1]].along_m - holes[chosen[0]].along_m)
+    left_over_m = (along_m[-1] - along_m) * span_m / (along_m[-1] - along_m[0])
     # each magnet tells where the bar's middle is at the last one
-    middles = points_m + (along_m[-1] - along_m)[:, None] * forward - lateral_m[:, None] * left
+    middles = points_m + left_over_m[:, None] * forward - lateral_m[:, None] * left
     array = bar.positions_m[bar.array]
     bar_m = np.array([array[:, 0].mean(), (array[:, 1].max() + array[:, 1].min()) / 2])
     place = middles.mean(axis=0) - bar_m[0] * forward - bar_m[1] * left

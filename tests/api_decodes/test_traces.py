@@ -19,6 +19,7 @@ from app.geodesy import enu_from_wgs84, wgs84_from_enu
 from app.markers.magnet import InformationTag, Polarity, parse_tag
 from app.services.decode_rules import DecodeRules
 from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
+from app.simulation.magnetic.readout import CanBus
 from app.simulation.magnetic.recorder import write_array_stream, write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
 from app.simulation.magnetic.vehicle import Course, Vehicle
@@ -277,3 +278,13 @@ def test_frames_have_no_plot_and_traces_no_annotation(client: httpx.Client, plac
     assert client.get(f"/v1/decodes/{decode['id']}/annotated.png").status_code == 404
     assert client.get(decode["links"]["plot"], headers={"If-None-Match": f'"{decode["id"]}-plot"'}).status_code == 304
     assert json.loads(client.get("/v1/decodes?limit=1").text)["items"][0]["kind"] == "trace"
+
+
+def test_a_wrong_scale_of_the_speed_does_not_move_the_fix(client: httpx.Client, place: Place) -> None:
+    drive = _drive(14, can=CanBus(speed_scale=0.04))
+    decode = post_frame(client, _zipped(write_recorder_files(drive.trace)), place.context, name="drive.zip").json()
+    assert len(decode["tags"]) == 3
+    for number, tag in enumerate(decode["tags"]):
+        last = [m for m in drive.magnets if m.tag == number][-1]
+        _across_m, along_m = place.across_along_m(tag["fix"], _AT_M[number] + 4.0)
+        assert abs(along_m - (tag["fix"]["t_s"] - last.t_s) * last.speed_m_s) < 0.02
