@@ -55,7 +55,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder to write to; created if need be.")] = Path("demo-out"),
     serve: Annotated[bool, typer.Option("--serve", help="Leave the server running to look around in.")] = False,
 ) -> None:
-    """Register plates on a real lane, write their artwork, decode a simulated drive over them; one table."""
+    """Register plates and magnets, write artwork and drilling sheets, decode simulated drives over them; two tables."""
     from app.demo import run_demo
 
     if not run_demo(out, say=lambda line: typer.echo(line), keep_serving=serve):

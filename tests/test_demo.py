@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import itertools
 import json
@@ -10,22 +11,29 @@ import re
 import subprocess
 import sys
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
 from app.demo.drive import DATA, drive_over, list_plates
 from app.demo.lane import list_lane_places
-from app.demo.table import Pass, draw_table
+from app.demo.magnets import LENGTH_M, TAGS_M, Built, Lane, build, list_drives
+from app.demo.server import LocalServer
+from app.demo.table import Pass, draw_table, draw_trace_table
+from app.demo.traces import drive_and_judge, judge_drive
 from app.geodesy import enu_from_wgs84
 from app.markers.plate import PlateCode
+from app.simulation.magnetic.drive import simulate_drive
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.slow
-def test_the_demo_reads_every_plate(tmp_path: Path) -> None:
+def test_the_demo_reads_every_plate_and_tag(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from app.cli import main; main()", "demo", "--out", str(tmp_path / "out")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=290)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -36,7 +44,25 @@ def test_the_demo_reads_every_plate(tmp_path: Path) -> None:
         assert int(wrong) == 0
         assert float(error_cm) < 10
     assert re.search(r"paper, figure 10 .* 11 +4", done.stdout)
+    drives = re.findall(
+        r"^[a-z, ]+ (\d+) cm +\d+ +(\d+) of (\d+) +5 of 5 +5 +0 +([05]) +([01]\.\d+) ± \S+ +([\d.]+) +([\d.]+) "
+        r" .* (\d+)$",
+        done.stdout,
+        re.MULTILINE,
+    )
+    assert [(row[0], row[3]) for row in drives] == [("16", "0"), ("30", "0"), ("16", "5")]
+    for _clearance, found, passed, _flagged, ratio, along_cm, across_cm, false in drives:
+        assert int(found) == int(passed) >= 15
+        assert int(false) == 0
+        assert abs(float(ratio) - 1) < 0.01
+        assert float(along_cm) < 3
+        assert float(across_cm) < 3
+    assert re.search(r"^ordinary .* 1 of 1 +1 of 1 ", done.stdout, re.MULTILINE)
+    assert re.search(r"METRO, curvy road .* 0\.965 ± 0\.044", done.stdout)
     out = tmp_path / "out"
+    assert len(list((out / "layouts").glob("*.pdf"))) == 7
+    assert (out / "trace.svg").read_text().startswith("<svg")
+    assert len(zipfile.ZipFile(out / "drive.zip").namelist()) == 3
     assert {path.suffix for path in (out / "artwork").iterdir()} == {".svg", ".pdf", ".dxf", ".png"}
     assert "023792168411.pdf" in {path.name for path in (out / "artwork").iterdir()}
     assert len(json.loads(zipfile.ZipFile(out / "artwork.zip").read("manifest.json"))["plates"]) == 6
@@ -82,3 +108,67 @@ def test_one_wrong_reading_fails_the_demo() -> None:
     assert [p.is_good for p in (good, wrong, unmatched)] == [True, False, False]
     table = draw_table([good, wrong])
     assert re.search(r"mean of a drive +11\.0 +4\.0 +0\.5 +4\.0 +1\.0 +0\.10", table)
+
+
+@pytest.fixture(scope="module")
+def local_client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """A server of its own."""
+    with LocalServer(tmp_path_factory.mktemp("demo")) as server, server.client() as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def built(local_client: httpx.Client, tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """Magnets registered and surveyed."""
+    return build(local_client, tmp_path_factory.mktemp("layouts"), np.random.default_rng(3))
+
+
+def test_a_drive_on_the_wrong_way_is_read_flagged_and_placed(local_client: httpx.Client, built: Built) -> None:
+    drive = list_drives()[2]
+    result, decode, _recording, _context = drive_and_judge(local_client, built, drive, np.random.default_rng(3))
+    assert result.is_good
+    assert (result.right, result.matched, result.flagged, result.wrong, result.false) == (5, 5, 5, 0, 0)
+    assert result.found == result.passed == 15
+    assert max(map(abs, result.along_m + result.across_m)) < 0.04
+    assert re.search(r"^wrong way +16 cm +40 +15 of 15 +5 of 5 +5 +0 +5 ", draw_trace_table([result]), re.MULTILINE)
+    scene, lane = built.scene(drive)
+    simulated = simulate_drive(scene, np.random.default_rng(3))
+
+    def judged(change: Any) -> Any:
+        changed = copy.deepcopy(decode)
+        change(changed)
+        return judge_drive(built, drive, lane, simulated, changed)
+
+    assert judged(lambda d: None) == result
+    legal = judged(lambda d: d["tags"][2].update(direction="legal"))
+    assert (legal.flagged, legal.is_good) == (4, False)
+    other = judged(lambda d: d["tags"][2].update(tag=d["tags"][0]["tag"]))
+    assert (other.right, other.wrong, other.is_good) == (4, 1, False)
+    stray = judged(lambda d: d["tags"].append({**d["tags"][0], "start_s": 1.0}))
+    assert (stray.wrong, stray.is_good) == (1, False)
+    astray = judged(lambda d: d["tags"][1]["fix"].update(d["tags"][2]["fix"]))
+    assert not astray.is_good
+    twice = judged(lambda d: d["magnets"].append(dict(d["magnets"][0])))
+    assert (twice.found, twice.false) == (15, 1)
+    flipped = judged(lambda d: d["magnets"][0].update(phi_deg=90))
+    assert (flipped.found, flipped.false) == (14, 0)
+
+
+def test_departures_are_told_once_each(local_client: httpx.Client, built: Built) -> None:
+    drive = list_drives()[0]
+    result, decode, _recording, _context = drive_and_judge(local_client, built, drive, np.random.default_rng(4))
+    assert result.is_good
+    assert result.departures == {"dashed": (1, 1, 0), "solid": (1, 1, 0)}
+    scene, lane = built.scene(drive)
+    simulated = simulate_drive(scene, np.random.default_rng(4))
+    decode["crossings"][1]["side"] = "left"
+    again = judge_drive(built, drive, lane, simulated, {**decode, "crossings": decode["crossings"][1:]})
+    assert again.departures == {"dashed": (0, 1, 0), "solid": (0, 1, 1)}
+
+
+def test_the_lane_driven_backwards_is_the_same_line() -> None:
+    lane = Lane.legal()
+    back = lane.reversed()
+    for at, left in ((0.0, 0.0), (TAGS_M[2], 1.75), (LENGTH_M, -1.75)):
+        assert back.lon_lat(LENGTH_M - at, -left) == pytest.approx(lane.lon_lat(at, left), abs=1e-11)
+        assert lane.project_m(*lane.lon_lat(at, left)) == pytest.approx((at, left), abs=1e-4)

@@ -1,4 +1,4 @@
-"""`waymark demo`: from surveyed plates on a real lane to a decoded drive, over HTTP, in one table."""
+"""`waymark demo`: from plates and magnets on a lane to decoded drives, over HTTP, in a table each."""
 
 from app.demo.run import run_demo
 

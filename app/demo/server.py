@@ -13,7 +13,7 @@ from types import TracebackType
 
 import httpx
 
-from app.errors import Unavailable
+from app.errors import Unavailable, WaymarkError
 
 _START_TIMEOUT_S = 180.0
 
@@ -88,3 +88,18 @@ class LocalServer:
                     last = self._log_path.read_text(errors="replace")[-2000:]
                     raise Unavailable(f"the demo's server did not start:\n{last}", cure="see the log above")
                 time.sleep(0.1)
+
+
+def checked(answer: httpx.Response) -> httpx.Response:
+    """The answer.
+
+    Raises
+    ------
+    WaymarkError
+        The server refused the request.
+    """
+    if answer.is_error:
+        raise WaymarkError(
+            f"{answer.request.method} {answer.request.url.path} answered {answer.status_code}: {answer.text}"
+        )
+    return answer

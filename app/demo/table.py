@@ -1,4 +1,4 @@
-"""The demo's one table."""
+"""The demo's tables: plates, and magnets."""
 
 from __future__ import annotations
 
@@ -7,7 +7,22 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+FIX_WITHIN_M = 0.5
+"""A position at a tag that is farther off is wrong. [m]"""
 PAPER_IN_VIEW, PAPER_DECODED = 11, 4  # figure 10 at 30 km/h and 30 frames a second
+_METRO: tuple[tuple[str, ...], ...] = (
+    ("METRO, figure 13a", "", "48", "0.97 / 1.00"),
+    ("METRO, figure 14b", "25 cm", "", "1.00 / 1.00"),
+    ("METRO, figure 14b", "30 cm", "", "0.87 / 0.93"),
+    ("METRO, figure 14", "35 cm", "", "0.47 / 0.67", "0.50"),
+    ("METRO, parked cars", "", "48", "", "", "", "", "", "0.989 ± 0.019"),
+    ("METRO, curvy road", "", "16", "", "", "", "", "", "0.965 ± 0.044"),
+)
+"""The paper's field trials: lying / upright magnets, tags, deviation ratio."""
+_TRACE_HEAD = (
+    "drive", "clearance", "km/h", "magnets", "tags", "matched", "wrong", "wrong way", "ratio", "along [cm]",
+    "across [cm]", "dashed", "solid", "false",
+)  # fmt: skip
 _HEAD = ("plate", "scheme", "digits", "in view", "decoded", "wrong", "matched", "position [cm]", "heading [deg]")
 
 
@@ -38,6 +53,49 @@ class Pass:
         return enough and self.wrong == 0
 
 
+@dataclass(slots=True)
+class TraceResult:
+    """What came of one drive.
+
+    Attributes
+    ----------
+    passed, found, false : int
+        Magnets under the bar, those of them read with the right polarity and orientation, readings that are no magnet.
+    tags, right, matched, wrong, flagged : int
+        Tags there are, read right, found in the registry as themselves, read as something else, told to be passed the
+        wrong way.
+    deviations : list of float
+        Measured over true distance ratio.
+    along_m, across_m : list of float
+        Errors of the vehicle's position at a tag. [m]
+    departures : dict of style to (told right, true, told wrong)
+    """
+
+    name: str
+    clearance_m: float
+    speed_kmh: float
+    wrong_way: bool
+    tags: int
+    passed: int = 0
+    found: int = 0
+    false: int = 0
+    right: int = 0
+    matched: int = 0
+    wrong: int = 0
+    flagged: int = 0
+    deviations: list[float] = field(default_factory=list)
+    along_m: list[float] = field(default_factory=list)
+    across_m: list[float] = field(default_factory=list)
+    departures: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+
+    @property
+    def is_good(self) -> bool:
+        """All tags were read right, matched, placed and passed the way that they were told to be; nothing was wrong."""
+        near = sum(math.hypot(*off_m) < FIX_WITHIN_M for off_m in zip(self.along_m, self.across_m, strict=True))
+        whole = self.right == self.matched == near == self.tags
+        return whole and self.wrong == 0 and self.flagged == (self.tags if self.wrong_way else 0)
+
+
 def draw_table(passes: Sequence[Pass]) -> str:
     """Table of passes, their sum per drive, and the paper's row beside them."""
     rows = [_row(p) for p in passes]
@@ -51,12 +109,53 @@ def draw_table(passes: Sequence[Pass]) -> str:
     rows.append(
         ("paper, figure 10", "position", "023792168411", f"{PAPER_IN_VIEW}", f"{PAPER_DECODED}", "-", "-", "-", "-")
     )
-    widths = [max(len(row[k]) for row in (_HEAD, *rows)) for k in range(len(_HEAD))]
-    lines = [_line(_HEAD, widths), "  ".join("-" * width for width in widths)]
-    lines += [_line(row, widths) for row in rows[:count]]
-    lines += ["  ".join("-" * width for width in widths)]
-    lines += [_line(row, widths) for row in rows[count:]]
-    return "\n".join(lines)
+    return _draw(_HEAD, rows[:count], rows[count:], left=3)
+
+
+def draw_trace_table(results: Sequence[TraceResult]) -> str:
+    """Table of drives over magnets, with the paper's field trials below."""
+    blank = ("",) * len(_TRACE_HEAD)
+    return _draw(
+        _TRACE_HEAD,
+        [_trace_row(result) for result in results],
+        [(row + blank)[: len(blank)] for row in _METRO],
+        left=1,
+    )
+
+
+def _trace_row(r: TraceResult) -> tuple[str, ...]:
+    ratio = f"{statistics.mean(r.deviations):.3f} ± {statistics.stdev(r.deviations):.3f}" if r.deviations[1:] else "-"
+    departures = (
+        (f"{right} of {true}" if true else "-") + (f" + {bad} bad" if bad else "")
+        for right, true, bad in r.departures.values()
+    )
+    return (
+        r.name,
+        f"{100 * r.clearance_m:.0f} cm",
+        f"{r.speed_kmh:.0f}",
+        f"{r.found} of {r.passed}",
+        f"{r.right} of {r.tags}",
+        f"{r.matched}",
+        f"{r.wrong}",
+        f"{r.flagged}",
+        ratio,
+        _rms(r.along_m),
+        _rms(r.across_m),
+        *departures,
+        f"{r.false}",
+    )
+
+
+def _rms(errors_m: Sequence[float]) -> str:
+    return f"{100 * math.sqrt(statistics.fmean(e * e for e in errors_m)):.1f}" if errors_m else "-"
+
+
+def _draw(head: Sequence[str], rows: Sequence[Sequence[str]], below: Sequence[Sequence[str]], *, left: int) -> str:
+    """Rows and those to compare them with; the first columns are texts, the others numbers."""
+    widths = [max(len(row[k]) for row in (head, *rows, *below)) for k in range(len(head))]
+    rule = "  ".join("-" * width for width in widths)
+    lines = [_line(head, widths, left), rule, *(_line(row, widths, left) for row in rows)]
+    return "\n".join([*lines, rule, *(_line(row, widths, left) for row in below)])
 
 
 def _row(p: Pass) -> tuple[str, ...]:
@@ -76,7 +175,7 @@ def _median(values: Sequence[float], scale: float, places: int) -> str:
     return f"{scale * statistics.median(finite):.{places}f}" if finite else "-"
 
 
-def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    text = [cell.ljust(width) for cell, width in zip(cells[:3], widths[:3], strict=True)]
-    numbers = [cell.rjust(width) for cell, width in zip(cells[3:], widths[3:], strict=True)]
+def _line(cells: Sequence[str], widths: Sequence[int], left: int) -> str:
+    text = [cell.ljust(width) for cell, width in zip(cells[:left], widths[:left], strict=True)]
+    numbers = [cell.rjust(width) for cell, width in zip(cells[left:], widths[left:], strict=True)]
     return "  ".join(text + numbers).rstrip()
