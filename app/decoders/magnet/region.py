@@ -26,9 +26,11 @@ _POLISH = 6
 """Most magnets that are fitted together."""
 _ENOUGH = 4
 _MAX_FAILED = 3
+_MAX_JOINT_FITS = 12
+_ROW_WIDTH_M = 0.3
 _TOGETHER_M = 1.1
 _SAME_M = 0.3
-_MAX_TOGETHER = 4
+_MAX_TOGETHER = 3
 _FIELD_M = 2.0
 _CHANGE_M, _CHANGE_HEIGHTS = 0.9, 3.0
 """Reach of a magnet's field, and of what it changes in the filters' results. [m]"""
@@ -88,9 +90,16 @@ class RegionFitter:
         if iron:
             return found
         for cluster in _clusters(found):
+            if self._is_slow(region, found):
+                return found
             if _doubtful(cluster) and 2 * sum(d.unlike for d in cluster) <= len(cluster):
                 found = self._rekind(region, found, cluster)
         return self._polish(region, found)
+
+    def _is_slow(self, region: _Region, found: list[Dipole]) -> bool:
+        """Whether the fits took so much that only a row of magnets is worth more."""
+        width = np.ptp([d.params[1] for d in found]) if found else 0.0
+        return bool(region.window.joint_fits > _MAX_JOINT_FITS and width > _ROW_WIDTH_M)
 
     def _rekind(self, region: _Region, found: list[Dipole], cluster: list[Dipole]) -> list[Dipole]:
         """Explain a cluster by magnets of one kind, if that is as likely."""
@@ -159,13 +168,13 @@ class RegionFitter:
             ):
                 left[max(k - 3, 0) : k + 4] = 0  # the fit does not bear out what the filters saw
                 failed += 1
-                if failed >= _MAX_FAILED and failed > len(found):
+                if (failed >= _MAX_FAILED and failed > len(found)) or self._is_slow(region, found):
                     return found, True
                 continue
             for i, dipole in zip(group, fitted, strict=False):
                 found[i] = replace(dipole, margin=found[i].margin)
             found.append(added)
-            if is_iron(found, self._half_width_m):
+            if is_iron(found, self._half_width_m) or self._is_slow(region, found):
                 return found, True
             if len(found) in (_ENOUGH, 2 * _ENOUGH) and 2 * sum(d.unlike for d in found) > len(found):
                 found = self._polish(region, found)

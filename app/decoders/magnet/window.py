@@ -102,6 +102,8 @@ class Window:
         self._alpha = alpha
         self._quiet = quiet[:, :, None]
         self._height_m = expected.clearance_m
+        self.joint_fits = 0
+        """Fits of two or more magnets so far: what takes time."""
 
     def fit_kinds(
         self, known: list[Dipole], starts: dict[int, Floats], others: list[Dipole], expected: Expectation
@@ -149,6 +151,7 @@ class Window:
         if near.size < len(positions):  # the others see next to nothing
             data, weight = np.ascontiguousarray(data[near]), np.ascontiguousarray(weight[near])
             alpha = alpha * near.size / len(positions)
+        self.joint_fits += len(starts) > 1
         params, covariance, explained, local, prior_costs = fit_dipoles(
             s, data, weight, delays, positions[near], basis, alpha, start, np.array(kinds), expected.prior, 9
         )
