@@ -87,8 +87,10 @@ def _quad_around(contour: npt.NDArray[Any]) -> tuple[float, Array] | None:
         return None
     hull = cv2.convexHull(contour)
     area = cv2.contourArea(hull)
+    if len(hull) < 4 or area < 40:
+        return None
     corners = cv2.approxPolyN(hull, 4, ensure_convex=True).reshape(-1, 2).astype(float)
-    if len(corners) != 4 or area < 40:
+    if len(corners) != 4:
         return None
     fill = area / max(cv2.contourArea(corners.astype(np.float32)), 1.0)
     if not LEAST_FILL < fill < 1.6:

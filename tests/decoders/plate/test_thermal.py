@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -37,3 +38,9 @@ def test_warm_and_cold_are_not_exchanged() -> None:
     inverted = 255 - shoot_warm(PAPER, 0.0).image
     readings = decode_plates(inverted, thermal=True)
     assert [r.digits for r in readings if r.outcome is PlateOutcome.READ] == []
+
+
+def test_a_warm_triangle_is_no_plate() -> None:
+    frame = np.full((200, 240), 60, np.uint8)
+    cv2.fillPoly(frame, [np.array([[40, 150], [200, 150], [120, 20]], np.int32)], 200)
+    assert decode_plates(frame, thermal=True) == []
