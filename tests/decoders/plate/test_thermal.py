@@ -42,5 +42,5 @@ def test_warm_and_cold_are_not_exchanged() -> None:
 
 def test_a_warm_triangle_is_no_plate() -> None:
     frame = np.full((200, 240), 60, np.uint8)
-    cv2.fillPoly(frame, [np.array([[40, 150], [200, 150], [120, 20]], np.int32)], 200)
+    cv2.fillPoly(frame, [np.array([[40, 40], [160, 40], [40, 160]], np.int32)], 200)
     assert decode_plates(frame, thermal=True) == []
