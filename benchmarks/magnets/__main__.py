@@ -156,7 +156,7 @@ def _tag_row(name: str, ours: TagTally, goal: float, peer: TagTally, paper: str)
 
 def run_ratio(seed: int, short: bool) -> Result:
     """Deviation ratio."""
-    n = 30 if short else 80
+    n = 80 if short else 200  # the mean of 30 is off by 0.003 by chance alone
     form, bend = TagFormat(3, 4.0, 1.0), TagFormat(3, 6.0, 1.0)
     length = scenes.LEAD_M + n * 15
     stops = [(float(a), v) for a, v in zip(np.arange(0, length + 80, 40), (16.0, 7.0) * n, strict=False)]
@@ -225,7 +225,7 @@ def run_false(seed: int, short: bool) -> Result:
     rows: list[Sequence[object]] = []
     for name, town, clearance, goal in (
         ("town, 16 cm", True, 0.16, 0.2), ("ferrous set, 16 cm", False, 0.16, 1.0),
-        ("town, 30 cm", True, 0.30, None), ("ferrous set, 30 cm", False, 0.30, None),
+        ("town, 30 cm", True, 0.30, 0.2), ("ferrous set, 30 cm", False, 0.30, 1.0),
     ):  # fmt: skip
         found, metro, km = 0, 0, 0.0
         for k in range(1 if short else 3):
@@ -239,8 +239,7 @@ def run_false(seed: int, short: bool) -> Result:
             found += judge_magnets(drive, decode_trace(drive.trace, BAR)).extra
             metro += judge_magnets(drive, _metro(drive)).extra
         rate = found / km
-        met = "-" if goal is None else _met(rate <= goal)
-        rows.append((name, f"{km:.1f}", found, f"{rate:.2f}", goal or "-", met, f"{metro / km:.0f}", "0"))
+        rows.append((name, f"{km:.1f}", found, f"{rate:.2f}", goal, _met(rate <= goal), f"{metro / km:.0f}", "0"))
     return "Readings where there is no magnet.", ("road", "km", "false", "a km", "goal", "met", "metro", "paper"), rows
 
 
