@@ -97,6 +97,8 @@ def test_benchmark_blocks_are_filled_by_name_and_nothing_else_changes() -> None:
 
 
 def test_every_benchmark_has_its_block() -> None:
-    from benchmarks.plates.__main__ import ITEMS
+    from benchmarks.magnets.__main__ import ITEMS as MAGNETS
+    from benchmarks.plates.__main__ import ITEMS as PLATES
 
-    assert re.findall(r"<!-- bench:([\w-]+) -->", README) == ["demo", "run", *ITEMS, "bundle", "http"]
+    magnets = [f"magnets-{item}" for item in ("run", *MAGNETS)]
+    assert re.findall(r"<!-- bench:([\w-]+) -->", README) == ["demo", "run", *PLATES, *magnets, "bundle", "http"]

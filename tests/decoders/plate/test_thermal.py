@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from app.decoders.plate import decode_plates
+from app.decoders.plate.thermal import _quad_around
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
 from tests.decoders.plate.scenes import PAPER, THERMAL_CAMERA, shoot_warm
@@ -40,7 +41,9 @@ def test_warm_and_cold_are_not_exchanged() -> None:
     assert [r.digits for r in readings if r.outcome is PlateOutcome.READ] == []
 
 
-def test_a_warm_triangle_is_no_plate() -> None:
-    frame = np.full((200, 240), 60, np.uint8)
-    cv2.fillPoly(frame, [np.array([[40, 40], [160, 40], [40, 160]], np.int32)], 200)
-    assert decode_plates(frame, thermal=True) == []
+def test_a_warm_triangle_is_no_quadrangle() -> None:
+    legs = [(k, 0) for k in range(40)], [(0, 39 - k) for k in range(39)]
+    diagonal = [(39 - k, k) for k in range(1, 39)]
+    contour = np.array([*legs[0], *diagonal, *legs[1]], np.int32)[:, None]
+    assert len(cv2.convexHull(contour)) == 3
+    assert _quad_around(contour) is None
