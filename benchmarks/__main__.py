@@ -35,6 +35,7 @@ def _list_commands(short: bool) -> list[list[str]]:
         ["bundle", "-m", "benchmarks.bundle", *(["--plates", "100"] if short else [])],
         ["http", "-m", "benchmarks.http_overhead", *(["--frames", "20"] if short else [])],
         ["plates", "-m", "benchmarks.plates", *(["--short"] if short else [])],
+        ["magnets", "-m", "benchmarks.magnets", *(["--short"] if short else [])],
     ]
 
 
@@ -47,8 +48,8 @@ def _run(name: str, command: list[str], write: Callable[[str], object]) -> bool:
         print(line, end="", flush=True)
         lines.append(line)
     text = "".join(lines)
-    if text.startswith("### "):
-        write(f"{text}\n")
+    if text.lstrip().startswith("### "):
+        write(f"{text.lstrip()}\n")
     elif "\n### " in text:
         write(f"### run\n\n{text}\n")  # what comes before its first table: seeds, frames, mode
     else:

@@ -43,8 +43,9 @@ def main() -> None:
     start = time.monotonic()
     for item in items:
         title, head, rows = RUNS[item](args.seed, args.short)
-        print(f"\n### {item}\n\n{title}\n\n{table(head, rows)}", flush=True)
-    print(f"\nSeed {args.seed}{', short mode' if args.short else ''}; {time.monotonic() - start:.0f} s.")
+        print(f"\n### magnets-{item}\n\n{title}\n\n{table(head, rows)}", flush=True)
+    mode = "short mode" if args.short else "long mode"
+    print(f"\n### magnets-run\n\nSeed {args.seed}, {mode}; {time.monotonic() - start:.0f} s.")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
