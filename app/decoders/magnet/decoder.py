@@ -18,7 +18,7 @@ from app.decoders.magnet.wheels import WheelCanceller
 from app.decoders.magnet.window import Dipole, Expectation
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
-VERSION = "matched-1"
+VERSION = "matched-2"
 MOMENT_AM2 = 2.47
 """METRO's N52 cuboid. [A m2]"""
 _THRESHOLD = 32.0

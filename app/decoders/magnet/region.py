@@ -26,8 +26,9 @@ _POLISH = 6
 """Most magnets that are fitted together."""
 _ENOUGH = 4
 _MAX_FAILED = 3
-_MAX_JOINT_FITS = 12
-_ROW_WIDTH_M = 0.3
+"""Fits that do not bear out what the filters saw, after which a region counts as iron."""
+_MAX_JOINT_FITS, _ROW_WIDTH_M = 12, 0.3
+"""Fits of several magnets that a region may take if its magnets stand in no row so narrow [m]: bounds the delay."""
 _TOGETHER_M = 1.1
 _SAME_M = 0.3
 _MAX_TOGETHER = 3
