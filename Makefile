@@ -21,7 +21,7 @@ $(VENV)/.dev: requirements-dev.txt $(VENV)/.runtime
 	$(PIP) install --quiet --require-hashes -r requirements-dev.txt
 	@touch $@
 
-demo: $(VENV)/.runtime ## From a coordinate to a decoded drive, in one table
+demo: $(VENV)/.runtime ## From a coordinate and a meaning to decoded drives, in two tables
 	$(BIN)/waymark demo
 
 serve: $(VENV)/.runtime ## Serve on http://127.0.0.1:8000
