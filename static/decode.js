@@ -82,7 +82,7 @@ async function show(decoded) {
 
 async function showTrace(decoded) {
   $("#decoded").hidden = false;
-  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.report.decode_ms.toFixed(0)} ms, ${decoded.codebook_tags} registered tags within reach.`;
+  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.report.decode_ms.toFixed(0)} ms, registered tags within reach: ${decoded.codebook_tags}.`;
   $("#readings").replaceChildren(...drawTags(decoded));
   $("#fix").replaceChildren(drawTagFix(decoded));
   await showPicture(decoded.links.plot, `The trace with what was found in it: ${decoded.summary.text}`);

@@ -158,3 +158,31 @@ def test_a_frame_is_decoded_and_the_vehicle_shown(page: Browser, server: LiveSer
     assert "exact" in page.run("document.querySelector('#fix').innerText")
     assert page.run("document.querySelectorAll('#fix-map .vehicle').length") == 1
     assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_a_trace_is_decoded_with_its_tag_and_line(page: Browser, server: LiveServer) -> None:
+    lane = [[8.416841693, 49.005889355], [8.417251732, 49.006356579]]  # of the README's drive
+    body = {
+        "family": "magnet",
+        "status": "surveyed",
+        "tag": {"code": "SNS_4_0.1_10-30", "chainage_m": 42.0},
+        "lane": {"geometry": {"type": "LineString", "coordinates": lane}, "horizontal_rmse_m": 0.01},
+    }
+    with server.client() as client:
+        assert client.post("/v1/markers", json=body).status_code == 201
+    page.click("a[href='#decode']")
+    page.choose_file("#file", ROOT / "docs/images/drive.zip")
+    page.run("document.querySelector('#file').dispatchEvent(new Event('change'))")
+    page.fill("[name='coarse_position.lon_deg']", "8.417")
+    page.fill("[name='coarse_position.lat_deg']", "49.006")
+    page.fill("[name='coarse_position.accuracy_m']", "50")
+    page.click("#decode-form button")
+    assert page.until("document.querySelector('#annotated').naturalWidth") > 1000
+    told = page.run("document.querySelector('#readings').innerText")
+    assert "SNS_4_0.1_10-30" in told
+    assert "dashed line crossed" in told
+    assert "steering wheel" in told
+    assert "From the tag's line" in page.run("document.querySelector('#fix').innerText")
+    assert page.run("document.querySelectorAll('#fix-map .vehicle').length") == 1
+    assert page.complaints == []
