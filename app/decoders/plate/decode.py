@@ -39,6 +39,7 @@ REGISTERED_TRUST = 0.9999  # in a registered plate that corrections reach
 RIVAL_CELLS = 3  # by which every other registered position plate must differ more from what was read
 FLAT_LIGHT = (0.65, 1.5)  # light on a cell of one level against that around, beyond which it may be a stain
 STRAY, STRAY_TRUST = 0.23, 0.97  # share of the contrast from which a unit is no sure reading, worn or stained
+STRAY_CLEAR, CLEAR_UNIT_PX = 0.16, 3.0  # the same where a unit is so large that its own noise strays less
 LEAST_CODEWORD = 0.05  # probability of the symbols, as read, from which a check that holds is no chance
 LETTERS_OUT_OF_REACH = 12.0  # cost of reading letters as digits up to which a plate may be a decimal one
 _DARK_SHARE = 0.12
@@ -63,7 +64,8 @@ class UnitEvidence:
     disputed : ndarray of bool, shape (cells,)
         Where the two classifiers differ.
     stray : ndarray, shape (cells,)
-        Distance of each cell's worst unit from the level that it was given, as a share of the contrast.
+        Distance of each cell's worst unit from the level that it was given, as a share of the contrast; more counts
+        on plates whose units are large.
     scatter : float
         Mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model.
     span : float
@@ -160,6 +162,8 @@ def weigh_units(fit: PlateFit) -> UnitEvidence | None:
     best = np.argmin(costs, axis=1)
     disputed = (first != dark).reshape(-1, 4).any(axis=1)
     stray = _level_distance(even, dark, contrast).reshape(-1, 4).max(axis=1)
+    if fit.unit_px >= CLEAR_UNIT_PX:
+        stray *= STRAY / STRAY_CLEAR
     stray = np.where(_flat_patches(light, dark, n), 1.0, stray)
     return UnitEvidence(
         costs - costs.min(axis=1, keepdims=True), best, dark > 0.5, disputed, stray, weight, residual, contrast,
