@@ -28,7 +28,7 @@ BLUR_PRIOR = (math.log(0.7), 0.35)  # log of the lens blur [px], and its spread
 MOTION_PRIOR = (0.001, 0.0045)  # square of the motion blur's length [plate sides^2], and its spread
 FIRST_BLUR = 0.2  # units
 # share of the pixels' variance that shapes of the best values explain in the first steps on anything that is a plate
-HOPELESS = (0.73, 0.74, 0.8, 0.83, 0.85, 0.85)
+HOPELESS = (0.3, 0.74, 0.8, 0.83, 0.85, 0.85)
 LEAST_FINE = 0.7  # the same of the values and the pose found, from the second fine step on
 LEAST_STEP = 1.25  # px, below which averaging gives nothing
 MOST_STEP = 0.06  # of the plate's image: how far a step may move a corner
@@ -412,7 +412,8 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
             return False, variance, explained, pixels
         half = substitute(factor, rhs)
         best = 1.0 - (sums[7] - (half[:shapes] ** 2).sum()) / max(sums[6], 1e-12)
-        if first and k < len(HOPELESS) and best < HOPELESS[k]:
+        # all pixels have their say in the best values, only the plate's own in what is explained: a lane line may lie beside
+        if first and k < len(HOPELESS) and max(best, explained) < HOPELESS[k]:
             return False, variance, explained, pixels
         solution = solve_factorized(factor, half, -pose[9])
         coef[:] = solution[:shapes]

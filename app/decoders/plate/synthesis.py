@@ -17,6 +17,7 @@ from scipy.special import ndtr
 POSE = 10  # eight of the homography, log of the blur, square of the motion's length
 SINGLES = 13  # triangle, its other half, three squares, four of the gap, four of the road
 ROAD_WEIGHT = 0.3  # the road around may hold anything
+ROAD_SPREAD = 0.1  # of its light; what is further off, a lane line, counts less
 UPRIGHT_SINE = 0.35  # of the angle between line of sight and plate columns up to which blur is along the plate's axes
 ROUND = 1.69  # ratio of the blur's variances up to which it is round
 _REACH = 4.25
@@ -351,7 +352,8 @@ def accumulate(  # type: ignore[no-untyped-def]
                 sums[4] += weight * target
                 sums[5] += weight * target * target
             else:
-                weight *= ROAD_WEIGHT
+                off = (target - road_light) / ROAD_SPREAD
+                weight *= ROAD_WEIGHT / (1.0 + off * off)
             all_w += weight
             all_t += weight * target
             sums[7] += weight * target * target
