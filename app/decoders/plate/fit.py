@@ -412,7 +412,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
             return False, variance, explained, pixels
         half = substitute(factor, rhs)
         best = 1.0 - (sums[7] - (half[:shapes] ** 2).sum()) / max(sums[6], 1e-12)
-        # all pixels have their say in the best values, only the plate's own in what is explained: a lane line may lie beside
+        # what is explained counts the plate's own pixels only: a lane line may lie beside it
         if first and k < len(HOPELESS) and max(best, explained) < HOPELESS[k]:
             return False, variance, explained, pixels
         solution = solve_factorized(factor, half, -pose[9])
