@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from app.decoders.magnet.book import TagBook
-from app.decoders.magnet.decoder import VERSION, MagnetDecoder
+from app.decoders.magnet.decoder import VERSION, decode_trace
 from app.decoders.magnet.readings import Finding
 from app.decoders.traces.read import read_trace
 from app.errors import UnreadableUpload
@@ -15,8 +15,6 @@ from app.jobs.trace_plot import plot_trace
 from app.markers.magnet import InformationTag, parse_tag
 from app.sensors.magnetometer_bar import MagnetTrace
 from app.services.traces import TraceResult, TraceTask, TraceTerms, trace_terms
-
-_CHUNK = 4096  # samples
 
 
 def decode_recording(task: TraceTask, _before: None) -> TraceResult:
@@ -58,12 +56,7 @@ def _decode(task: TraceTask, terms: TraceTerms, trace: MagnetTrace) -> tuple[lis
         return metro.decode_trace_metro(trace, terms.bar), metro.VERSION
     tags = [tag for text in task.tags if isinstance(tag := parse_tag(text), InformationTag)]
     book = TagBook(designs=tags) if tags else TagBook(formats=terms.formats or task.formats)
-    decoder = MagnetDecoder(terms.bar, book=book)
-    found: list[Finding] = []
-    for start in range(0, len(trace.t_s), _CHUNK):
-        end_s = trace.t_s[start + _CHUNK] if start + _CHUNK < len(trace.t_s) else np.inf
-        found += decoder.feed(trace.between(trace.t_s[start] if start else -np.inf, end_s))
-    return found + decoder.finish(), VERSION
+    return decode_trace(trace, terms.bar, book=book), VERSION
 
 
 def _driven_m(trace: MagnetTrace) -> float:

@@ -118,10 +118,10 @@ def _summary(frames: Sequence[ReadFrame]) -> dict[str, Any]:
         outcome = str(plate.reading.outcome)
         outcomes[outcome] = outcomes.get(outcome, 0) + 1
     refused = len(plates) - len(read)
-    text = f"{_count(len(read), 'plate')} read" if read else "no plate read"
-    text += f" in {_count(len(frames), 'frame')}, {len(matched)} of them registered" if read else ""
-    text += f"; {_count(refused, 'candidate')} refused" if refused else ""
-    text += f"; {_count(failed, 'frame')} could not be decoded" if failed else ""
+    text = f"{count_of(len(read), 'plate')} read" if read else "no plate read"
+    text += f" in {count_of(len(frames), 'frame')}, {len(matched)} of them registered" if read else ""
+    text += f"; {count_of(refused, 'candidate')} refused" if refused else ""
+    text += f"; {count_of(failed, 'frame')} could not be decoded" if failed else ""
     return {
         "text": text,
         "frames": len(frames),
@@ -133,7 +133,8 @@ def _summary(frames: Sequence[ReadFrame]) -> dict[str, Any]:
     }
 
 
-def _count(number: int, what: str) -> str:
+def count_of(number: int, what: str) -> str:
+    """So many of something, in words."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 

@@ -101,7 +101,7 @@ class DecodeJobs:
             started = start_trace(
                 connection, agency_id, self._decoder, data, context, self._rules, wait_s=_PATIENCE_S
             )  # fmt: skip
-        done, trace = finished_columns(row["id"], started.pending.result(), started, context, self._blobs)
+        done, trace = finished_columns(started.pending.result(), started, context, self._blobs)
         with self._database.write() as connection:
             if store.finish_decode(connection, row["id"], {**done, "finished_at": self._clock()}):
                 store_observations(connection, agency_id, row["id"], trace, context.captured_at or row["created_at"])

@@ -162,7 +162,7 @@ class Decodes:
         replayed = True
         try:
             self._blobs.put(row["upload_key"], data)
-            done, trace = finished_columns(row["id"], started.pending.result(), started, context, self._blobs)
+            done, trace = finished_columns(started.pending.result(), started, context, self._blobs)
             kept.append(done["picture_key"])
             with self._database.write() as connection:
                 document = find_answer(connection, caller.agency_id, key, created_at)

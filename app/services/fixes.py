@@ -57,7 +57,9 @@ def fix_from_match(pose: PlatePose, camera: Camera, match: Match, vehicle_headin
     row = match.row
     if row is None or not match.plausible:
         return None
-    notes = _doubts(row, match)
+    notes = position_doubts(row, "plate")
+    if match.ambiguous:
+        notes.append("several plates within reach carry these digits")
     heading_deg, heading_rmse_deg = row["heading_deg"], row["heading_rmse_deg"]
     if heading_deg is None:
         if vehicle_heading_deg is None:
@@ -119,17 +121,15 @@ def fuse_fixes(fixes: Sequence[Fix]) -> Fix | None:
     )
 
 
-def _doubts(row: Row, match: Match) -> list[str]:
-    """What makes a plate's position unfit for localization."""
+def position_doubts(row: Row, what: str) -> list[str]:
+    """What makes the position of a plate or a tag unfit for localization."""
     doubts = []
     if row["localization_grade"] != LocalizationGrade.EXACT:
-        doubts.append(row["transform_note"] or "the plate's position is approximate")
+        doubts.append(row["transform_note"] or f"the {what}'s position is approximate")
     if row["horizontal_rmse_m"] is None:
-        doubts.append("the plate's position has no stated accuracy")
+        doubts.append(f"the {what}'s position has no stated accuracy")
     if row["status"] not in SURVEYED:
-        doubts.append(f"the plate is {row['status']}, its position is not surveyed")
-    if match.ambiguous:
-        doubts.append("several plates within reach carry these digits")
+        doubts.append(f"the {what} is {row['status']}, its position is not surveyed")
     return doubts
 
 

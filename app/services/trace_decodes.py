@@ -60,7 +60,7 @@ def _book_formats(connection: sa.Connection, agency_id: str) -> tuple[TagFormat,
 
 
 def finished_columns(
-    decode_id: str, result: TraceResult, started: StartedTrace, context: DecodeContext, blobs: Blobs
+    result: TraceResult, started: StartedTrace, context: DecodeContext, blobs: Blobs
 ) -> tuple[dict[str, Any], ReadTrace]:
     """Columns of a decode that is done, its plot stored, and what was read."""
     trace = match_tags(result.findings, started.nearby, trace_terms(context.trace or {}).bar)

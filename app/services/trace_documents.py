@@ -10,6 +10,7 @@ import numpy as np
 
 from app import __version__
 from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFinding, TagReading
+from app.services.decode_documents import count_of
 from app.services.trace_reading import ReadTag, ReadTrace, TagFix, TagMatch
 from app.services.traces import TraceResult
 
@@ -57,11 +58,11 @@ def _summary(result: TraceResult, trace: ReadTrace) -> dict[str, Any]:
     matched = sum(tag.match is not None and tag.match.row is not None for tag in trace.tags)
     wrong_way = sum(tag.reading.wrong_way for tag in trace.tags)
     solid = sum(crossing.style.value == "solid" for crossing in trace.crossings)
-    text = f"{_count(len(trace.magnets), 'magnet')} over {result.length_m:.0f} m: {_count(len(trace.tags), 'tag')}"
+    text = f"{count_of(len(trace.magnets), 'magnet')} over {result.length_m:.0f} m: {count_of(len(trace.tags), 'tag')}"
     text += f", {matched} registered" if trace.tags else ""
-    text += f"; {_count(len(trace.crossings), 'line crossing')}, {solid} solid" if trace.crossings else ""
-    text += f"; WRONG WAY at {_count(wrong_way, 'tag')}" if wrong_way else ""
-    text += f"; {_count(len(trace.noise), 'disturbance')} left out" if trace.noise else ""
+    text += f"; {count_of(len(trace.crossings), 'line crossing')}, {solid} solid" if trace.crossings else ""
+    text += f"; WRONG WAY at {count_of(wrong_way, 'tag')}" if wrong_way else ""
+    text += f"; {count_of(len(trace.noise), 'disturbance')} left out" if trace.noise else ""
     kinds: dict[str, int] = {}
     for finding in trace.noise:
         kinds[str(finding.kind)] = kinds.get(str(finding.kind), 0) + 1
@@ -75,10 +76,6 @@ def _summary(result: TraceResult, trace: ReadTrace) -> dict[str, Any]:
         "fixes": sum(tag.fix is not None for tag in trace.tags),
         "noise": kinds,
     }
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _tag(tag: ReadTag) -> dict[str, Any]:

@@ -21,13 +21,12 @@ from app.registry.markers import MarkerFilter, Row
 from app.registry.spatial import distance_m
 from app.sensors.magnetometer_bar import MagnetometerBar
 from app.services.decode_context import CoarsePosition
+from app.services.fixes import ASSUMED_HORIZONTAL_RMSE_M, position_doubts
 from app.services.magnet_layouts import INFORMATION_TAG, layout_of
 
 Floats = npt.NDArray[np.float64]
 
 MAX_TAGS = 500
-SURVEYED = ("surveyed", "active")
-ASSUMED_HORIZONTAL_RMSE_M = 1.0
 LATERAL_STD_M, LATERAL_STD_CLEARANCE_M = 0.003, 0.16
 """Lateral error of a magnet on the bar at METRO's clearance; it grows with the square of it. [m]"""
 TAG_BEARING_STD_DEG = 0.1
@@ -197,7 +196,7 @@ def fix_from_tag(reading: TagReading, row: Row, layout: MagnetLayout, bar: Magne
     array = bar.positions_m[bar.array]
     bar_m = np.array([array[:, 0].mean(), (array[:, 1].max() + array[:, 1].min()) / 2])
     place = middles.mean(axis=0) - bar_m[0] * forward - bar_m[1] * left
-    notes = _doubts(row)
+    notes = position_doubts(row, "tag")
     survey_m = float(row["horizontal_rmse_m"] or ASSUMED_HORIZONTAL_RMSE_M) / math.sqrt(2)
     clearance_m = float(np.median([magnet.clearance_cm for magnet in reading.magnets])) / 100
     lateral_std_m = LATERAL_STD_M * max(clearance_m / LATERAL_STD_CLEARANCE_M, 0.5) ** 2
@@ -232,18 +231,6 @@ def _choose_holes(met_m: Floats, holes_m: Floats) -> tuple[int, ...] | None:
     if len(fits) > 1 and fits[1][0] < 4 * fits[0][0] + 1e-4:
         return None
     return fits[0][1]
-
-
-def _doubts(row: Row) -> list[str]:
-    """What makes a tag's position unfit for localization."""
-    doubts = []
-    if row["localization_grade"] != LocalizationGrade.EXACT:
-        doubts.append(row["transform_note"] or "the tag's position is approximate")
-    if row["horizontal_rmse_m"] is None:
-        doubts.append("the tag's position has no stated accuracy")
-    if row["status"] not in SURVEYED:
-        doubts.append(f"the tag is {row['status']}, its position is not surveyed")
-    return doubts
 
 
 def trace_observations(decode_id: str, trace: ReadTrace, seen_at: datetime) -> list[dict[str, Any]]:

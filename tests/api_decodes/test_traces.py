@@ -266,10 +266,11 @@ def test_bad_input_names_what_is_wrong_and_leaves_nothing(
     assert len(client.get("/v1/decodes?limit=1000").json()["items"]) == before
 
 
-def test_microtesla_declared_as_gauss_are_refused_or_warned_of(client: httpx.Client, place: Place) -> None:
-    context = {**place.context, "trace": {"unit": "gauss", "axes": "FLU", "calibrated": True}}
+def test_microtesla_declared_as_gauss_are_refused(client: httpx.Client, place: Place) -> None:
+    context = {**place.context, "trace": {"unit": "gauss", "axes": "FLU"}}
     answer = post_frame(client, _csv(_drive(12)), context, name="trace.csv")
-    assert answer.status_code == 422 or answer.json()["report"]["warnings"], answer.text
+    problem = _refused(answer, 422, "unit")
+    assert "uT" in problem["cure"]
 
 
 def test_frames_have_no_plot_and_traces_no_annotation(client: httpx.Client, place: Place) -> None:

@@ -255,7 +255,7 @@ def _matrix(pose: Array, frame: Array) -> Array:
     return matrix
 
 
-def _project(matrix: Array, points: Array) -> Array:
+def project(matrix: Array, points: Array) -> Array:
     """Homography applied to points, shape (N, 2)."""
     w = points @ matrix[2, :2] + matrix[2, 2]
     projected: Array = (points @ matrix[:2, :2].T + matrix[:2, 2]) / w[:, None]
@@ -300,9 +300,9 @@ def _hold_open_ends(normal, rhs, pose, coef, variance):  # type: ignore[no-untyp
     """Hold what the pixels leave open: values near their mean, blur near the usual."""
     shapes = coef.shape[0]
     mean = 0.0
-    for i in range(shapes - 13):
+    for i in range(shapes - SINGLES):
         mean += coef[i]
-    mean = min(max(mean / (shapes - 13), 0.01), 2.0)
+    mean = min(max(mean / (shapes - SINGLES), 0.01), 2.0)
     ridge = variance / (1.44 * mean * mean)
     for i in range(shapes):
         normal[i, i] += ridge
@@ -319,7 +319,10 @@ def _hold_open_ends(normal, rhs, pose, coef, variance):  # type: ignore[no-untyp
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _move(pose, step, frame, corners, moved, extents):  # type: ignore[no-untyped-def]
-    """Add a step to the pose, shortened where it carries the corners too far; how far they went, inf for nowhere."""
+    """Add a step to the pose, shortened where it carries the corners too far.
+
+    Returns how far they went, in pixels and as a share of the plate's image; -1 for nowhere.
+    """
     start = pose.copy()
     pose[8] += min(max(step[8], -0.4), 0.4)
     pose[9] = min(max(pose[9] + step[9], 0.0), pose[9] + 0.01)
@@ -331,11 +334,11 @@ def _move(pose, step, frame, corners, moved, extents):  # type: ignore[no-untype
             shift = np.abs(moved - corners)
             far = max(shift[:, 0].max() / extents[0], shift[:, 1].max() / extents[1])
             if far < MOST_STEP * 1.01:
-                return shift.max()
+                return shift.max(), far
             share *= max(MOST_STEP / far, 0.25)
         else:
             share *= 0.25
-    return np.inf
+    return -1.0, -1.0
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -400,8 +403,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
         flat = (sums[5] - sums[4] * sums[4] / max(sums[2], 1e-300)) / inside
         explained = 1.0 - total / max(flat, 1e-12)
         blind = first and k == 0  # no values yet: nothing says how they move with the pose
-        spread = flat if blind else variance
-        _hold_open_ends(normal, rhs, pose, coef, 0.02 * spread if blind else variance)
+        _hold_open_ends(normal, rhs, pose, coef, 0.02 * flat if blind else variance)
         if blind:
             for i in range(shapes, shapes + POSE):
                 normal[i, i] = 1e6 * (1.0 + normal[i, i])
@@ -419,10 +421,8 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
         coef[:] = solution[:shapes]
         if blind:
             continue
-        shift = _move(pose, solution[shapes:], frame, corners, moved, extents)
-        far = max(np.abs(moved[:, 0] - corners[:, 0]).max() / extents[0],
-                  np.abs(moved[:, 1] - corners[:, 1]).max() / extents[1])  # fmt: skip
-        if not np.isfinite(shift):
+        shift, far = _move(pose, solution[shapes:], frame, corners, moved, extents)
+        if shift < 0.0:
             return False, variance, explained, pixels
         if shift < REST_PX or (first and far < NEAR):
             break

@@ -20,7 +20,7 @@ from app.decoders.plate.colour import (
     vivid_signal,
 )
 from app.decoders.plate.decode import DecodedSymbols, decode_symbols, weigh_units
-from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids, unit_centres
+from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids, project, unit_centres
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.pose import locate_plate
 from app.decoders.plate.quads import MARKER_RATIO, MarkerQuad, detect_marker_quads
@@ -67,9 +67,8 @@ class _Task:
         fit = fit_plate(self.image, quad.centroids_px, geometry)
         self.fits.append((geometry, quad.centroids_px, fit))
         if fit is not None and fit.explained > CLEAN_EXPLAINED:
-            image_from_plate = np.linalg.inv(fit.plate_from_image)
-            homogeneous = np.column_stack([marker_centroids(geometry), np.ones(4)]) @ image_from_plate.T
-            self.fits.append((geometry, homogeneous[:, :2] / homogeneous[:, 2:], fit))
+            fitted_px = project(np.linalg.inv(fit.plate_from_image), marker_centroids(geometry))
+            self.fits.append((geometry, fitted_px, fit))
         return fit
 
 
@@ -287,8 +286,8 @@ def _missing_parts(
         return PlateOutcome.RED_MARKER_MISSING, "no red triangle where it should be"
     if margins[1:].min() < LEAST_MARGIN:
         return PlateOutcome.GREEN_MARKER_MISSING, "a green square is not where it should be"
-    homogeneous = np.column_stack([marker_centroids(geometry), np.ones(4)]) @ np.linalg.inv(fit.plate_from_image).T
-    moved = np.abs(homogeneous[:, :2] / homogeneous[:, 2:] - quad.centroids_px).max(axis=0)
+    fitted_px = project(np.linalg.inv(fit.plate_from_image), marker_centroids(geometry))
+    moved = np.abs(fitted_px - quad.centroids_px).max(axis=0)
     if (moved > 0.15 * np.ptp(fit.corners_px, axis=0) + 1.5).any():
         return PlateOutcome.VERTICES_BEYOND_MARKERS, "the grid's corners are not where the markers are"
     return None
