@@ -1,0 +1,1 @@
+"""CERPMs: their messages, what they are programmed with, and what their radio allows."""
