@@ -24,6 +24,9 @@ class Settings(BaseSettings):
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
     public_url: str = Field(default="", description="Where clients reach the server; goes into QR codes and links.")
+    master_key_file: Path | None = Field(
+        default=None, description="File of the 32 bytes that agencies' keys are stored under; made up if missing."
+    )
     admin_key: SecretStr | None = Field(default=None, description="Admin key to use instead of a generated one.")
 
     max_json_bytes: int = Field(default=1024**2, ge=1024, description="Largest JSON body. [byte]")
@@ -73,6 +76,11 @@ class Settings(BaseSettings):
     def resolved_blobs_url(self) -> str:
         """URL of the blob store with the default filled in."""
         return self.blobs_url or (self.data_dir.resolve() / "blobs").as_uri()
+
+    @property
+    def resolved_master_key_file(self) -> Path:
+        """File of the server's key with the default filled in."""
+        return self.master_key_file or self.data_dir / "master.key"
 
     @property
     def resolved_public_url(self) -> str:

@@ -1,7 +1,7 @@
 """The CERPM message: what a chip-enabled raised pavement marker says of itself, and its 24 bytes.
 
-Source: CERPM paper (Kadav et al., Sensors 2024, 24, 2327), section 2.2: geospatial information, speed limit and a number
-of its own, sent by LoRa. Bytes, tag and sequence are Waymark's: the paper names authentication as future work.
+Source: CERPM paper (Kadav et al., Sensors 2024, 24, 2327), section 2.2: geospatial information, speed limit and number,
+sent by LoRa. Bytes, tag and sequence are Waymark's: the paper names authentication as future work.
 
 ==========  =====  =========================================================================================
 bytes       field  form (integers are big endian)

@@ -15,7 +15,7 @@ from app.registry.spatial import Box, box_around, rtree, within_box, within_radi
 from app.registry.tables import marker_versions, markers
 
 Row = sa.RowMapping
-_PUBLIC = [column for column in markers.c if column.name not in ("row", "agency_id")]
+PUBLIC = [column for column in markers.c if column.name not in ("row", "agency_id")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ def get_marker(connection: sa.Connection, agency_id: str, marker_id: str) -> Row
     NotFound
         There is none with this id, or it belongs to another agency.
     """
-    query = sa.select(*_PUBLIC).where(markers.c.id == marker_id, markers.c.agency_id == agency_id)
+    query = sa.select(*PUBLIC).where(markers.c.id == marker_id, markers.c.agency_id == agency_id)
     row = connection.execute(query).mappings().one_or_none()
     if row is None:
         raise NotFound(f"there is no marker {marker_id}", field="marker_id")
@@ -52,7 +52,7 @@ def get_markers(connection: sa.Connection, agency_id: str, marker_ids: list[str]
     NotFound
         One is missing, or belongs to another agency.
     """
-    query = sa.select(*_PUBLIC).where(markers.c.agency_id == agency_id)
+    query = sa.select(*PUBLIC).where(markers.c.agency_id == agency_id)
     found: dict[str, Row] = {}
     for start in range(0, len(marker_ids), 500):
         chunk = query.where(markers.c.id.in_(marker_ids[start : start + 500]))
@@ -67,7 +67,7 @@ def list_markers(
     connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, *, after: str | None, limit: int
 ) -> list[Row]:
     """Markers in the order of their ids, which is the order they were registered in."""
-    query = sa.select(*_PUBLIC).where(markers.c.agency_id == agency_id, *_conditions(narrowed))
+    query = sa.select(*PUBLIC).where(markers.c.agency_id == agency_id, *_conditions(narrowed))
     if after is not None:
         query = query.where(markers.c.id > after)
     return list(connection.execute(query.order_by(markers.c.id).limit(limit)).mappings())
@@ -116,7 +116,7 @@ def _plates_near(parts: int) -> sa.Select[Any]:
         markers.c.lon_deg, markers.c.lat_deg, number("lon"), number("lat"), type_=sa.Double
     )
     return (
-        sa.select(*_PUBLIC)
+        sa.select(*PUBLIC)
         .where(
             markers.c.agency_id == sa.bindparam("agency"),
             markers.c.family == "plate",

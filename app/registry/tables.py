@@ -131,6 +131,16 @@ sa.Index(
     postgresql_where=markers.c.scheme == "id",
 )
 
+# a CERPM's number names one marker of its agency, for ever
+sa.Index(
+    "uq_markers_cerpm_number",
+    markers.c.agency_id,
+    markers.c.digits,
+    unique=True,
+    sqlite_where=markers.c.family == "cerpm",
+    postgresql_where=markers.c.family == "cerpm",
+)
+
 marker_versions = sa.Table(
     "marker_versions",
     metadata,
@@ -174,6 +184,31 @@ codebooks = sa.Table(
     sa.Column("updated_at", UtcTime, nullable=False),
     sa.UniqueConstraint("agency_id", "name"),
     sa.Index("ix_codebooks_agency_id_id", "agency_id", "id"),
+)
+
+# the key that an agency's CERPMs derive theirs from, encrypted under the server's own
+agency_secrets = sa.Table(
+    "agency_secrets",
+    metadata,
+    sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
+    sa.Column("wrapped", sa.LargeBinary, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+)
+
+# which transmissions of a CERPM were heard and when: what is sent again is known by it
+cerpm_spans = sa.Table(
+    "cerpm_spans",
+    metadata,
+    sa.Column("row", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), primary_key=True, autoincrement=True),
+    _agency(),
+    sa.Column("number", sa.BigInteger, nullable=False),
+    sa.Column("first_sequence", sa.BigInteger, nullable=False),
+    sa.Column("last_sequence", sa.BigInteger, nullable=False),
+    sa.Column("first_heard_s", sa.Double),  # seconds since 1970-01-01 UTC; null where the log had no times
+    sa.Column("last_heard_s", sa.Double),
+    sa.Column("decode_id", ID, sa.ForeignKey("decodes.id"), nullable=False),
+    sa.Index("ix_cerpm_spans_agency_id_number", "agency_id", "number"),
+    sqlite_autoincrement=True,
 )
 
 decodes = sa.Table(
