@@ -9,15 +9,16 @@ from pydantic import BaseModel, ConfigDict, Discriminator, RootModel, Tag, model
 
 from app.api.dependencies import Caller, Idempotency, Identifier, Markers, Text, Version, json_response, next_link
 from app.api.problems import UNION_TAG, problem_responses
+from app.api.schemas_cerpms import CERPM_EXAMPLES, CerpmMarkerIn, CerpmMarkerOut
 from app.api.schemas_magnets import MAGNET_EXAMPLES, MagnetMarkerIn, MagnetMarkerOut, MagnetMarkerSummary
-from app.api.schemas_markers import PLATE_EXAMPLES, GeometryIn, MarkerId, MarkerIn, MarkerOut, MarkerPatch, Status
+from app.api.schemas_markers import PLATE_EXAMPLES, GeometryIn, MarkerId, MarkerIn, MarkerOut, Status
+from app.api.schemas_patch import MarkerPatch
 from app.api.strict_json import StrictRoute
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.markers.plate import PlateGeometry, PlateScheme
 from app.registry.markers import MarkerFilter
 from app.registry.spatial import Box
-from app.services.markers import MarkerChange
 from app.services.plate_markers import GivenCode, NewPlate
 from app.services.positions import GivenPosition, naming
 
@@ -25,7 +26,7 @@ router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRou
 
 MAX_PAGE = 1000
 MAX_RADIUS_M = 100_000.0
-FAMILIES = ("plate", "magnet")
+FAMILIES = ("plate", "magnet", "cerpm")
 
 
 def _family_tag(body: Any) -> str:
@@ -36,14 +37,16 @@ def _family_tag(body: Any) -> str:
 class NewMarkerIn(
     RootModel[
         Annotated[
-            Annotated[MarkerIn, Tag(f"{UNION_TAG}plate")] | Annotated[MagnetMarkerIn, Tag(f"{UNION_TAG}magnet")],
+            Annotated[MarkerIn, Tag(f"{UNION_TAG}plate")]
+            | Annotated[MagnetMarkerIn, Tag(f"{UNION_TAG}magnet")]
+            | Annotated[CerpmMarkerIn, Tag(f"{UNION_TAG}cerpm")],
             Discriminator(_family_tag),
         ]
     ]
 ):
-    """A marker to register: a plate, or magnets where the family says so."""
+    """A marker to register: a plate, or magnets or a CERPM where the family says so."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [*PLATE_EXAMPLES, *MAGNET_EXAMPLES]})
+    model_config = ConfigDict(json_schema_extra={"examples": [*PLATE_EXAMPLES, *MAGNET_EXAMPLES, *CERPM_EXAMPLES]})
 
     @model_validator(mode="before")
     @classmethod
@@ -61,7 +64,7 @@ class NewMarkerIn(
 class MarkerPage(BaseModel):
     """A page of markers; the Link header leads to the next one."""
 
-    items: list[MarkerOut | MagnetMarkerSummary]
+    items: list[MarkerOut | MagnetMarkerSummary | CerpmMarkerOut]
 
 
 class VersionOut(BaseModel):
@@ -71,7 +74,7 @@ class VersionOut(BaseModel):
     at: str
     who: str
     why: str | None
-    marker: MarkerOut | MagnetMarkerSummary
+    marker: MarkerOut | MagnetMarkerSummary | CerpmMarkerOut
 
 
 class VersionPage(BaseModel):
@@ -84,13 +87,18 @@ class VersionPage(BaseModel):
     "",
     status_code=201,
     response_class=Response,
-    responses={201: {"model": MarkerOut | MagnetMarkerOut, "description": "Registered"}, **problem_responses(409)},
+    responses={
+        201: {"model": MarkerOut | MagnetMarkerOut | CerpmMarkerOut, "description": "Registered"},
+        **problem_responses(409),
+    },
 )
 def post_marker(marker: NewMarkerIn, caller: Caller, markers: Markers, idempotency: Idempotency) -> Response:
-    """Register a plate or magnets. With an Idempotency-Key a repeated request gets the first answer again."""
+    """Register a plate, magnets or a CERPM. With an Idempotency-Key a repeated request gets the first answer again."""
     new = marker.root
     if isinstance(new, MagnetMarkerIn):
         document, replayed = markers.register_magnets(caller, new.given(), idempotency)
+    elif isinstance(new, CerpmMarkerIn):
+        document, replayed = markers.register_cerpm(caller, new.given(), idempotency)
     else:
         document, replayed = markers.register_plate(caller, _new_plate(new), idempotency)
     headers = {"Location": f"/v1/markers/{document['id']}", "ETag": _etag(document)}
@@ -107,10 +115,15 @@ def list_markers(
     bbox: Annotated[Text | None, Query(max_length=200, examples=["114.1,22.2,114.3,22.4"])] = None,
     near: Annotated[Text | None, Query(max_length=200, examples=["114.179,22.304,500"])] = None,
     code: Annotated[
-        Text | None, Query(min_length=1, max_length=64, description="All digits of a plate, or the text of a tag.")
+        Text | None,
+        Query(
+            min_length=1,
+            max_length=64,
+            description="All digits of a plate, the text of a tag, or the number of a CERPM.",
+        ),
     ] = None,
     status: Status | None = None,
-    family: Literal["plate", "magnet"] | None = None,
+    family: Literal["plate", "magnet", "cerpm"] | None = None,
     limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100,
     after: Annotated[Identifier | None, Query(description="Last id of the page before.")] = None,
 ) -> Response:
@@ -132,7 +145,7 @@ def list_markers(
 @router.get(
     "/{marker_id}",
     response_class=Response,
-    responses={200: {"model": MarkerOut | MagnetMarkerOut}, **problem_responses(404)},
+    responses={200: {"model": MarkerOut | MagnetMarkerOut | CerpmMarkerOut}, **problem_responses(404)},
 )
 def get_marker(marker_id: MarkerId, request: Request, caller: Caller, markers: Markers) -> Response:
     """One marker, with its version as ETag."""
@@ -146,13 +159,13 @@ def get_marker(marker_id: MarkerId, request: Request, caller: Caller, markers: M
 @router.patch(
     "/{marker_id}",
     response_class=Response,
-    responses={200: {"model": MarkerOut | MagnetMarkerOut}, **problem_responses(404, 409, 412, 428)},
+    responses={200: {"model": MarkerOut | MagnetMarkerOut | CerpmMarkerOut}, **problem_responses(404, 409, 412, 428)},
 )
 def patch_marker(
     marker_id: MarkerId, patch: MarkerPatch, caller: Caller, markers: Markers, version: Version
 ) -> Response:
     """Change a marker that is still at the version named by If-Match."""
-    document = markers.change(caller, marker_id, _change(patch), version)
+    document = markers.change(caller, marker_id, patch.change(), version)
     return json_response(document, headers={"ETag": _etag(document)})
 
 
@@ -191,17 +204,6 @@ def _new_plate(marker: MarkerIn) -> NewPlate:
 def _geometry(given: GeometryIn) -> PlateGeometry:
     with naming("geometry"):
         return PlateGeometry(given.n, given.unit_mm, given.gap_mm, given.thickness_mm)
-
-
-def _change(patch: MarkerPatch) -> MarkerChange:
-    named = patch.model_fields_set
-    values = patch.model_dump(include=named - {"position", "reason"})
-    position = GivenPosition(**patch.position.model_dump()) if "position" in named else None
-    if not values and position is None:
-        raise InvalidParameter(
-            "the patch changes nothing", field="body", limit="at least one member", cure="name what to change"
-        )
-    return MarkerChange(values, position, patch.reason)
 
 
 def _numbers(text: str, field: str, form: str) -> list[float]:

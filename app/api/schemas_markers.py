@@ -84,14 +84,16 @@ class PlacementIn(BaseModel):
     reason: Text | None = Field(None, min_length=1, max_length=500, description="Why; goes into the history.")
 
 
-class _Headed(PlacementIn):
+class Headed(PlacementIn):
+    """Markers with a direction of travel of their own."""
+
     heading_deg: Heading | None = Field(
         None,
         description="Direction of travel, clockwise from true north; that of magnets follows from their lane. [deg]",
     )
 
 
-_POSITION_EXAMPLE: dict[str, JsonValue] = {
+POSITION_EXAMPLE: dict[str, JsonValue] = {
     "lon_deg": 114.179203,
     "lat_deg": 22.304161,
     "height_m": 5.21,
@@ -102,14 +104,14 @@ _POSITION_EXAMPLE: dict[str, JsonValue] = {
     "survey_method": "GNSS RTK, two occupations",
 }
 PLATE_EXAMPLES: list[JsonValue] = [
-    {"position": _POSITION_EXAMPLE, "heading_deg": 78.5, "status": "surveyed", "road": "Cheong Wan Road"},
-    {"position": _POSITION_EXAMPLE, "code": {"scheme": "position-check", "check_digits": 2}, "geometry": {"n": 10}},
-    {"position": _POSITION_EXAMPLE, "code": {"scheme": "id"}},
-    {"position": _POSITION_EXAMPLE, "code": {"digits": "023792168411", "allow_mismatched_digits": True}},
+    {"position": POSITION_EXAMPLE, "heading_deg": 78.5, "status": "surveyed", "road": "Cheong Wan Road"},
+    {"position": POSITION_EXAMPLE, "code": {"scheme": "position-check", "check_digits": 2}, "geometry": {"n": 10}},
+    {"position": POSITION_EXAMPLE, "code": {"scheme": "id"}},
+    {"position": POSITION_EXAMPLE, "code": {"digits": "023792168411", "allow_mismatched_digits": True}},
 ]
 
 
-class MarkerIn(_Headed):
+class MarkerIn(Headed):
     """A plate to register."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": PLATE_EXAMPLES})
@@ -119,27 +121,6 @@ class MarkerIn(_Headed):
     position: PositionIn
     code: CodeIn = Field(default_factory=CodeIn)
     geometry: GeometryIn = Field(default_factory=GeometryIn)
-
-
-class MarkerPatch(_Headed):
-    """Members to change; a member that is null is cleared, one that is left out stays."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "examples": [
-                {"status": "surveyed", "position": _POSITION_EXAMPLE, "reason": "as-built survey"},
-                {"status": "retired", "reason": "resurfaced"},
-            ]
-        },
-    )
-
-    status: Status = Field("planned", description="New status.")
-    position: PositionIn = Field(
-        default_factory=PositionIn,
-        description="New position; replaces the whole of the old. Of an information tag: where its first magnet was "
-        "surveyed; the others follow.",
-    )
 
 
 class CodeOut(BaseModel):

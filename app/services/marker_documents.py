@@ -160,3 +160,27 @@ def _plain(value: Any) -> Any:
 def meaning_document(meaning: Meaning) -> dict[str, Any]:
     """What a code tells: its kind, its value, and both for people."""
     return {"kind": meaning.kind.value, "value": meaning.value, "unit": meaning.unit, "text": meaning.text}
+
+
+def cerpm_document(row: Row | dict[str, Any]) -> dict[str, Any]:
+    """A CERPM."""
+    spec = row["spec"]
+    return {
+        "id": row["id"],
+        "family": row["family"],
+        "status": row["status"],
+        "version": row["version"],
+        "number": int(row["digits"]),
+        "side": spec["side"],
+        "speed_limit": spec["speed_limit"],
+        "dev_eui": spec["dev_eui"],
+        "beacon": spec["beacon"],
+        "position": _position(row),
+        "heading_deg": row["heading_deg"],
+        "heading_rmse_deg": row["heading_rmse_deg"],
+        "road": row["road"],
+        "measure_m": row["measure_m"],
+        "offset_m": row["offset_m"],
+        "created_at": row["created_at"],
+        "updated_at": row["updated_at"],
+    }

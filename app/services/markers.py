@@ -7,12 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from app.errors import StaleVersion
+from app.errors import InvalidParameter, StaleVersion
 from app.registry import markers as store
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, Row
 from app.services.access import Caller
+from app.services.cerpm_markers import Cerpms, NewCerpm
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
 from app.services.magnet_markers import Magnets, NewMagnets
 from app.services.marker_documents import version_document
@@ -58,7 +59,12 @@ class Markers:
         self._rules = rules or MarkerRules()
         self._plates = Plates(self._rules, random_bits)
         self._magnets = Magnets(database, self._rules)
-        self._families: dict[str, MarkerFamily[Any, Any]] = {"plate": self._plates, "magnet": self._magnets}
+        self._cerpms = Cerpms(self._rules)
+        self._families: dict[str, MarkerFamily[Any, Any]] = {
+            "plate": self._plates,
+            "magnet": self._magnets,
+            "cerpm": self._cerpms,
+        }
 
     def register_plate(
         self, caller: Caller, plate: NewPlate, key: IdempotencyKey | None = None
@@ -95,6 +101,20 @@ class Markers:
             Magnets of another marker lie too near.
         """
         return self._register(self._magnets, caller, magnets, key)
+
+    def register_cerpm(
+        self, caller: Caller, cerpm: NewCerpm, key: IdempotencyKey | None = None
+    ) -> tuple[dict[str, Any], bool]:
+        """Store a new CERPM; as `register_plate`.
+
+        Raises
+        ------
+        InvalidParameter, ReferenceSystemError
+            The request contradicts itself, or does not fit a message.
+        CodeTaken
+            Another marker carries the number.
+        """
+        return self._register(self._cerpms, caller, cerpm, key)
 
     def _register(
         self, family: MarkerFamily[New, Prepared], caller: Caller, new: New, key: IdempotencyKey | None
@@ -165,6 +185,13 @@ class Markers:
             if placed is not None and change.position is not None:
                 values |= position_columns(change.position, placed)
             family = self._family(row)
+            if "spec" in values and row["family"] != "cerpm":
+                raise InvalidParameter(
+                    f"a {row['family']} has no side, speed limit or beacon",
+                    field="/".join(values["spec"]),
+                    limit="CERPMs only",
+                    cure="leave it out",
+                )
             values |= family.revised(connection, caller, row, values, moved=placed is not None)
             changed = store.update_marker(
                 connection,

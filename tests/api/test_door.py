@@ -100,7 +100,7 @@ BAD_VALUES: list[tuple[dict[str, Any] | list[Any] | str, str]] = [
     ({"position": PLACED, "heading_deg": 360}, "heading_deg"),
     ({"position": PLACED, "heading_deg": -1}, "heading_deg"),
     ({"position": PLACED, "status": "lost"}, "status"),
-    ({"position": PLACED, "family": "cerpm"}, "family"),
+    ({"position": PLACED, "family": "balise"}, "family"),
     ({"position": PLACED, "road": ""}, "road"),
     ({"position": PLACED, "road": "x" * 201}, "road"),
     ({"position": PLACED, "agency_id": "someone else"}, "agency_id"),
