@@ -167,6 +167,48 @@ def decode_trace(
     typer.echo(orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
+ingest = typer.Typer(no_args_is_help=True, help="Send on what live sources deliver.")
+cli.add_typer(ingest, name="ingest")
+
+
+@ingest.callback()
+def ingest_sources() -> None:
+    """Send on what live sources deliver."""
+
+
+@ingest.command()
+def mqtt(
+    broker: Annotated[str, typer.Option(help="mqtt://[USER:PASSWORD@]HOST[:PORT], or mqtts://.")],
+    key: Annotated[str, typer.Option(envvar="WAYMARK_KEY", help="Key with the scope decode.")],
+    server: Annotated[str, typer.Option(help="Where Waymark listens.")] = "http://127.0.0.1:8000",
+    topic: Annotated[list[str] | None, typer.Option(help="May be repeated; ChirpStack's and TTS's without.")] = None,
+    client_id: Annotated[str, typer.Option(help="Name under which the broker keeps what waits.")] = "waymark-ingest",
+    spool: Annotated[Path, typer.Option(help="Folder of what is not sent yet; created if need be.")] = Path("spool"),
+    batch_s: Annotated[float, typer.Option(min=0.1, help="Longest that packets are collected. [s]")] = 10.0,
+    batch_messages: Annotated[int, typer.Option(min=1, max=100_000, help="Most packets of one upload.")] = 1000,
+    context: Annotated[str, typer.Option(help="Context of each upload, JSON; see docs/cerpms.md.")] = '{"packets": {}}',
+) -> None:
+    """Collect uplinks of CERPMs from a broker and upload them as packet logs, until it is stopped."""
+    import signal
+
+    import orjson
+
+    from app.ingest.mqtt import DEFAULT_TOPICS, MqttIngest, MqttSource, Sink
+    from app.logs import configure_logs
+
+    settings = _settings()
+    configure_logs(settings.log_format, settings.log_level)
+    try:
+        said = orjson.loads(context)
+    except orjson.JSONDecodeError as error:
+        raise InvalidParameter(f"--context is not JSON: {error}", field="context") from error
+    source = MqttSource(broker, tuple(topic or DEFAULT_TOPICS), client_id)
+    running = MqttIngest(source, Sink(server, key, said, batch_messages, batch_s), spool)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: running.stop())
+    running.run()
+
+
 @contextmanager
 def _owned_database(settings: Settings) -> Iterator[Database]:
     from app.registry.database import Database
