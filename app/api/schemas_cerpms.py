@@ -92,6 +92,14 @@ class CerpmMarkerIn(Headed):
         )
 
 
+class NumberOut(BaseModel):
+    """What a CERPM is known by."""
+
+    scheme: Literal["cerpm"]
+    text: str
+    number: int
+
+
 class CerpmMarkerOut(BaseModel):
     """A CERPM."""
 
@@ -99,7 +107,7 @@ class CerpmMarkerOut(BaseModel):
     family: Literal["cerpm"]
     status: Status
     version: int
-    number: int
+    code: NumberOut
     side: Side
     speed_limit: dict[str, Any] | None
     dev_eui: str | None

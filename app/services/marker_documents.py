@@ -170,7 +170,7 @@ def cerpm_document(row: Row | dict[str, Any]) -> dict[str, Any]:
         "family": row["family"],
         "status": row["status"],
         "version": row["version"],
-        "number": int(row["digits"]),
+        "code": {"scheme": row["scheme"], "text": row["digits"], "number": int(row["digits"])},
         "side": spec["side"],
         "speed_limit": spec["speed_limit"],
         "dev_eui": spec["dev_eui"],

@@ -24,7 +24,7 @@ def test_a_marker_is_registered_read_listed_and_found_by_its_number(client: http
     made = client.post("/v1/markers", json=cerpm(at, side="left", speed_limit=limit, status="surveyed"))
     assert made.status_code == 201, made.text
     marker = made.json()
-    assert (marker["number"], marker["side"], marker["speed_limit"]) == (1, "left", limit)
+    assert (marker["code"]["number"], marker["side"], marker["speed_limit"]) == (1, "left", limit)
     assert marker["beacon"]["spreading_factor"] == 7
     assert client.get(made.headers["location"]).json() == marker
     assert client.get("/v1/markers", params={"family": "cerpm", "code": "1"}).json()["items"] == [marker]
@@ -32,7 +32,7 @@ def test_a_marker_is_registered_read_listed_and_found_by_its_number(client: http
 
 def test_numbers_are_given_in_order_and_never_twice(client: httpx.Client, place: Place) -> None:
     first = client.post("/v1/markers", json=cerpm(place(), number=41)).json()
-    assert client.post("/v1/markers", json=cerpm(place())).json()["number"] == 42
+    assert client.post("/v1/markers", json=cerpm(place())).json()["code"]["number"] == 42
     taken = client.post("/v1/markers", json=cerpm(place(), number=41))
     assert taken.status_code == 409
     assert taken.json()["field"] == "number"
@@ -60,7 +60,7 @@ def test_what_is_said_can_be_changed(client: httpx.Client, place: Place) -> None
     assert changed.json()["side"] == "right"
     assert changed.json()["beacon"]["interval_s"] == 5.0
     assert changed.json()["dev_eui"] == "00a1b2c3d4e5f607"
-    assert changed.json()["number"] == made["number"]
+    assert changed.json()["code"] == made["code"]
     cleared = client.patch(path, json={"speed_limit": None}, headers={"If-Match": '"2"'})
     assert cleared.json()["speed_limit"] is None
     history = client.get(f"{path}/versions").json()["items"]
