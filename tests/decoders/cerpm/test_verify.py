@@ -1,0 +1,224 @@
+"""Authentic, fresh packets told from all others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from time import process_time
+
+import numpy as np
+import pytest
+
+from app.decoders.cerpm.freshness import FreshnessRules, SequenceSpan
+from app.decoders.cerpm.packets import HeardPacket, PlainClaim
+from app.decoders.cerpm.verify import Verdict, Verification, verify_packets
+from app.errors import InvalidParameter
+from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, START_S, body, heard, key_of, signed
+
+KEYS = {number: key_of(number) for number in range(1, 41)}
+DAY_S = 86_400.0
+
+
+def verdicts(packets: list[HeardPacket], **given: object) -> list[Verdict]:
+    """Of each packet."""
+    return [p.verdict for p in verify_packets(packets, KEYS, **given).packets]  # type: ignore[arg-type]
+
+
+def drive(
+    start_s: float, first: int, *, count: int = 20, number: int = 7, interval_s: float = 1.0
+) -> list[HeardPacket]:
+    """An honest drive past one marker."""
+    return [heard(first + i, start_s + i * interval_s, number, entry=i) for i in range(count)]
+
+
+def test_an_honest_drive_is_accepted_and_its_span_kept() -> None:
+    found = verify_packets(drive(0, 100), KEYS)
+    assert {p.verdict for p in found.packets} == {Verdict.AUTHENTIC}
+    assert found.spans == {7: (SequenceSpan(100, 119, START_S, START_S + 19),)}
+    assert found.packets[3].message is not None
+    assert found.packets[3].message.sequence == 103
+
+
+def test_what_is_not_signed_is_named() -> None:
+    good = signed(body(3, sequence=5))
+    cases = {
+        Verdict.UNAUTHENTICATED: HeardPacket(0, START_S, claim=PlainClaim(3, LON_DEG, LAT_DEG)),
+        Verdict.UNKNOWN_MARKER: HeardPacket(1, START_S, signed(body(4000))),
+        Verdict.FORGED: HeardPacket(2, START_S, body(4) + b"\0\0\0\1"),
+        Verdict.CORRUPT: HeardPacket(3, START_S, good[:7] + bytes([good[7] ^ 0x21]) + good[8:]),
+        Verdict.AUTHENTIC: HeardPacket(4, START_S, good),
+        Verdict.UNDECODABLE: HeardPacket(5, START_S, good[:23]),
+    }
+    found = verify_packets(list(cases.values()), KEYS)
+    assert [p.verdict for p in found.packets] == list(cases)
+    assert all(p.reason for p in found.packets if not p.accepted)
+    assert set(found.spans) == {3}
+
+
+def test_impossible_values_and_a_turned_tag_are_damage() -> None:
+    good = signed(body(3, sequence=5))
+    turned = good[:-1] + bytes([good[-1] ^ 4])
+    nowhere = signed(body(3, lon_deg=200.0, sequence=6))
+    packets = [HeardPacket(i, START_S + i, p) for i, p in enumerate((good, turned, nowhere))]
+    assert verdicts(packets) == [Verdict.AUTHENTIC, Verdict.CORRUPT, Verdict.CORRUPT]
+
+
+def test_a_marker_with_another_key_is_named_as_that() -> None:
+    packets = [HeardPacket(i, START_S + i, signed(body(5, sequence=i), key_of(99))) for i in range(4)]
+    assert verdicts(packets) == [Verdict.WRONG_KEY] * 4
+    assert verdicts(packets[:2]) == [Verdict.FORGED] * 2
+
+
+def test_disorder_and_echoes_cost_nothing() -> None:
+    packets = drive(0, 100)
+    echoes = [replace(p, heard_at_s=p.heard_at_s + 1.5, entry=50 + p.entry) for p in packets[::4]]
+    mixed = packets + echoes
+    np.random.default_rng(3).shuffle(mixed)  # type: ignore[arg-type]
+    found = verify_packets(mixed, KEYS)
+    assert found.counts()[Verdict.AUTHENTIC] == 20
+    assert found.counts()[Verdict.DUPLICATE] == 5
+    assert all(p.entry >= 50 for p in found.packets if p.verdict is Verdict.DUPLICATE)
+
+
+def test_the_same_sequence_again_is_a_replay_unless_it_is_the_same_uplink() -> None:
+    first = replace(heard(100, 0), event="uplink-1")
+    again = replace(first, heard_at_s=first.heard_at_s + 40)
+    other = replace(again, event="uplink-2")
+    assert verdicts([first, again]) == [Verdict.AUTHENTIC, Verdict.DUPLICATE]
+    assert verdicts([first, other]) == [Verdict.AUTHENTIC, Verdict.REPLAYED]
+
+
+def test_an_older_one_heard_after_a_newer_one_is_not_used() -> None:
+    packets = [*drive(0, 100), heard(90, 5, entry=99)]  # sequence 90 was lost on the way, and played later
+    found = verify_packets(packets, KEYS)
+    assert found.packets[-1].verdict is Verdict.OUT_OF_ORDER
+    assert found.counts()[Verdict.AUTHENTIC] == 20
+
+
+def test_a_recorded_one_played_before_the_first_honest_one_came_too_late() -> None:
+    recorded = heard(100, 995, entry=0)  # 900 transmissions before the honest ones take longer than 5 s
+    honest = drive(1000, 1000)
+    assert verdicts([recorded, *honest])[0] is Verdict.OUT_OF_ORDER
+    sharper = FreshnessRules(least_interval_s=0.5)
+    assert verdicts([heard(980, 995), *honest], rules=sharper)[0] is Verdict.OUT_OF_ORDER
+    assert verdicts([heard(998, 998), *honest], rules=sharper) == [Verdict.AUTHENTIC] * 21
+
+
+def test_a_replay_on_another_day_is_known_from_the_spans() -> None:
+    first = verify_packets(drive(0, 100), KEYS)
+    spans = {number: list(kept) for number, kept in first.spans.items()}
+    replays = [replace(p, heard_at_s=p.heard_at_s + DAY_S) for p in drive(0, 100)]
+    lost = heard(110, DAY_S)
+    earlier = heard(99, DAY_S)
+    fresh = drive(DAY_S, 80_000)
+    assert verdicts(replays, heard_before=spans) == [Verdict.REPLAYED] * 20
+    assert verdicts([lost, earlier], heard_before=spans) == [Verdict.REPLAYED, Verdict.OUT_OF_ORDER]
+    assert verdicts(fresh, heard_before=spans) == [Verdict.AUTHENTIC] * 20
+
+
+def test_a_late_log_fits_between_those_that_came_before_it() -> None:
+    spans = {
+        7: [
+            SequenceSpan(100, 120, START_S, START_S + 20),
+            SequenceSpan(5000, 5020, START_S + DAY_S, START_S + DAY_S + 20),
+        ]
+    }
+    assert verdicts(drive(3600, 2000), heard_before=spans) == [Verdict.AUTHENTIC] * 20
+    assert verdicts(drive(-3600, 50, count=1), heard_before=spans) == [Verdict.AUTHENTIC]
+    assert verdicts(drive(2 * DAY_S, 4000), heard_before=spans) == [Verdict.OUT_OF_ORDER] * 20
+    assert verdicts(drive(-3600, 4000), heard_before=spans) == [Verdict.OUT_OF_ORDER] * 20
+
+
+@pytest.mark.parametrize("offset_s", [-30.0, 30.0])
+def test_clocks_may_differ_between_drives(offset_s: float) -> None:
+    spans = verify_packets([replace(p, heard_at_s=p.heard_at_s - offset_s) for p in drive(0, 100)], KEYS).spans
+    beside = [replace(p, heard_at_s=p.heard_at_s + offset_s) for p in drive(0.2, 100, interval_s=0.99)]
+    assert verdicts(beside, heard_before=spans) == [Verdict.AUTHENTIC] * 20
+
+
+def test_the_same_log_again_is_read_again() -> None:
+    spans = verify_packets(drive(0, 100), KEYS).spans
+    assert verdicts(drive(0, 100), heard_before=spans) == [Verdict.AUTHENTIC] * 20
+
+
+def test_without_times_only_what_is_above_all_known_is_accepted() -> None:
+    packets = [replace(p, heard_at_s=math.nan) for p in drive(0, 100)]
+    found = verify_packets([*packets, packets[0]], KEYS, {7: [SequenceSpan(1, 104, START_S, START_S)]})
+    assert [p.verdict for p in found.packets] == [Verdict.OUT_OF_ORDER] * 5 + [Verdict.AUTHENTIC] * 15 + [
+        Verdict.DUPLICATE
+    ]
+    assert "freshness unknown" in found.packets[10].reason
+    assert "freshness unknown" in found.warnings[0]
+    (span,) = found.spans[7]
+    assert (span.first_sequence, span.last_sequence) == (105, 119)
+    assert math.isnan(span.last_heard_s)
+    assert verdicts(drive(DAY_S, 110), heard_before=found.spans) == [Verdict.REPLAYED] * 10 + [Verdict.AUTHENTIC] * 10
+
+
+def test_nothing_is_heard_after_its_upload() -> None:
+    rules = FreshnessRules(received_at_s=START_S + 10)
+    assert verdicts([heard(1, 0), heard(2, 3600)], rules=rules) == [Verdict.AUTHENTIC, Verdict.OUT_OF_ORDER]
+
+
+def test_two_markers_of_one_number_are_seen_by_their_messages() -> None:
+    other = heard(103, 3, payload=signed(body(7, LON_DEG + 1e-3, sequence=103)), entry=77)
+    found = verify_packets([*drive(0, 100), other], KEYS)
+    assert found.packets[-1].verdict is Verdict.OUT_OF_ORDER
+    assert "two markers" in found.packets[-1].reason
+
+
+def test_ten_thousand_forged_and_replayed_packets_are_all_refused_and_no_honest_one() -> None:
+    rng = np.random.default_rng(1007)
+    spans: dict[int, list[SequenceSpan]] = {}
+    refused = honest = 0
+    recorded: list[HeardPacket] = []
+    for day in range(5):
+        clock_s = day * 3600 + rng.uniform(-30, 30)
+        log = [
+            heard(1000 + 3600 * day + i, clock_s + i + rng.uniform(0, 0.5), number)
+            for number in range(1, 41)
+            for i in range(30)
+            if rng.random() > 0.3
+        ]
+        attack = [_forgery(rng, clock_s) for _ in range(1000)]
+        attack += [_replay(rng, recorded or log, clock_s, day > 0) for _ in range(1000)]
+        mixed = [replace(p, entry=i) for i, p in enumerate(log + attack)]
+        rng.shuffle(mixed)  # type: ignore[arg-type]
+        found = verify_packets(mixed, KEYS, spans)
+        refused += sum(1 for p in found.packets if p.entry >= len(log) and not p.accepted)
+        honest += sum(1 for p in found.packets if p.entry < len(log) and not p.accepted)
+        for number, kept in found.spans.items():
+            spans.setdefault(number, []).extend(kept)
+        recorded += log
+    assert refused == 10_000
+    assert honest == 0
+
+
+def _forgery(rng: np.random.Generator, clock_s: float) -> HeardPacket:
+    content = body(int(rng.integers(1, 41)), LON_DEG + 3e-4, sequence=int(rng.integers(0, 2**32)))
+    return HeardPacket(0, START_S + clock_s + rng.uniform(0, 30), content + rng.bytes(4))
+
+
+def _replay(rng: np.random.Generator, recorded: list[HeardPacket], clock_s: float, old: bool) -> HeardPacket:
+    packet = recorded[int(rng.integers(len(recorded)))]
+    at_s = START_S + clock_s + rng.uniform(0, 30) if old else packet.heard_at_s + rng.uniform(0.1, 100)
+    return replace(packet, heard_at_s=at_s)
+
+
+def test_a_long_log_takes_seconds() -> None:
+    packets = [heard(i // 40, i / 40, 1 + i % 40, entry=i) for i in range(20_000)]
+    began = process_time()
+    found = verify_packets(packets, KEYS, {})
+    assert process_time() - began < 5
+    assert found.counts()[Verdict.AUTHENTIC] == 20_000
+
+
+@pytest.mark.parametrize("name", ["clock_tolerance_s", "echo_s", "least_interval_s", "received_at_s"])
+def test_rules_are_checked(name: str) -> None:
+    for value in (-1.0, math.nan, math.inf):
+        with pytest.raises(InvalidParameter, match=name):
+            FreshnessRules(**{name: value})
+
+
+def test_an_empty_log_is_a_result() -> None:
+    assert verify_packets([], lambda number: None) == Verification([], {}, [])
