@@ -122,11 +122,11 @@ class CerpmMessage:
             ("number", self.number, 1, MAX_NUMBER),
             ("sequence", self.sequence, 0, MAX_SEQUENCE),
         ):
-            if not least <= value <= most:
+            if not least <= value <= most or value != int(value):
                 raise InvalidParameter(
                     f"{name} is {value}",
                     field=name,
-                    limit=f"{least} to {most}",
+                    limit=f"a whole number from {least} to {most}",
                     cure="numbers and sequences are 32 bits; a marker at the end of its sequence needs a new number",
                 )
         if self.height_m is not None and not (
