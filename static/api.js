@@ -56,6 +56,10 @@ export async function fetchLayout(id, form) {
   return (await ask(`/v1/markers/${id}/layout.${form}`)).blob();
 }
 
+export async function fetchPayload(id) {
+  return (await ask(`/v1/markers/${id}/payload.json`)).json();
+}
+
 export async function listCodebooks() {
   return (await (await ask("/v1/codebooks")).json()).items;
 }

@@ -1,6 +1,7 @@
 // Decode a frame or a trace: its picture, each reading, the vehicle's position.
 
 import * as api from "./api.js";
+import { drawLane, drawPackets, isPacketLog } from "./cerpms.js";
 import { drawMap } from "./map.js";
 import { $, attempt, facts, fillForm, make, readForm, say } from "./page.js";
 import { drawTagFix, drawTags, isTrace, waitFor } from "./traces.js";
@@ -41,15 +42,22 @@ export function startDecode() {
 function take(file) {
   frame = file || null;
   $("#file-name").textContent = file ? `${file.name}, ${Math.ceil(file.size / 1024)} kB` : "";
+  if (file) $("#kind").value = kindOf(file);
+}
+
+function kindOf(file) {
+  if (isPacketLog(file)) return "packets";
+  return isTrace(file) ? "trace" : "frame";
 }
 
 async function upload(form) {
   if (!frame) throw new api.Problem({ title: "There is no file", detail: "Choose a picture or a recording first.", field: "file", limit: "JPEG, PNG; a recording", cure: "drop one on the dashed field" });
   say("Decoding …");
   const context = contextOf(form);
-  if (isTrace(frame)) context.trace ??= {};
+  const kind = $("#kind").value;
+  if (kind !== "frame" && !context.trace && !context.packets) context[kind] = {};
   const decoded = await waitFor(await api.decode(frame, context));
-  await (decoded.kind === "trace" ? showTrace(decoded) : show(decoded));
+  await SHOWN[decoded.kind](decoded);
   say(decoded.summary.text);
   $("#decoded").scrollIntoView({ block: "start" });
 }
@@ -87,6 +95,16 @@ async function showTrace(decoded) {
   $("#fix").replaceChildren(drawTagFix(decoded));
   await showPicture(decoded.links.plot, `The trace with what was found in it: ${decoded.summary.text}`);
 }
+
+async function showPackets(decoded) {
+  $("#decoded").hidden = false;
+  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.report.decode_ms.toFixed(0)} ms.`;
+  $("#readings").replaceChildren(...drawPackets(decoded));
+  $("#fix").replaceChildren(drawLane(decoded));
+  await showPicture(decoded.links.plot, `The lane that the markers give: ${decoded.summary.text}`);
+}
+
+const SHOWN = { frame: show, archive: show, trace: showTrace, packets: showPackets };
 
 async function showPicture(path, text) {
   const picture = await api.fetchPicture(path);

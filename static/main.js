@@ -1,13 +1,14 @@
 // Views, and the key that every request needs.
 
 import { key } from "./api.js";
+import { startCerpms } from "./cerpms.js";
 import { startDecode } from "./decode.js";
 import { showMagnets, startMagnets } from "./magnets.js";
 import { showMarkers, startMarkers } from "./markers.js";
 import { $, clearProblem, say } from "./page.js";
 import { startRegister } from "./register.js";
 
-const VIEWS = ["markers", "register", "magnets", "decode"];
+const VIEWS = ["markers", "register", "magnets", "cerpms", "decode"];
 
 function showView() {
   const [asked, id] = location.hash.slice(1).split("/");
@@ -52,6 +53,7 @@ window.addEventListener("hashchange", () => {
 startMarkers();
 startRegister();
 startMagnets();
+startCerpms();
 startDecode();
 showKey();
 showView();

@@ -1,6 +1,7 @@
 // The list of markers, their plot, one marker's artwork or layout, a ZIP of many.
 
 import * as api from "./api.js";
+import { drawCerpm } from "./cerpms.js";
 import { drawMagnets } from "./magnets.js";
 import { drawMap } from "./map.js";
 import { $, attempt, facts, make, say } from "./page.js";
@@ -43,7 +44,7 @@ export async function showMarkers(chosenId = null) {
 
 function drawRows() {
   const rows = state.markers.map((marker) => {
-    let box = null; // magnets have no artwork to select
+    let box = null; // magnets and CERPMs have no artwork to select
     if (marker.family === "plate") {
       box = make("input", { type: "checkbox", "aria-label": `Select ${codeOf(marker)}`, onchange: (event) => select(marker.id, event.target.checked) });
       box.checked = state.selected.has(marker.id);
@@ -105,6 +106,7 @@ function choose(marker) {
 
 async function showDetail(marker) {
   if (marker.family === "plate") return showPlate(marker);
+  if (marker.family === "cerpm") return drawCerpm($("#detail"), marker);
   const whole = await api.getMarker(marker.id);
   if (state.chosen === marker.id) drawMagnets($("#detail"), whole);
   return undefined;

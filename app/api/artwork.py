@@ -7,18 +7,15 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from app.api.dependencies import Caller, Identifier, Number
+from app.api.dependencies import Caller, Number
 from app.api.problems import problem_responses
-from app.api.schemas_markers import MarkerId, Status
+from app.api.schemas_markers import MarkerId
+from app.api.schemas_selection import SelectionIn
 from app.api.strict_json import StrictRoute
 from app.encoders.plate import ArtworkFormat, ArtworkOptions, BundleOptions
-from app.errors import InvalidParameter
-from app.geodesy import check_lon_lat
-from app.registry.markers import MarkerFilter
-from app.registry.spatial import Box
-from app.services.artwork import MAX_PLATES, Artworks, Bundle, Selection
+from app.services.artwork import Artworks, Bundle
 
 router = APIRouter(prefix="/v1", tags=["artwork"], route_class=StrictRoute)
 
@@ -40,44 +37,16 @@ class SheetIn(BaseModel):
     height_mm: Number = Field(description="Height, up to 5000. [mm]")
 
 
-class ArtworkIn(BaseModel):
+class ArtworkIn(SelectionIn):
     """Plates to make, by id or by filter, and how."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": _EXAMPLES})
 
-    marker_ids: list[Identifier] | None = Field(None, min_length=1, description=f"Ids of 1 to {MAX_PLATES} plates.")
-    bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
-        None, description="west, south, east, north. [deg]"
-    )
-    status: Status | None = Field(None, description="Only plates with this status.")
     formats: list[ArtworkFormat] = Field([ArtworkFormat.PDF, ArtworkFormat.SVG], min_length=1, max_length=4)
     heaters: Flag = Field(False, description="Heating tracks under dark units.")
     leds: Flag = Field(False, description="Light sources under light units.")
     resolution_dpi: Resolution = Field(150.0, description="Of PNG files. [1/inch]")
     sheet: SheetIn | None = Field(None, description="Also nest the plates on sheets of this size.")
-
-    @model_validator(mode="after")
-    def _by_id_or_by_filter(self) -> ArtworkIn:
-        if (self.marker_ids is None) == (self.bbox is None and self.status is None):
-            raise InvalidParameter(
-                "plates are selected by id, or by a filter",
-                field="marker_ids",
-                limit="marker_ids; or bbox, status or both",
-                cure="send one of the two",
-            )
-        return self
-
-    def selection(self) -> Selection:
-        """The selection as the use cases know it."""
-        box = None
-        if self.bbox is not None:
-            west, south, east, north = self.bbox
-            check_lon_lat(west, south, field="bbox")
-            check_lon_lat(east, north, field="bbox")
-            if south > north:
-                raise InvalidParameter("bbox has its south above its north", field="bbox", limit="south <= north")
-            box = Box(west, south, east, north)
-        return Selection(tuple(self.marker_ids or ()), MarkerFilter(box=box, status=self.status))
 
     def options(self) -> BundleOptions:
         """The options as the encoders know them."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import tempfile
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import IO, Any
 
 from app.encoders.plate import (
@@ -24,12 +23,13 @@ from app.encoders.plate import (
 from app.encoders.plate.bundle import ARTWORK_VERSION
 from app.encoders.plate.formats import DEFAULT_DPI
 from app.encoders.plate.order import MAX_NOTE_LENGTH
-from app.errors import InvalidParameter, NotFound, Unavailable
+from app.errors import NotFound, Unavailable
 from app.geodesy import LocalizationGrade
 from app.registry import markers as store
 from app.registry.database import Database
-from app.registry.markers import MarkerFilter, Row
+from app.registry.markers import Row
 from app.services.access import Caller
+from app.services.marker_selection import Selection, select_markers
 from app.services.plate_markers import plate_code, plate_geometry
 
 MAX_PLATES = 5_000
@@ -44,14 +44,6 @@ class PlateArtwork:
     media_type: str
     file_name: str
     proof: PlateProof
-
-
-@dataclass(frozen=True, slots=True)
-class Selection:
-    """Plates to make: by id, or all that a filter leaves."""
-
-    marker_ids: tuple[str, ...] = ()
-    narrowed: MarkerFilter = field(default_factory=MarkerFilter)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +119,8 @@ class Artworks:
         Unavailable
             Other selections are being written.
         """
-        rows = self._select(caller, selection)
+        with self._database.read() as connection:
+            rows = select_markers(connection, caller.agency_id, selection, "plate", most=MAX_PLATES)
         if not self._places.acquire(blocking=False):
             raise Unavailable("other selections are being written", cure="try again in a few seconds")
         file = tempfile.TemporaryFile(prefix="waymark-artwork-")  # noqa: SIM115 - the response reads it
@@ -148,34 +141,6 @@ class Artworks:
         if row["family"] != "plate":
             raise NotFound(f"marker {marker_id} is no plate", field="marker_id", limit="plates have artwork")
         return row
-
-    def _select(self, caller: Caller, selection: Selection) -> Sequence[Row]:
-        count = len(selection.marker_ids)
-        if count > MAX_PLATES:
-            raise _too_many(f"{count} plates were selected")
-        if len(set(selection.marker_ids)) != count:
-            raise InvalidParameter(
-                "a plate is selected twice", field="marker_ids", limit="each id once", cure="leave repetitions out"
-            )
-        with self._database.read() as connection:
-            if selection.marker_ids:
-                rows = store.get_markers(connection, caller.agency_id, list(selection.marker_ids))
-            else:
-                rows = store.list_markers(
-                    connection,
-                    caller.agency_id,
-                    replace(selection.narrowed, family="plate"),
-                    after=None,
-                    limit=MAX_PLATES + 1,
-                )
-        plates = [row for row in rows if row["family"] == "plate"]
-        if len(plates) > MAX_PLATES:
-            raise _too_many(f"more than {MAX_PLATES} plates were selected")
-        if not plates:
-            raise InvalidParameter(
-                "no plate was selected", field="marker_ids", limit=f"1 to {MAX_PLATES} plates", cure="widen the filter"
-            )
-        return plates
 
     def _order(self, row: Row) -> PlateOrder:
         return PlateOrder(
@@ -206,12 +171,3 @@ def _is_approximate(row: Row) -> bool:
 
 def _lowest_confidence(manifest: dict[str, Any]) -> float:
     return float(min(plate["proof"]["confidence"] for plate in manifest["plates"]))
-
-
-def _too_many(message: str) -> InvalidParameter:
-    return InvalidParameter(
-        message,
-        field="marker_ids",
-        limit=f"{MAX_PLATES} plates in one bundle",
-        cure="select by a smaller box, by status, or by fewer ids",
-    )

@@ -193,6 +193,6 @@ def test_too_many_plates_name_the_limit(real_client: httpx.Client, marker: dict[
     ids = [f"01890000-0000-7000-8000-{k:012x}" for k in range(MAX_PLATES + 1)]
     answer = real_client.post("/v1/artwork", json={"marker_ids": ids})
     assert answer.status_code == 422
-    assert answer.json()["limit"] == f"{MAX_PLATES} plates in one bundle"
+    assert answer.json()["limit"] == f"{MAX_PLATES} plates at once"
     twice = real_client.post("/v1/artwork", json={"marker_ids": [marker["id"]] * 2})
     assert twice.status_code == 422
