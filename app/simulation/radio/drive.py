@@ -1,0 +1,146 @@
+"""A drive past markers: what the vehicle's receiver hears of them, and where the vehicle was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.cerpm.packets import HeardPacket, PlainClaim
+from app.markers.cerpm import CerpmMessage, LaneSide
+from app.sensors.pose_track import PoseTrack
+from app.simulation.radio.lanes import TrueLane
+from app.simulation.radio.link import (
+    Radio,
+    Transmissions,
+    draw_shadows_db,
+    hear_transmissions,
+    mean_rssi_dbm,
+    send_beacons,
+)
+from app.simulation.radio.markers import LaidMarkers
+from app.simulation.radio.vehicle import Drive, Driver, Receiver, drive_lane, observe_track
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Sign = Callable[[CerpmMessage], bytes]
+
+ANTENNA_M = 1.5
+"""Of the vehicle above the road. [m]"""
+_SNR_LIMITS_DB = (-20.0, 12.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeardDrive:
+    """A packet log, the vehicle's track, and what is true of them.
+
+    Attributes
+    ----------
+    packets : tuple of HeardPacket
+        In the order heard.
+    track : PoseTrack
+        On the same clock.
+    drive : Drive
+        Where the vehicle really was.
+    sent : Transmissions
+        All of them.
+    distance_m, strength_dbm : ndarray, shape (K,)
+        Of each transmission from the vehicle, and at its receiver. [m, dBm]
+    sender : ndarray of int, shape (len(packets),)
+        Which of the laid markers sent each packet.
+    """
+
+    packets: tuple[HeardPacket, ...]
+    track: PoseTrack
+    drive: Drive
+    sent: Transmissions
+    distance_m: Floats
+    strength_dbm: Floats
+    sender: Ints = field(default_factory=lambda: np.zeros(0, int))
+
+
+def drive_past(
+    lane: TrueLane,
+    markers: LaidMarkers,
+    rng: np.random.Generator,
+    *,
+    sign: Sign | None,
+    radio: Radio | None = None,
+    driver: Driver | None = None,
+    receiver: Receiver | None = None,
+    start_s: float = 1.78e9,
+    first_sequence: npt.ArrayLike | None = None,
+) -> HeardDrive:
+    """Drive a lane and listen.
+
+    Parameters
+    ----------
+    lane : TrueLane
+    markers : LaidMarkers
+        Those that send.
+    rng : numpy.random.Generator
+        Draws the drive, the receiver's errors and the radio.
+    sign : callable or None
+        Message to the bytes that its marker sends; None for the paper's packets in clear.
+    radio : Radio, optional
+    driver : Driver, optional
+    receiver : Receiver, optional
+        RTK unless given.
+    start_s : float
+        Seconds since 1970-01-01 UTC. [s]
+    first_sequence : array_like of int, shape (N,), optional
+        Of each marker's first transmission.
+    """
+    radio = radio or Radio()
+    drive = drive_lane(lane, driver or Driver(), rng, start_s=start_s)
+    track = observe_track(lane, drive, receiver or Receiver.rtk(), rng)
+    sent = send_beacons(
+        len(markers), radio, float(drive.time_s[0]), float(drive.time_s[-1]), rng, first_sequence=first_sequence
+    )
+    at = np.stack([np.interp(sent.start_s, drive.time_s, drive.point_m[:, k]) for k in range(2)], 1)
+    distance = np.hypot(np.linalg.norm(at - markers.point_m[sent.sender], axis=1), ANTENNA_M)
+    travelled = np.interp(sent.start_s, drive.time_s, drive.chainage_m)
+    strength = mean_rssi_dbm(distance) + draw_shadows_db(sent.sender, travelled, radio, rng)
+    strength = strength + rng.normal(0, radio.fading_sd_db, len(strength))
+    heard = np.flatnonzero(hear_transmissions(sent.start_s, strength, radio, rng))
+    snr = np.clip(strength[heard] - radio.noise_dbm + rng.normal(0, 0.5, len(heard)), *_SNR_LIMITS_DB)
+    packets = tuple(
+        _heard(entry, markers, sent, int(k), radio, sign, float(strength[k]), float(snr[entry]))
+        for entry, k in enumerate(heard)
+    )
+    return HeardDrive(packets, track, drive, sent, distance, strength, sent.sender[heard])
+
+
+def _heard(
+    entry: int,
+    markers: LaidMarkers,
+    sent: Transmissions,
+    k: int,
+    radio: Radio,
+    sign: Sign | None,
+    strength_dbm: float,
+    snr_db: float,
+) -> HeardPacket:
+    """A packet as the receiver logs it when it is over: RSSI in whole dB, SNR in quarters."""
+    message = marker_message(markers, int(sent.sender[k]), int(sent.sequence[k]))
+    at_s, rssi, snr = float(sent.start_s[k]) + radio.airtime_s, float(round(strength_dbm)), round(4 * snr_db) / 4
+    if sign is not None:
+        return HeardPacket(entry, at_s, payload=sign(message), rssi_dbm=rssi, snr_db=snr)
+    claim = PlainClaim(
+        message.number, message.lon_deg, message.lat_deg, message.height_m, message.side, message.speed_limit
+    )
+    return HeardPacket(entry, at_s, claim=claim, rssi_dbm=rssi, snr_db=snr)
+
+
+def marker_message(markers: LaidMarkers, row: int, sequence: int) -> CerpmMessage:
+    """What a laid marker says in a transmission."""
+    return CerpmMessage(
+        number=int(markers.number[row]),
+        lon_deg=float(markers.lon_deg[row]),
+        lat_deg=float(markers.lat_deg[row]),
+        side=LaneSide(int(markers.told_side[row])),
+        speed_limit=markers.speed_limit,
+        sequence=sequence,
+    )

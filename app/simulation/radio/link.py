@@ -1,0 +1,257 @@
+"""The radio between markers and a vehicle: path loss, sensitivity, collisions, a receiver that hears one at a time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from app.encoders.cerpm.airtime import time_on_air_s
+from app.errors import InvalidParameter
+from app.markers.cerpm import MESSAGE_BYTES
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+NEAR_M, NEAR_DBM, FAR_M, FAR_DBM = 50.0, -108.0, 340.0, -125.0
+"""CERPM paper, section 4.1."""
+EXPONENT = (NEAR_DBM - FAR_DBM) / (10 * math.log10(FAR_M / NEAR_M))
+SENSITIVITY_DBM = {
+    125_000: {7: -123.0, 8: -126.0, 9: -129.0, 10: -132.0, 11: -133.0, 12: -136.0},
+    250_000: {7: -120.0, 8: -123.0, 9: -125.0, 10: -128.0, 11: -130.0, 12: -133.0},
+    500_000: {7: -116.0, 8: -119.0, 9: -122.0, 10: -125.0, 11: -128.0, 12: -130.0},
+}
+"""By bandwidth and spreading factor: Semtech SX1276 data sheet, RFS_L125_HF, RFS_L250_HF, RFS_L500_HF. [dBm]"""
+_NOISE_FIGURE_DB = 6.0
+_SOFT_DB = 0.35
+"""Scale of the logistic step from hearing nothing to hearing all about the sensitivity. [dB]"""
+_PREAMBLE_TAIL_SYMBOLS = 4.25
+
+
+@dataclass(frozen=True, slots=True)
+class Radio:
+    """How markers send and what the air and the receiver do to it.
+
+    Attributes
+    ----------
+    spreading_factor : int
+        7 to 12.
+    bandwidth_hz : int
+        125, 250 or 500 kHz. [Hz]
+    interval_s, jitter : float
+        Between transmissions of a marker, and the share of it by which each is early or late at most, below half. [s]
+    payload_bytes : int
+        [bytes]
+    preamble_symbols : int
+        Programmed length.
+    lock_symbols : float
+        Of the preamble's end that the receiver needs undisturbed to lock (Bor et al. 2016: five).
+    capture_db : float
+        By how much a packet must be above all others together to be read; infinite: never. [dB]
+    shadow_sd_db, shadow_length_m : float
+        Of what stands in the way, and how far the vehicle drives until that is forgotten (Gudmundson). [dB, m]
+    fading_sd_db : float
+        From packet to packet. [dB]
+    """
+
+    spreading_factor: int = 7
+    bandwidth_hz: int = 500_000
+    interval_s: float = 2.0
+    jitter: float = 0.1
+    payload_bytes: int = MESSAGE_BYTES
+    preamble_symbols: int = 8
+    lock_symbols: float = 5.0
+    capture_db: float = 6.0
+    shadow_sd_db: float = 4.0
+    shadow_length_m: float = 25.0
+    fading_sd_db: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.bandwidth_hz not in SENSITIVITY_DBM or self.spreading_factor not in SENSITIVITY_DBM[self.bandwidth_hz]:
+            raise InvalidParameter(
+                f"SF{self.spreading_factor} at {self.bandwidth_hz} Hz",
+                field="radio",
+                limit="SF7 to SF12 at 125,000, 250,000 or 500,000 Hz",
+            )
+        if not (0 <= self.jitter < 0.5 and (1 - 2 * self.jitter) * self.interval_s > self.airtime_s):
+            raise InvalidParameter(
+                f"an interval of {self.interval_s:g} s with a jitter of {self.jitter:g}",
+                field="radio.interval_s",
+                limit=f"longer than the {self.airtime_s:.3f} s on air, jitter included",
+            )
+
+    @property
+    def airtime_s(self) -> float:
+        """Of one packet. [s]"""
+        return time_on_air_s(
+            self.payload_bytes, self.spreading_factor, self.bandwidth_hz, preamble_symbols=self.preamble_symbols
+        )
+
+    @property
+    def spare_s(self) -> float:
+        """From the start of a packet to where the receiver needs it undisturbed. [s]"""
+        return max(self.preamble_symbols + _PREAMBLE_TAIL_SYMBOLS - self.lock_symbols, 0.0) * self.symbol_s
+
+    @property
+    def symbol_s(self) -> float:
+        """[s]"""
+        return float(2**self.spreading_factor / self.bandwidth_hz)
+
+    @property
+    def sensitivity_dbm(self) -> float:
+        """Half of the packets at this strength are heard. [dBm]"""
+        return SENSITIVITY_DBM[self.bandwidth_hz][self.spreading_factor]
+
+    @property
+    def noise_dbm(self) -> float:
+        """Thermal noise in the receiver. [dBm]"""
+        return -174.0 + 10 * math.log10(self.bandwidth_hz) + _NOISE_FIGURE_DB
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transmissions:
+    """What markers sent, by time.
+
+    Attributes
+    ----------
+    sender : ndarray of int, shape (K,)
+        Which of the markers.
+    sequence : ndarray of int, shape (K,)
+        Of its message.
+    start_s : ndarray, shape (K,)
+        [s]
+    """
+
+    sender: Ints
+    sequence: Ints
+    start_s: Floats
+
+
+def mean_rssi_dbm(distance_m: npt.ArrayLike) -> Floats:
+    """Strength by distance, without shadows and fading: log-distance through the paper's two points. [dBm]"""
+    return np.asarray(NEAR_DBM - 10 * EXPONENT * np.log10(np.maximum(np.asarray(distance_m, float), 1.0) / NEAR_M))
+
+
+def send_beacons(
+    count: int,
+    radio: Radio,
+    start_s: float,
+    end_s: float,
+    rng: np.random.Generator,
+    *,
+    first_sequence: npt.ArrayLike | None = None,
+) -> Transmissions:
+    """What markers send from one time to another, none of them knowing of the others.
+
+    Parameters
+    ----------
+    count : int
+        Markers.
+    radio : Radio
+    start_s, end_s : float
+        [s]
+    rng : numpy.random.Generator
+        Draws phases, jitter and sequences to begin with.
+    first_sequence : array_like of int, shape (count,), optional
+        Drawn below 1,000,000 if not given.
+
+    Notes
+    -----
+    A marker's slots are one interval apart from a random phase; each transmission is uniformly early or late in its
+    slot. Clocks of 20 ppm do not matter within a drive.
+    """
+    slots = int((end_s - start_s) / radio.interval_s) + 2
+    first = rng.integers(0, 1_000_000, count) if first_sequence is None else np.asarray(first_sequence, int)
+    phase = rng.uniform(-1, 0, (count, 1)) * radio.interval_s
+    jitter = rng.uniform(-radio.jitter, radio.jitter, (count, slots)) * radio.interval_s
+    start = start_s + phase + np.arange(slots) * radio.interval_s + jitter
+    sender, slot = np.nonzero((start >= start_s) & (start < end_s))
+    sent = start[sender, slot]
+    order = np.argsort(sent, kind="stable")
+    return Transmissions(sender[order], (first[sender] + slot)[order], sent[order])
+
+
+def draw_shadows_db(sender: Ints, travelled_m: Floats, radio: Radio, rng: np.random.Generator) -> Floats:
+    """Shadowing of each transmission, correlated along the way between the same marker and the vehicle. [dB]
+
+    Parameters
+    ----------
+    sender : ndarray of int, shape (K,)
+        By time.
+    travelled_m : ndarray, shape (K,)
+        How far the vehicle had come. [m]
+    radio : Radio
+    rng : numpy.random.Generator
+    """
+    drawn = rng.normal(0, 1, len(sender))
+    shadows = np.empty(len(sender))
+    for one in np.unique(sender):
+        mine = np.flatnonzero(sender == one)
+        keep = np.exp(-np.diff(travelled_m[mine]) / radio.shadow_length_m)
+        value = 0.0
+        for k, at in enumerate(mine):
+            share = float(keep[k - 1]) if k else 0.0
+            value = share * value + math.sqrt(1 - share**2) * drawn[at]
+            shadows[at] = value
+    return shadows * radio.shadow_sd_db
+
+
+def hear_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, rng: np.random.Generator) -> Bools:
+    """Which transmissions one receiver reads.
+
+    Parameters
+    ----------
+    start_s : ndarray, shape (K,)
+        Rising. [s]
+    strength_dbm : ndarray, shape (K,)
+        At the receiver. [dBm]
+    radio : Radio
+        All send with the same settings.
+    rng : numpy.random.Generator
+        Draws what is heard about the sensitivity.
+
+    Returns
+    -------
+    ndarray of bool, shape (K,)
+
+    Notes
+    -----
+    Bor et al. 2016, "Do LoRa low-power wide-area networks scale?", section 4: packets of one spreading factor collide
+    where they overlap, but for the beginning of the preamble, unless one is `capture_db` above the others. The
+    receiver locks on to a preamble if it is idle and then hears nothing else until that packet is over: one that begins
+    meanwhile is lost, however strong, and strong enough it takes the first with it.
+    """
+    airtime, spare = radio.airtime_s, radio.spare_s
+    odds = 1 / (1 + np.exp(-np.clip((strength_dbm - radio.sensitivity_dbm) / _SOFT_DB, -60, 60)))
+    audible = rng.random(len(start_s)) < odds
+    power = 10 ** (strength_dbm / 10)
+    first = np.searchsorted(start_s, start_s - airtime + spare, side="right")
+    locked = np.searchsorted(start_s, start_s + spare + radio.lock_symbols * radio.symbol_s, side="left")
+    last = np.searchsorted(start_s, start_s + airtime, side="left")
+    heard = np.zeros(len(start_s), bool)
+    free_at = -math.inf
+    for k in np.flatnonzero(audible):
+        if start_s[k] + spare < free_at:
+            continue  # another packet is being read
+        others = np.r_[first[k] : k, k + 1 : locked[k]]
+        if not _stands_out(power[k], power[others].sum(), radio.capture_db):
+            continue  # no lock on a disturbed preamble
+        free_at = start_s[k] + airtime
+        others = np.r_[first[k] : k, k + 1 : last[k]]
+        worst = _strongest_moment(start_s[others], power[others], start_s[k] + spare, airtime)
+        heard[k] = _stands_out(power[k], worst, radio.capture_db)
+    return heard
+
+
+def _stands_out(power_mw: float, others_mw: float, capture_db: float) -> bool:
+    return others_mw <= 0 or power_mw >= 10 ** (capture_db / 10) * others_mw
+
+
+def _strongest_moment(start_s: Floats, power_mw: Floats, from_s: float, airtime_s: float) -> float:
+    """Greatest sum of packets' powers at any moment after a time; it is reached when one of them begins. [mW]"""
+    moments = np.maximum(start_s, from_s)[:, None]
+    on_air = (start_s <= moments) & (start_s + airtime_s > moments)
+    return float((on_air * power_mw).sum(axis=1).max(initial=0.0))
