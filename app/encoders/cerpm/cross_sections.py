@@ -146,8 +146,19 @@ def direction_rad(points_m: Floats, step_m: float, smoothing_m: float) -> Floats
     """Direction of evenly spaced points, Gaussian-smoothed along the line, unwrapped, shape (N,). [rad]"""
     delta = np.diff(points_m, axis=0)
     turn = np.unwrap(np.arctan2(delta[:, 1], delta[:, 0]))
-    at = np.concatenate([[turn[0]], (turn[:-1] + turn[1:]) / 2, [turn[-1]]])
-    return np.asarray(gaussian_filter1d(at, smoothing_m / step_m, mode="nearest"))
+    reach = int(4 * smoothing_m / step_m) + 1
+    going_on = np.concatenate([_extrapolated(turn[::-1], reach)[::-1], turn, _extrapolated(turn, reach)])
+    smooth = gaussian_filter1d(going_on, smoothing_m / step_m)[reach - 1 : len(turn) + reach + 1]
+    return np.asarray((smooth[:-1] + smooth[1:]) / 2)
+
+
+def _extrapolated(turn: Floats, count: int) -> Floats:
+    """Directions after the last one, as its bend goes on."""
+    known = turn[-count:]
+    if len(known) < 2:
+        return np.full(count, known[-1])
+    slope, start = np.polyfit(np.arange(len(known)), known, 1)
+    return np.asarray(start + slope * np.arange(len(known), len(known) + count))
 
 
 def _meet(line: Floats, along: Floats, start: Floats, centre: Floats, yaw: Floats) -> Floats:

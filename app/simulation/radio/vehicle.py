@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from scipy.signal import lfilter
 
 from app.errors import InvalidParameter
@@ -210,7 +210,8 @@ def _advance(lane: TrueLane, driver: Driver, rng: np.random.Generator) -> tuple[
     """Times, chainages and speeds of the drive: slower in bends, and never quite even."""
     step = float(lane.chainage_m[1])
     cap = np.sqrt(_LATERAL_M_S2 / np.maximum(np.abs(lane.curvature_1pm), 1e-6))
-    cap = gaussian_filter1d(np.minimum(cap, driver.speed_m_s), 15.0 / step, mode="nearest")
+    cap = minimum_filter1d(np.minimum(cap, driver.speed_m_s), int(60.0 / step), mode="nearest")
+    cap = gaussian_filter1d(cap, 15.0 / step, mode="nearest")
     pad = int(driver.lead_m / step) + 1
     at = np.concatenate(
         [
