@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import artwork, codebooks, decodes, layouts, markers, system, ui
+from app.api import artwork, cerpms, codebooks, decodes, layouts, markers, system, ui
 from app.api.middleware import Guarded, Observed
 from app.api.openapi import describe
 from app.api.problems import install_problem_handlers
@@ -27,7 +28,9 @@ from app.markers.plate import PlateGeometry
 from app.markers.reading import PlateReading
 from app.registry.database import Database
 from app.services.access import Access, Scope
+from app.services.agency_secrets import AgencySecrets
 from app.services.artwork import Artworks
+from app.services.cerpm_programs import CerpmPrograms
 from app.services.codebooks import Codebooks
 from app.services.decode_jobs import DecodeJobs
 from app.services.decode_rules import DecodeRules
@@ -37,6 +40,7 @@ from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
 from app.settings import Settings
 from app.storage.blobs import Blobs
+from app.storage.master_key import load_master_key
 
 ROUTERS = (
     ui.router,
@@ -44,6 +48,7 @@ ROUTERS = (
     markers.router,
     artwork.router,
     layouts.router,
+    cerpms.router,
     codebooks.router,
     decodes.router,
 )
@@ -61,6 +66,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     rules = _decode_rules(settings)
     jobs = DecodeJobs(database, utc_now, blobs=blobs, decoder=pool, rules=rules)
     access = Access(database, utc_now)
+    secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
     metrics = CollectorRegistry()
     readiness: dict[str, Callable[[], bool]] = {"database": database.is_ready, "decoders": pool.is_ready}
 
@@ -82,6 +88,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
 
     app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
     app.state.markers = Markers(database, utc_now, _marker_rules(settings))
+    app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)
     app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)
     app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, rules=rules)

@@ -27,7 +27,7 @@ export function startCerpms() {
 }
 
 export async function drawCerpm(box, marker) {
-  const { position, code, beacon, speed_limit: limit } = marker;
+  const { position, code, radio, speed_limit: limit } = marker;
   const message = make("div");
   box.replaceChildren(
     make("h2", { class: "digits" }, `CERPM ${code.number}`),
@@ -39,7 +39,7 @@ export async function drawCerpm(box, marker) {
       ["Height", position.height_m === null ? null : `${position.height_m.toFixed(3)} m`],
       ["Accuracy", position.horizontal_rmse_m === null ? "not stated" : `${position.horizontal_rmse_m} m horizontal`],
       ["Grade", position.localization_grade],
-      ["Sends", `every ${beacon.interval_s} s, SF${beacon.spreading_factor}, ${beacon.bandwidth_hz / 1000} kHz at ${beacon.frequency_hz / 1e6} MHz`],
+      ["Sends", `every ${radio.interval_s} s, SF${radio.spreading_factor}, ${radio.bandwidth_hz / 1000} kHz at ${radio.frequency_hz / 1e6} MHz`],
       ["DevEUI", marker.dev_eui],
       ["Road", marker.road],
       ["Id", marker.id],

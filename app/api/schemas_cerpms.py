@@ -8,11 +8,13 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from app.api.dependencies import Number, Whole
 from app.api.schemas_markers import Headed, PositionIn, PositionOut, Status
+from app.encoders.cerpm.settings import RadioSettings
 from app.markers.cerpm import MAX_NUMBER, MAX_SPEED_LIMIT, LaneSide, SpeedLimit, SpeedUnit
-from app.services.cerpm_markers import Beacon, NewCerpm
+from app.services.cerpm_markers import NewCerpm
 from app.services.positions import GivenPosition, naming
 
 Side = Literal["left", "right", "unknown"]
+Flag = Annotated[bool, Field(strict=True)]
 DevEui = Annotated[str, Field(pattern=r"^[0-9a-fA-F]{16}$")]
 
 
@@ -25,21 +27,30 @@ class SpeedLimitIn(BaseModel):
     unit: SpeedUnit = SpeedUnit.KM_H
 
 
-class BeaconIn(BaseModel):
-    """How the marker sends."""
+class RadioIn(BaseModel):
+    """How the marker's radio is set."""
 
     model_config = ConfigDict(extra="forbid")
 
-    interval_s: Number = Field(2.0, description="From one transmission to the next, 0.1 to 86 400. [s]")
-    spreading_factor: Whole = Field(7, description="6 to 12.")
+    frequency_hz: Whole = Field(915_000_000, description="Carrier, or the first of several. [Hz]")
+    spreading_factor: Whole = Field(7, description="7 to 12, or 6 without a header.")
     bandwidth_hz: Whole = Field(500_000, description="125000, 250000 or 500000. [Hz]")
-    frequency_hz: Whole = Field(915_000_000, description="Carrier. [Hz]")
-    tx_power_dbm: Number = Field(14.0, description="Radiated, -10 to 30. [dBm]")
+    interval_s: Number = Field(1.0, description="From one transmission to the next on average. [s]")
+    jitter_share: Number = Field(0.2, description="Each interval is drawn evenly around that, this share to each side.")
+    power_dbm: Number = Field(20.0, description="At the antenna's connector, -4 to 20. [dBm]")
+    antenna_gain_dbi: Number = Field(2.15, description="-10 to 6. [dBi]")
+    channels: Whole = Field(1, description="Over which packets are spread, 1 to 128.")
+    hopping: Flag = Field(False, description="Every marker uses all channels in turn; else each has one.")
+    coding_rate: Whole = Field(5, description="5 to 8: 4/5 to 4/8.")
+    preamble_symbols: Whole = Field(8, description="Length of the preamble.")
+    explicit_header: Flag = Field(True, description="Whether packets have a header.")
+    crc: Flag = Field(True, description="Whether packets have a checksum of the radio.")
+    lorawan: Flag = Field(False, description="The message travels in a LoRaWAN frame.")
 
-    def given(self) -> Beacon:
-        """The radio as the use cases know it."""
-        with naming("beacon"):
-            return Beacon(**self.model_dump())
+    def given(self) -> RadioSettings:
+        """The radio as the encoders know it."""
+        with naming("radio"):
+            return RadioSettings(**self.model_dump())
 
 
 CERPM_EXAMPLES: list[JsonValue] = [
@@ -57,7 +68,7 @@ CERPM_EXAMPLES: list[JsonValue] = [
         "number": 17,
         "side": "right",
         "speed_limit": {"value": 25, "unit": "mph"},
-        "beacon": {"interval_s": 2.0, "spreading_factor": 7, "bandwidth_hz": 500_000},
+        "radio": {"interval_s": 2.0, "spreading_factor": 7, "bandwidth_hz": 500_000},
         "status": "surveyed",
         "road": "Parkview Campus Drive",
     }
@@ -78,7 +89,7 @@ class CerpmMarkerIn(Headed):
     side: Side = Field("unknown", description="Boundary of the lane that it stands on, in the direction of travel.")
     speed_limit: SpeedLimitIn | None = Field(None, description="As it is posted; nothing where none is.")
     dev_eui: DevEui | None = Field(None, description="LoRaWAN DevEUI, where the marker joins a network.")
-    beacon: BeaconIn = Field(default_factory=lambda: BeaconIn())
+    radio: RadioIn = Field(default_factory=lambda: RadioIn())
 
     def given(self) -> NewCerpm:
         """The marker as the use cases know it."""
@@ -86,9 +97,9 @@ class CerpmMarkerIn(Headed):
             position=GivenPosition(**self.position.model_dump()),
             side=LaneSide[self.side.upper()],
             speed_limit=SpeedLimit(self.speed_limit.value, self.speed_limit.unit) if self.speed_limit else None,
-            beacon=self.beacon.given(),
+            radio=self.radio.given(),
             dev_eui=self.dev_eui.lower() if self.dev_eui is not None else None,
-            **self.model_dump(exclude={"family", "position", "side", "speed_limit", "beacon", "dev_eui"}),
+            **self.model_dump(exclude={"family", "position", "side", "speed_limit", "radio", "dev_eui"}),
         )
 
 
@@ -111,7 +122,7 @@ class CerpmMarkerOut(BaseModel):
     side: Side
     speed_limit: dict[str, Any] | None
     dev_eui: str | None
-    beacon: dict[str, Any]
+    radio: dict[str, Any]
     position: PositionOut
     heading_deg: float | None
     heading_rmse_deg: float | None

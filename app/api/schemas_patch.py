@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 from pydantic import ConfigDict, Field
 
-from app.api.schemas_cerpms import BeaconIn, DevEui, Side, SpeedLimitIn
+from app.api.schemas_cerpms import DevEui, RadioIn, Side, SpeedLimitIn
 from app.api.schemas_markers import POSITION_EXAMPLE, Headed, PositionIn, Status
 from app.errors import InvalidParameter
 from app.services.markers import MarkerChange
@@ -35,7 +35,7 @@ class MarkerPatch(Headed):
     side: Side = Field("unknown", description="Of a CERPM.")
     speed_limit: SpeedLimitIn | None = Field(None, description="Of a CERPM.")
     dev_eui: DevEui | None = Field(None, description="Of a CERPM.")
-    beacon: BeaconIn = Field(default_factory=BeaconIn, description="Of a CERPM; replaces the whole of the old.")
+    radio: RadioIn = Field(default_factory=RadioIn, description="Of a CERPM; replaces the whole of the old.")
 
     def change(self) -> MarkerChange:
         """The change as the use cases know it."""
@@ -47,8 +47,8 @@ class MarkerPatch(Headed):
             spec["speed_limit"] = None if limit is None else limit.model_dump(mode="json")
         if "dev_eui" in named:
             spec["dev_eui"] = self.dev_eui.lower() if self.dev_eui is not None else None
-        if "beacon" in named:
-            spec["beacon"] = asdict(self.beacon.given())
+        if "radio" in named:
+            spec["radio"] = asdict(self.radio.given())
         if spec:
             values["spec"] = spec
         position = GivenPosition(**self.position.model_dump()) if "position" in named else None
@@ -59,4 +59,4 @@ class MarkerPatch(Headed):
         return MarkerChange(values, position, self.reason)
 
 
-_SAID = ("side", "speed_limit", "dev_eui", "beacon")
+_SAID = ("side", "speed_limit", "dev_eui", "radio")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any
 
 import sqlalchemy as sa
 
-from app.errors import CodeTaken, InvalidParameter
+from app.encoders.cerpm.settings import RadioSettings
+from app.errors import CodeTaken
 from app.geodesy import PlacedPosition
 from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
 from app.registry import cerpms
@@ -23,43 +23,6 @@ FAMILY = "cerpm"
 
 
 @dataclass(frozen=True, slots=True)
-class Beacon:
-    """How a marker sends.
-
-    Attributes
-    ----------
-    interval_s : float
-        From one transmission to the next, 0.1 to 86,400. [s]
-    spreading_factor : int
-        6 to 12.
-    bandwidth_hz, frequency_hz : int
-        [Hz]
-    tx_power_dbm : float
-        Radiated. [dBm]
-    """
-
-    interval_s: float = 2.0
-    spreading_factor: int = 7
-    bandwidth_hz: int = 500_000
-    frequency_hz: int = 915_000_000
-    tx_power_dbm: float = 14.0
-
-    def __post_init__(self) -> None:
-        for name, value, least, most, unit in (
-            ("interval_s", self.interval_s, 0.1, 86_400.0, "s"),
-            ("spreading_factor", self.spreading_factor, 6, 12, ""),
-            ("frequency_hz", self.frequency_hz, 137_000_000, 1_020_000_000, "Hz"),
-            ("tx_power_dbm", self.tx_power_dbm, -10.0, 30.0, "dBm"),
-        ):
-            if not (math.isfinite(value) and least <= value <= most):
-                raise InvalidParameter(f"{name} is {value}", field=name, limit=f"{least:g} to {most:g} {unit}".strip())
-        if self.bandwidth_hz not in (125_000, 250_000, 500_000):
-            raise InvalidParameter(
-                f"bandwidth_hz is {self.bandwidth_hz}", field="bandwidth_hz", limit="125000, 250000 or 500000 Hz"
-            )
-
-
-@dataclass(frozen=True, slots=True)
 class NewCerpm:
     """A CERPM to register."""
 
@@ -68,7 +31,7 @@ class NewCerpm:
     side: LaneSide = LaneSide.UNKNOWN
     speed_limit: SpeedLimit | None = None
     dev_eui: str | None = None
-    beacon: Beacon = field(default_factory=Beacon)
+    radio: RadioSettings = field(default_factory=RadioSettings)
     status: str = PLANNED
     heading_deg: float | None = None
     heading_rmse_deg: float | None = None
@@ -120,7 +83,7 @@ class Cerpms:
                 "side": new.side.name.lower(),
                 "speed_limit": speed_limit_document(new.speed_limit),
                 "dev_eui": new.dev_eui,
-                "beacon": asdict(new.beacon),
+                "radio": asdict(new.radio),
             },
         }
         message_of(columns)
@@ -166,9 +129,9 @@ def side_of(row: Row | dict[str, Any]) -> LaneSide:
     return LaneSide[row["spec"]["side"].upper()]
 
 
-def beacon_of(row: Row | dict[str, Any]) -> Beacon:
-    """How a CERPM's row says that it sends."""
-    return Beacon(**row["spec"]["beacon"])
+def radio_of(row: Row | dict[str, Any]) -> RadioSettings:
+    """Radio of a CERPM's row."""
+    return RadioSettings(**row["spec"]["radio"])
 
 
 def message_of(row: Row | dict[str, Any], sequence: int = 0) -> CerpmMessage:

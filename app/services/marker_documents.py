@@ -174,7 +174,7 @@ def cerpm_document(row: Row | dict[str, Any]) -> dict[str, Any]:
         "side": spec["side"],
         "speed_limit": spec["speed_limit"],
         "dev_eui": spec["dev_eui"],
-        "beacon": spec["beacon"],
+        "radio": spec["radio"],
         "position": _position(row),
         "heading_deg": row["heading_deg"],
         "heading_rmse_deg": row["heading_rmse_deg"],

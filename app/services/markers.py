@@ -187,7 +187,7 @@ class Markers:
             family = self._family(row)
             if "spec" in values and row["family"] != "cerpm":
                 raise InvalidParameter(
-                    f"a {row['family']} has no side, speed limit or beacon",
+                    f"a {row['family']} has no side, speed limit or radio",
                     field="/".join(values["spec"]),
                     limit="CERPMs only",
                     cure="leave it out",

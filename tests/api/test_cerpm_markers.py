@@ -25,7 +25,7 @@ def test_a_marker_is_registered_read_listed_and_found_by_its_number(client: http
     assert made.status_code == 201, made.text
     marker = made.json()
     assert (marker["code"]["number"], marker["side"], marker["speed_limit"]) == (1, "left", limit)
-    assert marker["beacon"]["spreading_factor"] == 7
+    assert marker["radio"]["spreading_factor"] == 7
     assert client.get(made.headers["location"]).json() == marker
     assert client.get("/v1/markers", params={"family": "cerpm", "code": "1"}).json()["items"] == [marker]
 
@@ -53,12 +53,12 @@ def test_another_agency_has_numbers_of_its_own(server: LiveServer, client: httpx
 def test_what_is_said_can_be_changed(client: httpx.Client, place: Place) -> None:
     made = client.post("/v1/markers", json=cerpm(place(), side="left", speed_limit={"value": 25, "unit": "mph"})).json()
     path, new_limit = f"/v1/markers/{made['id']}", {"value": 30, "unit": "km/h"}
-    patch = {"speed_limit": new_limit, "side": "right", "beacon": {"interval_s": 5.0}, "dev_eui": "00A1B2C3D4E5F607"}
+    patch = {"speed_limit": new_limit, "side": "right", "radio": {"interval_s": 5.0}, "dev_eui": "00A1B2C3D4E5F607"}
     changed = client.patch(path, json=patch, headers={"If-Match": '"1"'})
     assert changed.status_code == 200, changed.text
     assert changed.json()["speed_limit"] == new_limit
     assert changed.json()["side"] == "right"
-    assert changed.json()["beacon"]["interval_s"] == 5.0
+    assert changed.json()["radio"]["interval_s"] == 5.0
     assert changed.json()["dev_eui"] == "00a1b2c3d4e5f607"
     assert changed.json()["code"] == made["code"]
     cleared = client.patch(path, json={"speed_limit": None}, headers={"If-Match": '"2"'})
@@ -85,9 +85,9 @@ def test_a_plate_has_no_speed_limit_to_change(client: httpx.Client, place: Place
         ({"speed_limit": {"value": 0}}, "speed_limit.value"),
         ({"speed_limit": {"value": 256}}, "speed_limit.value"),
         ({"speed_limit": {"value": 30, "unit": "knots"}}, "speed_limit.unit"),
-        ({"beacon": {"spreading_factor": 13}}, "beacon.spreading_factor"),
-        ({"beacon": {"bandwidth_hz": 200_000}}, "beacon.bandwidth_hz"),
-        ({"beacon": {"interval_s": 0}}, "beacon.interval_s"),
+        ({"radio": {"spreading_factor": 13}}, "radio.spreading_factor"),
+        ({"radio": {"bandwidth_hz": 200_000}}, "radio.bandwidth_hz"),
+        ({"radio": {"interval_s": 0}}, "radio.interval_s"),
         ({"dev_eui": "12"}, "dev_eui"),
         ({"position": {"lon_deg": 500.0, "lat_deg": 2.0}}, "position.lon_deg"),
         ({"position": {"lon_deg": 5.0, "lat_deg": 2.0, "height_m": 9000.0}}, "position.height_m"),
