@@ -1,4 +1,4 @@
-"""Readings drawn over their frame, for people to look at."""
+"""Readings and lanes drawn over their frame, for people to look at."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from typing import Any
 import cv2
 import numpy as np
 
+from app.decoders.cerpm.overlay import LaneOverlay
 from app.services.frames import Outline
 
 _BGR = {"read": (80, 220, 60), "unsure": (40, 190, 250), "not-in-registry": (40, 190, 250)}
 _REFUSED_BGR = (90, 90, 240)
 _DARK_BGR = (25, 25, 25)
+_LANE_BGR, _LANE_SHARE = (90, 200, 70), 0.32
+_LINE_BGR = {"left": (235, 160, 60), "right": (60, 170, 245), "centre": (245, 245, 245)}
+_MARKER_BGR = (60, 230, 250)
 
 
 def draw_outlines(
@@ -39,6 +43,42 @@ def draw_outlines(
             _draw_corners(canvas, outline.corners_px, colour, scale)
         _draw_label(canvas, outline, colour, scale, row)
     return np.asarray(canvas, dtype=np.uint8)
+
+
+def draw_lane(pixels: np.ndarray[Any, np.dtype[np.uint8]], overlay: LaneOverlay) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """The lane laid over a frame: its area green, left boundary blue, right boundary orange, centre line white.
+
+    Parameters
+    ----------
+    pixels : ndarray of uint8, shape (H, W, 3) BGR or (H, W) grey
+    overlay : LaneOverlay
+        Of a camera with this frame's size.
+
+    Returns
+    -------
+    ndarray of uint8, shape (H, W, 3)
+        A copy. BGR.
+    """
+    canvas = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if pixels.ndim == 2 else pixels.copy()
+    scale = max(min(canvas.shape[:2]) / 1080, 0.4)
+    if overlay.area_px:
+        filled = canvas.copy()
+        for polygon in overlay.area_px:
+            cv2.fillPoly(filled, [_fixed(polygon)], _LANE_BGR, cv2.LINE_AA, 4)
+        canvas = cv2.addWeighted(filled, _LANE_SHARE, canvas, 1 - _LANE_SHARE, 0)
+    for name, thick in (("centre", 2), ("left", 4), ("right", 4)):
+        pieces = [_fixed(piece) for piece in getattr(overlay, name).pieces_px]
+        cv2.polylines(canvas, pieces, False, _DARK_BGR, max(4, round((thick + 3) * scale)), cv2.LINE_AA, 4)
+        cv2.polylines(canvas, pieces, False, _LINE_BGR[name], max(2, round(thick * scale)), cv2.LINE_AA, 4)
+    for u, v in _fixed(overlay.markers.points_px[overlay.markers.visible]).reshape(-1, 2).tolist():
+        cv2.circle(canvas, (u, v), round(8 * scale) * 16, _DARK_BGR, cv2.FILLED, cv2.LINE_AA, 4)
+        cv2.circle(canvas, (u, v), round(5 * scale) * 16, _MARKER_BGR, cv2.FILLED, cv2.LINE_AA, 4)
+    return np.asarray(canvas, dtype=np.uint8)
+
+
+def _fixed(points_px: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.int32]]:
+    """OpenCV's points in sixteenths of a pixel."""
+    return np.asarray(np.round(points_px * 16), np.int32).reshape(-1, 1, 2)
 
 
 def _draw_corners(
