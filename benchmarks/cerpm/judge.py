@@ -1,0 +1,123 @@
+"""Decoded paths against the true centre line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from app.decoders.cerpm.lane import Lane
+from app.sensors.pose_track import PoseTrack
+from app.simulation.radio.lanes import TrueLane
+
+Floats = npt.NDArray[np.float64]
+
+NEAR_M = 1.0
+"""A true place is covered if the path is within this. [m]"""
+SURE = 0.5
+"""And if the path says that it is within 0.25 m of the centre with at least this probability."""
+TOLERANCE_M = 0.25
+
+
+@dataclass
+class Tally:
+    """Errors at true places every 0.25 m between the first and the last marker, over runs."""
+
+    off_m: list[Floats] = field(default_factory=list)
+    curvature_1pm: list[Floats] = field(default_factory=list)
+    confidence: list[Floats] = field(default_factory=list)
+    right: list[Floats] = field(default_factory=list)
+    covered: int = 0
+    places: int = 0
+    runs: int = 0
+    refused: int = 0
+
+    def add(self, other: Tally) -> None:
+        """Runs of another tally too."""
+        for name in ("off_m", "curvature_1pm", "confidence", "right"):
+            getattr(self, name).extend(getattr(other, name))
+        for name in ("covered", "places", "runs", "refused"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+    @property
+    def rms_m(self) -> float:
+        """Of the distance from the true centre line to the path. [m]"""
+        return _rms(self.off_m)
+
+    @property
+    def worst_m(self) -> float:
+        """[m]"""
+        return max((float(o.max()) for o in self.off_m if len(o)), default=float("nan"))
+
+    @property
+    def curvature_rms_1pm(self) -> float:
+        """[1/m]"""
+        return _rms(self.curvature_1pm)
+
+    @property
+    def coverage(self) -> float:
+        """Share of true places that a path covers."""
+        return self.covered / max(self.places, 1)
+
+    @property
+    def worst_run_m(self) -> float:
+        """RMS of the worst run. [m]"""
+        return max((_rms([o]) for o in self.off_m if len(o)), default=float("nan"))
+
+
+def judge_path(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> Tally:
+    """Errors of a path.
+
+    Parameters
+    ----------
+    lane : TrueLane
+    path : Lane
+    first_m, last_m : float
+        Chainages of the first and the last marker heard. [m]
+
+    Notes
+    -----
+    At each true place the error is the distance to the path; places beyond the path's ends have none, but count as
+    uncovered. A method that tells no confidence is taken to be sure.
+    """
+    inside = (lane.chainage_m >= first_m) & (lane.chainage_m <= last_m)
+    tally = Tally(places=int(inside.sum()), runs=1)
+    if path.refusal is not None or len(path.lon_deg) < 2:
+        tally.refused = 1
+        return tally
+    points = lane.enu_from_wgs84(path.lon_deg, path.lat_deg)
+    off, at, beside = _against_line(lane.centre_m[inside], points)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    confidence = np.interp(at, along, path.confidence)
+    told = np.isfinite(confidence)
+    tally.covered = int(((off <= NEAR_M) & (~told | (confidence >= SURE))).sum())
+    tally.off_m.append(off[beside])
+    bend = np.interp(at, along, path.curvature_1pm) - lane.curvature_1pm[inside]
+    tally.curvature_1pm.append(bend[beside])
+    tally.confidence.append(confidence[beside & told])
+    tally.right.append((off[beside & told] <= TOLERANCE_M).astype(float))
+    return tally
+
+
+def judge_track(lane: TrueLane, track: PoseTrack, first_m: float, last_m: float) -> Tally:
+    """Errors of the vehicle's own positions, taken as the path."""
+    inside = (lane.chainage_m >= first_m) & (lane.chainage_m <= last_m)
+    points = lane.enu_from_wgs84(track.lon_deg, track.lat_deg)
+    off, _at, beside = _against_line(lane.centre_m[inside], points)
+    return Tally([off[beside]], covered=int((off <= NEAR_M).sum()), places=int(inside.sum()), runs=1)
+
+
+def _against_line(places_m: Floats, line_m: Floats) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
+    """Distance of places from a line, where along it, and whether they are beside it rather than beyond an end."""
+    line = shapely.LineString(line_m)
+    points = shapely.points(places_m)
+    at = np.asarray(shapely.line_locate_point(line, points))
+    off = np.asarray(shapely.distance(line, points))
+    return off, at, (at > 1e-6) & (at < line.length - 1e-6)
+
+
+def _rms(parts: list[Floats]) -> float:
+    together = np.concatenate(parts) if parts else np.zeros(0)
+    return float(np.sqrt(np.mean(together**2))) if len(together) else float("nan")

@@ -1,0 +1,252 @@
+"""Rows about forgeries, steering, the radio and speed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from app.decoders.cerpm.control import Controller
+from app.decoders.cerpm.freshness import SequenceSpan
+from app.decoders.cerpm.lane import fit_lane
+from app.decoders.cerpm.packets import HeardPacket
+from app.decoders.cerpm.verify import Verdict, verify_packets
+from app.simulation.radio.attacks import forge_packets, number_entries, replay_packets
+from app.simulation.radio.drive import HeardDrive, drive_past, marker_message
+from app.simulation.radio.link import Radio, hear_transmissions, mean_rssi_dbm, send_beacons
+from app.simulation.radio.markers import LaidMarkers
+from app.simulation.steering import check_steering
+from app.simulation.vehicle import PoseNoise
+from benchmarks.cerpm import scenes
+from benchmarks.cerpm.paths import Result, met, runs_of
+
+REFERENCE = Path(__file__).parents[1] / "reference" / "cerpm.csv"
+_DAY_S = 86_400.0
+Spans = Mapping[int, Sequence[SequenceSpan]]
+
+
+def paper_figure(quantity: str) -> float:
+    """A figure of the paper."""
+    with REFERENCE.open() as file:
+        for row in csv.DictReader(line for line in file if not line.startswith("#")):
+            if row["quantity"] == quantity:
+                return float(row["value"])
+    raise KeyError(quantity)
+
+
+# --- forged and replayed packets ----------------------------------------------------------------------------------
+
+
+def run_forged(seed: int, short: bool) -> Result:
+    """10,000 packets that no marker sent there and then, among those of drives on three days."""
+    rng = np.random.default_rng([seed, 50])
+    lane = scenes.route("tfhrc_bend_1")
+    laid = scenes.lay(lane, rng)
+    keys = scenes.keys_for(laid)
+    counts = (400, 200, 200, 200) if short else (4000, 2000, 2000, 2000)
+    days = _days(lane, laid, rng)
+    rows: list[Sequence[object]] = []
+
+    def row(name: str, result: tuple[int, int, dict[Verdict, int], int, int], goal: bool) -> None:
+        sent, accepted, verdicts, real, kept = result
+        told = ", ".join(f"{n} {v}" for v, n in verdicts.items() if n)
+        rows.append(
+            (name, sent, accepted, 0 if goal else "-", met(accepted == 0) if goal else "-", f"{kept} of {real}", told)
+        )
+
+    forged = forge_packets(days[0].packets, counts[0], rng)
+    row("forged", _attack(days[0].packets, forged, keys, {})[0], True)
+    start, end = days[0].packets[0].heard_at_s, days[0].packets[-1].heard_at_s
+    same = [p for p in replay_packets(days[0].packets, counts[1], rng, at_s=(start, end + 30)) if _is_later(p, days[0])]
+    row("replayed in the drive that heard them", _attack(days[0].packets, same, keys, {})[0], True)
+    _result, spans = _attack(days[0].packets, [], keys, {})
+    next_day = replay_packets(days[0].packets, counts[2], rng, at_s=_times(days[1]))
+    result, spans_1 = _attack(days[1].packets, next_day, keys, spans)
+    row("replayed in the next day's drive", result, True)
+    kept = {**spans, **{n: (*spans.get(n, ()), *more) for n, more in spans_1.items()}}
+    restored = _through_text(kept)
+    both = (*days[0].packets, *days[1].packets)
+    third = replay_packets(both, counts[3], rng, at_s=_times(days[2]))
+    row("replayed on the third day, after a restart", _attack(days[2].packets, third, keys, restored)[0], True)
+    alone = replay_packets(both, counts[3], rng, at_s=_times(days[2]))
+    row("the same with no marker on the air", _attack([], alone, keys, restored)[0], True)
+    unheard = replay_packets(_all_sent(days[1], laid), counts[3], rng, at_s=_times(days[2]))
+    row("recorded by others, replayed beside the markers", _attack(days[2].packets, unheard, keys, restored)[0], False)
+    head = ("packets", "attacks", "accepted", "goal", "met", "real ones accepted", "verdicts on attacks")
+    note = (
+        "Kept sequences go through text between the second and the third day. Of the last row an attacker's receiver "
+        "recorded on the second day what the vehicle did not hear then; each says what its marker says anyway."
+    )
+    return note, head, rows
+
+
+def _days(lane, laid: LaidMarkers, rng: np.random.Generator) -> list[HeardDrive]:  # type: ignore[no-untyped-def]
+    """Drives a day apart; sequences go on between them."""
+    first = rng.integers(0, 10_000, len(laid))
+    a_day = int(_DAY_S / Radio().interval_s)
+    return [
+        drive_past(lane, laid, rng, sign=scenes.sign, start_s=1.78e9 + day * _DAY_S, first_sequence=first + day * a_day)
+        for day in range(3)
+    ]
+
+
+def _attack(
+    real: Sequence[HeardPacket], attack: Sequence[HeardPacket], keys: Mapping[int, bytes], spans: Spans
+) -> tuple[tuple[int, int, dict[Verdict, int], int, int], dict[int, tuple[SequenceSpan, ...]]]:
+    """Attacks sent and accepted, their verdicts, real packets and how many of them were accepted; and the spans."""
+    ours = [(p, False) for p in real] + [(p, True) for p in attack]
+    ours.sort(key=lambda one: one[0].heard_at_s)
+    log = number_entries([p for p, _bad in ours])
+    found = verify_packets(log, keys, spans)
+    verdicts = dict.fromkeys(Verdict, 0)
+    accepted = kept = 0
+    for packet, (_heard, bad) in zip(found.packets, ours, strict=True):
+        if bad:
+            verdicts[packet.verdict] += 1
+            accepted += packet.accepted
+        else:
+            kept += packet.accepted
+    return (len(attack), accepted, verdicts, len(real), kept), found.spans
+
+
+def _is_later(packet: HeardPacket, drive: HeardDrive) -> bool:
+    """Nobody sends again what was not sent yet."""
+    first = {p.payload: p.heard_at_s for p in drive.packets}
+    return packet.heard_at_s > first[packet.payload] + 0.01
+
+
+def _times(drive: HeardDrive) -> tuple[float, float]:
+    return drive.packets[0].heard_at_s, drive.packets[-1].heard_at_s
+
+
+def _through_text(spans: Spans) -> dict[int, tuple[SequenceSpan, ...]]:
+    text = json.dumps({n: [asdict(s) for s in some] for n, some in spans.items()})
+    return {int(n): tuple(SequenceSpan(**s) for s in some) for n, some in json.loads(text).items()}
+
+
+def _all_sent(drive: HeardDrive, laid: LaidMarkers) -> list[HeardPacket]:
+    """What somebody beside the road recorded and the vehicle did not hear."""
+    heard = scenes.payload_of(drive.packets)
+    out = []
+    for sender, sequence, start in zip(drive.sent.sender, drive.sent.sequence, drive.sent.start_s, strict=True):
+        payload = scenes.sign(marker_message(laid, int(sender), int(sequence)))
+        if payload not in heard:
+            out.append(HeardPacket(len(out), float(start), payload=payload, rssi_dbm=-90.0))
+    return out
+
+
+# --- steering -----------------------------------------------------------------------------------------------------
+
+
+def run_tracking(seed: int, short: bool) -> Result:
+    """A simulated car along decoded paths, against the true centre line."""
+    rows: list[Sequence[object]] = []
+    paper_m = f"{paper_figure('controller path error route 2')}, {paper_figure('controller path error route 3')}"
+    cases = (
+        ("40 ft, predictive", None, Controller.PREDICTIVE, (0.001, 0.03)),
+        ("40 ft, Stanley", None, Controller.STANLEY, None),
+        ("40 ft, Stanley with 15 m look-ahead", None, Controller.STANLEY_LOOKAHEAD, None),
+        ("ten a side, predictive", 10, Controller.PREDICTIVE, (0.01, None)),
+    )
+    runs, made = runs_of(short)
+    for name, per_side, law, goal in cases:
+        squares, mses, worst, rms_runs, ended = [], [], 0.0, [], 0
+        for run in range(runs):
+            for k, (_name, lane) in enumerate(scenes.list_lanes(seed, run, made)):
+                rng = np.random.default_rng([seed, 60, run, k])
+                laid = scenes.lay(lane, rng, per_side)
+                path = fit_lane(scenes.markers_for_lane(laid), scenes.track(lane, rng))
+                line = lane.enu_from_wgs84(path.lon_deg, path.lat_deg)
+                check = check_steering(
+                    line, scenes.LIMIT.km_h, controller=law, noise=PoseNoise(), truth_enu_m=lane.centre_m, rng=rng
+                )
+                squares.append(check.rms_m**2)
+                mses.append(check.mse_m2)
+                rms_runs.append(check.rms_m)
+                worst = max(worst, check.max_m)
+                ended += not check.completed
+        rms, mse = float(np.sqrt(np.mean(squares))), float(np.mean(mses))
+        good = not ended and (goal is None or (mse <= goal[0] and (goal[1] is None or rms <= goal[1])))
+        rows.append(
+            (
+                name, f"{rms:.3f}", f"{worst:.2f}", f"{max(rms_runs):.3f}", f"{mse:.5f}", f"{max(mses):.5f}",
+                "-" if goal is None else f"{goal[0]}" + (f", RMS {goal[1]}" if goal[1] else ""),
+                "-" if goal is None else met(good), paper_m,
+            )
+        )  # fmt: skip
+    head = (
+        "path, controller", "RMS [m]", "max [m]", "worst run", "|MSE| [m2]", "worst run", "goal", "met", "paper [m]",
+    )  # fmt: skip
+    return "Front axle against the true centre line, poses with RTK noise, 25 mph or less in bends.", head, rows
+
+
+# --- radio --------------------------------------------------------------------------------------------------------
+
+
+def run_radio(seed: int, short: bool) -> Result:
+    """The simulation itself: is the link the paper's, and are the losses ALOHA's?"""
+    rows: list[Sequence[object]] = []
+    for at_m in (50, 340):
+        paper = paper_figure(f"RSSI at {at_m} m")
+        strengths = []
+        for k in range(4 if short else 20):
+            rng = np.random.default_rng([seed, 70, k])
+            lane = scenes.route("tfhrc_bend_1" if k % 2 else "tfhrc_low_1")
+            drive = drive_past(lane, scenes.lay(lane, rng), rng, sign=None)
+            near = np.abs(drive.distance_m - at_m) < 0.06 * at_m
+            strengths.append(drive.strength_dbm[near] - mean_rssi_dbm(drive.distance_m[near]) + mean_rssi_dbm(at_m))
+        got = float(np.concatenate(strengths).mean())
+        rows.append((f"RSSI at {at_m} m [dBm]", f"{got:.1f}", f"{paper:.0f}", met(abs(got - paper) <= 1.0)))
+    for count, interval_s, bandwidth_hz in ((20, 2.0, 125_000), (100, 10.0, 125_000), (20, 2.0, 500_000)):
+        hard = Radio(7, bandwidth_hz, interval_s, payload_bytes=27, lock_symbols=12.25, capture_db=np.inf)
+        soft = Radio(7, bandwidth_hz, interval_s, payload_bytes=27)
+        rates = []
+        for radio in (hard, soft):
+            rng = np.random.default_rng([seed, 71, count, bandwidth_hz])
+            sent = send_beacons(count, radio, 0.0, (50 if short else 400) * interval_s, rng)
+            strength = rng.normal(-95, 8, len(sent.start_s))
+            rates.append(hear_transmissions(sent.start_s, strength, radio, rng).mean())
+        aloha = float(np.exp(-2 * count * hard.airtime_s / interval_s))
+        name = f"heard of {count} markers, {interval_s:g} s, {bandwidth_hz // 1000} kHz; with capture {rates[1]:.2f}"
+        rows.append((name, f"{rates[0]:.3f}", f"{aloha:.3f}", met(abs(rates[0] - aloha) <= 0.04)))
+    return "SF7, 27 bytes; strengths 8 dB apart.", ("simulation", "found", "paper, ALOHA", "met"), rows
+
+
+# --- speed --------------------------------------------------------------------------------------------------------
+
+
+def run_speed(seed: int, short: bool) -> Result:
+    """Time of a path on one core, and how it grows."""
+    rows: list[Sequence[object]] = []
+    rng = np.random.default_rng([seed, 80])
+    lanes = [lane for _name, lane in scenes.list_lanes(seed, 0, 4) if lane.length_m >= 480]
+    inputs = [(scenes.markers_for_lane(scenes.lay(lane, rng)), scenes.track(lane, rng)) for lane in lanes]
+    fit_lane(*inputs[0])
+    times = []
+    for markers, track in inputs * (3 if short else 10):
+        start = time.thread_time()
+        fit_lane(markers, track)
+        times.append(1000 * (time.thread_time() - start))
+    middle = float(np.median(times))
+    rows.append(("500 m, 40 ft, track of 20 Hz [ms]", f"{middle:.1f}", 20, met(middle <= 20)))
+    slopes = []
+    for km in (1, 10, 30) if short else (1, 10, 100, 1000):
+        markers, track = scenes.long_lane(np.random.default_rng([seed, 81, km]), 1000.0 * km)
+        start = time.thread_time()
+        found = fit_lane(markers, track)
+        seconds = time.thread_time() - start
+        slopes.append(seconds / km)
+        whole = found.refusal is None and found.station_m[-1] >= 990 * km
+        growth = slopes[-1] / slopes[0]
+        rows.append(
+            (
+                f"{km} km, {len(markers)} markers, track of 10 Hz [ms a km]", f"{1000 * slopes[-1]:.1f}",
+                "linear", met(whole and growth <= 1.5),
+            )
+        )  # fmt: skip
+    return "CPU time of `fit_lane` on one core.", ("path", "time", "goal", "met"), rows

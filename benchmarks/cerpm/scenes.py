@@ -1,0 +1,115 @@
+"""Lanes, markers and drives of the benchmark."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.cerpm.lane import LaneMarkers
+from app.decoders.cerpm.packets import HeardPacket
+from app.decoders.cerpm.verify import Verification
+from app.encoders.cerpm.payload import encode_message
+from app.markers.cerpm import CerpmMessage, SpeedLimit, SpeedUnit
+from app.markers.cerpm_keys import derive_marker_key
+from app.sensors.pose_track import PoseTrack
+from app.simulation.radio.lanes import TrueLane, lane_from_wgs84, make_lane
+from app.simulation.radio.markers import LaidMarkers, lay_markers
+from app.simulation.radio.vehicle import Driver, Receiver, drive_lane, observe_track
+
+Floats = npt.NDArray[np.float64]
+
+ROUTES = Path(__file__).parent / "routes"
+ROUTE_NAMES = ("karlsruhe_low_1", "karlsruhe_moderate_1", "tfhrc_bend_1", "tfhrc_low_1")
+MADE = "made"
+LIMIT = SpeedLimit(25, SpeedUnit.MPH)
+AGENCY_KEY = bytes(range(16))
+SURVEY_M = 0.02
+_HEIGHT_M = 120.0
+
+
+@lru_cache(maxsize=8)
+def route(name: str) -> TrueLane:
+    """A lane of the shared routes."""
+    with (ROUTES / f"{name}.geojson").open() as file:
+        features = json.load(file)["features"]
+    sides = {f["properties"]["side"]: np.array(f["geometry"]["coordinates"])[:, :2] for f in features}
+    return lane_from_wgs84(sides["L"], sides["R"], height_m=_HEIGHT_M)
+
+
+def list_lanes(seed: int, run: int, made: int) -> list[tuple[str, TrueLane]]:
+    """The shared routes and fresh made lanes."""
+    lanes = [(name, route(name)) for name in ROUTE_NAMES]
+    return lanes + [(MADE, make_lane(np.random.default_rng([seed, 1, run, k]))) for k in range(made)]
+
+
+def lay(lane: TrueLane, rng: np.random.Generator, per_side: int | None = None) -> LaidMarkers:
+    """Markers every 40 ft, closer in bends; or so many a side."""
+    return lay_markers(lane, rng, markers_per_side=per_side, speed_limit=LIMIT, survey_sd_m=SURVEY_M)
+
+
+def track(lane: TrueLane, rng: np.random.Generator, receiver: Receiver | None = None) -> PoseTrack:
+    """A drive as the vehicle's receiver has it."""
+    return observe_track(lane, drive_lane(lane, Driver(), rng), receiver or Receiver.rtk(), rng)
+
+
+def markers_for_lane(laid: LaidMarkers) -> LaneMarkers:
+    """Markers as if each was heard and verified."""
+    limit = laid.speed_limit.km_h if laid.speed_limit else np.nan
+    n = len(laid)
+    return LaneMarkers(laid.number, laid.lon_deg, laid.lat_deg, laid.told_side, np.full(n, SURVEY_M), np.full(n, limit))
+
+
+def markers_from_messages(messages: Iterable[CerpmMessage]) -> LaneMarkers:
+    """A row for each place and side that a number claims."""
+    claims = {(m.number, m.lon_deg, m.lat_deg, int(m.side)): m for m in messages}
+    rows = [(*key, SURVEY_M, m.speed_limit.km_h if m.speed_limit else np.nan) for key, m in claims.items()]
+    number, lon, lat, side, sigma, limit = (np.array(c) for c in zip(*rows, strict=True)) if rows else [np.zeros(0)] * 6
+    return LaneMarkers(number.astype(int), lon, lat, side.astype(int), sigma, limit)
+
+
+def accepted(verification: Verification) -> list[CerpmMessage]:
+    """Messages of authentic packets."""
+    return [p.message for p in verification.packets if p.accepted and p.message is not None]
+
+
+@lru_cache(maxsize=100_000)
+def key_of(number: int) -> bytes:
+    """Of a marker of the benchmark's agency."""
+    return derive_marker_key(AGENCY_KEY, number)
+
+
+def sign(message: CerpmMessage) -> bytes:
+    """What a marker of the benchmark's agency sends."""
+    return encode_message(message, key_of(message.number))
+
+
+def keys_for(laid: LaidMarkers) -> dict[int, bytes]:
+    """Keys of the registered markers."""
+    return {int(n): key_of(int(n)) for n in laid.number}
+
+
+def payload_of(packets: Iterable[HeardPacket]) -> set[bytes]:
+    """Payloads of a log."""
+    return {p.payload for p in packets if p.payload is not None}
+
+
+def long_lane(rng: np.random.Generator, length_m: float, rate_hz: float = 10.0) -> tuple[LaneMarkers, PoseTrack]:
+    """Many kilometres of markers in pairs every 12.25 m, and a drive along them at 25 m/s."""
+    lane = make_lane(rng, length_m=length_m, max_curvature_1pm=0.01)
+    every = slice(0, None, 49)
+    both = np.concatenate([lane.left_m[every], lane.right_m[every]])
+    lon, lat = lane.wgs84_from_enu(both + rng.normal(0, SURVEY_M, both.shape))
+    half = len(both) // 2
+    side = np.repeat([1, 2], half)
+    n = len(both)
+    markers = LaneMarkers(np.arange(1, n + 1), lon, lat, side, np.full(n, SURVEY_M), np.full(n, LIMIT.km_h))
+    drive = drive_lane(lane, Driver(speed_m_s=25.0), rng)
+    return markers, observe_track(lane, drive, Receiver.rtk(rate_hz), rng)
+
+
+Lose = Callable[[LaidMarkers, np.random.Generator], LaidMarkers]
