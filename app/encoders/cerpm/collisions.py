@@ -1,0 +1,164 @@
+"""How many packets get through where many markers share the air: pure ALOHA with capture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from app.encoders.cerpm.airtime import check_between, check_whole
+from app.encoders.cerpm.link import LinkModel, sensitivity_dbm
+from app.encoders.cerpm.settings import MAX_CHANNELS, RadioSettings
+
+Floats = npt.NDArray[np.float64]
+
+CAPTURE_DB = 6.0
+"""A packet survives others that are so much weaker: co-channel rejection of LoRa, Bor et al., "Do LoRa low-power
+wide-area networks scale?", MSWiM 2016. [dB]"""
+_EXACT_MARKERS = 200
+_LEVELS = 48
+
+
+@dataclass(frozen=True, slots=True)
+class Receiver:
+    """What listens in the vehicle.
+
+    Parameters
+    ----------
+    channels : int
+        That it hears at once; 1 for an SX1276, 8 for a gateway's chip.
+    sensitivity_dbm : float, optional
+        -150 to -60; the SX1276's by default. [dBm]
+    capture_db : float, optional
+        0 to 30; None where every overlap loses both packets. [dB]
+    relocks : bool
+        Leaves a weak packet that it has begun to read for a stronger one. An SX1276 does not.
+
+    Raises
+    ------
+    InvalidParameter
+        A value is outside its limits.
+    """
+
+    channels: int = 1
+    sensitivity_dbm: float | None = None
+    capture_db: float | None = CAPTURE_DB
+    relocks: bool = False
+
+    def __post_init__(self) -> None:
+        check_whole("receiver.channels", self.channels, 1, MAX_CHANNELS, "")
+        if self.sensitivity_dbm is not None:
+            check_between("receiver.sensitivity_dbm", self.sensitivity_dbm, -150.0, -60.0, "dBm")
+        if self.capture_db is not None:
+            check_between("receiver.capture_db", self.capture_db, 0.0, 30.0, "dB")
+
+    def threshold_dbm(self, settings: RadioSettings) -> float:
+        """The weakest packet of these settings that it reads. [dBm]"""
+        if self.sensitivity_dbm is not None:
+            return self.sensitivity_dbm
+        return sensitivity_dbm(settings.spreading_factor, settings.bandwidth_hz)
+
+
+def aloha_success(others: npt.ArrayLike, time_on_air_s: float, interval_s: float, channels: int = 1) -> Floats:
+    """Share of packets that no other overlaps: exp(-2 N ToA / (T K)).
+
+    Parameters
+    ----------
+    others : array_like
+        Markers that are heard besides the one that is asked for; fractions are allowed.
+    time_on_air_s, interval_s : float
+        Of a packet, and from one to the next of each marker. [s]
+    channels : int
+        That packets are spread over evenly.
+
+    Returns
+    -------
+    ndarray
+        Of the shape of `others`.
+
+    Raises
+    ------
+    InvalidParameter
+        A value is outside its limits.
+
+    Notes
+    -----
+    Abramson's pure ALOHA: a packet is lost where another begins within a time on air before or after its beginning.
+    """
+    check_between("time_on_air_s", time_on_air_s, 0.0, 100.0, "s")
+    check_between("interval_s", interval_s, 1e-3, 1e6, "s")
+    check_whole("channels", channels, 1, MAX_CHANNELS, "")
+    return np.asarray(np.exp(-2 * np.asarray(others, float) * time_on_air_s / (interval_s * channels)))
+
+
+def harmful_others(
+    wanted_dbm: npt.ArrayLike, others_dbm: npt.ArrayLike, threshold_dbm: float, link: LinkModel, receiver: Receiver
+) -> Floats:
+    """How many others can spoil a packet, each counted as in plain ALOHA.
+
+    Parameters
+    ----------
+    wanted_dbm : array_like, shape (...)
+        Mean level of the marker that is asked for. [dBm]
+    others_dbm : array_like, shape (..., M)
+        Mean levels of all others, without it. [dBm]
+    threshold_dbm : float
+        The weakest packet that is read. [dBm]
+    link : LinkModel
+        For its fading.
+    receiver : Receiver
+
+    Returns
+    -------
+    ndarray, shape (...)
+
+    Notes
+    -----
+    An other counts fully where its packet is less than `capture_db` weaker: then it spoils what it overlaps. A weaker
+    one that can be read counts half where the receiver does not relock: it spoils what begins while it is read.
+    Without capture all that can be read count fully, and the share of packets that get through is plain ALOHA's.
+    Others are compared with the mean level of those packets that are strong enough to be read.
+    """
+    others = np.asarray(others_dbm, float)
+    readable = link.share_above(others, threshold_dbm)
+    if receiver.capture_db is None:
+        return np.asarray(readable.sum(-1))
+    wanted = link.read_level_dbm(wanted_dbm, threshold_dbm)[..., None]
+    strong = link.share_above(others, wanted - receiver.capture_db, math.sqrt(2))
+    if receiver.relocks:
+        return np.asarray(strong.sum(-1))
+    return np.asarray((strong + 0.5 * readable * (1 - strong)).sum(-1))
+
+
+def harmful_to_each(levels_dbm: Floats, threshold_dbm: float, link: LinkModel, receiver: Receiver) -> Floats:
+    """The same for each of many markers that are heard at one place, shape (M,).
+
+    With fading and more than 200 of them it is interpolated between 48 levels.
+    """
+    if len(levels_dbm) == 0:
+        return np.empty(0)
+    wanted = levels_dbm
+    if link.fading_db > 0 and len(levels_dbm) > _EXACT_MARKERS:
+        wanted = np.linspace(levels_dbm.min(), levels_dbm.max(), _LEVELS)
+    everyone = np.broadcast_to(levels_dbm, (len(wanted), len(levels_dbm)))
+    harmful = harmful_others(wanted, everyone, threshold_dbm, link, receiver)
+    if wanted is not levels_dbm:
+        harmful = np.interp(levels_dbm, wanted, harmful)
+    itself = harmful_others(levels_dbm, levels_dbm[:, None], threshold_dbm, link, receiver)
+    return np.asarray(np.maximum(harmful - itself, 0.0))
+
+
+def packet_success(
+    wanted_dbm: npt.ArrayLike,
+    harmful: npt.ArrayLike,
+    settings: RadioSettings,
+    link: LinkModel,
+    receiver: Receiver,
+) -> Floats:
+    """Share of a marker's packets that are strong enough, on a channel that is listened to, and not spoilt."""
+    strong_enough = link.share_above(wanted_dbm, receiver.threshold_dbm(settings))
+    listened = min(1.0, receiver.channels / settings.channels)
+    clear = aloha_success(harmful, settings.time_on_air_s, settings.interval_s, settings.channels)
+    return np.asarray(strong_enough * listened * clear)
