@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import artwork, cerpms, codebooks, decodes, layouts, markers, system, ui
+from app.api import artwork, cerpms, codebooks, decodes, layouts, markers, radio_checks, system, ui
 from app.api.middleware import Guarded, Observed
 from app.api.openapi import describe
 from app.api.problems import install_problem_handlers
@@ -49,6 +49,7 @@ ROUTERS = (
     artwork.router,
     layouts.router,
     cerpms.router,
+    radio_checks.router,
     codebooks.router,
     decodes.router,
 )
@@ -106,7 +107,12 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         Guarded,
         authenticate=access.authenticate,
         body_limits={"": settings.max_json_bytes, "/v1/decodes": settings.max_upload_bytes},
-        needed_scopes={"": Scope.WRITE, "/v1/decodes": Scope.DECODE, "/v1/artwork": Scope.READ},
+        needed_scopes={
+            "": Scope.WRITE,
+            "/v1/decodes": Scope.DECODE,
+            "/v1/artwork": Scope.READ,
+            "/v1/radio-checks": Scope.READ,
+        },
         body_timeout_s=settings.body_timeout_s,
     )
     app.add_middleware(Observed, registry=metrics)
