@@ -1,0 +1,231 @@
+"""NMEA 0183 of a vehicle's receiver -> points over time."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, date, datetime, time, timedelta
+from typing import Any
+
+import pynmeagps
+from pynmeagps import NMEAReader
+
+from app.decoders.cerpm.log_report import LogReport
+from app.decoders.cerpm.log_text import numbered_lines
+from app.decoders.cerpm.log_times import LogClock
+from app.decoders.cerpm.pose_points import PosePoint
+from app.errors import InvalidParameter, ReferenceSystemError
+
+_SENTENCE = re.compile(r"\$([A-Z]{2})([A-Z]{3}),([^*$\r\n]{0,200})(?:\*([0-9A-Fa-f]{2}))?")
+_POSITIONS = ("RMC", "GGA", "GNS", "GLL")
+_READ = (*_POSITIONS, "VTG", "HDT", "THS", "GST", "ZDA", "DTM")
+_LEAST_SPEED_KN = 2.0
+"""Slower than this the course over ground says nothing about the heading. [kn]"""
+_HALF_DAY = timedelta(hours=12)
+
+
+@dataclass(slots=True)
+class _Epoch:
+    """What the sentences of one time said."""
+
+    entry: int
+    at: time
+    day: date | None = None
+    lon_deg: float = math.nan
+    lat_deg: float = math.nan
+    heading_deg: float = math.nan
+    course_deg: float = math.nan
+    accuracy_m: float = math.nan
+    void: bool = False
+
+
+@dataclass(slots=True)
+class _Reading:
+    """Where the reader of a log is."""
+
+    report: LogReport
+    epochs: list[_Epoch] = field(default_factory=list)
+
+    def epoch_at(self, entry: int, at: time) -> _Epoch:
+        """That of a time; sentences of one time come one after the other."""
+        if not self.epochs or self.epochs[-1].at != at:
+            self.epochs.append(_Epoch(entry, at))
+        return self.epochs[-1]
+
+
+def looks_like_nmea(text: str) -> bool:
+    """Whether the first lines hold sentences."""
+    return any(found[2] in _READ or found[1] in ("GP", "GN") for found in _SENTENCE.finditer(text[:4096]))
+
+
+def read_nmea(text: str, clock: LogClock, day: date | None, report: LogReport) -> Iterator[PosePoint]:
+    """Points of a log in the order they come.
+
+    Parameters
+    ----------
+    day : date, optional
+        UTC date of the first position, where no sentence has one.
+
+    Raises
+    ------
+    ReferenceSystemError
+        A DTM sentence names another datum.
+    InvalidParameter
+        Times have no date, and none was declared.
+    """
+    reading = _Reading(report)
+    sentences = list(_find_sentences(text, report))
+    chosen = _choose_talkers(sentences)
+    for entry, talker, kind, sentence in sentences:
+        if chosen.get(kind, talker) != talker:
+            continue
+        try:
+            parsed = NMEAReader.parse(sentence, validate=pynmeagps.VALNONE)
+        except (pynmeagps.NMEAParseError, pynmeagps.NMEATypeError, pynmeagps.NMEAMessageError, ValueError) as error:
+            report.leave_out(entry, "malformed", f"a {kind} sentence that cannot be read: {str(error)[:120]}")
+            continue
+        if parsed is not None:
+            _take(entry, kind, parsed, reading)
+    yield from _points(reading.epochs, clock, day, report)
+
+
+def _find_sentences(text: str, report: LogReport) -> Iterator[tuple[int, str, str, str]]:
+    for entry, line in numbered_lines(text):
+        report.entries += 1
+        found = _SENTENCE.search(line[:1024])
+        if found is None:
+            if "$" in line[:1024] and "$P" not in line[:1024]:
+                report.leave_out(entry, "malformed", "a line that holds no sentence of NMEA 0183")
+            continue
+        talker, kind, _rest, checksum = found.groups()
+        if kind not in _READ:
+            continue
+        content = found[0][1:].split("*")[0]
+        if checksum is None or int(checksum, 16) != _checksum(content):
+            what = "has no checksum" if checksum is None else "has a wrong checksum"
+            report.leave_out(entry, "checksum", f"a {kind} sentence {what}")
+            continue
+        yield entry, talker, kind, found[0]
+
+
+def _checksum(content: str) -> int:
+    value = 0
+    for byte in content.encode("ascii", "replace"):
+        value ^= byte
+    return value
+
+
+def _choose_talkers(sentences: Iterable[tuple[int, str, str, str]]) -> dict[str, str]:
+    """Of several receivers' solutions the combined one (GN), or else the commonest."""
+    counts: dict[str, Counter[str]] = {}
+    for _entry, talker, kind, _sentence in sentences:
+        if kind in _POSITIONS or kind == "GST":
+            counts.setdefault(kind, Counter())[talker] += 1
+    return {kind: "GN" if "GN" in found else found.most_common(1)[0][0] for kind, found in counts.items()}
+
+
+def _take(entry: int, kind: str, said: Any, reading: _Reading) -> None:
+    if kind == "DTM":
+        _check_datum(entry, said)
+    elif kind in ("HDT", "THS") and reading.epochs:
+        reading.epochs[-1].heading_deg = _figure(getattr(said, "headingT", None) if kind == "HDT" else _ths(said))
+    elif kind == "VTG" and reading.epochs:
+        if _figure(said.sogn) >= _LEAST_SPEED_KN:
+            reading.epochs[-1].course_deg = _figure(said.cogt)
+    elif kind == "ZDA" and isinstance(said.time, time):
+        epoch = reading.epoch_at(entry, said.time)
+        try:
+            epoch.day = date(int(said.year), int(said.month), int(said.day))
+        except (ValueError, TypeError):
+            reading.report.leave_out(entry, "malformed", "a ZDA sentence without a date")
+    elif isinstance(getattr(said, "time", None), time):
+        _take_position(entry, kind, said, reading)
+
+
+def _take_position(entry: int, kind: str, said: Any, reading: _Reading) -> None:
+    epoch = reading.epoch_at(entry, said.time)
+    if kind == "GST":
+        north_m, east_m = _figure(said.stdLat), _figure(said.stdLong)
+        epoch.accuracy_m = math.sqrt((north_m**2 + east_m**2) / 2)
+        return
+    if kind == "RMC":
+        if isinstance(said.date, date):
+            epoch.day = said.date
+        if _figure(said.spd) >= _LEAST_SPEED_KN:
+            epoch.course_deg = _figure(said.cog)
+    lon_deg, lat_deg = _figure(said.lon), _figure(said.lat)
+    if not _has_fix(kind, said):
+        epoch.void = True
+    elif not (math.isnan(lon_deg) or math.isnan(lat_deg)):
+        epoch.lon_deg, epoch.lat_deg = lon_deg, lat_deg
+    if kind == "GGA" and said.quality == 6:
+        reading.report.warn("positions were estimated by dead reckoning in places (GGA quality 6)")
+
+
+def _has_fix(kind: str, said: Any) -> bool:
+    if kind == "GGA":
+        return said.quality in (1, 2, 3, 4, 5, 6, 9)
+    mode = str(getattr(said, "posMode", "A"))
+    if kind == "GNS":
+        return bool(mode.strip("N"))
+    return said.status == "A" and mode not in ("N", "S", "M")  # none, simulated, typed in by hand
+
+
+def _ths(said: Any) -> object:
+    return getattr(said, "headt", getattr(said, "headingT", None)) if getattr(said, "mi", "A") == "A" else None
+
+
+def _figure(value: object) -> float:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+
+
+def _check_datum(entry: int, said: Any) -> None:
+    offsets = (_figure(said.latOfset), _figure(said.lonOfset))
+    if str(said.datum).upper() in ("W84", "") and not any(offset > 0 for offset in offsets):
+        return
+    raise ReferenceSystemError(
+        f"line {entry + 1} says that positions are in datum {str(said.datum)[:8]!r} (DTM sentence)",
+        field="poses",
+        limit="W84: WGS 84",
+        cure="set the receiver to WGS 84, or transform the track to WGS 84 before it is sent",
+    )
+
+
+def _points(epochs: list[_Epoch], clock: LogClock, day: date | None, report: LogReport) -> Iterator[PosePoint]:
+    first = next((i for i, epoch in enumerate(epochs) if epoch.day is not None), None)
+    if day is None and first is None and epochs:
+        raise InvalidParameter(
+            "no sentence has a date (RMC or ZDA)", field="poses.date", cure="declare the UTC date of the first position"
+        )
+    current = _day_of_first(epochs, first) if first is not None else day
+    last: time | None = None
+    for epoch in epochs:
+        if epoch.day is not None:
+            current = epoch.day
+        elif last is not None and current is not None and _since_midnight(last) - _since_midnight(epoch.at) > _HALF_DAY:
+            current += timedelta(days=1)  # past midnight, and no sentence with a date yet
+        last = epoch.at
+        if epoch.void or math.isnan(epoch.lon_deg):
+            if epoch.void:
+                report.leave_out(epoch.entry, "no-fix", "the receiver says that it has no position")
+            continue
+        assert current is not None
+        heading_deg = epoch.course_deg if math.isnan(epoch.heading_deg) else epoch.heading_deg
+        at_s = clock.read(datetime.combine(current, epoch.at, UTC).isoformat())
+        yield PosePoint(epoch.entry, at_s, epoch.lon_deg, epoch.lat_deg, heading_deg, epoch.accuracy_m)
+
+
+def _day_of_first(epochs: list[_Epoch], dated: int) -> date | None:
+    """The date of the first epoch, told back from the first that has one."""
+    day = epochs[dated].day
+    for later, earlier in zip(reversed(epochs[1 : dated + 1]), reversed(epochs[:dated]), strict=True):
+        if day is not None and _since_midnight(earlier.at) - _since_midnight(later.at) > _HALF_DAY:
+            day -= timedelta(days=1)
+    return day
+
+
+def _since_midnight(at: time) -> timedelta:
+    return timedelta(hours=at.hour, minutes=at.minute, seconds=at.second, microseconds=at.microsecond)
