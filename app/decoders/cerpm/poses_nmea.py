@@ -79,8 +79,17 @@ def read_nmea(text: str, clock: LogClock, day: date | None, report: LogReport) -
     reading = _Reading(report)
     sentences = list(_find_sentences(text, report))
     chosen = _choose_talkers(sentences)
+    told = {
+        _field(sentence, 1)
+        for _entry, talker, kind, sentence in sentences
+        if kind == "RMC" and chosen["RMC"] == talker and _field(sentence, 2) == "A"
+    }
     for entry, talker, kind, sentence in sentences:
         if chosen.get(kind, talker) != talker:
+            continue
+        if (
+            kind in _POSITIONS[1:] and _field(sentence, 5 if kind == "GLL" else 1) in told
+        ):  # RMC says the same, and the date
             continue
         try:
             parsed = NMEAReader.parse(sentence, validate=pynmeagps.VALNONE)
@@ -109,6 +118,11 @@ def _find_sentences(text: str, report: LogReport) -> Iterator[tuple[int, str, st
             report.leave_out(entry, "checksum", f"a {kind} sentence {what}")
             continue
         yield entry, talker, kind, found[0]
+
+
+def _field(sentence: str, place: int) -> str:
+    fields = sentence.split(",", place + 1)
+    return fields[place] if place < len(fields) else ""
 
 
 def _checksum(content: str) -> int:
