@@ -11,8 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from app.decoders.cerpm.lane_frame import plane_from_wgs84
+from app.decoders.cerpm.lane_types import Lane, LaneMarkers
 from app.jobs.plot_strokes import LEFT, RIGHT, WIDTH, area, dots, frame, label, nice_step, outlined, polylines, thin
 from app.jobs.signal_plot import PANEL_HEIGHT, SignalPicture, signal_panel
+from app.sensors.pose_track import PoseTrack
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -59,6 +62,28 @@ class LanePicture:
     left_out: dict[int, str] = field(default_factory=dict)
     track_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
     refusal: str | None = None
+
+
+def picture_of_lane(lane: Lane, markers: LaneMarkers, track: PoseTrack | None = None) -> LanePicture:
+    """What to show of a lane and the markers that it was decoded from, in the lane's own plane."""
+    origin = (lane.origin_lon_deg, lane.origin_lat_deg)
+    earthly = (np.abs(markers.lat_deg) <= 90) & (np.abs(markers.lon_deg) <= 360)
+    marker_m = np.full((len(markers), 2), np.nan)
+    marker_m[earthly] = plane_from_wgs84(markers.lon_deg[earthly], markers.lat_deg[earthly], origin)
+    return LanePicture(
+        lane.position_enu_m,
+        lane.left_enu_m,
+        lane.right_enu_m,
+        lane.station_m,
+        lane.sigma_m,
+        lane.confidence,
+        marker_m,
+        markers.number,
+        np.where(lane.side > 0, lane.side, markers.side),
+        {out.row: out.reason.value.replace("_", " ") for out in lane.left_out},
+        np.empty((0, 2)) if track is None else plane_from_wgs84(track.lon_deg, track.lat_deg, origin),
+        lane.refusal,
+    )
 
 
 def plot_lane(lane: LanePicture, signals: SignalPicture | None = None) -> str:

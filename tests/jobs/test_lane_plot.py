@@ -10,8 +10,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from app.jobs.lane_plot import LanePicture, plot_lane
+from app.decoders.cerpm.lane import fit_lane
+from app.decoders.cerpm.lane_types import LaneMarkers
+from app.jobs.lane_plot import LanePicture, picture_of_lane, plot_lane
 from app.jobs.signal_plot import SignalPicture
+from app.sensors.pose_track import PoseTrack
 
 SVG = "{http://www.w3.org/2000/svg}"
 BLUE, ORANGE, VIOLET, RED = "#1f5fa8", "#d68910", "#7d3c98", "#c0392b"
@@ -132,6 +135,7 @@ def test_straightened_lane_shows_metres_beside_the_centre_line():
     track = [p for p in root.iter(f"{SVG}polyline") if p.attrib["stroke"] == "#1e8449"][1]
     y_track = float(track.attrib["points"].split()[50].split(",")[1])
     middle = (left[3, 1] + right[3, 1]) / 2
+    assert left[3, 1] < middle
     assert (middle - y_track) / (middle - left[3, 1]) == pytest.approx(0.5 / 1.6, abs=0.02)
     np.testing.assert_allclose(np.diff(left[:, 0]), (left[-1, 0] - left[0, 0]) / 25, atol=0.2)
 
@@ -195,3 +199,29 @@ def test_short_and_long_lanes_stay_legible_and_small(length_m):
     assert float(root.attrib["height"]) < 700
     ticks = [t for t in texts(root) if re.fullmatch(r"\d+(\.\d+)? m", t)]
     assert 5 < len(ticks) < 25
+
+
+def test_a_decoded_lane_and_its_spoofed_marker():
+    degree_m = 111_320.0
+    along = np.repeat(np.arange(0, 240, 12.0), 2)
+    side = np.tile([1, 2], 20)
+    north = np.where(side == 1, 1.6, -1.6)
+    north[11] += 30.0
+    lat, lon = 0.0 + north / degree_m, 10.0 + along / degree_m
+    lat[30] = math.nan
+    markers = LaneMarkers(np.arange(101, 141), lon, lat, side, np.full(40, 0.02), np.full(40, math.nan))
+    t = np.arange(0, 25, 0.5)
+    track = PoseTrack(t, 10.0 + (10 * t - 5) / degree_m, np.zeros(50), np.full(50, 90.0), np.full(50, 0.02))
+    shown = picture_of_lane(fit_lane(markers, track), markers, track)
+    assert shown.left_out == {11: "off the line", 30: "not a place"}
+    root = parsed(plot_lane(shown))
+    assert "112: off the line" in texts(root)
+    assert "131: not a place" in texts(root)
+    assert texts(root)[0].startswith("Lane of 2")
+    assert len(circles(root, BLUE)) == 2 * 19
+    assert len(circles(root, ORANGE)) == 2 * 19
+    refused = picture_of_lane(
+        fit_lane(LaneMarkers(*(getattr(markers, n)[:1] for n in LaneMarkers.__slots__))),
+        LaneMarkers(*(getattr(markers, n)[:1] for n in LaneMarkers.__slots__)),
+    )
+    assert texts(parsed(plot_lane(refused)))[0].startswith("No lane: there are no two markers")
