@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +16,7 @@ Floats = npt.NDArray[np.float64]
 CAPTURE_DB = 6.0
 """A packet survives others that are so much weaker: co-channel rejection of LoRa, Bor et al., "Do LoRa low-power
 wide-area networks scale?", MSWiM 2016. [dB]"""
-_EXACT_MARKERS = 200
-_LEVELS = 48
+_LEVELS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,41 +110,45 @@ def harmful_others(
 
     Returns
     -------
-    ndarray, shape (...)
+    ndarray, shape (..., Q)
+        For equally likely levels of the packets that are strong enough (`LinkModel.read_levels_dbm`).
 
     Notes
     -----
     An other counts fully where its packet is less than `capture_db` weaker: then it spoils what it overlaps. A weaker
     one that can be read counts half where the receiver does not relock: it spoils what begins while it is read.
     Without capture all that can be read count fully, and the share of packets that get through is plain ALOHA's.
-    Others are compared with the mean level of those packets that are strong enough to be read.
     """
-    others = np.asarray(others_dbm, float)
-    readable = link.share_above(others, threshold_dbm)
+    levels = link.read_levels_dbm(wanted_dbm, threshold_dbm)
+    return _harmful_at(levels, np.asarray(others_dbm, float)[..., None, :], threshold_dbm, link, receiver)
+
+
+def _harmful_at(
+    levels_dbm: Floats, others_dbm: Floats, threshold_dbm: float, link: LinkModel, receiver: Receiver
+) -> Floats:
+    """Harmful others of packets that come with certain levels, shape (...), among others of shape (..., M)."""
+    readable = link.share_above(others_dbm, threshold_dbm)
     if receiver.capture_db is None:
-        return np.asarray(readable.sum(-1))
-    wanted = link.read_level_dbm(wanted_dbm, threshold_dbm)[..., None]
-    strong = link.share_above(others, wanted - receiver.capture_db, math.sqrt(2))
+        return np.asarray(np.broadcast_to(readable.sum(-1), levels_dbm.shape))
+    strong = link.share_above(others_dbm, levels_dbm[..., None] - receiver.capture_db)
     if receiver.relocks:
         return np.asarray(strong.sum(-1))
-    return np.asarray((strong + 0.5 * readable * (1 - strong)).sum(-1))
+    return np.asarray((strong + 0.5 * np.maximum(readable - strong, 0.0)).sum(-1))
 
 
 def harmful_to_each(levels_dbm: Floats, threshold_dbm: float, link: LinkModel, receiver: Receiver) -> Floats:
-    """The same for each of many markers that are heard at one place, shape (M,).
+    """The same for each of many markers that are heard at one place, shape (M, Q).
 
-    With fading and more than 200 of them it is interpolated between 48 levels.
+    With fading it is interpolated between 64 levels.
     """
     if len(levels_dbm) == 0:
-        return np.empty(0)
-    wanted = levels_dbm
-    if link.fading_db > 0 and len(levels_dbm) > _EXACT_MARKERS:
-        wanted = np.linspace(levels_dbm.min(), levels_dbm.max(), _LEVELS)
-    everyone = np.broadcast_to(levels_dbm, (len(wanted), len(levels_dbm)))
-    harmful = harmful_others(wanted, everyone, threshold_dbm, link, receiver)
-    if wanted is not levels_dbm:
-        harmful = np.interp(levels_dbm, wanted, harmful)
+        return np.empty((0, 1))
+    wanted = link.read_levels_dbm(levels_dbm, threshold_dbm)
     itself = harmful_others(levels_dbm, levels_dbm[:, None], threshold_dbm, link, receiver)
+    if link.fading_db == 0.0:
+        return _harmful_at(wanted, levels_dbm, threshold_dbm, link, receiver) - itself
+    grid = np.linspace(wanted.min(), wanted.max(), _LEVELS)
+    harmful = np.interp(wanted, grid, _harmful_at(grid, levels_dbm, threshold_dbm, link, receiver))
     return np.asarray(np.maximum(harmful - itself, 0.0))
 
 
@@ -157,8 +159,11 @@ def packet_success(
     link: LinkModel,
     receiver: Receiver,
 ) -> Floats:
-    """Share of a marker's packets that are strong enough, on a channel that is listened to, and not spoilt."""
+    """Share of a marker's packets that are strong enough, on a channel that is listened to, and not spoilt.
+
+    Levels have shape (...), harmful others (..., Q).
+    """
     strong_enough = link.share_above(wanted_dbm, receiver.threshold_dbm(settings))
     listened = min(1.0, receiver.channels / settings.channels)
     clear = aloha_success(harmful, settings.time_on_air_s, settings.interval_s, settings.channels)
-    return np.asarray(strong_enough * listened * clear)
+    return np.asarray(strong_enough * listened * clear.mean(-1))

@@ -22,7 +22,7 @@ MAX_OFFSET_M = 100.0
 SPACINGS_M = (1.0, 1000.0)
 LANE_WIDTH_M = 3.6
 _FADES = 2.5
-_APPROACH_STEPS = 64
+_APPROACH_STEPS = 40
 _PHASES = 32
 
 
@@ -73,6 +73,14 @@ class RoadMarkers:
         check_between("spacing_m", spacing_m, *SPACINGS_M, "m")
         check_whole("sides", sides, 1, 2, "")
         check_between("lane_width_m", lane_width_m, 1.0, 20.0, "m")
+        count = sides * (1 + 2 * math.floor(reach_m / spacing_m))
+        if count > MAX_MARKERS:
+            raise InvalidParameter(
+                f"{count} markers are in reach of one receiver",
+                field="spacing_m",
+                limit=f"at most {MAX_MARKERS} markers in reach",
+                cure="take a lower spreading factor, a wider band or less power: so many never get through",
+            )
         steps = np.arange(1, max(1, math.floor(reach_m / spacing_m)) + 1) * spacing_m
         along = np.concatenate([[0.0], -steps, steps])
         offsets = np.array([1.0, -1.0])[:sides] * lane_width_m / 2
@@ -210,7 +218,7 @@ class Approach:
         From the vehicle to the marker along the road, rising. [m]
     level_dbm : ndarray, shape (U,)
         [dBm]
-    harmful : ndarray, shape (U,)
+    harmful : ndarray, shape (U, Q)
         Others that can spoil its packets (`harmful_others`).
     """
 
@@ -222,7 +230,7 @@ class Approach:
 def approach(markers: RoadMarkers, index: int, nearest_m: float, air: Air) -> Approach:
     """Levels and harmful others from a marker's reach to `nearest_m` before it; empty where the reach is shorter."""
     if air.reach_m <= nearest_m:
-        return Approach(np.empty(0), np.empty(0), np.empty(0))
+        return Approach(np.empty(0), np.empty(0), np.empty((0, 1)))
     ahead_m = np.linspace(nearest_m, air.reach_m, _APPROACH_STEPS)
     away_m = markers.chainage_m - markers.chainage_m[index]
     others = (away_m >= -air.reach_m - air.harm_m) & (away_m <= air.harm_m - nearest_m)
@@ -231,7 +239,7 @@ def approach(markers: RoadMarkers, index: int, nearest_m: float, air: Air) -> Ap
     neighbours = RoadMarkers(markers.chainage_m[others], markers.offset_m[others]) if others.any() else None
     level = air.level_dbm(np.hypot(ahead_m, markers.offset_m[index]))
     if neighbours is None:
-        return Approach(ahead_m, level, np.zeros(len(ahead_m)))
+        return Approach(ahead_m, level, np.zeros((len(ahead_m), 1)))
     other_levels = air.level_dbm(neighbours.distances_m(stations_m))
     return Approach(ahead_m, level, harmful_others(level, other_levels, air.threshold_dbm, air.link, air.receiver))
 

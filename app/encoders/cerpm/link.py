@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from app.encoders.cerpm.airtime import check_between, check_modulation
 
@@ -23,6 +22,7 @@ PAPER_POWER_DBM = 20.0
 """The paper does not say what power its markers had: the most its chip gives, so that ranges come out no longer than
 they are. [dBm]"""
 LEAST_DISTANCE_M = 1.0
+_QUANTILES = (np.arange(6) + 0.5) / 6
 SENSITIVITY_DBM: dict[int, tuple[float, ...]] = {
     125_000: (-118.0, -123.0, -126.0, -129.0, -132.0, -133.0, -136.0),
     250_000: (-115.0, -120.0, -123.0, -125.0, -128.0, -130.0, -133.0),
@@ -94,17 +94,17 @@ class LinkModel:
         spare_db = self.near_dbm + power_dbm - self.at_power_dbm - threshold_dbm
         return float(self.near_m * 10 ** (spare_db / (10 * self.exponent)))
 
-    def share_above(self, level_dbm: npt.ArrayLike, threshold_dbm: npt.ArrayLike, spread: float = 1.0) -> Floats:
-        """Share of packets above a threshold where the mean is a level; `spread` times the fading."""
+    def share_above(self, level_dbm: npt.ArrayLike, threshold_dbm: npt.ArrayLike) -> Floats:
+        """Share of packets above a threshold where the mean is a level."""
         spare_db = np.asarray(level_dbm, float) - np.asarray(threshold_dbm, float)
         if self.fading_db == 0.0:
             return np.asarray(spare_db >= 0.0, float)
-        return np.asarray(ndtr(spare_db / (spread * self.fading_db)))
+        return np.asarray(ndtr(spare_db / self.fading_db))
 
-    def read_level_dbm(self, level_dbm: npt.ArrayLike, threshold_dbm: float) -> Floats:
-        """Mean level of those packets that are above a threshold: of a normal distribution cut off there. [dBm]"""
-        level = np.asarray(level_dbm, float)
+    def read_levels_dbm(self, level_dbm: npt.ArrayLike, threshold_dbm: float) -> Floats:
+        """Equally likely levels of those packets that are above a threshold, shape (...) to (..., Q). [dBm]"""
+        level = np.asarray(level_dbm, float)[..., None]
         if self.fading_db == 0.0:
             return level
-        beneath = (threshold_dbm - level) / self.fading_db
-        return np.asarray(level + self.fading_db * np.exp(norm.logpdf(beneath) - norm.logsf(beneath)))
+        above = ndtr((level - threshold_dbm) / self.fading_db)
+        return np.asarray(level - self.fading_db * ndtri(above * _QUANTILES))

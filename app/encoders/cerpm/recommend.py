@@ -93,7 +93,10 @@ def _best(plan: RadioPlan) -> Recommendation:
     reaching: tuple[float, RadioSettings, float] | None = None
     likeliest: tuple[float, RadioSettings] | None = None
     for first in _modulations(plan):
-        heard = _approaches(replace(plan, settings=first))
+        try:
+            heard = _approaches(replace(plan, settings=first))
+        except InvalidParameter:  # more markers in reach than a check takes
+            continue
         for settings in _intervals(first, plan):
             air = Air(settings, plan.link, plan.receiver)
             probability = min(read_probability(one, plan.design_speed_mps, air) for one in heard)
