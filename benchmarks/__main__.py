@@ -36,6 +36,7 @@ def _list_commands(short: bool) -> list[list[str]]:
         ["http", "-m", "benchmarks.http_overhead", *(["--frames", "20"] if short else [])],
         ["plates", "-m", "benchmarks.plates", *(["--short"] if short else [])],
         ["magnets", "-m", "benchmarks.magnets", *(["--short"] if short else [])],
+        ["cerpm", "-m", "benchmarks.cerpm", *(["--short"] if short else [])],
     ]
 
 

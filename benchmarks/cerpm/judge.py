@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-import shapely
+from scipy.spatial import cKDTree
 
 from app.decoders.cerpm.lane import Lane
 from app.sensors.pose_track import PoseTrack
@@ -110,12 +110,23 @@ def judge_track(lane: TrueLane, track: PoseTrack, first_m: float, last_m: float)
 
 
 def _against_line(places_m: Floats, line_m: Floats) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
-    """Distance of places from a line, where along it, and whether they are beside it rather than beyond an end."""
-    line = shapely.LineString(line_m)
-    points = shapely.points(places_m)
-    at = np.asarray(shapely.line_locate_point(line, points))
-    off = np.asarray(shapely.distance(line, points))
-    return off, at, (at > 1e-6) & (at < line.length - 1e-6)
+    """Distance of places from a line, where along it, and whether they are beside it rather than beyond an end.
+
+    The nearest place of the line is on one of the two pieces at the nearest of its points, which are close together.
+    """
+    line = line_m[np.concatenate([[True], np.linalg.norm(np.diff(line_m, axis=0), axis=1) > 1e-9])]
+    pieces = np.diff(line, axis=0)
+    lengths = np.linalg.norm(pieces, axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    nearest = cKDTree(line).query(places_m)[1]
+    off, at = np.full(len(places_m), np.inf), np.zeros(len(places_m))
+    for piece in (np.maximum(nearest - 1, 0), np.minimum(nearest, len(pieces) - 1)):
+        beside = places_m - line[piece]
+        share = np.clip(np.einsum("ij,ij->i", beside, pieces[piece]) / lengths[piece] ** 2, 0.0, 1.0)
+        away = np.linalg.norm(beside - share[:, None] * pieces[piece], axis=1)
+        closer = away < off
+        off, at = np.where(closer, away, off), np.where(closer, along[piece] + share * lengths[piece], at)
+    return off, at, (at > 1e-6) & (at < along[-1] - 1e-6)
 
 
 def _rms(parts: list[Floats]) -> float:

@@ -180,7 +180,7 @@ def run_tracking(seed: int, short: bool) -> Result:
             )
         )  # fmt: skip
     head = (
-        "path, controller", "RMS [m]", "max [m]", "worst run", "|MSE| [m2]", "worst run", "goal", "met", "paper [m]",
+        "path, controller", "RMS [m]", "max [m]", "worst run", "MSE [m2]", "worst run", "goal", "met", "paper [m]",
     )  # fmt: skip
     return "Front axle against the true centre line, poses with RTK noise, 25 mph or less in bends.", head, rows
 

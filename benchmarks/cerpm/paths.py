@@ -38,6 +38,8 @@ class Condition:
     per_side: int | None = None
     lose: Callable[[LaidMarkers, np.random.Generator], LaidMarkers] | None = None
     with_track: bool = True
+    longest_m: float = np.inf
+    """Lanes are cut to this. [m]"""
 
 
 CONDITIONS = (
@@ -48,6 +50,7 @@ CONDITIONS = (
     Condition("ten a side", (0.10, None, None), 10),
     Condition("ten a side, 40 % lost", (0.17, None, None), 10, lambda m, r: lose_share(m, 0.4, r)),
     Condition("ten a side, markers alone", (0.13, None, None), 10, with_track=False),
+    Condition("ten a side of at most 300 m, markers alone", (0.13, None, None), 10, with_track=False, longest_m=300.0),
 )
 CURVATURE_GOAL_1PM = 0.003
 
@@ -75,7 +78,7 @@ def run_path(seed: int, short: bool) -> Result:
         ours = {name: Tally() for name in names}
         paper, own = Tally(), Tally()
         for name, lane, rng in _scenes(seed, short, 10 + number):
-            _one_path(condition, lane, rng, ours[name], paper, own)
+            add_errors(condition, scenes.shortened(lane, condition.longest_m), rng, ours[name], paper, own)
         every = Tally()
         for tally in ours.values():
             every.add(tally)
@@ -102,9 +105,10 @@ def _scenes(seed: int, short: bool, item: int):  # type: ignore[no-untyped-def]
             yield name, lane, np.random.default_rng([seed, item, run, k])
 
 
-def _one_path(
+def add_errors(
     condition: Condition, lane: TrueLane, rng: np.random.Generator, ours: Tally, paper: Tally, own: Tally
 ) -> None:
+    """Errors of the path, of the paper's way and of the vehicle's own track on one drive."""
     laid = scenes.lay(lane, rng, condition.per_side)
     if condition.lose is not None:
         laid = condition.lose(laid, rng)
@@ -184,7 +188,7 @@ def run_dirty(seed: int, short: bool) -> Result:
     for number, (name, more, (rms, coverage)) in enumerate(cases):
         tally, own, broken = Tally(), Tally(), 0
         for _name, lane, rng in _scenes(seed, short, 40 + number):
-            found, log_track, (first, last), raised = _dirty_path(lane, rng, more)
+            found, log_track, (first, last), raised = dirty_path(lane, rng, more)
             broken += raised
             if found is not None:
                 tally.add(judge_path(lane, found, first, last))
@@ -206,7 +210,7 @@ def run_dirty(seed: int, short: bool) -> Result:
     return note, head, rows
 
 
-def _dirty_path(lane: TrueLane, rng: np.random.Generator, more: bool):  # type: ignore[no-untyped-def]
+def dirty_path(lane: TrueLane, rng: np.random.Generator, more: bool):  # type: ignore[no-untyped-def]
     """Path or None, track, span of the markers heard, and whether anything was raised."""
     laid = scenes.lay(lane, rng).without_sides()
     keys = scenes.keys_for(laid)

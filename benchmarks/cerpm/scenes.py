@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
 
@@ -45,6 +46,13 @@ def list_lanes(seed: int, run: int, made: int) -> list[tuple[str, TrueLane]]:
     """The shared routes and fresh made lanes."""
     lanes = [(name, route(name)) for name in ROUTE_NAMES]
     return lanes + [(MADE, make_lane(np.random.default_rng([seed, 1, run, k]))) for k in range(made)]
+
+
+def shortened(lane: TrueLane, longest_m: float) -> TrueLane:
+    """The first so many metres of a lane."""
+    kept = lane.chainage_m <= longest_m
+    parts = {f.name: getattr(lane, f.name)[kept] for f in fields(lane) if f.name != "origin"}
+    return TrueLane(lane.origin, **parts)
 
 
 def lay(lane: TrueLane, rng: np.random.Generator, per_side: int | None = None) -> LaidMarkers:
@@ -110,6 +118,3 @@ def long_lane(rng: np.random.Generator, length_m: float, rate_hz: float = 10.0) 
     markers = LaneMarkers(np.arange(1, n + 1), lon, lat, side, np.full(n, SURVEY_M), np.full(n, LIMIT.km_h))
     drive = drive_lane(lane, Driver(speed_m_s=25.0), rng)
     return markers, observe_track(lane, drive, Receiver.rtk(rate_hz), rng)
-
-
-Lose = Callable[[LaidMarkers, np.random.Generator], LaidMarkers]
