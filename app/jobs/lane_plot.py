@@ -294,7 +294,7 @@ def _beside(lane: LanePicture, points_m: Floats) -> Floats:
     rows = np.flatnonzero(np.isfinite(points_m).all(axis=1))
     if not len(rows):
         return out
-    away, nearest = cKDTree(lane.centre_m).query(points_m[rows])
+    nearest = cKDTree(lane.centre_m).query(points_m[rows])[1]
     ahead = np.gradient(lane.centre_m, axis=0)[nearest]
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
     offset = points_m[rows] - lane.centre_m[nearest]
@@ -302,7 +302,7 @@ def _beside(lane: LanePicture, points_m: Floats) -> Floats:
     left = ahead[:, 0] * offset[:, 1] - ahead[:, 1] * offset[:, 0]
     ends = (nearest == 0) | (nearest == len(lane.centre_m) - 1)
     kept = ~(ends & (np.abs(along) > 5.0)) | (np.abs(left) > np.abs(along))
-    out[rows[kept]] = np.column_stack([lane.station_m[nearest] + along, np.copysign(away, left)])[kept]
+    out[rows[kept]] = np.column_stack([lane.station_m[nearest] + along, left])[kept]
     return out
 
 
