@@ -55,9 +55,8 @@ def run_forged(seed: int, short: bool) -> Result:
     def row(name: str, result: tuple[int, int, dict[Verdict, int], int, int], goal: bool) -> None:
         sent, accepted, verdicts, real, kept = result
         told = ", ".join(f"{n} {v}" for v, n in verdicts.items() if n)
-        rows.append(
-            (name, sent, accepted, 0 if goal else "-", met(accepted == 0) if goal else "-", f"{kept} of {real}", told)
-        )
+        good = accepted == 0 and kept >= 0.995 * real  # who refuses everything is not safe but deaf
+        rows.append((name, sent, accepted, 0 if goal else "-", met(good) if goal else "-", f"{kept} of {real}", told))
 
     forged = forge_packets(days[0].packets, counts[0], rng)
     row("forged", _attack(days[0].packets, forged, keys, {})[0], True)
