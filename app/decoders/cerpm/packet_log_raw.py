@@ -55,9 +55,10 @@ def looks_like_hex_lines(text: str) -> bool:
 
 def read_hex_lines(text: str, clock: LogClock, report: LogReport) -> Iterable[HeardPacket]:
     """A packet a line: its bytes in hexadecimal, and beside them a time and an RSSI if there are any."""
-    for entry, line in numbered_lines(text):
+    for _number, line in numbered_lines(text):
         if line.startswith("#"):
             continue
+        entry = report.entries
         report.entries += 1
         try:
             if len(line) > MAX_LINE:

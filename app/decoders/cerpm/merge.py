@@ -1,0 +1,318 @@
+"""Verified packets -> one place a marker, held against the registry, the other markers and the vehicle's track."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.cerpm.merge_types import (
+    USED_ANYWAY,
+    Disagreement,
+    Finding,
+    MergedMarkers,
+    MergeRules,
+    RegisteredMarker,
+)
+from app.decoders.cerpm.packets import PlainClaim
+from app.decoders.cerpm.track_places import distances_m, offsets_m, vehicle_places
+from app.decoders.cerpm.verify import Verdict, VerifiedPacket
+from app.markers.cerpm import CerpmMessage, LaneSide
+from app.sensors.pose_track import PoseTrack
+
+Floats = npt.NDArray[np.float64]
+
+SURVEY_SIGMA_M = 0.02
+"""Of a marker's survey where it is not known (CERPM paper, section 2.2). [m]"""
+_LEAST_SHARED = 3
+"""Markers that a common shift must show in."""
+_SHIFT_SCATTER_M, _SHARE_SHIFTED, _LARGEST_SHIFT_M = 0.2, 0.8, 1000.0
+
+
+@dataclass(slots=True)
+class _Candidate:
+    """What was heard of one number."""
+
+    number: int
+    newest: CerpmMessage | PlainClaim
+    accepted: list[VerifiedPacket]
+    place: tuple[float, float]
+    known: RegisteredMarker | None
+
+
+def merge_markers(
+    verified: Iterable[VerifiedPacket],
+    registered: Mapping[int, RegisteredMarker | None],
+    track: PoseTrack | None = None,
+    rules: MergeRules | None = None,
+) -> MergedMarkers:
+    """One place for each marker; what disagrees is named and, but for `USED_ANYWAY`, left out.
+
+    Parameters
+    ----------
+    verified : iterable of VerifiedPacket
+        Of `verify_packets`.
+    registered : mapping of int to RegisteredMarker or None
+        By number.
+    track : PoseTrack, optional
+        The vehicle's own positions.
+    rules : MergeRules, optional
+
+    Returns
+    -------
+    MergedMarkers
+        In the order of numbers.
+    """
+    rules = rules or MergeRules()
+    packets = list(verified)
+    candidates = _candidates(packets, registered, rules)
+    findings = _two_places(packets, candidates, rules)
+    findings += _swapped(candidates, track, rules)
+    warnings: list[str] = []
+    findings += _out_of_reach(_unnamed(candidates, findings), track, rules, warnings)
+    rest = _unnamed(candidates, findings)
+    shift_m = _common_shift(rest, rules)
+    findings += _against_registry(rest, rules) if shift_m is None else _shifted(rest, shift_m)
+    left_out = {f.number: f.reason for f in reversed(findings) if f.kind not in USED_ANYWAY}
+    return _rows([c for c in candidates if c.number not in left_out], left_out, findings, shift_m, warnings)
+
+
+def _unnamed(candidates: Sequence[_Candidate], findings: Sequence[Finding]) -> list[_Candidate]:
+    named = {finding.number for finding in findings if finding.kind not in USED_ANYWAY}
+    return [candidate for candidate in candidates if candidate.number not in named]
+
+
+def _candidates(
+    packets: Sequence[VerifiedPacket], registered: Mapping[int, RegisteredMarker | None], rules: MergeRules
+) -> list[_Candidate]:
+    accepted: dict[int, list[VerifiedPacket]] = defaultdict(list)
+    clear: dict[int, list[VerifiedPacket]] = defaultdict(list)
+    for packet in packets:
+        if packet.accepted and packet.number is not None:
+            accepted[packet.number].append(packet)
+        elif rules.accept_clear and packet.verdict is Verdict.UNAUTHENTICATED and packet.number is not None:
+            clear[packet.number].append(packet)
+    found = []
+    for number in sorted({*accepted, *clear}):
+        if number in accepted:
+            group = accepted[number]
+            newest: CerpmMessage | PlainClaim | None = max(
+                (p.message for p in group if p.message is not None), key=lambda m: m.sequence, default=None
+            )
+        else:
+            group = clear[number]
+            newest = max(group, key=lambda p: _time_key(p.packet.heard_at_s)).packet.claim
+        if newest is not None:
+            found.append(_Candidate(number, newest, group, (newest.lon_deg, newest.lat_deg), registered.get(number)))
+    return found
+
+
+def _time_key(time_s: float) -> float:
+    return time_s if math.isfinite(time_s) else -math.inf
+
+
+def _claimed(packet: VerifiedPacket) -> tuple[float, float]:
+    said = packet.message or packet.packet.claim
+    return (said.lon_deg, said.lat_deg) if said is not None else (math.nan, math.nan)
+
+
+# --- one number in two places -------------------------------------------------------------------------------------
+
+
+def _two_places(
+    packets: Sequence[VerifiedPacket], candidates: Sequence[_Candidate], rules: MergeRules
+) -> list[Finding]:
+    """Numbers whose packets carry valid tags and tell of different places."""
+    rejected: dict[int, list[VerifiedPacket]] = defaultdict(list)
+    for packet in packets:
+        # what an earlier drive heard already is a replay for sure: it says nothing of a second marker
+        if packet.verdict is Verdict.OUT_OF_ORDER and packet.number is not None:
+            rejected[packet.number].append(packet)
+    findings = []
+    for candidate in candidates:
+        more = rejected.get(candidate.number, [])
+        if all(_claimed(packet) == candidate.place for packet in (*candidate.accepted, *more)):
+            continue
+        ordered = sorted(candidate.accepted, key=_order_key)
+        away_m = _away_m(candidate.place, ordered)
+        changes = int(np.count_nonzero(np.diff((away_m > rules.apart_m).astype(int))))
+        also_m = _away_m(candidate.place, more)
+        if changes > 1 or (candidate.known is None and (also_m > rules.apart_m).any()):
+            far_m = max(float(away_m.max()), float(also_m.max(initial=0.0)))
+            reason = (
+                f"packets with valid tags claim two places {far_m:.1f} m apart: two markers have this number, or an "
+                "old message of a moved marker is being sent again"
+            )
+            findings.append(Finding(candidate.number, Disagreement.TWO_PLACES, reason, far_m))
+        elif changes == 1:
+            far_m = float(away_m.max())
+            reason = f"its place changed by {far_m:.1f} m during the log: programmed again; the newest is used"
+            findings.append(Finding(candidate.number, Disagreement.REPROGRAMMED, reason, far_m))
+    return findings
+
+
+def _away_m(place: tuple[float, float], packets: Sequence[VerifiedPacket]) -> Floats:
+    claims = np.array([_claimed(packet) for packet in packets], float).reshape(-1, 2)
+    return distances_m(np.broadcast_to(place, claims.shape), claims)
+
+
+def _order_key(packet: VerifiedPacket) -> tuple[float, float]:
+    sequence = packet.message.sequence if packet.message else -1
+    return (float(sequence), _time_key(packet.packet.heard_at_s))
+
+
+# --- places that cannot be ----------------------------------------------------------------------------------------
+
+
+def _swapped(candidates: Sequence[_Candidate], track: PoseTrack | None, rules: MergeRules) -> list[Finding]:
+    """Claims that would fit with longitude and latitude exchanged, and do not as they are."""
+    if not candidates:
+        return []
+    near = _where_they_should_be(candidates, track)
+    claims = np.array([c.place for c in candidates], float)
+    fits = (np.abs(claims[:, 0]) <= 90) & (distances_m(near, claims) > 5 * rules.reach_m)
+    fits &= distances_m(near, claims[:, ::-1]) <= rules.reach_m
+    findings = []
+    for i in np.flatnonzero(fits).tolist():
+        lon_deg, lat_deg = candidates[i].place
+        reason = f"longitude {lon_deg:.5f} and latitude {lat_deg:.5f} fit if they are exchanged: programmed swapped"
+        findings.append(Finding(candidates[i].number, Disagreement.SWAPPED, reason))
+    return findings
+
+
+def _where_they_should_be(candidates: Sequence[_Candidate], track: PoseTrack | None) -> Floats:
+    """Near each marker: its registered place, or the vehicle's when it was heard, or the middle of all others."""
+    near = np.array([(c.known.lon_deg, c.known.lat_deg) if c.known else (math.nan, math.nan) for c in candidates])
+    unknown = np.isnan(near[:, 0])
+    if track is not None:
+        near[unknown] = vehicle_places(track, [c.accepted[0].packet.heard_at_s for c in candidates])[unknown]
+        unknown = np.isnan(near[:, 0])
+    if len(candidates) >= _LEAST_SHARED:
+        claims = np.array([c.place for c in candidates], float)
+        near[unknown] = np.median(claims, axis=0)
+    return near
+
+
+def _out_of_reach(
+    candidates: Sequence[_Candidate], track: PoseTrack | None, rules: MergeRules, warnings: list[str]
+) -> list[Finding]:
+    """Markers whose every packet was heard further away than radio reaches."""
+    if track is None or not candidates:
+        return []
+    counts = [len(c.accepted) for c in candidates]
+    vehicle = vehicle_places(track, [p.packet.heard_at_s for c in candidates for p in c.accepted])
+    away_m = distances_m(vehicle, np.repeat(np.array([_used_place(c) for c in candidates], float), counts, axis=0))
+    nearest_m = np.full(len(candidates), np.inf)
+    np.fmin.at(nearest_m, np.repeat(np.arange(len(candidates)), counts), away_m)
+    heard = int(np.isfinite(nearest_m).sum())
+    findings = []
+    for i in np.flatnonzero(np.isfinite(nearest_m) & (nearest_m > rules.reach_m)).tolist():
+        reason = (
+            f"heard {nearest_m[i] / 1000:.1f} km from its place, further than radio reaches: recorded there and sent "
+            "again here, or carried away"
+        )
+        findings.append(Finding(candidates[i].number, Disagreement.OUT_OF_REACH, reason, float(nearest_m[i])))
+    if 2 * len(findings) > max(heard, 2):
+        warnings.append(
+            f"{len(findings)} of {heard} markers were heard further away than radio reaches: the track is of another "
+            "drive, or the clocks do not fit"
+        )
+    return findings
+
+
+def _used_place(candidate: _Candidate) -> tuple[float, float]:
+    known = candidate.known
+    return candidate.place if known is None else (known.lon_deg, known.lat_deg)
+
+
+# --- against the registry -----------------------------------------------------------------------------------------
+
+
+def _common_shift(candidates: Sequence[_Candidate], rules: MergeRules) -> tuple[float, float] | None:
+    """Shift of the claims that the registered markers share, if it is more than their surveys explain."""
+    pairs = [(_used_place(c), c.place) for c in candidates if c.known is not None]
+    if len(pairs) < _LEAST_SHARED:
+        return None
+    off_m = offsets_m([known for known, _claim in pairs], [claim for _known, claim in pairs])
+    shift_m = np.median(off_m, axis=0)
+    size_m = float(np.hypot(*shift_m))
+    scatter_m = np.hypot(*(off_m - shift_m).T)
+    if not rules.apart_m < size_m <= _LARGEST_SHIFT_M or np.mean(scatter_m <= _SHIFT_SCATTER_M) < _SHARE_SHIFTED:
+        return None
+    return float(shift_m[0]), float(shift_m[1])
+
+
+def _shifted(candidates: Sequence[_Candidate], shift_m: tuple[float, float]) -> list[Finding]:
+    reason = (
+        f"the markers claim places {shift_m[0]:+.2f} m east and {shift_m[1]:+.2f} m north of their registered ones, "
+        "all alike: positions of another datum"
+    )
+    return [Finding(c.number, Disagreement.DATUM_SHIFT, reason, math.hypot(*shift_m)) for c in candidates]
+
+
+def _against_registry(candidates: Sequence[_Candidate], rules: MergeRules) -> list[Finding]:
+    known = [(c, c.known) for c in candidates if c.known is not None]
+    if not known:
+        return []
+    places = np.array([(marker.lon_deg, marker.lat_deg) for _c, marker in known], float)
+    away_m = distances_m(places, [c.place for c, _marker in known])
+    findings = []
+    for (candidate, marker), apart_m in zip(known, away_m, strict=True):
+        limit_m = max(rules.apart_m, rules.sigmas * _sigma_m(marker))
+        said = candidate.newest.side
+        if not apart_m <= limit_m:
+            reason = (
+                f"claims a place {apart_m:.2f} m from its registered one (limit {limit_m:.2f} m): moved, or programmed "
+                "wrongly"
+            )
+            findings.append(Finding(candidate.number, Disagreement.MOVED, reason, float(apart_m)))
+        elif LaneSide.UNKNOWN not in (marker.side, said) and marker.side != said:
+            reason = (
+                f"says that it stands {said.name.lower()}, registered {marker.side.name.lower()}; the registry is used"
+            )
+            findings.append(Finding(candidate.number, Disagreement.OTHER_SIDE, reason))
+    return findings
+
+
+def _sigma_m(known: RegisteredMarker | None) -> float:
+    return known.sigma_m if known is not None and known.sigma_m > 0 else SURVEY_SIGMA_M
+
+
+def _rows(
+    used: Sequence[_Candidate],
+    left_out: dict[int, str],
+    findings: list[Finding],
+    shift_m: tuple[float, float] | None,
+    warnings: list[str],
+) -> MergedMarkers:
+    places = np.array([_used_place(c) for c in used], float).reshape(-1, 2)
+    return MergedMarkers(
+        number=np.array([c.number for c in used], np.int64),
+        lon_deg=places[:, 0],
+        lat_deg=places[:, 1],
+        side=np.array([_side(c) for c in used], np.int64),
+        sigma_m=np.array([_sigma_m(c.known) for c in used], float),
+        speed_limit_km_h=np.array([_speed_limit_km_h(c) for c in used], float),
+        packets=np.array([len(c.accepted) for c in used], np.int64),
+        registered=np.array([c.known is not None for c in used], bool),
+        left_out=left_out,
+        findings=findings,
+        shift_m=shift_m,
+        warnings=warnings,
+    )
+
+
+def _side(candidate: _Candidate) -> int:
+    known = candidate.known
+    return int(candidate.newest.side if known is None or known.side is LaneSide.UNKNOWN else known.side)
+
+
+def _speed_limit_km_h(candidate: _Candidate) -> float:
+    if candidate.known is not None and math.isfinite(candidate.known.speed_limit_km_h):
+        return candidate.known.speed_limit_km_h
+    limit = candidate.newest.speed_limit
+    return math.nan if limit is None else limit.km_h
