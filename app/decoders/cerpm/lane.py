@@ -37,6 +37,7 @@ __all__ = ["Lane", "LaneMarkers", "LaneRules", "LeftOut", "LeftOutReason", "fit_
 
 _KNOWN_WIDTH_M, _KNOWN_SIDE_M = 0.3, 0.4
 _BEYOND_M = 15.0
+_SURE_TRACK_M = 0.5
 _SAME_PLACE_M = 3.0
 
 
@@ -106,20 +107,31 @@ def _drive(track: PoseTrack | None, stock: Stock, notes: Notes) -> Drive | None:
 def _fit(stock: Stock, taken: Bools, drive: Drive | None, rules: LaneRules, notes: Notes) -> Lane:
     line, taken = _first_line(stock, taken, drive, rules, notes)
     if line is None:
-        return _refused(stock, notes, "the markers do not lie along a lane", "waymark")
+        return _refused(
+            stock, notes, "the markers do not lie along a lane, or are one row that tells no side", "waymark"
+        )
     fit = fit_along(line, stock, taken, drive, rules, notes)
     if fit is None:
         return _refused(stock, notes, "no two markers lie on one lane", "waymark")
     for k, (reason, off) in fit.left_out.items():
         notes.left_out.append(LeftOut(int(stock.row[k]), int(stock.number[k]), reason, off))
+    strays = len(fit.left_out) / max(len(fit.left_out) + int(fit.used.sum()), 1)
+    if strays > rules.most_strays:
+        return _refused(
+            stock, notes, f"{len(fit.left_out)} markers lie off the one line that most of them have", "waymark"
+        )
     found = set(np.unique(fit.side[fit.used]).tolist())
-    if len(found) == 1 and drive is None and not (stock.side[fit.used] != UNKNOWN).any():
+    sure = drive is not None and drive.accuracy_m < _SURE_TRACK_M
+    if len(found) == 1 and not sure and not (stock.side[fit.used] != UNKNOWN).any():
         return _refused(stock, notes, "one row of markers, and nothing tells on which side of the lane", "waymark")
     if len(found) == 1:
         notes.doubt("only one side of the lane was heard: the path lies half the usual width off it")
     if drive is None and not (stock.side[fit.used] != UNKNOWN).any():
         notes.doubt("neither a track nor a side tells the direction of travel: it may be the other one")
-    return _lane(fit, stock, rules, notes)
+    lane = _lane(fit, stock, rules, notes)
+    if not len(lane.sigma_m) or float(np.median(lane.sigma_m)) > rules.hopeless_sigma_m:
+        return _refused(stock, notes, "the markers are too few or too coarse to tell where the lane runs", "waymark")
+    return lane
 
 
 def _first_line(
@@ -144,7 +156,7 @@ def _first_line(
         return None, belongs
     line = line_through(stock.point_m[belongs], side[belongs], half)
     if line is not None and drive is not None:
-        at, _ = line.find(drive.line.points_m)
+        at, _ = line.nearest(drive.line.points_m)
         if np.sum(np.diff(at)) < 0:
             line = Line(line.points_m[::-1])
     return line, belongs
@@ -208,7 +220,7 @@ def _lane(fit: Fit, stock: Stock, rules: LaneRules, notes: Notes) -> Lane:
     return Lane(
         *stock.origin, at[keep] - at[keep][0], path.points_m[keep], bounds[0][keep], bounds[1][keep],
         lon[keep], lat[keep], heading_of(lon, lat)[keep], path.curvature_1pm[keep], known_width[keep], limit[keep],
-        sigma[keep], erf(rules.tolerance_m / (np.sqrt(2) * sigma[keep])), row_side, row_residual,
+        sigma[keep], erf(rules.tolerance_m / (np.sqrt(2) * np.maximum(sigma[keep], 1e-6))), row_side, row_residual,
         tuple(notes.left_out), tuple(notes.doubts),
     )  # fmt: skip
 

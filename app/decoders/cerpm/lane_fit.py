@@ -8,15 +8,19 @@ import numpy as np
 
 from app.decoders.cerpm.lane_input import Stock
 from app.decoders.cerpm.lane_line import Line, lengths_along
+from app.decoders.cerpm.lane_pairs import Pairs, abreast
 from app.decoders.cerpm.lane_sides import Sides, assign_sides
-from app.decoders.cerpm.lane_solve import Evidence, Problem, Solution, Strengths, choose_strengths
+from app.decoders.cerpm.lane_solve import VEHICLES, Evidence, Problem, Solution, Strengths, choose_strengths
+from app.decoders.cerpm.lane_spacing import NONE, Stretches, even_stretches
 from app.decoders.cerpm.lane_track import Drive
 from app.decoders.cerpm.lane_types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints, LaneRules, LeftOutReason, Notes
 
-_ROUNDS = 3
+_ROUNDS = 8
+_CLOSE_M = 0.1  # a line so close to the centre is as good as the centre
 _REJECTIONS = 12
 _ONE_EACH_M = 60.0  # of markers that stray, one a stretch is left out at a time: the rest may be its doing
 _AGAINST = 0.2
+_SURE_TRACK_M, _UNTOLD_M = 0.5, 3.0
 
 
 @dataclass(slots=True, eq=False)
@@ -65,8 +69,10 @@ def fit_along(
         Markers that may take part.
     drive : Drive or None
     """
-    named = _named_sides(line, stock, taken, drive, notes)
-    station, left = line.find(stock.point_m, named, rules.usual_width_m / 2)
+    station, left = line.find(stock.point_m, stock.side, rules.usual_width_m / 2)
+    named = _named_sides(left, stock, taken, drive, notes)
+    if named is not stock.side:
+        station, left = line.find(stock.point_m, named, rules.usual_width_m / 2)
     sides = _sides(station, left, named, taken, drive)
     left_out = {
         int(k): (LeftOutReason.WRONG_SIDE if sides.against[k] else LeftOutReason.OFF_THE_LINE, float(sides.off_m[k]))
@@ -79,11 +85,10 @@ def fit_along(
     fixes = _fixes_beside(line, drive)
     fit: Fit | None = None
     for turn in range(_ROUNDS):
-        last = turn == _ROUNDS - 1
         strengths = start if fit is None else fit.strengths
         fit = _solve(line, stock, used, sides.side, station, left, fixes, drive, strengths, left_out, rules, turn)
         used = fit.used
-        if last or used.sum() < 2:
+        if used.sum() < 2 or turn == _ROUNDS - 1 or (turn and np.abs(fit.solution.centre_m).max() < _CLOSE_M):
             break
         points = line.offset(fit.problem.station_m, fit.solution.centre_m)
         before = lengths_along(points)
@@ -101,10 +106,9 @@ Fixes = tuple[Floats, Floats, Floats, Floats]
 """Station, left offset, place and standard deviation of fixes."""
 
 
-def _named_sides(line: Line, stock: Stock, taken: Bools, drive: Drive | None, notes: Notes) -> Ints:
+def _named_sides(left: Floats, stock: Stock, taken: Bools, drive: Drive | None, notes: Notes) -> Ints:
     """The sides that markers name, as seen in the direction of the line."""
     named = stock.side
-    _, left = line.find(stock.point_m)
     told = taken & (named != UNKNOWN) & (np.abs(left) > 0.5) & (np.abs(left) < 4)
     if drive is None or told.sum() < 4:
         return named
@@ -133,10 +137,22 @@ def _start_strengths(sides: Sides, used: Bools, drive: Drive | None, rules: Lane
     return Strengths(width_m=rules.usual_width_m, width_sd_m=0.4, width_length_m=400.0)
 
 
+def _vehicles(side: Ints, drive: Drive | None) -> tuple[dict[str, float], ...]:
+    """What may be true of the vehicle's offset: a driver's wander, or a receiver's slow error."""
+    if drive is None:
+        return ()
+    one_sided = (side == LEFT).all() or (side == RIGHT).all()
+    told = drive.accuracy_m
+    if one_sided and not told < _SURE_TRACK_M:  # nothing would show that the whole track lies aside
+        slow = told if np.isfinite(told) else _UNTOLD_M
+        return tuple({"drift": value, "slow_m": slow} for value in (0.05, 0.15, 0.4))
+    return VEHICLES
+
+
 def _fixes_beside(line: Line, drive: Drive | None) -> Fixes | None:
     if drive is None:
         return None
-    station, left = line.find(drive.fix_m)
+    station, left = line.nearest(drive.fix_m)
     good = np.abs(left - np.median(left)) < max(8 * drive.sigma_m, 6.0)
     return station[good], left[good], drive.fix_m[good], np.full(int(good.sum()), drive.sigma_m)
 
@@ -148,16 +164,22 @@ def _solve(
 ) -> Fit:  # fmt: skip
     """Solve beside one line, leaving out markers that stray until none does."""
     used = used.copy()
+    later = turn > 0  # a first line does not tell lengths
     start, end = float(station[used].min()), float(station[used].max())
     if fixes is not None and len(fixes[0]):
         start = min(start, max(start - rules.reach_m, float(fixes[0].min())))
         end = max(end, min(end + rules.reach_m, float(fixes[0].max())))
     sign = np.where(side == LEFT, 1.0, -1.0)
+    vehicles = _vehicles(side[used], drive)
     chosen = False
     for _ in range(_REJECTIONS):
-        problem = Problem(line, _evidence(stock, used, station, left, sign, fixes, start, end), start, end)
-        if not chosen and turn < 2:
-            strengths = choose_strengths(problem, strengths, track=problem.fields == 3)
+        pairs = abreast(station, left, np.where(used, side, UNKNOWN), stock.sigma_m)
+        stretches = even_stretches(line, station, used, strengths.width_m) if drive is None and later else NONE
+        problem = Problem(
+            line, _evidence(stock, used, station, left, sign, fixes, start, end, pairs, stretches), start, end
+        )
+        if not chosen and turn < (1 if drive is not None else 3):
+            strengths = choose_strengths(problem, strengths, vehicles)
             chosen = True
         solution = problem.solve(strengths)
         residual, share = solution.residuals()
@@ -170,7 +192,7 @@ def _solve(
         for k in _worst(z * stray, station[rows]):
             used[rows[k]] = False
             left_out[int(rows[k])] = (LeftOutReason.OFF_THE_LINE, float(off[k]))
-        chosen = False
+        chosen, turn = False, 0
     full = np.full(len(used), np.nan)
     full[rows] = residual
     return Fit(line, problem, solution, strengths, used, side, full, station, left_out)
@@ -185,13 +207,17 @@ def _evidence(
     fixes: Fixes | None,
     start: float,
     end: float,
+    pairs: Pairs,
+    stretches: Stretches,
 ) -> Evidence:
-    if fixes is None:
-        empty = np.empty(0)
-        return Evidence(station[used], left[used], stock.sigma_m[used], sign[used], empty, empty, empty)
-    inside = (fixes[0] >= start) & (fixes[0] <= end)
-    beside = tuple(values[inside] for values in (fixes[0], fixes[1], fixes[3]))
-    return Evidence(station[used], left[used], stock.sigma_m[used], sign[used], *beside)
+    fix_station, fix_left, fix_sigma = np.empty(0), np.empty(0), np.empty(0)
+    if fixes is not None:
+        inside = (fixes[0] >= start) & (fixes[0] <= end)
+        fix_station, fix_left, fix_sigma = fixes[0][inside], fixes[1][inside], fixes[3][inside]
+    return Evidence(
+        station[used], left[used], stock.sigma_m[used], sign[used],
+        fix_station, fix_left, fix_sigma, *pairs, stretches,
+    )  # fmt: skip
 
 
 def _worst(z: Floats, station: Floats) -> list[int]:

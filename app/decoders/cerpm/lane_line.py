@@ -11,6 +11,7 @@ from app.decoders.cerpm.lane_types import LEFT, RIGHT, Floats, Ints
 STEP_M = 1.0
 _LEG_M = 20.0  # places on the line further apart than this are on two legs of it
 _NEWTON_STEPS = 4
+_SURE_M = 1e-4
 
 
 def lengths_along(points_m: Floats) -> Floats:
@@ -80,12 +81,18 @@ class Line:
             point, tangent = self.at(station)
             step = np.sum((points_m - point) * tangent, 1)
             station = station + np.clip(step, -5, 5)
-        point, tangent = self.at(station)
+            if not len(step) or np.abs(step).max() < _SURE_M:
+                break
         off = points_m - point
         return station, tangent[:, 0] * off[:, 1] - tangent[:, 1] * off[:, 0]
 
-    def find(self, points_m: Floats, side: Ints | None = None, half_width_m: float = 1.65) -> tuple[Floats, Floats]:
-        """Station and left offset of points anywhere. [m]
+    def nearest(self, points_m: Floats) -> tuple[Floats, Floats]:
+        """Station and left offset of points that lie near the line or anywhere, from the nearest leg of it. [m]"""
+        _, index = cKDTree(self.points_m).query(points_m)
+        return self.follow(points_m, self.station_m[index])
+
+    def find(self, points_m: Floats, side: Ints, half_width_m: float) -> tuple[Floats, Floats]:
+        """Station and left offset of points on the boundaries. [m]
 
         Where the line passes a point twice, the leg is taken from which the point lies about half a width, on its side.
         """
@@ -99,10 +106,8 @@ class Line:
         if len(rows):
             second = index[rows, np.argmax(other[rows], 1)]
             station_2, left_2 = self.follow(points_m[rows], self.station_m[second])
-            wanted = np.zeros(len(points_m), np.int64) if side is None else side
-            better = _strangeness(left_2, wanted[rows], half_width_m) < _strangeness(
-                left[rows], wanted[rows], half_width_m
-            )
+            strange = [_strangeness(value, side[rows], half_width_m) for value in (left_2, left[rows])]
+            better = strange[0] < strange[1]
             station[rows[better]], left[rows[better]] = station_2[better], left_2[better]
         return station, left
 

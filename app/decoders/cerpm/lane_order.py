@@ -16,6 +16,7 @@ _BEND = 0.002  # change of curvature over a metre that the first line is given, 
 _FIRST_SIGMA_M, _SIDED_SIGMA_M = 1.6, 0.3
 _BESIDE_M = 8.0
 _ROUNDS = 4
+_ROW_M = 0.4
 
 
 def connected(points_m: Floats, bridge_m: float) -> Bools:
@@ -28,7 +29,8 @@ def connected(points_m: Floats, bridge_m: float) -> Bools:
 
 
 def line_through(points_m: Floats, side: Ints, half_width_m: float) -> Line | None:
-    """A line near the lane's centre through markers in no order; None where they have no length.
+    """A line near the lane's centre through markers in no order; None where they have no length, or
+    are one row without sides.
 
     Parameters
     ----------
@@ -48,8 +50,9 @@ def line_through(points_m: Floats, side: Ints, half_width_m: float) -> Line | No
     near = far < _BESIDE_M
     sided = side if (side != UNKNOWN).sum() > 1 else np.zeros_like(side)
     line = _smooth(points_m[near], along[nearest[near]], _FIRST_SIGMA_M)
-    for _ in range(_ROUNDS if line is not None else 0):
-        assert line is not None
+    if line is None or (not sided.any() and _one_row(points_m[near], along[nearest[near]])):
+        return None
+    for _ in range(_ROUNDS):
         station, left = line.find(points_m, sided, half_width_m)
         known = sided != UNKNOWN
         if known.any() and np.sum(np.where(sided == LEFT, left, -left)[known & near] > 0) * 2 < np.sum(known & near):
@@ -62,10 +65,17 @@ def line_through(points_m: Floats, side: Ints, half_width_m: float) -> Line | No
         near = np.abs(left - sign * half_width_m) < _BESIDE_M
         if near.sum() < 2:
             break
-        line = _smooth(centred[near], station[near], _SIDED_SIGMA_M if known.any() else _FIRST_SIGMA_M / 2)
-        if line is None:
+        better = _smooth(centred[near], station[near], _SIDED_SIGMA_M if known.any() else _FIRST_SIGMA_M / 2)
+        if better is None:
             break
+        line = better
     return line
+
+
+def _one_row(points_m: Floats, station_m: Floats) -> bool:
+    """Whether one smooth line runs through all markers: nothing tells on which side of it the lane is."""
+    line = _smooth(points_m, station_m, _SIDED_SIGMA_M)
+    return line is None or float(np.median(np.abs(line.nearest(points_m)[1]))) < _ROW_M
 
 
 def _spanning(points_m: Floats) -> csr_array:

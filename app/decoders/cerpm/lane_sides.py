@@ -14,6 +14,7 @@ _SPREAD_M = 0.25  # of a marker about a lane of even width
 _CAP = 12.0  # cost of a marker that is on no boundary
 _LABEL_COST = 8.0  # of a marker on the boundary that it does not name
 _TRACK_COST = 0.02  # per marker and square metre: a driver keeps within the lane
+_BAND_M = 0.8  # about the middle of a band, where there is nothing to find out
 _WIDTHS_M = (2.5, 2.8, 3.1, 3.4, 3.8, 4.3)
 
 
@@ -58,6 +59,9 @@ def assign_sides(station_m: Floats, left_m: Floats, named: Ints, *, wander: floa
     States are places of the centre beside the line on a grid; a marker costs the square of its distance from the
     boundary that it fits best, up to a cap, so that a wild one bends nothing. All widths run side by side.
     """
+    plain = _plain_sides(left_m, named) if near_track else None
+    if plain is not None:
+        return plain
     order = np.argsort(station_m, kind="stable")
     widths = np.array(_WIDTHS_M)
     grid = np.arange(-_REACH_M, _REACH_M + _GRID_M / 2, _GRID_M)
@@ -85,6 +89,19 @@ def assign_sides(station_m: Floats, left_m: Floats, named: Ints, *, wander: floa
     back[order] = np.arange(len(order))
     side = np.where(lost | against, UNKNOWN, side)
     return Sides(side[back], off_m[back], against[back], float(widths[width]))
+
+
+def _plain_sides(left_m: Floats, named: Ints) -> Sides | None:
+    """The sides where nothing is to be found out: two bands beside the track, and all names agree."""
+    side = np.where(left_m > 0, LEFT, RIGHT)
+    if len(left_m) < 4 or (side == LEFT).all() or (side == RIGHT).all() or ((named != UNKNOWN) & (named != side)).any():
+        return None
+    middle = np.array([np.median(left_m[side == which]) for which in (LEFT, RIGHT)])
+    width = float(middle[0] - middle[1])
+    off = left_m - np.where(side == LEFT, middle[0], middle[1])
+    if not _WIDTHS_M[0] < width < _WIDTHS_M[-1] or np.abs(off).max() > _BAND_M:
+        return None
+    return Sides(side, off, np.zeros(len(side), bool), width)
 
 
 def _walk(unary: Floats, grid: Floats, ahead_m: Floats, wander: float) -> tuple[Ints, int]:

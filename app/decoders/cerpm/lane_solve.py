@@ -19,12 +19,15 @@ import numpy as np
 
 from app.decoders.cerpm.lane_banded import apply, covariances, factor, gather, gram, log_determinant, solve
 from app.decoders.cerpm.lane_line import Line
+from app.decoders.cerpm.lane_spacing import NONE as NO_STRETCHES
+from app.decoders.cerpm.lane_spacing import Stretches
 from app.decoders.cerpm.lane_types import Floats, Ints
 
-KNOT_M = 2.0
+KNOT_M = 3.0
 _PROBE_KNOTS = 2
 _FEEL_M = 256.0  # measurements further away than this do not change what is known of a place
 _BAND = 9
+_EXACT_M = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +40,8 @@ class Strengths:
         Standard deviation of the change of curvature over a metre. [1/m^2 sqrt(m)]
     wander_m, wander_length_m : float
         Of the vehicle's offset, and the length over which it is forgotten. [m]
-    drift : float
-        Growth of the receiver's slow error, which replaces the wander where it is not 0. [m/sqrt(m)]
+    drift, slow_m : float
+        Growth of the receiver's slow error, which replaces the wander where it is not 0 [m/sqrt(m)], and its size. [m]
     width_m, width_sd_m, width_length_m : float
         Of the lane's width. [m]
     """
@@ -47,6 +50,7 @@ class Strengths:
     wander_m: float = 0.2
     wander_length_m: float = 30.0
     drift: float = 0.0
+    slow_m: float = 3.0
     width_m: float = 3.3
     width_sd_m: float = 0.25
     width_length_m: float = 60.0
@@ -54,7 +58,11 @@ class Strengths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What was measured, at stations of a line; `sign` is 1 for markers on the left, -1 on the right."""
+    """What was measured, at stations of a line.
+
+    `sign` is 1 for markers on the left, -1 on the right; `pair_slope` is the slope of the centre against the line that
+    pairs of markers across from each other tell.
+    """
 
     station_m: Floats
     left_m: Floats
@@ -63,6 +71,10 @@ class Evidence:
     fix_station_m: Floats
     fix_left_m: Floats
     fix_sigma_m: Floats
+    pair_station_m: Floats
+    pair_slope: Floats
+    pair_sigma: Floats
+    stretches: Stretches = NO_STRETCHES
 
 
 class Problem:
@@ -77,7 +89,8 @@ class Problem:
     """
 
     def __init__(self, line: Line, evidence: Evidence, start_m: float, end_m: float) -> None:
-        self.fields = 3 if len(evidence.fix_left_m) else 2
+        self.tracked = len(evidence.fix_left_m) > 0
+        self.fields = 3 if self.tracked or len(evidence.stretches.start_m) else 2
         self.count = max(int(np.ceil((end_m - start_m) / KNOT_M)) + 1, 5)
         self.knot_m = (end_m - start_m) / (self.count - 1)
         self.start_m = start_m
@@ -87,6 +100,8 @@ class Problem:
         self.marker_index, self.marker_value = self.rows(evidence.station_m, [1.0, None], evidence.sign / 2)
         self._measure()
         self._priors(line)
+        if self.fields == 3 and not self.tracked:
+            self._lengths(line)
 
     def rows(self, station_m: Floats, parts: list[float | None], varying: Floats | None = None) -> tuple[Ints, Floats]:
         """Sparse rows that read a mix of the fields at stations: one coefficient a field, None for a varying one."""
@@ -106,13 +121,21 @@ class Problem:
         self.data = gram(self.marker_index, self.marker_value, weight, self.size, _BAND)
         self.right = gather(self.marker_index, self.marker_value, weight * e.left_m, self.size)
         self.energy = float(np.sum(weight * e.left_m**2))
-        if self.fields == 3:
+        if self.tracked:
             index, value = self.rows(e.fix_station_m, [1.0, 0.0, 1.0])
             index, value = index[:, [0, 1, 4, 5]], value[:, [0, 1, 4, 5]]
             weight = e.fix_sigma_m**-2.0
             self.data += gram(index, value, weight, self.size, _BAND)
             self.right += gather(index, value, weight * e.fix_left_m, self.size)
             self.energy += float(np.sum(weight * e.fix_left_m**2))
+
+        knot = np.clip(((e.pair_station_m - self.start_m) / self.knot_m).astype(np.int64), 0, self.count - 2)
+        self.pair_index = self.fields * np.stack([knot, knot + 1], 1)
+        self.pair_value = np.broadcast_to(np.array([-1.0, 1.0]) / self.knot_m, (len(knot), 2))
+        weight = e.pair_sigma**-2.0
+        self.data += gram(self.pair_index, self.pair_value, weight, self.size, _BAND)
+        self.right += gather(self.pair_index, self.pair_value, weight * e.pair_slope, self.size)
+        self.energy += float(np.sum(weight * e.pair_slope**2))
 
     def _priors(self, line: Line) -> None:
         n, h = self.count, self.knot_m
@@ -129,6 +152,37 @@ class Problem:
         self.bend_right = gather(self.bend_index, self.bend_value, self.bend_target, self.size) / h**5
         self.bend_energy = float(np.sum(self.bend_target**2)) / h**5
         self.smooth = [[self._differences(order, k) for order in range(3)] for k in range(1, self.fields)]
+
+    def _lengths(self, line: Line) -> None:
+        """Length of the centre beyond the line's on stretches where it is known: it shrinks by c times the curvature.
+
+        The third field adds it up from the start of each stretch, so that the matrix stays banded.
+        """
+        e, h, n = self.evidence.stretches, self.knot_m, self.count
+        first = np.clip(np.ceil((e.start_m - self.start_m) / h).astype(np.int64), 0, n - 1)
+        last = np.clip(np.floor((e.end_m - self.start_m) / h).astype(np.int64), 0, n - 1)
+        apart = last > first
+        first, last = first[apart], last[apart]
+        inside = np.zeros(n + 1, np.int64)
+        np.add.at(inside, first, 1)
+        np.add.at(inside, last, -1)
+        k = np.flatnonzero(np.cumsum(inside)[:-1] > 0)
+        bend = np.interp(self.station_m, line.station_m, line.curvature_1pm)
+        index = np.stack([3 * k, 3 * k + 2, 3 * k + 3, 3 * k + 5], 1)
+        ones = np.ones(len(k))
+        value = np.stack([h * bend[k] / 2, -ones, h * bend[k + 1] / 2, ones], 1)
+        # A stretch ends where the next begins: its last knot is the next one's first, so it ends one knot before.
+        closing = np.isin(k + 1, first)
+        self.data += gram(
+            index[~closing], value[~closing], np.full(int((~closing).sum()), _EXACT_M**-2.0), self.size, _BAND
+        )
+        self.data[0, 2::3] += 1e-6
+        self.data[0, 3 * first + 2] += _EXACT_M**-2.0
+        ends = np.where(np.isin(last, first), last - 1, last)
+        weight = e.sigma_m[apart] ** -2.0
+        self.data[0, 3 * ends + 2] += weight
+        self.right[3 * ends + 2] += weight * e.excess_m[apart]
+        self.energy += float(np.sum(weight * e.excess_m[apart] ** 2))
 
     def _differences(self, order: int, which: int) -> Floats:
         """Integral of a field's squared derivative."""
@@ -147,31 +201,25 @@ class Problem:
         ones = width[0] * self.smooth[0][0][0] * s.width_m
         right = right + ones
         energy = self.energy + self.bend_energy / s.bend**2 + float(np.sum(ones)) * s.width_m
-        if self.fields == 3:
+        if self.tracked:
             for order, a in enumerate(_vehicle(s)):
                 if a:
                     total += a * self.smooth[1][order]
         return total, right, energy
 
     def log_likelihood(self, s: Strengths) -> float:
-        """Of the measurements under some strengths, but for a constant."""
+        """Of the measurements under some strengths, but for what does not depend on bend and vehicle."""
         total, right, energy = self.matrix(s)
         cholesky = factor(total)
         x = solve(cholesky, right)
         fit = energy - float(right @ x)
         value = -0.5 * (fit + log_determinant(cholesky)) - (self.count - 3) * float(np.log(s.bend))
-        value += 0.5 * self._log_prior(0, [*_ornstein(s.width_sd_m, s.width_length_m), 0.0])
-        if self.fields == 3:
-            value += 0.5 * self._log_prior(1, _vehicle(s))
-        return value
+        return value + (0.5 * self._log_prior(_vehicle(s)) if self.tracked else 0.0)
 
-    def _log_prior(self, which: int, weights: list[float]) -> float:
-        """Log determinant of a field's prior precision."""
-        own = np.zeros((3, self.count))
-        for order, a in enumerate(weights):
-            if a:
-                own += a * self.smooth[which][order][: 2 * self.fields + 1 : self.fields, which + 1 :: self.fields]
-        return log_determinant(factor(own))
+    def _log_prior(self, weights: list[float]) -> float:
+        """Log determinant of the prior precision of the vehicle's offset."""
+        own = sum(a * self.smooth[1][order][:7:3, 2::3] for order, a in enumerate(weights))
+        return log_determinant(factor(np.asarray(own)))
 
     def solve(self, s: Strengths) -> Solution:
         """Centre, width and offset under some strengths, and what is not sure of them."""
@@ -187,6 +235,11 @@ class Solution:
         self.problem, self._cholesky, self._x = problem, cholesky, x
         self.centre_m = x[:: problem.fields]
         self.width_m = x[1 :: problem.fields]
+
+    def pair_residuals(self) -> Floats:
+        """How far the slope that each pair tells is from the centre's, in its standard deviations."""
+        p = self.problem
+        return (p.evidence.pair_slope - apply(p.pair_index, p.pair_value, self._x)) / p.evidence.pair_sigma
 
     def residuals(self) -> tuple[Floats, Floats]:
         """How far each marker lies left of its boundary, and the share of it that its neighbours explain away.
@@ -242,24 +295,28 @@ def _ornstein(sd: float, length: float) -> tuple[float, float]:
 def _vehicle(s: Strengths) -> list[float]:
     """Weights of the squared value, slope and bend of the vehicle's offset."""
     if s.drift:
-        return [1e-2 / 1000.0, s.drift**-2.0, 0.0]
+        return [s.drift**2 / (4 * s.slow_m**4), s.drift**-2.0, 0.0]
     k = 1 / s.wander_length_m
     return [k / (4 * s.wander_m**2), 1 / (2 * k * s.wander_m**2), 1 / (4 * k**3 * s.wander_m**2)]
 
 
-def choose_strengths(problem: Problem, start: Strengths, *, track: bool) -> Strengths:
-    """The likeliest strengths from a coarse table, one kind after the other."""
-    best, score = start, problem.log_likelihood(start)
-    vehicles: list[dict[str, float]] = [
-        {"wander_m": 0.2, "wander_length_m": 15.0}, {"wander_m": 0.5, "wander_length_m": 30.0},
-        {"drift": 0.05}, {"drift": 0.15}, {"drift": 0.4},
-    ]  # fmt: skip
-    bends: list[dict[str, float]] = [{"bend": 0.0005}, {"bend": 0.0015}, {"bend": 0.006}, {"bend": 0.015}]
-    for table in [vehicles, bends] if track else [bends]:
-        base = best
-        for row in table:
-            tried = replace(base, **row)
-            value = problem.log_likelihood(tried)
-            if value > score:
-                best, score = tried, value
-    return best
+VEHICLES: tuple[dict[str, float], ...] = (
+    {"wander_m": 0.2, "wander_length_m": 30.0}, {"wander_m": 0.2, "wander_length_m": 15.0},
+    {"wander_m": 0.5, "wander_length_m": 30.0}, {"drift": 0.05}, {"drift": 0.15}, {"drift": 0.4},
+)  # fmt: skip
+_BENDS = (0.0005, 0.0015, 0.003, 0.006, 0.015)
+
+
+def choose_strengths(problem: Problem, start: Strengths, vehicles: tuple[dict[str, float], ...]) -> Strengths:
+    """The likeliest strengths: of some for the vehicle's offset, then of some for the lane's bends."""
+    best = start
+    if problem.tracked and vehicles:
+        best = _likeliest(
+            problem, [replace(start, drift=0.0) if "drift" not in v else start for v in vehicles], vehicles
+        )
+    return _likeliest(problem, [best] * len(_BENDS), tuple({"bend": value} for value in _BENDS))
+
+
+def _likeliest(problem: Problem, bases: list[Strengths], changes: tuple[dict[str, float], ...]) -> Strengths:
+    tried = [replace(base, **change) for base, change in zip(bases, changes, strict=True)]
+    return max(tried, key=problem.log_likelihood)

@@ -30,14 +30,17 @@ class Drive:
     line : Line
         Along the fixes, smoothed.
     fix_m : ndarray, shape (F, 2)
-        Fixes without the wild ones, at most one each half metre. [m]
+        Fixes without the wild ones, at most one each metre. [m]
     sigma_m : float
         Standard deviation of a fix, from one to the next. [m]
+    accuracy_m : float
+        What the receiver says of itself; NaN where it says nothing. [m]
     """
 
     line: Line
     fix_m: Floats
     sigma_m: float
+    accuracy_m: float
 
 
 def drive_from_track(track: PoseTrack, origin: tuple[float, float], markers_m: Floats) -> Drive | None:
@@ -63,15 +66,15 @@ def drive_from_track(track: PoseTrack, origin: tuple[float, float], markers_m: F
     if len(binned) < 4:
         return None
     sigma = _noise(fixes)
-    told = float(np.nanmedian(stated)) if np.isfinite(stated).any() else sigma
-    loose = max(sigma, 0.1 * min(max(told, 0.0), 10.0))
+    told = float(np.median(stated[np.isfinite(stated)])) if np.isfinite(stated).any() else float("nan")
+    loose = max(sigma, 0.1 * min(max(told, 0.0), 10.0)) if np.isfinite(told) else sigma
     smooth = _smoothed(time_binned, binned, counts, loose)
     smooth, wild = _without_wild(time_binned, binned, counts, smooth, loose)
     kept = _advancing(smooth[~wild])
     if len(kept) < 2:
         return None
-    fine = _advancing(fixes, 0.5) if sigma < 0.25 else fixes
-    return Drive(Line(kept), fine, max(sigma, _LEAST_SIGMA_M))
+    fine = _advancing(fixes, 1.0) if sigma < 0.25 else fixes
+    return Drive(Line(kept), fine, max(sigma, _LEAST_SIGMA_M), told)
 
 
 def _binned(time_s: Floats, fixes_m: Floats) -> tuple[Floats, Floats, Floats]:

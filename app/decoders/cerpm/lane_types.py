@@ -90,6 +90,10 @@ class LaneRules:
         The path ends where past the outermost markers its standard deviation grows above this. [m]
     bridge_m : float
         Without a track, the widest stretch without a marker that is bridged. [m]
+    hopeless_sigma_m : float
+        There is no path where at half of its stations its standard deviation is above this. [m]
+    most_strays : float
+        There is no path where more than this share of the markers lies off it.
     tolerance_m : float
         Confidence is the probability that the path is within this of the centre. [m]
     """
@@ -102,6 +106,8 @@ class LaneRules:
     reach_m: float = 25.0
     worst_sigma_m: float = 0.5
     bridge_m: float = 150.0
+    hopeless_sigma_m: float = 1.0
+    most_strays: float = 0.25
     tolerance_m: float = 0.25
 
     def __post_init__(self) -> None:

@@ -28,7 +28,7 @@ def boundaries_by_splines(points_m: Floats, side: Ints, taken: Bools, line: Line
     line : Line
         Along the lane, in the direction of travel.
     """
-    station, left = line.find(points_m, side)
+    station, left = line.find(points_m, side, 1.65)
     found = np.where(side != UNKNOWN, side, np.where(left > 0, LEFT, RIGHT))
     chains = [_chain(points_m, station, taken & (found == which)) for which in (LEFT, RIGHT)]
     if min(len(chain) for chain in chains) < 2:
