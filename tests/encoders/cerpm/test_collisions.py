@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import truncnorm
 
 from app.encoders.cerpm import (
     LinkModel,
@@ -128,6 +129,22 @@ def test_many_markers_are_interpolated_closely() -> None:
     for i in (0, 100, 700, 1999):
         exact = harmful_others(levels[i], np.delete(levels, i), -116.0, link, receiver)
         assert quick[i] == pytest.approx(exact, rel=0.01)
+
+
+@pytest.mark.parametrize("link", [LinkModel(), STEADY], ids=["fading", "steady"])
+def test_a_marker_does_not_spoil_its_own_packets(link: LinkModel) -> None:
+    air = Air(RadioSettings(interval_s=0.1), link, Receiver())
+    heard = hear_at(RoadMarkers([0.0], [1.8]), 60.0, air)
+    assert heard.success == pytest.approx(link.share_above(heard.level_dbm, air.threshold_dbm))
+
+
+@pytest.mark.parametrize("level_dbm", [-100.0, -116.0, -124.0])
+def test_levels_of_read_packets_are_a_normal_distribution_cut_off(level_dbm: float) -> None:
+    link = LinkModel(fading_db=4.0)
+    levels = link.read_levels_dbm(level_dbm, -116.0)
+    cut = (-116.0 - level_dbm) / 4.0
+    assert levels.min() > -116.0
+    assert levels.mean() == pytest.approx(float(truncnorm.mean(cut, math.inf, level_dbm, 4.0)), abs=0.2)
 
 
 def test_channels_part_packets_and_a_receiver_hears_its_own_only() -> None:

@@ -208,6 +208,15 @@ def test_a_quieter_air_needs_no_more_channels() -> None:
     assert "no lawful settings tried reach" in alone.sentence
 
 
+def test_of_those_that_reach_the_longest_lived_is_recommended() -> None:
+    plan = RadioPlan(RadioSettings(), markers=TEN_A_SIDE, preview=PreviewRule(31.0))
+    found = recommend_settings(plan)
+    assert found.settings is not None
+    assert found.battery_days > battery_life_days(replace(found.settings, interval_s=1.0), plan.battery)
+    rarer = replace(found.settings, interval_s=1.3 * found.settings.interval_s)
+    assert check_radio(replace(plan, settings=rarer)).read_probability < plan.least_probability
+
+
 def test_more_markers_than_a_check_takes_are_refused_and_not_recommended() -> None:
     crowded = RadioPlan(replace(PAPERS_RADIO, spreading_factor=12, interval_s=20.0), spacing_m=1.0)
     with pytest.raises(InvalidParameter, match="in reach") as caught:
