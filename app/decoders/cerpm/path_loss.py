@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
-from scipy.special import expit, log_ndtr, ndtr
+from scipy.special import log_expit, log_ndtr, ndtr
 from scipy.stats import t as student
 
 Floats = npt.NDArray[np.float64]
@@ -207,7 +207,10 @@ class _Likelihood:
     def each(self, at: Floats) -> Floats:
         """Log density of each packet."""
         exponent = at[1] if self._free else PAPER_EXPONENT
-        sensitivity = at[3] if self._sensitivity_dbm is None else self._sensitivity_dbm
+        floor_dbm = self._priors[3][0]
+        # far above what was heard the tails of the two steps are no longer alike
+        fitted = min(max(at[3], floor_dbm - 4 * _FLOOR_WIDTH_DB), floor_dbm + 4 * _FLOOR_WIDTH_DB)
+        sensitivity = fitted if self._sensitivity_dbm is None else self._sensitivity_dbm
         spread = math.exp(min(max(at[2], -1.0), 3.0))
         return _log_density(self._rssi_dbm, at[0] - exponent * self._far_db, spread, float(sensitivity))
 
@@ -224,11 +227,11 @@ def _decades_db(distance_m: Floats) -> Floats:
 
 def _log_density(rssi_dbm: Floats, expected_dbm: Floats, spread_db: float, sensitivity_dbm: float) -> Floats:
     """Of strengths that were heard."""
-    z = np.clip((rssi_dbm - expected_dbm) / spread_db, -1e3, 1e3)
+    z = (rssi_dbm - expected_dbm) / spread_db
     normal = -(z**2) / 2 - math.log(spread_db * math.sqrt(2 * math.pi))
-    audible = np.log(expit((rssi_dbm - sensitivity_dbm) / _SOFT_DB) + 1e-12)
+    audible = log_expit((rssi_dbm - sensitivity_dbm) / _SOFT_DB)
     # a logistic step is a normal one of 1.7 times its scale
-    any_heard = log_ndtr(np.clip((expected_dbm - sensitivity_dbm) / math.hypot(spread_db, 1.702 * _SOFT_DB), -1e3, 1e3))
+    any_heard = log_ndtr((expected_dbm - sensitivity_dbm) / math.hypot(spread_db, 1.702 * _SOFT_DB))
     return np.asarray(
         np.logaddexp(normal + audible - any_heard + math.log1p(-_STRAY), math.log(_STRAY * _STRAY_DENSITY))
     )

@@ -112,6 +112,13 @@ def test_intervals_hold_what_they_promise() -> None:
     assert (held >= 35).all()  # 38 of 40 are promised
 
 
+def test_a_sensitivity_that_cannot_be_told_does_not_run_away() -> None:
+    packets, places, track = drive(1302)  # it did, to 4040 dBm
+    line = profile_signals(packets, places, track).path_loss
+    assert line is not None
+    assert line.level_dbm.value == pytest.approx(-108, abs=3)
+
+
 def test_distances_that_are_all_alike_tell_no_exponent() -> None:
     rng = np.random.default_rng(1005)
     line = fit_path_loss(rng.uniform(95, 105, 60), rng.normal(-114, 3, 60), np.arange(60) // 6)
