@@ -6,7 +6,7 @@ import csv
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +14,12 @@ import numpy as np
 from app.decoders.cerpm.control import Controller
 from app.decoders.cerpm.freshness import SequenceSpan
 from app.decoders.cerpm.lane import fit_lane
+from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.packets import HeardPacket
 from app.decoders.cerpm.verify import Verdict, verify_packets
 from app.simulation.radio.attacks import forge_packets, number_entries, replay_packets
 from app.simulation.radio.drive import HeardDrive, drive_past, marker_message
+from app.simulation.radio.lanes import make_lane
 from app.simulation.radio.link import Radio, hear_transmissions, mean_rssi_dbm, send_beacons
 from app.simulation.radio.markers import LaidMarkers
 from app.simulation.steering import check_steering
@@ -61,7 +63,8 @@ def run_forged(seed: int, short: bool) -> Result:
     forged = forge_packets(days[0].packets, counts[0], rng)
     row("forged", _attack(days[0].packets, forged, keys, {})[0], True)
     start, end = days[0].packets[0].heard_at_s, days[0].packets[-1].heard_at_s
-    same = [p for p in replay_packets(days[0].packets, counts[1], rng, at_s=(start, end + 30)) if _is_later(p, days[0])]
+    again = replay_packets(days[0].packets, 4 * counts[1], rng, at_s=(start, end + 30))
+    same = [packet for packet in again if _is_later(packet, days[0])][: counts[1]]
     row("replayed in the drive that heard them", _attack(days[0].packets, same, keys, {})[0], True)
     _result, spans = _attack(days[0].packets, [], keys, {})
     next_day = replay_packets(days[0].packets, counts[2], rng, at_s=_times(days[1]))
@@ -76,10 +79,13 @@ def run_forged(seed: int, short: bool) -> Result:
     row("the same with no marker on the air", _attack([], alone, keys, restored)[0], True)
     unheard = replay_packets(_all_sent(days[1], laid), counts[3], rng, at_s=_times(days[2]))
     row("recorded by others, replayed beside the markers", _attack(days[2].packets, unheard, keys, restored)[0], False)
+    row("recorded 5 km away, of markers never heard", _from_afar(lane, days[2], keys, counts[3], rng), True)
     head = ("packets", "attacks", "accepted", "goal", "met", "real ones accepted", "verdicts on attacks")
     note = (
-        "Kept sequences go through text between the second and the third day. Of the last row an attacker's receiver "
-        "recorded on the second day what the vehicle did not hear then; each says what its marker says anyway."
+        "Kept sequences go through text between the second and the third day. Of the last row but one an attacker's "
+        "receiver recorded on the second day what the vehicle did not hear; each says what its marker says anyway. In the "
+        "last row a packet counts as accepted if its marker is used after merging with the vehicle's track; no "
+        "place is registered."
     )
     return note, head, rows
 
@@ -111,6 +117,29 @@ def _attack(
         else:
             kept += packet.accepted
     return (len(attack), accepted, verdicts, len(real), kept), found.spans
+
+
+def _from_afar(  # type: ignore[no-untyped-def]
+    lane, drive: HeardDrive, keys: Mapping[int, bytes], count: int, rng: np.random.Generator
+) -> tuple[int, int, dict[Verdict, int], int, int]:
+    """Packets of another road's markers, fresh by all their bytes tell, sent where the vehicle is."""
+    lon, lat, height = lane.origin
+    afar = make_lane(rng, origin=(lon + 0.06, lat, height))
+    laid = scenes.lay(afar, rng)
+    laid = replace(laid, number=laid.number + 100_000)
+    recorded = _all_sent(drive_past(afar, laid, rng, sign=scenes.sign, start_s=drive.packets[0].heard_at_s - 600), laid)
+    attack = replay_packets(recorded, count, rng, at_s=_times(drive))
+    log = number_entries(sorted([*drive.packets, *attack], key=lambda p: p.heard_at_s))
+    found = verify_packets(log, {**keys, **scenes.keys_for(laid)})
+    used = set(merge_markers(found.packets, {}, drive.track).number.tolist())
+    alien, verdicts, accepted, kept = set(laid.number.tolist()), dict.fromkeys(Verdict, 0), 0, 0
+    for packet in found.packets:
+        if packet.number in alien:
+            verdicts[packet.verdict] += 1
+            accepted += packet.accepted and packet.number in used
+        else:
+            kept += packet.accepted and packet.number in used
+    return count, accepted, verdicts, len(drive.packets), kept
 
 
 def _is_later(packet: HeardPacket, drive: HeardDrive) -> bool:

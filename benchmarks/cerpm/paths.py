@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.decoders.cerpm.lane import Lane, fit_lane
+from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.verify import verify_packets
 from app.simulation.radio.attacks import (
     corrupt_packets,
@@ -204,8 +205,8 @@ def run_dirty(seed: int, short: bool) -> Result:
         )  # fmt: skip
     head = ("log", "runs", "exceptions", "RMS [m]", "max [m]", "coverage", "goal", "met", "own track")
     note = (
-        "Packet logs at 40 ft through link and verifier: a tenth of the packets corrupt, a third twice, out of order, "
-        "the clock up to 10 s off."
+        "Packet logs at 40 ft through link, verifier and merger, no place registered: a tenth of the packets corrupt, a "
+        "third twice, out of order, the clock up to 10 s off."
     )
     return note, head, rows
 
@@ -226,8 +227,8 @@ def dirty_path(lane: TrueLane, rng: np.random.Generator, more: bool):  # type: i
     span = span_of(laid.chosen(np.unique(heard.sender)))
     found: Lane | None = None
     try:
-        verified = verify_packets(log, keys)
-        found = fit_lane(scenes.markers_from_messages(scenes.accepted(verified)), heard.track)
+        merged = merge_markers(verify_packets(log, keys).packets, {}, heard.track)
+        found = fit_lane(scenes.markers_from_merged(merged), heard.track)
     except Exception as error:  # noqa: BLE001 - what is counted here
         print(f"raised: {error!r}")
         return None, heard.track, span, 1

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.cerpm.lane import LaneMarkers
+from app.decoders.cerpm.merge_types import MergedMarkers
 from app.decoders.cerpm.packets import HeardPacket
-from app.decoders.cerpm.verify import Verification
 from app.encoders.cerpm.payload import encode_message
 from app.markers.cerpm import CerpmMessage, SpeedLimit, SpeedUnit
 from app.markers.cerpm_keys import derive_marker_key
@@ -72,17 +72,11 @@ def markers_for_lane(laid: LaidMarkers) -> LaneMarkers:
     return LaneMarkers(laid.number, laid.lon_deg, laid.lat_deg, laid.told_side, np.full(n, SURVEY_M), np.full(n, limit))
 
 
-def markers_from_messages(messages: Iterable[CerpmMessage]) -> LaneMarkers:
-    """A row for each place and side that a number claims."""
-    claims = {(m.number, m.lon_deg, m.lat_deg, int(m.side)): m for m in messages}
-    rows = [(*key, SURVEY_M, m.speed_limit.km_h if m.speed_limit else np.nan) for key, m in claims.items()]
-    number, lon, lat, side, sigma, limit = (np.array(c) for c in zip(*rows, strict=True)) if rows else [np.zeros(0)] * 6
-    return LaneMarkers(number.astype(int), lon, lat, side.astype(int), sigma, limit)
-
-
-def accepted(verification: Verification) -> list[CerpmMessage]:
-    """Messages of authentic packets."""
-    return [p.message for p in verification.packets if p.accepted and p.message is not None]
+def markers_from_merged(merged: MergedMarkers) -> LaneMarkers:
+    """What is left of a log when verified and merged."""
+    return LaneMarkers(
+        merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_km_h
+    )
 
 
 @lru_cache(maxsize=100_000)
