@@ -205,8 +205,8 @@ def run_dirty(seed: int, short: bool) -> Result:
         )  # fmt: skip
     head = ("log", "runs", "exceptions", "RMS [m]", "max [m]", "coverage", "goal", "met", "own track")
     note = (
-        "Packet logs at 40 ft through link, verifier and merger, no place registered: a tenth of the packets corrupt, a "
-        "third twice, out of order, the clock up to 10 s off."
+        "Packet logs at 40 ft through link, verifier and merger, no place registered: a tenth of the packets corrupt, "
+        "a third twice, out of order, the clock up to 10 s off."
     )
     return note, head, rows
 
