@@ -65,9 +65,9 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     pool = _decode_pool(settings, decode)
     queue = LocalQueue()
     rules = _decode_rules(settings)
-    jobs = DecodeJobs(database, utc_now, blobs=blobs, decoder=pool, rules=rules)
-    access = Access(database, utc_now)
     secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
+    jobs = DecodeJobs(database, utc_now, blobs=blobs, decoder=pool, secrets=secrets, rules=rules)
+    access = Access(database, utc_now)
     metrics = CollectorRegistry()
     readiness: dict[str, Callable[[], bool]] = {"database": database.is_ready, "decoders": pool.is_ready}
 
@@ -92,7 +92,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)
     app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)
-    app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, rules=rules)
+    app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, secrets=secrets, rules=rules)
     app.state.jobs = jobs
     app.state.artworks = Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode))
     app.state.access = access

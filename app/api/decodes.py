@@ -81,10 +81,13 @@ Decodes = Annotated[DecodesService, Depends(get_decodes)]
     },
 )
 def post_decode(caller: Caller, upload: Upload, decodes: Decodes) -> Response:
-    """Decode a frame or a magnetometer trace (answered at once), or a ZIP of frames or a long trace (queued).
+    """Decode a frame, a magnetometer trace or a packet log (answered at once), a ZIP of frames or a long log (queued).
 
     A trace is announced by `trace` in its context; its file is METRO's stream, the recorder's or plain CSV, Parquet, or
     a ZIP of the files of one recording, CAN logs with them.
+
+    A packet log of CERPMs is announced by `packets`; it is CSV, JSON lines, raw payloads or uplinks of ChirpStack or
+    The Things Stack, or a ZIP of these with the vehicle's poses and a camera frame.
 
     The context comes as the form's part `context`, or beside a bare file in the header `Waymark-Context`, as JSON. With
     an Idempotency-Key a repeated request gets the first answer again. No plate is a result: an empty list.
@@ -134,12 +137,40 @@ def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Resp
     responses={200: {"content": {"image/svg+xml": {}}}, **problem_responses(404)},
 )
 def get_plot(decode_id: DecodeId, request: Request, caller: Caller, decodes: Decodes) -> Response:
-    """A trace with the magnets, tags, line crossings and disturbances that were found in it."""
+    """What was found: magnets, tags and line crossings in a trace, or the lane and the radio of a packet log."""
     headers = {"ETag": f'"{decode_id}-plot"', "Cache-Control": "private, max-age=86400"}
     plot = decodes.plot(caller, decode_id)
     if request.headers.get("if-none-match") == headers["ETag"]:
         return Response(status_code=304, headers=headers)
     return Response(plot, headers=headers, media_type="image/svg+xml")
+
+
+@router.get(
+    "/{decode_id}/lane.geojson",
+    response_class=Response,
+    responses={200: {"content": {"application/geo+json": {}}}, **problem_responses(404)},
+)
+def get_lane(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
+    """Path, boundaries and markers that a packet log gave, as GeoJSON."""
+    answer = json_response(decodes.lane(caller, decode_id))
+    answer.headers["Content-Type"] = "application/geo+json"
+    return answer
+
+
+@router.get(
+    "/{decode_id}/overlay.{suffix}",
+    response_class=Response,
+    responses={200: {"content": {kind: {} for kind in _MEDIA_TYPES.values()}}, **problem_responses(404)},
+)
+def get_overlay(
+    decode_id: DecodeId, suffix: Literal["png", "jpg"], request: Request, caller: Caller, decodes: Decodes
+) -> Response:
+    """The camera frame of a packet log with the lane drawn over it, drawn when it is asked for."""
+    headers = {"ETag": f'"{decode_id}-overlay-{suffix}"', "Cache-Control": "private, max-age=86400"}
+    if request.headers.get("if-none-match") == headers["ETag"]:
+        decodes.get(caller, decode_id)
+        return Response(status_code=304, headers=headers)
+    return Response(decodes.overlay(caller, decode_id, suffix), headers=headers, media_type=_MEDIA_TYPES[suffix])
 
 
 @router.get(

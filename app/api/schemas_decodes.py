@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, JsonValue
 
 from app.api.dependencies import Number, Whole
+from app.api.schemas_packets import HeardMarkerOut, LaneOut, OverlayOut, PacketReportOut, PacketsIn, SteeringOut
 from app.api.schemas_traces import CrossingOut, MagnetReadingOut, NoiseOut, ReportOut, TagFixOut, TagOut, TraceIn
 from app.services.decode_context import CameraSetup, CoarsePosition, DecodeContext
 
@@ -73,6 +74,10 @@ class ContextIn(BaseModel):
     captured_at: AwareDatetime | None = Field(None, description="When the frame was taken, or the trace began.")
     trace: TraceIn | None = Field(None, description="The file is a magnetometer trace; {} for METRO's own formats.")
 
+    packets: PacketsIn | None = Field(
+        None, description="The file is a packet log of CERPMs, or a ZIP of one with the vehicle's poses and a frame."
+    )
+
     def domain(self) -> DecodeContext:
         """The context as the use cases know it."""
         position, camera, counts = self.coarse_position, self.camera, self.thermal_range
@@ -83,8 +88,13 @@ class ContextIn(BaseModel):
             thermal=self.thermal,
             thermal_range=(counts[0], counts[1]) if counts else None,
             captured_at=self.captured_at,
-            trace=self.trace.model_dump(exclude_none=True, exclude_unset=True) if self.trace is not None else None,
+            trace=_declared(self.trace),
+            packets=_declared(self.packets),
         )
+
+
+def _declared(given: BaseModel | None) -> dict[str, Any] | None:
+    return None if given is None else given.model_dump(exclude_none=True, exclude_unset=True)
 
 
 class FixOut(BaseModel):
@@ -163,7 +173,7 @@ class DecodeOut(BaseModel):
 
     id: str
     state: State
-    kind: Literal["frame", "archive", "trace"]
+    kind: Literal["frame", "archive", "trace", "packets"]
     progress: float
     attempts: int
     created_at: str
@@ -178,11 +188,16 @@ class DecodeOut(BaseModel):
     fix: FixOut | TagFixOut | None = None
     frames: list[FrameOut] | None = None
     codebook_tags: int | None = None
-    report: ReportOut | None = None
+    report: ReportOut | PacketReportOut | None = None
     tags: list[TagOut] | None = None
     crossings: list[CrossingOut] | None = None
     magnets: list[MagnetReadingOut] | None = None
     noise: list[NoiseOut] | None = None
+    markers: list[HeardMarkerOut] | None = None
+    lane: LaneOut | None = None
+    steering: SteeringOut | None = None
+    overlay: OverlayOut | None = None
+    path_loss: dict[str, Any] | None = None
 
 
 class DecodePage(BaseModel):

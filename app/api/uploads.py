@@ -22,7 +22,7 @@ CONTEXT_HEADER = "waymark-context"
 MAX_CONTEXT_BYTES = 64 * 1024
 RAW_TYPES = (
     "image/jpeg", "image/png", "application/zip", "application/octet-stream", "text/csv",
-    "application/vnd.apache.parquet",
+    "application/vnd.apache.parquet", "application/json", "application/x-ndjson", "text/plain",
 )  # fmt: skip
 _FORM = "multipart/form-data"
 _CURE = "send multipart/form-data with the parts file and context"
@@ -69,10 +69,14 @@ async def get_upload(request: Request) -> UploadedFile:
 
 
 def _named(context: DecodeContext, name: str) -> DecodeContext:
-    """A trace's context with the name of its file: its suffix tells kinds of text apart."""
-    if context.trace is None or not name:
+    """A trace's or a packet log's context with the name of its file: its suffix tells kinds of text apart."""
+    if not name:
         return context
-    return replace(context, trace={**context.trace, "file_name": name[:120]})
+    if context.trace is not None:
+        return replace(context, trace={**context.trace, "file_name": name[:120]})
+    if context.packets is not None:
+        return replace(context, packets={**context.packets, "file_name": name[:120]})
+    return context
 
 
 def _idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKey | None:

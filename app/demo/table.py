@@ -1,4 +1,4 @@
-"""The demo's tables: plates, and magnets."""
+"""The demo's tables: plates, magnets, and CERPMs."""
 
 from __future__ import annotations
 
@@ -23,6 +23,17 @@ _TRACE_HEAD = (
     "drive", "clearance", "km/h", "magnets", "tags", "matched", "wrong", "wrong way", "ratio", "along [cm]",
     "across [cm]", "dashed", "solid", "false",
 )  # fmt: skip
+PATH_WITHIN_M = 0.1
+"""A path that is farther off, RMS, is wrong. [m]"""
+_LANE_HEAD = (
+    "drive", "markers", "packets", "accepted", "refused", "left out", "path RMS [cm]", "worst [cm]", "coverage",
+    "own track [cm]", "steering [cm]",
+)  # fmt: skip
+_KADAV = (
+    ("CERPM paper, route 2", "20", "", "", "", "", "", "", "", "", "42"),
+    ("CERPM paper, route 3", "20", "", "", "", "", "", "", "", "", "38"),
+)
+"""Table 1 of the paper: path error of its controller."""
 _HEAD = ("plate", "scheme", "digits", "in view", "decoded", "wrong", "matched", "position [cm]", "heading [deg]")
 
 
@@ -96,6 +107,48 @@ class TraceResult:
         return whole and self.wrong == 0 and self.flagged == (self.tags if self.wrong_way else 0)
 
 
+@dataclass(slots=True)
+class LaneResult:
+    """What came of one drive past CERPMs.
+
+    Attributes
+    ----------
+    packets, authentic, true_packets : int
+        Uploaded, accepted, and those of them that the markers really sent in this drive.
+    left_out : list of int
+        Numbers of the markers that were named and left out.
+    moved : int or None
+        The one that claims a wrong place.
+    path_rms_m, path_max_m : float
+        Of the path from the lane's true centre line. [m]
+    coverage : float
+        Share of the true centre line that has a path.
+    track_rms_m : float
+        Of the vehicle's own track from it. [m]
+    steering_rms_m : float
+        Of a simulated drive along the path. [m]
+    """
+
+    name: str
+    markers: int
+    packets: int
+    authentic: int
+    true_packets: int
+    left_out: list[int]
+    moved: int | None
+    path_rms_m: float = math.nan
+    path_max_m: float = math.nan
+    coverage: float = 0.0
+    track_rms_m: float = math.nan
+    steering_rms_m: float = math.nan
+
+    @property
+    def is_good(self) -> bool:
+        """Nothing forged was accepted, who lies is named and nobody else, and the path is where the lane is."""
+        named = [self.moved] if self.moved is not None else []
+        return self.authentic <= self.true_packets and self.left_out == named and self.path_rms_m < PATH_WITHIN_M
+
+
 def draw_table(passes: Sequence[Pass]) -> str:
     """Table of passes, their sum per drive, and the paper's row beside them."""
     rows = [_row(p) for p in passes]
@@ -121,6 +174,27 @@ def draw_trace_table(results: Sequence[TraceResult]) -> str:
         [(row + blank)[: len(blank)] for row in _METRO],
         left=1,
     )
+
+
+def draw_lane_table(results: Sequence[LaneResult]) -> str:
+    """Table of drives past CERPMs, with the paper's below."""
+    rows = [
+        (
+            r.name,
+            f"{r.markers}",
+            f"{r.packets}",
+            f"{r.authentic}",
+            f"{r.packets - r.authentic}",
+            ", ".join(str(number) for number in r.left_out) or "-",
+            f"{100 * r.path_rms_m:.1f}",
+            f"{100 * r.path_max_m:.1f}",
+            f"{100 * r.coverage:.1f} %",
+            f"{100 * r.track_rms_m:.1f}",
+            f"{100 * r.steering_rms_m:.1f}",
+        )
+        for r in results
+    ]
+    return _draw(_LANE_HEAD, rows, _KADAV, left=1)
 
 
 def _trace_row(r: TraceResult) -> tuple[str, ...]:

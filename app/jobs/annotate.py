@@ -81,6 +81,13 @@ def _fixed(points_px: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, 
     return np.asarray(np.round(points_px * 16), np.int32).reshape(-1, 1, 2)
 
 
+def encode_picture(pixels: np.ndarray[Any, np.dtype[np.uint8]], suffix: str) -> bytes:
+    """A picture as ``png`` or ``jpg``."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, 90] if suffix == "jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 3]
+    _ok, encoded = cv2.imencode(f".{suffix}", pixels, options)
+    return bytes(encoded)
+
+
 def _draw_corners(
     canvas: Any, corners_px: Sequence[tuple[float, float]], colour: tuple[int, int, int], scale: float
 ) -> None:

@@ -8,8 +8,7 @@ import os
 import resource
 import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
@@ -19,8 +18,8 @@ import cv2
 import numpy as np
 
 from app.decoders.images import Frame, load_image
-from app.errors import UnreadableUpload
-from app.jobs.annotate import draw_outlines
+from app.jobs.annotate import draw_outlines, encode_picture
+from app.jobs.memory import memory_is_the_limit
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateReading
 from app.services.frames import AnnotationTask, FrameResult, FrameTask, PlateSearch
@@ -30,6 +29,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 
 READY = "ready"
+_PICTURE = ("picture", "send frames at the camera's resolution, or crop them to the road")
 # glibc's mallopt: keep freed memory for the next frame, or the kernel clears every page of every frame anew
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _KEPT_BYTES = 256 * 1024**2
@@ -123,7 +123,7 @@ class LoadedFrame:
 
 def load_frame(task: FrameTask, _before: None) -> LoadedFrame:
     """First step: the picture's codec."""
-    with _memory_is_the_limit():
+    with memory_is_the_limit(*_PICTURE):
         began = time.perf_counter()
         frame = load_image(task.data, task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
         return LoadedFrame(frame, task.thermal, 1e3 * (time.perf_counter() - began))
@@ -135,7 +135,7 @@ def find_plates(search: PlateSearch, loaded: LoadedFrame) -> FrameResult:
         raise RuntimeError("the decoder process was not warmed")
     options = {"geometries": search.geometries} if search.geometries else {}
     frame = loaded.frame
-    with _memory_is_the_limit():
+    with memory_is_the_limit(*_PICTURE):
         began = time.perf_counter()
         readings = _State.decode(
             frame.pixels, camera=search.camera, codebook=search.codebook, thermal=loaded.thermal, **options
@@ -146,27 +146,9 @@ def find_plates(search: PlateSearch, loaded: LoadedFrame) -> FrameResult:
 
 def annotate_frame(task: AnnotationTask, _before: None) -> bytes:
     """Draw outlines over a frame and encode it."""
-    with _memory_is_the_limit():
+    with memory_is_the_limit(*_PICTURE):
         frame = load_image(task.data, task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
-        options = [cv2.IMWRITE_JPEG_QUALITY, 90] if task.suffix == "jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 3]
-        _ok, encoded = cv2.imencode(f".{task.suffix}", draw_outlines(frame.pixels, task.outlines), options)
-        return bytes(encoded)
-
-
-@contextmanager
-def _memory_is_the_limit() -> Iterator[None]:
-    """Report an allocation that the process's limit refused as the upload's fault, which it is."""
-    try:
-        yield
-    except (MemoryError, cv2.error) as error:
-        if isinstance(error, cv2.error) and error.code != cv2.Error.StsNoMem:
-            raise
-        raise UnreadableUpload(
-            "decoding the picture takes more memory than a decoder process has",
-            field="file",
-            limit=f"{resource.getrlimit(resource.RLIMIT_AS)[0]} bytes",
-            cure="send frames at the camera's resolution, or crop them to the road",
-        ) from error
+        return encode_picture(draw_outlines(frame.pixels, task.outlines), task.suffix)
 
 
 def _warm_frame() -> np.ndarray[Any, np.dtype[np.uint8]]:

@@ -11,8 +11,10 @@ from typing import Any
 from app.errors import Unavailable
 from app.jobs.child import ONE_THREAD, ChildLimits, DecodePlates, annotate_frame, find_plates, load_frame, process_id
 from app.jobs.keeper import Keeper, Pending, Step
+from app.jobs.packet_child import draw_overlay, lay_lane, read_drive
 from app.jobs.trace_child import decode_recording
 from app.services.frames import AnnotationTask, FrameResult, FrameTask, PlateSearch
+from app.services.packets import DriveFiles, DriveTask, LaneResult, LaneTask, OverlayTask
 from app.services.traces import TraceResult, TraceTask
 
 
@@ -92,6 +94,19 @@ class DecodePool:
     def start_trace(self, task: TraceTask, *, wait_s: float = 0.0) -> Pending[TraceResult]:
         """Hand a recording over and return, at once or as soon as there is a place for it within `wait_s`."""
         return self._start(((decode_recording, task),), wait_s, self._limits.trace_timeout_s)
+
+    def start_drive(self, task: DriveTask, *, wait_s: float = 0.0) -> Pending[DriveFiles]:
+        """Hand the files of a drive over to be read, at once or as soon as there is a place within `wait_s`."""
+        return self._start(((read_drive, task),), wait_s, self._limits.trace_timeout_s)
+
+    def start_lane(self, task: LaneTask, *, wait_s: float = 0.0) -> Pending[LaneResult]:
+        """Hand verified markers over to lay a lane, at once or as soon as there is a place within `wait_s`."""
+        return self._start(((lay_lane, task),), wait_s, self._limits.trace_timeout_s)
+
+    def draw_overlay(self, task: OverlayTask) -> bytes:
+        """Camera frame with a lane, encoded."""
+        drawn: bytes = self._start(((draw_overlay, task),)).result()
+        return drawn
 
     def annotate(self, task: AnnotationTask) -> bytes:
         """Picture with outlines, encoded."""

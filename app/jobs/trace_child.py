@@ -10,7 +10,7 @@ from app.decoders.magnet.book import TagBook
 from app.decoders.magnet.decoder import VERSION, decode_trace
 from app.decoders.magnet.readings import Finding
 from app.decoders.traces.read import read_trace
-from app.errors import UnreadableUpload
+from app.jobs.memory import memory_is_the_limit
 from app.jobs.trace_plot import plot_trace
 from app.markers.magnet import InformationTag, parse_tag
 from app.sensors.magnetometer_bar import MagnetTrace
@@ -19,14 +19,8 @@ from app.services.traces import TraceResult, TraceTask, TraceTerms, trace_terms
 
 def decode_recording(task: TraceTask, _before: None) -> TraceResult:
     """Read the files of a recording and decode their trace."""
-    try:
+    with memory_is_the_limit("recording", "cut the recording into shorter ones"):
         return _decode_recording(task)
-    except MemoryError as error:
-        raise UnreadableUpload(
-            "decoding the recording takes more memory than a decoder process has",
-            field="file",
-            cure="cut the recording into shorter ones",
-        ) from error
 
 
 def _decode_recording(task: TraceTask) -> TraceResult:

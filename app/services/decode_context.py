@@ -11,6 +11,7 @@ from app.decoders.images import ImageHeader, check_thermal_range
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.sensors.camera import Camera
+from app.services.packets import packet_terms
 from app.services.traces import trace_terms
 
 VIEW_RANGE_M = 100.0
@@ -168,6 +169,8 @@ class DecodeContext:
         Aware.
     trace : dict, optional
         The upload is a magnetometer trace, declared like this (`app.services.traces.trace_terms`).
+    packets : dict, optional
+        The upload is a packet log, declared like this (`app.services.packets.packet_terms`).
     """
 
     coarse_position: CoarsePosition | None = None
@@ -177,10 +180,17 @@ class DecodeContext:
     thermal_range: tuple[float, float] | None = None
     captured_at: datetime | None = None
     trace: dict[str, Any] | None = None
+    packets: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
+        if self.trace is not None and self.packets is not None:
+            raise InvalidParameter(
+                "an upload is a trace or a packet log", field="packets", limit="one of trace, packets", cure="send one"
+            )
         if self.trace is not None:
             trace_terms(self.trace)
+        if self.packets is not None:
+            packet_terms(self.packets)
         if self.heading_deg is not None and not 0 <= self.heading_deg <= 360:
             raise InvalidParameter(
                 f"heading_deg is {self.heading_deg:g}",
@@ -207,9 +217,10 @@ class DecodeContext:
 
     def document(self) -> dict[str, Any]:
         """The context as it is stored: what was given and nothing else."""
-        given = _given(asdict(replace(self, trace=None)))
+        given = _given(asdict(replace(self, trace=None, packets=None)))
         document = {name: value for name, value in given.items() if value is not False}
-        return document if self.trace is None else {**document, "trace": self.trace}
+        declared = {"trace": self.trace, "packets": self.packets}
+        return {**document, **{name: value for name, value in declared.items() if value is not None}}
 
 
 def context_from_document(document: dict[str, Any]) -> DecodeContext:
@@ -223,6 +234,7 @@ def context_from_document(document: dict[str, Any]) -> DecodeContext:
         thermal_range=(counts[0], counts[1]) if counts else None,
         captured_at=datetime.fromisoformat(captured_at) if isinstance(captured_at, str) else captured_at,
         trace=document.get("trace"),
+        packets=document.get("packets"),
     )
     if camera:
         setup = CameraSetup(**{**camera, "distortion": tuple(camera.get("distortion", ()))})

@@ -60,10 +60,17 @@ def decode_document(row: Mapping[str, Any] | sa.RowMapping) -> dict[str, Any]:
         "context": row["context"],
         "error": row["error"],
         **result,
-        "links": {"self": head, "plot": f"{head}/plot.svg"}
-        if row["kind"] == "trace"
-        else {"self": head, "annotated": f"{head}/annotated.jpg"},
+        "links": {"self": head, **_links(head, row["kind"], result)},
     }
+
+
+def _links(head: str, kind: str, result: Mapping[str, Any]) -> dict[str, str]:
+    if kind == "trace":
+        return {"plot": f"{head}/plot.svg"}
+    if kind == "packets":
+        overlay = {"overlay": f"{head}/overlay.jpg"} if result.get("overlay") else {}
+        return {"plot": f"{head}/plot.svg", "lane": f"{head}/lane.geojson", **overlay}
+    return {"annotated": f"{head}/annotated.jpg"}
 
 
 def result_document(frames: Sequence[ReadFrame], *, codebook_plates: int) -> dict[str, Any]:

@@ -13,14 +13,25 @@ from app.errors import Unavailable, UnreadableUpload, WaymarkError
 from app.registry import decodes as store
 from app.registry.database import Database
 from app.registry.decodes import Row
+from app.services.agency_secrets import AgencySecrets
 from app.services.decode_context import DecodeContext, context_from_document
 from app.services.decode_documents import ReadFrame, error_document, result_document
 from app.services.decode_rules import DecodeRules
 from app.services.frame_reading import observations_of, read_frame, start_frame
 from app.services.frames import Blobs, FrameDecoder, PendingFrame
 from app.services.matching import NearbyPlates, find_nearby_plates
+from app.services.packet_decodes import (
+    PACKETS,
+    TRIES,
+    decode_packets,
+    is_still_newest,
+    keep_heard,
+    start_packets,
+    too_many_at_once,
+)
 from app.services.ports import Clock
-from app.services.trace_decodes import TRACE, finished_columns, start_trace, store_observations
+from app.services.trace_decodes import PICTURES, TRACE, finished_columns, start_trace, store_observations
+from app.storage.blobs import new_blob_key
 
 _PATIENCE_S = 60.0
 _LOG = structlog.get_logger(__name__)
@@ -37,6 +48,8 @@ class DecodeJobs:
         Where the uploads are.
     decoder : FrameDecoder
         Decoder processes.
+    secrets : AgencySecrets
+        Keys of CERPMs.
     rules : DecodeRules, optional
     """
 
@@ -47,12 +60,14 @@ class DecodeJobs:
         *,
         blobs: Blobs,
         decoder: FrameDecoder,
+        secrets: AgencySecrets,
         rules: DecodeRules | None = None,
     ) -> None:
         self._database = database
         self._clock = clock
         self._blobs = blobs
         self._decoder = decoder
+        self._secrets = secrets
         self._rules = rules or DecodeRules()
 
     def run_job(self, decode_id: str) -> None:
@@ -73,6 +88,9 @@ class DecodeJobs:
         try:
             if row["kind"] == TRACE:
                 self._run_trace(row)
+                return
+            if row["kind"] == PACKETS:
+                self._run_packets(row)
                 return
             frames, codebook_plates = self._read_archive(row)
         except _Cancelled:
@@ -107,6 +125,28 @@ class DecodeJobs:
                 store_observations(connection, agency_id, row["id"], trace, context.captured_at or row["created_at"])
                 return
         self._blobs.delete(done["picture_key"])
+
+    def _run_packets(self, row: Row) -> None:
+        context = context_from_document(row["context"])
+        data = self._blobs.get(row["upload_key"])
+        agency_id, received_at = row["agency_id"], row["created_at"]
+        files = start_packets(self._decoder, data, context, self._rules, wait_s=_PATIENCE_S).result()
+        for _try in range(TRIES):
+            drive = decode_packets(
+                self._database, agency_id, self._secrets, self._decoder, files, context, received_at, wait_s=_PATIENCE_S
+            )
+            picture_key = new_blob_key(PICTURES)
+            self._blobs.put(picture_key, drive.plot)
+            done = {"state": "done", "progress": 1.0, "result": drive.document, "picture_key": picture_key}
+            with self._database.write() as connection:
+                newest = is_still_newest(connection, agency_id, drive)
+                if newest and store.finish_decode(connection, row["id"], {**done, "finished_at": self._clock()}):
+                    keep_heard(connection, agency_id, row["id"], drive, context.captured_at or received_at)
+                    return
+            self._blobs.delete(picture_key)
+            if newest:
+                return  # somebody else finished or cancelled it
+        raise too_many_at_once()
 
     def _read_archive(self, row: Row) -> tuple[list[ReadFrame], int]:
         context = context_from_document(row["context"])

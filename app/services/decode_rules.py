@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 
 from app.decoders.archives import ArchiveLimits
+from app.decoders.cerpm.packet_log import PacketLimits
 from app.decoders.images import ImageLimits
 from app.decoders.traces.declaration import TraceLimits
 
@@ -19,8 +20,9 @@ class DecodeRules:
     images : ImageLimits
     archives : ArchiveLimits
     traces : TraceLimits
+    packets : PacketLimits
     trace_at_once_bytes : int
-        Recordings up to this size are decoded while the caller waits, larger ones become jobs. [byte]
+        Recordings and packet logs up to this size are decoded while the caller waits, larger ones become jobs. [byte]
     frames_in_flight : int
         Frames of one archive that are decoded at the same time.
     max_attempts : int
@@ -33,6 +35,7 @@ class DecodeRules:
     images: ImageLimits = field(default_factory=ImageLimits)
     archives: ArchiveLimits = field(default_factory=ArchiveLimits)
     traces: TraceLimits = field(default_factory=TraceLimits)
+    packets: PacketLimits = field(default_factory=PacketLimits)
     trace_at_once_bytes: int = 8 * 1024**2
     frames_in_flight: int = 2
     max_attempts: int = 3

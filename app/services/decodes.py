@@ -17,15 +17,28 @@ from app.registry import decodes as store
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.services.access import Caller
+from app.services.agency_secrets import AgencySecrets
 from app.services.decode_context import DecodeContext, context_from_document
 from app.services.decode_documents import ReadFrame, decode_document, result_document
 from app.services.decode_rules import DecodeRules
 from app.services.frame_reading import observations_of, read_frame, start_frame
 from app.services.frames import AnnotationTask, Blobs, FrameDecoder, JobQueue, Outline
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
+from app.services.lane_documents import lane_geojson, overlay_from_document
 from app.services.matching import NearbyPlates, find_nearby_plates
+from app.services.packet_decodes import (
+    PACKETS,
+    TRIES,
+    DecodedDrive,
+    decode_packets,
+    is_still_newest,
+    keep_heard,
+    start_packets,
+    too_many_at_once,
+)
+from app.services.packets import OverlayTask
 from app.services.ports import Clock
-from app.services.trace_decodes import TRACE, finished_columns, start_trace, store_observations
+from app.services.trace_decodes import PICTURES, TRACE, finished_columns, start_trace, store_observations
 from app.storage.blobs import new_blob_key
 
 FRAME, ARCHIVE = "frame", "archive"
@@ -45,6 +58,8 @@ class Decodes:
         Decoder processes.
     queue : JobQueue
         Where archives wait for `DecodeJobs.run_job`.
+    secrets : AgencySecrets
+        Keys of CERPMs.
     rules : DecodeRules, optional
     """
 
@@ -56,6 +71,7 @@ class Decodes:
         blobs: Blobs,
         decoder: FrameDecoder,
         queue: JobQueue,
+        secrets: AgencySecrets,
         rules: DecodeRules | None = None,
     ) -> None:
         self._database = database
@@ -63,6 +79,7 @@ class Decodes:
         self._blobs = blobs
         self._decoder = decoder
         self._queue = queue
+        self._secrets = secrets
         self._rules = rules or DecodeRules()
 
     # --- uploads --------------------------------------------------------------------------------------------------
@@ -96,6 +113,10 @@ class Decodes:
             if len(data) <= self._rules.trace_at_once_bytes:
                 return self._decode_trace(caller, data, context, key)
             return self._put_in_queue(caller, TRACE, data, context, key)
+        if context.packets is not None:
+            if len(data) <= self._rules.trace_at_once_bytes:
+                return self._decode_packets(caller, data, context, key)
+            return self._put_in_queue(caller, PACKETS, data, context, key)
         if is_archive(data):
             count_members(data, self._rules.archives)
             return self._put_in_queue(caller, ARCHIVE, data, context, key)
@@ -184,6 +205,55 @@ class Decodes:
                 self._blobs.delete(blob_key)
         return document, replayed
 
+    def _decode_packets(
+        self, caller: Caller, data: bytes, context: DecodeContext, key: IdempotencyKey | None
+    ) -> tuple[dict[str, Any], bool]:
+        created_at = self._clock()
+        files = start_packets(self._decoder, data, context, self._rules).result()
+        row = _new_row(PACKETS, context, new_blob_key(UPLOADS), created_at)
+        kept = [row["upload_key"]]
+        try:
+            self._blobs.put(row["upload_key"], data)
+            for _try in range(TRIES):
+                drive = decode_packets(
+                    self._database, caller.agency_id, self._secrets, self._decoder, files, context, created_at
+                )
+                row |= {"picture_key": new_blob_key(PICTURES), "result": drive.document}
+                kept.append(row["picture_key"])
+                self._blobs.put(row["picture_key"], drive.plot)
+                with self._database.write() as connection:
+                    answer = find_answer(connection, caller.agency_id, key, created_at)
+                    if answer is None and is_still_newest(connection, caller.agency_id, drive):
+                        return self._store_packets(connection, caller, row, drive, context, key), False
+                for blob_key in kept[answer is None :]:
+                    self._blobs.delete(blob_key)
+                if answer is not None:
+                    return answer, True
+                del kept[1:]
+            raise too_many_at_once()
+        except BaseException:
+            for blob_key in kept:
+                self._blobs.delete(blob_key)
+            raise
+
+    def _store_packets(
+        self,
+        connection: sa.Connection,
+        caller: Caller,
+        row: dict[str, Any],
+        drive: DecodedDrive,
+        context: DecodeContext,
+        key: IdempotencyKey | None,
+    ) -> dict[str, Any]:
+        now = self._clock()
+        row |= {"state": "done", "progress": 1.0, "attempts": 1, "finished_at": now}
+        store.add_decode(connection, caller.agency_id, row)
+        seen_at = context.captured_at or row["created_at"]
+        keep_heard(connection, caller.agency_id, row["id"], drive, seen_at)
+        document = decode_document(row)
+        keep_answer(connection, caller.agency_id, key, document, row["created_at"], self._rules.idempotency_ttl)
+        return document
+
     def _put_in_queue(
         self, caller: Caller, kind: str, data: bytes, context: DecodeContext, key: IdempotencyKey | None
     ) -> tuple[dict[str, Any], bool]:
@@ -240,15 +310,7 @@ class Decodes:
         NotFound
             There is no such decode or frame, or it is not done.
         """
-        with self._database.read() as connection:
-            row = store.get_decode(connection, caller.agency_id, decode_id)
-        result = row["result"]
-        if result is None:
-            raise NotFound(
-                f"decode {decode_id} has no result: it is {row['state']}",
-                field="decode_id",
-                cure="wait until it is done",
-            )
+        row, result = self._result(caller, decode_id)
         known = next((entry for entry in result.get("frames", ()) if entry["frame"] == frame), None)
         if known is None or known["error"] is not None:
             raise NotFound(f"decode {decode_id} has no readable frame {frame}", field="frame")
@@ -260,8 +322,56 @@ class Decodes:
         task = AnnotationTask(data, outlines, suffix, context.thermal, context.thermal_range, limits=self._rules.images)
         return self._decoder.annotate(task)
 
+    def overlay(self, caller: Caller, decode_id: str, suffix: str) -> bytes:
+        """The camera frame of a drive with its lane drawn over it, encoded as ``png`` or ``jpg``.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode, or no overlay in it.
+        """
+        row, result = self._result(caller, decode_id)
+        if not result.get("overlay"):
+            raise NotFound(
+                f"decode {decode_id} has no overlay",
+                field="decode_id",
+                limit="a packet log with a camera frame, a camera and the vehicle's pose",
+                cure="report.warnings says what was missing",
+            )
+        overlay = result["overlay"]
+        data = self._blobs.get(row["upload_key"])
+        return self._decoder.draw_overlay(
+            OverlayTask(data, overlay["frame"], overlay_from_document(overlay), suffix, self._rules.images)
+        )
+
+    def lane(self, caller: Caller, decode_id: str) -> dict[str, Any]:
+        """Path, boundaries and markers of a drive as GeoJSON.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode, or it is not of a packet log.
+        """
+        _row, result = self._result(caller, decode_id)
+        if "lane" not in result:
+            raise NotFound(
+                f"decode {decode_id} is of no packet log", field="decode_id", limit="packet logs have a lane"
+            )
+        return lane_geojson(result["lane"], result["markers"])
+
+    def _result(self, caller: Caller, decode_id: str) -> tuple[store.Row, dict[str, Any]]:
+        with self._database.read() as connection:
+            row = store.get_decode(connection, caller.agency_id, decode_id)
+        if row["result"] is None:
+            raise NotFound(
+                f"decode {decode_id} has no result: it is {row['state']}",
+                field="decode_id",
+                cure="wait until it is done",
+            )
+        return row, row["result"]
+
     def plot(self, caller: Caller, decode_id: str) -> bytes:
-        """Plot of a trace with what was found in it, SVG.
+        """Plot of a trace or a lane with what was found, SVG.
 
         Raises
         ------
@@ -274,7 +384,9 @@ class Decodes:
             raise NotFound(
                 f"decode {decode_id} has no plot: it is {row['state']}, of kind {row['kind']}",
                 field="decode_id",
-                cure="wait until it is done" if row["kind"] == TRACE else "frames have annotated.png and annotated.jpg",
+                cure="wait until it is done"
+                if row["kind"] in (TRACE, PACKETS)
+                else "frames have annotated.png and annotated.jpg",
             )
         return self._blobs.get(row["picture_key"])
 

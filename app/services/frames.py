@@ -11,6 +11,7 @@ from app.decoders.images import ImageHeader, ImageLimits
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateReading
 from app.sensors.camera import Camera
+from app.services.packets import PacketDecoder
 from app.services.traces import TraceDecoder
 
 
@@ -123,7 +124,7 @@ class PendingFrame(Protocol):
         """Stop it, also when it runs already. Every frame that is started ends in `result` or here."""
 
 
-class FrameDecoder(TraceDecoder, Protocol):
+class FrameDecoder(TraceDecoder, PacketDecoder, Protocol):
     """Decoder processes, as the services see them."""
 
     def start(self, task: FrameTask, search: Future[PlateSearch], *, wait_s: float = 0.0) -> PendingFrame:

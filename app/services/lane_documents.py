@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from app.decoders.cerpm.lane_frame import wgs84_from_plane
 from app.decoders.cerpm.lane_types import Lane
-from app.decoders.cerpm.overlay import LaneOverlay, LineInFrame
+from app.decoders.cerpm.overlay import LaneOverlay, LineInFrame, PointsInFrame
 from app.simulation.steering import SteeringCheck
 
 Floats = npt.NDArray[np.float64]
@@ -115,6 +115,21 @@ def overlay_document(overlay: LaneOverlay, frame: str) -> dict[str, Any]:
         "area_px": [_points_px(polygon) for polygon in overlay.area_px],
         "markers_px": _points_px(overlay.markers.points_px[overlay.markers.visible]),
     }
+
+
+def overlay_from_document(document: dict[str, Any]) -> LaneOverlay:
+    """A stored overlay, to be drawn again."""
+
+    def line(name: str) -> LineInFrame:
+        return LineInFrame(_NO_POINTS, tuple(np.array(piece, float).reshape(-1, 2) for piece in document[name]))
+
+    markers = np.array(document["markers_px"], float).reshape(-1, 2)
+    shown = PointsInFrame(markers, np.ones(len(markers), bool), np.full(len(markers), np.nan))
+    area = tuple(np.array(polygon, float).reshape(-1, 2) for polygon in document["area_px"])
+    return LaneOverlay(line("left_px"), line("right_px"), line("centre_px"), area, shown)
+
+
+_NO_POINTS = PointsInFrame(np.empty((0, 2)), np.empty(0, bool), np.empty(0))
 
 
 def _feature(kind: str, geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,222 @@
+"""Decoded drives past CERPMs as clients see them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from app import __version__
+from app.decoders.cerpm.lane_types import Lane
+from app.decoders.cerpm.merge_types import Disagreement
+from app.decoders.cerpm.path_loss import Estimate
+from app.decoders.cerpm.signal import SignalProfile
+from app.decoders.cerpm.verify import Verdict
+from app.markers.cerpm import LaneSide
+from app.services.decode_documents import count_of
+from app.services.lane_documents import lane_document, overlay_document, steering_document
+from app.services.packet_reading import ReadPackets
+from app.services.packets import DriveFiles, LaneResult
+
+DECODER_VERSION = "cerpm/1"
+MAX_REFUSED = 500
+_OBSERVED = {Disagreement.MOVED: "moved", Disagreement.TWO_PLACES: "cloned", Disagreement.OUT_OF_REACH: "out-of-reach"}
+
+
+def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -> dict[str, Any]:
+    """What a decode of a drive found, as it is stored."""
+    lane = result.lane
+    markers = _markers(read, lane)
+    document = lane_document(lane, grade=str(read.grade))
+    document["doubts"] += read.doubts
+    path_loss = read.signal.path_loss
+    return {
+        "decoder": f"waymark {__version__} {DECODER_VERSION}",
+        "summary": _summary(files, read, markers, lane),
+        "report": _report(files, read, result),
+        "markers": markers,
+        "lane": document,
+        "steering": steering_document(result.steering),
+        "overlay": overlay_document(result.overlay, files.frame[0]) if result.overlay and files.frame else None,
+        "path_loss": None
+        if path_loss is None
+        else {
+            "level_at_50m_dbm": _estimate(path_loss.level_dbm),
+            "exponent": _estimate(path_loss.exponent),
+            "spread_db": round(path_loss.spread_db, 2),
+            "packets": path_loss.packets,
+            "fitted_exponent": path_loss.fitted_exponent,
+        },
+    }
+
+
+def packet_observations(decode_id: str, read: ReadPackets, lane: Lane, seen_at: Any) -> list[dict[str, Any]]:
+    """One row a registered marker that was authentically heard."""
+    off_line = {entry.number for entry in lane.left_out}
+    kinds = {finding.number: _OBSERVED.get(finding.kind) for finding in read.merged.findings}
+    rows = []
+    for number, row in read.known.rows.items():
+        profile = read.signal.profiles.get(number)
+        if profile is None:
+            continue
+        what = kinds.get(number) or ("off-line" if number in off_line else "seen")
+        detail = {"packets": profile.heard, "expected": profile.expected, "health": str(profile.health)}
+        rows.append(
+            {"decode_id": decode_id, "marker_id": row["id"], "frame": 0, "at": seen_at, "what": what, "detail": detail}
+        )
+    return rows
+
+
+def _summary(files: DriveFiles, read: ReadPackets, markers: list[dict[str, Any]], lane: Lane) -> dict[str, Any]:
+    counts = read.verification.counts()
+    accepted, repeated, clear = (
+        counts[verdict] for verdict in (Verdict.AUTHENTIC, Verdict.DUPLICATE, Verdict.UNAUTHENTICATED)
+    )
+    refused = len(files.packets) - accepted - repeated - clear
+    named = [marker["number"] for marker in markers if marker["left_out"]]
+    length_m = float(lane.station_m[-1]) if len(lane.station_m) else 0.0
+    text = f"{count_of(len(files.packets), 'packet')}, {accepted} authentic" + (
+        f", {refused} refused" if refused else ""
+    )
+    text += f"; {count_of(len(markers), 'marker')}"
+    text += f", left out: {', '.join(str(number) for number in named)}" if named else ""
+    if lane.refusal is None and np.isfinite(lane.sigma_m).all():
+        text += f"; path of {length_m:.0f} m, ± {100 * float(np.median(lane.sigma_m)):.1f} cm"
+    else:
+        text += f"; path of {length_m:.0f} m" if lane.refusal is None else f"; no path: {lane.refusal}"
+    return {
+        "text": text,
+        "packets": len(files.packets),
+        "accepted": accepted,
+        "repeated": repeated,
+        "in_clear": clear,
+        "refused": refused,
+        "markers": len(markers),
+        "left_out": named,
+        "path_m": round(length_m, 3),
+    }
+
+
+def _report(files: DriveFiles, read: ReadPackets, result: LaneResult) -> dict[str, Any]:
+    verdicts = {str(verdict): count for verdict, count in read.verification.counts().items()}
+    refused = [
+        {"entry": p.entry, "number": p.number, "verdict": str(p.verdict), "reason": p.reason}
+        for p in read.verification.packets
+        if p.verdict not in (Verdict.AUTHENTIC, Verdict.DUPLICATE)
+    ]
+    left_out = [
+        {"file": name, "entry": entry.entry, "what": f"{name}, entry {entry.entry}", "reason": entry.reason}
+        for name, report in files.reports.items()
+        for entry in report.left_out
+    ]
+    warnings = [text for report in files.reports.values() for text in report.warnings]
+    warnings += [*read.verification.warnings, *read.merged.warnings]
+    if files.frame is not None and result.overlay is None and not result.lane.refusal:
+        warnings.append(
+            "no overlay: it takes camera in the context, and where the vehicle was at captured_at (poses with "
+            "headings), or coarse_position and heading_deg"
+        )
+    return {
+        "files": {
+            name: {"format": str(report.format), "entries": report.entries, "left_out": report.left_out_count}
+            for name, report in files.reports.items()
+        },
+        "packets": len(files.packets),
+        "verdicts": verdicts,
+        "refused": refused[:MAX_REFUSED],
+        "left_out": left_out,
+        "warnings": list(dict.fromkeys(warnings)),
+        "load_ms": round(files.load_ms, 1),
+        "verify_ms": round(read.verify_ms, 1),
+        "decode_ms": round(result.decode_ms, 1),
+    }
+
+
+def _markers(read: ReadPackets, lane: Lane) -> list[dict[str, Any]]:
+    merged = read.merged
+    rows = {int(number): k for k, number in enumerate(merged.number)}
+    off_line = {entry.number: entry for entry in lane.left_out}
+    claims: dict[int, list[Any]] = {}
+    for packet in read.verification.packets:
+        if packet.number is not None and (packet.accepted or packet.number in rows or packet.number in merged.left_out):
+            claims.setdefault(packet.number, []).append(packet)
+    documents = []
+    for number in sorted({*rows, *merged.left_out}):
+        k, row, profile = rows.get(number), read.known.rows.get(number), read.signal.profiles.get(number)
+        heard = [packet for packet in claims.get(number, ()) if packet.accepted]
+        sequences = [packet.message.sequence for packet in heard if packet.message is not None]
+        strengths = [p.packet.rssi_dbm for p in claims.get(number, ()) if math.isfinite(p.packet.rssi_dbm)]
+        out = merged.left_out.get(number)
+        if out is None and number in off_line:
+            entry = off_line[number]
+            out = str(entry.reason).replace("_", " ") + (f", {entry.off_m:.2f} m" if math.isfinite(entry.off_m) else "")
+        residual = float(lane.residual_m[k]) if k is not None else math.nan
+        side = LaneSide(int(lane.side[k]) or int(merged.side[k])) if k is not None else LaneSide.UNKNOWN
+        lon_deg, lat_deg = _place(number, read, k)
+        documents.append(
+            {
+                "number": number,
+                "marker_id": row["id"] if row is not None else None,
+                "registered": row is not None,
+                "authentic": bool(heard),
+                "side": side.name.lower(),
+                "lon_deg": lon_deg,
+                "lat_deg": lat_deg,
+                "packets": len(heard) or len(claims.get(number, ())),
+                "first_sequence": min(sequences, default=None),
+                "last_sequence": max(sequences, default=None),
+                "best_rssi_dbm": max(strengths, default=None),
+                "off_registered_m": _off_m(number, read),
+                "residual_m": round(residual, 4) if math.isfinite(residual) else None,
+                "left_out": out,
+                "notes": [f.reason for f in merged.findings if f.number == number and f.reason != out],
+                "health": _health(profile) if profile is not None else None,
+            }
+        )
+    return documents
+
+
+def _place(number: int, read: ReadPackets, k: int | None) -> tuple[float | None, float | None]:
+    """Where a marker is taken to be; of one that was left out, where it claims to be."""
+    if k is not None:
+        return round(float(read.merged.lon_deg[k]), 9), round(float(read.merged.lat_deg[k]), 9)
+    return claimed_place(number, read)
+
+
+def claimed_place(number: int, read: ReadPackets) -> tuple[float | None, float | None]:
+    """Where the newest accepted packet of a marker says that it is, else its last in clear. [deg]"""
+    said: Any = None
+    for packet in read.verification.packets:
+        if packet.number == number and packet.accepted and packet.message is not None:
+            if said is None or packet.message.sequence >= getattr(said, "sequence", -1):
+                said = packet.message
+        elif packet.number == number and said is None and packet.packet.claim is not None:
+            said = packet.packet.claim
+    return (None, None) if said is None else (said.lon_deg, said.lat_deg)
+
+
+def _off_m(number: int, read: ReadPackets) -> float | None:
+    distance = [
+        f.distance_m
+        for f in read.merged.findings
+        if f.number == number and f.kind in (Disagreement.MOVED, Disagreement.DATUM_SHIFT)
+    ]
+    return round(distance[0], 3) if distance and math.isfinite(distance[0]) else None
+
+
+def _health(profile: SignalProfile) -> dict[str, Any]:
+    level, delivery = profile.level_db, profile.delivery
+    return {
+        "verdict": str(profile.health),
+        "sentence": profile.reason,
+        "level_db": round(level.value, 2) if level is not None else None,
+        "level_db_low": round(level.low, 2) if level is not None else None,
+        "level_db_high": round(level.high, 2) if level is not None else None,
+        "delivery": round(delivery.value, 4) if delivery is not None else None,
+        "farthest_m": round(profile.farthest_m, 1) if math.isfinite(profile.farthest_m) else None,
+    }
+
+
+def _estimate(value: Estimate) -> dict[str, float]:
+    return {"value": round(value.value, 3), "low": round(value.low, 3), "high": round(value.high, 3)}
