@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import erf
 
-from app.decoders.cerpm.lane_fit import Fit, fit_along
+from app.decoders.cerpm.lane_fit import Fit
 from app.decoders.cerpm.lane_frame import heading_of, plane_from_wgs84, wgs84_from_plane
 from app.decoders.cerpm.lane_input import Stock, moving, stock_from_markers
 from app.decoders.cerpm.lane_line import Line, lengths_along
@@ -110,16 +110,12 @@ def _fit(stock: Stock, taken: Bools, drive: Drive | None, rules: LaneRules, note
         return _refused(
             stock, notes, "the markers do not lie along a lane, or are one row that tells no side", "waymark"
         )
-    fit = fit_along(line, stock, taken, drive, rules, notes)
-    if fit is None:
-        return _refused(stock, notes, "no two markers lie on one lane", "waymark")
+    fit = Fit(line, stock, taken, drive, rules, notes)
+    whole = fit.run()
     for k, (reason, off) in fit.left_out.items():
         notes.left_out.append(LeftOut(int(stock.row[k]), int(stock.number[k]), reason, off))
-    strays = len(fit.left_out) / max(len(fit.left_out) + int(fit.used.sum()), 1)
-    if strays > rules.most_strays:
-        return _refused(
-            stock, notes, f"{len(fit.left_out)} markers lie off the one line that most of them have", "waymark"
-        )
+    if not whole:
+        return _refused(stock, notes, f"the markers share no line: {len(fit.left_out)} of them lie off it", "waymark")
     found = set(np.unique(fit.side[fit.used]).tolist())
     sure = drive is not None and drive.accuracy_m < _SURE_TRACK_M
     if len(found) == 1 and not sure and not (stock.side[fit.used] != UNKNOWN).any():

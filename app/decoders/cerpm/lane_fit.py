@@ -2,63 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from app.decoders.cerpm.lane_input import Stock
 from app.decoders.cerpm.lane_line import Line, lengths_along
-from app.decoders.cerpm.lane_pairs import Pairs, abreast
+from app.decoders.cerpm.lane_pairs import abreast
 from app.decoders.cerpm.lane_sides import Sides, assign_sides
 from app.decoders.cerpm.lane_solve import VEHICLES, Evidence, Problem, Solution, Strengths, choose_strengths
-from app.decoders.cerpm.lane_spacing import NONE, Stretches, even_stretches
+from app.decoders.cerpm.lane_spacing import NONE, even_stretches
 from app.decoders.cerpm.lane_track import Drive
 from app.decoders.cerpm.lane_types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints, LaneRules, LeftOutReason, Notes
 
 _ROUNDS = 8
 _CLOSE_M = 0.1  # a line so close to the centre is as good as the centre
 _REJECTIONS = 12
+_LONGER = 2.0  # than its first line no lane becomes: it would be winding to and fro between strays
 _ONE_EACH_M = 60.0  # of markers that stray, one a stretch is left out at a time: the rest may be its doing
 _AGAINST = 0.2
 _SURE_TRACK_M, _UNTOLD_M = 0.5, 3.0
 
 
-@dataclass(slots=True, eq=False)
+Fixes = tuple[Floats, Floats, Floats, Floats]
+"""Station, left offset, place and standard deviation of fixes; empty without a track."""
+NO_FIXES: Fixes = (np.empty(0), np.empty(0), np.empty((0, 2)), np.empty(0))
+
+
 class Fit:
-    """A lane on the way to its path.
-
-    Attributes
-    ----------
-    line : Line
-        Near the centre.
-    problem, solution
-        Beside that line.
-    strengths : Strengths
-    used : ndarray of bool, shape (M,)
-        Markers of the stock that take part.
-    side : ndarray of int, shape (M,)
-    residual_m : ndarray, shape (M,)
-    station_m : ndarray, shape (M,)
-        Of the markers along the line.
-    left_out : dict
-        Row of the stock to reason and distance.
-    """
-
-    line: Line
-    problem: Problem
-    solution: Solution
-    strengths: Strengths
-    used: Bools
-    side: Ints
-    residual_m: Floats
-    station_m: Floats
-    left_out: dict[int, tuple[LeftOutReason, float]]
-
-
-def fit_along(
-    line: Line, stock: Stock, taken: Bools, drive: Drive | None, rules: LaneRules, notes: Notes
-) -> Fit | None:
-    """Fit the lane beside a first line; None where fewer than two markers are left.
+    """A lane on the way to its path: a line, what was measured beside it, and the solution beside it.
 
     Parameters
     ----------
@@ -68,42 +38,128 @@ def fit_along(
     taken : ndarray of bool, shape (M,)
         Markers that may take part.
     drive : Drive or None
+    rules : LaneRules
+    notes : Notes
+
+    Attributes
+    ----------
+    used : ndarray of bool, shape (M,)
+        Markers that take part.
+    side : ndarray of int, shape (M,)
+    residual_m, station_m : ndarray, shape (M,)
+        How far each marker lies off its boundary, and where along the line. [m]
+    left_out : dict
+        Row of the stock to reason and distance.
     """
-    station, left = line.find(stock.point_m, stock.side, rules.usual_width_m / 2)
-    named = _named_sides(left, stock, taken, drive, notes)
-    if named is not stock.side:
-        station, left = line.find(stock.point_m, named, rules.usual_width_m / 2)
-    sides = _sides(station, left, named, taken, drive)
-    left_out = {
-        int(k): (LeftOutReason.WRONG_SIDE if sides.against[k] else LeftOutReason.OFF_THE_LINE, float(sides.off_m[k]))
-        for k in np.flatnonzero(taken & (sides.side == UNKNOWN))
-    }
-    used = taken & (sides.side != UNKNOWN)
-    if used.sum() < 2:
-        return None
-    start = _start_strengths(sides, used, drive, rules)
-    fixes = _fixes_beside(line, drive)
-    fit: Fit | None = None
-    for turn in range(_ROUNDS):
-        strengths = start if fit is None else fit.strengths
-        fit = _solve(line, stock, used, sides.side, station, left, fixes, drive, strengths, left_out, rules, turn)
-        used = fit.used
-        if used.sum() < 2 or turn == _ROUNDS - 1 or (turn and np.abs(fit.solution.centre_m).max() < _CLOSE_M):
-            break
-        points = line.offset(fit.problem.station_m, fit.solution.centre_m)
-        before = lengths_along(points)
-        scale = fit.problem.station_m
-        line = Line(points)
-        guess = np.interp(station, scale, before) + (station - np.clip(station, scale[0], scale[-1]))
-        station, left = line.follow(stock.point_m, guess)
-        if fixes is not None:
-            guess = np.interp(fixes[0], scale, before) + (fixes[0] - np.clip(fixes[0], scale[0], scale[-1]))
-            fixes = (*line.follow(fixes[2], guess), fixes[2], fixes[3])
-    return fit if fit is not None and fit.used.sum() >= 2 else None
 
+    problem: Problem
+    solution: Solution
 
-Fixes = tuple[Floats, Floats, Floats, Floats]
-"""Station, left offset, place and standard deviation of fixes."""
+    def __init__(
+        self, line: Line, stock: Stock, taken: Bools, drive: Drive | None, rules: LaneRules, notes: Notes
+    ) -> None:
+        self.line, self._stock, self._drive, self._rules = line, stock, drive, rules
+        half = rules.usual_width_m / 2
+        self.station_m, self._left_m = line.find(stock.point_m, stock.side, half)
+        named = _named_sides(self._left_m, stock, taken, drive, notes)
+        if named is not stock.side:
+            self.station_m, self._left_m = line.find(stock.point_m, named, half)
+        sides = _sides(self.station_m, self._left_m, named, taken, drive)
+        self.side = sides.side
+        self.used = taken & (sides.side != UNKNOWN)
+        self.left_out = {
+            int(k): (
+                LeftOutReason.WRONG_SIDE if sides.against[k] else LeftOutReason.OFF_THE_LINE,
+                float(sides.off_m[k]),
+            )
+            for k in np.flatnonzero(taken & ~self.used)
+        }
+        self.residual_m = np.full(len(taken), np.nan)
+        self._strengths = _start_strengths(sides, self.used, rules)
+        self._fixes = _fixes_beside(line, drive)
+
+    def run(self) -> bool:
+        """Solve beside the line, move the line to the solution, and so on; whether a lane came of it."""
+        longest_m = _LONGER * (self.line.length_m + 2 * self._rules.reach_m) + 2 * self._rules.bridge_m
+        for turn in range(_ROUNDS):
+            reach = np.ptp(self.station_m[self.used]) if self.used.any() else 0.0
+            if self.used.sum() < 2 or self.strays > self._rules.most_strays or not reach < longest_m:
+                return False
+            self._solve(turn)
+            moved = float(np.abs(self.solution.centre_m).max())
+            if turn and moved < _CLOSE_M:
+                break
+            if turn < _ROUNDS - 1:
+                self._move()
+        return self.strays <= self._rules.most_strays
+
+    @property
+    def strays(self) -> float:
+        """Share of the markers that lie off the line."""
+        return len(self.left_out) / max(len(self.left_out) + int(self.used.sum()), 1)
+
+    def _solve(self, turn: int) -> None:
+        """Solve beside one line, leaving out markers that stray until none does."""
+        vehicles = _vehicles(self.side[self.used], self._drive)
+        choosing = turn < (1 if self._drive is not None else 3)
+        for left in range(_REJECTIONS, -1, -1):
+            self.problem = self._problem(turn)
+            if choosing:
+                self._strengths = choose_strengths(self.problem, self._strengths, vehicles)
+            self.solution = self.problem.solve(self._strengths)
+            residual, share = self.solution.residuals()
+            if not left or not self._leave_out_strays(residual, share):
+                break
+            choosing = True
+        self.residual_m[:] = np.nan
+        self.residual_m[self.used] = residual
+
+    def _problem(self, turn: int) -> Problem:
+        start, end = float(self.station_m[self.used].min()), float(self.station_m[self.used].max())
+        fixes = self._fixes
+        if len(fixes[0]):
+            start = min(start, max(start - self._rules.reach_m, float(fixes[0].min())))
+            end = max(end, min(end + self._rules.reach_m, float(fixes[0].max())))
+        inside = (fixes[0] >= start) & (fixes[0] <= end)
+        known = np.where(self.used, self.side, UNKNOWN)
+        stretches = NONE
+        if self._drive is None and turn:  # a first line does not tell lengths
+            stretches = even_stretches(self.line, self.station_m, self.used, self._strengths.width_m)
+        sign = np.where(self.side == LEFT, 1.0, -1.0)
+        pairs = abreast(self.station_m, self._left_m, known, self._stock.sigma_m)
+        station, left, sigma, sign = (
+            values[self.used] for values in (self.station_m, self._left_m, self._stock.sigma_m, sign)
+        )
+        fix_station, fix_left, fix_sigma = (values[inside] for values in (fixes[0], fixes[1], fixes[3]))
+        evidence = Evidence(station, left, sigma, sign, fix_station, fix_left, fix_sigma, *pairs, stretches)
+        return Problem(self.line, evidence, start, end)
+
+    def _leave_out_strays(self, residual_m: Floats, share: Floats) -> bool:
+        """Leave out the worst of the markers that are not where all the others put them; whether there was one."""
+        rows = np.flatnonzero(self.used)
+        z = np.abs(residual_m) / (self._stock.sigma_m[rows] * np.sqrt(share))
+        off = residual_m / share
+        stray = (z > self._rules.off_the_line_z) & (np.abs(off) > self._rules.off_the_line_m)
+        if len(rows) <= 2 or not stray.any():
+            return False
+        for k in _worst(z * stray, self.station_m[rows])[: len(rows) - 2]:
+            self.used[rows[k]] = False
+            self.left_out[int(rows[k])] = (LeftOutReason.OFF_THE_LINE, float(off[k]))
+        return True
+
+    def _move(self) -> None:
+        """Take the solution as the line, and measure beside it."""
+        knots = self.problem.station_m
+        points = self.line.offset(knots, self.solution.centre_m)
+        along = lengths_along(points)
+
+        def carried(station_m: Floats) -> Floats:
+            return np.interp(station_m, knots, along) + station_m - np.clip(station_m, knots[0], knots[-1])
+
+        self.line = Line(points)
+        self.station_m, self._left_m = self.line.follow(self._stock.point_m, carried(self.station_m))
+        station, _, place, sigma = self._fixes
+        self._fixes = (*self.line.follow(place, carried(station)), place, sigma)
 
 
 def _named_sides(left: Floats, stock: Stock, taken: Bools, drive: Drive | None, notes: Notes) -> Ints:
@@ -130,7 +186,7 @@ def _sides(station: Floats, left: Floats, named: Ints, taken: Bools, drive: Driv
     return Sides(side, off, against, found.width_m)
 
 
-def _start_strengths(sides: Sides, used: Bools, drive: Drive | None, rules: LaneRules) -> Strengths:
+def _start_strengths(sides: Sides, used: Bools, rules: LaneRules) -> Strengths:
     both = (sides.side[used] == LEFT).any() and (sides.side[used] == RIGHT).any()
     if both:
         return Strengths(width_m=sides.width_m)
@@ -149,75 +205,12 @@ def _vehicles(side: Ints, drive: Drive | None) -> tuple[dict[str, float], ...]:
     return VEHICLES
 
 
-def _fixes_beside(line: Line, drive: Drive | None) -> Fixes | None:
+def _fixes_beside(line: Line, drive: Drive | None) -> Fixes:
     if drive is None:
-        return None
+        return NO_FIXES
     station, left = line.nearest(drive.fix_m)
     good = np.abs(left - np.median(left)) < max(8 * drive.sigma_m, 6.0)
     return station[good], left[good], drive.fix_m[good], np.full(int(good.sum()), drive.sigma_m)
-
-
-def _solve(
-    line: Line, stock: Stock, used: Bools, side: Ints, station: Floats, left: Floats, fixes: Fixes | None,
-    drive: Drive | None, strengths: Strengths, left_out: dict[int, tuple[LeftOutReason, float]], rules: LaneRules,
-    turn: int,
-) -> Fit:  # fmt: skip
-    """Solve beside one line, leaving out markers that stray until none does."""
-    used = used.copy()
-    later = turn > 0  # a first line does not tell lengths
-    start, end = float(station[used].min()), float(station[used].max())
-    if fixes is not None and len(fixes[0]):
-        start = min(start, max(start - rules.reach_m, float(fixes[0].min())))
-        end = max(end, min(end + rules.reach_m, float(fixes[0].max())))
-    sign = np.where(side == LEFT, 1.0, -1.0)
-    vehicles = _vehicles(side[used], drive)
-    chosen = False
-    for _ in range(_REJECTIONS):
-        pairs = abreast(station, left, np.where(used, side, UNKNOWN), stock.sigma_m)
-        stretches = even_stretches(line, station, used, strengths.width_m) if drive is None and later else NONE
-        problem = Problem(
-            line, _evidence(stock, used, station, left, sign, fixes, start, end, pairs, stretches), start, end
-        )
-        if not chosen and turn < (1 if drive is not None else 3):
-            strengths = choose_strengths(problem, strengths, vehicles)
-            chosen = True
-        solution = problem.solve(strengths)
-        residual, share = solution.residuals()
-        rows = np.flatnonzero(used)
-        z = np.abs(residual) / (stock.sigma_m[rows] * np.sqrt(share))
-        off = residual / share
-        stray = (z > rules.off_the_line_z) & (np.abs(off) > rules.off_the_line_m)
-        if not stray.any() or used.sum() <= 2:
-            break
-        for k in _worst(z * stray, station[rows]):
-            used[rows[k]] = False
-            left_out[int(rows[k])] = (LeftOutReason.OFF_THE_LINE, float(off[k]))
-        chosen, turn = False, 0
-    full = np.full(len(used), np.nan)
-    full[rows] = residual
-    return Fit(line, problem, solution, strengths, used, side, full, station, left_out)
-
-
-def _evidence(
-    stock: Stock,
-    used: Bools,
-    station: Floats,
-    left: Floats,
-    sign: Floats,
-    fixes: Fixes | None,
-    start: float,
-    end: float,
-    pairs: Pairs,
-    stretches: Stretches,
-) -> Evidence:
-    fix_station, fix_left, fix_sigma = np.empty(0), np.empty(0), np.empty(0)
-    if fixes is not None:
-        inside = (fixes[0] >= start) & (fixes[0] <= end)
-        fix_station, fix_left, fix_sigma = fixes[0][inside], fixes[1][inside], fixes[3][inside]
-    return Evidence(
-        station[used], left[used], stock.sigma_m[used], sign[used],
-        fix_station, fix_left, fix_sigma, *pairs, stretches,
-    )  # fmt: skip
 
 
 def _worst(z: Floats, station: Floats) -> list[int]:

@@ -15,7 +15,7 @@ _NEIGHBOURS = 10
 _BEND = 0.002  # change of curvature over a metre that the first line is given, 1/m^2 sqrt(m)
 _FIRST_SIGMA_M, _SIDED_SIGMA_M = 1.6, 0.3
 _BESIDE_M = 8.0
-_ROUNDS = 4
+_ROUNDS = 3
 _ROW_M = 0.4
 
 

@@ -59,7 +59,7 @@ def assign_sides(station_m: Floats, left_m: Floats, named: Ints, *, wander: floa
     States are places of the centre beside the line on a grid; a marker costs the square of its distance from the
     boundary that it fits best, up to a cap, so that a wild one bends nothing. All widths run side by side.
     """
-    plain = _plain_sides(left_m, named) if near_track else None
+    plain = _plain_sides(left_m, named) if near_track or (named != UNKNOWN).all() else None
     if plain is not None:
         return plain
     order = np.argsort(station_m, kind="stable")
