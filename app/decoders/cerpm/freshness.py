@@ -8,7 +8,7 @@ was made before t: heard later than that, it was kept back and sent again. This 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,13 @@ import numpy.typing as npt
 from app.errors import InvalidParameter
 
 Floats = npt.NDArray[np.float64]
+
+
+FASTEST_INTERVAL_S = 0.014
+"""Less than the time on air of a message at the fastest setting (SF7, 500 kHz). [s]"""
+_MOST_STEPS, _LEAST_PAIRS, _LEAST_OWN_PAIRS = 50, 20, 6
+_ALIKE, _SHARE_ALIKE = 1.25, 0.5
+_HALF = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +57,9 @@ class FreshnessRules:
         Most that times within one log are out of order by. [s]
     echo_s : float
         The same sequence again within this is an echo (another gateway, a repeated delivery), later it is a replay. [s]
-    least_interval_s : float
-        Shortest time from one transmission of a marker to the next. The default is less than the time on air at the
-        fastest setting; the interval that markers are programmed with makes the check sharper. [s]
+    least_interval_s : float or None
+        Shortest time from one transmission of a marker to the next, where it is known. Without it half of the interval
+        that the log itself shows is taken within the log, and the time on air at the fastest setting beyond it. [s]
     received_at_s : float or None
         When the log was uploaded: nothing can have been heard later. [s]
 
@@ -65,7 +72,7 @@ class FreshnessRules:
     clock_tolerance_s: float = 60.0
     log_tolerance_s: float = 3.0
     echo_s: float = 3.0
-    least_interval_s: float = 0.014
+    least_interval_s: float | None = None
     received_at_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -130,3 +137,53 @@ def within_spans(spans: Sequence[SequenceSpan], sequences: npt.ArrayLike) -> npt
     last = np.maximum.accumulate(np.array([span.last_sequence for span in order], float))
     at = np.searchsorted(first, asked, side="right") - 1
     return (at >= 0) & (last[np.maximum(at, 0)] >= asked)
+
+
+class LearntIntervals:
+    """Intervals between transmissions as a log shows them.
+
+    Parameters
+    ----------
+    heard : mapping of int to (array, array)
+        Sequences and times of the packets of each marker that carry its tag. [s]
+
+    Notes
+    -----
+    Times from one packet to the next, over their steps in sequence, crowd about the interval where packets are honest,
+    and lie anywhere where they were kept back. So the densest place counts, if half of all are there: whoever floods a
+    log spoils the estimate, and then nothing is taken as known, but does not shift it.
+    """
+
+    def __init__(self, heard: Mapping[int, tuple[Floats, Floats]]) -> None:
+        self._own = {number: _steps_s(*values) for number, values in heard.items()}
+        pooled = np.concatenate(list(self._own.values())) if self._own else np.empty(0)
+        self._fleet_s = _densest(pooled, _LEAST_PAIRS)
+
+    def least_s(self, number: int) -> float:
+        """Half of the marker's own interval or of the fleet's, whichever is shorter of those that show. [s]"""
+        own = self._own.get(number, np.empty(0))
+        found = [interval for interval in (self._fleet_s, _densest(own, _LEAST_OWN_PAIRS)) if interval is not None]
+        if self._fleet_s is not None and len(own):  # one that is clearly faster than the others
+            found.append(float(own.max()))
+        return max(_HALF * min(found), FASTEST_INTERVAL_S) if found else FASTEST_INTERVAL_S
+
+
+def _steps_s(sequences: Floats, heard_s: Floats) -> Floats:
+    order = np.lexsort((heard_s, sequences))
+    order = order[np.diff(sequences[order], prepend=-1) > 0]  # of each sequence the first hearing
+    steps, apart_s = np.diff(sequences[order]), np.diff(heard_s[order])
+    kept = (steps >= 1) & (steps <= _MOST_STEPS) & (apart_s > 0)
+    return np.asarray(apart_s[kept] / steps[kept])
+
+
+def _densest(intervals_s: Floats, least: int) -> float | None:
+    """The middle of the shortest stretch that holds half of the values, if they are alike there."""
+    if len(intervals_s) < least:
+        return None
+    values = np.sort(np.log(intervals_s))
+    half = math.ceil(_SHARE_ALIKE * len(values))
+    widths = values[half - 1 :] - values[: len(values) - half + 1]
+    first = int(widths.argmin())
+    if widths[first] > 2 * math.log(_ALIKE):
+        return None
+    return float(np.exp(np.median(values[first : first + half])))

@@ -11,7 +11,15 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.freshness import FreshnessRules, HeardOrder, SequenceSpan, order_of_spans, within_spans
+from app.decoders.cerpm.freshness import (
+    FASTEST_INTERVAL_S,
+    FreshnessRules,
+    HeardOrder,
+    LearntIntervals,
+    SequenceSpan,
+    order_of_spans,
+    within_spans,
+)
 from app.decoders.cerpm.packets import HeardPacket
 from app.decoders.cerpm.payload import UndecodablePayload, decode_message, has_valid_tag
 from app.errors import InvalidParameter
@@ -153,10 +161,12 @@ def verify_packets(
     for index, packet in enumerate(checked):
         if packet.accepted and packet.number is not None:
             by_number[packet.number].append(index)
+    intervals = LearntIntervals({n: _sequences_and_times([checked[i] for i in at]) for n, at in by_number.items()})
     spans: dict[int, tuple[SequenceSpan, ...]] = {}
     for number, indices in by_number.items():
         known = tuple((heard_before or {}).get(number, ()))
-        for index, verdict, reason in _judge_marker([checked[i] for i in indices], known, rules):
+        least_s = intervals.least_s(number) if rules.least_interval_s is None else rules.least_interval_s
+        for index, verdict, reason in _judge_marker([checked[i] for i in indices], known, rules, least_s):
             at = indices[index]
             checked[at] = replace(checked[at], verdict=verdict, reason=reason)
         accepted = [checked[i] for i in indices if checked[i].accepted]
@@ -249,11 +259,10 @@ _Judged = tuple[int, Verdict, str]
 
 
 def _judge_marker(
-    packets: Sequence[VerifiedPacket], known: Sequence[SequenceSpan], rules: FreshnessRules
+    packets: Sequence[VerifiedPacket], known: Sequence[SequenceSpan], rules: FreshnessRules, least_interval_s: float
 ) -> list[_Judged]:
     """Verdicts on packets of one marker that carry its tag; those that are accepted are left out unless unsure."""
-    heard_s = np.array([packet.packet.heard_at_s for packet in packets])
-    sequences = np.array([packet.message.sequence if packet.message else 0 for packet in packets], float)
+    sequences, heard_s = _sequences_and_times(packets)
     judged: list[_Judged] = []
     timed = np.isfinite(heard_s)
     if rules.received_at_s is not None:
@@ -264,9 +273,14 @@ def _judge_marker(
         timed &= ~future
     leaders, echoes = _split_echoes(packets, sequences, heard_s, np.flatnonzero(timed), rules)
     judged += echoes
-    judged += _judge_timed(sequences[leaders], heard_s[leaders], leaders, known, rules)
+    judged += _judge_timed(sequences[leaders], heard_s[leaders], leaders, known, rules, least_interval_s)
     highest = max([span.last_sequence for span in known] + [int(sequences[i]) for i in leaders], default=-1)
     return judged + _judge_untimed(sequences, np.flatnonzero(np.isnan(heard_s)), highest)
+
+
+def _sequences_and_times(packets: Sequence[VerifiedPacket]) -> tuple[Floats, Floats]:
+    sequences = [packet.message.sequence if packet.message else 0 for packet in packets]
+    return np.array(sequences, float), np.array([packet.packet.heard_at_s for packet in packets], float)
 
 
 def _split_echoes(
@@ -301,11 +315,13 @@ def _judge_timed(
     indices: npt.NDArray[np.intp],
     known: Sequence[SequenceSpan],
     rules: FreshnessRules,
+    least_interval_s: float,
 ) -> list[_Judged]:
-    before = order_of_spans(known, rules.least_interval_s)
+    # a marker may have been programmed to another interval between drives
+    before = order_of_spans(known, rules.least_interval_s or FASTEST_INTERVAL_S)
     within = within_spans(known, sequences)
     late_s, early_s = before.late_s(sequences, heard_s), before.early_s(sequences, heard_s)
-    late_here_s = HeardOrder(sequences, heard_s, rules.least_interval_s).late_s(sequences, heard_s)
+    late_here_s = HeardOrder(sequences, heard_s, least_interval_s).late_s(sequences, heard_s)
     tolerance_s = rules.clock_tolerance_s + rules.log_tolerance_s
     judged: list[_Judged] = []
     for k in np.flatnonzero((late_s > tolerance_s) | (early_s > tolerance_s) | (late_here_s > rules.log_tolerance_s)):

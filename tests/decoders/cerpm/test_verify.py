@@ -104,6 +104,41 @@ def test_a_recorded_one_played_before_the_first_honest_one_came_too_late() -> No
     assert verdicts([heard(998, 998), *honest], rules=sharper) == [Verdict.AUTHENTIC] * 21
 
 
+def fleet(start_s: float, first: int, numbers: range, *, interval_s: float = 2.0, count: int = 6) -> list[HeardPacket]:
+    """An honest drive past several markers, whose transmissions are up to 10 % early or late."""
+    rng = np.random.default_rng(first)
+    return [
+        heard(first + i, start_s + (i + rng.uniform(-0.1, 0.1)) * interval_s, number)
+        for number in numbers
+        for i in range(count)
+    ]
+
+
+def test_the_interval_that_a_log_shows_tells_what_was_kept_back() -> None:
+    honest = fleet(100, 1000, range(1, 9))
+    # sent 100 times before the first honest one, so 200 s before, and heard 60 s before it
+    late = [heard(900, 40, number) for number in (1, 5)]
+    found = verdicts([*late, *honest])
+    assert found[:2] == [Verdict.OUT_OF_ORDER] * 2
+    assert set(found[2:]) == {Verdict.AUTHENTIC}
+    assert verdicts([*late, *honest[:12]])[:1] == [Verdict.AUTHENTIC]  # of two markers the interval does not show
+
+
+def test_a_flood_of_replays_costs_no_honest_packet() -> None:
+    rng = np.random.default_rng(1008)
+    honest = fleet(100, 1000, range(1, 9))
+    flood = [heard(int(rng.integers(0, 999)), rng.uniform(95, 115), int(rng.integers(1, 9))) for _ in range(400)]
+    found = verdicts([*honest, *flood])
+    assert set(found[: len(honest)]) == {Verdict.AUTHENTIC}
+
+
+def test_markers_of_other_intervals_are_no_replays() -> None:
+    slow = fleet(100, 1000, range(1, 9), interval_s=20.0)
+    fast = fleet(105, 5000, range(9, 10), interval_s=1.0, count=30)
+    few = [heard(7000, 110, 10), heard(7010, 120, 10)]
+    assert set(verdicts([*slow, *fast, *few])) == {Verdict.AUTHENTIC}
+
+
 def test_a_replay_on_another_day_is_known_from_the_spans() -> None:
     first = verify_packets(drive(0, 100), KEYS)
     spans = {number: list(kept) for number, kept in first.spans.items()}
