@@ -15,6 +15,7 @@ from app.decoders.cerpm.lane_types import LEFT, RIGHT, UNKNOWN, Bools, Floats, I
 
 _ROUNDS = 8
 _CLOSE_M = 0.1  # a line so close to the centre is as good as the centre
+_SETTLED_M = 0.5  # a line that moved less shows no strays that it did not show before
 _REJECTIONS = 12
 _LONGER = 2.0  # than its first line no lane becomes: it would be winding to and fro between strays
 _ONE_EACH_M = 60.0  # of markers that stray, one a stretch is left out at a time: the rest may be its doing
@@ -81,11 +82,12 @@ class Fit:
     def run(self) -> bool:
         """Solve beside the line, move the line to the solution, and so on; whether a lane came of it."""
         longest_m = _LONGER * (self.line.length_m + 2 * self._rules.reach_m) + 2 * self._rules.bridge_m
+        moved = np.inf
         for turn in range(_ROUNDS):
             reach = np.ptp(self.station_m[self.used]) if self.used.any() else 0.0
             if self.used.sum() < 2 or self.strays > self._rules.most_strays or not reach < longest_m:
                 return False
-            self._solve(turn)
+            self._solve(turn, settled=moved < _SETTLED_M)
             moved = float(np.abs(self.solution.centre_m).max())
             if turn and moved < _CLOSE_M:
                 break
@@ -98,17 +100,17 @@ class Fit:
         """Share of the markers that lie off the line."""
         return len(self.left_out) / max(len(self.left_out) + int(self.used.sum()), 1)
 
-    def _solve(self, turn: int) -> None:
-        """Solve beside one line, leaving out markers that stray until none does."""
+    def _solve(self, turn: int, *, settled: bool) -> None:
+        """Solve beside one line, leaving out markers that stray until none does; none does beside a settled one."""
         vehicles = _vehicles(self.side[self.used], self._drive)
-        choosing = turn < (1 if self._drive is not None else 3)
+        choosing = turn < (1 if self._drive is not None else 2)
         for left in range(_REJECTIONS, -1, -1):
             self.problem = self._problem(turn)
             if choosing:
                 self._strengths = choose_strengths(self.problem, self._strengths, vehicles)
             self.solution = self.problem.solve(self._strengths)
-            residual, share = self.solution.residuals()
-            if not left or not self._leave_out_strays(residual, share):
+            residual = self.solution.residuals()
+            if settled or not left or not self._leave_out_strays(residual, self.solution.shares()):
                 break
             choosing = True
         self.residual_m[:] = np.nan

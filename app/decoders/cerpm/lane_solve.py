@@ -236,26 +236,21 @@ class Solution:
         self.centre_m = x[:: problem.fields]
         self.width_m = x[1 :: problem.fields]
 
-    def pair_residuals(self) -> Floats:
-        """How far the slope that each pair tells is from the centre's, in its standard deviations."""
+    def residuals(self) -> Floats:
+        """How far each marker lies left of its boundary. [m]"""
         p = self.problem
-        return (p.evidence.pair_slope - apply(p.pair_index, p.pair_value, self._x)) / p.evidence.pair_sigma
+        return p.evidence.left_m - apply(p.marker_index, p.marker_value, self._x)
 
-    def residuals(self) -> tuple[Floats, Floats]:
-        """How far each marker lies left of its boundary, and the share of it that its neighbours explain away.
+    def shares(self) -> Floats:
+        """1 - h for each marker, where h is the share of its own place in what is said of it.
 
-        The second is 1 - h: with it, the residual against the neighbours alone is r / (1 - h), and its standard
-        deviation sigma / sqrt(1 - h).
+        Against its neighbours alone its residual is r / (1 - h), with a standard deviation of sigma / sqrt(1 - h).
         """
         p = self.problem
         e = p.evidence
-        if not len(e.left_m):
-            return np.empty(0), np.empty(0)
-        residual = e.left_m - apply(p.marker_index, p.marker_value, self._x)
-        cell = 2.0
-        group, groups = _grouped(e.station_m, cell)
+        group, groups = _grouped(e.station_m)
         variance = covariances(self._cholesky, p.marker_index, p.marker_value, p.marker_value, group, p.size, groups)
-        return residual, np.maximum(1 - variance / e.sigma_m**2, 1e-9)
+        return np.maximum(1 - variance / e.sigma_m**2, 1e-9)
 
     def sigmas(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """Some stations, and standard deviations there of the centre, left boundary, right boundary and width. [m]"""
@@ -274,7 +269,7 @@ class Solution:
         return p.station_m[knots], np.sqrt(np.maximum(cc, 0)), left, right_side, np.sqrt(np.maximum(ww, 0))
 
 
-def _grouped(station_m: Floats, cell_m: float) -> tuple[Ints, int]:
+def _grouped(station_m: Floats) -> tuple[Ints, int]:
     """Groups of rows that are at least `_FEEL_M` apart, as few as there can be."""
     order = np.argsort(station_m, kind="stable")
     ordered = station_m[order]
