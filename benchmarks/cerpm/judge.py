@@ -62,6 +62,12 @@ class Tally:
         return self.covered / max(self.places, 1)
 
     @property
+    def told_and_right(self) -> tuple[float, float]:
+        """Mean probability that paths gave for being within 0.25 m of the centre, and the share that was."""
+        parts = [np.concatenate(p) if p else np.full(1, np.nan) for p in (self.confidence, self.right)]
+        return float(parts[0].mean()), float(parts[1].mean())
+
+    @property
     def worst_run_m(self) -> float:
         """RMS of the worst run. [m]"""
         return max((_rms([o]) for o in self.off_m if len(o)), default=float("nan"))

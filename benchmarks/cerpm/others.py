@@ -84,8 +84,8 @@ def run_forged(seed: int, short: bool) -> Result:
     note = (
         "Kept sequences go through text between the second and the third day. Of the last row but one an attacker's "
         "receiver recorded on the second day what the vehicle did not hear; each says what its marker says anyway. In "
-        "the last row a packet counts as accepted if its marker is used after merging with the vehicle's track; no place "
-        "is registered."
+        "the last row a packet counts as accepted if its marker is used after merging with the vehicle's track; no "
+        "place is registered."
     )
     return note, head, rows
 
