@@ -88,8 +88,9 @@ def faint_signal(planes: Planes) -> MarkerSignal:
     opponent: Array = np.empty(planes.red.shape, np.int16)
     _ratio(planes.green.reshape(-1), planes.red.reshape(-1), opponent.reshape(-1))
     height, width = opponent.shape
-    tiny = (max(width // BLOCK, 1), max(height // BLOCK, 1))
-    level = cv2.medianBlur(cv2.resize(opponent, tiny, interpolation=cv2.INTER_AREA), 5)
+    means = np.empty((max(height // BLOCK, 1), max(width // BLOCK, 1)), np.int16)
+    _block_means(opponent, means)  # cv2.resize by area takes ten times as long where the sides are no multiples
+    level = cv2.medianBlur(means, 5)
     opponent = cv2.subtract(opponent, cv2.resize(level, (width, height), interpolation=cv2.INTER_LINEAR))
     return _signal(opponent, planes, FAINT_LEVELS)
 
@@ -127,12 +128,15 @@ class MarkerColours:
     margins : ndarray, shape (4,)
         How far the signal of the triangle and the squares stands out of the units', in their spreads.
     tints : ndarray, shape (4,)
-        Red above green of the triangle, green above red of the squares, as shares of the median square's; grey being
-        what the units are. A black square in the dark has none, whatever the ratio of its few grey levels says.
+        Red of the triangle, green of the squares above their other colours, as shares of the median square's; grey
+        being what the units are. A black square in the dark has none, whatever the ratio of its few grey levels says.
+    cast : ndarray, shape (2,)
+        Blue and red of the units as shares of their green.
     """
 
     margins: Array
     tints: Array
+    cast: Array
 
 
 def marker_colours(signal: MarkerSignal, plate_from_image: Array, centroids: Array, units: Array) -> MarkerColours:
@@ -153,16 +157,22 @@ def marker_colours(signal: MarkerSignal, plate_from_image: Array, centroids: Arr
     pixels = (projected[:, :2] / projected[:, 2:] - (signal.scale - 1) / 2) / signal.scale
     height, width = signal.opponent.shape
     at = np.clip(np.rint(pixels[:, ::-1]), 0, (height - 1, width - 1)).astype(int).T
-    strength, green, red = (plane[at[0], at[1]].astype(float) for plane in
-                            (signal.opponent, signal.planes.green, signal.planes.red))  # fmt: skip
+    planes = signal.planes
+    strength, blue, green, red = (plane[at[0], at[1]].astype(float) for plane in
+                                  (signal.opponent, planes.blue, planes.green, planes.red))  # fmt: skip
     spots = 4 * len(_SPOTS)
-    grey = red[spots:].sum() / max(green[spots:].sum(), 1.0)
+    cast = np.array([plane[spots:].sum() for plane in (blue, green, red)])
+    cast = np.maximum(cast, 1.0) / max(cast[1], 1.0)
     sign = np.array([1, -1, -1, -1])
     inside = strength[:spots].reshape(4, -1).mean(axis=1)
     between = strength[spots:]
-    tints = sign * (red - grey * green)[:spots].reshape(4, -1).mean(axis=1)
+    # as grey units would look in the same light
+    blue, green, red = (
+        plane[:spots].reshape(4, -1).mean(axis=1) / c for plane, c in zip((blue, green, red), cast, strict=True)
+    )
+    tints = np.where(sign > 0, red - np.maximum(green, blue), green - np.maximum(red, blue))
     return MarkerColours(sign * (inside - between.mean()) / (between.std() + 1.0),
-                         tints / max(float(np.median(tints[1:])), 1.0))  # fmt: skip
+                         tints / max(float(np.median(tints[1:])), 1.0), cast[[0, 2]])  # fmt: skip
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -171,6 +181,27 @@ def _ratio(green, red, opponent):  # type: ignore[no-untyped-def]
         r = np.float32(red[k])
         g = np.float32(green[k])
         opponent[k] = np.int16(np.int32(np.float32(256.0) * (r - g) / (r + g + np.float32(24.0))))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _block_means(signal, means):  # type: ignore[no-untyped-def]
+    """Means of about equal blocks of a signal."""
+    height, width = signal.shape
+    rows, columns = means.shape
+    total = np.empty(columns, np.int32)
+    for r in range(rows):
+        y0 = r * height // rows
+        y1 = (r + 1) * height // rows
+        total[:] = 0
+        for y in range(y0, y1):
+            for c in range(columns):
+                row = np.int32(0)
+                for x in range(c * width // columns, (c + 1) * width // columns):
+                    row += signal[y, x]
+                total[c] += row
+        for c in range(columns):
+            area = (y1 - y0) * ((c + 1) * width // columns - c * width // columns)
+            means[r, c] = np.int16(np.rint(total[c] / area))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

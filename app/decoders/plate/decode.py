@@ -40,6 +40,9 @@ RIVAL_CELLS = 3  # by which every other registered position plate must differ mo
 FLAT_LIGHT = (0.65, 1.5)  # light on a cell of one level against that around, beyond which it may be a stain
 STRAY, STRAY_TRUST = 0.23, 0.97  # share of the contrast from which a unit is no sure reading, worn or stained
 STRAY_CLEAR, CLEAR_UNIT_PX = 0.16, 3.0  # the same where a unit is so large that its own noise strays less
+MOST_DAMAGE, STAIN_UNIT_PX = 0.34, 2.0  # in digits without a check; more on units of fewer pixels, which say less
+STAIN_DARK, STAIN_LIGHT = 0.07, 0.105  # share of the contrast from which a unit's residual may be a stain
+LEAST_OF_A_LEVEL = 6  # light or dark units that say what is usual among them
 LEAST_CODEWORD = 0.05  # probability of the symbols, as read, from which a check that holds is no chance
 LETTERS_OUT_OF_REACH = 12.0  # cost of reading letters as digits up to which a plate may be a decimal one
 _DARK_SHARE = 0.12
@@ -66,6 +69,9 @@ class UnitEvidence:
     stray : ndarray, shape (cells,)
         Distance of each cell's worst unit from the level that it was given, as a share of the contrast; more counts
         on plates whose units are large.
+    damage : float
+        The largest stray times how far the residual of some unit's pixels stands out of the others'. A stain that
+        turns a light unit dark ends beside it, on gaps and neighbours, and the plate has others that stop half way.
     scatter : float
         Mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model.
     span : float
@@ -77,6 +83,7 @@ class UnitEvidence:
     dark: npt.NDArray[np.bool_]
     disputed: npt.NDArray[np.bool_]
     stray: Array
+    damage: float
     weight: Array
     residual: Array
     contrast: float
@@ -164,11 +171,28 @@ def weigh_units(fit: PlateFit) -> UnitEvidence | None:
     stray = _level_distance(even, dark, contrast).reshape(-1, 4).max(axis=1)
     if fit.unit_px >= CLEAR_UNIT_PX:
         stray *= STRAY / STRAY_CLEAR
+    misfit = np.sqrt(fit.unit_misfit.reshape(-1)[unit_index(n).reshape(-1)])
+    damage = float(stray.max()) * _worst_misfit(misfit, values, dark)
+    damage *= min(1.0, fit.unit_px / STAIN_UNIT_PX)
     stray = np.where(_flat_patches(light, dark, n), 1.0, stray)
     return UnitEvidence(
-        costs - costs.min(axis=1, keepdims=True), best, dark > 0.5, disputed, stray, weight, residual, contrast,
+        costs - costs.min(axis=1, keepdims=True), best, dark > 0.5, disputed, stray, damage, weight, residual, contrast,
         scatter / len(residual), light_level - dark_level,
     )  # fmt: skip
+
+
+def _worst_misfit(misfit: Array, values: Array, dark: Array) -> float:
+    """Largest residual of a unit's pixels, as a multiple of what units of its level usually have.
+
+    Residuals that are small against the contrast do not count; on light units less, as stains make dark ones.
+    """
+    light = dark < 0.5
+    if min(light.sum(), len(dark) - light.sum()) < LEAST_OF_A_LEVEL:
+        return float(misfit.max() / max(float(np.median(misfit)), 1e-9))
+    usual = np.where(light, np.median(misfit[light]), np.median(misfit[~light]))
+    contrast = float(np.median(values[light]) - np.median(values[~light]))
+    counts = misfit > np.where(light, STAIN_LIGHT, STAIN_DARK) * contrast
+    return float((misfit / np.maximum(usual, 1e-9))[counts].max(initial=0.0))
 
 
 def _flat_patches(light: Array, dark: Array, n: int) -> npt.NDArray[np.bool_]:
@@ -308,7 +332,13 @@ def pattern_cost(evidence: UnitEvidence, code: PlateCode) -> float:
 
 
 def decode_symbols(
-    evidence: UnitEvidence, n: int, codebook: Sequence[PlateCode], sure: float, *, clean: bool = True
+    evidence: UnitEvidence,
+    n: int,
+    codebook: Sequence[PlateCode],
+    sure: float,
+    *,
+    clean: bool = True,
+    most_damage: float = MOST_DAMAGE,
 ) -> DecodedSymbols:
     """Most likely code: read as it is, corrected, or taken from the codebook, in this order.
 
@@ -323,11 +353,13 @@ def decode_symbols(
         Least probability at which digits are given out.
     clean : bool
         The image looks so much like a plate that wrong cells may be corrected without a registry.
+    most_damage : float
+        Of digits that neither a check nor the registry confirms.
     """
     read = _decode_alone(evidence, n, sure, clean=clean)
     known = [code for code in codebook if code.n == n]
     if not known:
-        return read
+        return _unless_damaged(read, evidence, most_damage)
     same = next((code for code in known if read.code is not None and code.digits == read.code.digits), None)
     if same is not None:
         return replace(read, code=same, confirmed=True)
@@ -339,7 +371,14 @@ def decode_symbols(
     near = min(known, key=lambda code: pattern_cost(evidence, code))
     if read.code is not None and sum(a != b for a, b in zip(near.digits, read.code.digits, strict=True)) <= n // 2:
         return replace(read, code=None, reason=f"close to the registered {near.digits}, but not the same")
-    return read
+    return _unless_damaged(read, evidence, most_damage)
+
+
+def _unless_damaged(read: DecodedSymbols, evidence: UnitEvidence, most: float) -> DecodedSymbols:
+    """Digits that neither a check nor the registry confirms are no reading when a unit looks stained."""
+    if read.code is None or read.code.scheme is PlateScheme.ID or evidence.damage <= most:
+        return read
+    return replace(read, code=None, reason="a unit looks stained, and nothing checks these digits")
 
 
 def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> DecodedSymbols | None:

@@ -8,6 +8,7 @@ first on an image of two or three pixels a unit, then on one of more.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -55,6 +56,8 @@ class PlateFit:
         Of the units in the order of `unit_order`, everything else free.
     unit_order : ndarray of int
         Flat indices into the grid.
+    unit_misfit : ndarray, shape (n, n)
+        Mean squared residual of the pixels on each unit and its halves of the gaps. [1]
     markers : ndarray, shape (5,)
         Triangle, its other half, squares clockwise. [1]
     gap, road : float
@@ -75,6 +78,7 @@ class PlateFit:
     units: Array
     units_covariance: Array
     unit_order: npt.NDArray[np.intp]
+    unit_misfit: Array
     markers: Array
     gap: float
     road: float
@@ -143,7 +147,12 @@ _THOROUGH = (_Stage(2.4, 2, 6), _Stage(3.5, 4, 4))  # a thermal camera's plates 
 
 
 def fit_plate(
-    image: npt.NDArray[Any], centroids_px: Array, geometry: PlateGeometry, *, linear: bool = False
+    image: npt.NDArray[Any],
+    centroids_px: Array,
+    geometry: PlateGeometry,
+    *,
+    linear: bool = False,
+    promising: Callable[[Array, float], bool] | None = None,
 ) -> PlateFit | None:
     """Fit a plate whose marker centroids are roughly known.
 
@@ -156,6 +165,8 @@ def fit_plate(
     geometry : PlateGeometry
     linear : bool
         The levels are proportional to what is seen, as a thermal camera's; else they are gamma encoded.
+    promising : callable, optional
+        Asked after the coarse stage with plate_from_image and the share explained; when it says no, that is all.
 
     Returns
     -------
@@ -173,6 +184,7 @@ def fit_plate(
     coef = np.zeros(geometry.n**2 - 16 + SINGLES)
     normal = np.empty((len(coef) + POSE, len(coef) + POSE))
     corners = np.empty((4, 2))
+    misfit = np.empty((geometry.n, geometry.n, 2))
     variance, explained, pixels = 0.0, 0.0, 0
     for number, stage in enumerate(_THOROUGH if linear else _QUICK):
         first = number == 0
@@ -184,15 +196,15 @@ def fit_plate(
         if first:
             coef[:] = patch.light.mean()
         ok, variance, explained, pixels = _gauss_newton(
-            patch.light, patch.weights, patch.grid, NORMAL_TABLE, frame, pose, edges, slot, coef, normal,
+            patch.light, patch.weights, patch.grid, NORMAL_TABLE, frame, pose, edges, slot, coef, normal, misfit,
             stage.nodes, stage.steps, first,
         )  # fmt: skip
-        if not ok:
+        if not ok or (first and promising is not None and not promising(_matrix(pose, frame), explained)):
             return None
     covariance = invert(normal) * variance
     if not covariance.size:
         return None
-    return _result(frame, pose, slot, coef, covariance, math.sqrt(variance), explained, pixels)
+    return _result(frame, pose, slot, coef, covariance, misfit, math.sqrt(variance), explained, pixels)
 
 
 def _first_blur(points_px: Array, n: int) -> float:
@@ -361,7 +373,7 @@ def _box_around(corners, grid, shape, box, margin, extents):  # type: ignore[no-
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _gauss_newton(  # type: ignore[no-untyped-def]
-    light, weights, grid, table, frame, pose, edges, slot, coef, normal, most_nodes, steps, first,
+    light, weights, grid, table, frame, pose, edges, slot, coef, normal, misfit, most_nodes, steps, first,
 ):  # fmt: skip
     """Move pose and shape values until the corners rest.
 
@@ -390,7 +402,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
         rhs[:] = 0.0
         accumulate(
             light, weights, grid, box, frame, pose, edges, slot, coef, nodes, node_weights, direction, by_spread,
-            margin, table, normal, cross, inner, rhs[:shapes], rhs[shapes:], sums,
+            margin, table, normal, cross, inner, rhs[:shapes], rhs[shapes:], sums, misfit,
         )  # fmt: skip
         normal[shapes:, :shapes] = cross.T
         normal[shapes:, shapes:] = inner
@@ -432,7 +444,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
 
 
 def _result(
-    frame: Array, pose: Array, slot: npt.NDArray[np.int64], coef: Array, covariance: Array,
+    frame: Array, pose: Array, slot: npt.NDArray[np.int64], coef: Array, covariance: Array, misfit: Array,
     residual: float, explained: float, pixels: int,
 ) -> PlateFit:  # fmt: skip
     n, shapes = len(slot), len(coef)
@@ -447,6 +459,7 @@ def _result(
         units=units,
         units_covariance=covariance[: len(order), : len(order)],
         unit_order=order,
+        unit_misfit=misfit[..., 1] / np.maximum(misfit[..., 0], 1e-12),
         markers=coef[shapes - SINGLES : shapes - 8],
         gap=float(coef[shapes - 8 : shapes - 4].mean()),
         road=float(coef[shapes - 4 :].mean()),

@@ -137,7 +137,7 @@ def _shape_error(b, pxx, pxy, pyy):  # type: ignore[no-untyped-def]
     high = t / 2 + root
     if low <= 0:
         return 9.0
-    return max(abs(np.log(low)), abs(np.log(high)))
+    return np.log(max(high, 1.0 / low))  # one logarithm is the larger magnitude, on whichever side of 1 they are
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -186,10 +186,10 @@ def _green_triples(blobs, greens, opponent, quads):  # type: ignore[no-untyped-d
             other = blobs[greens[b]]
             if abs(other[2] - corner[2]) > reach or abs(other[3] - corner[3]) > reach:
                 continue
-            m = abs(np.log(other[7] / corner[7]))
-            if m > 1.3 or abs(np.log(other[12] / corner[12])) > 1.3:
+            larger = max(other[7] / corner[7], corner[7] / other[7])
+            if larger > 3.67 or other[12] > 3.67 * corner[12] or corner[12] > 3.67 * other[12]:
                 continue
-            k = _keep_nearest(near, merit, k, greens[b], m)
+            k = _keep_nearest(near, merit, k, greens[b], larger)
         for i in range(k):
             for j in range(k):
                 if i == j:
@@ -208,11 +208,11 @@ def _green_triples(blobs, greens, opponent, quads):  # type: ignore[no-untyped-d
                 if ratio < 1.6 or ratio > 7.5:
                     continue
                 pxx, pxy, pyy = _square_moments(px, py, qx, qy, ratio)
-                shape = max(
-                    _shape_error(g1, pxx, pxy, pyy),
-                    _shape_error(g2, pxx, pxy, pyy),
-                    _shape_error(corner, pxx, pxy, pyy),
-                )
+                shape = 0.0
+                for square in (corner, g1, g2):
+                    shape = max(shape, _shape_error(square, pxx, pxy, pyy))
+                    if shape > 1.8:
+                        break
                 if shape > 1.8:
                     continue
                 # the triangle's centroid is nearer to the plate's corner than a square's
@@ -289,9 +289,9 @@ def _quads_of_red(blobs, red, near, quads, found):  # type: ignore[no-untyped-de
         for j in range(near.shape[0]):
             g1 = blobs[near[i]]
             g2 = blobs[near[j]]
-            similar = abs(np.log(g1[7] / g2[7]))
-            if i == j or similar > 1.4:
+            if i == j or g1[7] > 4.06 * g2[7] or g2[7] > 4.06 * g1[7]:
                 continue
+            similar = abs(np.log(g1[7] / g2[7]))
             for role in range(3):  # which two green squares: 0 = TR, BL; 1 = TR, BR; 2 = BR, BL
                 if role == 0:
                     px, py, qx, qy = g1[2] - red[2], g1[3] - red[3], g2[2] - red[2], g2[3] - red[3]
@@ -307,8 +307,10 @@ def _quads_of_red(blobs, red, near, quads, found):  # type: ignore[no-untyped-de
                 if size_ratio < 1.6 or size_ratio > 7.5:
                     continue
                 moments = _square_moments(px, py, qx, qy, size_ratio)
-                shape = max(_shape_error(g1, moments[0], moments[1], moments[2]),
-                            _shape_error(g2, moments[0], moments[1], moments[2]))  # fmt: skip
+                shape = _shape_error(g1, moments[0], moments[1], moments[2])
+                if shape > 2.2:
+                    continue
+                shape = max(shape, _shape_error(g2, moments[0], moments[1], moments[2]))
                 if shape > 2.2:
                     continue
                 x = red[2] + (px if role != 1 else 0.0) + (qx if role != 2 else 0.0)

@@ -19,7 +19,7 @@ from app.decoders.plate.colour import (
     marker_colours,
     vivid_signal,
 )
-from app.decoders.plate.decode import DecodedSymbols, decode_symbols, weigh_units
+from app.decoders.plate.decode import MOST_DAMAGE, DecodedSymbols, decode_symbols, weigh_units
 from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids, project, unit_centres
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.pose import locate_plate
@@ -36,11 +36,17 @@ SURE = 0.9995  # least probability at which digits are given out
 MOST_FITS = 5  # candidates that are fitted in one pass
 LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
 LEAST_EXPLAINED_ALONE = 0.83  # the same for digits that no registry confirms
+LEAST_EXPLAINED_SMALL, SMALL_UNIT_PX = 0.9, 2.5  # the same where a grid that lies wrong explains nearly as much
 CLEAN_EXPLAINED = 0.93  # from which a word may be corrected without a registry
 STRONG_RANK = 3.5  # of a candidate that deserves a second geometry when the first explains nothing
 LEAST_MARGIN = 1.0  # colour margin of a marker that is there
 LEAST_MARGIN_ALONE = 2.2  # the same without a registry
-LEAST_TINT_ALONE = 0.25  # red or green of a marker against the median square, the same
+LEAST_TINT_ALONE = 0.35  # red or green of a marker against the median square, the same
+CAST_ALONE = (0.65, 1.5)  # blue and red of the units against their green, beyond which they are no greys, the same
+# after the coarse stage of a fit: margin and tint of the second weakest marker, cast of the units
+COARSE_MARGIN, COARSE_TINT, COARSE_CAST = 1.5, 0.4, (0.74, 1.35)
+COARSE_WEAKEST = (1.0, 0.3)  # margin and tint of the weakest, unless a marker is missing on what is plainly a plate:
+PLAIN_EXPLAINED, PLAIN_MARGIN = 0.93, 8.0  # so much is explained, or the second weakest stands out so far
 LEAST_SIDE_PX = 24
 SAME_MARKER = 0.03  # distance of two candidates' markers, as a share of the plate, up to which one fit serves both
 Frame = npt.NDArray[Any]
@@ -57,15 +63,24 @@ class _Task:
     geometries: Sequence[PlateGeometry]
     fits: list[tuple[PlateGeometry, Array, PlateFit | None]] = field(default_factory=list)
 
-    def fit_candidate(self, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
+    def fit_candidate(self, signal: MarkerSignal, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
         """Fit of a candidate; that of about the same markers in an earlier pass serves again."""
+        plain = True
+
+        def promising(plate_from_image: Array, explained: float) -> bool:
+            nonlocal plain
+            colours = marker_colours(signal, plate_from_image, marker_centroids(geometry), unit_centres(geometry))
+            plain = _may_be_plate(colours, explained)
+            return plain
+
         reach_px = SAME_MARKER * np.ptp(quad.centroids_px, axis=0) + 0.5
         for known, centroids_px, earlier in self.fits:
             apart_px = np.abs(centroids_px - quad.centroids_px)
             if known == geometry and (apart_px < reach_px).all():
                 return earlier
-        fit = fit_plate(self.image, quad.centroids_px, geometry)
-        self.fits.append((geometry, quad.centroids_px, fit))
+        fit = fit_plate(self.image, quad.centroids_px, geometry, promising=promising)
+        if plain:  # else another signal's colours may say more
+            self.fits.append((geometry, quad.centroids_px, fit))
         if fit is not None and fit.explained > CLEAN_EXPLAINED:
             fitted_px = project(np.linalg.inv(fit.plate_from_image), marker_centroids(geometry))
             self.fits.append((geometry, fitted_px, fit))
@@ -205,7 +220,7 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
     """The candidate's best reading under the geometries that fit it; empty when it is no plate."""
     best: PlateReading | None = None
     for geometry in _likely_geometries(quad, task.geometries):
-        fit = task.fit_candidate(quad, geometry)
+        fit = task.fit_candidate(signal, quad, geometry)
         if fit is None or fit.explained < LEAST_EXPLAINED:
             if quad.rank < STRONG_RANK:
                 break
@@ -213,7 +228,7 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
         colours = marker_colours(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
         if np.sort(colours.margins)[1] < LEAST_MARGIN:
             continue
-        missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins) or _pale_marker(colours)
+        missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins) or _odd_colours(colours)
         reading = _judge(task, fit, geometry, missing, weakest_marker=float(colours.margins.min()))
         if reading.code is not None:
             return [reading]
@@ -222,6 +237,19 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
         if fit.explained > CLEAN_EXPLAINED or quad.rank < STRONG_RANK:
             break
     return [best] if best else []
+
+
+def _may_be_plate(colours: MarkerColours, explained: float) -> bool:
+    """Whether a coarse fit is worth a fine one: most of what is not a plate has no colours where a plate has them."""
+    margins, tints = np.sort(colours.margins), np.sort(colours.tints)
+    weakest = margins[0] >= COARSE_WEAKEST[0] and tints[0] >= COARSE_WEAKEST[1]
+    return bool(
+        (weakest or explained >= PLAIN_EXPLAINED or margins[1] >= PLAIN_MARGIN)
+        and margins[1] >= COARSE_MARGIN
+        and tints[1] >= COARSE_TINT
+        and COARSE_CAST[0] < colours.cast.min()
+        and colours.cast.max() < COARSE_CAST[1]
+    )
 
 
 def _judge(
@@ -245,7 +273,10 @@ def _judge(
     if evidence is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
         return replace(reading, outcome=outcome, reason=reason)
-    decoded = decode_symbols(evidence, geometry.n, task.codebook, SURE, clean=fit.explained > CLEAN_EXPLAINED)
+    decoded = decode_symbols(
+        evidence, geometry.n, task.codebook, SURE, clean=fit.explained > CLEAN_EXPLAINED,
+        most_damage=math.inf if task.image.ndim == 2 else MOST_DAMAGE,  # no stain hides a heater
+    )  # fmt: skip
     reading = replace(
         reading,
         confidence=decoded.confidence,
@@ -256,7 +287,8 @@ def _judge(
     if decoded.code is None:
         outcome, reason = missing or _undecoded(decoded)
         return replace(reading, outcome=outcome, reason=reason)
-    weak = missing is not None or fit.explained < LEAST_EXPLAINED_ALONE
+    least = LEAST_EXPLAINED_SMALL if fit.unit_px < SMALL_UNIT_PX else LEAST_EXPLAINED_ALONE
+    weak = missing is not None or fit.explained < least
     if weak and not decoded.confirmed:
         outcome, reason = missing or (PlateOutcome.UNSURE, "the plate's pattern explains too little of the image")
         return replace(reading, outcome=outcome, reason=reason)
@@ -293,13 +325,15 @@ def _missing_parts(
     return None
 
 
-def _pale_marker(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
-    """A marker that may be one, but too pale to be believed without a registry: a look-alike or a worn plate."""
+def _odd_colours(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
+    """A marker or units whose colours are not believed without a registry: a look-alike or a worn plate."""
     pale = (colours.margins < LEAST_MARGIN_ALONE) | (colours.tints < LEAST_TINT_ALONE)
     if pale[0]:
         return PlateOutcome.RED_MARKER_MISSING, "what stands for the red triangle is hardly red"
     if pale.any():
         return PlateOutcome.GREEN_MARKER_MISSING, "what stands for a green square is hardly green"
+    if colours.cast.min() < CAST_ALONE[0] or colours.cast.max() > CAST_ALONE[1]:
+        return PlateOutcome.CELLS_UNDECODABLE, "what stands for the units is coloured"
     return None
 
 

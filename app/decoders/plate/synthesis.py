@@ -208,7 +208,7 @@ def _add_rows(jac, value, index, entries, target, weight, normal, cross, inner, 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def accumulate(  # type: ignore[no-untyped-def]
     light, weights, grid, box, frame, pose, edges, slot, coef, nodes, node_weights, direction, by_spread, margin, table,
-    normal, cross, inner, rhs, rhs_pose, sums,
+    normal, cross, inner, rhs, rhs_pose, sums, misfit,
 ):  # fmt: skip
     """Normal equations of shape values and pose from every pixel in a box, shape values taken as `coef`.
 
@@ -231,6 +231,8 @@ def accumulate(  # type: ignore[no-untyped-def]
     sums : ndarray, shape (8,)
         Is set: pixels; pixels inside, their weight, squared residual, light, light squared; all pixels' variance about
         their mean, and their light squared.
+    misfit : ndarray, shape (n, n, 2)
+        Is set: weight of the pixels on each unit with the half of the gaps around it, and their squared residual.
     """
     n = edges.shape[0]
     shapes = coef.shape[0]
@@ -250,6 +252,9 @@ def accumulate(  # type: ignore[no-untyped-def]
     many = nodes.shape[0] > 1
     motion = 0.0 if many else math.sqrt(pose[9])
     sums[:] = 0.0
+    misfit[:] = 0.0
+    pitch = edges[1, 0] - edges[0, 0]
+    border = 0.5 * (edges[0, 0] + edges[0, 1] - pitch)  # of the units with their halves of the gaps
     all_w = 0.0
     all_t = 0.0
     for y in range(box[1], box[3]):
@@ -351,6 +356,10 @@ def accumulate(  # type: ignore[no-untyped-def]
                 sums[3] += weight * residual * residual
                 sums[4] += weight * target
                 sums[5] += weight * target * target
+                row = min(max(int((v0 - border) / pitch), 0), n - 1)
+                column = min(max(int((u0 - border) / pitch), 0), n - 1)
+                misfit[row, column, 0] += weight
+                misfit[row, column, 1] += weight * residual * residual
             else:
                 off = (target - road_light) / ROAD_SPREAD
                 weight *= ROAD_WEIGHT / (1.0 + off * off)

@@ -8,7 +8,7 @@ import pytest
 from app.decoders.plate import decode_plates
 from app.markers.plate import PlateCode, code_cells
 from app.markers.reading import PlateOutcome, PlateReading
-from app.simulation.plate_face import Face
+from app.simulation.plate_face import Face, PlateWear
 from app.simulation.plate_scene import PlacedFace
 from tests.decoders.plate.scenes import PAPER, face_of, marker_units, painted, shoot, shoot_plate
 
@@ -102,6 +102,29 @@ def test_a_plate_half_out_of_the_frame_is_never_read_wrong(cut: str, share: floa
 def test_a_face_without_dark_units_is_undecodable() -> None:
     readings = decode_plates(shoot_plate(PlateCode("000000000000"), ahead_m=AHEAD_M).image)
     assert {r.outcome for r in readings} == {PlateOutcome.CELLS_UNDECODABLE}
+
+
+@pytest.mark.parametrize("seed", [20, 53, 95])
+def test_a_stain_that_turns_a_light_unit_dark_is_no_digit(seed: int) -> None:
+    """Each of these shows a wrong digit, every cell clear: what tells is that stains end beside units, too."""
+    wear = PlateWear(contrast_loss=0.2, patchy_loss=0.4, dirt_blobs=3, dirt_mm=16.0)
+    readings = read_face(face_of(wear=wear, seed=seed), turn_deg=20.0)
+    assert digits_in(readings) == []
+    assert [r.outcome for r in readings] == [PlateOutcome.UNSURE]
+    assert "stained" in readings[0].reason
+
+
+def test_the_registry_vouches_for_digits_beside_a_stain() -> None:
+    wear = PlateWear(contrast_loss=0.2, patchy_loss=0.4, dirt_blobs=3, dirt_mm=16.0)
+    face = face_of(wear=wear, seed=5)
+    assert digits_in(read_face(face, turn_deg=20.0)) == []
+    assert digits_in(read_face(face, turn_deg=20.0, codebook=(PAPER, PlateCode("123456789012")))) == [PAPER.digits]
+
+
+def test_the_same_stain_does_not_matter_where_digits_are_checked() -> None:
+    wear = PlateWear(contrast_loss=0.2, patchy_loss=0.4, dirt_blobs=3, dirt_mm=16.0)
+    for seed in (20, 53, 95):
+        assert digits_in(read_face(face_of(ID, wear=wear, seed=seed), turn_deg=20.0)) in ([], [ID.digits])
 
 
 @pytest.mark.parametrize("how", ["inverted", "stained", "unreadable"])
