@@ -27,6 +27,7 @@ from app.jobs.memory import memory_is_the_limit
 from app.jobs.signal_plot import SignalPicture
 from app.sensors.pose_track import PoseTrack
 from app.services.packets import DriveFiles, DriveTask, LaneResult, LaneTask, OverlayTask, packet_terms
+from app.services.positions import naming
 from app.simulation.steering import SteeringCheck, check_steering
 
 _DEFAULT_SPEED_KM_H = 50.0
@@ -61,9 +62,11 @@ def _read_drive(task: DriveTask) -> DriveFiles:
         elif kind == "poses":
             if track is not None:
                 raise _twice("track", part.name)
-            track, reports[part.name] = read_poses(part.name, data, terms.poses)
+            with naming("packets"):
+                track, reports[part.name] = read_poses(part.name, data, terms.poses)
         else:
-            log = read_packets(part.name, data, terms.packets, task.packets)
+            with naming("packets"):
+                log = read_packets(part.name, data, terms.packets, task.packets)
             first = sum(report.entries for name, report in reports.items() if name != part.name)
             packets += [replace(packet, entry=packet.entry + first) for packet in log.packets]
             reports[part.name] = log.report

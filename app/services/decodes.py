@@ -107,9 +107,9 @@ class Decodes:
                 answer = find_answer(connection, caller.agency_id, key, self._clock())
             if answer is not None:
                 return answer, True
+        if not data and (context.trace is not None or context.packets is not None):
+            raise UnreadableUpload("the file is empty", field="file", cure="send the recording again, whole")
         if context.trace is not None:
-            if not data:
-                raise UnreadableUpload("the file is empty", field="file", cure="send the recording again, whole")
             if len(data) <= self._rules.trace_at_once_bytes:
                 return self._decode_trace(caller, data, context, key)
             return self._put_in_queue(caller, TRACE, data, context, key)

@@ -261,13 +261,21 @@ def _packet_declaration(declared: Mapping[str, Any]) -> PacketDeclaration:
 
 
 def _pose_declaration(declared: Mapping[str, Any]) -> PoseDeclaration:
-    day = declared.get("date")
     return PoseDeclaration(
         _clock(declared.get("clock") or {}),
         declared.get("columns") or {},
         declared.get("crs"),
-        date.fromisoformat(day) if day else None,
+        _date(declared["date"]) if declared.get("date") else None,
     )
+
+
+def _date(text: str) -> date:
+    try:
+        return date.fromisoformat(text)
+    except ValueError as error:
+        raise InvalidParameter(
+            f"{text} is no date", field="poses.date", limit="YYYY-MM-DD", cure="give the UTC date of the first position"
+        ) from error
 
 
 def _clock(declared: Mapping[str, Any]) -> LogClock:

@@ -113,8 +113,8 @@ class HeardOrder:
             return np.asarray(heard_s, float) - (self._made_before_s[at] + asked * self._interval_s)
 
     def early_s(self, sequences: npt.ArrayLike, heard_s: npt.ArrayLike) -> Floats:
-        """How long before a lower sequence each was heard; -inf where there is no lower one."""
-        at = np.searchsorted(self._sequences, np.asarray(sequences, float), side="left")
+        """How long before a lower sequence, or the same, each was heard; -inf where there is none."""
+        at = np.searchsorted(self._sequences, np.asarray(sequences, float), side="right")
         return np.asarray(self._heard_after_s[at] - np.asarray(heard_s, float))
 
 
