@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from app.encoders.cerpm.airtime import time_on_air_s
+from app.encoders.cerpm.airtime import check_modulation, symbol_time_s, time_on_air_s
+from app.encoders.cerpm.link import LinkModel, sensitivity_dbm
 from app.errors import InvalidParameter
 from app.markers.cerpm import MESSAGE_BYTES
 
@@ -16,15 +17,6 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-NEAR_M, NEAR_DBM, FAR_M, FAR_DBM = 50.0, -108.0, 340.0, -125.0
-"""CERPM paper, section 4.1."""
-EXPONENT = (NEAR_DBM - FAR_DBM) / (10 * math.log10(FAR_M / NEAR_M))
-SENSITIVITY_DBM = {
-    125_000: {7: -123.0, 8: -126.0, 9: -129.0, 10: -132.0, 11: -133.0, 12: -136.0},
-    250_000: {7: -120.0, 8: -123.0, 9: -125.0, 10: -128.0, 11: -130.0, 12: -133.0},
-    500_000: {7: -116.0, 8: -119.0, 9: -122.0, 10: -125.0, 11: -128.0, 12: -130.0},
-}
-"""By bandwidth and spreading factor: Semtech SX1276 data sheet, RFS_L125_HF, RFS_L250_HF, RFS_L500_HF. [dBm]"""
 _NOISE_FIGURE_DB = 6.0
 _SOFT_DB = 0.35
 """Scale of the logistic step from hearing nothing to hearing all about the sensitivity. [dB]"""
@@ -70,12 +62,7 @@ class Radio:
     fading_sd_db: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.bandwidth_hz not in SENSITIVITY_DBM or self.spreading_factor not in SENSITIVITY_DBM[self.bandwidth_hz]:
-            raise InvalidParameter(
-                f"SF{self.spreading_factor} at {self.bandwidth_hz} Hz",
-                field="radio",
-                limit="SF7 to SF12 at 125,000, 250,000 or 500,000 Hz",
-            )
+        check_modulation(self.spreading_factor, self.bandwidth_hz)
         if not (0 <= self.jitter < 0.5 and (1 - 2 * self.jitter) * self.interval_s > self.airtime_s):
             raise InvalidParameter(
                 f"an interval of {self.interval_s:g} s with a jitter of {self.jitter:g}",
@@ -98,12 +85,12 @@ class Radio:
     @property
     def symbol_s(self) -> float:
         """[s]"""
-        return float(2**self.spreading_factor / self.bandwidth_hz)
+        return symbol_time_s(self.spreading_factor, self.bandwidth_hz)
 
     @property
     def sensitivity_dbm(self) -> float:
         """Half of the packets at this strength are heard. [dBm]"""
-        return SENSITIVITY_DBM[self.bandwidth_hz][self.spreading_factor]
+        return sensitivity_dbm(self.spreading_factor, self.bandwidth_hz)
 
     @property
     def noise_dbm(self) -> float:
@@ -132,7 +119,7 @@ class Transmissions:
 
 def mean_rssi_dbm(distance_m: npt.ArrayLike) -> Floats:
     """Strength by distance, without shadows and fading: log-distance through the paper's two points. [dBm]"""
-    return np.asarray(NEAR_DBM - 10 * EXPONENT * np.log10(np.maximum(np.asarray(distance_m, float), 1.0) / NEAR_M))
+    return LinkModel().level_dbm(distance_m)
 
 
 def send_beacons(
