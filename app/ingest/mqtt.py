@@ -117,16 +117,9 @@ class MqttIngest:
         NotAllowed
             The broker or the server refuses to let this client in.
         """
-        parts = urlsplit(self._source.url)
-        port = parts.port or (8883 if parts.scheme == "mqtts" else 1883)
         try:
-            self._client.connect(str(parts.hostname), port, keepalive=30)
-        except OSError as error:
-            raise Unavailable(
-                f"the broker at {parts.hostname}:{port} does not answer: {error}", field="broker"
-            ) from error
-        self._client.loop_start()
-        try:
+            self._connect()
+            self._client.loop_start()
             self._collect()
         finally:
             self._client.disconnect()
@@ -142,6 +135,16 @@ class MqttIngest:
         self._messages.put(None)
 
     # --- the broker's side ----------------------------------------------------------------------------------------
+
+    def _connect(self) -> None:
+        parts = urlsplit(self._source.url)
+        port = parts.port or (8883 if parts.scheme == "mqtts" else 1883)
+        try:
+            self._client.connect(str(parts.hostname), port, keepalive=30)
+        except OSError as error:
+            raise Unavailable(
+                f"the broker at {parts.hostname}:{port} does not answer: {error}", field="broker"
+            ) from error
 
     def _make_client(self) -> mqtt.Client:
         parts = urlsplit(self._source.url)
