@@ -111,7 +111,10 @@ def _fit(stock: Stock, taken: Bools, drive: Drive | None, rules: LaneRules, note
             stock, notes, "the markers do not lie along a lane, or are one row that tells no side", "waymark"
         )
     fit = Fit(line, stock, taken, drive, rules, notes)
-    whole = fit.run()
+    try:
+        whole = fit.run()
+    except np.linalg.LinAlgError:  # accuracies too unlike for the digits of a float
+        return _refused(stock, notes, "the accuracies of markers and track are too unlike to be weighed", "waymark")
     for k, (reason, off) in fit.left_out.items():
         notes.left_out.append(LeftOut(int(stock.row[k]), int(stock.number[k]), reason, off))
     if not whole:

@@ -82,11 +82,10 @@ def stock_from_markers(markers: LaneMarkers, rules: LaneRules, notes: Notes) -> 
 
 
 def _name_double(markers: LaneMarkers, rows: Ints, which: Ints, spread: Floats, rules: LaneRules, notes: Notes) -> None:
-    for k in np.flatnonzero(spread > rules.duplicate_m)[:]:
-        for row in rows[which == k]:
-            notes.left_out.append(
-                LeftOut(int(row), int(markers.number[row]), LeftOutReason.TWO_PLACES, float(spread[k]))
-            )
+    torn = spread[which] > rules.duplicate_m
+    for row, apart in zip(rows[torn].tolist(), spread[which][torn].tolist(), strict=True):
+        notes.left_out.append(LeftOut(row, int(markers.number[row]), LeftOutReason.TWO_PLACES, apart))
+    if torn.any():
         notes.doubt("a number claims two places: its claims are left out")
 
 

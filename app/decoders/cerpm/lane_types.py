@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -76,8 +77,6 @@ class LaneRules:
     ----------
     usual_width_m : float
         Width where only one side is known. [m]
-    width_m : tuple of float
-        Narrowest and widest lane. [m]
     off_the_line_m : float
         A marker must stray at least this far from where its neighbours put it before it is left out. [m]
     off_the_line_z : float
@@ -99,7 +98,6 @@ class LaneRules:
     """
 
     usual_width_m: float = 3.3
-    width_m: tuple[float, float] = (2.2, 5.0)
     off_the_line_m: float = 0.6
     off_the_line_z: float = 5.0
     duplicate_m: float = 0.3
@@ -113,11 +111,8 @@ class LaneRules:
     def __post_init__(self) -> None:
         for name in self.__slots__:
             value = getattr(self, name)
-            values = np.atleast_1d(np.asarray(value, float))
-            if not (np.isfinite(values).all() and (values > 0).all()):
+            if not (math.isfinite(value) and value > 0):
                 raise InvalidParameter(f"{name} is {value}", field=f"rules.{name}", limit="positive and finite")
-        if not self.width_m[0] < self.width_m[1]:
-            raise InvalidParameter("the narrowest lane is wider than the widest", field="rules.width_m")
 
 
 class LeftOutReason(StrEnum):

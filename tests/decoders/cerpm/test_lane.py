@@ -211,4 +211,4 @@ def test_what_is_refused_as_a_call():
     with pytest.raises(InvalidParameter):
         LaneRules(usual_width_m=float("nan"))
     with pytest.raises(InvalidParameter):
-        LaneRules(width_m=(4.0, 3.0))
+        LaneRules(bridge_m=-1.0)
