@@ -96,8 +96,12 @@ def read_nmea(text: str, clock: LogClock, day: date | None, report: LogReport) -
         except (pynmeagps.NMEAParseError, pynmeagps.NMEATypeError, pynmeagps.NMEAMessageError, ValueError) as error:
             report.leave_out(entry, "malformed", f"a {kind} sentence that cannot be read: {str(error)[:120]}")
             continue
-        if parsed is not None:
+        if parsed is None:
+            continue
+        try:
             _take(entry, kind, parsed, reading)
+        except AttributeError:  # a cut sentence has no such field
+            report.leave_out(entry, "malformed", f"a {kind} sentence with fields missing")
     yield from _points(reading.epochs, clock, day, report)
 
 
@@ -153,7 +157,7 @@ def _take(entry: int, kind: str, said: Any, reading: _Reading) -> None:
         epoch = reading.epoch_at(entry, said.time)
         try:
             epoch.day = date(int(said.year), int(said.month), int(said.day))
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             reading.report.leave_out(entry, "malformed", "a ZDA sentence without a date")
     elif isinstance(getattr(said, "time", None), time):
         _take_position(entry, kind, said, reading)

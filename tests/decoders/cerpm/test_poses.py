@@ -219,6 +219,22 @@ def test_checksums_and_voids() -> None:
     assert report.reasons["no-fix"] == 2
 
 
+def test_cut_sentences_are_left_out() -> None:
+    track, report = read(
+        nmea(
+            rmc("133932.00"),
+            "GNGST,133932.00,1",
+            "GNRMC,133933.00",
+            "GPHDT",
+            "GNZDA,133934.00",
+            "GNZDA,133934.00,16,03,99999999999999999999,00,00",
+            rmc("133935.00"),
+        )
+    )
+    assert (track.time_s - AT_S).tolist() == [0, 3]
+    assert report.reasons["malformed"] >= 2
+
+
 def test_midnight() -> None:
     text = nmea(
         gga("235958.00"), rmc("235959.00", "311226"), gga("000000.00"), gga("000001.00"), rmc("000002.00", "010127")
