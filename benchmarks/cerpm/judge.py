@@ -67,11 +67,6 @@ class Tally:
         parts = [np.concatenate(p) if p else np.full(1, np.nan) for p in (self.confidence, self.right)]
         return float(parts[0].mean()), float(parts[1].mean())
 
-    @property
-    def worst_run_m(self) -> float:
-        """RMS of the worst run. [m]"""
-        return max((_rms([o]) for o in self.off_m if len(o)), default=float("nan"))
-
 
 def judge_path(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> Tally:
     """Errors of a path.

@@ -160,7 +160,7 @@ def _through_text(spans: Spans) -> dict[int, tuple[SequenceSpan, ...]]:
 def _all_sent(drive: HeardDrive, laid: LaidMarkers) -> list[HeardPacket]:
     """What somebody beside the road recorded and the vehicle did not hear."""
     heard = scenes.payload_of(drive.packets)
-    out = []
+    out: list[HeardPacket] = []
     for sender, sequence, start in zip(drive.sent.sender, drive.sent.sequence, drive.sent.start_s, strict=True):
         payload = scenes.sign(marker_message(laid, int(sender), int(sequence)))
         if payload not in heard:
