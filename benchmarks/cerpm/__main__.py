@@ -16,6 +16,7 @@ RUNS: dict[str, Callable[[int, bool], Result]] = {
     "path": run_path, "spoof": run_spoof, "forged": run_forged, "dirty": run_dirty, "tracking": run_tracking,
     "radio": run_radio, "speed": run_speed,
 }  # fmt: skip
+ITEMS = tuple(RUNS)
 
 
 def main() -> None:
