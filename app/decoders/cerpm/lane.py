@@ -126,7 +126,9 @@ def _fit(stock: Stock, taken: Bools, drive: Drive | None, rules: LaneRules, note
     if len(found) == 1:
         notes.doubt("only one side of the lane was heard: the path lies half the usual width off it")
     if drive is None and not (stock.side[fit.used] != UNKNOWN).any():
-        notes.doubt("neither a track nor a side tells the direction of travel: it may be the other one")
+        notes.doubt(
+            "neither a track nor a marker tells a side: sides are guessed, and the direction of travel may be the other"
+        )
     lane = _lane(fit, stock, rules, notes)
     if not len(lane.sigma_m) or float(np.median(lane.sigma_m)) > rules.hopeless_sigma_m:
         return _refused(stock, notes, "the markers are too few or too coarse to tell where the lane runs", "waymark")
