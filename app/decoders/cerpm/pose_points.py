@@ -77,8 +77,8 @@ def track_of(name: str, points: Iterable[PosePoint], report: LogReport) -> PoseT
     new = np.diff(table[:, 0], prepend=-np.inf) > 0
     table = _keep(table, new, "same-time", "another position has the same time", report)
     table = _keep(table, ~_jumps(table), "jump", f"faster than {FASTEST_M_S:g} m/s from both sides", report)
-    heading = np.where(np.isfinite(table[:, 3]), table[:, 3] % 360.0, np.nan)
-    accuracy = np.where(table[:, 4] > 0, table[:, 4], np.nan)
+    heading = np.where(np.isfinite(table[:, 3]), table[:, 3], np.nan) % 360.0
+    accuracy = np.where((table[:, 4] > 0) & np.isfinite(table[:, 4]), table[:, 4], np.nan)
     return PoseTrack(table[:, 0], table[:, 1], table[:, 2], heading, accuracy)
 
 

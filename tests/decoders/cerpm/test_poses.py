@@ -235,6 +235,11 @@ def test_cut_sentences_are_left_out() -> None:
     assert report.reasons["malformed"] >= 2
 
 
+def test_headings_that_are_not_finite_are_not_known() -> None:
+    track, _report = read(nmea(rmc("133932.00"), "GPHDT,1e999,T"))
+    assert np.isnan(track.heading_deg).all() or track.heading_deg[0] == 84.4
+
+
 def test_midnight() -> None:
     text = nmea(
         gga("235958.00"), rmc("235959.00", "311226"), gga("000000.00"), gga("000001.00"), rmc("000002.00", "010127")
