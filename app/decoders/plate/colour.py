@@ -153,13 +153,11 @@ def marker_colours(signal: MarkerSignal, plate_from_image: Array, centroids: Arr
         Centres of the units, in plate coordinates.
     """
     points = np.concatenate([(centroids[:, None] + _SPOTS[None]).reshape(-1, 2), units])
-    projected = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(plate_from_image).T
-    pixels = (projected[:, :2] / projected[:, 2:] - (signal.scale - 1) / 2) / signal.scale
-    height, width = signal.opponent.shape
-    at = np.clip(np.rint(pixels[:, ::-1]), 0, (height - 1, width - 1)).astype(int).T
     planes = signal.planes
-    strength, blue, green, red = (plane[at[0], at[1]].astype(float) for plane in
-                                  (signal.opponent, planes.blue, planes.green, planes.red))  # fmt: skip
+    seen = np.empty((4, len(points)))
+    _look_up(np.linalg.inv(plate_from_image), points, signal.scale, signal.opponent,
+             planes.blue, planes.green, planes.red, seen)  # fmt: skip
+    strength, blue, green, red = seen
     spots = 4 * len(_SPOTS)
     cast = np.array([plane[spots:].sum() for plane in (blue, green, red)])
     cast = np.maximum(cast, 1.0) / max(cast[1], 1.0)
@@ -173,6 +171,25 @@ def marker_colours(signal: MarkerSignal, plate_from_image: Array, centroids: Arr
     tints = np.where(sign > 0, red - np.maximum(green, blue), green - np.maximum(red, blue))
     return MarkerColours(sign * (inside - between.mean()) / (between.std() + 1.0),
                          tints / max(float(np.median(tints[1:])), 1.0), cast[[0, 2]])  # fmt: skip
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _look_up(image_from_plate, points, scale, opponent, blue, green, red, seen):  # type: ignore[no-untyped-def]
+    """Signal and colours at points of the plate."""
+    height, width = opponent.shape
+    m = image_from_plate
+    for k in range(points.shape[0]):
+        u = points[k, 0]
+        v = points[k, 1]
+        w = m[2, 0] * u + m[2, 1] * v + m[2, 2]
+        x = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) / w - (scale - 1) / 2) / scale
+        y = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) / w - (scale - 1) / 2) / scale
+        column = int(np.rint(min(max(x, 0.0), width - 1.0)))
+        row = int(np.rint(min(max(y, 0.0), height - 1.0)))
+        seen[0, k] = opponent[row, column]
+        seen[1, k] = blue[row, column]
+        seen[2, k] = green[row, column]
+        seen[3, k] = red[row, column]
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
