@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -12,6 +13,7 @@ import httpx
 import numpy as np
 import pytest
 
+from app.demo.cerpms import build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import drive_over, list_plates, registered_code
 from tests.browser import Browser
 from tests.conftest import ADMIN_KEY, LiveServer
@@ -185,4 +187,56 @@ def test_a_trace_is_decoded_with_its_tag_and_line(page: Browser, server: LiveSer
     assert "steering wheel" in told
     assert "From the tag's line" in page.run("document.querySelector('#fix').innerText")
     assert page.run("document.querySelectorAll('#fix-map .vehicle').length") == 1
+    assert page.complaints == []
+
+
+def test_a_cerpm_is_registered_and_its_message_explained(page: Browser) -> None:
+    page.click("a[href='#cerpms']")
+    page.run("document.querySelector('#cerpms-form').elements['position.lon_deg'].value = '-85.6436'")
+    page.run("document.querySelector('#cerpms-form').elements['position.lat_deg'].value = '42.2531'")
+    page.run("document.querySelector('#cerpms-form').elements['speed_limit.value'].value = '300'")
+    page.run("document.querySelector('#cerpms-form').elements['number'].value = '4711'")
+    page.click("#cerpms-form button")
+    told = page.until("!document.querySelector('#problem').hidden && document.querySelector('#problem').innerText")
+    assert "255" in told
+    page.complaints.clear()  # the browser itself complains of the 422
+    page.run("document.querySelector('#cerpms-form').elements['speed_limit.value'].value = '25'")
+    page.run("document.querySelector('#cerpms-form').elements['speed_limit.unit'].value = 'mph'")
+    page.click("#cerpms-form button")
+    detail = page.until(
+        "/marker's own/.test(document.querySelector('#detail').innerText)"
+        " && document.querySelector('#detail').innerText"
+    )
+    for part in ("CERPM 4711", "left", "25 mph", "-85.6436000 degrees", "marker 4711", "SF7, 500 kHz"):
+        assert part in detail
+    page.run("window.saved = []; HTMLAnchorElement.prototype.click = function () { window.saved.push(this.download); }")
+    page.click("#detail .buttons button")
+    assert page.until("window.saved[0]") == "cerpm-4711.bin"
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_a_packet_log_is_decoded_to_its_lane(page: Browser, server: LiveServer, tmp_path: Path) -> None:
+    with server.client() as client:
+        client.timeout = httpx.Timeout(280)  # the first lane waits for kernels that may have to be compiled
+        built = build_lane(client, np.random.default_rng(1))
+        drive = next(drive for drive in list_lane_drives() if drive.moved)
+        _result, _decode, recording, context, _heard = drive_lane_and_judge(
+            client, built, drive, 0, (), np.random.default_rng(2)
+        )
+    (tmp_path / "packets.zip").write_bytes(recording)
+    page.click("a[href='#decode']")
+    page.choose_file("#file", tmp_path / "packets.zip")
+    page.run("document.querySelector('#file').dispatchEvent(new Event('change'))")
+    assert page.run("document.querySelector('#kind').value") == "packets"
+    page.run(f"document.querySelector('#context').value = {json.dumps(json.dumps(context))}")
+    page.click("#decode-form button")
+    assert page.until("document.querySelector('#annotated').naturalWidth") > 1000
+    told = page.run("document.querySelector('#readings').innerText")
+    assert "authentic" in told
+    assert "left out CERPM" in told
+    assert "moved" in told
+    assert "Steering check" in told
+    assert "median ±" in page.run("document.querySelector('#fix').innerText")
+    assert page.run("document.querySelectorAll('#fix-map .marker').length") > 20
     assert page.complaints == []
