@@ -24,7 +24,7 @@ from app.markers.cerpm_keys import derive_marker_key
 from app.registry import cerpms
 from app.registry.markers import Row
 from app.services.agency_secrets import AgencySecrets
-from app.services.cerpm_markers import side_of, speed_limit_of
+from app.services.cerpm_markers import radio_of, side_of, speed_limit_of
 from app.services.fixes import position_doubts
 from app.services.marker_rules import RETIRED
 from app.services.packets import DriveFiles, PacketTerms
@@ -98,7 +98,7 @@ def read_packets_of(files: DriveFiles, known: KnownMarkers, terms: PacketTerms, 
             return None
         return derive_marker_key(known.agency_key, number)
 
-    freshness = replace(terms.freshness, received_at_s=received_at_s)
+    freshness = replace(terms.freshness, received_at_s=received_at_s, least_interval_s=_least_interval_s(known))
     verification = verify_packets(files.packets, key_of, known.heard_before, freshness)
     registered = {number: _registered(row) for number, row in known.rows.items()}
     rules = MergeRules(accept_clear=terms.accept_clear)
@@ -132,6 +132,12 @@ def spans_of(verification: Verification) -> list[dict[str, Any]]:
         for number, spans in verification.spans.items()
         for span in spans
     ]
+
+
+def _least_interval_s(known: KnownMarkers) -> float | None:
+    """Half of the shortest interval that any of the markers is programmed with: their clocks may be off. [s]"""
+    radios = [radio_of(row) for row in known.rows.values()]
+    return min((radio.interval_s * (1 - radio.jitter_share) / 2 for radio in radios), default=None)
 
 
 def _span(row: Row) -> SequenceSpan:
