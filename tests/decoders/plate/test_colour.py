@@ -26,8 +26,8 @@ def colours_of(triangle: Colour, squares: Colour, units: Colour) -> MarkerColour
 
 
 def test_a_black_triangle_with_a_purple_tint_is_not_red() -> None:
-    """Lateral chromatic aberration tints what is black: redder than green, but no redder than blue. From a frame."""
-    colours = colours_of((35, 33, 45), (49, 73, 49), (100, 106, 116))
+    """Lateral chromatic aberration tints what is black: much redder than green, but no redder than blue."""
+    colours = colours_of((40, 30, 46), (49, 73, 49), (100, 106, 116))
     assert colours.tints[0] < LEAST_TINT_ALONE
     np.testing.assert_allclose(colours.tints[1:], 1.0)
 
