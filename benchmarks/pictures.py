@@ -8,12 +8,14 @@ import json
 import shutil
 import tempfile
 import zipfile
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
 import httpx
 import numpy as np
 
+from app.demo.cerpms import build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import drive_over, list_plates, registered_code
 from app.demo.server import LocalServer
 from app.jobs.trace_child import decode_recording
@@ -23,6 +25,7 @@ from app.simulation.magnetic.drive import Scene, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
 from app.simulation.magnetic.vehicle import Course, Vehicle
+from app.simulation.radio.drive import drive_past
 from tests.browser import Browser
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
@@ -51,7 +54,32 @@ def main() -> None:
         annotated = client.get(decode["links"]["annotated"]).raise_for_status().content
         (IMAGES / "drive.jpg").write_bytes(_recoded(annotated, 0.5, 85))
         _write_page(server, Path(folder))
+        _write_lane(client)
     _write_trace()
+
+
+def _write_lane(client: httpx.Client) -> None:
+    """A drive past CERPMs: its lane, the lane over a frame, and a log in clear for the tour."""
+    built = build_lane(client, np.random.default_rng(_SEED))
+    drive = next(drive for drive in list_lane_drives() if drive.moved)
+    _result, decode, _recording, _context, _heard = drive_lane_and_judge(
+        client, built, drive, 0, (), np.random.default_rng(_SEED)
+    )
+    print(decode["summary"]["text"])
+    (IMAGES / "lane.svg").write_bytes(client.get(decode["links"]["plot"]).raise_for_status().content)
+    overlay = client.get(decode["links"]["overlay"]).raise_for_status().content
+    (IMAGES / "overlay.jpg").write_bytes(_recoded(overlay, 0.5, 80))
+    heard = drive_past(built.lane, built.laid, np.random.default_rng(_SEED), sign=None)
+    rows = ["id,latitude,longitude,altitude,side,rssi,snr,timestamp"]
+    first = {packet.claim.number: packet for packet in reversed(heard.packets) if packet.claim is not None}
+    for number, packet in sorted(first.items()):
+        at, claim = datetime.fromtimestamp(packet.heard_at_s, UTC), packet.claim
+        assert claim is not None
+        rows.append(
+            f"{number},{claim.lat_deg:.7f},{claim.lon_deg:.7f},0.0,{claim.side.name.lower()},{packet.rssi_dbm:.0f},"
+            f"{packet.snr_db:.2f},{at.isoformat(timespec='milliseconds')}"
+        )
+    (IMAGES / "packets.csv").write_text("\n".join(rows) + "\n")
 
 
 def _write_trace() -> None:

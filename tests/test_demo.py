@@ -58,6 +58,19 @@ def test_the_demo_reads_every_plate_and_tag(tmp_path: Path) -> None:
         assert float(along_cm) < 3
         assert float(across_cm) < 3
     assert re.search(r"^ordinary .* 1 of 1 +1 of 1 ", done.stdout, re.MULTILINE)
+    lanes = re.findall(
+        r"^([a-z0-9, ]+?) +40 +(\d+) +(\d+) +(\d+) +(-|\d+) +([\d.]+) +([\d.]+) +([\d.]+) % +([\d.]+) +([\d.]+)$",
+        done.stdout,
+        re.MULTILINE,
+    )
+    assert [row[0] for row in lanes] == ["ordinary", "forged, replayed", "a marker moved", "2 m positions"]
+    assert [row[4] != "-" for row in lanes] == [False, False, True, False]
+    for name, packets, accepted, refused, _out, rms_cm, _worst, coverage, _own, steering_cm in lanes:
+        assert int(packets) == int(accepted) + int(refused)
+        assert int(refused) == (400 if name.startswith("forged") else 0)
+        assert float(rms_cm) < 5
+        assert float(coverage) > 99.5
+        assert float(steering_cm) < 8
     assert re.search(r"METRO, curvy road .* 0\.965 ± 0\.044", done.stdout)
     out = tmp_path / "out"
     assert len(list((out / "layouts").glob("*.pdf"))) == 7

@@ -97,8 +97,11 @@ def test_benchmark_blocks_are_filled_by_name_and_nothing_else_changes() -> None:
 
 
 def test_every_benchmark_has_its_block() -> None:
+    from benchmarks.cerpm.__main__ import ITEMS as CERPM
     from benchmarks.magnets.__main__ import ITEMS as MAGNETS
     from benchmarks.plates.__main__ import ITEMS as PLATES
 
     magnets = [f"magnets-{item}" for item in ("run", *MAGNETS)]
-    assert re.findall(r"<!-- bench:([\w-]+) -->", README) == ["demo", "run", *PLATES, *magnets, "bundle", "http"]
+    cerpm = [f"cerpm-{item}" for item in ("run", *CERPM)]
+    blocks = ["demo", "run", *PLATES, *magnets, *cerpm, "bundle", "http"]
+    assert re.findall(r"<!-- bench:([\w-]+) -->", README) == blocks
