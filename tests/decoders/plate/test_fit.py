@@ -1,0 +1,50 @@
+"""The fit's two stages, and the look between them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.decoders.plate.fit import fit_plate, marker_centroids, project
+from app.markers.plate import PlateGeometry
+from app.simulation.plate_scene import PlacedFace
+from tests.decoders.plate.scenes import face_of, shoot, shoot_plate
+
+GEOMETRY = PlateGeometry()
+UNIT_SQUARE = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+
+
+def centroids_px(corners_px: np.ndarray) -> np.ndarray:
+    """Where a plate's marker centroids are, roughly: sides taken as parallel."""
+    u, v = marker_centroids(GEOMETRY).T[..., None]
+    a, b, c, d = corners_px
+    return (1 - u) * (1 - v) * a + u * (1 - v) * b + u * v * c + (1 - u) * v * d
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_candidate_that_is_not_promising_ends_after_the_coarse_stage(goes_on: bool) -> None:
+    frame = shoot_plate(turn_deg=20.0)
+    corners = frame.truths[0].corners_px
+    asked: list[tuple[np.ndarray, float]] = []
+
+    def promising(plate_from_image: np.ndarray, explained: float) -> bool:
+        asked.append((plate_from_image, explained))
+        return goes_on
+
+    fit = fit_plate(frame.image, centroids_px(corners), GEOMETRY, promising=promising)
+    assert (fit is not None) is goes_on
+    assert len(asked) == 1
+    np.testing.assert_allclose(project(asked[0][0], corners), UNIT_SQUARE, atol=0.05)
+    assert asked[0][1] > 0.9
+
+
+def test_the_residual_stands_out_where_a_unit_is_stained() -> None:
+    face = face_of()
+    face.reflectance[130:160, 175:200] = 0.2  # on the edge between two units
+    frame = shoot(PlacedFace(face, 2.0, 0.0, 20.0))
+    fit = fit_plate(frame.image, centroids_px(frame.truths[0].corners_px), GEOMETRY)
+    assert fit is not None
+    row, column = np.unravel_index(np.argmax(fit.unit_misfit), (8, 8))
+    assert row == 3
+    assert column in (4, 5)
+    assert fit.unit_misfit.max() > 4 * np.median(fit.unit_misfit)
