@@ -136,7 +136,7 @@ _PATTERNS = np.array(list(itertools.product((0, 1), repeat=4)), dtype=float)  # 
 
 
 def weigh_units(fit: PlateFit) -> UnitEvidence | None:
-    """Costs of all symbols; None when the units do not differ by more than their noise.
+    """Costs of all symbols; None when the units do not differ by more than their noise, or show one level only.
 
     Two classifiers in turn: the first on logarithms, where any illumination is a sum, gives the light that falls on
     each unit; the second on the light so evened out, where the noise is even.
@@ -160,11 +160,14 @@ def weigh_units(fit: PlateFit) -> UnitEvidence | None:
     dark = first.copy()
     step = _levels_apart(even, dark)
     residual, contrast = _settle(weight, even - even.mean(), dark, step, 0.3 * step)
+    if dark.all() or not dark.any():
+        return None  # with one level only, what looks like it may be anything even; all zeros would satisfy any check
     # how well this plate follows the model scales what a difference means
     scatter = float(residual @ weight @ residual)
     weight /= (scatter + SCATTER_PRIOR[0] * SCATTER_PRIOR[1]) / (len(residual) + SCATTER_PRIOR[0])
     resolved_px = fit.unit_px / max(fit.blur_px, USUAL_BLUR_PX) * USUAL_BLUR_PX
     weight *= min(1.0, (resolved_px / FULL_TRUST_PX) ** 4) * min(1.0, (2 * USUAL_BLUR_PX / fit.blur_px) ** 2)
+    weight *= min(1.0, 1 / max(fit.motion * n, 1e-9)) ** 2  # smeared over more than a unit: the smear's form matters
     costs = _cell_costs(weight, residual, dark, contrast, _PATTERNS)
     best = np.argmin(costs, axis=1)
     disputed = (first != dark).reshape(-1, 4).any(axis=1)
