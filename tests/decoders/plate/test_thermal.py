@@ -10,6 +10,7 @@ from app.decoders.plate import decode_plates
 from app.decoders.plate.thermal import _quad_around
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
+from benchmarks.plates.sets import Job, Shot, find_shot
 from tests.decoders.plate.scenes import PAPER, THERMAL_CAMERA, shoot_warm
 
 CODES = [PAPER, PlateCode.from_registry_number(0xDEADBEEF)]
@@ -33,6 +34,14 @@ def test_a_cold_road_gives_nothing() -> None:
     road = np.clip(85 + 4 * np.random.default_rng(0).standard_normal((512, 640)), 0, 255).astype(np.uint8)
     assert decode_plates(road, thermal=True) == []
     assert [r for r in decode_plates(road, thermal=True, codebook=CODES) if r.outcome is PlateOutcome.READ] == []
+
+
+def test_a_warm_patch_of_one_level_is_no_plate_of_zeros() -> None:
+    """In this frame one was: all zeros are a Reed-Solomon codeword, so the check said nothing."""
+    shot = find_shot(Job("thermal", 10, seed=51, frames=0), 2)
+    assert isinstance(shot, Shot)
+    digits = {r.digits for r in decode_plates(shot.frame.image, thermal=True)}
+    assert digits <= {None, shot.code.digits if shot.code else None}
 
 
 def test_warm_and_cold_are_not_exchanged() -> None:

@@ -1,0 +1,64 @@
+"""What the units of a fit say, and when they say nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from app.decoders.plate.decode import MOST_DAMAGE, decode_symbols, weigh_units
+from app.decoders.plate.fit import PlateFit
+from app.markers.plate import PlateCode
+from tests.decoders.plate.scenes import PAPER
+
+N, SIDE_PX, SURE = 8, 40.0, 0.9995
+
+
+def fit_of(units: np.ndarray, *, motion: float = 0.0, misfit: np.ndarray | None = None) -> PlateFit:
+    """A fit that found these units on a plate of five pixels a unit."""
+    corner = np.zeros((N, N), dtype=bool)
+    corner[np.ix_([0, 1, N - 2, N - 1], [0, 1, N - 2, N - 1])] = True
+    order = np.flatnonzero(~corner.reshape(-1))
+    return PlateFit(
+        plate_from_image=np.diag([1 / SIDE_PX, 1 / SIDE_PX, 1.0]),
+        units=np.where(corner, np.nan, units),
+        units_covariance=1e-5 * np.eye(len(order)),
+        unit_order=order,
+        unit_misfit=np.full((N, N), 1e-4) if misfit is None else misfit,
+        markers=np.full(5, 0.3),
+        gap=0.1,
+        road=0.2,
+        corners_px=SIDE_PX * np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]),
+        corners_covariance_px2=0.01 * np.eye(8),
+        residual=0.01,
+        explained=0.99,
+        blur_px=0.8,
+        motion=motion,
+        pixels=900,
+    )
+
+
+def levels(code: PlateCode) -> np.ndarray:
+    """Light of a plate's units with a little wear."""
+    return np.where(code.units, 0.1, 0.6) + 0.01 * np.random.default_rng(0).standard_normal((N, N))
+
+
+def test_a_smear_over_more_than_a_unit_is_believed_less() -> None:
+    short, long = (weigh_units(fit_of(levels(PAPER), motion=motion)) for motion in (0.1, 0.2))
+    assert short is not None
+    assert long is not None
+    np.testing.assert_allclose(long.cell_margin, short.cell_margin / (0.2 * N) ** 2)
+
+
+def test_a_stain_counts_only_where_the_level_of_some_unit_strays_as_well() -> None:
+    values, misfit = levels(PAPER), np.full((N, N), 1e-4)
+    row, column = np.argwhere(PAPER.units)[5]
+    misfit[row, column] = 50e-4
+    clean, edge = weigh_units(fit_of(values)), weigh_units(fit_of(values, misfit=misfit))
+    values[tuple(np.argwhere(PAPER.units)[7])] += 0.05
+    both = weigh_units(fit_of(values, misfit=misfit))
+    assert clean is not None
+    assert edge is not None
+    assert both is not None
+    assert clean.damage < edge.damage < MOST_DAMAGE < both.damage
+    assert decode_symbols(edge, N, (), SURE).code == PAPER
+    assert decode_symbols(both, N, (), SURE).code is None
+    assert decode_symbols(both, N, (PAPER,), SURE).code == PAPER
