@@ -67,7 +67,7 @@ def migrate(revision: Annotated[str, typer.Argument(help="Revision to go to, up 
     """Bring the database's schema to a revision; `serve` goes to the newest by itself."""
     with _owned_database(_settings()) as database:
         database.migrate(revision)
-    typer.echo(f"{database.path} is at revision {revision}")
+    typer.echo(f"{database.name} is at revision {revision}")
 
 
 @cli.command()

@@ -17,7 +17,12 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="WAYMARK_", frozen=True, extra="ignore", env_ignore_empty=True)
 
     data_dir: Path = Field(default=Path("var"), description="Folder of the embedded database and of uploads.")
-    database_url: str = Field(default="", description="SQLAlchemy URL; empty means a SQLite file in the data folder.")
+    database_url: str = Field(
+        default="",
+        repr=False,
+        description="sqlite:///PATH or postgresql+psycopg://USER@HOST/DATABASE with PostGIS; empty means a SQLite file "
+        "in the data folder.",
+    )
     blobs_url: str = Field(
         default="", description="file:///FOLDER or s3://BUCKET/PREFIX; empty means a folder in the data folder."
     )
@@ -63,8 +68,8 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _supported_database(self) -> Self:
-        if self.database_url and not self.database_url.startswith("sqlite:///"):
-            raise ValueError("database_url must be sqlite:///PATH; other databases are not supported yet")
+        if self.database_url and not self.database_url.startswith(("sqlite:///", "postgresql+psycopg://")):
+            raise ValueError("database_url must be sqlite:///PATH or postgresql+psycopg://USER@HOST/DATABASE")
         return self
 
     @property

@@ -17,6 +17,7 @@ from fastapi import FastAPI
 from app.main import create_app
 from app.services.access import Scope
 from app.settings import Settings
+from tests.databases import PostgresServer, postgres_server
 
 ADMIN_KEY = "an-admin-key-for-tests-only"
 
@@ -56,10 +57,34 @@ class LiveServer:
         return self.client(self.app.state.access.create_key(name, scope, label=f"{name} {scope}"))
 
 
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[PostgresServer]:
+    """A PostgreSQL server to make databases on."""
+    with postgres_server() as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def backend() -> str:
+    """The kind of database that the tests of a module run on; a module that runs on both overrides this."""
+    return "sqlite"
+
+
+@pytest.fixture(scope="module")
+def new_database_url(backend: str, request: pytest.FixtureRequest) -> Callable[[Path], str]:
+    """URLs of empty databases, for each the folder that a file may lie in."""
+    if backend == "postgresql":
+        server: PostgresServer = request.getfixturevalue("postgres")
+        return lambda _folder: server.empty()
+    return lambda folder: f"sqlite:///{folder / 'waymark.sqlite3'}"
+
+
 @pytest.fixture
-def settings(tmp_path: Path) -> Settings:
-    """Settings of a server with an empty folder of its own."""
-    return Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY, warm_decoders=False)
+def settings(tmp_path: Path, new_database_url: Callable[[Path], str]) -> Settings:
+    """Settings of a server with an empty folder and an empty database of its own."""
+    folder = tmp_path / "var"
+    url = new_database_url(folder)
+    return Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, warm_decoders=False)
 
 
 @pytest.fixture
@@ -83,10 +108,13 @@ def fresh_server(serve: Callable[[Settings], LiveServer], settings: Settings) ->
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
+def server(
+    tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str]
+) -> Iterator[LiveServer]:
     """A server that the tests of a module share; each test has an agency of its own."""
-    folder = tmp_path_factory.mktemp("server")
-    settings = Settings(data_dir=folder / "var", admin_key=ADMIN_KEY, warm_decoders=False)
+    folder = tmp_path_factory.mktemp("server") / "var"
+    url = new_database_url(folder)
+    settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, warm_decoders=False)
     with LiveServer(create_app(settings)) as running:
         yield running
 

@@ -1,7 +1,7 @@
-"""Connections, transactions, ownership and migrations of the database.
+"""Transactions, ownership and migrations of the database: a SQLite file, or PostgreSQL with PostGIS.
 
-SQLite runs in WAL mode with synchronous FULL and foreign keys on. Reads use plain transactions; writes start with
-BEGIN IMMEDIATE, so that a writer never discovers halfway that another one came first.
+Both give the same guarantees. A read sees one snapshot. Writes come one after another, so what a write finds by a
+query stays true until it is committed: SQLite's BEGIN IMMEDIATE, PostgreSQL's advisory lock (engines.py).
 """
 
 from __future__ import annotations
@@ -12,22 +12,17 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-import orjson
 import sqlalchemy as sa
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import event
 
 from app.errors import Unavailable
-from app.registry.spatial import register_functions
+from app.registry.engines import BUSY_TIMEOUT_S, LONG, busy_is_unavailable, isolation, postgres_engine, sqlite_engine
 
 MIGRATIONS = Path(__file__).resolve().parents[2] / "migrations"
-BUSY_TIMEOUT_S = 10.0
-_WRITE = "waymark_write"
 
 
 class Database:
@@ -36,26 +31,50 @@ class Database:
     Parameters
     ----------
     url : str
-        SQLAlchemy URL of a SQLite file. Nothing is opened or created before `open` or the first transaction.
+        SQLAlchemy URL of a SQLite file, or postgresql+psycopg://... of a database that has PostGIS. Nothing is opened
+        or created before `open` or the first transaction.
     """
 
     def __init__(self, url: str) -> None:
-        self.url = sa.make_url(url)
-        if self.url.get_backend_name() != "sqlite" or not self.url.database or self.url.database == ":memory:":
-            raise Unavailable(f"{self.url.render_as_string()} is not a SQLite file", field="database_url")
-        self.path = Path(self.url.database)
-        self.engine = _sqlite_engine(self.url)
+        try:
+            self.url = sa.make_url(url)
+        except (sa.exc.ArgumentError, ValueError) as error:
+            raise Unavailable("this is not the URL of a database", field="database_url") from error
+        self.path: Path | None = None
+        if self.url.drivername == "postgresql+psycopg" and self.url.database:
+            self.engine = postgres_engine(self.url)
+        elif (
+            self.url.get_backend_name() == "sqlite"
+            and self.url.database
+            and not self.url.database.startswith(":memory:")
+        ):
+            self.path = Path(self.url.database)
+            self.engine = sqlite_engine(self.url)
+        else:
+            raise Unavailable(
+                f"{self.name} is neither a SQLite file nor a PostgreSQL database",
+                field="database_url",
+                limit="sqlite:///PATH or postgresql+psycopg://USER@HOST/DATABASE",
+            )
         self._one_writer = threading.Lock()
         self._lock_fd: int | None = None
 
+    @property
+    def name(self) -> str:
+        """What to call the database in messages: its path, or its URL without the password."""
+        return str(self.path) if self.path is not None else self.url.set(query={}).render_as_string()
+
     def open(self) -> None:
-        """Take ownership of the file for this process.
+        """Take ownership of the file for this process, or see that the server can be used.
 
         Raises
         ------
         Unavailable
-            Another process owns it.
+            Another process owns the file; the server cannot be reached or has no PostGIS.
         """
+        if self.path is None:
+            self._see_the_server()
+            return
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._lock_fd = _lock_file(self.path.with_name(self.path.name + ".lock"), self.path)
 
@@ -69,17 +88,23 @@ class Database:
     @contextmanager
     def read(self) -> Iterator[sa.Connection]:
         """A read transaction: one consistent snapshot."""
-        with _busy_is_unavailable(), self.engine.connect() as connection:
-            yield connection
+        with busy_is_unavailable(), self.engine.connect() as connection:
+            yield connection.execution_options(**isolation(self.url, write=False))
 
     @contextmanager
-    def write(self) -> Iterator[sa.Connection]:
-        """A write transaction, committed when the block ends without an error."""
+    def write(self, *, long: bool = False) -> Iterator[sa.Connection]:
+        """A write transaction, committed when the block ends without an error.
+
+        Parameters
+        ----------
+        long : bool, optional
+            Single statements may take as long as they take: migrations, bulk imports.
+        """
         if not self._one_writer.acquire(timeout=BUSY_TIMEOUT_S):
             raise Unavailable("the database is busy", cure="try again in a few seconds")
         try:
-            with _busy_is_unavailable(), self.engine.connect() as connection:
-                connection = connection.execution_options(**{_WRITE: True})
+            with busy_is_unavailable(), self.engine.connect() as connection:
+                connection = connection.execution_options(**isolation(self.url, write=True), **{LONG: long})
                 with connection.begin():
                     yield connection
         finally:
@@ -87,7 +112,7 @@ class Database:
 
     def migrate(self, revision: str = "head") -> None:
         """Bring the schema to a revision, up or down, in one transaction."""
-        with self.write() as connection:
+        with self.write(long=True) as connection:
             config = alembic_config()
             config.attributes["connection"] = connection
             now = MigrationContext.configure(connection).get_current_revision()
@@ -105,6 +130,26 @@ class Database:
         except (Unavailable, sa.exc.SQLAlchemyError):
             return False
 
+    def _see_the_server(self) -> None:
+        try:
+            with self.engine.connect() as connection:
+                postgis = connection.exec_driver_sql("SELECT 1 FROM pg_extension WHERE extname = 'postgis'").scalar()
+                encoding = connection.exec_driver_sql("SHOW server_encoding").scalar()
+        except sa.exc.OperationalError as error:
+            raise Unavailable(
+                f"{self.name} cannot be reached: {str(error.orig).strip()}",
+                field="database_url",
+                cure="start the server, or correct WAYMARK_DATABASE_URL",
+            ) from error
+        if postgis is None:
+            raise Unavailable(
+                f"{self.name} has no PostGIS",
+                field="database_url",
+                cure="run CREATE EXTENSION postgis in it once, as a superuser",
+            )
+        if encoding != "UTF8":
+            raise Unavailable(f"{self.name} is encoded in {encoding}", field="database_url", limit="UTF8")
+
 
 def alembic_config() -> Config:
     """Alembic's configuration, without a file."""
@@ -116,31 +161,6 @@ def alembic_config() -> Config:
 def head_revision() -> str | None:
     """The newest revision that this code knows."""
     return ScriptDirectory.from_config(alembic_config()).get_current_head()
-
-
-def _sqlite_engine(url: sa.URL) -> sa.Engine:
-    engine = sa.create_engine(
-        url,
-        connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False},
-        json_serializer=lambda value: orjson.dumps(value).decode(),
-        json_deserializer=orjson.loads,
-        pool_size=8,
-        max_overflow=40,
-    )
-
-    @event.listens_for(engine, "connect")
-    def configure(connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # the driver starts no transaction of its own; `begin` below does
-        register_functions(connection)
-        for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
-            connection.execute(f"PRAGMA {pragma}")
-
-    @event.listens_for(engine, "begin")
-    def begin(connection: sa.Connection) -> None:
-        immediate = connection.get_execution_options().get(_WRITE, False)
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
-
-    return engine
 
 
 def _lock_file(lock: Path, database: Path) -> int:
@@ -159,15 +179,3 @@ def _lock_file(lock: Path, database: Path) -> int:
     os.ftruncate(descriptor, 0)
     os.write(descriptor, f"{os.getpid()}\n".encode())
     return descriptor
-
-
-@contextmanager
-def _busy_is_unavailable() -> Iterator[None]:
-    try:
-        yield
-    except sa.exc.TimeoutError as error:
-        raise Unavailable("every database connection is in use", cure="try again in a few seconds") from error
-    except sa.exc.OperationalError as error:
-        if "locked" in str(error.orig) or "busy" in str(error.orig):
-            raise Unavailable("the database is busy", cure="try again in a few seconds") from error
-        raise

@@ -11,7 +11,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from app.errors import NotFound, StaleVersion
-from app.registry.spatial import Box, box_around, rtree, within_box, within_radius
+from app.registry.spatial import Box, box_around, distance_to, proposed_by_index, within_box, within_radius
 from app.registry.tables import marker_versions, markers
 
 Row = sa.RowMapping
@@ -103,28 +103,20 @@ def list_plates_near(
 def _plates_near(parts: int) -> sa.Select[Any]:
     """Statement of `list_plates_near`, built once: every frame runs it, and building it costs more."""
     number = partial(sa.bindparam, type_=sa.Double)
-    proposed = [
-        sa.select(rtree.c.row).where(
-            rtree.c.max_lon >= number(f"w{k}"),
-            rtree.c.min_lon <= number(f"e{k}"),
-            rtree.c.max_lat >= number(f"s{k}"),
-            rtree.c.min_lat <= number(f"n{k}"),
-        )
-        for k in range(parts)
-    ]
-    distance = sa.func.waymark_distance_m(
-        markers.c.lon_deg, markers.c.lat_deg, number("lon"), number("lat"), type_=sa.Double
+    proposed = (
+        proposed_by_index(markers, *(number(f"{side}{k}") for side in ("w", "s", "e", "n"))) for k in range(parts)
     )
+    distance = distance_to(number("lon"), number("lat"))
     return (
         sa.select(*PUBLIC)
         .where(
             markers.c.agency_id == sa.bindparam("agency"),
             markers.c.family == "plate",
             markers.c.status != "retired",
-            sa.or_(*(markers.c.row.in_(rows) for rows in proposed)),
+            sa.or_(*proposed),
             distance <= number("radius"),
         )
-        .order_by(distance)
+        .order_by(distance, markers.c.id)
         .limit(sa.bindparam("most", type_=sa.Integer))
     )
 

@@ -1,6 +1,8 @@
-"""Where markers are: boxes, circles and the R*Tree that finds them on SQLite (migration 0001 keeps it by triggers).
+"""Where markers are: boxes, circles and the index that finds them.
 
-The R*Tree keeps 32-bit floats rounded outward, so it only proposes; the exact columns decide.
+SQLite has an R*Tree, kept by triggers (migrations 0001 and 0002); PostgreSQL a GiST index over PostGIS points, kept by
+generated columns (migration 0004). Both keep 32-bit floats rounded outward, so they only propose; the exact columns and
+the geodesic distance decide.
 """
 
 from __future__ import annotations
@@ -9,19 +11,27 @@ import math
 import sqlite3
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import sqlalchemy as sa
 from pyproj import Geod
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.compiler import SQLCompiler
+from sqlalchemy.sql.functions import FunctionElement
 
 from app.registry.tables import markers
 
 _CONTINENT_DEG2 = 2_500.0
 _M_PER_DEG = 110_574.0  # least length of a degree of latitude on WGS 84
 
-rtree = sa.table(
-    "markers_rtree",
-    *(sa.column(name, sa.Double) for name in ("row", "min_lon", "max_lon", "min_lat", "max_lat")),
-)
+
+def _rtree(table: str) -> sa.TableClause:
+    names = ("row", "min_lon", "max_lon", "min_lat", "max_lat")
+    return sa.table(f"{table}_rtree", *(sa.column(name, sa.Double) for name in names))
+
+
+rtree = _rtree("markers")
+_RTREES = {"markers": rtree, "magnets": _rtree("magnets")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,31 +73,77 @@ def _wrapped(lon_deg: float) -> float:
     return lon_deg - 360.0 if lon_deg > 180.0 else lon_deg + 360.0 if lon_deg < -180.0 else lon_deg
 
 
-def within_box(box: Box) -> sa.ColumnElement[bool]:
-    """Markers inside a box: the index proposes, the exact columns decide."""
-    return sa.or_(*(_within_part(part) for part in box.parts))
+class _Proposed(FunctionElement[bool]):
+    """Rows that the spatial index of their table proposes for a box: row column, west, south, east, north."""
+
+    name = "waymark_proposed"
+    type = sa.Boolean()
+    inherit_cache = True
+
+    def self_group(self, against: Any = None) -> _Proposed:
+        """Itself: SQLAlchemy would write `... IN (...) = 1` for SQLite, which then ignores the index."""
+        return self
 
 
-def _within_part(box: Box) -> sa.ColumnElement[bool]:
+def proposed_by_index(
+    table: sa.Table,
+    west_deg: sa.ColumnElement[float],
+    south_deg: sa.ColumnElement[float],
+    east_deg: sa.ColumnElement[float],
+    north_deg: sa.ColumnElement[float],
+) -> sa.ColumnElement[bool]:
+    """Rows of `markers` or `magnets` whose place may be inside a box that does not span the antimeridian."""
+    return _Proposed(table.c.row, west_deg, south_deg, east_deg, north_deg)
+
+
+@compiles(_Proposed, "sqlite")
+def _by_rtree(element: _Proposed, compiler: SQLCompiler, **how: Any) -> str:
+    row, west, south, east, north = element.clauses
+    index = _RTREES[row.table.name]
+    rows = sa.select(index.c.row).where(
+        index.c.max_lon >= west, index.c.min_lon <= east, index.c.max_lat >= south, index.c.min_lat <= north
+    )
+    return compiler.process(row.in_(rows), **how)
+
+
+@compiles(_Proposed, "postgresql")
+def _by_gist(element: _Proposed, compiler: SQLCompiler, **how: Any) -> str:
+    row, *sides = element.clauses
+    point = sa.table(row.table.name, sa.column("geom")).c.geom
+    box = sa.func.ST_MakeEnvelope(*sides, sa.literal_column("4326"))
+    return compiler.process(point.op("&&", is_comparison=True)(box), **how)
+
+
+def within_box(box: Box, table: sa.Table = markers) -> sa.ColumnElement[bool]:
+    """Rows of `markers` or `magnets` inside a box: the index proposes, the exact columns decide."""
+    return sa.or_(*(_within_part(part, table) for part in box.parts))
+
+
+def _within_part(box: Box, table: sa.Table) -> sa.ColumnElement[bool]:
     exact = sa.and_(
-        markers.c.lon_deg.between(box.west_deg, box.east_deg),
-        markers.c.lat_deg.between(box.south_deg, box.north_deg),
+        table.c.lon_deg.between(box.west_deg, box.east_deg),
+        table.c.lat_deg.between(box.south_deg, box.north_deg),
     )
     if (box.east_deg - box.west_deg) * (box.north_deg - box.south_deg) >= _CONTINENT_DEG2:
         return exact  # most markers are inside: reading them in the order of the page finds it sooner
-    proposed = sa.select(rtree.c.row).where(
-        rtree.c.max_lon >= box.west_deg,
-        rtree.c.min_lon <= box.east_deg,
-        rtree.c.max_lat >= box.south_deg,
-        rtree.c.min_lat <= box.north_deg,
+    west, south, east, north = (
+        sa.literal(side, sa.Double) for side in (box.west_deg, box.south_deg, box.east_deg, box.north_deg)
     )
-    return sa.and_(markers.c.row.in_(proposed), exact)
+    return sa.and_(proposed_by_index(table, west, south, east, north), exact)
 
 
 def within_radius(lon_deg: float, lat_deg: float, radius_m: float) -> sa.ColumnElement[bool]:
     """Markers within a geodesic distance."""
-    distance = sa.func.waymark_distance_m(markers.c.lon_deg, markers.c.lat_deg, lon_deg, lat_deg, type_=sa.Double)
-    return sa.and_(within_box(box_around(lon_deg, lat_deg, radius_m)), distance <= radius_m)
+    place = (sa.literal(lon_deg, sa.Double), sa.literal(lat_deg, sa.Double))
+    return sa.and_(within_box(box_around(lon_deg, lat_deg, radius_m)), distance_to(*place) <= radius_m)
+
+
+def distance_to(lon_deg: sa.ColumnElement[float], lat_deg: sa.ColumnElement[float]) -> sa.ColumnElement[float]:
+    """Geodesic distance of a marker from a place, as SQL. [m]
+
+    SQLite calls `distance_m`, PostgreSQL a function of migration 0004; the two agree within 2e-8 m.
+    """
+    return sa.func.waymark_distance_m(markers.c.lon_deg, markers.c.lat_deg, lon_deg, lat_deg, type_=sa.Double)
 
 
 def distance_m(lon_a_deg: float, lat_a_deg: float, lon_b_deg: float, lat_b_deg: float) -> float:

@@ -13,6 +13,11 @@ from tests.conftest import LiveServer
 Place = Callable[[], dict[str, Any]]
 
 
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 def cerpm(place: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A marker to register."""
     return {"family": "cerpm", "position": {**place, "horizontal_rmse_m": 0.02, "height_m": 20.0}, **more}

@@ -24,6 +24,11 @@ MEANINGS = [
 ]
 
 
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 def _post(client: httpx.Client, **body: Any) -> dict[str, Any]:
     response = client.post("/v1/codebooks", json={"name": "City", "design": DESIGN} | body)
     assert response.status_code == 201, response.text

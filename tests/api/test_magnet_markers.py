@@ -25,6 +25,11 @@ Lane = Callable[..., dict[str, Any]]
 _LANES = itertools.count()
 
 
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 @pytest.fixture
 def lane() -> Lane:
     """Straight lanes of 300 m heading east, far from each other."""

@@ -16,6 +16,11 @@ from tests.conftest import LiveServer
 Place = Callable[[], dict[str, Any]]
 
 
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 def _post(client: httpx.Client, **body: Any) -> dict[str, Any]:
     response = client.post("/v1/markers", json=body)
     assert response.status_code == 201, response.text

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,9 +32,22 @@ CENTRES = [
     (180.0, 0.0),
 ]
 
+PLAIN = {
+    "family": "plate",
+    "status": "planned",
+    "crs": "EPSG:4326",
+    "original": {},
+    "localization_grade": "exact",
+    "version": 1,
+    "created_at": NOW,
+    "updated_at": NOW,
+}
+
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Database, str, np.ndarray]]:
+def store(
+    tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str]
+) -> Iterator[tuple[Database, str, np.ndarray]]:
     rng = np.random.default_rng(5)
     spots = [
         (
@@ -45,26 +59,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Database, 
         for _ in range(12)
     ]
     spots = [(lon, float(np.clip(lat, -90, 90))) for lon, lat in spots] + CENTRES
-    database = Database(f"sqlite:///{tmp_path_factory.mktemp('spatial') / 'x.sqlite3'}")
+    database = Database(new_database_url(tmp_path_factory.mktemp("spatial")))
     database.open()
     database.migrate()
     with database.write() as connection:
         agency_id = agencies.add_agency(connection, "a", NOW)
         rows = [
-            {
-                "id": new_id(NOW),
-                "agency_id": agency_id,
-                "family": "plate",
-                "status": "planned",
-                "lon_deg": float(lon),
-                "lat_deg": float(lat),
-                "crs": "EPSG:4326",
-                "original": {},
-                "localization_grade": "exact",
-                "version": 1,
-                "created_at": NOW,
-                "updated_at": NOW,
-            }
+            {"id": new_id(NOW), "agency_id": agency_id, "lon_deg": float(lon), "lat_deg": float(lat), **PLAIN}
             for lon, lat in spots
         ]
         connection.execute(sa.insert(markers), rows)
@@ -133,42 +134,37 @@ def test_a_box_around_a_small_circle_is_small() -> None:
     assert box.east_deg - box.west_deg < 0.04
 
 
-@pytest.mark.parametrize(
-    "narrowed", [MarkerFilter(box=Box(1, 1, 2, 2)), MarkerFilter(near=(114.0, 22.0, 500.0))], ids=["box", "circle"]
-)
-def test_the_spatial_index_goes_first(store: tuple[Database, str, np.ndarray], narrowed: MarkerFilter) -> None:
-    plan = _plan(store, narrowed)
-    assert "SEARCH markers USING INTEGER PRIMARY KEY" in plan
-    assert "VIRTUAL TABLE INDEX" in plan
+def test_both_databases_measure_the_distance_of_proj(store: tuple[Database, str, np.ndarray]) -> None:
+    """Karney's geodesic, from 0.1 mm to the other side of the world."""
+    database, _, _ = store
+    rng = np.random.default_rng(11)
+    lon, lat = rng.uniform(-180, 180, 400), np.degrees(np.arcsin(rng.uniform(-1, 1, 400)))
+    to_lon, to_lat, _ = GEOD.fwd(lon, lat, rng.uniform(0, 360, 400), 10.0 ** rng.uniform(-4, 7.3, 400))
+    pairs = [*np.stack([lon, lat, to_lon, to_lat], axis=1).tolist()]
+    pairs += [(180, 0, -180, 0), (0, 90, 50, 90), (0, -90, 120, -89), (179.9999, 10, -179.9999, 10), (5, 5, 5, 5)]
+    pairs += [(0, 0, 179.5, 0.3), (0, 0, 180, 0), (10, 45, -170, -45)]
+    query = sa.select(sa.func.waymark_distance_m(*(sa.bindparam(name, type_=sa.Double) for name in "abcd")))
+    with database.read() as connection:
+        asked = [connection.execute(query, dict(zip("abcd", pair, strict=True))).scalar() for pair in pairs]
+    expected = GEOD.inv(*np.array(pairs, dtype=float).T)[2]
+    np.testing.assert_allclose(np.array(asked, dtype=float), expected, rtol=0, atol=2e-8)
 
 
-@pytest.mark.parametrize(
-    ("narrowed", "index"),
-    [
-        (MarkerFilter(), "ix_markers_agency_id_id (agency_id=?)"),
-        (MarkerFilter(box=Box(-180, -90, 180, 90)), "ix_markers_agency_id_id (agency_id=?)"),
-        (MarkerFilter(status="suspect"), "ix_markers_agency_id_status_id (agency_id=? AND status=?)"),
-        (MarkerFilter(digits="0"), "ix_markers_digits (digits=?)"),
-    ],
-    ids=["all", "world", "status", "digits"],
-)
-def test_lists_use_their_index(store: tuple[Database, str, np.ndarray], narrowed: MarkerFilter, index: str) -> None:
-    assert f"USING INDEX {index}" in _plan(store, narrowed)
-
-
-def _plan(store: tuple[Database, str, np.ndarray], narrowed: MarkerFilter) -> str:
+def test_the_spatial_index_follows_the_table(store: tuple[Database, str, np.ndarray]) -> None:
     database, agency_id, _ = store
-    statements = []
+    from_there, to_there = Box(-70.1, -33.1, -69.9, -32.9), Box(69.9, 32.9, 70.1, 33.1)
+    new = {"id": new_id(NOW), "agency_id": agency_id, "lon_deg": -70.0, "lat_deg": -33.0, **PLAIN}
 
-    def explain(_c: object, _cur: object, statement: str, parameters: tuple[object, ...], *_: object) -> None:
-        if not statement.startswith("EXPLAIN"):
-            statements.append((statement, parameters))
+    def counts() -> tuple[int, int]:
+        found = [_found(store, MarkerFilter(box=box)) for box in (from_there, to_there)]
+        return len(found[0]), len(found[1])
 
-    sa.event.listen(database.engine, "before_cursor_execute", explain)
-    try:
-        with database.read() as connection:
-            list_markers(connection, agency_id, narrowed, after=None, limit=10)
-            query, parameters = statements[-1]
-            return " ".join(str(row) for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {query}", parameters))
-    finally:
-        sa.event.remove(database.engine, "before_cursor_execute", explain)
+    with database.write() as connection:
+        connection.execute(sa.insert(markers), new)
+    assert counts() == (1, 0)
+    with database.write() as connection:
+        connection.execute(sa.update(markers).where(markers.c.id == new["id"]).values(lon_deg=70.0, lat_deg=33.0))
+    assert counts() == (0, 1)
+    with database.write() as connection:
+        connection.execute(sa.delete(markers).where(markers.c.id == new["id"]))
+    assert counts() == (0, 0)

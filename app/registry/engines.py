@@ -1,0 +1,126 @@
+"""Engines of the two databases: connections, their settings, and which failures mean "try again later"."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import orjson
+import psycopg
+import sqlalchemy as sa
+from sqlalchemy import event
+
+from app.errors import Unavailable
+from app.registry.spatial import register_functions
+
+BUSY_TIMEOUT_S = 10.0
+STATEMENT_TIMEOUT_S = 60.0
+WRITE = "waymark_write"
+LONG = "waymark_long"
+# Every write transaction on PostgreSQL holds this lock of its database from its first statement until it is committed.
+_ONE_WRITER = 0x5741594D41524B  # "WAYMARK"
+_SESSION = {
+    "timezone": "UTC",
+    "statement_timeout": f"{STATEMENT_TIMEOUT_S * 1000:.0f}",
+    "lock_timeout": f"{BUSY_TIMEOUT_S * 1000:.0f}",
+    "jit": "off",  # compiling costs more than any of these queries
+    "plan_cache_mode": "force_custom_plan",  # a plan for any box reads the whole agency for a small one
+}
+_CANNOT_BE_REACHED = "the database cannot be reached"
+
+
+def sqlite_engine(url: sa.URL) -> sa.Engine:
+    """Engine of a SQLite file: WAL, synchronous FULL, foreign keys on; writes start with BEGIN IMMEDIATE."""
+    engine = sa.create_engine(
+        url,
+        connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False},
+        json_serializer=_json,
+        json_deserializer=orjson.loads,
+        pool_size=8,
+        max_overflow=40,
+    )
+
+    @event.listens_for(engine, "connect")
+    def configure(connection: Any, _record: Any) -> None:
+        connection.isolation_level = None  # the driver starts no transaction of its own; `begin` below does
+        register_functions(connection)
+        for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+            connection.execute(f"PRAGMA {pragma}")
+
+    @event.listens_for(engine, "begin")
+    def begin(connection: sa.Connection) -> None:
+        immediate = connection.get_execution_options().get(WRITE, False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+
+    return engine
+
+
+def postgres_engine(url: sa.URL) -> sa.Engine:
+    """Engine of a PostgreSQL database: reads see one snapshot and cannot write; writes come one after another."""
+    given = url.query.get("options", "")
+    options = [f"-c {name}={value}" for name, value in _SESSION.items()]
+    engine = sa.create_engine(
+        url,
+        connect_args={
+            "options": " ".join([*options, given if isinstance(given, str) else " ".join(given)]),
+            "connect_timeout": url.query.get("connect_timeout", int(BUSY_TIMEOUT_S)),
+            "application_name": url.query.get("application_name", "waymark"),
+        },
+        json_serializer=_json,
+        json_deserializer=orjson.loads,
+        pool_size=10,
+        max_overflow=20,
+        pool_timeout=BUSY_TIMEOUT_S,
+        pool_pre_ping=True,
+    )
+
+    @event.listens_for(engine, "begin")
+    def begin(connection: sa.Connection) -> None:
+        options = connection.get_execution_options()
+        if not options.get(WRITE, False):
+            return
+        if options.get(LONG, False):
+            connection.exec_driver_sql("SET LOCAL statement_timeout = 0")
+            connection.exec_driver_sql("SET LOCAL lock_timeout = 0")
+        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_ONE_WRITER})")
+
+    return engine
+
+
+def isolation(url: sa.URL, *, write: bool) -> dict[str, Any]:
+    """Execution options of a connection's next transaction."""
+    if url.get_backend_name() == "sqlite":
+        return {WRITE: write}
+    # after it has the lock, a writer is the only one: each of its statements sees all that was committed before
+    level = "READ COMMITTED" if write else "REPEATABLE READ"
+    return {WRITE: write, "isolation_level": level, "postgresql_readonly": not write}
+
+
+@contextmanager
+def busy_is_unavailable() -> Iterator[None]:
+    """Failures of a database that works again later, as `Unavailable`."""
+    try:
+        yield
+    except sa.exc.TimeoutError as error:
+        raise Unavailable("every database connection is in use", cure="try again in a few seconds") from error
+    except sa.exc.OperationalError as error:
+        message = _temporary(error)
+        if message is None:
+            raise
+        raise Unavailable(message, cure="try again in a few seconds") from error
+
+
+def _temporary(error: sa.exc.OperationalError) -> str | None:
+    cause = error.orig
+    if not isinstance(cause, psycopg.Error):
+        return "the database is busy" if "locked" in str(cause) or "busy" in str(cause) else None
+    if cause.sqlstate == "57014":
+        return f"the database needed more than {STATEMENT_TIMEOUT_S:.0f} s for one statement"
+    if cause.sqlstate in ("55P03", "40001", "40P01"):
+        return "the database is busy"
+    return _CANNOT_BE_REACHED
+
+
+def _json(value: Any) -> str:
+    return orjson.dumps(value).decode()

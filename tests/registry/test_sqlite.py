@@ -1,0 +1,91 @@
+"""What only a SQLite file has: its owner, its durability, its lock, its R*Tree."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+
+from app.registry import agencies
+from app.registry.database import Database
+from app.services.access import Access, Caller, Scope
+from app.services.markers import GivenPosition, Markers, NewPlate
+
+NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def backend() -> str:
+    return "sqlite"
+
+
+def test_constructing_a_database_touches_nothing(tmp_path: Path) -> None:
+    Database(f"sqlite:///{tmp_path / 'db' / 'waymark.sqlite3'}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_connection_is_durable(database: Database) -> None:
+    with database.read() as connection:
+        journal = connection.exec_driver_sql("PRAGMA journal_mode").scalar()
+        numbers = [connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in ("synchronous", "foreign_keys")]
+    assert journal == "wal"
+    assert numbers == [2, 1]
+
+
+def test_a_write_takes_the_lock_at_its_start(database: Database) -> None:
+    rival = sa.create_engine(database.url, connect_args={"timeout": 0})
+    with database.write(), rival.connect() as connection, pytest.raises(sa.exc.OperationalError, match="locked"):
+        connection.exec_driver_sql("INSERT INTO agencies VALUES ('a', 'b', '2026-01-01')")
+    rival.dispose()
+
+
+def test_a_second_process_is_told_who_owns_the_file(database: Database) -> None:
+    program = (
+        "import sys; from app.registry.database import Database; from app.errors import Unavailable\n"
+        "try: Database(sys.argv[1]).open()\nexcept Unavailable as error: print(error.message, '|', error.cure)"
+    )
+    second = subprocess.run(
+        [sys.executable, "-c", program, str(database.url)],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parents[2],
+    )
+    assert "in use by another Waymark process (pid " in second.stdout
+    assert "WAYMARK_DATA_DIR" in second.stdout
+    database.close()
+    reopened = Database(str(database.url))
+    reopened.open()
+    reopened.close()
+
+
+def test_the_spatial_index_follows_the_table(database: Database) -> None:
+    with database.write() as connection:
+        caller = Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.WRITE)
+    plate = NewPlate(GivenPosition(lon_deg=7.5, lat_deg=1.0))
+    marker = Markers(database, lambda: NOW).register_plate(caller, plate)[0]
+
+    def boxes() -> list[tuple[float, ...]]:
+        with database.read() as connection:
+            rows = connection.exec_driver_sql("SELECT min_lon, max_lon, min_lat, max_lat FROM markers_rtree").all()
+        return [tuple(row) for row in rows]
+
+    assert boxes() == [(7.5, 7.5, 1.0, 1.0)]
+    with database.write() as connection:
+        connection.exec_driver_sql("UPDATE markers SET lon_deg = -3.25")
+    assert boxes() == [(-3.25, -3.25, 1.0, 1.0)]
+    with database.write() as connection:
+        connection.exec_driver_sql("DELETE FROM marker_versions")
+        connection.exec_driver_sql("DELETE FROM markers WHERE id = ?", (marker["id"],))
+    assert boxes() == []
+
+
+def test_no_key_is_in_the_files(database: Database) -> None:
+    key = Access(database, lambda: NOW).create_key("agency", Scope.READ, "a key")
+    assert database.path is not None
+    database.engine.dispose()
+    assert all(key.encode() not in file.read_bytes() for file in database.path.parent.iterdir())
