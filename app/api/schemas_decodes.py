@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, JsonValue
 
 from app.api.dependencies import Number, Whole
-from app.api.schemas_packets import HeardMarkerOut, LaneOut, OverlayOut, PacketReportOut, PacketsIn, SteeringOut
+from app.api.schemas_packets import DecodedLaneOut, HeardMarkerOut, OverlayOut, PacketReportOut, PacketsIn, SteeringOut
 from app.api.schemas_traces import CrossingOut, MagnetReadingOut, NoiseOut, ReportOut, TagFixOut, TagOut, TraceIn
 from app.services.decode_context import CameraSetup, CoarsePosition, DecodeContext
 
@@ -194,7 +194,7 @@ class DecodeOut(BaseModel):
     magnets: list[MagnetReadingOut] | None = None
     noise: list[NoiseOut] | None = None
     markers: list[HeardMarkerOut] | None = None
-    lane: LaneOut | None = None
+    lane: DecodedLaneOut | None = None
     steering: SteeringOut | None = None
     overlay: OverlayOut | None = None
     path_loss: dict[str, Any] | None = None

@@ -102,6 +102,13 @@ class HealthOut(BaseModel):
     farthest_m: float | None
 
 
+class RssiProfileOut(BaseModel):
+    """Strength of a marker's packets by distance, nearest first; at most 200 of them."""
+
+    distance_m: list[float]
+    rssi_dbm: list[float]
+
+
 class HeardMarkerOut(BaseModel):
     """One marker that was heard."""
 
@@ -121,9 +128,10 @@ class HeardMarkerOut(BaseModel):
     left_out: str | None
     notes: list[str]
     health: HealthOut | None
+    rssi_profile: RssiProfileOut | None
 
 
-class LaneOut(BaseModel):
+class DecodedLaneOut(BaseModel):
     """The lane's reference path, at stations along it."""
 
     method: str

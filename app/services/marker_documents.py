@@ -17,10 +17,7 @@ def plate_document(row: Row | dict[str, Any]) -> dict[str, Any]:
     """A plate."""
     n, unit_mm, gap_mm = row["n"], row["unit_mm"], row["gap_mm"]
     return {
-        "id": row["id"],
-        "family": row["family"],
-        "status": row["status"],
-        "version": row["version"],
+        **_head(row),
         "code": {
             "scheme": row["scheme"],
             "digits": row["digits"],
@@ -35,6 +32,17 @@ def plate_document(row: Row | dict[str, Any]) -> dict[str, Any]:
             "thickness_mm": row["thickness_mm"],
             "side_mm": n * unit_mm + (n + 1) * gap_mm,
         },
+        **_place(row),
+    }
+
+
+def _head(row: Row | dict[str, Any]) -> dict[str, Any]:
+    return {name: row[name] for name in ("id", "family", "status", "version")}
+
+
+def _place(row: Row | dict[str, Any]) -> dict[str, Any]:
+    """What every family says of where a marker is, and since when."""
+    return {
         "position": _position(row),
         "heading_deg": row["heading_deg"],
         "heading_rmse_deg": row["heading_rmse_deg"],
@@ -84,20 +92,10 @@ def magnet_document(row: Row | dict[str, Any]) -> dict[str, Any]:
     """A magnet marker as lists and histories show it: all but what follows from its layout."""
     spec = row["spec"]
     return {
-        "id": row["id"],
-        "family": row["family"],
-        "status": row["status"],
-        "version": row["version"],
+        **_head(row),
         "code": _tag_document(spec),
         "layout": spec["place"],
-        "position": _position(row),
-        "heading_deg": row["heading_deg"],
-        "heading_rmse_deg": row["heading_rmse_deg"],
-        "road": row["road"],
-        "measure_m": row["measure_m"],
-        "offset_m": row["offset_m"],
-        "created_at": row["created_at"],
-        "updated_at": row["updated_at"],
+        **_place(row),
     }
 
 
@@ -166,21 +164,11 @@ def cerpm_document(row: Row | dict[str, Any]) -> dict[str, Any]:
     """A CERPM."""
     spec = row["spec"]
     return {
-        "id": row["id"],
-        "family": row["family"],
-        "status": row["status"],
-        "version": row["version"],
+        **_head(row),
         "code": {"scheme": row["scheme"], "text": row["digits"], "number": int(row["digits"])},
         "side": spec["side"],
         "speed_limit": spec["speed_limit"],
         "dev_eui": spec["dev_eui"],
         "radio": spec["radio"],
-        "position": _position(row),
-        "heading_deg": row["heading_deg"],
-        "heading_rmse_deg": row["heading_rmse_deg"],
-        "road": row["road"],
-        "measure_m": row["measure_m"],
-        "offset_m": row["offset_m"],
-        "created_at": row["created_at"],
-        "updated_at": row["updated_at"],
+        **_place(row),
     }
