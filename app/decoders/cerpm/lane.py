@@ -39,6 +39,7 @@ _KNOWN_WIDTH_M, _KNOWN_SIDE_M = 0.3, 0.4
 _BEYOND_M = 15.0
 _SURE_TRACK_M = 0.5
 _SAME_PLACE_M = 3.0
+_LEAST_CHANGES = 0.35
 
 
 def fit_lane(
@@ -121,7 +122,8 @@ def _fit(stock: Stock, taken: Bools, drive: Drive | None, rules: LaneRules, note
         return _refused(stock, notes, f"the markers share no line: {len(fit.left_out)} of them lie off it", "waymark")
     found = set(np.unique(fit.side[fit.used]).tolist())
     sure = drive is not None and drive.accuracy_m < _SURE_TRACK_M
-    if len(found) == 1 and not sure and not (stock.side[fit.used] != UNKNOWN).any():
+    told = sure or bool((stock.side[fit.used] != UNKNOWN).any())
+    if not told and (len(found) == 1 or _is_one_row(fit)):
         return _refused(stock, notes, "one row of markers, and nothing tells on which side of the lane", "waymark")
     if len(found) == 1:
         notes.doubt("only one side of the lane was heard: the path lies half the usual width off it")
@@ -133,6 +135,12 @@ def _fit(stock: Stock, taken: Bools, drive: Drive | None, rules: LaneRules, note
     if not len(lane.sigma_m) or float(np.median(lane.sigma_m)) > rules.hopeless_sigma_m:
         return _refused(stock, notes, "the markers are too few or too coarse to tell where the lane runs", "waymark")
     return lane
+
+
+def _is_one_row(fit: Fit) -> bool:
+    """Whether sides hardly ever change from marker to marker: a row that a coarse track has cut into two sides."""
+    side = fit.side[fit.used][np.argsort(fit.station_m[fit.used], kind="stable")]
+    return float(np.mean(side[1:] != side[:-1])) < _LEAST_CHANGES
 
 
 def _first_line(

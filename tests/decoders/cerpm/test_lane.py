@@ -7,7 +7,8 @@ import pytest
 
 from app.decoders.cerpm.lane import LaneMarkers, LaneRules, LeftOutReason, fit_lane, preview_m
 from app.errors import InvalidParameter
-from tests.decoders.cerpm.lanes import bendy, chosen, drive, markers_at, moved, place, straight
+from app.sensors.pose_track import PoseTrack
+from tests.decoders.cerpm.lanes import bendy, chosen, drive, markers_at, moved, on_globe, place, straight
 
 
 def rms(values):
@@ -212,3 +213,29 @@ def test_what_is_refused_as_a_call():
         LaneRules(usual_width_m=float("nan"))
     with pytest.raises(InvalidParameter):
         LaneRules(bridge_m=-1.0)
+
+
+@pytest.mark.parametrize(("wave_m", "seed"), [(80.0, 1100), (80.0, 1102), (150.0, 1101), (150.0, 1103)])
+def test_a_row_that_a_coarse_track_crosses_is_not_two_sides(wave_m, seed):
+    rng = np.random.default_rng(seed)
+    road = bendy(400.0)
+    points = road.beside(np.arange(0, road.at[-1], 12.2), -1.6)
+    row = markers_at(points + rng.normal(0, 0.02, points.shape), 0)
+    at = road.at[::4]
+    wave = 2.0 * np.sin(2 * np.pi * at / wave_m + rng.uniform(0, 2 * np.pi))
+    lon_deg, lat_deg = on_globe(road.beside(at, wave - 1.6))
+    count = len(at)
+    track = PoseTrack(1.7e9 + 0.1 * np.arange(count), lon_deg, lat_deg, np.full(count, np.nan), np.full(count, 2.0))
+    lane = fit_lane(row, track)
+    assert lane.refusal is not None
+    assert "side" in lane.refusal
+
+
+def test_two_unlabelled_rows_beside_a_coarse_track_are_two_sides():
+    rng = np.random.default_rng(1104)
+    road = bendy(400.0)
+    markers = place(road, rng, labelled=False)
+    kept = chosen(markers, rng.random(len(markers)) > 0.3)
+    lane = fit_lane(kept, drive(road, rng, wander=0.8, accuracy=2.0))
+    assert lane.refusal is None
+    assert rms(road.errors(lane)) < 0.1
