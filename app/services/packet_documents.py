@@ -12,7 +12,9 @@ from app.decoders.cerpm.lane_types import Lane
 from app.decoders.cerpm.merge_types import Disagreement
 from app.decoders.cerpm.path_loss import Estimate
 from app.decoders.cerpm.signal import SignalProfile
+from app.decoders.cerpm.track_places import vehicle_places
 from app.decoders.cerpm.verify import Verdict
+from app.geodesy import LocalizationGrade
 from app.markers.cerpm import LaneSide
 from app.services.decode_documents import count_of
 from app.services.lane_documents import lane_document, overlay_document, steering_document
@@ -21,6 +23,8 @@ from app.services.packets import DriveFiles, LaneResult
 
 DECODER_VERSION = "cerpm/1"
 MAX_REFUSED = 500
+MAX_PROFILE = 200
+"""Packets in the RSSI profile of one marker."""
 _OBSERVED = {Disagreement.MOVED: "moved", Disagreement.TWO_PLACES: "cloned", Disagreement.OUT_OF_REACH: "out-of-reach"}
 
 
@@ -28,7 +32,8 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
     """What a decode of a drive found, as it is stored."""
     lane = result.lane
     markers = _markers(read, lane)
-    document = lane_document(lane, grade=str(read.grade))
+    grade = read.grade if lane.refusal is None else LocalizationGrade.APPROXIMATE
+    document = lane_document(lane, grade=str(grade))
     document["doubts"] += read.doubts
     path_loss = read.signal.path_loss
     return {
@@ -112,6 +117,11 @@ def _report(files: DriveFiles, read: ReadPackets, result: LaneResult) -> dict[st
     ]
     warnings = [text for report in files.reports.values() for text in report.warnings]
     warnings += [*read.verification.warnings, *read.merged.warnings]
+    if files.track is not None and _is_of_another_time(files):
+        warnings.append(
+            "no packet was heard while the vehicle's track lasts: how far away markers were is not known; the track "
+            "is of another drive, or the clocks do not fit"
+        )
     if files.frame is not None and result.overlay is None and not result.lane.refusal:
         warnings.append(
             "no overlay: it takes camera in the context, and where the vehicle was at captured_at (poses with "
@@ -131,6 +141,12 @@ def _report(files: DriveFiles, read: ReadPackets, result: LaneResult) -> dict[st
         "verify_ms": round(read.verify_ms, 1),
         "decode_ms": round(result.decode_ms, 1),
     }
+
+
+def _is_of_another_time(files: DriveFiles) -> bool:
+    times_s = np.array([packet.heard_at_s for packet in files.packets], float)
+    times_s = times_s[np.isfinite(times_s)]
+    return len(times_s) > 0 and files.track is not None and not np.isfinite(vehicle_places(files.track, times_s)).any()
 
 
 def _markers(read: ReadPackets, lane: Lane) -> list[dict[str, Any]]:
@@ -172,6 +188,7 @@ def _markers(read: ReadPackets, lane: Lane) -> list[dict[str, Any]]:
                 "left_out": out,
                 "notes": [f.reason for f in merged.findings if f.number == number and f.reason != out],
                 "health": _health(profile) if profile is not None else None,
+                "rssi_profile": _rssi_profile(profile) if profile is not None else None,
             }
         )
     return documents
@@ -215,6 +232,19 @@ def _health(profile: SignalProfile) -> dict[str, Any]:
         "level_db_high": round(level.high, 2) if level is not None else None,
         "delivery": round(delivery.value, 4) if delivery is not None else None,
         "farthest_m": round(profile.farthest_m, 1) if math.isfinite(profile.farthest_m) else None,
+    }
+
+
+def _rssi_profile(profile: SignalProfile) -> dict[str, list[float]] | None:
+    """Strength of a marker's packets by distance, nearest first; of many packets evenly chosen ones."""
+    measured = np.flatnonzero(np.isfinite(profile.distance_m) & np.isfinite(profile.rssi_dbm))
+    if not len(measured):
+        return None
+    rows = measured[np.argsort(profile.distance_m[measured], kind="stable")]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MAX_PROFILE)).round().astype(int)]
+    return {
+        "distance_m": profile.distance_m[rows].round(2).tolist(),
+        "rssi_dbm": profile.rssi_dbm[rows].round(2).tolist(),
     }
 
 

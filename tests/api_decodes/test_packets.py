@@ -140,6 +140,22 @@ def test_a_drive_gives_the_lane_its_pictures_and_observations(road: tuple[httpx.
     plot = client.get(found["links"]["plot"])
     assert plot.headers["content-type"].startswith("image/svg")
     assert "Lane of" in plot.text
+    for marker in found["markers"]:
+        strengths, health = marker["rssi_profile"], marker["health"]
+        assert strengths["distance_m"] == sorted(strengths["distance_m"])
+        assert len(strengths["distance_m"]) == len(strengths["rssi_dbm"]) == marker["packets"]
+        assert max(strengths["rssi_dbm"]) == pytest.approx(marker["best_rssi_dbm"], abs=0.01)
+        assert strengths["distance_m"][-1] == pytest.approx(health["farthest_m"], abs=0.1)
+
+
+def test_a_track_of_another_day_is_said(road: tuple[httpx.Client, BuiltLane]) -> None:
+    client, built = road
+    heard, _hour = drive(built, 1915)
+    later = replace(heard, track=replace(heard.track, time_s=heard.track.time_s + 86_400.0))
+    found = decoded(client, packed(later))
+    assert any("no packet was heard while" in warning for warning in found["report"]["warnings"])
+    assert all(marker["rssi_profile"] is None for marker in found["markers"])
+    assert not any("no packet" in text for text in decoded(client, packed(heard))["report"]["warnings"])
 
 
 def test_packets_without_poses_or_times_still_give_a_lane(road: tuple[httpx.Client, BuiltLane]) -> None:
