@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry
 from app import __version__
 from app.api import artwork, cerpms, codebooks, decodes, layouts, markers, radio_checks, system, ui
 from app.api.middleware import Guarded, Observed
+from app.api.ogc import mount_ogc
 from app.api.openapi import describe
 from app.api.problems import install_problem_handlers
 from app.decoders.archives import ArchiveLimits
@@ -35,6 +36,7 @@ from app.services.codebooks import Codebooks
 from app.services.decode_jobs import DecodeJobs
 from app.services.decode_rules import DecodeRules
 from app.services.decodes import Decodes
+from app.services.features import Features
 from app.services.layouts import Layouts
 from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
@@ -95,11 +97,14 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, secrets=secrets, rules=rules)
     app.state.jobs = jobs
     app.state.artworks = Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode))
+    app.state.features = Features(database, utc_now)
+    app.state.public_url = settings.public_url.rstrip("/")
     app.state.access = access
     app.state.readiness = readiness
     app.state.metrics = metrics
     for router in ROUTERS:
         app.include_router(router)
+    mount_ogc(app)
     ui.mount_static(app)
     install_problem_handlers(app)
     describe(app)

@@ -1,0 +1,276 @@
+"""Query strings of /ogc. What a client cannot mean is 400 here, as OGC API Features asks."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection as Names
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, timezone
+from typing import NoReturn
+from urllib.parse import parse_qsl
+
+from starlette.requests import Request
+
+from app.errors import MalformedRequest
+from app.registry.features import FIELDS_BY_NAME, FeatureFilter
+from app.registry.spatial import Box
+from app.services.feature_crs import STORAGE_CRS, FeatureCrs
+
+DEFAULT_LIMIT = 1000
+MAX_LIMIT = 10_000
+_MAX_QUERY_BYTES = 8192
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?", re.ASCII)
+_TIME = re.compile(
+    r"(?P<year>[0-9]{4})-(?P<month>[0-9]{2})-(?P<day>[0-9]{2})"
+    r"(?P<clock>[Tt ](?P<hour>[0-9]{2}):(?P<minute>[0-9]{2})(:(?P<second>[0-9]{2})(?P<part>\.[0-9]+)?)?"
+    r"(?P<zone>[Zz]|[+-][0-9]{2}:[0-9]{2})?)?",
+    re.ASCII,
+)
+_ID = re.compile(r"[\x21-\x7e]{1,300}", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class ItemsQuery:
+    """What a request for items asks for."""
+
+    narrowed: FeatureFilter
+    limit: int
+    after: str | None
+    crs: FeatureCrs
+    hits: bool
+    counted: bool
+
+
+def refuse(name: str, message: str, limit: str) -> NoReturn:
+    """Refuse a parameter."""
+    raise MalformedRequest(message, field=name, limit=limit, cure="/ogc/api describes the parameters")
+
+
+def query_pairs(request: Request) -> list[tuple[str, str]]:
+    """The parameters as they were sent.
+
+    Raises
+    ------
+    MalformedRequest
+        They are not UTF-8, too long, hold a NUL, or one is sent twice.
+    """
+    raw: bytes = request.scope["query_string"]
+    if not raw:
+        return []
+    if len(raw) > _MAX_QUERY_BYTES:
+        refuse("query", "the query string is too long", f"{_MAX_QUERY_BYTES} bytes")
+    try:
+        pairs = parse_qsl(raw.decode("ascii"), keep_blank_values=True, errors="strict", max_num_fields=100)
+    except ValueError:
+        refuse("query", "the query string cannot be read", "at most 100 parameters in UTF-8, percent-encoded")
+    if any("\x00" in text for pair in pairs for text in pair):
+        refuse("query", "the query string holds NUL", "no U+0000")
+    return pairs
+
+
+def known_parameters(request: Request, known: Names[str]) -> dict[str, str]:
+    """Parameters by name, each of them known and sent once.
+
+    Raises
+    ------
+    MalformedRequest
+        They are not.
+    """
+    pairs = query_pairs(request)
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        refuse("query", "a parameter is sent twice", "each parameter once")
+    for name in found:
+        if name not in known:
+            refuse(name[:80], "there is no such parameter here", ", ".join(known))
+    return found
+
+
+ITEM_PARAMETERS = ("f", "crs")
+LIST_PARAMETERS = (
+    *("f", "crs", "bbox", "bbox-crs", "datetime", "limit", "after", "resultType", "count"),
+    *(name for name in FIELDS_BY_NAME if name != "updated_at"),
+)
+
+
+def items_query(request: Request, *, retired: bool) -> ItemsQuery:
+    """The parsed parameters of a request for items.
+
+    Raises
+    ------
+    MalformedRequest
+        One is unknown or cannot be.
+    """
+    found = known_parameters(request, LIST_PARAMETERS)
+    box, heights_m = _bbox(found)
+    since, until = _datetime(found["datetime"]) if "datetime" in found else (None, None)
+    kind = found.get("resultType", "results")
+    if kind not in ("results", "hits"):
+        refuse("resultType", "resultType is results or hits", "results, hits")
+    after = found.get("after")
+    if after is not None and not _ID.fullmatch(after):
+        refuse("after", "after is the id of a feature", "take it from a next link")
+    narrowed = FeatureFilter(
+        retired=retired,
+        box=box,
+        heights_m=heights_m,
+        since=since,
+        until=until,
+        equal=tuple((name, _value(name, text)) for name, text in found.items() if name in FIELDS_BY_NAME),
+    )
+    return ItemsQuery(
+        narrowed, _limit(found), after, crs_parameter(found, "crs"), kind == "hits", _flag(found, "count")
+    )
+
+
+def crs_parameter(found: dict[str, str], name: str) -> FeatureCrs:
+    """The CRS that a parameter names.
+
+    Raises
+    ------
+    MalformedRequest
+        It is none of ours.
+    """
+    given = found.get(name)
+    if given is None:
+        return STORAGE_CRS
+    if given not in list(FeatureCrs):
+        refuse(name, "this CRS is not offered", ", ".join(FeatureCrs))
+    return FeatureCrs(given)
+
+
+def number(name: str, text: str) -> float:
+    """A finite number.
+
+    Raises
+    ------
+    MalformedRequest
+        It is none.
+    """
+    text = text.strip()
+    if len(text) > 64 or not _NUMBER.fullmatch(text) or not math.isfinite(float(text)):
+        refuse(name, f"{name} holds something that is not a finite number", "finite decimal numbers")
+    return float(text)
+
+
+def _limit(found: dict[str, str]) -> int:
+    text = found.get("limit")
+    if text is None:
+        return DEFAULT_LIMIT
+    if not re.fullmatch(r"[+-]?[0-9]{1,200}", text, re.ASCII):
+        refuse("limit", "limit is not a whole number", f"1 to {MAX_LIMIT}; what is beyond is brought back to it")
+    return min(max(int(text), 1), MAX_LIMIT)
+
+
+def _flag(found: dict[str, str], name: str) -> bool:
+    text = found.get(name, "false")
+    if text not in ("true", "false"):
+        refuse(name, f"{name} is true or false", "true, false")
+    return text == "true"
+
+
+def _value(name: str, text: str) -> str | float:
+    kind = FIELDS_BY_NAME[name].kind
+    if kind == "string":
+        return text
+    value = number(name, text)
+    if kind != "integer":
+        return value
+    if value != int(value) or not -(2**31) <= value < 2**31:
+        refuse(name, f"{name} is a whole number", "32 bits")
+    return int(value)
+
+
+def _bbox(found: dict[str, str]) -> tuple[Box | None, tuple[float, float] | None]:
+    crs = crs_parameter(found, "bbox-crs")
+    text = found.get("bbox")
+    if text is None:
+        if "bbox-crs" in found:
+            refuse("bbox-crs", "bbox-crs means nothing without bbox", "bbox with bbox-crs")
+        return None, None
+    numbers = [number("bbox", part) for part in text.split(",", 7)]
+    if len(numbers) not in (4, 6):
+        refuse("bbox", "bbox has four numbers, or six with heights", "west,south,east,north")
+    half = len(numbers) // 2
+    low, high = numbers[:half], numbers[half:]
+    heights_m = (low[2], high[2]) if half == 3 else None
+    west, south = crs.to_lon_lat(low[0], low[1])
+    east, north = crs.to_lon_lat(high[0], high[1])
+    if south > north or (heights_m is not None and heights_m[0] > heights_m[1]):
+        refuse(
+            "bbox", "bbox has its upper bound below its lower one", "lower corner first; west of east may be greater"
+        )
+    return _on_earth(west, south, east, north), heights_m
+
+
+def _on_earth(west: float, south: float, east: float, north: float) -> Box:
+    """The box within -180 to 180 and -90 to 90; maps that show more than the world ask for more."""
+    south, north = max(south, -90.0), min(north, 90.0)
+    if east - west >= 360.0:
+        return Box(-180.0, south, 180.0, north)
+    return Box(_wrapped(west), south, _wrapped(east), north)
+
+
+def _wrapped(lon_deg: float) -> float:
+    return lon_deg if -180.0 <= lon_deg <= 180.0 else (lon_deg + 180.0) % 360.0 - 180.0
+
+
+def _datetime(text: str) -> tuple[datetime | None, datetime | None]:
+    """First and last moment of an instant or an interval; None is open."""
+    parts = text.split("/")
+    if len(parts) == 1:
+        return _moment(parts[0], last=False), _moment(parts[0], last=True)
+    if len(parts) != 2 or all(part in ("", "..") for part in parts):
+        refuse("datetime", "datetime is a moment or an interval", "2026-03-04T05:06:07Z, a/b, ../b or a/..")
+    since = None if parts[0] in ("", "..") else _moment(parts[0], last=False)
+    until = None if parts[1] in ("", "..") else _moment(parts[1], last=True)
+    if since is not None and until is not None and since > until:
+        refuse("datetime", "the interval ends before it begins", "begin/end")
+    return since, until
+
+
+_FIRST = datetime.min.replace(tzinfo=UTC)
+_LAST = datetime.max.replace(tzinfo=UTC)
+
+
+def _moment(text: str, *, last: bool) -> datetime:
+    """A moment; of a date or a whole second, its first or last one. Years without a datetime become the nearest."""
+    match = _TIME.fullmatch(text)
+    if match is None:
+        refuse("datetime", "datetime is not in RFC 3339", "2026-03-04T05:06:07Z or 2026-03-04")
+    year = int(match["year"])
+    leap_second = match["second"] == "60"
+    try:
+        moment = datetime(
+            max(year, 1) if year else 4,  # year 0 was a leap year; only its month and day are checked
+            int(match["month"]),
+            int(match["day"]),
+            int(match["hour"] or 0),
+            int(match["minute"] or 0),
+            59 if leap_second else int(match["second"] or 0),
+            int((match["part"] or ".0")[1:7].ljust(6, "0")),
+            tzinfo=_zone(match["zone"]),
+        )
+    except ValueError:
+        refuse("datetime", "there is no such moment", "RFC 3339")
+    if year == 0:
+        return _FIRST
+    try:
+        moment = moment.astimezone(UTC)
+        if last and match["part"] is None:
+            moment += timedelta(seconds=1) if match["clock"] else timedelta(days=1)
+            moment -= timedelta(microseconds=1)
+    except OverflowError:
+        return _FIRST if year == 1 else _LAST
+    return moment
+
+
+def _zone(text: str | None) -> timezone:
+    if text is None or text in "Zz":
+        return UTC
+    sign = -1 if text[0] == "-" else 1
+    hours, minutes = int(text[1:3]), int(text[4:6])
+    if hours > 23 or minutes > 59:
+        raise ValueError("no such zone")
+    return timezone(sign * timedelta(hours=hours, minutes=minutes))

@@ -1,0 +1,103 @@
+"""What every answer under /ogc has in common: media types, absolute links, and who may see what."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+from urllib.parse import urlencode
+
+import orjson
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from app.api.ogc.query import refuse
+from app.errors import NotAuthenticated
+from app.services.access import Caller
+from app.services.feature_crs import FeatureCrs
+
+JSON = "application/json"
+GEOJSON = "application/geo+json"
+SCHEMA = "application/schema+json"
+OPENAPI = "application/vnd.oai.openapi+json;version=3.0"
+MVT = "application/vnd.mapbox-vector-tile"
+_OPTIONS = orjson.OPT_NAIVE_UTC | orjson.OPT_UTC_Z
+_HOST = re.compile(r"[A-Za-z0-9.\-]+(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]+\](:[0-9]{1,5})?", re.ASCII)
+_PREFIX = re.compile(r"(/[A-Za-z0-9._~\-]+)*/?", re.ASCII)
+
+
+def caller_of(request: Request) -> Caller:
+    """The caller that the middleware authenticated."""
+    caller = request.scope.get("state", {}).get("caller")
+    if not isinstance(caller, Caller):
+        raise NotAuthenticated("this resource needs a key", field="Authorization")
+    return caller
+
+
+def base_url(request: Request) -> str:
+    """Where the client reaches /ogc: as the deployment says, or as the proxy or the client says."""
+    configured: str = request.app.state.public_url
+    if configured:
+        return f"{configured}/ogc"
+    headers = request.headers
+    scheme = _first(headers.get("x-forwarded-proto"))
+    scheme = scheme if scheme in ("http", "https") else request.url.scheme
+    host = _first(headers.get("x-forwarded-host")) or headers.get("host", "")
+    prefix = _first(headers.get("x-forwarded-prefix"))
+    if not _HOST.fullmatch(host):
+        host = request.url.netloc
+    if not _PREFIX.fullmatch(prefix):
+        prefix = ""
+    return f"{scheme}://{host}{prefix.rstrip('/')}/ogc"
+
+
+def _first(header: str | None) -> str:
+    return (header or "").partition(",")[0].strip()
+
+
+def link(href: str, rel: str, kind: str, title: str | None = None) -> dict[str, str]:
+    """A link."""
+    made = {"href": href, "rel": rel, "type": kind}
+    return made if title is None else {**made, "title": title}
+
+
+def with_query(url: str, pairs: list[tuple[str, str]]) -> str:
+    """A URL with parameters."""
+    return f"{url}?{urlencode(pairs)}" if pairs else url
+
+
+def negotiate(request: Request, found: dict[str, str], *kinds: str, names: tuple[str, ...] = ("json",)) -> None:
+    """Refuse a client that wants none of these media types.
+
+    Raises
+    ------
+    MalformedRequest
+        `f` names another format.
+    HTTPException
+        406: the Accept header names others only.
+    """
+    if "f" in found:
+        if found["f"] not in names:
+            refuse("f", "this format is not offered", ", ".join(names))
+        return
+    accepted = request.headers.get("accept")
+    if accepted is None or "*/*" in accepted or "application/*" in accepted:
+        return
+    wanted = [part.partition(";")[0].strip().lower() for part in accepted.split(",")]
+    if not any(kind.partition(";")[0] in wanted for kind in kinds):
+        raise HTTPException(406, f"this is sent as {', '.join(kinds)}")
+
+
+def answer(
+    content: Any,
+    kind: str = JSON,
+    *,
+    status: int = 200,
+    crs: FeatureCrs | None = None,
+    headers: dict[str, str] | None = None,
+) -> Response:
+    """A JSON document, as the key's owner alone may keep it."""
+    sent = {"Cache-Control": "private, no-cache", **(headers or {})}
+    if crs is not None:
+        sent["Content-Crs"] = f"<{crs}>"
+    return Response(orjson.dumps(content, option=_OPTIONS), status, sent, media_type=kind)

@@ -1,0 +1,45 @@
+"""The routes of /ogc. Plain ones: bodies and parameters are read by hand here, and every map view passes through."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+from starlette.routing import Match, Route
+from starlette.types import Scope
+
+from app.api.ogc import documents, items
+
+_ITEMS = "/ogc/collections/{collection}/items"
+
+
+class _NamedRoute(Route):
+    """A route that metrics and logs can name."""
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        match, child = super().matches(scope)
+        if match is not Match.NONE:
+            child["route"] = self
+        return match, child
+
+
+def _route(path: str, endpoint: Any, *methods: str) -> Route:
+    return _NamedRoute(path, endpoint, methods=list(methods or ("GET",)), include_in_schema=False)
+
+
+ROUTES = (
+    _route("/ogc", documents.landing_page),
+    _route("/ogc/", documents.landing_page),
+    _route("/ogc/conformance", documents.conformance),
+    _route("/ogc/api", documents.api),
+    _route("/ogc/collections", documents.collections),
+    _route("/ogc/collections/{collection}", documents.collection),
+    _route("/ogc/collections/{collection}/schema", documents.schema),
+    _route(_ITEMS, items.list_items),
+    _route(f"{_ITEMS}/{{feature}}", items.get_item),
+)
+
+
+def mount_ogc(app: FastAPI) -> None:
+    """Add /ogc to an app that has its use cases in `app.state.features` and `app.state.public_url`."""
+    app.router.routes.extend(ROUTES)

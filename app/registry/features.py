@@ -1,0 +1,238 @@
+"""Markers as features: pages, counts and extents for GIS clients.
+
+A page is asked for thousands of times a second, and building a statement costs more than running it. So a statement is
+built once for each shape of a question, and every value in it is a bound parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import sqlalchemy as sa
+
+from app.registry.spatial import Box, proposed_by_index
+from app.registry.tables import markers
+
+Rows = list[sa.Row[Any]]
+_WIDE_DEG2 = 2_500.0  # from here on most markers are inside, and the order of the page finds them sooner than the index
+
+
+class Field(NamedTuple):
+    """A property of a feature: its name, its JSON type, its column, and what it means."""
+
+    name: str
+    kind: str
+    column: sa.ColumnElement[Any]
+    text: str
+
+
+_C = markers.c
+_side = sa.case((_C.family == "cerpm", _C.spec["side"].as_string()))
+FIELDS = (
+    Field("family", "string", _C.family, "plate, magnet or cerpm"),
+    Field("status", "string", _C.status, "planned, built, surveyed, active, suspect or retired"),
+    Field("scheme", "string", _C.scheme, "How the code carries its meaning"),
+    Field("code", "string", _C.digits, "Digits of a plate, text of a tag, number of a CERPM"),
+    Field("heading_deg", "number", _C.heading_deg, "Direction of travel, clockwise from true north [deg]"),
+    Field("heading_rmse_deg", "number", _C.heading_rmse_deg, "Accuracy of the heading [deg]"),
+    Field("side", "string", _side, "Side of the lane that a CERPM says it is on"),
+    Field("road", "string", _C.road, "Road's name or number"),
+    Field("measure_m", "number", _C.measure_m, "Chainage along the road [m]"),
+    Field("offset_m", "number", _C.offset_m, "Offset from the road's axis, left positive [m]"),
+    Field("realization", "string", _C.realization, "Reference frame of the position"),
+    Field("epoch", "number", _C.epoch, "Coordinate epoch [decimal year]"),
+    Field("vertical_datum", "string", _C.vertical_datum, "What the height is above"),
+    Field("horizontal_rmse_m", "number", _C.horizontal_rmse_m, "Horizontal accuracy [m]"),
+    Field("vertical_rmse_m", "number", _C.vertical_rmse_m, "Vertical accuracy [m]"),
+    Field("survey_method", "string", _C.survey_method, "How it was surveyed"),
+    Field("localization_grade", "string", _C.localization_grade, "Whether a vehicle may be localized by it"),
+    Field("version", "integer", _C.version, "Version of the marker"),
+    Field("updated_at", "date-time", _C.updated_at, "When it was last changed"),
+)
+FIELDS_BY_NAME = {field.name: field for field in FIELDS}
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureFilter:
+    """Which markers are asked for; None does not narrow.
+
+    Attributes
+    ----------
+    retired : bool
+        Markers that are out of use, instead of all others.
+    box : Box or None
+    heights_m : tuple of float or None
+        Least and greatest height; markers without one are in. [m]
+    since, until : datetime or None
+        Bounds of the last change, both inclusive.
+    equal : tuple of (name, value)
+        Properties with a value.
+    """
+
+    retired: bool = False
+    box: Box | None = None
+    heights_m: tuple[float, float] | None = None
+    since: datetime | None = None
+    until: datetime | None = None
+    equal: tuple[tuple[str, str | float], ...] = ()
+
+
+class _Shape(NamedTuple):
+    """What a statement depends on; all else is bound."""
+
+    retired: bool
+    wide: tuple[bool, ...]
+    heights: bool
+    since: bool
+    until: bool
+    equal: tuple[str, ...]
+    after: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """What an agency's markers cover."""
+
+    count: int
+    west_deg: float
+    south_deg: float
+    east_deg: float
+    north_deg: float
+    first: datetime
+    last: datetime
+    epoch: float | None
+
+
+def list_features(
+    connection: sa.Connection, agency_id: str, narrowed: FeatureFilter, *, after: str | None, limit: int
+) -> Rows:
+    """Rows of id, longitude, latitude, height and the fields, in the order of ids."""
+    values = _values(agency_id, narrowed)
+    if after is not None:
+        values["after"] = after
+    return list(connection.execute(_page(_shape(narrowed, after is not None)), {**values, "most": limit}).all())
+
+
+def count_features(connection: sa.Connection, agency_id: str, narrowed: FeatureFilter) -> int:
+    """How many markers a filter leaves."""
+    return int(connection.execute(_count(_shape(narrowed, False)), _values(agency_id, narrowed)).scalar_one())
+
+
+def find_feature(connection: sa.Connection, agency_id: str, marker_id: str, *, retired: bool) -> sa.Row[Any] | None:
+    """One row as `list_features` has them."""
+    return connection.execute(_one(retired), {"agency": agency_id, "id": marker_id}).one_or_none()
+
+
+def find_extent(connection: sa.Connection, agency_id: str, *, retired: bool) -> Extent | None:
+    """What the agency's markers cover, and their epoch if all state the same one; None without any marker."""
+    row = connection.execute(_extent(retired), {"agency": agency_id}).one()
+    if not row.total:
+        return None
+    same = row.epochs == row.total and row.least == row.greatest
+    return Extent(row.total, row.west, row.south, row.east, row.north, row.first, row.last, row.least if same else None)
+
+
+def _shape(narrowed: FeatureFilter, after: bool) -> _Shape:
+    parts = narrowed.box.parts if narrowed.box is not None else ()
+    return _Shape(
+        narrowed.retired,
+        tuple((p.east_deg - p.west_deg) * (p.north_deg - p.south_deg) >= _WIDE_DEG2 for p in parts),
+        narrowed.heights_m is not None,
+        narrowed.since is not None,
+        narrowed.until is not None,
+        tuple(name for name, _ in narrowed.equal),
+        after,
+    )
+
+
+def _values(agency_id: str, narrowed: FeatureFilter) -> dict[str, Any]:
+    values: dict[str, Any] = {"agency": agency_id, "retired": "retired"}
+    for k, box in enumerate(narrowed.box.parts if narrowed.box is not None else ()):
+        values |= {f"w{k}": box.west_deg, f"s{k}": box.south_deg, f"e{k}": box.east_deg, f"n{k}": box.north_deg}
+    if narrowed.heights_m is not None:
+        values["low"], values["high"] = narrowed.heights_m
+    if narrowed.since is not None:
+        values["since"] = narrowed.since
+    if narrowed.until is not None:
+        values["until"] = narrowed.until
+    for k, (_, value) in enumerate(narrowed.equal):
+        values[f"v{k}"] = value
+    return values
+
+
+def _owned(retired: bool) -> list[sa.ColumnElement[bool]]:
+    status: sa.BindParameter[str] = sa.bindparam("retired", "retired", sa.String())
+    return [_C.agency_id == sa.bindparam("agency"), _C.status == status if retired else _C.status != status]
+
+
+def in_box(k: int, wide: bool = False) -> sa.ColumnElement[bool]:
+    """Markers in the box of the parameters wK, sK, eK, nK: the index proposes, the exact columns decide."""
+    number = partial(sa.bindparam, type_=sa.Double)
+    west, south, east, north = (number(f"{side}{k}") for side in "wsen")
+    exact = sa.and_(_C.lon_deg.between(west, east), _C.lat_deg.between(south, north))
+    if wide:
+        return exact
+    return sa.and_(proposed_by_index(markers, west, south, east, north), exact)
+
+
+def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
+    conditions = _owned(shape.retired)
+    if shape.wide:
+        conditions.append(sa.or_(*(in_box(k, wide) for k, wide in enumerate(shape.wide))))
+    if shape.heights:
+        low, high = sa.bindparam("low", type_=sa.Double), sa.bindparam("high", type_=sa.Double)
+        conditions.append(sa.or_(_C.height_m.is_(None), _C.height_m.between(low, high)))
+    if shape.since:
+        conditions.append(_C.updated_at >= sa.bindparam("since", type_=_C.updated_at.type))
+    if shape.until:
+        conditions.append(_C.updated_at <= sa.bindparam("until", type_=_C.updated_at.type))
+    for k, name in enumerate(shape.equal):
+        column = FIELDS_BY_NAME[name].column
+        conditions.append(column == sa.bindparam(f"v{k}", type_=column.type))
+    if shape.after:
+        conditions.append(_C.id > sa.bindparam("after"))
+    return conditions
+
+
+_UTC = sa.DateTime()  # read without a zone where the database keeps none: what writes JSON takes such times for UTC
+_PAGE = (
+    *(_C.id, _C.lon_deg, _C.lat_deg, _C.height_m),
+    *((sa.type_coerce(f.column, _UTC) if f.kind == "date-time" else f.column).label(f.name) for f in FIELDS),
+)
+
+
+@lru_cache(maxsize=1024)
+def _page(shape: _Shape) -> sa.Select[Any]:
+    most = sa.bindparam("most", type_=sa.Integer)
+    return sa.select(*_PAGE).where(*_conditions(shape)).order_by(_C.id).limit(most)
+
+
+@lru_cache(maxsize=1024)
+def _count(shape: _Shape) -> sa.Select[Any]:
+    return sa.select(sa.func.count()).select_from(markers).where(*_conditions(shape))
+
+
+@lru_cache(maxsize=2)
+def _one(retired: bool) -> sa.Select[Any]:
+    return sa.select(*_PAGE).where(*_owned(retired), _C.id == sa.bindparam("id"))
+
+
+@lru_cache(maxsize=2)
+def _extent(retired: bool) -> sa.Select[Any]:
+    figures: Mapping[str, sa.ColumnElement[Any]] = {
+        "total": sa.func.count(),
+        "west": sa.func.min(_C.lon_deg),
+        "south": sa.func.min(_C.lat_deg),
+        "east": sa.func.max(_C.lon_deg),
+        "north": sa.func.max(_C.lat_deg),
+        "first": sa.func.min(_C.updated_at),
+        "last": sa.func.max(_C.updated_at),
+        "epochs": sa.func.count(_C.epoch),
+        "least": sa.func.min(_C.epoch),
+        "greatest": sa.func.max(_C.epoch),
+    }
+    return sa.select(*(figure.label(name) for name, figure in figures.items())).where(*_owned(retired))

@@ -1,0 +1,169 @@
+"""Markers as GIS clients read them: collections of GeoJSON features. Built from rows by hand: every map view asks."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any
+
+from app.errors import NotFound
+from app.registry import features as store
+from app.registry.database import Database
+from app.registry.features import FIELDS, Extent, FeatureFilter
+from app.services.access import Caller
+from app.services.feature_crs import STORAGE_CRS, FeatureCrs
+from app.services.ports import Clock
+
+_EXTENT_AGE = timedelta(seconds=60)
+_MAX_EXTENTS = 4096
+_CHEAP_TO_COUNT = frozenset({"family", "code"})
+_NAMES = tuple(field.name for field in FIELDS)
+
+
+@dataclass(frozen=True, slots=True)
+class Collection:
+    """A set of features that clients list as a layer."""
+
+    id: str
+    title: str
+    text: str
+    geometry: str
+    editable: bool = False
+    retired: bool = False
+
+
+MARKERS = Collection(
+    "markers",
+    "Markers",
+    "Plates, magnets and CERPMs that are on the road or planned: one point each.",
+    "Point",
+    editable=True,
+)
+RETIRED = Collection(
+    "retired_markers", "Retired markers", "Markers that are out of use: one point each.", "Point", retired=True
+)
+COLLECTIONS = {collection.id: collection for collection in (MARKERS, RETIRED)}
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A page of features, the id to continue after if there are more, and how many match if that is known."""
+
+    features: list[dict[str, Any]]
+    after: str | None
+    matched: int | None
+
+
+def get_collection(collection_id: str) -> Collection:
+    """The collection with an id.
+
+    Raises
+    ------
+    NotFound
+        There is none.
+    """
+    found = COLLECTIONS.get(collection_id)
+    if found is None:
+        raise NotFound("there is no such collection", field="collectionId", limit=", ".join(COLLECTIONS))
+    return found
+
+
+class Features:
+    """Reading features, one transaction each."""
+
+    def __init__(self, database: Database, clock: Clock) -> None:
+        self._database = database
+        self._clock = clock
+        self._extents: dict[tuple[str, str], tuple[datetime, Extent | None]] = {}
+        self._lock = threading.Lock()
+
+    def page(
+        self,
+        caller: Caller,
+        narrowed: FeatureFilter,
+        *,
+        after: str | None = None,
+        limit: int = 1000,
+        crs: FeatureCrs = STORAGE_CRS,
+        counted: bool = False,
+    ) -> Page:
+        """A page of features in the order of their ids, counted if that is asked for or costs little."""
+        with self._database.read() as connection:
+            rows = store.list_features(connection, caller.agency_id, narrowed, after=after, limit=limit + 1)
+            more = len(rows) > limit
+            matched = None
+            if after is None and not more:
+                matched = len(rows)
+            elif counted or (after is None and _is_cheap(narrowed)):
+                matched = store.count_features(connection, caller.agency_id, narrowed)
+        features = _features(rows[:limit], crs)
+        return Page(features, features[-1]["id"] if more else None, matched)
+
+    def count(self, caller: Caller, narrowed: FeatureFilter) -> int:
+        """How many features a filter leaves."""
+        with self._database.read() as connection:
+            return store.count_features(connection, caller.agency_id, narrowed)
+
+    def get(
+        self, caller: Caller, collection: Collection, feature_id: str, crs: FeatureCrs = STORAGE_CRS
+    ) -> dict[str, Any]:
+        """One feature.
+
+        Raises
+        ------
+        NotFound
+            There is none with this id in the collection, or it belongs to another agency.
+        """
+        with self._database.read() as connection:
+            row = store.find_feature(connection, caller.agency_id, feature_id, retired=collection.retired)
+        if row is None:
+            raise no_feature(collection)
+        return _features([row], crs)[0]
+
+    def extent(self, caller: Caller, collection: Collection) -> Extent | None:
+        """What the agency's features cover, as it was within the last minute."""
+        key, now = (caller.agency_id, collection.id), self._clock()
+        with self._lock:
+            known = self._extents.get(key)
+        if known is not None and timedelta() <= now - known[0] < _EXTENT_AGE:
+            return known[1]
+        with self._database.read() as connection:
+            extent = store.find_extent(connection, caller.agency_id, retired=collection.retired)
+        with self._lock:
+            if len(self._extents) >= _MAX_EXTENTS:
+                self._extents.clear()
+            self._extents[key] = (now, extent)
+        return extent
+
+
+def no_feature(collection: Collection) -> NotFound:
+    """The same for a row that is not there and for another agency's."""
+    return NotFound(f"there is no such feature in {collection.id}", field="featureId")
+
+
+def _is_cheap(narrowed: FeatureFilter) -> bool:
+    rest = (narrowed.box, narrowed.heights_m, narrowed.since, narrowed.until)
+    return rest == (None, None, None, None) and {name for name, _ in narrowed.equal} <= _CHEAP_TO_COUNT
+
+
+def _features(rows: Iterable[Sequence[Any]], crs: FeatureCrs) -> list[dict[str, Any]]:
+    place: Callable[[float, float], tuple[float, float]] | None = None
+    if crs not in (FeatureCrs.CRS84, FeatureCrs.CRS84H):
+        place = crs.from_lon_lat
+    features = []
+    for row in rows:
+        lon_deg, lat_deg, height_m = row[1], row[2], row[3]
+        spot: tuple[float, ...] = (lon_deg, lat_deg) if place is None else place(lon_deg, lat_deg)
+        if height_m is not None:
+            spot = (*spot, height_m)
+        features.append(
+            {
+                "type": "Feature",
+                "id": row[0],
+                "geometry": {"type": "Point", "coordinates": spot},
+                "properties": dict(zip(_NAMES, row[4:], strict=True)),
+            }
+        )
+    return features
