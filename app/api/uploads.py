@@ -25,6 +25,7 @@ RAW_TYPES = (
     "application/vnd.apache.parquet", "application/json", "application/x-ndjson", "text/plain",
 )  # fmt: skip
 _FORM = "multipart/form-data"
+_JSON = "application/json"  # uplinks, as network servers post them: with the header that says so
 _CURE = "send multipart/form-data with the parts file and context"
 
 
@@ -52,7 +53,7 @@ async def get_upload(request: Request) -> UploadedFile:
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == _FORM:
         data, text, name = await _read_form(request)
-    elif media_type in RAW_TYPES:
+    elif media_type in RAW_TYPES and (media_type != _JSON or CONTEXT_HEADER in request.headers):
         data, name = await request.body(), ""
         # headers arrive as Latin-1; the bytes themselves are the JSON text
         text = request.headers.get(CONTEXT_HEADER, "").encode("latin-1")

@@ -228,6 +228,17 @@ def things_stack_uplink(packet: HeardPacket) -> dict[str, Any]:
     }
 
 
+def test_a_network_server_posts_one_uplink_as_it_is(road: tuple[httpx.Client, BuiltLane]) -> None:
+    client, built = road
+    heard, _hour = drive(built, 1923)
+    answer = client.post(
+        "/v1/decodes", json=chirpstack_uplink(heard.packets[0]), headers={"Waymark-Context": '{"packets": {}}'}
+    )
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["report"]["verdicts"]["authentic"] == 1
+    assert answer.json()["lane"]["refusal"]
+
+
 # --- what is not accepted -----------------------------------------------------------------------------------------
 
 

@@ -333,6 +333,9 @@ def test_openapi_describes_uploads(client: httpx.Client) -> None:
         "application/octet-stream",
         "text/csv",
         "application/vnd.apache.parquet",
+        "application/json",
+        "application/x-ndjson",
+        "text/plain",
     }
     context = body["multipart/form-data"]["schema"]["properties"]["context"]
     assert "horizontal_fov_deg" in json.dumps(context)
