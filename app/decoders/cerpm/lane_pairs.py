@@ -18,6 +18,7 @@ _SHARE = 0.7
 _CLOSE = 0.12  # of the spacing: pairs by chance are so close in one of four
 _LAID_M = 0.012
 _FARTHEST_M = 4.0
+_LEAST_STAGGER_M, _STAGGER_Z = 0.1, 3.0
 
 
 def abreast(station_m: Floats, left_m: Floats, side: Ints, sigma_m: Floats) -> Pairs:
@@ -45,10 +46,19 @@ def abreast(station_m: Floats, left_m: Floats, side: Ints, sigma_m: Floats) -> P
     close = mutual & (np.abs(apart) < min(_CLOSE * spacing, _FARTHEST_M))
     if close.sum() < max(_FEWEST, _SHARE * mutual.sum()):
         return none
+    if _is_staggered(apart[close]):
+        return none
     a, b = left[close], across[close]
     width = np.maximum(left_m[a] - left_m[b], 1.0)
     sigma = np.sqrt(sigma_m[a] ** 2 + sigma_m[b] ** 2 + 2 * _LAID_M**2) / width
     return (station_m[a] + station_m[b]) / 2, -apart[close] / width, sigma
+
+
+def _is_staggered(apart_m: Floats) -> bool:
+    """Whether one row as a whole stands ahead of the other: then a line across a pair is not square to the lane."""
+    middle_m = float(np.median(apart_m))
+    spread_m = 1.4826 * float(np.median(np.abs(apart_m - middle_m)))
+    return abs(middle_m) > max(_LEAST_STAGGER_M, _STAGGER_Z * 1.25 * spread_m / np.sqrt(len(apart_m)))
 
 
 def _nearest(sorted_m: Floats, wanted_m: Floats) -> Ints:

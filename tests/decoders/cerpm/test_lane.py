@@ -239,3 +239,16 @@ def test_two_unlabelled_rows_beside_a_coarse_track_are_two_sides():
     lane = fit_lane(kept, drive(road, rng, wander=0.8, accuracy=2.0))
     assert lane.refusal is None
     assert rms(road.errors(lane)) < 0.1
+
+
+@pytest.mark.parametrize("with_track", [True, False])
+@pytest.mark.parametrize("stagger_m", [0.3, 0.6, 1.2])
+def test_a_row_that_stands_a_little_ahead_of_the_other_does_not_wind_the_path(stagger_m, with_track):
+    rng = np.random.default_rng(1105)
+    road = bendy(400.0)
+    at = np.arange(0, road.at[-1] - 2, 12.2)
+    points = np.concatenate([road.beside(at, 1.6), road.beside(at + stagger_m, -1.6)])
+    markers = markers_at(points + rng.normal(0, 0.02, points.shape), np.repeat([1, 2], len(at)))
+    lane = fit_lane(markers, drive(road, rng) if with_track else None)
+    assert lane.refusal is None
+    assert np.abs(road.errors(lane)).max() < 0.2
