@@ -1,0 +1,185 @@
+"""Migrations up, down and up again over a registry that holds everything: what the older schema knows stays."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+import pytest
+import sqlalchemy as sa
+
+from app.registry.database import Database
+from app.registry.magnets import list_magnets_in
+from app.registry.markers import MarkerFilter, list_markers
+from app.registry.spatial import Box
+from app.registry.tables import markers, metadata
+
+NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)
+AGENCY = "019cb624-0000-7000-8000-00000000aaaa"
+DECODE = "019cb624-0000-7000-8000-00000000dddd"
+FAMILIES = ("plate", "magnet", "cerpm")
+MARKERS = 2_000
+EARLIER = {"0003": FAMILIES, "0002": ("plate", "magnet"), "0001": ("plate",)}
+Made = dict[str, list[dict[str, Any]]]
+
+
+@pytest.fixture
+def database(tmp_path: Path, new_database_url: Callable[[Path], str]) -> Iterator[Database]:
+    database = Database(new_database_url(tmp_path))
+    database.open()
+    database.migrate()
+    yield database
+    database.close()
+
+
+def _marker(k: int, lon_deg: float, lat_deg: float) -> dict[str, Any]:
+    family = FAMILIES[k % 3]
+    return {
+        "row": k + 1,
+        "id": f"019cb624-0000-7000-8000-{k:012x}",
+        "agency_id": AGENCY,
+        "family": family,
+        "status": ("active", "retired", "suspect")[k % 7 % 3],
+        "scheme": "position" if family == "plate" else None,
+        "digits": str(k),
+        "digits_match_position": k % 2 == 0 if family == "plate" else None,
+        "lon_deg": lon_deg,
+        "lat_deg": lat_deg,
+        "height_m": 0.1 + k / 3 if k % 5 else None,
+        "crs": "EPSG:4326",
+        "original": {"lon_deg": lon_deg, "text": "Straße 大道\u0001", "none": None},
+        "localization_grade": "exact",
+        "road": "A 7 ü" if k % 2 else None,
+        "spec": None if family == "plate" else {"b": 1.5, "a": [k, 1e-300, True]},
+        "version": 1,
+        "created_at": NOW,
+        "updated_at": NOW + timedelta(microseconds=k),
+    }
+
+
+def _made(count: int) -> Made:
+    """Rows of every table, in an order that foreign keys allow."""
+    rng = np.random.default_rng(17)
+    places = zip(rng.uniform(-180, 180, count).tolist(), rng.uniform(-90, 90, count).tolist(), strict=True)
+    made = [_marker(k, *place) for k, place in enumerate(places)]
+    made[0] |= {"lon_deg": 180.0, "lat_deg": -90.0}
+    owned = {"agency_id": AGENCY, "created_at": NOW}
+    decode = {"id": DECODE, "state": "done", "kind": "frame", "context": {"z": 1, "a": 2}, "result": {"n": None}}
+    span = {"row": 1, "number": 2, "first_sequence": 3, "last_sequence": 2**40, "decode_id": DECODE}
+    key = {"id": "key", "label": "l", "prefix": "p", "sha256": "s", "scope": "read", "last_used_at": NOW}
+    versions = ("version", "agency_id")
+    return {
+        "agencies": [{"id": AGENCY, "name": "one", "created_at": NOW}],
+        "api_keys": [{**key, **owned}],
+        "markers": made,
+        "marker_versions": [
+            {
+                "marker_id": m["id"],
+                **{name: m[name] for name in versions},
+                "at": NOW,
+                "who": "w",
+                "marker": m["original"],
+            }
+            for m in made
+        ],
+        "decodes": [{**decode, **owned, "progress": 1.0}],
+        "observations": [
+            {"decode_id": DECODE, "marker_id": m["id"], "frame": 1, "agency_id": AGENCY, "at": NOW, "what": "seen"}
+            for m in made[:300]
+        ],
+        "idempotency_keys": [{"key": "k", "request_sha256": "s", "response": {"b": 1}, "expires_at": NOW, **owned}],
+        "magnets": [
+            {"row": k + 1, "marker_id": m["id"], "number": 1, "agency_id": AGENCY, "polarity": "N", "phi_deg": 90}
+            | {"lon_deg": m["lon_deg"], "lat_deg": m["lat_deg"]}
+            for k, m in enumerate(made)
+            if m["family"] == "magnet"
+        ],
+        "codebooks": [
+            {"id": "book", "name": "n", "design": {}, "rules": {}, "figures": {}, "entries": [], "version": 1, **owned}
+            | {"updated_at": NOW}
+        ],
+        "agency_secrets": [{"wrapped": b"\x00\xff", **owned}],
+        "cerpm_spans": [{**span, "agency_id": AGENCY}],
+    }
+
+
+def _fill(database: Database, made: Made) -> None:
+    with database.write(long=True) as connection:
+        for table, rows in made.items():
+            connection.execute(sa.insert(metadata.tables[table]), rows)
+
+
+def _hashes(database: Database, tables: Sequence[str], families: Sequence[str] = FAMILIES) -> dict[str, str]:
+    """SHA-256 of each table's rows in the order of their keys; of markers and theirs, some families only."""
+    hashes = {}
+    kept = sa.select(markers.c.id).where(markers.c.family.in_(families))
+    with database.read() as connection:
+        for name in tables:
+            table = metadata.tables[name]
+            query = sa.select(table).order_by(*table.primary_key.columns)
+            if name == "markers":
+                query = query.where(table.c.id.in_(kept))
+            elif "marker_id" in table.c:
+                query = query.where(table.c.marker_id.in_(kept))
+            digest = hashlib.sha256()
+            for row in connection.execute(query):
+                digest.update(orjson.dumps(tuple(row), default=bytes.hex))
+            hashes[name] = digest.hexdigest()
+    return hashes
+
+
+def test_rows_are_the_same_on_both_databases(database: Database) -> None:
+    made = _made(300)
+    _fill(database, made)
+    plain = hashlib.sha256()
+    columns = [column.name for column in markers.c]
+    for marker in made["markers"]:
+        plain.update(orjson.dumps([marker.get(name) for name in columns]))
+    assert _hashes(database, ["markers"]) == {"markers": plain.hexdigest()}
+
+
+@pytest.mark.parametrize("revision", EARLIER)
+def test_down_and_up_keeps_what_the_older_schema_knows(database: Database, revision: str) -> None:
+    made = _made(MARKERS)
+    _fill(database, made)
+    families = EARLIER[revision]
+    new = {"0003": set(), "0002": {"agency_secrets", "cerpm_spans"}}
+    new["0001"] = new["0002"] | {"magnets", "codebooks"}
+    kept = [name for name in made if name not in new[revision]]
+    before = _hashes(database, kept, families)
+    database.migrate(revision)
+    with database.read() as connection:
+        assert not new[revision] & set(sa.inspect(connection).get_table_names())
+    database.migrate()
+    assert database.is_ready()
+    assert _hashes(database, kept) == before
+    assert _hashes(database, kept, families) == before
+    with database.read() as connection:
+        _compare_indexes(connection, [m for m in made["markers"] if m["family"] in families])
+
+
+def _compare_indexes(connection: sa.Connection, made: list[dict[str, Any]]) -> None:
+    """The spatial indexes were filled again: they find what is in the tables."""
+    box = Box(-30.0, -20.0, 15.0, 25.0)
+    inside = {m["id"] for m in made if -30 <= m["lon_deg"] <= 15 and -20 <= m["lat_deg"] <= 25}
+    listed = list_markers(connection, AGENCY, MarkerFilter(box=box), after=None, limit=len(made) + 1)
+    assert {row["id"] for row in listed} == inside
+    magnets = {m["id"] for m in made if m["family"] == "magnet" and m["status"] != "retired"}
+    assert {row["marker_id"] for row in list_magnets_in(connection, box)} == inside & magnets
+    assert inside
+
+
+def test_to_nothing_and_back(database: Database) -> None:
+    made = _made(100)
+    _fill(database, made)
+    before = _hashes(database, list(made))
+    database.migrate("base")
+    database.migrate()
+    assert set(_hashes(database, list(made)).values()) == {hashlib.sha256().hexdigest()}
+    _fill(database, made)
+    assert _hashes(database, list(made)) == before
