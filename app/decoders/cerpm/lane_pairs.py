@@ -58,7 +58,7 @@ def _is_staggered(apart_m: Floats) -> bool:
     """Whether one row as a whole stands ahead of the other: then a line across a pair is not square to the lane."""
     middle_m = float(np.median(apart_m))
     spread_m = 1.4826 * float(np.median(np.abs(apart_m - middle_m)))
-    return abs(middle_m) > max(_LEAST_STAGGER_M, _STAGGER_Z * 1.25 * spread_m / np.sqrt(len(apart_m)))
+    return abs(middle_m) > max(_LEAST_STAGGER_M, float(_STAGGER_Z * 1.25 * spread_m / np.sqrt(len(apart_m))))
 
 
 def _nearest(sorted_m: Floats, wanted_m: Floats) -> Ints:
