@@ -191,6 +191,119 @@ def place_position(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class PlacedPositions:
+    """Positions in WGS 84 / ITRF that came the same way; as `PlacedPosition`, with arrays of shape (N,).
+
+    `placed` is False where a position is not finite, out of range, or far outside the area of use: NaN stands there.
+    """
+
+    lon_deg: npt.NDArray[np.float64]
+    lat_deg: npt.NDArray[np.float64]
+    height_m: npt.NDArray[np.float64]
+    placed: npt.NDArray[np.bool_]
+    crs: str
+    realization: str | None
+    transform_accuracy_m: float | None
+    grade: LocalizationGrade
+    note: str | None
+
+
+def place_positions(
+    first: npt.NDArray[np.float64],
+    second: npt.NDArray[np.float64],
+    height_m: npt.NDArray[np.float64],
+    *,
+    crs: str | None = None,
+    realization: str | None = None,
+    epoch: float | None = None,
+    ellipsoidal_height: bool = True,
+    accuracy_m: float = 0.1,
+) -> PlacedPositions:
+    """Bring many positions to WGS 84 / ITRF at once, each as `place_position` would.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (N,)
+        Longitude and latitude [deg], or easting and northing in the unit of the CRS.
+    height_m : ndarray, shape (N,)
+        Height as given; NaN where there is none. [m]
+    crs, realization, epoch, ellipsoidal_height, accuracy_m
+        As for `place_position`.
+
+    Raises
+    ------
+    ReferenceSystemError
+        As for `place_position`.
+    """
+    name = normalize_crs(crs)
+    system = _system(name)
+    lon, lat = _inside(system, *_many_wgs84(name, system, first, second))
+    known = np.isfinite(lon)
+    heights = height_m if ellipsoidal_height else np.full_like(height_m, np.nan)
+    sample = int(np.argmax(known)) if known.any() else None
+    if sample is None or _is_global(system):
+        one = _placed_globally(name, 0.0, 0.0, None, realization)
+        return PlacedPositions(
+            lon, lat, height_m, known, name, one.realization, one.transform_accuracy_m, one.grade, one.note
+        )
+    has_height = bool(np.isfinite(heights[known]).all())
+    moved = _itrf2014(
+        name,
+        float(first[sample]),
+        float(second[sample]),
+        float(heights[sample]) if has_height else None,
+        epoch,
+        accuracy_m,
+    )
+    if isinstance(moved, str):
+        grade, note = LocalizationGrade.APPROXIMATE, f"from {name}: {moved}"
+        return PlacedPositions(lon, lat, height_m, known, name, None, None, grade, note)
+    operation = _bounded_operation(name, has_height)
+    assert operation is not None
+    zeros = np.zeros_like(first)
+    x, y, z, _ = operation[0].transform(
+        first, second, np.where(np.isfinite(heights), heights, 0.0), zeros + (epoch or 0.0)
+    )
+    reached = known & np.isfinite(x) & np.isfinite(y)
+    return PlacedPositions(
+        np.where(reached, x, np.nan),
+        np.where(reached, y, np.nan),
+        np.where(reached, z, np.nan) if has_height else height_m,
+        reached,
+        name,
+        "ITRF2014",
+        moved[3],
+        LocalizationGrade.EXACT,
+        f"transformed from {name} to ITRF2014, stated accuracy {moved[3]:g} m",
+    )
+
+
+def _many_wgs84(
+    name: str, system: CRS, first: npt.NDArray[np.float64], second: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Longitudes and latitudes, not finite where there are none."""
+    if system.is_geographic and _is_global(system):
+        return first, second
+    lon, lat = _best_effort(name).transform(first, second)
+    return np.asarray(lon, dtype=np.float64), np.asarray(lat, dtype=np.float64)
+
+
+def _inside(
+    system: CRS, lon_deg: npt.NDArray[np.float64], lat_deg: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The positions, with NaN for those that are out of range or far outside the area of use."""
+    inside = (np.abs(lon_deg) <= 180.0) & (np.abs(lat_deg) <= 90.0)
+    area = system.area_of_use
+    if area is not None:
+        west, east = area.west - _OUTSIDE_DEG, area.east + _OUTSIDE_DEG
+        across = (
+            (lon_deg >= west) & (lon_deg <= east) if area.west <= area.east else (lon_deg >= west) | (lon_deg <= east)
+        )
+        inside &= across & (lat_deg >= area.south - _OUTSIDE_DEG) & (lat_deg <= area.north + _OUTSIDE_DEG)
+    return np.where(inside, lon_deg, np.nan), np.where(inside, lat_deg, np.nan)
+
+
 def normalize_crs(crs: str | None) -> str:
     """``EPSG:code`` or ``OGC:CRS84`` from the forms that people and standards write.
 
@@ -212,6 +325,17 @@ def normalize_crs(crs: str | None) -> str:
         limit=_CRS_RULE,
         cure=_CRS_CURE,
     )
+
+
+def reference_system(crs: str | None) -> CRS:
+    """The system behind a name in any of the forms of `normalize_crs`.
+
+    Raises
+    ------
+    ReferenceSystemError
+        It is unknown or of a kind that places nothing on a road.
+    """
+    return _system(normalize_crs(crs))
 
 
 @lru_cache(maxsize=256)

@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import artwork, cerpms, codebooks, decodes, layouts, markers, radio_checks, system, ui
+from app.api import artwork, cerpms, codebooks, decodes, imports, layouts, markers, radio_checks, system, ui
 from app.api.middleware import Guarded, Observed
 from app.api.ogc import mount_ogc
 from app.api.openapi import describe
@@ -37,6 +37,7 @@ from app.services.decode_jobs import DecodeJobs
 from app.services.decode_rules import DecodeRules
 from app.services.decodes import Decodes
 from app.services.features import Features
+from app.services.imports import Imports
 from app.services.layouts import Layouts
 from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
@@ -54,6 +55,7 @@ ROUTERS = (
     radio_checks.router,
     codebooks.router,
     decodes.router,
+    imports.router,
 )
 
 
@@ -91,6 +93,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
 
     app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
     app.state.markers = Markers(database, utc_now, _marker_rules(settings))
+    app.state.imports = Imports(database, utc_now, pool, _marker_rules(settings))
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)
     app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)
@@ -111,7 +114,11 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.add_middleware(
         Guarded,
         authenticate=access.authenticate,
-        body_limits={"": settings.max_json_bytes, "/v1/decodes": settings.max_upload_bytes},
+        body_limits={
+            "": settings.max_json_bytes,
+            "/v1/decodes": settings.max_upload_bytes,
+            "/v1/imports": settings.max_upload_bytes,
+        },
         needed_scopes={
             "": Scope.WRITE,
             "/v1/decodes": Scope.DECODE,

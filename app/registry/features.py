@@ -164,7 +164,8 @@ def _values(agency_id: str, narrowed: FeatureFilter) -> dict[str, Any]:
     return values
 
 
-def _owned(retired: bool) -> list[sa.ColumnElement[bool]]:
+def owned(retired: bool) -> list[sa.ColumnElement[bool]]:
+    """An agency's markers, by the parameter `agency`."""
     status: sa.BindParameter[str] = sa.bindparam("retired", "retired", sa.String())
     return [_C.agency_id == sa.bindparam("agency"), _C.status == status if retired else _C.status != status]
 
@@ -180,7 +181,7 @@ def in_box(k: int, wide: bool = False) -> sa.ColumnElement[bool]:
 
 
 def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
-    conditions = _owned(shape.retired)
+    conditions = owned(shape.retired)
     if shape.wide:
         conditions.append(sa.or_(*(in_box(k, wide) for k, wide in enumerate(shape.wide))))
     if shape.heights:
@@ -218,7 +219,7 @@ def _count(shape: _Shape) -> sa.Select[Any]:
 
 @lru_cache(maxsize=2)
 def _one(retired: bool) -> sa.Select[Any]:
-    return sa.select(*_PAGE).where(*_owned(retired), _C.id == sa.bindparam("id"))
+    return sa.select(*_PAGE).where(*owned(retired), _C.id == sa.bindparam("id"))
 
 
 @lru_cache(maxsize=2)
@@ -235,4 +236,4 @@ def _extent(retired: bool) -> sa.Select[Any]:
         "least": sa.func.min(_C.epoch),
         "greatest": sa.func.max(_C.epoch),
     }
-    return sa.select(*(figure.label(name) for name, figure in figures.items())).where(*_owned(retired))
+    return sa.select(*(figure.label(name) for name, figure in figures.items())).where(*owned(retired))

@@ -12,6 +12,7 @@ from app.errors import NotFound
 from app.registry import features as store
 from app.registry.database import Database
 from app.registry.features import FIELDS, Extent, FeatureFilter
+from app.registry.tiles import Tile, marker_tile
 from app.services.access import Caller
 from app.services.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.ports import Clock
@@ -121,6 +122,11 @@ class Features:
         if row is None:
             raise no_feature(collection)
         return _features([row], crs)[0]
+
+    def tile(self, caller: Caller, collection: Collection, tile: Tile) -> bytes:
+        """A vector tile of a collection; empty without features."""
+        with self._database.read() as connection:
+            return marker_tile(connection, caller.agency_id, tile, retired=collection.retired, layer=collection.id)
 
     def extent(self, caller: Caller, collection: Collection) -> Extent | None:
         """What the agency's features cover, as it was within the last minute."""

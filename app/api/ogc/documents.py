@@ -10,17 +10,25 @@ from starlette.responses import Response
 from app.api.ogc.openapi import api_document
 from app.api.ogc.query import known_parameters
 from app.api.ogc.responses import GEOJSON, JSON, OPENAPI, SCHEMA, answer, base_url, caller_of, link, negotiate
+from app.api.ogc.tiles import TILES_REL
 from app.registry.features import FIELDS, Extent
 from app.services.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.features import COLLECTIONS, Collection, Features, get_collection
 
 _OFFERED = ("f",)
+_SCHEMES_REL = "http://www.opengis.net/def/rel/ogc/1.0/tiling-schemes"
 _FEATURES = "http://www.opengis.net/spec/ogcapi-features"
+_TILES = "http://www.opengis.net/spec/ogcapi-tiles-1/1.0/conf"
 CONFORMANCE = (
     f"{_FEATURES}-1/1.0/conf/core",
     f"{_FEATURES}-1/1.0/conf/oas30",
     f"{_FEATURES}-1/1.0/conf/geojson",
     f"{_FEATURES}-2/1.0/conf/crs",
+    f"{_TILES}/core",
+    f"{_TILES}/tileset",
+    f"{_TILES}/tilesets-list",
+    f"{_TILES}/geodata-tilesets",
+    f"{_TILES}/mvt",
 )
 
 
@@ -34,6 +42,7 @@ def landing_page(request: Request) -> Response:
         link(f"{base}/api", "service-desc", OPENAPI, "The API"),
         link(f"{base}/conformance", "conformance", JSON, "Conformance classes"),
         link(f"{base}/collections", "data", JSON, "Collections"),
+        link(f"{base}/tileMatrixSets", _SCHEMES_REL, JSON, "Tile matrix sets"),
     ]
     return answer({"title": "Waymark", "description": "The registry of machine-readable roads", "links": links})
 
@@ -107,6 +116,7 @@ def _described(request: Request, found: Collection, base: str) -> dict[str, Any]
         "links": [
             link(url, "self", JSON),
             link(f"{url}/items", "items", GEOJSON, found.title),
+            link(f"{url}/tiles", TILES_REL, JSON, "Vector tiles"),
             link(f"{url}/schema", "describedby", SCHEMA, "Schema of the features"),
             link(f"{url}/schema", "describedBy", SCHEMA, "Schema of the features, for older clients"),
         ],

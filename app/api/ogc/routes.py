@@ -8,9 +8,10 @@ from fastapi import FastAPI
 from starlette.routing import Match, Route
 from starlette.types import Scope
 
-from app.api.ogc import documents, items
+from app.api.ogc import documents, items, tiles
 
 _ITEMS = "/ogc/collections/{collection}/items"
+_TILES = "/ogc/collections/{collection}/tiles"
 
 
 class _NamedRoute(Route):
@@ -37,6 +38,11 @@ ROUTES = (
     _route("/ogc/collections/{collection}/schema", documents.schema),
     _route(_ITEMS, items.list_items),
     _route(f"{_ITEMS}/{{feature}}", items.get_item),
+    _route("/ogc/tileMatrixSets", tiles.list_matrix_sets),
+    _route("/ogc/tileMatrixSets/{matrix_set}", tiles.get_matrix_set),
+    _route(_TILES, tiles.list_tilesets),
+    _route(f"{_TILES}/{{matrix_set}}", tiles.get_tileset),
+    _route(f"{_TILES}/{{matrix_set}}/{{zoom}}/{{row}}/{{column}}", tiles.get_tile),
 )
 
 

@@ -1,0 +1,161 @@
+"""/v1/imports: surveys come in."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import orjson
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
+from starlette.datastructures import UploadFile
+
+from app.api.dependencies import Caller, checked_idempotency_key, json_response
+from app.api.problems import MEDIA_TYPE, problem_responses
+from app.api.schemas_imports import DECLARATION_EXAMPLE, DeclarationIn, ReportOut
+from app.api.strict_json import parse_json
+from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.services.idempotency import IdempotencyKey
+from app.services.imports import GivenImport
+from app.services.imports import Imports as ImportsService
+
+router = APIRouter(prefix="/v1/imports", tags=["imports"])
+
+MAX_DECLARATION_BYTES = 64 * 1024
+_FORM = "multipart/form-data"
+_CURE = "send multipart/form-data with the parts file and declaration"
+_REFUSED = {"type": "urn:waymark:problem:import-refused", "title": "The import was refused", "status": 422}
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            _FORM: {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {
+                        "file": {"type": "string", "format": "binary", "description": "The survey."},
+                        "declaration": {"type": "object", "description": "DeclarationIn; see docs/imports.md."},
+                    },
+                },
+                "encoding": {"declaration": {"contentType": "application/json"}},
+                "example": {"file": "survey.csv", "declaration": DECLARATION_EXAMPLE},
+            }
+        },
+    }
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    given: GivenImport
+    idempotency: IdempotencyKey | None
+
+
+async def get_imports(request: Request) -> ImportsService:
+    """Use cases on imports."""
+    service: ImportsService = request.app.state.imports
+    return service
+
+
+async def get_asked(request: Request) -> _Asked:
+    """Read the file and its declaration from the form.
+
+    Raises
+    ------
+    UnsupportedUpload
+        The request is no form.
+    UnreadableUpload
+        There is no file in it, or an empty one.
+    MalformedRequest
+        The form or the declaration's JSON cannot be read.
+    """
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _FORM:
+        raise UnsupportedUpload("an import is a form", field="Content-Type", limit=_FORM, cure=_CURE)
+    async with request.form(max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
+        names = [name for name, _value in form.multi_items()]
+        if set(names) - {"file", "declaration"} or len(set(names)) != len(names):
+            raise MalformedRequest(
+                "the form has an unexpected part, or has one twice",
+                field="body",
+                limit="one file, one declaration",
+                cure=_CURE,
+            )
+        file, declared = form.get("file"), form.get("declaration", "")
+        if not isinstance(file, UploadFile):
+            raise UnreadableUpload("there is no file in the form", field="file", limit="a part file", cure=_CURE)
+        data = await file.read()
+        text = await declared.read() if isinstance(declared, UploadFile) else declared.encode()
+    if not data:
+        raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
+    if len(text) > MAX_DECLARATION_BYTES:
+        raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
+    return _Asked(_declared(text).given(data), _idempotency_of(request, data, text))
+
+
+def _declared(text: bytes) -> DeclarationIn:
+    try:
+        return DeclarationIn.model_validate(parse_json(text, "declaration") if text.strip() else {})
+    except ValidationError as error:
+        faults = [{**fault, "loc": ("body", "declaration", *fault["loc"])} for fault in error.errors()]
+        raise RequestValidationError(faults) from error
+
+
+def _idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKey | None:
+    key = checked_idempotency_key(request)
+    if key is None:
+        return None
+    digest = hashlib.sha256(f"{request.url.path} {len(text)}\n".encode() + text)
+    digest.update(data)
+    return IdempotencyKey(key, digest.hexdigest())
+
+
+Asked = Annotated[_Asked, Depends(get_asked)]
+Imports = Annotated[ImportsService, Depends(get_imports)]
+
+
+@router.post(
+    "",
+    status_code=201,
+    response_class=Response,
+    openapi_extra=_BODY,
+    responses={
+        200: {"model": ReportOut, "description": "Checked; nothing was stored"},
+        201: {"model": ReportOut, "description": "Stored"},
+        **problem_responses(409, 415),
+    },
+)
+def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports) -> Response:
+    """Import a survey: CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, LandXML or DXF.
+
+    With `dry_run` the report says what would be stored. A refused import answers 422 with the report in the problem;
+    nothing of it is stored.
+    """
+    try:
+        report, replayed = imports.run(caller, asked.given, asked.idempotency)
+    except InvalidParameter as error:
+        if error.field is not None and not error.field.startswith(("declaration", "file")):
+            error.field = f"declaration.{error.field.removeprefix('position.')}"
+        raise
+    if report["outcome"] == "refused":
+        return _refused(request, report)
+    headers = {"Idempotency-Replayed": "true"} if replayed else None
+    return json_response(report, 200 if report["dry_run"] else 201, headers)
+
+
+def _refused(request: Request, report: dict[str, Any]) -> Response:
+    first = report["faults"][0]
+    place = f"row {first['row']}: " if first["row"] is not None else ""
+    body = {
+        **_REFUSED,
+        "detail": f"{place}{first['message']}; {report['refused_rows']} of {report['rows']} rows are refused",
+        "instance": request.url.path,
+        "request_id": request.scope.get("state", {}).get("request_id"),
+        "field": f"file.{first['field']}",
+        "limit": "all rows good" if report["mode"] == "all" else "one good row at least",
+        "cure": first["proposal"] or 'correct the rows, or declare mode "good" to store the others',
+        "report": report,
+    }
+    return Response(orjson.dumps(body), 422, media_type=MEDIA_TYPE)

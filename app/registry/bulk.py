@@ -1,0 +1,97 @@
+"""Markers by the thousand: looked up by box, by digits and by number, and stored in one statement a chunk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.registry.markers import PUBLIC, MarkerFilter, Row, list_markers
+from app.registry.spatial import Box, box_around, within_box
+from app.registry.tables import marker_versions, markers
+
+_CHUNK = 500
+_INSERT = 2000
+_PLACE = (markers.c.lon_deg, markers.c.lat_deg, markers.c.height_m, markers.c.vertical_datum)
+
+
+def list_places_in(connection: sa.Connection, agency_id: str, box: Box, *, limit: int) -> list[Row]:
+    """Places and heights of the agency's markers in a box that may be on the road."""
+    query = sa.select(*_PLACE).where(markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box))
+    return list(connection.execute(query.limit(limit)).mappings())
+
+
+def is_any_near(connection: sa.Connection, agency_id: str, lon_deg: float, lat_deg: float, radius_m: float) -> bool:
+    """Whether the agency has a marker in the box around a circle."""
+    query = sa.select(markers.c.row).where(
+        markers.c.agency_id == agency_id, within_box(box_around(lon_deg, lat_deg, radius_m))
+    )
+    return connection.execute(query.limit(1)).first() is not None
+
+
+def list_markers_in(connection: sa.Connection, agency_id: str, family: str, box: Box, *, limit: int) -> list[Row]:
+    """The agency's markers of a family in a box that may be on the road."""
+    query = sa.select(*PUBLIC).where(
+        markers.c.agency_id == agency_id,
+        markers.c.family == family,
+        markers.c.status != "retired",
+        within_box(box),
+    )
+    return list(connection.execute(query.limit(limit)).mappings())
+
+
+def list_by_digits(connection: sa.Connection, family: str, digits: Sequence[str]) -> Iterator[Row]:
+    """What any agency's markers with these digits are: id, agency_id, digits, n, scheme, place, status."""
+    columns = (
+        markers.c.id, markers.c.agency_id, markers.c.digits, markers.c.n, markers.c.scheme, markers.c.status,
+        markers.c.lon_deg, markers.c.lat_deg, markers.c.digits_match_position,
+    )  # fmt: skip
+    wanted = sorted(set(digits))
+    for start in range(0, len(wanted), _CHUNK):
+        query = sa.select(*columns).where(
+            markers.c.digits.in_(wanted[start : start + _CHUNK]), markers.c.family == family
+        )
+        yield from connection.execute(query).mappings()
+
+
+def add_markers(
+    connection: sa.Connection,
+    agency_id: str,
+    rows: Sequence[Mapping[str, Any]],
+    *,
+    now: datetime,
+    who: str,
+    why: str | None,
+) -> None:
+    """Store new markers, each with the first entry of its history; every row has the same columns."""
+    names = [str(column.name) for column in PUBLIC]
+    for start in range(0, len(rows), _INSERT):
+        chunk = rows[start : start + _INSERT]
+        connection.execute(sa.insert(markers), [{"agency_id": agency_id, **row} for row in chunk])
+        connection.execute(
+            sa.insert(marker_versions),
+            [
+                {
+                    "marker_id": row["id"],
+                    "version": 1,
+                    "agency_id": agency_id,
+                    "at": now,
+                    "who": who,
+                    "why": why,
+                    "marker": {name: row.get(name) for name in names},
+                }
+                for row in chunk
+            ],
+        )
+
+
+def walk_markers(
+    connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, *, page: int = 2000
+) -> Iterator[list[Row]]:
+    """All markers of a filter in the order of their ids, a page at a time."""
+    after: str | None = None
+    while rows := list_markers(connection, agency_id, narrowed, after=after, limit=page):
+        yield rows
+        after = rows[-1]["id"]

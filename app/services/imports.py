@@ -1,0 +1,363 @@
+"""Surveys come in: read in a decoder process, checked, held against the registry, stored in one transaction."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+import sqlalchemy as sa
+
+from app.errors import InvalidParameter
+from app.registry import bulk
+from app.registry import markers as store
+from app.registry.database import Database
+from app.registry.exchange.compare import Comparison, check_residuals, compare_survey
+from app.registry.exchange.declaration import ImportDeclaration
+from app.registry.exchange.place import PlacedSurvey, place_survey
+from app.registry.exchange.place_checks import NEAR_M, Neighbours, check_place
+from app.registry.exchange.read import row_flags
+from app.registry.exchange.shape_checks import check_shape
+from app.registry.exchange.table import Fault, Severity, SurveyTable
+from app.registry.spatial import Box
+from app.services.access import Caller
+from app.services.cerpm_markers import Cerpms
+from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
+from app.services.import_rows import MarkerDefaults, PreparedRow, common_columns, prepare_rows, settle_codes
+from app.services.marker_rules import PLANNED, MarkerFamily, MarkerRules
+from app.services.plate_markers import Plates
+from app.services.ports import Clock
+
+ALL, GOOD = "all", "good"
+FAMILIES = ("plate", "cerpm")
+MAX_FAULTS = 1000
+_KNOWN_M = 5_000.0
+_NEIGHBOURS = 50_000
+_BUSY_WAIT_S = 10.0
+_MARGIN_DEG = NEAR_M / 90_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyTask:
+    """What goes to a decoder process."""
+
+    data: bytes
+    declaration: ImportDeclaration
+
+
+class PendingSurvey(Protocol):
+    """A survey on its way through a decoder process."""
+
+    def result(self) -> SurveyTable:
+        """Wait for it."""
+
+
+class SurveyReader(Protocol):
+    """Decoder processes, as this use case sees them."""
+
+    def start_survey(self, task: SurveyTask, *, wait_s: float = 0.0) -> PendingSurvey:
+        """Hand a file over."""
+
+
+@dataclass(frozen=True, slots=True)
+class GivenImport:
+    """A file with what is declared of it."""
+
+    data: bytes
+    declaration: ImportDeclaration
+    defaults: MarkerDefaults = field(default_factory=MarkerDefaults)
+    dry_run: bool = False
+    mode: str = ALL
+    reason: str | None = None
+
+
+class Imports:
+    """Use cases on imports, one transaction each."""
+
+    def __init__(self, database: Database, clock: Clock, reader: SurveyReader, rules: MarkerRules) -> None:
+        self._database = database
+        self._clock = clock
+        self._reader = reader
+        self._rules = rules
+        self._families: dict[str, MarkerFamily[Any, Any]] = {"plate": Plates(rules), "cerpm": Cerpms(rules)}
+
+    def run(self, caller: Caller, given: GivenImport, key: IdempotencyKey | None = None) -> tuple[dict[str, Any], bool]:
+        """Import a survey, or say what an import would do.
+
+        Returns
+        -------
+        report : dict
+            `outcome` is ``checked`` (dry run), ``stored`` or ``refused``; nothing is stored of what is refused.
+        replayed : bool
+
+        Raises
+        ------
+        UnreadableUpload, UnsupportedUpload, InvalidParameter, ReferenceSystemError
+            The file, the declaration, or both together cannot be used.
+        Unavailable
+            The decoder processes are busy.
+        """
+        _check_family(given.declaration)
+        now = self._clock()
+        with self._database.read() as connection:
+            if (answer := find_answer(connection, caller.agency_id, key, now)) is not None:
+                return answer, True
+        pending = self._reader.start_survey(SurveyTask(given.data, given.declaration), wait_s=_BUSY_WAIT_S)
+        survey = place_survey(pending.result(), given.declaration, self._rules.crs_accuracy_m)
+        running = _Running(caller, given, survey, now, hashlib.sha256(given.data).hexdigest(), self._rules)
+        with self._database.read() as connection:
+            running.check(connection)
+            if given.dry_run:
+                running.prepare(connection)
+                return running.report("checked"), False
+        if running.is_hopeless:
+            return running.report("refused"), False
+        with self._database.write() as connection:
+            if (answer := find_answer(connection, caller.agency_id, key, now)) is not None:
+                return answer, True
+            running.prepare(connection)
+            if running.is_refused:
+                return running.report("refused"), False
+            running.store(connection, self._families[given.declaration.family])
+            report = running.report("stored")
+            keep_answer(connection, caller.agency_id, key, report, now, self._rules.idempotency_ttl)
+        return report, False
+
+
+class _Running:
+    """An import between its steps."""
+
+    def __init__(
+        self, caller: Caller, given: GivenImport, survey: PlacedSurvey, now: datetime, sha256: str, rules: MarkerRules
+    ) -> None:
+        self._caller, self._given, self._survey, self._now = caller, given, survey, now
+        self._sha256, self._rules = sha256, rules
+        self._faults: list[Fault] = [*survey.table.faults, *check_shape(survey)]
+        self._prepared: list[PreparedRow] = []
+        self._known: list[Any] = []
+        self._comparison: Comparison | None = None
+        self._stored = 0
+
+    def check(self, connection: sa.Connection) -> None:
+        """Hold the survey against the registry's places."""
+        neighbours = self._neighbours(connection)
+        is_known = partial(self._is_known, connection)
+        self._faults += check_place(self._survey, self._given.declaration, neighbours, is_known)
+
+    def prepare(self, connection: sa.Connection) -> None:
+        """What would be stored."""
+        good = self._good_rows()
+        if self._given.declaration.compare:
+            self._compare(connection, good)
+            return
+        self._prepared, wrong = prepare_rows(
+            self._survey, good, self._given.declaration, self._given.defaults, now=self._now, file_sha256=self._sha256
+        )
+        self._faults += wrong
+        self._faults += settle_codes(
+            connection, self._caller, self._prepared, self._given.declaration.family, self._rules
+        )
+        accepted = set(self._good_rows())
+        self._prepared = [row for row in self._prepared if row.row in accepted]
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether nothing can be stored, whatever the codes are."""
+        return self._refuses_file() or (self._given.mode == ALL and len(self._good_rows()) < self._survey.table.rows)
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether nothing is to be stored."""
+        return self.is_hopeless or not self._good_rows()
+
+    def store(self, connection: sa.Connection, family: MarkerFamily[Any, Any]) -> None:
+        """Store what was prepared."""
+        if self._given.declaration.compare:
+            self._resurvey(connection, family)
+            return
+        bulk.add_markers(
+            connection,
+            self._caller.agency_id,
+            [row.columns for row in self._prepared],
+            now=self._now,
+            who=self._caller.label,
+            why=self._given.reason or f"import of {self._sha256[:12]}",
+        )
+        self._stored = len(self._prepared)
+
+    def report(self, outcome: str) -> dict[str, Any]:
+        """What is to be said of the import."""
+        table, placed = self._survey.table, self._survey.placed
+        refused = row_flags(self._faults, table.rows, Severity.REFUSED)
+        warned = row_flags(self._faults, table.rows, Severity.WARNING)
+        shown = sorted(self._faults, key=lambda fault: (fault.severity, fault.row or 0))
+        good = 0 if self._refuses_file() else int((~refused & placed.placed).sum())
+        lon, lat = placed.lon_deg[placed.placed], placed.lat_deg[placed.placed]
+        return {
+            "outcome": outcome,
+            "dry_run": self._given.dry_run,
+            "mode": self._given.mode,
+            "format": table.format,
+            "file_sha256": self._sha256,
+            "crs": table.crs,
+            "localization_grade": str(placed.grade),
+            "transform_note": placed.note,
+            "rows": table.rows,
+            "good_rows": good,
+            "refused_rows": int(refused.sum()),
+            "warned_rows": int((warned & ~refused).sum()),
+            "stored": self._stored,
+            "extent_deg": [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]
+            if len(lon)
+            else None,
+            "counts": dict(Counter(fault.code for fault in self._faults)),
+            "comparison": self._comparison_document(),
+            "faults": [{**fault._asdict(), "severity": str(fault.severity)} for fault in shown[:MAX_FAULTS]],
+            "faults_left_out": max(len(shown) - MAX_FAULTS, 0),
+        }
+
+    # --- steps ------------------------------------------------------------------------------------------------------
+
+    def _refuses_file(self) -> bool:
+        return any(fault.row is None and fault.severity is Severity.REFUSED for fault in self._faults)
+
+    def _good_rows(self) -> list[int]:
+        if self._refuses_file():
+            return []
+        refused = row_flags(self._faults, self._survey.table.rows, Severity.REFUSED)
+        return [int(row) for row in np.flatnonzero(~refused & self._survey.placed.placed)]
+
+    def _is_known(self, connection: sa.Connection, lon_deg: float, lat_deg: float) -> bool:
+        return bulk.is_any_near(connection, self._caller.agency_id, lon_deg, lat_deg, _KNOWN_M)
+
+    def _box(self) -> Box | None:
+        """The box of the middle nine tenths of the rows, widened: one row far away must not stretch it."""
+        placed = self._survey.placed
+        if not placed.placed.any():
+            return None
+        west, east = np.quantile(placed.lon_deg[placed.placed], [0.05, 0.95])
+        south, north = np.quantile(placed.lat_deg[placed.placed], [0.05, 0.95])
+        wide, high = _MARGIN_DEG * 2 + (east - west) / 8, _MARGIN_DEG + (north - south) / 8
+        clipped = np.clip([west - wide, east + wide], -180.0, 180.0), np.clip([south - high, north + high], -90.0, 90.0)
+        return Box(float(clipped[0][0]), float(clipped[1][0]), float(clipped[0][1]), float(clipped[1][1]))
+
+    def _neighbours(self, connection: sa.Connection) -> Neighbours:
+        box = self._box()
+        agency_id = self._caller.agency_id
+        found = bulk.list_places_in(connection, agency_id, box, limit=_NEIGHBOURS) if box is not None else []
+        return Neighbours(
+            *_places(found),
+            tuple(row["vertical_datum"] for row in found),
+        )
+
+    def _compare(self, connection: sa.Connection, good: Sequence[int]) -> None:
+        declaration = self._given.declaration
+        codes = self._survey.table.texts.get("code")
+        if declaration.match == "code" and codes is None:
+            raise InvalidParameter(
+                "the survey has no codes to find its markers by",
+                field="declaration.match",
+                limit="a column with the role code",
+                cure='declare the column, or match "nearest"',
+            )
+        matched: Any = None
+        if declaration.match == "code":
+            assert codes is not None
+            matched = self._by_code(connection, codes, good)
+        elif (box := self._box()) is not None:
+            self._known = bulk.list_markers_in(
+                connection, self._caller.agency_id, declaration.family, box, limit=_NEIGHBOURS
+            )
+        lon, lat, height = _places(self._known)
+        self._comparison = compare_survey(self._survey, lon, lat, height, matched)
+        self._faults += check_residuals(self._comparison, declaration.tolerance_m)
+
+    def _by_code(self, connection: sa.Connection, codes: Sequence[str | None], good: Sequence[int]) -> Any:
+        """Index of the marker that each row names: of several with the same digits the nearest."""
+        named = {codes[row] for row in good}
+        family, agency_id = self._given.declaration.family, self._caller.agency_id
+        found = bulk.list_by_digits(connection, family, [code for code in named if code is not None])
+        ids = [row["id"] for row in found if row["agency_id"] == agency_id and row["status"] != "retired"]
+        self._known = list(store.get_markers(connection, agency_id, ids))
+        by_digits: dict[str, list[int]] = {}
+        for index, marker in enumerate(self._known):
+            by_digits.setdefault(marker["digits"], []).append(index)
+        placed = self._survey.placed
+        matched = np.full(self._survey.table.rows, -1, dtype=np.intp)
+        used: set[int] = set()
+        for row in good:
+            candidates = by_digits.get(codes[row] or "", [])
+            if candidates:
+                lon, lat = placed.lon_deg[row], placed.lat_deg[row]
+                best = min(candidates, key=lambda k: _square_deg(self._known[k], lon, lat))
+                if best in used:
+                    self._faults.append(Fault(row + 1, "code", "duplicate_code", "another row has the same code"))
+                used.add(best)
+                matched[row] = best
+        return matched
+
+    def _resurvey(self, connection: sa.Connection, family: MarkerFamily[Any, Any]) -> None:
+        """A new version of every marker that a good row measured."""
+        assert self._comparison is not None
+        for index in self._good_rows():
+            marker = self._known[int(self._comparison.matched[index])]
+            columns = common_columns(self._survey, index, self._given.declaration, file_sha256=self._sha256)
+            kept = ("family", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")
+            values = {name: v for name, v in columns.items() if name not in kept}
+            values["status"] = self._given.declaration.status or "surveyed"
+            # what stands on the road keeps its digits, whatever was planned
+            built = {**marker, "status": "built" if marker["status"] == PLANNED else marker["status"]}
+            values |= family.revised(connection, self._caller, built, values, moved=True)  # type: ignore[arg-type]
+            store.update_marker(
+                connection,
+                self._caller.agency_id,
+                marker["id"],
+                values,
+                version=marker["version"],
+                now=self._now,
+                who=self._caller.label,
+                why=self._given.reason or f"as built, import of {self._sha256[:12]}",
+            )
+            self._stored += 1
+
+    def _comparison_document(self) -> dict[str, Any] | None:
+        if self._comparison is None:
+            return None
+        found = self._comparison
+        residuals = [
+            {
+                "row": int(row) + 1,
+                "marker_id": self._known[int(found.matched[row])]["id"],
+                "east_m": round(float(found.east_m[row]), 4),
+                "north_m": round(float(found.north_m[row]), 4),
+                "up_m": round(float(found.up_m[row]), 4) if np.isfinite(found.up_m[row]) else None,
+                "horizontal_m": round(float(found.horizontal_m[row]), 4),
+            }
+            for row in np.flatnonzero(np.isfinite(found.east_m))[:MAX_FAULTS]
+        ]
+        return {**found.document(self._given.declaration.tolerance_m), "residuals": residuals}
+
+
+def _places(rows: Sequence[Any]) -> tuple[Any, Any, Any]:
+    values = [(r["lon_deg"], r["lat_deg"], np.nan if r["height_m"] is None else r["height_m"]) for r in rows]
+    array = np.array(values, dtype=np.float64).reshape(-1, 3)
+    return array[:, 0], array[:, 1], array[:, 2]
+
+
+def _square_deg(marker: Any, lon_deg: float, lat_deg: float) -> float:
+    return float((marker["lon_deg"] - lon_deg) ** 2 + (marker["lat_deg"] - lat_deg) ** 2)
+
+
+def _check_family(declaration: ImportDeclaration) -> None:
+    if declaration.family not in FAMILIES:
+        raise InvalidParameter(
+            f"{declaration.family[:40]!r} cannot be imported from points",
+            field="declaration.family",
+            limit=", ".join(FAMILIES),
+            cure="magnets are registered as layouts along a lane: POST /v1/markers",
+        )
