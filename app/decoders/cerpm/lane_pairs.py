@@ -50,15 +50,20 @@ def abreast(station_m: Floats, left_m: Floats, side: Ints, sigma_m: Floats) -> P
         return none
     a, b = left[close], across[close]
     width = np.maximum(left_m[a] - left_m[b], 1.0)
-    sigma = np.sqrt(sigma_m[a] ** 2 + sigma_m[b] ** 2 + 2 * _LAID_M**2) / width
+    laid_m = max(np.sqrt(2) * _LAID_M, _spread_m(apart[close]))
+    sigma = np.sqrt(sigma_m[a] ** 2 + sigma_m[b] ** 2 + laid_m**2) / width
     return (station_m[a] + station_m[b]) / 2, -apart[close] / width, sigma
 
 
 def _is_staggered(apart_m: Floats) -> bool:
     """Whether one row as a whole stands ahead of the other: then a line across a pair is not square to the lane."""
-    middle_m = float(np.median(apart_m))
-    spread_m = 1.4826 * float(np.median(np.abs(apart_m - middle_m)))
-    return abs(middle_m) > max(_LEAST_STAGGER_M, float(_STAGGER_Z * 1.25 * spread_m / np.sqrt(len(apart_m))))
+    error_m = 1.25 * _spread_m(apart_m) / np.sqrt(len(apart_m))
+    return abs(float(np.median(apart_m))) > max(_LEAST_STAGGER_M, float(_STAGGER_Z * error_m))
+
+
+def _spread_m(apart_m: Floats) -> float:
+    """Robust standard deviation of how far the markers of a pair stand apart along the line: pairs are laid by hand."""
+    return 1.4826 * float(np.median(np.abs(apart_m - np.median(apart_m))))
 
 
 def _nearest(sorted_m: Floats, wanted_m: Floats) -> Ints:

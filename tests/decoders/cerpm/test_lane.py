@@ -252,3 +252,17 @@ def test_a_row_that_stands_a_little_ahead_of_the_other_does_not_wind_the_path(st
     lane = fit_lane(markers, drive(road, rng) if with_track else None)
     assert lane.refusal is None
     assert np.abs(road.errors(lane)).max() < 0.2
+
+
+@pytest.mark.parametrize("with_track", [True, False])
+@pytest.mark.parametrize("laid_m", [0.1, 0.3])
+def test_pairs_that_are_laid_carelessly_do_not_wind_the_path(laid_m, with_track):
+    rng = np.random.default_rng(1106)
+    road = bendy(400.0)
+    at = np.arange(2, road.at[-1] - 2, 12.2)
+    left, right = at + rng.normal(0, laid_m, (2, len(at)))
+    points = np.concatenate([road.beside(left, 1.6), road.beside(right, -1.6)])
+    markers = markers_at(points + rng.normal(0, 0.02, points.shape), np.repeat([1, 2], len(at)))
+    lane = fit_lane(markers, drive(road, rng) if with_track else None)
+    assert lane.refusal is None
+    assert np.abs(road.errors(lane)).max() < 0.15
