@@ -30,8 +30,7 @@ def _rtree(table: str) -> sa.TableClause:
     return sa.table(f"{table}_rtree", *(sa.column(name, sa.Double) for name in names))
 
 
-rtree = _rtree("markers")
-_RTREES = {"markers": rtree, "magnets": _rtree("magnets")}
+_RTREES = {table: _rtree(table) for table in ("markers", "magnets")}
 
 
 @dataclass(frozen=True, slots=True)
