@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import artwork, cerpms, codebooks, decodes, imports, layouts, markers, radio_checks, system, ui
+from app.api import artwork, cerpms, codebooks, decodes, exports, imports, layouts, markers, radio_checks, system, ui
 from app.api.middleware import Guarded, Observed
 from app.api.ogc import mount_ogc
 from app.api.openapi import describe
@@ -36,6 +36,7 @@ from app.services.codebooks import Codebooks
 from app.services.decode_jobs import DecodeJobs
 from app.services.decode_rules import DecodeRules
 from app.services.decodes import Decodes
+from app.services.exports import Exports
 from app.services.features import Features
 from app.services.imports import Imports
 from app.services.layouts import Layouts
@@ -56,6 +57,7 @@ ROUTERS = (
     codebooks.router,
     decodes.router,
     imports.router,
+    exports.router,
 )
 
 
@@ -94,6 +96,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
     app.state.markers = Markers(database, utc_now, _marker_rules(settings))
     app.state.imports = Imports(database, utc_now, pool, _marker_rules(settings))
+    app.state.exports = Exports(database)
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)
     app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)

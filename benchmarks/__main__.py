@@ -37,6 +37,7 @@ def _list_commands(short: bool) -> list[list[str]]:
         ["plates", "-m", "benchmarks.plates", *(["--short"] if short else [])],
         ["magnets", "-m", "benchmarks.magnets", *(["--short"] if short else [])],
         ["cerpm", "-m", "benchmarks.cerpm", *(["--short"] if short else [])],
+        ["imports", "-m", "benchmarks.imports", *(["--short"] if short else [])],
     ]
 
 

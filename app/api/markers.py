@@ -132,7 +132,7 @@ def list_markers(
     Magnets are where their first one lies; lists leave out their lanes, magnets, checks and costs.
     """
     narrowed = MarkerFilter(
-        box=_box(bbox) if bbox is not None else None,
+        box=parse_box(bbox) if bbox is not None else None,
         near=_circle(near) if near is not None else None,
         digits=code,
         status=status,
@@ -216,7 +216,8 @@ def _numbers(text: str, field: str, form: str) -> list[float]:
         raise InvalidParameter(f"{field} holds something that is not a number", field=field, limit=form) from error
 
 
-def _box(text: str) -> Box:
+def parse_box(text: str) -> Box:
+    """West, south, east, north as a query writes them."""
     west, south, east, north = _numbers(text, "bbox", "west,south,east,north")
     check_lon_lat(west, south, field="bbox")
     check_lon_lat(east, north, field="bbox")

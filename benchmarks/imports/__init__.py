@@ -1,0 +1,1 @@
+"""Imports: surveys with planted faults, clean surveys, rows a second."""

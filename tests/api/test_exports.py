@@ -1,0 +1,108 @@
+"""Markers as files: read back by GDAL, ezdxf and our own import; formulas harmless; streams whole."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import ezdxf
+import httpx
+import pytest
+import shapely
+from pyogrio import raw
+
+from app.registry.exchange.declaration import ImportDeclaration
+from app.registry.exchange.place import place_survey
+from app.registry.exchange.read import read_survey
+from app.registry.exchange.write import FIELDS, SHAPEFILE_NAMES, write_csv
+
+LON, LAT = 8.416412345, 49.005112345
+
+
+@pytest.fixture
+def markers(client: httpx.Client) -> list[dict[str, float]]:
+    """Three CERPMs, one with a road that a spreadsheet would run."""
+    made = []
+    for k in range(3):
+        position = {"lon_deg": LON + k * 2e-4, "lat_deg": LAT, "height_m": 160.25 + k, "horizontal_rmse_m": 0.01}
+        road = "=HYPERLINK(1)" if k == 0 else "B 10"
+        marker = {"family": "cerpm", "position": position, "side": "left", "road": road}
+        answer = client.post("/v1/markers", json=marker)
+        assert answer.status_code == 201, answer.text
+        made.append(position)
+    return made
+
+
+def test_csv_is_harmless_and_its_numbers_are_exact(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    answer = client.get("/v1/exports/csv", params={"family": "cerpm"})
+    assert answer.headers["content-type"].startswith("text/csv")
+    rows = list(csv.DictReader(io.StringIO(answer.text)))
+    assert [float(row["lon_deg"]) for row in rows] == [m["lon_deg"] for m in markers]
+    assert rows[0]["road"] == "'=HYPERLINK(1)"
+    assert rows[1]["road"] == "B 10"
+    assert tuple(rows[0]) == FIELDS
+
+
+@pytest.mark.parametrize("text", ["=1", "+1", "-1", "@A1", "\t=1"])
+def test_texts_like_formulas_get_an_apostrophe_and_numbers_none(text: str) -> None:
+    record = dict.fromkeys(FIELDS) | {"road": text, "lon_deg": -77.15, "lat_deg": 1e-9}
+    row = next(csv.DictReader(io.StringIO(b"".join(write_csv([[record]])).decode())))
+    assert (row["road"], row["lon_deg"], row["lat_deg"]) == ("'" + text, "-77.15", "1e-09")
+
+
+def test_geojson_comes_whole_also_when_empty(client: httpx.Client) -> None:
+    empty = client.get("/v1/exports/geojson").json()
+    assert empty == {"type": "FeatureCollection", "features": []}
+
+
+@pytest.mark.parametrize("kind", ["geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"])
+def test_what_is_exported_can_be_imported(client: httpx.Client, markers: list[dict[str, float]], kind: str) -> None:
+    answer = client.get(f"/v1/exports/{kind}")
+    assert answer.status_code == 200, answer.text
+    declaration = ImportDeclaration(
+        family="cerpm", vertical_datum="ellipsoid", crs="EPSG:32632" if kind == "dxf" else None
+    )
+    table = read_survey(answer.content, declaration)
+    assert table.format == kind
+    placed = place_survey(table, declaration, 0.1).placed
+    assert placed.lon_deg == pytest.approx([m["lon_deg"] for m in markers], abs=2e-9)
+    assert placed.lat_deg == pytest.approx([m["lat_deg"] for m in markers], abs=2e-9)
+    if kind != "kml":
+        assert placed.height_m == pytest.approx([m["height_m"] for m in markers])
+    named = table.texts["point" if kind == "landxml" else "code"]
+    assert named == ["1", "2", "3"]
+
+
+def test_gdal_reads_every_field(client: httpx.Client, markers: list[dict[str, float]], tmp_path: Path) -> None:
+    path = tmp_path / "markers.gpkg"
+    path.write_bytes(client.get("/v1/exports/gpkg").content)
+    meta, _, geometry, _ = raw.read(path)
+    assert tuple(meta["fields"]) == FIELDS
+    assert shapely.get_x(shapely.from_wkb(geometry)) == pytest.approx([m["lon_deg"] for m in markers])
+
+
+def test_a_shapefile_has_the_fixed_names(client: httpx.Client, markers: list[dict[str, float]], tmp_path: Path) -> None:
+    with zipfile.ZipFile(io.BytesIO(client.get("/v1/exports/shapefile").content)) as archive:
+        archive.extractall(tmp_path)
+    meta, *_ = raw.read(tmp_path / "markers.shp")
+    assert list(meta["fields"]) == [SHAPEFILE_NAMES[name] for name in FIELDS]
+    assert all(len(name) <= 10 for name in SHAPEFILE_NAMES.values())
+    assert len(set(SHAPEFILE_NAMES.values())) == len(FIELDS)
+
+
+def test_dxf_is_in_metres(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    document = ezdxf.read(io.StringIO(client.get("/v1/exports/dxf").text))
+    assert document.header["$INSUNITS"] == 6
+    assert len(document.modelspace()) == 3
+
+
+def test_filters_and_refusals(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    box = f"{LON - 1e-5},{LAT - 1e-5},{LON + 1e-5},{LAT + 1e-5}"
+    found = json.loads(client.get("/v1/exports/geojson", params={"bbox": box}).text)["features"]
+    assert len(found) == 1
+    assert client.get("/v1/exports/gpkg", params={"status": "retired"}).status_code == 422
+    assert client.get("/v1/exports/gpkg", params={"bbox": "1,2"}).json()["field"] == "bbox"
+    assert client.get("/v1/exports/exe").status_code == 422
