@@ -8,10 +8,14 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
+import shapely
+
 from app.errors import NotFound
 from app.registry import features as store
 from app.registry.database import Database
-from app.registry.features import FIELDS, Extent, FeatureFilter
+from app.registry.features import FIELDS, Extent, FeatureFilter, Field
+from app.registry.line_runs import LINE_FIELDS, Line, list_lines
+from app.registry.spatial import Box
 from app.registry.tiles import Tile, marker_tile
 from app.services.access import Caller
 from app.services.feature_crs import STORAGE_CRS, FeatureCrs
@@ -33,6 +37,13 @@ class Collection:
     geometry: str
     editable: bool = False
     retired: bool = False
+    fields: tuple[Field, ...] = FIELDS
+    filters: tuple[str, ...] = tuple(field.name for field in FIELDS if field.kind != "date-time")
+
+    @property
+    def has_tiles(self) -> bool:
+        """Whether there are vector tiles of it."""
+        return self.geometry == "Point"
 
 
 MARKERS = Collection(
@@ -45,7 +56,15 @@ MARKERS = Collection(
 RETIRED = Collection(
     "retired_markers", "Retired markers", "Markers that are out of use: one point each.", "Point", retired=True
 )
-COLLECTIONS = {collection.id: collection for collection in (MARKERS, RETIRED)}
+LINES = Collection(
+    "marker_lines",
+    "Lines of markers",
+    "Painted lines of magnets, and runs of CERPMs along one side of a lane, at most 100 m from one to the next.",
+    "LineString",
+    fields=LINE_FIELDS,
+    filters=("family", "side", "road", "status"),
+)
+COLLECTIONS = {collection.id: collection for collection in (MARKERS, RETIRED, LINES)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +142,44 @@ class Features:
             raise no_feature(collection)
         return _features([row], crs)[0]
 
+    def lines(
+        self,
+        caller: Caller,
+        narrowed: FeatureFilter,
+        *,
+        after: str | None = None,
+        limit: int = 1000,
+        crs: FeatureCrs = STORAGE_CRS,
+    ) -> Page:
+        """A page of lines in the order of their ids, always counted."""
+        with self._database.read() as connection:
+            lines = list_lines(connection, caller.agency_id, narrowed.box)
+        wanted = dict(narrowed.equal)
+        found = [
+            line
+            for line in lines
+            if all(line.properties[name] == value for name, value in wanted.items())
+            and (narrowed.box is None or _crosses(line, narrowed.box))
+        ]
+        onward = [line for line in found if after is None or line.id > after]
+        page = onward[:limit]
+        return Page([_line(line, crs) for line in page], page[-1].id if len(onward) > limit else None, len(found))
+
+    def get_line(self, caller: Caller, line_id: str, crs: FeatureCrs = STORAGE_CRS) -> dict[str, Any]:
+        """One line.
+
+        Raises
+        ------
+        NotFound
+            There is none with this id, or it belongs to another agency.
+        """
+        with self._database.read() as connection:
+            lines = list_lines(connection, caller.agency_id)
+        for line in lines:
+            if line.id == line_id:
+                return _line(line, crs)
+        raise no_feature(LINES)
+
     def tile(self, caller: Caller, collection: Collection, tile: Tile) -> bytes:
         """A vector tile of a collection; empty without features."""
         with self._database.read() as connection:
@@ -147,6 +204,23 @@ class Features:
 def no_feature(collection: Collection) -> NotFound:
     """The same for a row that is not there and for another agency's."""
     return NotFound(f"there is no such feature in {collection.id}", field="featureId")
+
+
+def _crosses(line: Line, box: Box) -> bool:
+    shape = shapely.LineString(line.points)
+    return any(
+        shape.intersects(shapely.box(part.west_deg, part.south_deg, part.east_deg, part.north_deg))
+        for part in box.parts
+    )
+
+
+def _line(line: Line, crs: FeatureCrs) -> dict[str, Any]:
+    return {
+        "type": "Feature",
+        "id": line.id,
+        "geometry": {"type": "LineString", "coordinates": [crs.from_lon_lat(*point) for point in line.points]},
+        "properties": line.properties,
+    }
 
 
 def _is_cheap(narrowed: FeatureFilter) -> bool:

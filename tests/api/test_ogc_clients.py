@@ -51,7 +51,7 @@ def gdal(server: LiveServer, road: str) -> Iterator[Gdal]:
 
 
 def test_gdal_lists_the_layers(gdal: Gdal) -> None:
-    assert {"markers", "retired_markers"} <= set(gdal(pyogrio.list_layers)[:, 0])
+    assert {"markers", "retired_markers", "marker_lines"} <= set(gdal(pyogrio.list_layers)[:, 0])
 
 
 def test_gdal_reads_types_from_the_schema(gdal: Gdal) -> None:

@@ -11,7 +11,7 @@ from app.api.ogc.openapi import api_document
 from app.api.ogc.query import known_parameters
 from app.api.ogc.responses import GEOJSON, JSON, OPENAPI, SCHEMA, answer, base_url, caller_of, link, negotiate
 from app.api.ogc.tiles import TILES_REL
-from app.registry.features import FIELDS, Extent
+from app.registry.features import Extent
 from app.services.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.features import COLLECTIONS, Collection, Features, get_collection
 
@@ -80,7 +80,7 @@ def schema(request: Request) -> Response:
     found = get_collection(request.path_params["collection"])
     negotiate(request, known_parameters(request, _OFFERED), SCHEMA, JSON)
     base = base_url(request)
-    properties = {field.name: schema_type(field.kind) | {"title": field.text} for field in FIELDS}
+    properties = {field.name: schema_type(field.kind) | {"title": field.text} for field in found.fields}
     document = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": f"{base}/collections/{found.id}/schema",
@@ -116,7 +116,7 @@ def _described(request: Request, found: Collection, base: str) -> dict[str, Any]
         "links": [
             link(url, "self", JSON),
             link(f"{url}/items", "items", GEOJSON, found.title),
-            link(f"{url}/tiles", TILES_REL, JSON, "Vector tiles"),
+            *([link(f"{url}/tiles", TILES_REL, JSON, "Vector tiles")] if found.has_tiles else []),
             link(f"{url}/schema", "describedby", SCHEMA, "Schema of the features"),
             link(f"{url}/schema", "describedBy", SCHEMA, "Schema of the features, for older clients"),
         ],

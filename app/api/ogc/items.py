@@ -17,7 +17,7 @@ from app.api.ogc.query import (
     query_pairs,
 )
 from app.api.ogc.responses import GEOJSON, JSON, answer, base_url, caller_of, link, negotiate, with_query
-from app.services.features import Collection, Features, get_collection, no_feature
+from app.services.features import LINES, Collection, Features, get_collection, no_feature
 
 _NAMES = ("json", "geojson")
 _MARKER_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", re.ASCII)
@@ -26,15 +26,20 @@ _MARKER_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", re.ASCII)
 def list_items(request: Request) -> Response:
     """A page of features, or how many there are."""
     collection = get_collection(request.path_params["collection"])
-    asked = items_query(request, retired=collection.retired)
+    asked = items_query(request, collection)
     negotiate(request, dict(query_pairs(request)), GEOJSON, JSON, names=_NAMES)
     features: Features = request.app.state.features
     caller = caller_of(request)
-    if asked.hits:
+    if collection is LINES:
+        page = features.lines(caller, asked.narrowed, after=asked.after, limit=asked.limit, crs=asked.crs)
+        if asked.hits:
+            return answer(_hits(page.matched or 0), GEOJSON)
+    elif asked.hits:
         return answer(_hits(features.count(caller, asked.narrowed)), GEOJSON)
-    page = features.page(
-        caller, asked.narrowed, after=asked.after, limit=asked.limit, crs=asked.crs, counted=asked.counted
-    )
+    else:
+        page = features.page(
+            caller, asked.narrowed, after=asked.after, limit=asked.limit, crs=asked.crs, counted=asked.counted
+        )
     document: dict[str, Any] = {
         "type": "FeatureCollection",
         "timeStamp": datetime.now(UTC),
@@ -54,13 +59,18 @@ def get_item(request: Request) -> Response:
     crs = crs_parameter(found, "crs")
     negotiate(request, found, GEOJSON, JSON, names=_NAMES)
     features: Features = request.app.state.features
-    feature = features.get(caller_of(request), collection, feature_id(request, collection), crs)
+    caller, wanted = caller_of(request), feature_id(request, collection)
+    if collection is LINES:
+        feature = features.get_line(caller, wanted, crs)
+    else:
+        feature = features.get(caller, collection, wanted, crs)
     url = f"{base_url(request)}/collections/{collection.id}"
     feature["links"] = [
         link(f"{url}/items/{feature['id']}", "self", GEOJSON),
         link(url, "collection", JSON),
     ]
-    return answer(feature, GEOJSON, crs=crs, headers={"ETag": f'"{feature["properties"]["version"]}"'})
+    version = feature["properties"].get("version")
+    return answer(feature, GEOJSON, crs=crs, headers={"ETag": f'"{version}"'} if version is not None else None)
 
 
 def feature_id(request: Request, collection: Collection) -> str:

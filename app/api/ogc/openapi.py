@@ -19,7 +19,6 @@ _PROBLEM = {
     "description": "A problem document (RFC 9457)",
     "content": {"application/problem+json": {"schema": {"type": "object"}}},
 }
-_EDIT_TYPES = {"post": GEOJSON, "put": GEOJSON, "patch": "application/merge-patch+json"}
 
 
 def api_document(base: str) -> dict[str, Any]:
@@ -56,7 +55,7 @@ def api_document(base: str) -> dict[str, Any]:
 
 def _paths(collection: Collection) -> dict[str, Any]:
     url, name = f"/collections/{collection.id}", collection.title
-    items = _read(f"{name}: a page", GEOJSON, LIST_PARAMETERS)
+    items = _read(f"{name}: a page", GEOJSON, (*LIST_PARAMETERS, *collection.filters))
     item = _read(f"{name}: one", GEOJSON, ("f", "crs"))
     item["parameters"] = [{"$ref": "#/components/parameters/featureId"}]
     return {
@@ -109,7 +108,7 @@ def _parameters() -> dict[str, Any]:
         "count": _query("count", {"type": "boolean", "default": False}, "numberMatched with every page"),
         "featureId": {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}},
     }
-    for name in LIST_PARAMETERS:
+    for name in sorted({name for collection in COLLECTIONS.values() for name in collection.filters}):
         if name in FIELDS_BY_NAME:
             field = FIELDS_BY_NAME[name]
             parameters[name] = _query(name, {"type": field.kind}, f"{field.text}: equal to this")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection as Names
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 from typing import NoReturn
@@ -16,6 +16,7 @@ from app.errors import MalformedRequest
 from app.registry.features import FIELDS_BY_NAME, FeatureFilter
 from app.registry.spatial import Box
 from app.services.feature_crs import STORAGE_CRS, FeatureCrs
+from app.services.features import Collection
 
 DEFAULT_LIMIT = 1000
 MAX_LIMIT = 10_000
@@ -69,7 +70,7 @@ def query_pairs(request: Request) -> list[tuple[str, str]]:
     return pairs
 
 
-def known_parameters(request: Request, known: Names[str]) -> dict[str, str]:
+def known_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
     """Parameters by name, each of them known and sent once.
 
     Raises
@@ -88,21 +89,18 @@ def known_parameters(request: Request, known: Names[str]) -> dict[str, str]:
 
 
 ITEM_PARAMETERS = ("f", "crs")
-LIST_PARAMETERS = (
-    *("f", "crs", "bbox", "bbox-crs", "datetime", "limit", "after", "resultType", "count"),
-    *(name for name in FIELDS_BY_NAME if name != "updated_at"),
-)
+LIST_PARAMETERS = ("f", "crs", "bbox", "bbox-crs", "datetime", "limit", "after", "resultType", "count")
 
 
-def items_query(request: Request, *, retired: bool) -> ItemsQuery:
-    """The parsed parameters of a request for items.
+def items_query(request: Request, collection: Collection) -> ItemsQuery:
+    """The parsed parameters of a request for items of a collection.
 
     Raises
     ------
     MalformedRequest
         One is unknown or cannot be.
     """
-    found = known_parameters(request, LIST_PARAMETERS)
+    found = known_parameters(request, (*LIST_PARAMETERS, *collection.filters))
     box, heights_m = _bbox(found)
     since, until = _datetime(found["datetime"]) if "datetime" in found else (None, None)
     kind = found.get("resultType", "results")
@@ -112,12 +110,12 @@ def items_query(request: Request, *, retired: bool) -> ItemsQuery:
     if after is not None and not _ID.fullmatch(after):
         refuse("after", "after is the id of a feature", "take it from a next link")
     narrowed = FeatureFilter(
-        retired=retired,
+        retired=collection.retired,
         box=box,
         heights_m=heights_m,
         since=since,
         until=until,
-        equal=tuple((name, _value(name, text)) for name, text in found.items() if name in FIELDS_BY_NAME),
+        equal=tuple((name, _value(name, text)) for name, text in found.items() if name in collection.filters),
     )
     return ItemsQuery(
         narrowed, _limit(found), after, crs_parameter(found, "crs"), kind == "hits", _flag(found, "count")

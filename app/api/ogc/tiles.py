@@ -26,14 +26,14 @@ _WHOLE = re.compile(r"0|[1-9][0-9]{0,8}", re.ASCII)
 
 def list_tilesets(request: Request) -> Response:
     """The tile sets of a collection: one."""
-    collection = get_collection(request.path_params["collection"])
+    collection = _tiled(request)
     negotiate(request, known_parameters(request, ("f",)), JSON)
     return answer({"tilesets": [_tileset(request, collection)]})
 
 
 def get_tileset(request: Request) -> Response:
     """A tile set of a collection."""
-    collection = get_collection(request.path_params["collection"])
+    collection = _tiled(request)
     _check_matrix_set(request)
     negotiate(request, known_parameters(request, ("f",)), JSON)
     return answer(_tileset(request, collection))
@@ -41,7 +41,7 @@ def get_tileset(request: Request) -> Response:
 
 def get_tile(request: Request) -> Response:
     """A tile; 204 without features."""
-    collection = get_collection(request.path_params["collection"])
+    collection = _tiled(request)
     _check_matrix_set(request)
     tile = _tile(request)
     found = known_parameters(request, ("f",))
@@ -88,6 +88,13 @@ def get_matrix_set(request: Request) -> Response:
             "tileMatrices": matrices,
         }
     )
+
+
+def _tiled(request: Request) -> Collection:
+    collection = get_collection(request.path_params["collection"])
+    if not collection.has_tiles:
+        raise NotFound("there are no tiles of this collection", field="collectionId", cure="ask for its items")
+    return collection
 
 
 def _check_matrix_set(request: Request) -> None:
