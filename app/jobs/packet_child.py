@@ -53,6 +53,8 @@ def _read_drive(task: DriveTask) -> DriveFiles:
     frame: tuple[str, ImageHeader] | None = None
     reports: dict[str, LogReport] = {}
     for part in open_parts({task.name: task.data}, TraceLimits(file_bytes=task.packets.file_bytes)):
+        if part.name.startswith("."):
+            continue  # what a desktop leaves in a ZIP
         data = part.content()
         kind = terms.files.get(part.name) or _kind_of(part, data)
         if kind == "frame":

@@ -20,6 +20,7 @@ from app.registry.markers import Row
 from app.services.access import Caller, Scope
 from app.services.agency_secrets import AgencySecrets
 from app.services.cerpm_markers import FAMILY, message_of, radio_of
+from app.services.marker_rules import RETIRED
 from app.services.marker_selection import Selection, select_markers
 from app.services.ports import Clock
 
@@ -139,6 +140,8 @@ def _next_sequences(connection: sa.Connection, agency_id: str, rows: list[Row]) 
 
 
 def _note(row: Row) -> str | None:
+    if row["status"] == RETIRED:
+        return "the marker is retired: packets from it are not used"
     if row["localization_grade"] == LocalizationGrade.EXACT:
         return None
     return f"{LocalizationGrade.APPROXIMATE}: {row['transform_note']}"

@@ -17,6 +17,7 @@ Floats = npt.NDArray[np.float64]
 LonLat = list[list[float]]
 _STRAIGHT_1PM = 1e-4
 _BOUNDARIES = ("left", "right")
+_IN_GEOMETRY = ("lon_deg", "lat_deg")
 
 
 def lane_document(lane: Lane, *, grade: str) -> dict[str, Any]:
@@ -70,7 +71,7 @@ def lane_geojson(document: dict[str, Any], markers: list[dict[str, Any]]) -> dic
     head = {name: document[name] for name in ("method", "localization_grade", "length_m", "sigma_median_m", "refusal")}
     features: list[dict[str, Any]] = []
     if len(path) > 1:
-        columns = {name: stations[name] for name in ("station_m", "curvature_1pm", "sigma_m", "confidence")}
+        columns = {name: values for name, values in stations.items() if name not in _IN_GEOMETRY}
         limits = {"speed_limits_km_h": document["speed_limits_km_h"]}
         geometry = {"type": "LineString", "coordinates": path}
         features.append(_feature("path", geometry, {**head, **limits, "stations": columns}))

@@ -39,7 +39,7 @@ from app.services.packets import (
 )
 
 PACKETS = "packets"
-TRIES = 5
+TRIES = 12
 """How often packets are verified anew because another upload was stored in between."""
 
 

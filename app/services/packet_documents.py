@@ -23,6 +23,7 @@ from app.services.packets import DriveFiles, LaneResult
 
 DECODER_VERSION = "cerpm/1"
 MAX_REFUSED = 500
+_SURE_M = 0.25
 MAX_PROFILE = 200
 """Packets in the RSSI profile of one marker."""
 _OBSERVED = {Disagreement.MOVED: "moved", Disagreement.TWO_PLACES: "cloned", Disagreement.OUT_OF_REACH: "out-of-reach"}
@@ -32,8 +33,10 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
     """What a decode of a drive found, as it is stored."""
     lane = result.lane
     markers = _markers(read, lane)
-    grade = read.grade if lane.refusal is None else LocalizationGrade.APPROXIMATE
+    unsure = _unsure(lane)
+    grade = LocalizationGrade.APPROXIMATE if unsure else read.grade
     document = lane_document(lane, grade=str(grade))
+    document["doubts"] += unsure
     document["doubts"] += read.doubts
     path_loss = read.signal.path_loss
     return {
@@ -56,10 +59,24 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
     }
 
 
+def _unsure(lane: Lane) -> list[str]:
+    """What keeps a path from localizing a vehicle, whatever its markers are worth."""
+    if lane.refusal is not None:
+        return [lane.refusal]
+    if not np.isfinite(lane.sigma_m).all():
+        return ["the method does not say how sure the path is"]
+    if float(np.median(lane.sigma_m)) > _SURE_M:
+        return [f"the path is not sure within {_SURE_M:g} m"]
+    return []
+
+
 def packet_observations(decode_id: str, read: ReadPackets, lane: Lane, seen_at: Any) -> list[dict[str, Any]]:
     """One row a registered marker that was authentically heard."""
     off_line = {entry.number for entry in lane.left_out}
     kinds = {finding.number: _OBSERVED.get(finding.kind) for finding in read.merged.findings}
+    far = [number for number, kind in kinds.items() if kind == _OBSERVED[Disagreement.OUT_OF_REACH]]
+    if 2 * len(far) > len(read.signal.profiles):
+        return []  # the track is of another drive: it accuses no marker
     rows = []
     for number, row in read.known.rows.items():
         profile = read.signal.profiles.get(number)
@@ -81,9 +98,10 @@ def _summary(files: DriveFiles, read: ReadPackets, markers: list[dict[str, Any]]
     refused = len(files.packets) - accepted - repeated - clear
     named = [marker["number"] for marker in markers if marker["left_out"]]
     length_m = float(lane.station_m[-1]) if len(lane.station_m) else 0.0
-    text = f"{count_of(len(files.packets), 'packet')}, {accepted} authentic" + (
-        f", {refused} refused" if refused else ""
-    )
+    text = f"{count_of(len(files.packets), 'packet')}, {accepted} authentic"
+    text += f", {repeated} repeated" if repeated else ""
+    text += f", {clear} in clear" if clear else ""
+    text += f", {refused} refused" if refused else ""
     text += f"; {count_of(len(markers), 'marker')}"
     text += f", left out: {', '.join(str(number) for number in named)}" if named else ""
     if lane.refusal is None and np.isfinite(lane.sigma_m).all():

@@ -20,12 +20,15 @@ import cv2
 import httpx
 import numpy as np
 import pytest
+import sqlalchemy as sa
 
 from app.decoders.cerpm.packets import HeardPacket
 from app.demo.cerpms import BuiltLane, build_lane, draw_frame, path_errors_m, write_packets, write_poses
 from app.encoders.cerpm.payload import encode_message
 from app.main import create_app
 from app.markers.cerpm import CerpmMessage
+from app.registry.decodes import list_observations
+from app.registry.tables import decodes
 from app.services.access import Scope
 from app.settings import Settings
 from app.simulation.radio.attacks import forge_packets, move_claim, number_entries, replay_packets
@@ -380,6 +383,32 @@ def test_bad_payloads_are_named_one_by_one(
     assert refused[0]["verdict"] in (verdict, "undecodable", "corrupt")
     assert refused[0]["reason"]
     assert found["report"]["verdicts"]["authentic"] == len(heard.packets) - 1
+
+
+def test_a_track_of_another_place_accuses_no_marker(road: tuple[httpx.Client, BuiltLane], server: LiveServer) -> None:
+    client, built = road
+    heard, _hour = drive(built, 1924)
+    away = replace(heard, track=replace(heard.track, lat_deg=heard.track.lat_deg + 0.1))
+    found = decoded(client, packed(away))
+    assert any("another drive" in warning for warning in found["report"]["warnings"])
+    assert found["lane"]["localization_grade"] != "exact"
+    database = server.app.state.markers._database
+    with database.read() as connection:
+        agency_id = find_agency_of(connection, found["id"])
+        assert list_observations(connection, agency_id, found["id"]) == []
+
+
+def test_a_path_that_is_not_sure_is_not_for_localization(road: tuple[httpx.Client, BuiltLane]) -> None:
+    client, built = road
+    heard, _hour = drive(built, 1925)
+    paper = decoded(client, packed(heard), {"packets": {"method": "paper"}})
+    assert paper["lane"]["localization_grade"] != "exact"
+    assert any("how sure" in doubt for doubt in paper["lane"]["doubts"])
+
+
+def find_agency_of(connection: sa.Connection, decode_id: str) -> str:
+    """Whose a decode is."""
+    return str(connection.execute(sa.select(decodes.c.agency_id).where(decodes.c.id == decode_id)).scalar_one())
 
 
 def test_a_log_in_clear_is_used_only_if_that_is_said(road: tuple[httpx.Client, BuiltLane]) -> None:

@@ -39,6 +39,9 @@ _KNOWN_WIDTH_M, _KNOWN_SIDE_M = 0.3, 0.4
 _BEYOND_M = 15.0
 _SURE_TRACK_M = 0.5
 _SAME_PLACE_M = 3.0
+_OTHER_ROW, _OTHER_ROW_SHARE = 3, 0.08
+"""So many markers off the line, and such a share of all, may be a row that the path should have followed."""
+_OTHER_ROW_SIGMA_M = 1.0
 _LEAST_CHANGES = 0.35
 
 
@@ -215,6 +218,12 @@ def _lane(fit: Fit, stock: Stock, rules: LaneRules, notes: Notes) -> Lane:
     markers_at = np.interp(fit.station_m, problem.station_m, along)
     inner = markers_at[fit.used]
     keep = _kept(at, sigma, inner.min(), inner.max(), rules.worst_sigma_m)
+    if len(fit.left_out) >= _OTHER_ROW and fit.strays > _OTHER_ROW_SHARE:
+        out, all_told = len(fit.left_out), len(fit.left_out) + int(fit.used.sum())
+        notes.doubt(
+            f"{out} of {all_told} markers lie off the line: another lane's row, or a lane that merges or splits"
+        )
+        sigma = np.hypot(sigma, _OTHER_ROW_SIGMA_M)
     normal = np.stack([-path.tangent[:, 1], path.tangent[:, 0]], 1)
     bounds = [
         np.where((known < _KNOWN_SIDE_M)[:, None], path.points_m + s * normal * width[:, None] / 2, np.nan)

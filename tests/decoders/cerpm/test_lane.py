@@ -266,3 +266,18 @@ def test_pairs_that_are_laid_carelessly_do_not_wind_the_path(laid_m, with_track)
     lane = fit_lane(markers, drive(road, rng) if with_track else None)
     assert lane.refusal is None
     assert np.abs(road.errors(lane)).max() < 0.15
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_several_markers_off_the_line_lower_the_confidence(labelled):
+    rng = np.random.default_rng(1071)
+    road = straight(200.0)
+    markers = place(road, rng, labelled=labelled)
+    at = np.linspace(70, 120, 5)  # the edge of a ramp that joins from the right
+    ramp = markers_at(road.beside(at, -1.6 - np.linspace(6, 3, 5)), 2 if labelled else 0, number=900 + np.arange(5))
+    both = LaneMarkers(*(np.append(getattr(markers, name), getattr(ramp, name)) for name in LaneMarkers.__slots__))
+    lane = fit_lane(both, drive(road, rng))
+    if lane.refusal is None:
+        assert any("off the line" in doubt for doubt in lane.doubts), lane.doubts
+        assert lane.confidence.max() < 0.5
+    assert fit_lane(markers, drive(road, rng)).confidence.mean() > 0.9
