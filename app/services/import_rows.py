@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -217,11 +218,17 @@ def _cerpm_columns(
         "side": (LaneSide[side.upper()] if side is not None else defaults.side).name.lower(),
         "speed_limit": speed_limit_document(defaults.speed_limit),
         "dev_eui": None,
-        "radio": asdict(RadioSettings()),
+        "radio": _default_radio(),
     }
     columns = {"scheme": "cerpm", "digits": str(number), "spec": spec}
     message_of({**common, **columns})
     return columns, text is not None
+
+
+@lru_cache
+def _default_radio() -> dict[str, Any]:
+    """Worked out once: a million rows share it, and none changes it."""
+    return asdict(RadioSettings())
 
 
 def _number(text: str) -> int:
