@@ -41,7 +41,7 @@ _SURE_TRACK_M = 0.5
 _SAME_PLACE_M = 3.0
 _OTHER_ROW, _OTHER_ROW_SHARE = 3, 0.08
 """So many markers off the line, and such a share of all, may be a row that the path should have followed."""
-_OTHER_ROW_SIGMA_M = 1.0
+_OTHER_ROW_SIGMA_M = 0.6
 _LEAST_CHANGES = 0.35
 
 

@@ -277,7 +277,7 @@ def test_several_markers_off_the_line_lower_the_confidence(labelled):
     ramp = markers_at(road.beside(at, -1.6 - np.linspace(6, 3, 5)), 2 if labelled else 0, number=900 + np.arange(5))
     both = LaneMarkers(*(np.append(getattr(markers, name), getattr(ramp, name)) for name in LaneMarkers.__slots__))
     lane = fit_lane(both, drive(road, rng))
-    if lane.refusal is None:
-        assert any("off the line" in doubt for doubt in lane.doubts), lane.doubts
-        assert lane.confidence.max() < 0.5
+    assert lane.refusal is None
+    assert any("off the line" in doubt for doubt in lane.doubts), lane.doubts
+    assert lane.confidence.max() < 0.5
     assert fit_lane(markers, drive(road, rng)).confidence.mean() > 0.9
