@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from starlette.routing import Match, Route
 from starlette.types import Scope
 
-from app.api.ogc import documents, items, tiles
+from app.api.ogc import documents, edits, items, tiles
 
 _ITEMS = "/ogc/collections/{collection}/items"
 _TILES = "/ogc/collections/{collection}/tiles"
@@ -38,6 +38,11 @@ ROUTES = (
     _route("/ogc/collections/{collection}/schema", documents.schema),
     _route(_ITEMS, items.list_items),
     _route(f"{_ITEMS}/{{feature}}", items.get_item),
+    _route(_ITEMS, edits.post_item, "POST"),
+    _route(_ITEMS, edits.item_options, "OPTIONS"),
+    _route(f"{_ITEMS}/{{feature}}", edits.patch_item, "PATCH"),
+    _route(f"{_ITEMS}/{{feature}}", edits.delete_item, "DELETE"),
+    _route(f"{_ITEMS}/{{feature}}", edits.item_options, "OPTIONS"),
     _route("/ogc/tileMatrixSets", tiles.list_matrix_sets),
     _route("/ogc/tileMatrixSets/{matrix_set}", tiles.get_matrix_set),
     _route(_TILES, tiles.list_tilesets),

@@ -1,0 +1,107 @@
+"""Editing features as QGIS does: OPTIONS, POST, PATCH, DELETE."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import pytest
+
+from app.services.access import Scope
+from tests.api.test_ogc_features import ITEMS, MERCATOR, get, ids
+from tests.conftest import LiveServer
+
+SEND = {"Content-Type": "application/geo+json"}
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def _feature(lon: float, lat: float, **properties: Any) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": {"type": "Point", "coordinates": [lon, lat]}, "properties": properties}
+
+
+def _post(client: httpx.Client, feature: dict[str, Any], **headers: str) -> str:
+    response = client.post(ITEMS, json=feature, headers={**SEND, **headers})
+    assert response.status_code == 201, response.text
+    assert client.get(response.headers["location"]).status_code == 200
+    return response.headers["location"].rsplit("/", 1)[1]
+
+
+def test_options_say_what_the_key_may_do(server: LiveServer, client: httpx.Client) -> None:
+    assert "POST" in client.options(ITEMS).headers["allow"]
+    assert {"PATCH", "DELETE"} <= set(client.options(f"{ITEMS}/x").headers["allow"].split(", "))
+    assert "POST" not in client.options("/ogc/collections/marker_lines/items").headers["allow"]
+    with server.agency("edit lookers", Scope.READ) as reader:
+        assert "POST" not in reader.options(ITEMS).headers["allow"]
+        assert reader.post(ITEMS, json=_feature(1, 2), headers=SEND).status_code == 403
+
+
+def test_a_marker_is_registered_changed_moved_and_deleted(client: httpx.Client) -> None:
+    marker = _post(client, _feature(31.5, 41.5, road="A7", epoch=2025.5, version=None))
+    headers = {"Content-Type": "application/merge-patch+json"}
+    change = {"properties": {"status": "surveyed", "survey_method": "RTK", "family": "plate"}}
+    assert client.patch(f"{ITEMS}/{marker}", json=change, headers=headers).status_code == 204
+    feature = get(client, f"{ITEMS}/{marker}")
+    assert feature["properties"]["status"] == "surveyed"
+    assert (feature["properties"]["survey_method"], feature["properties"]["epoch"]) == ("RTK", 2025.5)
+    assert feature["geometry"]["coordinates"] == [31.5, 41.5]
+    move = {"geometry": {"type": "Point", "coordinates": [31.6, 41.6, 7.5]}}
+    assert client.patch(f"{ITEMS}/{marker}", json=move, headers=headers).status_code == 204
+    feature = get(client, f"{ITEMS}/{marker}")
+    assert feature["geometry"]["coordinates"] == [31.6, 41.6, 7.5]
+    assert feature["properties"]["survey_method"] is None  # what was said of the old place is not said of the new one
+    assert client.delete(f"{ITEMS}/{marker}").status_code == 204
+    assert client.get(f"{ITEMS}/{marker}").status_code == 404
+    assert marker in ids(get(client, "/ogc/collections/retired_markers/items"))
+    assert len(client.get(f"/v1/markers/{marker}/versions").json()["items"]) == 4
+
+
+def test_a_cerpm_in_web_mercator(client: httpx.Client) -> None:
+    feature = _feature(556597.4539663679, 5621521.486192066, family="cerpm", code="17", side="left")
+    marker = _post(client, feature, **{"Content-Crs": f"<{MERCATOR}>"})
+    stored = get(client, f"{ITEMS}/{marker}")
+    assert stored["geometry"]["coordinates"] == pytest.approx([5.0, 45.0], abs=1e-9)
+    assert (stored["properties"]["code"], stored["properties"]["side"]) == ("17", "left")
+
+
+BAD = {
+    "magnet": (_feature(1, 2, family="magnet"), 422),
+    "another family": (_feature(1, 2, family="balise"), 422),
+    "unknown property": (_feature(1, 2, colour="red"), 422),
+    "off the earth": (_feature(181, 2), 422),
+    "huge": (_feature(1e300, 2), 422),
+    "text": (_feature("1", 2), 422),  # type: ignore[arg-type]
+    "no geometry": ({"type": "Feature", "geometry": None, "properties": {}}, 422),
+    "a collection": ({"type": "FeatureCollection", "features": []}, 422),
+    "a list": ([], 422),
+    "bad number": (_feature(1, 2, family="cerpm", code="9" * 24), 422),
+    "bad status": (_feature(1, 2, status="lost"), 422),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_features_are_refused(client: httpx.Client, name: str) -> None:
+    body, status = BAD[name]
+    response = client.post(ITEMS, json=body, headers=SEND)
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    assert ids(get(client)) == []
+
+
+def test_bad_bodies_are_refused(client: httpx.Client) -> None:
+    for raw in (b"{", b'{"type": NaN}', b'{"type": "\\ud800"}', b'{"type": "a\\u0000"}', b"[" * 5000, b'{"a":1,"a":2}'):
+        assert client.post(ITEMS, content=raw, headers=SEND).status_code == 400, raw[:20]
+    assert client.post(ITEMS, content=b"{}", headers={"Content-Type": "text/plain"}).status_code == 415
+
+
+def test_one_agency_never_changes_anothers(server: LiveServer, client: httpx.Client) -> None:
+    marker = _post(client, _feature(33.5, 41.5))
+    with server.agency("strangers to edits") as stranger:
+        change = {"properties": {"status": "active"}}
+        assert stranger.patch(f"{ITEMS}/{marker}", json=change, headers=SEND).status_code == 404
+        assert stranger.delete(f"{ITEMS}/{marker}").status_code == 404
+    assert get(client, f"{ITEMS}/{marker}")["properties"]["status"] == "planned"
+    assert client.patch(f"{ITEMS}/{marker}", json={"properties": {"code": "1"}}, headers=SEND).status_code == 422
