@@ -14,7 +14,7 @@ from starlette.datastructures import UploadFile
 
 from app.api.dependencies import Caller, checked_idempotency_key, json_response
 from app.api.problems import MEDIA_TYPE, problem_responses
-from app.api.schemas_imports import DECLARATION_EXAMPLE, DeclarationIn, ReportOut
+from app.api.schemas_imports import DECLARATION_EXAMPLE, DeclarationIn, ImportReportOut
 from app.api.strict_json import parse_json
 from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, UnsupportedUpload
 from app.services.idempotency import IdempotencyKey
@@ -122,8 +122,8 @@ Imports = Annotated[ImportsService, Depends(get_imports)]
     response_class=Response,
     openapi_extra=_BODY,
     responses={
-        200: {"model": ReportOut, "description": "Checked; nothing was stored"},
-        201: {"model": ReportOut, "description": "Stored"},
+        200: {"model": ImportReportOut, "description": "Checked; nothing was stored"},
+        201: {"model": ImportReportOut, "description": "Stored"},
         **problem_responses(409, 415),
     },
 )

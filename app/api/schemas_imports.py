@@ -128,7 +128,7 @@ class FaultOut(BaseModel):
     severity: Literal["refused", "warning"]
 
 
-class ReportOut(BaseModel):
+class ImportReportOut(BaseModel):
     """What was found in a survey, and what became of it."""
 
     outcome: Literal["checked", "stored", "refused"]

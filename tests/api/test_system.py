@@ -127,6 +127,8 @@ def test_the_examples_of_every_json_body_are_accepted(client: httpx.Client, docu
         content = operation.get("requestBody", {}).get("content", {})
         if "application/json" not in content:
             continue
+        if "$ref" not in content["application/json"]["schema"]:
+            continue  # a file as it comes
         schema = schemas[content["application/json"]["schema"]["$ref"].split("/")[-1]]
         assert schema.get("examples") or schema.get("example"), name
         seen += 1
@@ -141,6 +143,10 @@ def test_the_examples_of_every_json_body_are_accepted(client: httpx.Client, docu
     for example in schemas["MarkerPatch"]["examples"]:
         changed = client.patch(path, json=example, headers={"If-Match": "*"})
         assert changed.status_code == 200, changed.text
+
+
+def test_every_schema_has_a_name_of_its_own(document: dict[str, Any]) -> None:
+    assert [name for name in document["components"]["schemas"] if "__" in name] == []
 
 
 def test_responses_have_the_documented_members(client: httpx.Client, document: dict[str, Any]) -> None:
