@@ -35,15 +35,18 @@ SCATTER_PRIOR = (8.0, 0.6)  # weight in units, expected scatter against the mode
 TEMPER = 0.35  # share of a cost difference that is believed: the model is not the road
 USUAL_BLUR_PX = 1.0
 FULL_TRUST_PX = 1.4  # size of a unit in the image from which it is not believed less
+MOST_SPREAD = 0.6  # standard deviation of lens and motion blur together [units], the same
 REGISTERED_TRUST = 0.9999  # in a registered plate that corrections reach
 RIVAL_CELLS = 3  # by which every other registered position plate must differ more from what was read
 FLAT_LIGHT = (0.65, 1.5)  # light on a cell of one level against that around, beyond which it may be a stain
 STRAY, STRAY_TRUST = 0.23, 0.97  # share of the contrast from which a unit is no sure reading, worn or stained
 STRAY_CLEAR, CLEAR_UNIT_PX = 0.16, 3.0  # the same where a unit is so large that its own noise strays less
-MOST_DAMAGE, STAIN_UNIT_PX = 0.34, 2.0  # in digits without a check; more on units of fewer pixels, which say less
+STRAY_SPREAD = 0.12  # stray times that spread [units], from which a unit is no sure reading
+MOST_DAMAGE, STAIN_UNIT_PX = 0.25, 2.0  # in digits without a check; more on units of fewer pixels, which say less
 STAIN_DARK, STAIN_LIGHT = 0.07, 0.105  # share of the contrast from which a unit's residual may be a stain
 LEAST_OF_A_LEVEL = 6  # light or dark units that say what is usual among them
 LEAST_CODEWORD = 0.05  # probability of the symbols, as read, from which a check that holds is no chance
+LEAST_CHECKED = 0.99  # probability of each cell's symbol from which a check confirms digits beside a stain
 LETTERS_OUT_OF_REACH = 12.0  # cost of reading letters as digits up to which a plate may be a decimal one
 _DARK_SHARE = 0.12
 
@@ -68,7 +71,7 @@ class UnitEvidence:
         Where the two classifiers differ.
     stray : ndarray, shape (cells,)
         Distance of each cell's worst unit from the level that it was given, as a share of the contrast; more counts
-        on plates whose units are large.
+        on plates whose units are large, or so blurred that they run into each other.
     damage : float
         The largest stray times how far the residual of some unit's pixels stands out of the others'. A stain that
         turns a light unit dark ends beside it, on gaps and neighbours, and the plate has others that stop half way.
@@ -168,6 +171,8 @@ def weigh_units(fit: PlateFit) -> UnitEvidence | None:
     resolved_px = fit.unit_px / max(fit.blur_px, USUAL_BLUR_PX) * USUAL_BLUR_PX
     weight *= min(1.0, (resolved_px / FULL_TRUST_PX) ** 4) * min(1.0, (2 * USUAL_BLUR_PX / fit.blur_px) ** 2)
     weight *= min(1.0, 1 / max(fit.motion * n, 1e-9)) ** 2  # smeared over more than a unit: the smear's form matters
+    spread = math.hypot(fit.blur_px / fit.unit_px, fit.motion * n / math.sqrt(12))
+    weight *= min(1.0, MOST_SPREAD / spread) ** 2  # units seen through each other: errors of the blur pass for units
     costs = _cell_costs(weight, residual, dark, contrast, _PATTERNS)
     best = np.argmin(costs, axis=1)
     disputed = (first != dark).reshape(-1, 4).any(axis=1)
@@ -177,6 +182,7 @@ def weigh_units(fit: PlateFit) -> UnitEvidence | None:
     misfit = np.sqrt(fit.unit_misfit.reshape(-1)[unit_index(n).reshape(-1)])
     damage = float(stray.max()) * _worst_misfit(misfit, values, dark)
     damage *= min(1.0, fit.unit_px / STAIN_UNIT_PX)
+    stray *= max(1.0, spread * STRAY / STRAY_SPREAD)
     stray = np.where(_flat_patches(light, dark, n), 1.0, stray)
     return UnitEvidence(
         costs - costs.min(axis=1, keepdims=True), best, dark > 0.5, disputed, stray, damage, weight, residual, contrast,
@@ -378,10 +384,17 @@ def decode_symbols(
 
 
 def _unless_damaged(read: DecodedSymbols, evidence: UnitEvidence, most: float) -> DecodedSymbols:
-    """Digits that neither a check nor the registry confirms are no reading when a unit looks stained."""
-    if read.code is None or read.code.scheme is PlateScheme.ID or evidence.damage <= most:
+    """Digits that neither a check nor the registry confirms are no reading when a unit looks stained.
+
+    A check confirms only what was read without doubt: damaged position plates come near words of the id scheme.
+    """
+    if read.code is None or evidence.damage <= most:
         return read
-    return replace(read, code=None, reason="a unit looks stained, and nothing checks these digits")
+    if read.code.scheme is not PlateScheme.ID:
+        return replace(read, code=None, reason="a unit looks stained, and nothing checks these digits")
+    if read.corrected or min(read.cell_confidence) < LEAST_CHECKED:
+        return replace(read, code=None, reason="a unit looks stained, and the check is spent on cells in doubt")
+    return read
 
 
 def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> DecodedSymbols | None:

@@ -273,9 +273,11 @@ def _judge(
     if evidence is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
         return replace(reading, outcome=outcome, reason=reason)
+    thermal = task.image.ndim == 2
     decoded = decode_symbols(
-        evidence, geometry.n, task.codebook, SURE, clean=fit.explained > CLEAN_EXPLAINED,
-        most_damage=math.inf if task.image.ndim == 2 else MOST_DAMAGE,  # no stain hides a heater
+        evidence, geometry.n, task.codebook, SURE,
+        clean=fit.explained > CLEAN_EXPLAINED and not thermal,  # no colours vouch for the way it lies
+        most_damage=math.inf if thermal else MOST_DAMAGE,  # no stain hides a heater
     )  # fmt: skip
     reading = replace(
         reading,

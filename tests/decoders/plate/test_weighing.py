@@ -12,7 +12,9 @@ from tests.decoders.plate.scenes import PAPER
 N, SIDE_PX, SURE = 8, 40.0, 0.9995
 
 
-def fit_of(units: np.ndarray, *, motion: float = 0.0, misfit: np.ndarray | None = None) -> PlateFit:
+def fit_of(
+    units: np.ndarray, *, motion: float = 0.0, blur_px: float = 0.8, misfit: np.ndarray | None = None
+) -> PlateFit:
     """A fit that found these units on a plate of five pixels a unit."""
     corner = np.zeros((N, N), dtype=bool)
     corner[np.ix_([0, 1, N - 2, N - 1], [0, 1, N - 2, N - 1])] = True
@@ -30,7 +32,7 @@ def fit_of(units: np.ndarray, *, motion: float = 0.0, misfit: np.ndarray | None 
         corners_covariance_px2=0.01 * np.eye(8),
         residual=0.01,
         explained=0.99,
-        blur_px=0.8,
+        blur_px=blur_px,
         motion=motion,
         pixels=900,
     )
@@ -62,3 +64,38 @@ def test_a_stain_counts_only_where_the_level_of_some_unit_strays_as_well() -> No
     assert decode_symbols(edge, N, (), SURE).code == PAPER
     assert decode_symbols(both, N, (), SURE).code is None
     assert decode_symbols(both, N, (PAPER,), SURE).code == PAPER
+
+
+def test_units_seen_through_each_other_are_believed_less_and_may_not_stray() -> None:
+    short, long = (weigh_units(fit_of(levels(PAPER), motion=motion)) for motion in (0.25, 0.3))
+    values = levels(PAPER)
+    values[tuple(np.argwhere(PAPER.units)[7])] += 0.14
+    sharp, smeared = weigh_units(fit_of(values)), weigh_units(fit_of(values, motion=0.135, blur_px=3.5))
+    assert short is not None
+    assert long is not None
+    assert sharp is not None
+    assert smeared is not None
+    assert (long.cell_margin < short.cell_margin * (0.25 / 0.3) ** 3).all()  # twice for a smear, as much for the spread
+    assert decode_symbols(sharp, N, (), SURE).code == PAPER
+    assert decode_symbols(smeared, N, (), SURE).code is None
+    assert decode_symbols(smeared, N, (PAPER,), SURE).code == PAPER
+
+
+def test_a_check_that_is_spent_on_a_correction_confirms_nothing_beside_a_stain() -> None:
+    code = PlateCode.from_registry_number(0xDEADBEEF)
+    misfit = np.full((N, N), 1e-4)
+    misfit[tuple(np.argwhere(code.units)[5])] = 50e-4
+    values = levels(code)
+    values[tuple(np.argwhere(code.units)[7])] += 0.05
+    whole = weigh_units(fit_of(values, misfit=misfit))
+    row, column = np.argwhere(code.units)[9]
+    values[row, column] = 0.6
+    wrong, clean = weigh_units(fit_of(values, misfit=misfit)), weigh_units(fit_of(values))
+    assert whole is not None
+    assert wrong is not None
+    assert clean is not None
+    assert min(whole.damage, wrong.damage) > MOST_DAMAGE
+    assert decode_symbols(whole, N, (), SURE).code == code
+    assert decode_symbols(wrong, N, (), SURE).code is None
+    assert decode_symbols(clean, N, (), SURE).corrected
+    assert decode_symbols(wrong, N, (code,), SURE).code == code
