@@ -108,9 +108,7 @@ def fresh_server(serve: Callable[[Settings], LiveServer], settings: Settings) ->
 
 
 @pytest.fixture(scope="module")
-def server(
-    tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str]
-) -> Iterator[LiveServer]:
+def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str]) -> Iterator[LiveServer]:
     """A server that the tests of a module share; each test has an agency of its own."""
     folder = tmp_path_factory.mktemp("server") / "var"
     url = new_database_url(folder)
