@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import date
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from app.decoders.cerpm.control import Controller
 from app.decoders.cerpm.freshness import FreshnessRules
 from app.decoders.cerpm.lane_types import Lane, LaneMarkers, LaneRules
 from app.decoders.cerpm.log_report import LogReport
 from app.decoders.cerpm.log_times import LogClock, TimeScale
-from app.decoders.cerpm.overlay import LaneOverlay
 from app.decoders.cerpm.packet_log import PacketDeclaration, PacketLimits
 from app.decoders.cerpm.packet_log_rows import PayloadText
 from app.decoders.cerpm.packets import HeardPacket
@@ -21,11 +19,15 @@ from app.decoders.images import ImageHeader, ImageLimits
 from app.errors import InvalidParameter
 from app.sensors.camera import Camera
 from app.sensors.pose_track import PoseTrack
-from app.simulation.steering import SteeringCheck
+
+if TYPE_CHECKING:  # they load numba, and every decoder process loads this module when it starts
+    from app.decoders.cerpm.control import Controller
+    from app.decoders.cerpm.overlay import LaneOverlay
+    from app.simulation.steering import SteeringCheck
 
 METHODS = ("waymark", "paper")
 FILE_KINDS = ("packets", "poses", "frame")
-NO_CHECK = "none"
+PREDICTIVE, NO_CHECK = "predictive", "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +238,7 @@ def packet_terms(declared: Mapping[str, Any]) -> PacketTerms:
         for name, kind in files.items():
             if kind not in FILE_KINDS:
                 raise InvalidParameter(f"{name} is of no kind {kind}", field="files", limit=", ".join(FILE_KINDS))
-        steering = declared.get("steering", str(Controller.PREDICTIVE))
+        steering = declared.get("steering", PREDICTIVE)
         return PacketTerms(
             _packet_declaration(declared),
             _pose_declaration(declared.get("poses") or {}),
@@ -245,11 +247,17 @@ def packet_terms(declared: Mapping[str, Any]) -> PacketTerms:
             LaneRules(**(declared.get("lane") or {})),
             method,
             bool(declared.get("accept_clear", False)),
-            None if steering == NO_CHECK else Controller(steering),
+            None if steering == NO_CHECK else _controller(steering),
         )
     except InvalidParameter as error:
         error.field = f"packets.{error.field}" if error.field else "packets"
         raise
+
+
+def _controller(name: str) -> Controller:
+    from app.decoders.cerpm.control import Controller
+
+    return Controller(name)
 
 
 def _packet_declaration(declared: Mapping[str, Any]) -> PacketDeclaration:
