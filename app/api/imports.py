@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -12,10 +11,11 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.datastructures import UploadFile
 
-from app.api.dependencies import Caller, checked_idempotency_key, json_response
+from app.api.dependencies import Caller, json_response
 from app.api.problems import MEDIA_TYPE, problem_responses
 from app.api.schemas_imports import DECLARATION_EXAMPLE, DeclarationIn, ImportReportOut
 from app.api.strict_json import parse_json
+from app.api.uploads import idempotency_of
 from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, UnsupportedUpload
 from app.services.idempotency import IdempotencyKey
 from app.services.imports import GivenImport
@@ -92,7 +92,7 @@ async def get_asked(request: Request) -> _Asked:
         raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
     if len(text) > MAX_DECLARATION_BYTES:
         raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
-    return _Asked(_declared(text).given(data), _idempotency_of(request, data, text))
+    return _Asked(_declared(text).given(data), idempotency_of(request, data, text))
 
 
 def _declared(text: bytes) -> DeclarationIn:
@@ -101,15 +101,6 @@ def _declared(text: bytes) -> DeclarationIn:
     except ValidationError as error:
         faults = [{**fault, "loc": ("body", "declaration", *fault["loc"])} for fault in error.errors()]
         raise RequestValidationError(faults) from error
-
-
-def _idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKey | None:
-    key = checked_idempotency_key(request)
-    if key is None:
-        return None
-    digest = hashlib.sha256(f"{request.url.path} {len(text)}\n".encode() + text)
-    digest.update(data)
-    return IdempotencyKey(key, digest.hexdigest())
 
 
 Asked = Annotated[_Asked, Depends(get_asked)]

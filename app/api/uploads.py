@@ -66,7 +66,7 @@ async def get_upload(request: Request) -> UploadedFile:
         )
     if len(text) > MAX_CONTEXT_BYTES:
         raise MalformedRequest("the context is too long", field="context", limit=f"{MAX_CONTEXT_BYTES} bytes")
-    return UploadedFile(data, _named(_read_context(text), name), _idempotency_of(request, data, text))
+    return UploadedFile(data, _named(_read_context(text), name), idempotency_of(request, data, text))
 
 
 def _named(context: DecodeContext, name: str) -> DecodeContext:
@@ -80,7 +80,7 @@ def _named(context: DecodeContext, name: str) -> DecodeContext:
     return context
 
 
-def _idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKey | None:
+def idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKey | None:
     """The key with the hash of what was uploaded: a form's boundaries differ at each try."""
     key = checked_idempotency_key(request)
     if key is None:

@@ -225,11 +225,10 @@ class Decodes:
                     answer = find_answer(connection, caller.agency_id, key, created_at)
                     if answer is None and is_still_newest(connection, caller.agency_id, drive):
                         return self._store_packets(connection, caller, row, drive, context, key), False
-                for blob_key in kept[answer is None :]:
-                    self._blobs.delete(blob_key)
+                self._blobs.delete(kept.pop())
                 if answer is not None:
+                    self._blobs.delete(kept.pop())
                     return answer, True
-                del kept[1:]
             raise too_many_at_once()
         except BaseException:
             for blob_key in kept:
