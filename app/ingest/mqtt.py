@@ -103,6 +103,8 @@ class MqttIngest:
         self._on_decode = on_decode or (lambda _decode: None)
         self._messages: queue.SimpleQueue[mqtt.MQTTMessage | None] = queue.SimpleQueue()
         self._stopping = threading.Event()
+        self.listening = threading.Event()
+        """Set once the broker has taken the subscription."""
         self._fatal: Exception | None = None
         self._client = self._make_client()
         self._http = httpx.Client(base_url=sink.server, headers={"Authorization": f"Bearer {sink.key}"}, timeout=120)
@@ -156,6 +158,7 @@ class MqttIngest:
         if parts.scheme == "mqtts":
             client.tls_set()
         client.on_connect = self._subscribe
+        client.on_subscribe = lambda *_: self.listening.set()
         client.on_message = lambda _client, _data, message: self._messages.put(message)
         return client
 

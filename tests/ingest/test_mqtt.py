@@ -103,7 +103,7 @@ class Running:
 
     def __enter__(self) -> Running:
         self._thread.start()
-        time.sleep(0.5)  # subscribed
+        assert self.ingest.listening.wait(20)
         return self
 
     def __exit__(self, *_: object) -> None:
