@@ -73,7 +73,7 @@ def migrate(revision: Annotated[str, typer.Argument(help="Revision to go to, up 
 @cli.command()
 def key(
     agency: Annotated[str, typer.Argument(help="Name of the agency; created if there is none of that name.")],
-    scope: Annotated[str, typer.Option(help="read, decode, write or admin.")] = "write",
+    scope: Annotated[str, typer.Option(help="admin, planner, surveyor, viewer or vehicle.")] = "planner",
     label: Annotated[str, typer.Option(help="Who or what the key is for; appears in histories.")] = "key",
 ) -> None:
     """Make a key for an agency and print it once. The server must not be running."""
@@ -179,7 +179,7 @@ def ingest_sources() -> None:
 @ingest.command()
 def mqtt(
     broker: Annotated[str, typer.Option(help="mqtt://[USER:PASSWORD@]HOST[:PORT], or mqtts://.")],
-    key: Annotated[str, typer.Option(envvar="WAYMARK_KEY", help="Key with the scope decode.")],
+    key: Annotated[str, typer.Option(envvar="WAYMARK_KEY", help="Key with the scope vehicle.")],
     server: Annotated[str, typer.Option(help="Where Waymark listens.")] = "http://127.0.0.1:8000",
     topic: Annotated[list[str] | None, typer.Option(help="May be repeated; ChirpStack's and TTS's without.")] = None,
     client_id: Annotated[str, typer.Option(help="Name under which the broker keeps what waits.")] = "waymark-ingest",

@@ -17,6 +17,7 @@ from app.api import artwork, cerpms, codebooks, decodes, exports, imports, layou
 from app.api.middleware import Guarded, Observed
 from app.api.ogc import mount_ogc
 from app.api.openapi import describe
+from app.api.permissions import Permissions
 from app.api.problems import install_problem_handlers
 from app.decoders.archives import ArchiveLimits
 from app.decoders.images import ImageLimits
@@ -28,7 +29,7 @@ from app.jobs.pool import DecodePool
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlateReading
 from app.registry.database import Database
-from app.services.access import Access, Scope
+from app.services.access import Access
 from app.services.agency_secrets import AgencySecrets
 from app.services.artwork import Artworks
 from app.services.cerpm_programs import CerpmPrograms
@@ -122,12 +123,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
             "/v1/decodes": settings.max_upload_bytes,
             "/v1/imports": settings.max_upload_bytes,
         },
-        needed_scopes={
-            "": Scope.WRITE,
-            "/v1/decodes": Scope.DECODE,
-            "/v1/artwork": Scope.READ,
-            "/v1/radio-checks": Scope.READ,
-        },
+        permissions=Permissions(),
         body_timeout_s=settings.body_timeout_s,
     )
     app.add_middleware(Observed, registry=metrics)

@@ -52,7 +52,7 @@ class LiveServer:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         return httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False)
 
-    def agency(self, name: str, scope: Scope = Scope.WRITE) -> httpx.Client:
+    def agency(self, name: str, scope: Scope = Scope.PLANNER) -> httpx.Client:
         """A client of an agency, which is created if need be."""
         return self.client(self.app.state.access.create_key(name, scope, label=f"{name} {scope}"))
 
@@ -122,7 +122,7 @@ _AGENCIES = itertools.count(1)
 
 @pytest.fixture
 def client(server: LiveServer) -> Iterator[httpx.Client]:
-    """A client with the scope `write` of an agency that only this test uses."""
+    """A client with the scope `planner` of an agency that only this test uses."""
     with server.agency(f"agency {next(_AGENCIES)}") as agency:
         yield agency
 

@@ -39,7 +39,7 @@ def test_migrate_up_and_down(waymark: Run, tmp_path: Path) -> None:
 
 
 def test_a_key_for_another_agency(waymark: Run, tmp_path: Path) -> None:
-    status, key, _ = waymark("key", "City of Elsewhere", "--scope", "read", "--label", "map")
+    status, key, _ = waymark("key", "City of Elsewhere", "--scope", "viewer", "--label", "map")
     assert status == 0
     with (
         LiveServer(create_app(Settings(data_dir=tmp_path, warm_decoders=False))) as server,
@@ -52,7 +52,7 @@ def test_a_key_for_another_agency(waymark: Run, tmp_path: Path) -> None:
         assert "in use by another Waymark process" in error
     status, _, error = waymark("key", "City", "--scope", "everything")
     assert status == 1
-    assert "read, decode, write, admin" in error
+    assert "admin, planner, surveyor, viewer, vehicle" in error
 
 
 def test_the_admin_key_of_the_environment_can_change(tmp_path: Path) -> None:

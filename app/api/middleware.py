@@ -6,7 +6,6 @@ import re
 import time
 import uuid
 from collections.abc import Callable, Mapping
-from typing import TypeVar
 
 import anyio
 import structlog
@@ -16,16 +15,13 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.api.permissions import Permissions
 from app.api.problems import BodyRefused, problem_from, unexpected
 from app.errors import MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
 from app.services.access import Caller
-from app.services.access import Scope as KeyScope
-
-T = TypeVar("T")
 
 PROTECTED = ("/v1", "/ogc")
-_SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
-_METHODS = (*_SAFE_METHODS, "POST", "PUT", "PATCH", "DELETE")
+_METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 _AUTH_THREADS = 4
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _LOG = structlog.get_logger("waymark.access")
@@ -101,8 +97,8 @@ class Guarded:
         The caller behind a key; runs in a thread.
     body_limits : mapping
         Most bytes of a body by path prefix; the empty prefix is the default. [byte]
-    needed_scopes : mapping
-        Scope that changing requests need by path prefix; the empty prefix is the default.
+    permissions : Permissions
+        Who may make which request.
     body_timeout_s : float
         Longest wait for the next part of a body. [s]
     """
@@ -113,13 +109,13 @@ class Guarded:
         *,
         authenticate: Callable[[str], Caller],
         body_limits: Mapping[str, int],
-        needed_scopes: Mapping[str, KeyScope],
+        permissions: Permissions,
         body_timeout_s: float,
     ) -> None:
         self._app = app
         self._authenticate = authenticate
         self._body_limits = body_limits
-        self._needed_scopes = needed_scopes
+        self._permissions = permissions
         self._body_timeout_s = body_timeout_s
         self._threads = anyio.CapacityLimiter(_AUTH_THREADS)  # its own, or slow requests would keep new ones waiting
 
@@ -143,12 +139,14 @@ class Guarded:
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
         caller = await to_thread.run_sync(self._authenticate, _key_in(headers), limiter=self._threads)
+        allowed = self._permissions.find(scope["method"], scope["path"])
+        if allowed is None:
+            return  # nothing there: 404 or 405. Should there be a route after all, it finds no caller and refuses
+        caller.require(allowed)
         scope.setdefault("state", {})["caller"] = caller
-        reads = scope["method"] in _SAFE_METHODS
-        caller.require(KeyScope.READ if reads else _by_prefix(self._needed_scopes, scope["path"]))
 
 
-def _by_prefix(table: Mapping[str, T], path: str) -> T:
+def _by_prefix(table: Mapping[str, int], path: str) -> int:
     return table[max((prefix for prefix in table if path.startswith(prefix)), key=len)]
 
 

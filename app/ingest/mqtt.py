@@ -68,7 +68,7 @@ class Sink:
     Attributes
     ----------
     server, key : str
-        Waymark's URL and a key with the scope `decode`.
+        Waymark's URL and a key with the scope `vehicle`.
     context : dict
         Of each upload, as POST /v1/decodes takes it.
     batch_messages, batch_s : int, float

@@ -48,8 +48,10 @@ def add_key(
     expires_at: datetime | None = None,
 ) -> str:
     """Store a key and return its id."""
+    key_id = new_id(now)
     row: dict[str, Any] = {
-        "id": new_id(now),
+        "id": key_id,
+        "holder_id": key_id,
         "agency_id": agency_id,
         "label": label,
         "prefix": key[:8],
@@ -59,7 +61,7 @@ def add_key(
         "expires_at": expires_at,
     }
     connection.execute(sa.insert(api_keys).values(row))
-    return str(row["id"])
+    return key_id
 
 
 def find_key(connection: sa.Connection, key: str) -> Row | None:

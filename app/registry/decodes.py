@@ -14,7 +14,7 @@ from app.registry.tables import decodes, observations
 
 Row = sa.RowMapping
 UNFINISHED = ("queued", "running")
-_PUBLIC = [column for column in decodes.c if column.name != "agency_id"]
+_PUBLIC = [column for column in decodes.c if column.name not in ("agency_id", "holder_id")]
 _ADD_DECODE = sa.insert(decodes)  # built once: building a statement costs more than running it
 _ADD_OBSERVATIONS = {
     "sqlite": sqlite.insert(observations).on_conflict_do_nothing(),
@@ -23,20 +23,22 @@ _ADD_OBSERVATIONS = {
 _SHORT = [column for column in _PUBLIC if column.name != "result"]
 
 
-def add_decode(connection: sa.Connection, agency_id: str, values: Mapping[str, Any]) -> None:
-    """Store a new decode."""
-    connection.execute(_ADD_DECODE, {**values, "agency_id": agency_id})
+def add_decode(connection: sa.Connection, agency_id: str, holder_id: str, values: Mapping[str, Any]) -> None:
+    """Store a new decode, uploaded with somebody's key."""
+    connection.execute(_ADD_DECODE, {**values, "agency_id": agency_id, "holder_id": holder_id})
 
 
-def get_decode(connection: sa.Connection, agency_id: str, decode_id: str) -> Row:
-    """One decode.
+def get_decode(connection: sa.Connection, agency_id: str, decode_id: str, *, holder_id: str | None = None) -> Row:
+    """One decode, of anybody in the agency or of one holder of a key.
 
     Raises
     ------
     NotFound
-        There is none with this id, or it belongs to another agency.
+        There is none with this id, or it belongs to another.
     """
     query = sa.select(*_PUBLIC).where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
+    if holder_id is not None:
+        query = query.where(decodes.c.holder_id == holder_id)
     row = connection.execute(query).mappings().one_or_none()
     if row is None:
         raise NotFound(f"there is no decode {decode_id}", field="decode_id", cure="GET /v1/decodes lists yours")
@@ -44,10 +46,18 @@ def get_decode(connection: sa.Connection, agency_id: str, decode_id: str) -> Row
 
 
 def list_decodes(
-    connection: sa.Connection, agency_id: str, *, state: str | None, before: str | None, limit: int
+    connection: sa.Connection,
+    agency_id: str,
+    *,
+    state: str | None,
+    before: str | None,
+    limit: int,
+    holder_id: str | None = None,
 ) -> list[Row]:
-    """Decodes without their results, newest first."""
+    """Decodes without their results, newest first; of anybody in the agency or of one holder of a key."""
     query = sa.select(*_SHORT).where(decodes.c.agency_id == agency_id)
+    if holder_id is not None:
+        query = query.where(decodes.c.holder_id == holder_id)
     if state is not None:
         query = query.where(decodes.c.state == state)
     if before is not None:

@@ -19,7 +19,7 @@ metadata = sa.MetaData(naming_convention=_NAMES)
 ID = sa.String(36)
 STATUSES = ("planned", "built", "surveyed", "active", "suspect", "retired")
 DECODE_STATES = ("queued", "running", "done", "failed", "cancelled")
-SCOPES = ("read", "decode", "write", "admin")
+SCOPES = ("admin", "planner", "surveyor", "viewer", "vehicle")
 
 
 class UtcTime(sa.TypeDecorator[datetime]):
@@ -65,6 +65,7 @@ api_keys = sa.Table(
     metadata,
     sa.Column("id", ID, primary_key=True),
     _agency(),
+    sa.Column("holder_id", ID, nullable=False),  # keys that replace one another have the id of the first
     sa.Column("label", sa.String(200), nullable=False),
     sa.Column("prefix", sa.String(16), nullable=False),
     sa.Column("sha256", sa.String(64), nullable=False, unique=True),
@@ -220,6 +221,7 @@ decodes = sa.Table(
     _agency(),
     sa.Column("state", sa.String(16), nullable=False),
     sa.Column("kind", sa.String(32), nullable=False),
+    sa.Column("holder_id", sa.String(200)),  # of the key that uploaded it
     sa.Column("context", sa.JSON, nullable=False),
     sa.Column("upload_key", sa.String(200)),
     sa.Column("picture_key", sa.String(200)),

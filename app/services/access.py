@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
@@ -18,17 +19,13 @@ _TOUCH_EVERY = timedelta(hours=1)
 
 
 class Scope(StrEnum):
-    """What a key may do; each covers those before it."""
+    """What a key is for. app/api/permissions.py says which requests each may make, docs/access.md why."""
 
-    READ = "read"
-    DECODE = "decode"
-    WRITE = "write"
     ADMIN = "admin"
-
-    def covers(self, needed: Scope) -> bool:
-        """Whether this scope includes another."""
-        order = list(Scope)
-        return order.index(self) >= order.index(needed)
+    PLANNER = "planner"
+    SURVEYOR = "surveyor"
+    VIEWER = "viewer"
+    VEHICLE = "vehicle"
 
 
 def parse_scope(name: str) -> Scope:
@@ -46,21 +43,44 @@ def parse_scope(name: str) -> Scope:
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """An authenticated caller."""
+    """An authenticated caller.
+
+    Attributes
+    ----------
+    agency_id : str
+        Whose rows it works on.
+    key_id : str
+        Who it is: the same for keys that replace one another.
+    label : str
+        What histories call it.
+    scope : Scope
+    """
 
     agency_id: str
     key_id: str
     label: str
     scope: Scope
 
-    def require(self, needed: Scope) -> None:
-        """Refuse unless the key's scope covers `needed`."""
-        if not self.scope.covers(needed):
+    def require(self, allowed: Collection[Scope]) -> None:
+        """Refuse unless the key's scope is one of these.
+
+        Raises
+        ------
+        NotAllowed
+            It is not.
+        """
+        if self.scope not in allowed:
+            limit = " or ".join(scope for scope in Scope if scope in allowed) or "nobody"
             raise NotAllowed(
-                f"this key's scope is {self.scope}, the request needs {needed}",
-                limit=f"scope {needed}",
-                cure="use a key with a wider scope",
+                f"a key with the scope {self.scope} may not do this",
+                limit=f"scope {limit}",
+                cure="ask an admin of your agency for a key with such a scope",
             )
+
+    @property
+    def own_key_id(self) -> str | None:
+        """The key whose rows alone this caller sees among its agency's: a vehicle its own, others all (None)."""
+        return self.key_id if self.scope is Scope.VEHICLE else None
 
 
 class Access:
@@ -88,7 +108,7 @@ class Access:
         if row["last_used_at"] is None or now - row["last_used_at"] >= _TOUCH_EVERY:
             with self._database.write() as connection:
                 agencies.touch_key(connection, row["id"], now)
-        return Caller(row["agency_id"], row["id"], row["label"], Scope(row["scope"]))
+        return Caller(row["agency_id"], row["holder_id"], row["label"], Scope(row["scope"]))
 
     def ensure_first_key(self, admin_key: str | None = None) -> str | None:
         """On an empty database create an agency with an admin key; afterwards keep `admin_key` in step.

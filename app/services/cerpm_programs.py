@@ -25,6 +25,7 @@ from app.services.marker_selection import Selection, select_markers
 from app.services.ports import Clock
 
 MAX_PROGRAMS = 5_000
+_SPEAKERS = (Scope.PLANNER, Scope.ADMIN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,7 @@ class CerpmPrograms:
         InvalidParameter
             The sequence does not fit, or is at its end.
         """
-        caller.require(Scope.WRITE)
+        caller.require(_SPEAKERS)
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
             if row["family"] != FAMILY:
@@ -99,7 +100,7 @@ class CerpmPrograms:
         NotAllowed
             Keys are asked for by a caller who is no admin.
         """
-        caller.require(Scope.ADMIN if with_keys else Scope.WRITE)
+        caller.require((Scope.ADMIN,) if with_keys else _SPEAKERS)
         agency_id = caller.agency_id
         with self._database.read() as connection:
             rows = select_markers(connection, agency_id, selection, FAMILY, most=MAX_PROGRAMS)

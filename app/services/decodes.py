@@ -167,7 +167,7 @@ class Decodes:
             "result": result_document([frame], codebook_plates=len(nearby.codebook)),
             "finished_at": self._clock(),
         }
-        store.add_decode(connection, caller.agency_id, row)
+        store.add_decode(connection, caller.agency_id, caller.key_id, row)
         seen_at = context.captured_at or row["created_at"]
         store.add_observations(connection, caller.agency_id, observations_of(row["id"], [frame], seen_at))
         return decode_document(row)
@@ -190,7 +190,7 @@ class Decodes:
                 if document is None:
                     replayed = False
                     row |= done | {"attempts": 1, "finished_at": self._clock()}
-                    store.add_decode(connection, caller.agency_id, row)
+                    store.add_decode(connection, caller.agency_id, caller.key_id, row)
                     seen_at = context.captured_at or created_at
                     store_observations(connection, caller.agency_id, row["id"], trace, seen_at)
                     document = decode_document(row)
@@ -246,7 +246,7 @@ class Decodes:
     ) -> dict[str, Any]:
         now = self._clock()
         row |= {"state": "done", "progress": 1.0, "attempts": 1, "finished_at": now}
-        store.add_decode(connection, caller.agency_id, row)
+        store.add_decode(connection, caller.agency_id, caller.key_id, row)
         seen_at = context.captured_at or row["created_at"]
         keep_heard(connection, caller.agency_id, row["id"], drive, seen_at)
         document = decode_document(row)
@@ -266,7 +266,7 @@ class Decodes:
                 document = find_answer(connection, caller.agency_id, key, created_at)
                 if document is None:
                     replayed = False
-                    store.add_decode(connection, caller.agency_id, row)
+                    store.add_decode(connection, caller.agency_id, caller.key_id, row)
                     document = decode_document(row)
                     keep_answer(connection, caller.agency_id, key, document, created_at, self._rules.idempotency_ttl)
         except BaseException:
@@ -283,23 +283,30 @@ class Decodes:
     def get(self, caller: Caller, decode_id: str) -> dict[str, Any]:
         """One decode with its result."""
         with self._database.read() as connection:
-            return decode_document(store.get_decode(connection, caller.agency_id, decode_id))
+            return decode_document(_get_own(connection, caller, decode_id))
 
     def page(
         self, caller: Caller, *, state: str | None = None, before: str | None = None, limit: int = 100
     ) -> tuple[list[dict[str, Any]], str | None]:
         """A page of decodes without their results, newest first, and the id to continue before."""
         with self._database.read() as connection:
-            rows = store.list_decodes(connection, caller.agency_id, state=state, before=before, limit=limit + 1)
+            rows = store.list_decodes(
+                connection,
+                caller.agency_id,
+                state=state,
+                before=before,
+                limit=limit + 1,
+                holder_id=caller.own_key_id,
+            )
         page = [decode_document(row) for row in rows[:limit]]
         return page, page[-1]["id"] if len(rows) > limit else None
 
     def cancel(self, caller: Caller, decode_id: str) -> dict[str, Any]:
         """Ask a job to stop; a finished one stays as it is."""
         with self._database.write() as connection:
-            store.get_decode(connection, caller.agency_id, decode_id)
+            _get_own(connection, caller, decode_id)
             store.request_cancel(connection, caller.agency_id, decode_id, self._clock())
-            return decode_document(store.get_decode(connection, caller.agency_id, decode_id))
+            return decode_document(_get_own(connection, caller, decode_id))
 
     def annotated(self, caller: Caller, decode_id: str, suffix: str, frame: int = 0) -> bytes:
         """A frame with its readings drawn over it, encoded as ``png`` or ``jpg``.
@@ -360,7 +367,7 @@ class Decodes:
 
     def _result(self, caller: Caller, decode_id: str) -> tuple[store.Row, dict[str, Any]]:
         with self._database.read() as connection:
-            row = store.get_decode(connection, caller.agency_id, decode_id)
+            row = _get_own(connection, caller, decode_id)
         if row["result"] is None:
             raise NotFound(
                 f"decode {decode_id} has no result: it is {row['state']}",
@@ -378,7 +385,7 @@ class Decodes:
             There is no such decode, it is of frames, or it is not done.
         """
         with self._database.read() as connection:
-            row = store.get_decode(connection, caller.agency_id, decode_id)
+            row = _get_own(connection, caller, decode_id)
         if row["picture_key"] is None:
             raise NotFound(
                 f"decode {decode_id} has no plot: it is {row['state']}, of kind {row['kind']}",
@@ -388,6 +395,10 @@ class Decodes:
                 else "frames have annotated.png and annotated.jpg",
             )
         return self._blobs.get(row["picture_key"])
+
+
+def _get_own(connection: sa.Connection, caller: Caller, decode_id: str) -> store.Row:
+    return store.get_decode(connection, caller.agency_id, decode_id, holder_id=caller.own_key_id)
 
 
 def _new_row(kind: str, context: DecodeContext, blob_key: str, created_at: datetime) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class Judge:
     def caller(self, survey: Survey) -> Caller:
         """An agency that has what the survey says is registered."""
         self._count += 1
-        caller = self._access.authenticate(self._access.create_key(f"agency {self._count}", Scope.WRITE, "bench"))
+        caller = self._access.authenticate(self._access.create_key(f"agency {self._count}", Scope.PLANNER, "bench"))
         if survey.registered:
             lines = ["number,lon,lat,height", *(",".join(map(repr, map(_plain, row))) for row in survey.registered)]
             declaration = ImportDeclaration(

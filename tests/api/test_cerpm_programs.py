@@ -82,7 +82,7 @@ def test_an_admin_gets_the_key_of_each_marker(server: LiveServer, place: Place) 
 def test_readers_and_vehicles_cannot_speak_for_a_marker(
     server: LiveServer, client: httpx.Client, marker: dict[str, Any]
 ) -> None:
-    with server.agency("readers only", scope=Scope.DECODE) as vehicle:
+    with server.agency("readers only", scope=Scope.VEHICLE) as vehicle:
         assert vehicle.get(f"/v1/markers/{marker['id']}/payload.bin").status_code == 403
         assert vehicle.post("/v1/programs", json={"status": "planned"}).status_code == 403
 

@@ -152,7 +152,7 @@ def test_names_are_unique_in_an_agency(client: httpx.Client, server: LiveServer)
             _refused(stranger.get(f"/v1/codebooks/{book['id']}{path}"), 404, "not-found")
         added = stranger.post(f"/v1/codebooks/{book['id']}/entries", json={"meanings": MEANINGS})
         _refused(added, 404, "not-found")
-    with server.agency("readers of books", Scope.READ) as reader:
+    with server.agency("readers of books", Scope.VIEWER) as reader:
         assert reader.get("/v1/codebooks").status_code == 200
         _refused(reader.post("/v1/codebooks", json={"name": "x", "design": DESIGN}), 403, "not-allowed")
 

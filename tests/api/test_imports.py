@@ -318,7 +318,7 @@ def test_a_geopackage_with_a_view_is_refused(client: httpx.Client, tmp_path: Pat
 def test_a_viewer_cannot_import_and_a_large_file_is_refused_unread(server: LiveServer, client: httpx.Client) -> None:
     from app.services.access import Scope
 
-    with server.agency("viewers", Scope.READ) as viewer:
+    with server.agency("viewers", Scope.VIEWER) as viewer:
         assert _post(viewer, _csv(), DEGREES).status_code == 403
     assert _post(client, b"x" * 2**23, DEGREES).status_code == 413
 

@@ -435,7 +435,7 @@ def test_agencies_never_see_each_others_magnets(client: httpx.Client, server: Li
     with server.agency("a nosy stranger to magnets") as stranger:
         for path in ("", "/layout.pdf", "/layout.csv", "/layout.geojson"):
             _refused(stranger.get(f"/v1/markers/{marker['id']}{path}"), 404, "not-found")
-    with server.agency("readers of magnets", Scope.READ) as reader:
+    with server.agency("readers of magnets", Scope.VIEWER) as reader:
         _refused(reader.post("/v1/markers", json=_tag(lane())), 403, "not-allowed")
 
 

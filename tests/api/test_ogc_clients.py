@@ -30,7 +30,7 @@ def backend(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="module")
 def road(server: LiveServer) -> str:
     """The key of an agency with twelve markers."""
-    key = str(server.app.state.access.create_key("gis", Scope.WRITE, label="gis"))
+    key = str(server.app.state.access.create_key("gis", Scope.PLANNER, label="gis"))
     with server.client(key) as client:
         for k, (lon, lat) in enumerate(ROW):
             add(client, lon, lat, road=f"A{k % 3}", measure_m=float(k), position={"height_m": 3.25})

@@ -34,7 +34,7 @@ def test_options_say_what_the_key_may_do(server: LiveServer, client: httpx.Clien
     assert "POST" in client.options(ITEMS).headers["allow"]
     assert {"PATCH", "DELETE"} <= set(client.options(f"{ITEMS}/x").headers["allow"].split(", "))
     assert "POST" not in client.options("/ogc/collections/marker_lines/items").headers["allow"]
-    with server.agency("edit lookers", Scope.READ) as reader:
+    with server.agency("edit lookers", Scope.VIEWER) as reader:
         assert "POST" not in reader.options(ITEMS).headers["allow"]
         assert reader.post(ITEMS, json=_feature(1, 2), headers=SEND).status_code == 403
 

@@ -318,7 +318,7 @@ def test_features_need_a_key(server: LiveServer) -> None:
         for path in ("/ogc", "/ogc/", "/ogc/api", ITEMS, "/ogc/nothing"):
             assert anonymous.get(path).status_code == 401, path
         assert anonymous.get(ITEMS, headers={"X-API-Key": ADMIN_KEY}).status_code == 200
-    with server.agency("lookers", Scope.READ) as reader:
+    with server.agency("lookers", Scope.VIEWER) as reader:
         assert reader.get(ITEMS).status_code == 200
 
 

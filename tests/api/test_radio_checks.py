@@ -48,7 +48,7 @@ def test_markers_may_be_placed_one_by_one(client: httpx.Client) -> None:
 
 
 def test_a_reader_may_check(server: LiveServer) -> None:
-    with server.agency("those who look", scope=Scope.READ) as reader:
+    with server.agency("those who look", scope=Scope.VIEWER) as reader:
         assert reader.post(URL, json={}).status_code == 200
 
 

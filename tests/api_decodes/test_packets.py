@@ -430,7 +430,7 @@ def test_a_log_in_clear_is_used_only_if_that_is_said(road: tuple[httpx.Client, B
 def test_another_agency_learns_nothing(road: tuple[httpx.Client, BuiltLane], server: LiveServer) -> None:
     client, built = road
     heard, _hour = drive(built, 1920)
-    with server.agency("strangers on the road", Scope.DECODE) as stranger:
+    with server.agency("strangers on the road", Scope.VEHICLE) as stranger:
         found = decoded(stranger, packed(heard))
         assert found["report"]["verdicts"]["unknown-marker"] == len(heard.packets)
         assert found["markers"] == []
@@ -457,7 +457,7 @@ def test_another_agency_learns_nothing(road: tuple[httpx.Client, BuiltLane], ser
 def test_bad_uploads_name_what_is_wrong_and_leave_nothing(
     server: LiveServer, folder: Path, data: bytes, context: Any, status: int, field: str
 ) -> None:
-    with server.agency("those with bad logs", Scope.DECODE) as client:
+    with server.agency("those with bad logs", Scope.VEHICLE) as client:
         before = sorted(path for path in (folder / "blobs").rglob("*") if path.is_file())
         answer = post(client, data, context, name="log.csv")
         assert answer.status_code == status, answer.text

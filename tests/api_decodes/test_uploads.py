@@ -248,7 +248,7 @@ def test_a_stream_without_a_length_is_stopped_at_the_limit(client: httpx.Client)
 def test_keys_and_scopes(server: LiveServer) -> None:
     with server.client(key=None) as nobody:
         assert post_frame(nobody, GOOD).status_code == 401
-    with server.agency("readers", Scope.READ) as reader:
+    with server.agency("readers", Scope.VIEWER) as reader:
         assert post_frame(reader, GOOD).status_code == 403
         assert reader.get("/v1/decodes").status_code == 200
 

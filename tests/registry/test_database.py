@@ -23,7 +23,7 @@ NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 
 
 def _register(database: Database, lon_deg: float) -> dict[str, object]:
-    caller = Caller(_agency(database), "key", "tester", Scope.WRITE)
+    caller = Caller(_agency(database), "key", "tester", Scope.PLANNER)
     plate = NewPlate(GivenPosition(lon_deg=lon_deg, lat_deg=1.0))
     return Markers(database, lambda: NOW).register_plate(caller, plate)[0]
 
@@ -47,7 +47,7 @@ def _is_declared(name: str | None, kind: str, parents: Mapping[str, str | None])
 
 def test_the_connection_is_strict(database: Database) -> None:
     with pytest.raises(sa.exc.IntegrityError), database.write() as connection:
-        agencies.add_key(connection, "x" * 40, agency_id="nobody", scope="read", label="x", now=NOW)
+        agencies.add_key(connection, "x" * 40, agency_id="nobody", scope="viewer", label="x", now=NOW)
 
 
 @pytest.mark.filterwarnings("ignore:Did not recognize type 'geometry'")
@@ -160,7 +160,7 @@ def test_what_is_unique_by_a_query_stays_unique(database: Database) -> None:
 
 
 def test_keys_are_stored_as_hashes_only(database: Database) -> None:
-    key = Access(database, lambda: NOW).create_key("agency", Scope.READ, "a key")
+    key = Access(database, lambda: NOW).create_key("agency", Scope.VIEWER, "a key")
     with database.read() as connection:
         row = agencies.find_key(connection, key)
     assert row is not None

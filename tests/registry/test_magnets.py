@@ -30,7 +30,7 @@ NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 @pytest.fixture
 def caller(database: Database) -> Caller:
     with database.write() as connection:
-        return Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.WRITE)
+        return Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.PLANNER)
 
 
 def _register(database: Database, caller: Caller, lon_deg: float = 7.0) -> dict[str, Any]:

@@ -71,7 +71,15 @@ def _made(count: int) -> Made:
     owned = {"agency_id": AGENCY, "created_at": NOW}
     decode = {"id": DECODE, "state": "done", "kind": "frame", "context": {"z": 1, "a": 2}, "result": {"n": None}}
     span = {"row": 1, "number": 2, "first_sequence": 3, "last_sequence": 2**40, "decode_id": DECODE}
-    key = {"id": "key", "label": "l", "prefix": "p", "sha256": "s", "scope": "read", "last_used_at": NOW}
+    key = {
+        "id": "key",
+        "label": "l",
+        "prefix": "p",
+        "sha256": "s",
+        "holder_id": "key",
+        "scope": "viewer",
+        "last_used_at": NOW,
+    }
     versions = ("version", "agency_id")
     return {
         "agencies": [{"id": AGENCY, "name": "one", "created_at": NOW}],

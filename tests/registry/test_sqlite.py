@@ -65,7 +65,7 @@ def test_a_second_process_is_told_who_owns_the_file(database: Database) -> None:
 
 def test_the_spatial_index_follows_the_table(database: Database) -> None:
     with database.write() as connection:
-        caller = Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.WRITE)
+        caller = Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.PLANNER)
     plate = NewPlate(GivenPosition(lon_deg=7.5, lat_deg=1.0))
     marker = Markers(database, lambda: NOW).register_plate(caller, plate)[0]
 
@@ -85,7 +85,7 @@ def test_the_spatial_index_follows_the_table(database: Database) -> None:
 
 
 def test_no_key_is_in_the_files(database: Database) -> None:
-    key = Access(database, lambda: NOW).create_key("agency", Scope.READ, "a key")
+    key = Access(database, lambda: NOW).create_key("agency", Scope.VIEWER, "a key")
     assert database.path is not None
     database.engine.dispose()
     assert all(key.encode() not in file.read_bytes() for file in database.path.parent.iterdir())

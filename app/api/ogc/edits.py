@@ -17,10 +17,10 @@ from app.api.markers import NewMarkerIn, patch_marker, post_marker
 from app.api.ogc.items import feature_id
 from app.api.ogc.query import known_parameters
 from app.api.ogc.responses import GEOJSON, JSON, base_url, caller_of
+from app.api.permissions import PERMISSIONS
 from app.api.schemas_patch import MarkerPatch
 from app.api.strict_json import parse_json
 from app.errors import InvalidParameter, UnsupportedUpload
-from app.services.access import Scope
 from app.services.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.features import Features, get_collection
 
@@ -35,8 +35,10 @@ async def item_options(request: Request) -> Response:
     """What may be done with this."""
     collection = get_collection(request.path_params["collection"])
     allowed = ["GET", "HEAD", "OPTIONS"]
-    if collection.editable and caller_of(request).scope.covers(Scope.WRITE):
-        allowed += ["PATCH", "DELETE"] if "feature" in request.path_params else ["POST"]
+    if collection.editable:
+        scope, path = caller_of(request).scope, request.scope["route"].path
+        edits = ("PATCH", "DELETE") if "feature" in request.path_params else ("POST",)
+        allowed += [method for method in edits if scope in PERMISSIONS[f"{method} {path}"]]
     return Response(headers={"Allow": ", ".join(allowed)})
 
 

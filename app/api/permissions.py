@@ -1,0 +1,123 @@
+"""Who may call what: one table of every route. The middleware asks it before a body is read; a test compares it with
+the application's routes.
+
+A route that is missing here is refused to everybody. docs/access.md says what each scope is for.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from re import Pattern
+
+from starlette.routing import compile_path
+
+from app.services.access import Scope
+
+Allowed = frozenset[Scope]
+
+PUBLIC: Allowed = frozenset()
+"""Needs no key."""
+EVERYBODY: Allowed = frozenset(Scope)
+"""Any key. What a vehicle sees through such a route is its own."""
+READERS: Allowed = EVERYBODY - {Scope.VEHICLE}
+UPLOADERS: Allowed = EVERYBODY - {Scope.VIEWER}
+SURVEYORS: Allowed = READERS - {Scope.VIEWER}
+PLANNERS: Allowed = frozenset({Scope.PLANNER, Scope.ADMIN})
+ADMINS: Allowed = frozenset({Scope.ADMIN})
+
+_OGC_ITEMS = "/ogc/collections/{collection}/items"
+_OGC_TILES = "/ogc/collections/{collection}/tiles"
+
+PERMISSIONS: dict[str, Allowed] = {
+    # --- the page, the documentation, the operator's
+    "GET /": PUBLIC,
+    "GET /static": PUBLIC,
+    "GET /docs": PUBLIC,
+    "GET /docs/oauth2-redirect": PUBLIC,
+    "GET /redoc": PUBLIC,
+    "GET /openapi.json": PUBLIC,
+    "GET /healthz": PUBLIC,
+    "GET /readyz": PUBLIC,
+    "GET /metrics": PUBLIC,
+    # --- markers and what is made from them
+    "GET /v1/markers": READERS,
+    "POST /v1/markers": PLANNERS,
+    "GET /v1/markers/{marker_id}": READERS,
+    "PATCH /v1/markers/{marker_id}": SURVEYORS,
+    "GET /v1/markers/{marker_id}/versions": READERS,
+    "GET /v1/markers/{marker_id}/artwork.{form}": READERS,
+    "GET /v1/markers/{marker_id}/layout.{form}": READERS,
+    "GET /v1/markers/{marker_id}/payload.{form}": PLANNERS,  # who has a payload can speak for the marker
+    "POST /v1/artwork": READERS,
+    "POST /v1/programs": PLANNERS,  # with the markers' keys: admins, see app/services/cerpm_programs.py
+    "POST /v1/radio-checks": READERS,
+    "POST /v1/imports": SURVEYORS,
+    "GET /v1/exports/{kind}": READERS,
+    # --- codebooks
+    "GET /v1/codebooks": READERS,
+    "POST /v1/codebooks": PLANNERS,
+    "GET /v1/codebooks/{codebook_id}": READERS,
+    "GET /v1/codebooks/{codebook_id}/entries": READERS,
+    "POST /v1/codebooks/{codebook_id}/entries": PLANNERS,
+    "GET /v1/codebooks/{codebook_id}/entries/{code}": READERS,
+    # --- decodes
+    "GET /v1/decodes": EVERYBODY,
+    "POST /v1/decodes": UPLOADERS,
+    "GET /v1/decodes/{decode_id}": EVERYBODY,
+    "POST /v1/decodes/{decode_id}/cancel": UPLOADERS,
+    "GET /v1/decodes/{decode_id}/plot.svg": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/lane.geojson": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/overlay.{suffix}": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/annotated.{suffix}": EVERYBODY,
+    # --- OGC API
+    "GET /ogc": READERS,
+    "GET /ogc/": READERS,
+    "GET /ogc/conformance": READERS,
+    "GET /ogc/api": READERS,
+    "GET /ogc/collections": READERS,
+    "GET /ogc/collections/{collection}": READERS,
+    "GET /ogc/collections/{collection}/schema": READERS,
+    f"GET {_OGC_ITEMS}": READERS,
+    f"POST {_OGC_ITEMS}": PLANNERS,
+    f"OPTIONS {_OGC_ITEMS}": READERS,
+    f"GET {_OGC_ITEMS}/{{feature}}": READERS,
+    f"PATCH {_OGC_ITEMS}/{{feature}}": SURVEYORS,
+    f"DELETE {_OGC_ITEMS}/{{feature}}": PLANNERS,
+    f"OPTIONS {_OGC_ITEMS}/{{feature}}": READERS,
+    "GET /ogc/tileMatrixSets": READERS,
+    "GET /ogc/tileMatrixSets/{matrix_set}": READERS,
+    f"GET {_OGC_TILES}": READERS,
+    f"GET {_OGC_TILES}/{{matrix_set}}": READERS,
+    f"GET {_OGC_TILES}/{{matrix_set}}/{{zoom}}/{{row}}/{{column}}": READERS,
+}
+
+
+class Permissions:
+    """The table, ready to be asked for each request.
+
+    Parameters
+    ----------
+    table : mapping of str to set of Scope
+        By method and path template, e.g. ``GET /v1/markers/{marker_id}``. A parameter fills no more than one segment.
+    """
+
+    def __init__(self, table: Mapping[str, Allowed] = PERMISSIONS) -> None:
+        self._plain: dict[tuple[str, str], Allowed] = {}
+        self._templates: dict[tuple[str, int], list[tuple[Pattern[str], Allowed]]] = defaultdict(list)
+        # where two templates fit a path, that with fewer parameters is meant: /markers/summary, not /markers/{id}
+        for route, allowed in sorted(table.items(), key=lambda item: item[0].count("{")):
+            method, _, path = route.partition(" ")
+            if "{" in path:
+                self._templates[method, path.count("/")].append((compile_path(path)[0], allowed))
+            else:
+                self._plain[method, path] = allowed
+
+    def find(self, method: str, path: str) -> Allowed | None:
+        """Scopes that may do this; None where the table has no such route. HEAD is asked for as GET."""
+        method = "GET" if method == "HEAD" else method
+        allowed = self._plain.get((method, path))
+        if allowed is None:
+            candidates = self._templates.get((method, path.count("/")), ())
+            allowed = next((found for pattern, found in candidates if pattern.match(path)), None)
+        return allowed
