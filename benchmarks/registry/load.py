@@ -1,0 +1,102 @@
+"""Requests through HTTP, as many as 16 kept-alive connections get answered; the same client for every server."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import uvloop
+
+CONNECTIONS = 16
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What a server answered in a while.
+
+    Attributes
+    ----------
+    per_s : float
+        Requests answered. [1/s]
+    p50_ms, p99_ms : float
+        Time from the request to the last byte of its answer. [ms]
+    size_kb : float
+        Mean size of a body. [kB]
+    """
+
+    per_s: float
+    p50_ms: float
+    p99_ms: float
+    size_kb: float
+
+
+def ask(port: int, paths: Sequence[str], *, key: str = "", seconds: float, connections: int = CONNECTIONS) -> Timing:
+    """Ask for the paths again and again, a second to warm up and then for some seconds.
+
+    Raises
+    ------
+    RuntimeError
+        An answer was neither 200 nor 204.
+    """
+    header = f"Host: 127.0.0.1:{port}\r\nAccept: */*\r\n" + (f"X-API-Key: {key}\r\n" if key else "")
+    requests = itertools.cycle([f"GET {path} HTTP/1.1\r\n{header}\r\n".encode() for path in paths])
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        return runner.run(_ask(port, requests, seconds, connections))
+
+
+async def _ask(port: int, requests: Iterator[bytes], seconds: float, connections: int) -> Timing:
+    begin = time.perf_counter() + min(1.0, seconds)
+    samples: list[tuple[float, int]] = []
+    await asyncio.gather(*(_connection(port, requests, begin, begin + seconds, samples) for _ in range(connections)))
+    took_ms = np.array([took for took, _ in samples]) * 1e3
+    sizes = np.array([size for _, size in samples])
+    p50, p99 = np.percentile(took_ms, (50, 99))
+    return Timing(len(samples) / seconds, float(p50), float(p99), float(sizes.mean()) / 1e3)
+
+
+async def _connection(
+    port: int, requests: Iterator[bytes], begin: float, end: float, samples: list[tuple[float, int]]
+) -> None:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=2**22)
+    while (began := time.perf_counter()) < end:
+        writer.write(next(requests))
+        size = len(await _answer(reader))
+        ended = time.perf_counter()
+        if begin <= began and ended <= end:
+            samples.append((ended - began, size))
+    writer.close()
+
+
+async def _answer(reader: asyncio.StreamReader) -> bytes:
+    head = (await reader.readuntil(b"\r\n\r\n")).lower()
+    status = int(head[9:12])
+    if status == 204:
+        return b""
+    if b"transfer-encoding: chunked" in head:
+        body = b""
+        while size := int(await reader.readuntil(b"\r\n"), 16):
+            body += (await reader.readexactly(size + 2))[:-2]
+        await reader.readexactly(2)
+    else:
+        body = await reader.readexactly(int(head.partition(b"content-length:")[2].partition(b"\r\n")[0]))
+    if status != 200:
+        raise RuntimeError(f"answered {status}: {body[:300]!r}")
+    return body
+
+
+def fetch(port: int, path: str, key: str = "") -> bytes:
+    """One answer's body."""
+
+    async def one() -> bytes:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=2**22)
+        keyed = f"X-API-Key: {key}\r\n" if key else ""
+        writer.write(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nAccept: */*\r\n{keyed}\r\n".encode())
+        body = await _answer(reader)
+        writer.close()
+        return body
+
+    return asyncio.run(one())

@@ -1,0 +1,118 @@
+"""Searches and matches at the service, without HTTP, and how they grow with the registry."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from datetime import UTC, datetime
+from typing import Any
+
+from app.markers.plate import PlateCode
+from app.markers.reading import PlateOutcome, PlateReading
+from app.registry.database import Database
+from app.registry.features import FeatureFilter
+from app.registry.markers import MarkerFilter
+from app.registry.spatial import Box
+from app.services.access import Access, Caller
+from app.services.decode_context import CoarsePosition
+from app.services.features import Features
+from app.services.markers import Markers
+from app.services.matching import find_nearby_plates, match_reading
+from benchmarks.registry.fill import CERPM_EVERY, Network
+from benchmarks.registry.serving import BOX_FEATURES, PAGE, Registry
+
+TIMES = 300
+GOAL_MS = 5.0
+COARSE_M = 15.0
+RADIUS_M = 200.0
+Search = Callable[[int, float, float], object]
+
+
+def measure_searches(registry: Registry) -> bool:
+    """Print the searches at one size; whether each has its median below the goal on both databases."""
+    rows = len(registry.network.lon_deg)
+    print(f"### registry-searches\n\n{rows:,} markers; {TIMES} places at random, one search after the other.\n")
+    print(f"| search | database | median [ms] | 99 % [ms] | below {GOAL_MS:g} ms |\n|---|---|---|---|---|")
+    met = True
+    for kind in registry.urls:
+        for name, (p50, p99) in _measured(registry, kind).items():
+            good = p50 < GOAL_MS
+            met &= good
+            print(f"| {name} | {kind} | {p50:.2f} | {p99:.2f} | {'yes' if good else '**no**'} |", flush=True)
+    return met
+
+
+def measure_growth(sizes: Sequence[int], filled: Callable[[int], AbstractContextManager[Registry]]) -> bool:
+    """Print the medians at growing sizes; whether matching stays below the goal at the greatest."""
+    table: dict[tuple[str, str], list[float]] = {}
+    for rows in sizes:
+        with filled(rows) as registry:
+            for kind in registry.urls:
+                for name, (p50, _) in _measured(registry, kind).items():
+                    table.setdefault((name, kind), []).append(p50)
+    print("### registry-growth\n\nMedian at the service [ms] by the number of markers.\n")
+    print(f"| search | database | {' | '.join(f'{rows:,}' for rows in sizes)} |\n|---|---|{'---|' * len(sizes)}")
+    for (name, kind), medians in table.items():
+        print(f"| {name} | {kind} | {' | '.join(f'{p50:.2f}' for p50 in medians)} |")
+    return all(medians[-1] < GOAL_MS for (name, _), medians in table.items() if name.startswith("match"))
+
+
+def _measured(registry: Registry, kind: str) -> dict[str, tuple[float, float]]:
+    """Median and 99th percentile of each search. [ms]"""
+    with _opened(registry.urls[kind], registry.keys[kind]) as (database, caller):
+        searches = _searches(database, caller, registry.network)
+        places = registry.network.places(TIMES, seed=3)
+        return {name: _timed(search, places) for name, search in searches.items()}
+
+
+@contextmanager
+def _opened(url: str, key: str) -> Iterator[tuple[Database, Caller]]:
+    database = Database(url)
+    database.open()
+    try:
+        yield database, Access(database, lambda: datetime.now(UTC)).authenticate(key)
+    finally:
+        database.close()
+
+
+def _timed(search: Search, places: Sequence[tuple[int, float, float]]) -> tuple[float, float]:
+    for place in places[:20]:
+        search(*place)
+    took_ms = []
+    for place in places:
+        began = time.perf_counter()
+        search(*place)
+        took_ms.append(1e3 * (time.perf_counter() - began))
+    return statistics.median(took_ms), statistics.quantiles(took_ms, n=100)[-1]
+
+
+def _searches(database: Database, caller: Caller, network: Network) -> dict[str, Search]:
+    """What is timed, by name; each gets the row and the place of a marker."""
+    use_cases, features = Markers(database, lambda: datetime.now(UTC)), Features(database, lambda: datetime.now(UTC))
+    boxes = {k: Box(*box) for k, box in enumerate(network.boxes_of(BOX_FEATURES, 100, seed=4))}
+
+    def box(k: int, _lon: float, _lat: float) -> object:
+        return features.page(caller, FeatureFilter(box=boxes[k % len(boxes)]), limit=PAGE)
+
+    def near(_k: int, lon: float, lat: float) -> object:
+        return use_cases.page(caller, MarkerFilter(near=(lon, lat, RADIUS_M)), limit=100)
+
+    def match(k: int, _lon: float, _lat: float) -> object:
+        k = k if k % CERPM_EVERY else k + 1
+        k = min(k, len(network.lon_deg) - 1)
+        lon, lat = float(network.lon_deg[k]), float(network.lat_deg[k])
+        reading = PlateReading(PlateOutcome.READ, code=PlateCode.from_position(lon, lat), confidence=1.0)
+        position = CoarsePosition(lon + 5e-5, lat - 5e-5, COARSE_M)
+        with database.read() as connection:
+            nearby = find_nearby_plates(connection, caller.agency_id, position)
+            return _found(match_reading(connection, caller.agency_id, reading, position, nearby))
+
+    return {f"box of {BOX_FEATURES}": box, f"radius {RADIUS_M:g} m": near, "match code + coarse position": match}
+
+
+def _found(match: Any) -> Any:
+    if match is None or match.row is None:
+        raise RuntimeError("a registered plate was not found")
+    return match
