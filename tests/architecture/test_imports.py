@@ -12,7 +12,7 @@ import pytest
 import app
 
 ROOT = Path(__file__).resolve().parents[2]
-CORE = ("simulation", "encoders", "decoders", "markers", "sensors", "geodesy", "errors")
+CORE = ("simulation", "encoders", "decoders", "markers", "sensors", "roads", "geodesy", "errors")
 
 
 def _modules(prefix: str = "app") -> list[str]:
