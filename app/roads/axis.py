@@ -208,7 +208,7 @@ class Axis:
         """Places and pieces that may belong together, some places at a time; all pieces of a place come together."""
         radius = self._reach + 2 * max_offset_m + 1.0
         places = _ecef(lon, lat)
-        counts = self._tree.query_ball_point(places, radius, return_length=True)
+        counts = np.asarray(self._tree.query_ball_point(places, radius, return_length=True), dtype=np.intp)
         start = 0
         while start < len(places):
             end = start + max(1, int(np.searchsorted(np.cumsum(counts[start:]), _PAIRS, side="right")))
