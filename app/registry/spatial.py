@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+import shapely
 import sqlalchemy as sa
 from pyproj import Geod
 from sqlalchemy.ext.compiler import compiles
@@ -21,6 +24,7 @@ from sqlalchemy.sql.functions import FunctionElement
 
 from app.registry.tables import markers
 
+FloatArray = npt.NDArray[np.float64]
 _CONTINENT_DEG2 = 2_500.0
 _M_PER_DEG = 110_574.0  # least length of a degree of latitude on WGS 84
 
@@ -51,6 +55,22 @@ class Box:
             Box(self.west_deg, self.south_deg, 180.0, self.north_deg),
             Box(-180.0, self.south_deg, self.east_deg, self.north_deg),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A polygon or several in longitude and latitude; its edges are straight there. It spans no antimeridian.
+
+    Attributes
+    ----------
+    wkb : bytes
+        Well-known binary, little-endian.
+    boxes : tuple of Box
+        One around each polygon.
+    """
+
+    wkb: bytes
+    boxes: tuple[Box, ...]
 
 
 def box_around(lon_deg: float, lat_deg: float, radius_m: float) -> Box:
@@ -131,6 +151,46 @@ def _within_part(box: Box, table: sa.Table) -> sa.ColumnElement[bool]:
     return sa.and_(proposed_by_index(table, west, south, east, north), exact)
 
 
+def within_area(area: Area) -> sa.ColumnElement[bool]:
+    """Markers inside an area or on its edge: both databases ask GEOS."""
+    return sa.and_(sa.or_(*(within_box(box) for box in area.boxes)), _Covered(sa.literal(area.wkb, sa.LargeBinary)))
+
+
+class _Covered(FunctionElement[bool]):
+    """Markers that an area in well-known binary covers."""
+
+    name = "waymark_covered"
+    type = sa.Boolean()
+    inherit_cache = True
+
+    def self_group(self, against: Any = None) -> _Covered:
+        """Itself; see `_Proposed`."""
+        return self
+
+
+@compiles(_Covered, "sqlite")
+def _by_function(element: _Covered, compiler: SQLCompiler, **how: Any) -> str:
+    return compiler.process(sa.func.waymark_covers(*element.clauses, markers.c.lon_deg, markers.c.lat_deg), **how)
+
+
+@compiles(_Covered, "postgresql")
+def _by_postgis(element: _Covered, compiler: SQLCompiler, **how: Any) -> str:
+    area = sa.func.ST_GeomFromWKB(*element.clauses, sa.literal_column("4326"))
+    point = sa.table("markers", sa.column("geom")).c.geom
+    return compiler.process(sa.func.ST_Covers(area, point), **how)
+
+
+def _covers(wkb: bytes, lon_deg: float, lat_deg: float) -> bool:
+    return bool(shapely.intersects_xy(_prepared(wkb), lon_deg, lat_deg))
+
+
+@lru_cache(maxsize=8)
+def _prepared(wkb: bytes) -> shapely.Geometry:
+    area = shapely.from_wkb(wkb)
+    shapely.prepare(area)
+    return area
+
+
 def within_radius(lon_deg: float, lat_deg: float, radius_m: float) -> sa.ColumnElement[bool]:
     """Markers within a geodesic distance."""
     place = (sa.literal(lon_deg, sa.Double), sa.literal(lat_deg, sa.Double))
@@ -143,6 +203,12 @@ def distance_to(lon_deg: sa.ColumnElement[float], lat_deg: sa.ColumnElement[floa
     SQLite calls `distance_m`, PostgreSQL a function of migration 0004; the two agree within 2e-8 m.
     """
     return sa.func.waymark_distance_m(markers.c.lon_deg, markers.c.lat_deg, lon_deg, lat_deg, type_=sa.Double)
+
+
+def distances_m(lon_deg: float, lat_deg: float, lons_deg: FloatArray, lats_deg: FloatArray) -> FloatArray:
+    """Geodesic distances of places from one place, shape (N,). [m]"""
+    same = np.ones(len(lons_deg))
+    return np.asarray(_ellipsoid().inv(lon_deg * same, lat_deg * same, lons_deg, lats_deg)[2], dtype=np.float64)
 
 
 def distance_m(lon_a_deg: float, lat_a_deg: float, lon_b_deg: float, lat_b_deg: float) -> float:
@@ -158,3 +224,4 @@ def _ellipsoid() -> Geod:
 def register_functions(connection: sqlite3.Connection) -> None:
     """Give a SQLite connection the functions that the queries use."""
     connection.create_function("waymark_distance_m", 4, distance_m, deterministic=True)
+    connection.create_function("waymark_covers", 3, _covers, deterministic=True)

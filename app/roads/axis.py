@@ -212,8 +212,8 @@ class Axis:
         start = 0
         while start < len(places):
             end = start + max(1, int(np.searchsorted(np.cumsum(counts[start:]), _PAIRS, side="right")))
-            found = self._tree.query_ball_point(places[start:end], radius)
-            number = np.repeat(np.arange(start, min(end, len(places))), [len(pieces) for pieces in found])
+            found = list(self._tree.query_ball_point(places[start:end], radius))
+            number = np.repeat(np.arange(start, min(end, len(places))), counts[start:end])
             if len(number):
                 yield number, np.concatenate([np.asarray(pieces, dtype=np.intp) for pieces in found])
             start = end
