@@ -13,7 +13,20 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import artwork, cerpms, codebooks, decodes, exports, imports, layouts, markers, radio_checks, system, ui
+from app.api import (
+    artwork,
+    cerpms,
+    codebooks,
+    decodes,
+    exports,
+    imports,
+    layouts,
+    markers,
+    radio_checks,
+    system,
+    ui,
+    vehicles,
+)
 from app.api.middleware import Guarded, Observed
 from app.api.ogc import mount_ogc
 from app.api.openapi import describe
@@ -43,6 +56,7 @@ from app.services.imports import Imports
 from app.services.layouts import Layouts
 from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
+from app.services.vehicles import Vehicles
 from app.settings import Settings
 from app.storage.blobs import Blobs
 from app.storage.master_key import load_master_key
@@ -59,6 +73,7 @@ ROUTERS = (
     decodes.router,
     imports.router,
     exports.router,
+    vehicles.router,
 )
 
 
@@ -101,6 +116,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)
     app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)
+    app.state.vehicles = Vehicles(database, utc_now, rules.idempotency_ttl)
     app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, secrets=secrets, rules=rules)
     app.state.jobs = jobs
     app.state.artworks = Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode))

@@ -70,6 +70,16 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/decodes/{decode_id}/lane.geojson": EVERYBODY,
     "GET /v1/decodes/{decode_id}/overlay.{suffix}": EVERYBODY,
     "GET /v1/decodes/{decode_id}/annotated.{suffix}": EVERYBODY,
+    # --- fleet
+    "GET /v1/vehicles": READERS,
+    "POST /v1/vehicles": PLANNERS,
+    "GET /v1/vehicles/{vehicle_id}": READERS,
+    "PATCH /v1/vehicles/{vehicle_id}": PLANNERS,
+    "DELETE /v1/vehicles/{vehicle_id}": PLANNERS,
+    "GET /v1/vehicles/{vehicle_id}/versions": READERS,
+    "PUT /v1/vehicles/{vehicle_id}/calibration": PLANNERS,
+    "PUT /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
+    "DELETE /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
     # --- OGC API
     "GET /ogc": READERS,
     "GET /ogc/": READERS,

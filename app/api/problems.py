@@ -41,7 +41,7 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     CodebookFull: ProblemKind(409, "codebook-full", "No further code keeps its distance"),
     errors.CodeTaken: ProblemKind(409, "code-taken", "The code is taken"),
     errors.IdempotencyConflict: ProblemKind(409, "idempotency-conflict", "The Idempotency-Key is taken"),
-    errors.StaleVersion: ProblemKind(412, "stale-version", "The marker was changed meanwhile"),
+    errors.StaleVersion: ProblemKind(412, "stale-version", "It was changed meanwhile"),
     errors.UploadTooLarge: ProblemKind(413, "too-large", "The request is too large"),
     errors.UnsupportedUpload: ProblemKind(415, "unsupported-upload", "No decoder reads this"),
     errors.InvalidParameter: ProblemKind(422, "invalid-parameter", "A value is not allowed"),

@@ -38,6 +38,24 @@ class PosesIn(BaseModel):
     date: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None = Field(
         None, description="UTC date of the first position, for NMEA without dates."
     )
+    forward_m: Number | None = Field(
+        None, ge=-100, le=100, description="Of what was positioned, ahead of the vehicle's reference point. [m]"
+    )
+    left_m: Number | None = Field(
+        None, ge=-100, le=100, description="Of what was positioned, left of the vehicle's reference point. [m]"
+    )
+    accuracy_m: Number | None = Field(
+        None, gt=0, le=1000, description="Standard deviation of a position where the track does not say. [m]"
+    )
+
+
+class ReceiverIn(BaseModel):
+    """The vehicle's radio receiver."""
+
+    model_config = _STRICT
+
+    sensitivity_dbm: Number | None = Field(None, ge=-160, le=-40, description="Fitted if left out. [dBm]")
+    antenna_height_m: Number | None = Field(None, gt=0, le=20, description="Above the road, 1.5 if left out. [m]")
 
 
 class FreshnessIn(BaseModel):
@@ -79,6 +97,7 @@ class PacketsIn(BaseModel):
         None, max_length=32, description="Kinds of files in a ZIP whose content does not show it, by name."
     )
     poses: PosesIn | None = None
+    receiver: ReceiverIn | None = None
     freshness: FreshnessIn | None = None
     lane: LaneRulesIn | None = None
     method: Literal["waymark", "paper"] = Field("waymark", description="`paper` is the CERPM paper's own way.")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +11,11 @@ import numpy.typing as npt
 from app.errors import InvalidParameter
 
 Floats = npt.NDArray[np.float64]
+
+LEAST_STEP_M = 5.0
+"""Between two places that count as driven. [m]"""
+FASTEST_M_S = 70.0
+_MAJOR_M, _E2 = 6378137.0, 0.0066943799901413165  # WGS 84
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,3 +57,63 @@ class PoseTrack:
             raise InvalidParameter("times of poses do not rise", field="poses.time_s", limit="rising times")
         for name, values in arrays.items():
             object.__setattr__(self, name, values)
+
+    def moved(self, forward_m: float, left_m: float) -> PoseTrack:
+        """The track of another point of the vehicle.
+
+        Parameters
+        ----------
+        forward_m, left_m : float
+            From the point of this track to the other, in the vehicle (ISO 8855). [m]
+
+        Returns
+        -------
+        PoseTrack
+            The same where no heading is known; between known headings they are interpolated.
+        """
+        known = np.isfinite(self.heading_deg)
+        if not known.any():
+            return self
+        turned = np.unwrap(self.heading_deg[known], period=360.0)
+        heading = np.radians(np.interp(self.time_s, self.time_s[known], turned))
+        east_m = forward_m * np.sin(heading) - left_m * np.cos(heading)
+        north_m = forward_m * np.cos(heading) + left_m * np.sin(heading)
+        lat_rad = np.radians(self.lat_deg)
+        east_per_rad, north_per_rad = metres_per_radian(lat_rad)
+        lon_deg = self.lon_deg + np.degrees(east_m / east_per_rad)
+        return replace(
+            self,
+            lon_deg=(lon_deg + 180.0) % 360.0 - 180.0,
+            lat_deg=self.lat_deg + np.degrees(north_m / north_per_rad),
+        )
+
+    def driven_m(self) -> float:
+        """How far the vehicle drove.
+
+        Returns
+        -------
+        float
+            Sum of the straight lines between places that are at least 5 m, and twice the accuracy of the position,
+            apart: a receiver that stands still wanders, and that is no way. A line that would take more than 70 m/s is
+            a gap in the track, and counts nothing. [m]
+        """
+        if len(self.time_s) < 2:
+            return 0.0
+        lon, lat = np.radians(np.unwrap(self.lon_deg, period=360.0)), np.radians(self.lat_deg)
+        east_per_rad, north_per_rad = metres_per_radian(lat)
+        step_m = np.maximum(LEAST_STEP_M, 2 * np.nan_to_num(self.accuracy_m, nan=0.0))
+        total_m, at = 0.0, 0
+        for k in range(1, len(lon)):
+            leg_m = math.hypot((lon[k] - lon[at]) * east_per_rad[at], (lat[k] - lat[at]) * north_per_rad[at])
+            if leg_m < step_m[k]:
+                continue
+            if leg_m <= FASTEST_M_S * (self.time_s[k] - self.time_s[at]):
+                total_m += leg_m
+            at = k
+        return total_m
+
+
+def metres_per_radian(lat_rad: Floats) -> tuple[Floats, Floats]:
+    """East and north of a radian of longitude and of latitude, on the WGS 84 ellipsoid. [m]"""
+    curve = 1 - _E2 * np.sin(lat_rad) ** 2
+    return np.cos(lat_rad) * _MAJOR_M / np.sqrt(curve), _MAJOR_M * (1 - _E2) / curve**1.5

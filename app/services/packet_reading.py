@@ -107,7 +107,7 @@ def read_packets_of(files: DriveFiles, known: KnownMarkers, terms: PacketTerms, 
         int(number): (float(lon), float(lat))
         for number, lon, lat in zip(merged.number, merged.lon_deg, merged.lat_deg, strict=True)
     }
-    signal = profile_signals(verification.packets, places, files.track)
+    signal = profile_signals(verification.packets, places, files.track, terms.signal)
     grade, doubts = _grade(merged, verification, known)
     return ReadPackets(verification, merged, signal, known, grade, doubts, 1e3 * (time.perf_counter() - began))
 

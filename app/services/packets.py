@@ -15,6 +15,7 @@ from app.decoders.cerpm.packet_log import PacketDeclaration, PacketLimits
 from app.decoders.cerpm.packet_log_rows import PayloadText
 from app.decoders.cerpm.packets import HeardPacket
 from app.decoders.cerpm.poses import PoseDeclaration
+from app.decoders.cerpm.signal import SignalRules
 from app.decoders.images import ImageHeader, ImageLimits
 from app.errors import InvalidParameter
 from app.sensors.camera import Camera
@@ -48,6 +49,8 @@ class PacketTerms:
         Use markers that were only heard in clear, without a tag.
     controller : Controller or None
         Of the check of steering; none is made without.
+    signal : SignalRules
+        With what is known of the receiver.
     """
 
     packets: PacketDeclaration
@@ -58,6 +61,7 @@ class PacketTerms:
     method: str
     accept_clear: bool
     controller: Controller | None
+    signal: SignalRules
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +252,7 @@ def packet_terms(declared: Mapping[str, Any]) -> PacketTerms:
             method,
             bool(declared.get("accept_clear", False)),
             None if steering == NO_CHECK else _controller(steering),
+            SignalRules(**(declared.get("receiver") or {})),
         )
     except InvalidParameter as error:
         error.field = f"packets.{error.field}" if error.field else "packets"
@@ -274,6 +279,9 @@ def _pose_declaration(declared: Mapping[str, Any]) -> PoseDeclaration:
         declared.get("columns") or {},
         declared.get("crs"),
         _date(declared["date"]) if declared.get("date") else None,
+        forward_m=float(declared.get("forward_m", 0.0)),
+        left_m=float(declared.get("left_m", 0.0)),
+        accuracy_m=declared.get("accuracy_m"),
     )
 
 

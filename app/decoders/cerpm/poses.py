@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from itertools import islice
 from typing import Any
 
 import gpxpy
 import gpxpy.gpx
+import numpy as np
 
 from app.decoders.cerpm.log_report import LogReport
 from app.decoders.cerpm.log_text import (
@@ -67,12 +68,19 @@ class PoseDeclaration:
         Coordinate reference system of the positions; WGS 84 without.
     date : date or None
         UTC date of the first position, for NMEA without dates.
+    forward_m, left_m : float
+        Of what was positioned, from the vehicle's reference point (ISO 8855). [m]
+    accuracy_m : float or None
+        Standard deviation of a position where the track does not say. [m]
     """
 
     clock: LogClock = field(default_factory=LogClock)
     columns: Mapping[str, str] = field(default_factory=dict)
     crs: str | None = None
     date: date | None = None
+    forward_m: float = 0.0
+    left_m: float = 0.0
+    accuracy_m: float | None = None
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.columns) - set(ALIASES))
@@ -135,7 +143,15 @@ def read_poses(
         raise _too_many(name, limits)
     if declaration.crs and points:
         check_datum(declaration.crs, points[0].lon_deg, points[0].lat_deg)
-    return track_of(name, points, report), report
+    track = track_of(name, points, report)
+    if declaration.accuracy_m is not None:
+        known = np.isfinite(track.accuracy_m)
+        track = replace(track, accuracy_m=np.where(known, track.accuracy_m, declaration.accuracy_m))
+    if declaration.forward_m or declaration.left_m:
+        if not np.isfinite(track.heading_deg).any():
+            report.warn("there is no heading: positions stay where they were measured, off the vehicle's reference")
+        track = track.moved(-declaration.forward_m, -declaration.left_m)
+    return track, report
 
 
 def check_datum(crs: str, lon_deg: float = 0.0, lat_deg: float = 0.0) -> None:

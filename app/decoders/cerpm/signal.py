@@ -29,7 +29,7 @@ from app.sensors.pose_track import PoseTrack
 Floats = npt.NDArray[np.float64]
 
 ANTENNA_M = 1.5
-"""Of the receiver above the road. [m]"""
+"""Of the receiver above the road, where it is not known. [m]"""
 LEAST_FLEET = 5
 """Markers with a profile that make a fleet to compare with."""
 LEAST_LEVELS, LEAST_EXPECTED = 8, 10
@@ -61,6 +61,8 @@ class SignalRules:
         Delivery ratio over that of the fleet; the whole interval of 95 % must lie below.
     sensitivity_dbm : float or None
         Of the receiver; fitted without. [dBm]
+    antenna_height_m : float
+        Of the receiver above the road. [m]
     """
 
     weak_db: float = -6.0
@@ -68,6 +70,7 @@ class SignalRules:
     weak_share: float = 0.5
     failing_share: float = 0.25
     sensitivity_dbm: float | None = None
+    antenna_height_m: float = ANTENNA_M
 
     def __post_init__(self) -> None:
         if not self.failing_db < self.weak_db < 0:
@@ -76,6 +79,12 @@ class SignalRules:
             )
         if not 0 < self.failing_share < self.weak_share <= 1:
             raise InvalidParameter("shares lie between 0 and 1", field="signal.weak_share", limit="0 to 1")
+        if not 0 < self.antenna_height_m <= 20:
+            raise InvalidParameter(
+                f"the antenna is {self.antenna_height_m:g} m above the road",
+                field="receiver.antenna_height_m",
+                limit="above 0, at most 20 m",
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,11 +177,13 @@ def profile_signals(
     reason to look again, not to dig it out.
     """
     rules = rules or SignalRules()
-    heard = _gather(verified, places, track)
+    antenna_m = rules.antenna_height_m
+    heard = _gather(verified, places, track, antenna_m)
     line = _fleet_line(heard, rules)
     fleet = line is not None and sum(one.measured.sum() >= LEAST_LEVELS for one in heard) >= LEAST_FLEET
     compared = line if fleet and line is not None else _paper_line(line, rules)
-    scene = _Scene("fleet" if fleet else "paper", compared, _correlation(heard, line), *_missed(heard, places, track))
+    missed = _missed(heard, places, track, antenna_m)
+    scene = _Scene("fleet" if fleet else "paper", compared, _correlation(heard, line), *missed)
     scene.set_heard_share(heard)
     deliveries = {one.number: _delivery(one) for one in heard}
     ratios = [e.value for _h, n, e in deliveries.values() if e is not None and n >= LEAST_EXPECTED]
@@ -239,7 +250,7 @@ def _profile(
 
 
 def _missed(
-    heard: Sequence[_Heard], places: Mapping[int, tuple[float, float]], track: PoseTrack | None
+    heard: Sequence[_Heard], places: Mapping[int, tuple[float, float]], track: PoseTrack | None, antenna_m: float
 ) -> tuple[float, dict[int, Floats]]:
     """The interval of the markers, and how far the vehicle was at each transmission that it did not hear.
 
@@ -266,13 +277,16 @@ def _missed(
         before = np.arange(one.time_s[0] - interval_s, start_s, -interval_s)
         after = np.arange(one.time_s[-1] + interval_s, end_s, interval_s)
         vehicle = vehicle_places(track, np.concatenate((before, between, after)))
-        away = np.hypot(distances_m(vehicle, np.broadcast_to(places[one.number], vehicle.shape)), ANTENNA_M)
+        away = np.hypot(distances_m(vehicle, np.broadcast_to(places[one.number], vehicle.shape)), antenna_m)
         missed[one.number] = away[np.isfinite(away) & (away <= _REACH_M)]
     return interval_s, missed
 
 
 def _gather(
-    verified: Iterable[VerifiedPacket], places: Mapping[int, tuple[float, float]], track: PoseTrack | None
+    verified: Iterable[VerifiedPacket],
+    places: Mapping[int, tuple[float, float]],
+    track: PoseTrack | None,
+    antenna_m: float,
 ) -> list[_Heard]:
     groups: dict[int, list[tuple[float, float, float]]] = defaultdict(list)
     for packet in verified:
@@ -285,7 +299,7 @@ def _gather(
         distance = np.full(len(rows), np.nan)
         if track is not None and number in places:
             vehicle = vehicle_places(track, rows[:, 0])
-            distance = np.hypot(distances_m(vehicle, np.broadcast_to(places[number], vehicle.shape)), ANTENNA_M)
+            distance = np.hypot(distances_m(vehicle, np.broadcast_to(places[number], vehicle.shape)), antenna_m)
         found.append(_Heard(number, rows[:, 0], rows[:, 1], rows[:, 2], distance))
     return found
 

@@ -18,6 +18,7 @@ from app.errors import (
     UnsupportedUpload,
     UploadTooLarge,
 )
+from app.geodesy import enu_from_wgs84
 from app.sensors.pose_track import PoseTrack
 
 CSV = (
@@ -317,3 +318,37 @@ def test_a_long_track_takes_seconds() -> None:
     track, _report = read("time,lon,lat,heading,accuracy\n" + rows)
     assert process_time() - began < 2
     assert len(track.time_s) == 20_000
+
+
+# --- what a vehicle's profile says of its track -------------------------------------------------------------------
+
+
+def test_a_lever_arm_brings_the_track_to_the_vehicles_reference() -> None:
+    for heading, east_m, north_m in ((90.0, -2.0, -0.5), (0.0, 0.5, -2.0), (225.0, 1.0607, 1.7678)):
+        text = f"time,longitude,latitude,heading\n2026-03-16T13:39:32Z,10.0,50.0,{heading}\n"
+        track, report = read(text, forward_m=2.0, left_m=0.5)
+        moved_m = enu_from_wgs84(float(track.lon_deg[0]), float(track.lat_deg[0]), 0.0, (10.0, 50.0, 0.0))
+        assert moved_m[:2] == pytest.approx([east_m, north_m], abs=1e-3)
+        assert not report.warnings
+    unturned, report = read("time,longitude,latitude\n2026-03-16T13:39:32Z,10.0,50.0\n", forward_m=2.0)
+    assert (unturned.lon_deg[0], unturned.lat_deg[0]) == (10.0, 50.0)
+    assert any("no heading" in warning for warning in report.warnings)
+
+
+def test_an_accuracy_is_declared_where_the_track_has_none() -> None:
+    track, _report = read(CSV, accuracy_m=0.5)
+    assert track.accuracy_m.tolist() == [0.02, 0.5]
+
+
+def test_the_way_driven_leaves_out_wandering_and_gaps() -> None:
+    rng = np.random.default_rng(3)
+    seconds = np.arange(0.0, 700.0, 0.1)
+    along_m = np.where(seconds < 600, 0.0, (seconds - 600) * 12.0)  # ten minutes at a stop, then 1.2 km
+    lat = 50.0 + (along_m + rng.normal(0, 0.7, len(seconds))) / 111_230.0
+    lon = 179.9999 + rng.normal(0, 0.7, len(seconds)) / 71_700.0
+    nothing = np.full(len(seconds), np.nan)
+    track = PoseTrack(seconds, (lon + 180) % 360 - 180, lat, nothing, np.full(len(seconds), 2.5))
+    assert track.driven_m() == pytest.approx(1200.0, rel=0.02)
+    far = PoseTrack([0.0, 1.0, 2.0], [10.0, 11.0, 11.0001], [50.0] * 3, [np.nan] * 3, [np.nan] * 3)
+    assert far.driven_m() == pytest.approx(7.17, abs=0.05)
+    assert PoseTrack([0.0], [10.0], [50.0], [np.nan], [np.nan]).driven_m() == 0.0

@@ -1,0 +1,156 @@
+"""Sensor profiles: the part of a decode's context that stays the same from upload to upload.
+
+A profile has the members of the context (`camera`, `thermal`, `thermal_range`, `trace`, `packets`) and their names.
+What an upload states itself goes before its vehicle's profile, member by member.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from app.errors import InvalidParameter
+from app.services.decode_context import CameraSetup, DecodeContext
+from app.services.packets import packet_terms
+from app.services.positions import naming
+from app.services.traces import trace_terms
+
+FRAME, TRACE, PACKETS = "frame", "trace", "packets"
+NEEDED = {FRAME: "camera", TRACE: "trace", PACKETS: "packets"}
+"""Section that an upload of a kind cannot do without."""
+SECTIONS = {
+    FRAME: ("camera", "thermal", "thermal_range"),
+    TRACE: ("trace",),
+    PACKETS: ("packets", "camera"),
+}
+INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
+_SIZE = ("width_px", "height_px")
+_OF_THE_SIZE = (*INTRINSICS, "distortion")
+_PROFILE_ONLY = ("readout_s", "calibration_id")
+"""What a vehicle's camera has and a context's has not."""
+_WHOLE = ("trace.can.speed", "trace.can.heading")
+"""Objects that are replaced as a whole: a signal by its name and one by its bits are two ways to say one thing."""
+
+Object = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Inherited:
+    """A context after its vehicle's profile was put behind it.
+
+    Attributes
+    ----------
+    context : dict
+        As `DecodeContext.document` writes it, without what is nobody's.
+    sources : dict of str to str
+        Path of each member to ``upload``, ``vehicle`` or ``default``.
+    """
+
+    context: Object
+    sources: dict[str, str]
+
+
+def check_profile(profile: Mapping[str, Any]) -> None:
+    """Refuse a profile that no upload could use.
+
+    Raises
+    ------
+    InvalidParameter
+        The field is below ``profile``.
+    """
+    with naming("profile"):
+        camera = context_camera(profile.get("camera"))
+        if camera is not None:
+            # the mount alone is allowed: intrinsics can come from a calibration later
+            known = camera if has_intrinsics(camera) else {**camera, "horizontal_fov_deg": 60.0}
+            CameraSetup(**{**known, "distortion": tuple(known.get("distortion", ()))})
+        counts = profile.get("thermal_range")
+        DecodeContext(thermal=profile.get("thermal", False), thermal_range=(counts[0], counts[1]) if counts else None)
+        if profile.get("trace") is not None:
+            trace_terms(profile["trace"])
+        if profile.get("packets") is not None:
+            packet_terms(profile["packets"])
+
+
+def has_intrinsics(camera: Mapping[str, Any]) -> bool:
+    """Whether a camera says how it projects, whether completely or not."""
+    return any(camera.get(name) is not None for name in (*INTRINSICS, "horizontal_fov_deg"))
+
+
+def context_camera(camera: Mapping[str, Any] | None) -> Object | None:
+    """A vehicle's camera as a context has it."""
+    if camera is None:
+        return None
+    return {name: value for name, value in camera.items() if name not in _PROFILE_ONLY}
+
+
+def inherit(profile: Mapping[str, Any], stated: Mapping[str, Any], kind: str) -> Inherited:
+    """Put a vehicle's profile behind what an upload states.
+
+    Parameters
+    ----------
+    profile : mapping
+    stated : mapping
+        What the upload says and nothing else; a member that is None is said to be unknown, and not inherited.
+    kind : str
+        ``frame``, ``trace`` or ``packets``: sections of other kinds are left where they are.
+
+    Raises
+    ------
+    InvalidParameter
+        The profile's intrinsics are of another size of frame than the upload says.
+    """
+    ours = {name: profile[name] for name in SECTIONS[kind] if name in profile}
+    said = dict(stated)
+    if "camera" in ours:
+        ours["camera"] = _fitting_camera(context_camera(ours["camera"]) or {}, said.get("camera", {}))
+    if said.get("thermal") is False:
+        ours.pop("thermal_range", None)
+    sources: dict[str, str] = {}
+    context = _merge(ours, said, sources)
+    if isinstance(context.get("camera"), dict):
+        for entry in fields(CameraSetup):
+            if entry.default is not None and entry.name not in context["camera"] and entry.name != "distortion":
+                sources[f"camera.{entry.name}"] = "default"
+    return Inherited(context, dict(sorted(sources.items())))
+
+
+def _fitting_camera(camera: Object, stated: Any) -> Object:
+    """A profile's camera without what the upload's own makes meaningless."""
+    if not isinstance(stated, Mapping):
+        return camera
+    given = {name for name, value in stated.items() if value is not None}
+    if "horizontal_fov_deg" in given:
+        return {name: value for name, value in camera.items() if name not in (*_OF_THE_SIZE, *_SIZE)}
+    if given & set(INTRINSICS):
+        camera = {name: value for name, value in camera.items() if name != "horizontal_fov_deg"}
+    if set(INTRINSICS) <= given:
+        return {name: value for name, value in camera.items() if name not in (*_OF_THE_SIZE, *_SIZE)}
+    for name in _SIZE:
+        if name in given and camera.get(INTRINSICS[0]) is not None and stated[name] != camera.get(name):
+            raise InvalidParameter(
+                f"the vehicle's camera was calibrated at {camera.get('width_px')} x {camera.get('height_px')} px, "
+                f"the upload says {name} {stated[name]}",
+                field=f"camera.{name}",
+                limit="intrinsics belong to one size of frame",
+                cure="send all four intrinsics of this size, or frames of the calibrated size",
+            )
+    return camera
+
+
+def _merge(ours: Mapping[str, Any], said: Mapping[str, Any], sources: dict[str, str], path: str = "") -> Object:
+    merged: Object = {}
+    for name in [*ours, *(name for name in said if name not in ours)]:
+        at = f"{path}{name}"
+        theirs, own = said.get(name), ours.get(name)
+        if name in said and theirs is None:
+            continue  # said to be unknown
+        if isinstance(theirs if name in said else own, Mapping) and at not in _WHOLE:
+            merged[name] = _merge(
+                own if isinstance(own, Mapping) else {}, theirs if name in said else {}, sources, f"{at}."
+            )
+            continue
+        merged[name] = theirs if name in said else own
+        sources[at] = "upload" if name in said else "vehicle"
+    return merged
