@@ -11,7 +11,7 @@ from app.api.dependencies import Caller, Idempotency, Identifier, Markers, Text,
 from app.api.problems import UNION_TAG, problem_responses
 from app.api.schemas_cerpms import CERPM_EXAMPLES, CerpmMarkerIn, CerpmMarkerOut
 from app.api.schemas_magnets import MAGNET_EXAMPLES, MagnetMarkerIn, MagnetMarkerOut, MagnetMarkerSummary
-from app.api.schemas_markers import PLATE_EXAMPLES, GeometryIn, MarkerId, MarkerIn, MarkerOut, Status
+from app.api.schemas_markers import PLATE_EXAMPLES, GeometryIn, MarkerId, MarkerIn, MarkerOut, Status, VersionKind
 from app.api.schemas_patch import MarkerPatch
 from app.api.strict_json import StrictRoute
 from app.errors import InvalidParameter
@@ -74,6 +74,9 @@ class VersionOut(BaseModel):
     at: str
     who: str
     why: str | None
+    kind: VersionKind
+    sha256: str
+    audit_number: int
     marker: MarkerOut | MagnetMarkerSummary | CerpmMarkerOut
 
 

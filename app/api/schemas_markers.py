@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from app.api.dependencies import Identifier, Number, Text, Whole
 
 Status = Literal["planned", "built", "surveyed", "active", "suspect", "retired"]
+VersionKind = Literal["as-planned", "as-built", "resurvey", "correction", "change"]
 Heading = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, lt=360)]
 Accuracy = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6)]
 Metres = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e8, le=1e8)]
@@ -81,6 +82,9 @@ class PlacementIn(BaseModel):
     road: Text | None = Field(None, min_length=1, max_length=200, description="Road's name or number.")
     measure_m: Metres | None = Field(None, description="Chainage along the road. [m]")
     offset_m: Metres | None = Field(None, description="Offset from the road's axis, left positive. [m]")
+    kind: VersionKind | None = Field(
+        None, description="Kind of this version in the history; told by the status and by what changes without."
+    )
     reason: Text | None = Field(None, min_length=1, max_length=500, description="Why; goes into the history.")
 
 

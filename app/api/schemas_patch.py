@@ -40,7 +40,7 @@ class MarkerPatch(Headed):
     def change(self) -> MarkerChange:
         """The change as the use cases know it."""
         named = self.model_fields_set
-        values = self.model_dump(include=named - {"position", "reason", *_SAID})
+        values = self.model_dump(include=named - {"position", "kind", "reason", *_SAID})
         spec = {**self.model_dump(include=named & {"side"})}
         if "speed_limit" in named:
             limit = self.speed_limit
@@ -56,7 +56,7 @@ class MarkerPatch(Headed):
             raise InvalidParameter(
                 "the patch changes nothing", field="body", limit="at least one member", cure="name what to change"
             )
-        return MarkerChange(values, position, self.reason)
+        return MarkerChange(values, position, self.kind, self.reason)
 
 
 _SAID = ("side", "speed_limit", "dev_eui", "radio")

@@ -1,16 +1,16 @@
-"""Markers by the thousand: looked up by box, by digits and by number, and stored in one statement a chunk."""
+"""Markers by the thousand: looked up by box, by digits and by number, and stored a chunk at a time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from datetime import datetime
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import sqlalchemy as sa
 
+from app.registry.audit import AuditEntry, add_versions
 from app.registry.markers import PUBLIC, MarkerFilter, Row, list_markers
 from app.registry.spatial import Box, box_around, within_box
-from app.registry.tables import marker_versions, markers
+from app.registry.tables import markers
 
 _CHUNK = 500
 _INSERT = 2000
@@ -58,33 +58,25 @@ def list_by_digits(connection: sa.Connection, family: str, digits: Sequence[str]
 
 def add_markers(
     connection: sa.Connection,
-    agency_id: str,
+    entry: AuditEntry,
     rows: Sequence[Mapping[str, Any]],
     *,
-    now: datetime,
-    who: str,
+    kind: Callable[[str], str],
     why: str | None,
 ) -> None:
-    """Store new markers, each with the first entry of its history; every row has the same columns."""
+    """Store new markers of the entry's agency, each with the first version of its history.
+
+    Every row has the same columns, and they are in the order of their ids; `kind` tells a version's from the status.
+    """
     names = [str(column.name) for column in PUBLIC]
     for start in range(0, len(rows), _INSERT):
         chunk = rows[start : start + _INSERT]
-        connection.execute(sa.insert(markers), [{"agency_id": agency_id, **row} for row in chunk])
-        connection.execute(
-            sa.insert(marker_versions),
-            [
-                {
-                    "marker_id": row["id"],
-                    "version": 1,
-                    "agency_id": agency_id,
-                    "at": now,
-                    "who": who,
-                    "why": why,
-                    "marker": {name: row.get(name) for name in names},
-                }
-                for row in chunk
-            ],
-        )
+        connection.execute(sa.insert(markers), [{"agency_id": entry.agency_id, **row} for row in chunk])
+        versions = []
+        for row in chunk:
+            marker = {name: row.get(name) for name in names}
+            versions.append(entry.version(row["id"], 1, marker, kind=kind(row["status"]), why=why))
+        add_versions(connection, versions)
 
 
 def walk_markers(

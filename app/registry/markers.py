@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from functools import lru_cache, partial
 from typing import Any
 
 import sqlalchemy as sa
 
 from app.errors import NotFound, StaleVersion
-from app.registry.spatial import Box, box_around, distance_to, proposed_by_index, within_box, within_radius
+from app.registry.audit import AuditEntry, add_versions
+from app.registry.spatial import (
+    Area,
+    Box,
+    box_around,
+    distance_to,
+    proposed_by_index,
+    within_area,
+    within_box,
+    within_radius,
+)
 from app.registry.tables import marker_versions, markers
 
 Row = sa.RowMapping
@@ -27,6 +36,10 @@ class MarkerFilter:
     digits: str | None = None
     status: str | None = None
     family: str | None = None
+    area: Area | None = None
+    road: str | None = None
+    from_m: float | None = None
+    to_m: float | None = None
 
 
 def get_marker(connection: sa.Connection, agency_id: str, marker_id: str) -> Row:
@@ -67,13 +80,14 @@ def list_markers(
     connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, *, after: str | None, limit: int
 ) -> list[Row]:
     """Markers in the order of their ids, which is the order they were registered in."""
-    query = sa.select(*PUBLIC).where(markers.c.agency_id == agency_id, *_conditions(narrowed))
+    query = sa.select(*PUBLIC).where(markers.c.agency_id == agency_id, *conditions_of(narrowed))
     if after is not None:
         query = query.where(markers.c.id > after)
     return list(connection.execute(query.order_by(markers.c.id).limit(limit)).mappings())
 
 
-def _conditions(narrowed: MarkerFilter) -> list[sa.ColumnElement[bool]]:
+def conditions_of(narrowed: MarkerFilter) -> list[sa.ColumnElement[bool]]:
+    """What a filter asks of a row."""
     conditions = []
     if narrowed.box is not None:
         conditions.append(within_box(narrowed.box))
@@ -85,6 +99,14 @@ def _conditions(narrowed: MarkerFilter) -> list[sa.ColumnElement[bool]]:
         conditions.append(markers.c.status == narrowed.status)
     if narrowed.family is not None:
         conditions.append(markers.c.family == narrowed.family)
+    if narrowed.area is not None:
+        conditions.append(within_area(narrowed.area))
+    if narrowed.road is not None:
+        conditions.append(markers.c.road == narrowed.road)
+    if narrowed.from_m is not None:
+        conditions.append(markers.c.measure_m >= narrowed.from_m)
+    if narrowed.to_m is not None:
+        conditions.append(markers.c.measure_m <= narrowed.to_m)
     return conditions
 
 
@@ -157,22 +179,21 @@ def find_id_code(connection: sa.Connection, digits: str, n: int) -> Row | None:
 
 
 def add_marker(
-    connection: sa.Connection, agency_id: str, values: Mapping[str, Any], *, who: str, why: str | None
+    connection: sa.Connection, entry: AuditEntry, values: Mapping[str, Any], *, kind: str, why: str | None
 ) -> Row:
-    """Store a new marker with the first entry of its history."""
-    connection.execute(sa.insert(markers).values(agency_id=agency_id, **values))
-    return _recorded(connection, agency_id, values["id"], who=who, why=why)
+    """Store a new marker of the entry's agency with the first version of its history."""
+    connection.execute(sa.insert(markers).values(agency_id=entry.agency_id, **values))
+    return _recorded(connection, entry, values["id"], kind=kind, why=why)
 
 
 def update_marker(
     connection: sa.Connection,
-    agency_id: str,
+    entry: AuditEntry,
     marker_id: str,
     changes: Mapping[str, Any],
     *,
     version: int,
-    now: datetime,
-    who: str,
+    kind: str,
     why: str | None,
 ) -> Row:
     """Change a marker that is still at the version the caller read, and add to its history.
@@ -184,12 +205,12 @@ def update_marker(
     """
     statement = (
         sa.update(markers)
-        .where(markers.c.id == marker_id, markers.c.agency_id == agency_id, markers.c.version == version)
-        .values(**changes, version=version + 1, updated_at=now)
+        .where(markers.c.id == marker_id, markers.c.agency_id == entry.agency_id, markers.c.version == version)
+        .values(**changes, version=version + 1, updated_at=entry.at)
     )
     if connection.execute(statement).rowcount != 1:
         raise StaleVersion(f"marker {marker_id} is no longer at version {version}", field="If-Match")
-    return _recorded(connection, agency_id, marker_id, who=who, why=why)
+    return _recorded(connection, entry, marker_id, kind=kind, why=why)
 
 
 def list_versions(
@@ -209,17 +230,8 @@ def list_versions(
     return list(connection.execute(query).mappings())
 
 
-def _recorded(connection: sa.Connection, agency_id: str, marker_id: str, *, who: str, why: str | None) -> Row:
-    row = get_marker(connection, agency_id, marker_id)
-    connection.execute(
-        sa.insert(marker_versions).values(
-            marker_id=marker_id,
-            version=row["version"],
-            agency_id=agency_id,
-            at=row["updated_at"],
-            who=who,
-            why=why,
-            marker={str(name): value for name, value in row.items()},
-        )
-    )
+def _recorded(connection: sa.Connection, entry: AuditEntry, marker_id: str, *, kind: str, why: str | None) -> Row:
+    row = get_marker(connection, entry.agency_id, marker_id)
+    marker = {str(name): value for name, value in row.items()}
+    add_versions(connection, [entry.version(marker_id, row["version"], marker, kind=kind, why=why)])
     return row

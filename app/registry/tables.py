@@ -18,6 +18,7 @@ metadata = sa.MetaData(naming_convention=_NAMES)
 
 ID = sa.String(36)
 STATUSES = ("planned", "built", "surveyed", "active", "suspect", "retired")
+VERSION_KINDS = ("as-planned", "as-built", "resurvey", "correction", "change")
 DECODE_STATES = ("queued", "running", "done", "failed", "cancelled")
 SCOPES = ("admin", "planner", "surveyor", "viewer", "vehicle")
 
@@ -106,6 +107,11 @@ markers = sa.Table(
     sa.Column("horizontal_rmse_m", sa.Double),
     sa.Column("vertical_rmse_m", sa.Double),
     sa.Column("survey_method", sa.String(200)),
+    sa.Column("check_points", sa.Integer),
+    sa.Column("surveyor", sa.String(200)),
+    sa.Column("instrument", sa.String(200)),
+    sa.Column("survey_file_sha256", sa.String(64)),
+    sa.Column("transform_accuracy_m", sa.Double),
     sa.Column("original", sa.JSON, nullable=False),
     sa.Column("localization_grade", sa.String(64), nullable=False),
     sa.Column("transform_note", sa.String(500)),
@@ -154,6 +160,28 @@ marker_versions = sa.Table(
     sa.Column("who", sa.String(200), nullable=False),
     sa.Column("why", sa.String(500)),
     sa.Column("marker", sa.JSON, nullable=False),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("audit_number", sa.BigInteger, nullable=False),
+    sa.Column("sha256", sa.String(64), nullable=False),
+    _one_of("kind", VERSION_KINDS),
+)
+
+# what changed an agency's part of the registry: a chain, each entry with the hash of the one before (audit.py)
+audit_log = sa.Table(
+    "audit_log",
+    metadata,
+    sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
+    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("key_id", sa.String(200)),
+    sa.Column("action", sa.String(40), nullable=False),
+    sa.Column("subject", sa.String(200)),
+    sa.Column("detail", sa.JSON(none_as_null=True)),
+    sa.Column("versions", sa.BigInteger, nullable=False),
+    sa.Column("digest", sa.String(64), nullable=False),
+    sa.Column("previous_hash", sa.String(64), nullable=False),
+    sa.Column("hash", sa.String(64), nullable=False),
 )
 
 # where the magnets of magnet markers lie: what follows from their layouts, kept for searches

@@ -38,6 +38,7 @@ class NewCerpm:
     road: str | None = None
     measure_m: float | None = None
     offset_m: float | None = None
+    kind: str | None = None
     reason: str | None = None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
@@ -16,6 +17,7 @@ import sqlalchemy as sa
 from app.errors import InvalidParameter
 from app.registry import bulk
 from app.registry import markers as store
+from app.registry.audit import AuditEntry, recording
 from app.registry.database import Database
 from app.registry.exchange.compare import Comparison, check_residuals, compare_survey
 from app.registry.exchange.declaration import ImportDeclaration
@@ -26,12 +28,14 @@ from app.registry.exchange.shape_checks import check_shape
 from app.registry.exchange.table import Fault, Severity, SurveyTable
 from app.registry.spatial import Box
 from app.services.access import Caller
+from app.services.audit import author_of
 from app.services.cerpm_markers import Cerpms
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
 from app.services.import_rows import MarkerDefaults, PreparedRow, common_columns, prepare_rows, settle_codes
 from app.services.marker_rules import PLANNED, MarkerFamily, MarkerRules
 from app.services.plate_markers import Plates
 from app.services.ports import Clock
+from app.services.version_kinds import kind_of_change, kind_of_new
 
 ALL, GOOD = "all", "good"
 FAMILIES = ("plate", "cerpm")
@@ -180,14 +184,14 @@ class _Running:
         if self._given.declaration.compare:
             self._resurvey(connection, family)
             return
-        bulk.add_markers(
-            connection,
-            self._caller.agency_id,
-            [row.columns for row in self._prepared],
-            now=self._now,
-            who=self._caller.label,
-            why=self._given.reason or f"import of {self._sha256[:12]}",
-        )
+        with self._recording(connection) as entry:
+            bulk.add_markers(
+                connection,
+                entry,
+                [row.columns for row in self._prepared],
+                kind=kind_of_new,
+                why=self._given.reason or f"import of {self._sha256[:12]}",
+            )
         self._stored = len(self._prepared)
 
     def report(self, outcome: str) -> dict[str, Any]:
@@ -304,26 +308,38 @@ class _Running:
     def _resurvey(self, connection: sa.Connection, family: MarkerFamily[Any, Any]) -> None:
         """A new version of every marker that a good row measured."""
         assert self._comparison is not None
-        for index in self._good_rows():
-            marker = self._known[int(self._comparison.matched[index])]
-            columns = common_columns(self._survey, index, self._given.declaration, file_sha256=self._sha256)
-            kept = ("family", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")
-            values = {name: v for name, v in columns.items() if name not in kept}
-            values["status"] = self._given.declaration.status or "surveyed"
-            # what stands on the road keeps its digits, whatever was planned
-            built = {**marker, "status": "built" if marker["status"] == PLANNED else marker["status"]}
-            values |= family.revised(connection, self._caller, built, values, moved=True)  # type: ignore[arg-type]
-            store.update_marker(
-                connection,
-                self._caller.agency_id,
-                marker["id"],
-                values,
-                version=marker["version"],
-                now=self._now,
-                who=self._caller.label,
-                why=self._given.reason or f"as built, import of {self._sha256[:12]}",
-            )
-            self._stored += 1
+        found = ((self._known[int(self._comparison.matched[index])], index) for index in self._good_rows())
+        with self._recording(connection) as entry:
+            for marker, index in sorted(found, key=lambda pair: str(pair[0]["id"])):
+                columns = common_columns(self._survey, index, self._given.declaration, file_sha256=self._sha256)
+                kept = ("family", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")
+                values = {name: v for name, v in columns.items() if name not in kept}
+                values["status"] = self._given.declaration.status or "surveyed"
+                # what stands on the road keeps its digits, whatever was planned
+                built = {**marker, "status": "built" if marker["status"] == PLANNED else marker["status"]}
+                values |= family.revised(connection, self._caller, built, values, moved=True)  # type: ignore[arg-type]
+                store.update_marker(
+                    connection,
+                    entry,
+                    marker["id"],
+                    values,
+                    version=marker["version"],
+                    kind=kind_of_change(marker["status"], values["status"], moved=True),
+                    why=self._given.reason or f"as built, import of {self._sha256[:12]}",
+                )
+                self._stored += 1
+
+    def _recording(self, connection: sa.Connection) -> AbstractContextManager[AuditEntry]:
+        """The entry of the audit log that stands for the whole import."""
+        return recording(
+            connection,
+            self._caller.agency_id,
+            author_of(self._caller),
+            "import.stored",
+            now=self._now,
+            subject=self._sha256,
+            detail={"format": self._survey.table.format, "compare": self._given.declaration.compare},
+        )
 
     def _comparison_document(self) -> dict[str, Any] | None:
         if self._comparison is None:

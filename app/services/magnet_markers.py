@@ -69,6 +69,7 @@ class NewMagnets:
     road: str | None = None
     measure_m: float | None = None
     offset_m: float | None = None
+    kind: str | None = None
     reason: str | None = None
 
 

@@ -84,6 +84,9 @@ def version_document(row: Row, marker: dict[str, Any]) -> dict[str, Any]:
         "at": row["at"],
         "who": row["who"],
         "why": row["why"],
+        "kind": row["kind"],
+        "sha256": row["sha256"],
+        "audit_number": row["audit_number"],
         "marker": marker,
     }
 

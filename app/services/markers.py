@@ -9,10 +9,12 @@ from typing import Any, TypeVar
 
 from app.errors import InvalidParameter, StaleVersion
 from app.registry import markers as store
+from app.registry.audit import recording
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, Row
 from app.services.access import Caller
+from app.services.audit import author_of
 from app.services.cerpm_markers import Cerpms, NewCerpm
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
 from app.services.magnet_markers import Magnets, NewMagnets
@@ -21,6 +23,7 @@ from app.services.marker_rules import MarkerFamily, MarkerRules, NewMarker
 from app.services.plate_markers import NewPlate, Plates
 from app.services.ports import Clock
 from app.services.positions import GivenPosition, place_given, position_columns
+from app.services.version_kinds import kind_of_change, kind_of_new
 
 New = TypeVar("New", bound=NewMarker)
 Prepared = TypeVar("Prepared")
@@ -32,6 +35,7 @@ class MarkerChange:
 
     values: dict[str, Any] = field(default_factory=dict)
     position: GivenPosition | None = None
+    kind: str | None = None
     reason: str | None = None
 
 
@@ -137,7 +141,12 @@ class Markers:
                 "updated_at": now,
                 **family.columns(connection, caller, new, prepared),
             }
-            row = store.add_marker(connection, caller.agency_id, values, who=caller.label, why=new.reason)
+            kind = kind_of_new(new.status, new.kind)
+            who = author_of(caller)
+            with recording(
+                connection, caller.agency_id, who, "marker.registered", now=now, subject=values["id"]
+            ) as entry:
+                row = store.add_marker(connection, entry, values, kind=kind, why=new.reason)
             family.index(connection, caller, row)
             marker = family.detail(row)
             keep_answer(connection, caller.agency_id, key, marker, now, self._rules.idempotency_ttl)
@@ -193,16 +202,14 @@ class Markers:
                     cure="leave it out",
                 )
             values |= family.revised(connection, caller, row, values, moved=placed is not None)
-            changed = store.update_marker(
-                connection,
-                caller.agency_id,
-                marker_id,
-                values,
-                version=row["version"],
-                now=now,
-                who=caller.label,
-                why=change.reason,
+            kind = kind_of_change(
+                row["status"], values.get("status", row["status"]), moved=placed is not None, said=change.kind
             )
+            who = author_of(caller)
+            with recording(connection, caller.agency_id, who, "marker.changed", now=now, subject=marker_id) as entry:
+                changed = store.update_marker(
+                    connection, entry, marker_id, values, version=row["version"], kind=kind, why=change.reason
+                )
             if placed is not None:
                 family.index(connection, caller, changed)
         return family.detail(changed)

@@ -49,6 +49,7 @@ class NewPlate:
     road: str | None = None
     measure_m: float | None = None
     offset_m: float | None = None
+    kind: str | None = None
     reason: str | None = None
 
 

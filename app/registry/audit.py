@@ -1,0 +1,180 @@
+"""The audit log: each agency's changes as a chain of entries, each with the hash of the one before.
+
+An entry stands for one operation. It counts the versions of markers that were written and covers them by a digest over
+their hashes, so that one entry is enough for an import of a million. `audit_check` finds what was changed since.
+
+Writes come one after another on both databases (decision 0010), so nobody else appends to a chain meanwhile.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import orjson
+import sqlalchemy as sa
+
+from app.registry.tables import audit_log, marker_versions
+
+Row = sa.RowMapping
+NO_ENTRY = "0" * 64
+"""What the first entry of a chain names as the hash before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Author:
+    """Who makes a change: `who` is the label in histories, `key_id` the key that was used."""
+
+    who: str
+    key_id: str | None = None
+
+
+@dataclass(slots=True)
+class AuditEntry:
+    """An entry that is being written: versions of markers are added to it in the order of their ids and numbers."""
+
+    agency_id: str
+    number: int
+    at: datetime
+    who: str
+    versions: int = 0
+    _last: tuple[str, int] = ("", 0)
+    _hashes: Any = field(default_factory=hashlib.sha256)
+
+    def version(
+        self, marker_id: str, version: int, marker: Mapping[str, Any], *, kind: str, why: str | None
+    ) -> dict[str, Any]:
+        """A version of a marker as a row of `marker_versions`, counted and covered by this entry.
+
+        Raises
+        ------
+        ValueError
+            It does not come after the version before it: the digest could not be computed again.
+        """
+        if (marker_id, version) <= self._last:
+            raise ValueError("versions of one entry are in the order of their markers' ids")
+        self._last = (marker_id, version)
+        text = orjson.Fragment(orjson.dumps(marker, option=orjson.OPT_SORT_KEYS))
+        sha256 = version_sha256(self.agency_id, marker_id, version, self.at, self.who, why, kind, text)
+        self.versions += 1
+        self._hashes.update(sha256.encode())
+        return {
+            "marker_id": marker_id,
+            "version": version,
+            "agency_id": self.agency_id,
+            "at": self.at,
+            "who": self.who,
+            "why": why,
+            "kind": kind,
+            "audit_number": self.number,
+            "sha256": sha256,
+            "marker": text,
+        }
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the hashes of the versions, in the order of their markers' ids and numbers."""
+        return str(self._hashes.hexdigest())
+
+
+def version_sha256(
+    agency_id: str,
+    marker_id: str,
+    version: int,
+    at: datetime,
+    who: str,
+    why: str | None,
+    kind: str,
+    marker: orjson.Fragment | Mapping[str, Any],
+) -> str:
+    """Hash of a version: SHA-256 of these values as a JSON array with sorted keys (RFC 8259, no spaces)."""
+    values = (agency_id, marker_id, version, at.astimezone(UTC), who, why, kind, marker)
+    return hashlib.sha256(orjson.dumps(values, option=orjson.OPT_SORT_KEYS)).hexdigest()
+
+
+def entry_hash(entry: Mapping[str, Any]) -> str:
+    """Hash of an entry: SHA-256 of all its other columns as a JSON array, the hash before it among them."""
+    values = [entry[column.name] for column in audit_log.c if column.name != "hash"]
+    return hashlib.sha256(orjson.dumps(values, option=orjson.OPT_SORT_KEYS)).hexdigest()
+
+
+@contextmanager
+def recording(
+    connection: sa.Connection,
+    agency_id: str,
+    author: Author,
+    action: str,
+    *,
+    now: datetime,
+    subject: str | None = None,
+    detail: Mapping[str, Any] | None = None,
+) -> Iterator[AuditEntry]:
+    """Append an entry to the agency's chain when the block ends; versions written in the block belong to it.
+
+    Parameters
+    ----------
+    connection : Connection
+        Of a write transaction. Blocks do not nest.
+    author : Author
+    action : str
+        What was done, e.g. ``marker.registered``.
+    subject : str, optional
+        Id or name of what it was done to.
+    detail : mapping, optional
+        What else there is to say, as JSON; never a secret.
+    """
+    head = find_head(connection, agency_id)
+    number, previous = (head["number"] + 1, head["hash"]) if head is not None else (1, NO_ENTRY)
+    now = now.astimezone(UTC)
+    entry = AuditEntry(agency_id, number, now, author.who)
+    yield entry
+    row = {
+        "agency_id": agency_id,
+        "number": number,
+        "at": now,
+        "who": author.who,
+        "key_id": author.key_id,
+        "action": action,
+        "subject": subject,
+        "detail": dict(detail) if detail is not None else None,
+        "versions": entry.versions,
+        "digest": entry.digest,
+        "previous_hash": previous,
+    }
+    connection.execute(sa.insert(audit_log).values(**row, hash=entry_hash(row)))
+
+
+def record(
+    connection: sa.Connection,
+    agency_id: str,
+    author: Author,
+    action: str,
+    *,
+    now: datetime,
+    subject: str | None = None,
+    detail: Mapping[str, Any] | None = None,
+) -> None:
+    """Append an entry for a change that writes no versions of markers; parameters as `recording`."""
+    with recording(connection, agency_id, author, action, now=now, subject=subject, detail=detail):
+        pass
+
+
+def add_versions(connection: sa.Connection, versions: list[dict[str, Any]]) -> None:
+    """Store rows that `AuditEntry.version` made."""
+    connection.execute(sa.insert(marker_versions), versions)
+
+
+def find_head(connection: sa.Connection, agency_id: str) -> Row | None:
+    """The newest entry of the agency's chain."""
+    query = sa.select(audit_log).where(audit_log.c.agency_id == agency_id).order_by(audit_log.c.number.desc()).limit(1)
+    return connection.execute(query).mappings().one_or_none()
+
+
+def list_entries(connection: sa.Connection, agency_id: str, *, after: int = 0, limit: int = 100) -> list[Row]:
+    """Entries of the agency's chain, oldest first."""
+    query = sa.select(audit_log).where(audit_log.c.agency_id == agency_id, audit_log.c.number > after)
+    return list(connection.execute(query.order_by(audit_log.c.number).limit(limit)).mappings())
