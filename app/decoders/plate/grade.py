@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.decoders.plate.decode import DecodedSymbols, UnitEvidence
+from app.decoders.plate.decode import DecodedSymbols
 from app.decoders.plate.fit import PlateFit
+from app.decoders.plate.weighing import UnitEvidence
 from app.markers.plate import PlateScheme, plate_capacity
 from app.markers.reading import PlateGrade
 

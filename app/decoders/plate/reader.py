@@ -19,12 +19,13 @@ from app.decoders.plate.colour import (
     marker_colours,
     vivid_signal,
 )
-from app.decoders.plate.decode import MOST_DAMAGE, DecodedSymbols, decode_symbols, weigh_units
+from app.decoders.plate.decode import MOST_DAMAGE, DecodedSymbols, decode_symbols
 from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids, project, unit_centres
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.pose import locate_plate
 from app.decoders.plate.quads import MARKER_RATIO, MarkerQuad, detect_marker_quads
 from app.decoders.plate.thermal import ORIENTATION_EVIDENCE, fit_warm_plates
+from app.decoders.plate.weighing import weigh_units
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading

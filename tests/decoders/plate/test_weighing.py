@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.decoders.plate.decode import MOST_DAMAGE, decode_symbols, weigh_units
+from app.decoders.plate.decode import MOST_DAMAGE, decode_symbols
 from app.decoders.plate.fit import PlateFit
+from app.decoders.plate.weighing import weigh_units
 from app.markers.plate import PlateCode
 from tests.decoders.plate.scenes import PAPER
 
