@@ -75,7 +75,6 @@ class Observed:
         method = scope["method"] if scope["method"] in _METHODS else "other"
         self._count.labels(method, route, str(status)).inc()
         self._seconds.labels(method, route).observe(seconds)
-        caller = scope["state"].get("caller")
         _LOG.info(
             "request",
             method=scope["method"],
@@ -83,7 +82,7 @@ class Observed:
             route=route,
             status=status,
             ms=round(seconds * 1000, 2),
-            agency=caller.agency_id if caller else None,
+            agency=scope["state"].get("agency_id"),
         )
 
 
@@ -139,11 +138,13 @@ class Guarded:
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
         caller = await to_thread.run_sync(self._authenticate, _key_in(headers), limiter=self._threads)
+        state = scope.setdefault("state", {})
+        state["agency_id"] = caller.agency_id
         allowed = self._permissions.find(scope["method"], scope["path"])
         if allowed is None:
             return  # nothing there: 404 or 405. Should there be a route after all, it finds no caller and refuses
         caller.require(allowed)
-        scope.setdefault("state", {})["caller"] = caller
+        state["caller"] = caller
 
 
 def _by_prefix(table: Mapping[str, int], path: str) -> int:
