@@ -23,6 +23,7 @@ from app.api import (
     layouts,
     markers,
     radio_checks,
+    searches,
     system,
     ui,
     vehicles,
@@ -56,6 +57,7 @@ from app.services.imports import Imports
 from app.services.layouts import Layouts
 from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
+from app.services.searches import Searches
 from app.services.vehicles import Vehicles
 from app.settings import Settings
 from app.storage.blobs import Blobs
@@ -64,6 +66,7 @@ from app.storage.master_key import load_master_key
 ROUTERS = (
     ui.router,
     system.router,
+    searches.router,
     markers.router,
     artwork.router,
     layouts.router,
@@ -113,6 +116,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.markers = Markers(database, utc_now, _marker_rules(settings))
     app.state.imports = Imports(database, utc_now, pool, _marker_rules(settings))
     app.state.exports = Exports(database)
+    app.state.searches = Searches(database)
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)
     app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)

@@ -8,9 +8,9 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from app.api.dependencies import Caller, Text
-from app.api.markers import parse_box
 from app.api.problems import problem_responses
 from app.api.schemas_markers import Status
+from app.api.searches import parse_box
 from app.registry.markers import MarkerFilter
 from app.services.exports import STREAMED, WHOLE
 from app.services.exports import Exports as ExportsService

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Discriminator, RootModel, Tag, model_validator
 
-from app.api.dependencies import Caller, Idempotency, Identifier, Markers, Text, Version, json_response, next_link
+from app.api.dependencies import Caller, Idempotency, Markers, Version, json_response, next_link
 from app.api.problems import UNION_TAG, problem_responses
 from app.api.schemas_cerpms import CERPM_EXAMPLES, CerpmMarkerIn, CerpmMarkerOut
 from app.api.schemas_magnets import MAGNET_EXAMPLES, MagnetMarkerIn, MagnetMarkerOut, MagnetMarkerSummary
-from app.api.schemas_markers import PLATE_EXAMPLES, GeometryIn, MarkerId, MarkerIn, MarkerOut, Status, VersionKind
+from app.api.schemas_markers import PLATE_EXAMPLES, GeometryIn, MarkerId, MarkerIn, MarkerOut, VersionKind
 from app.api.schemas_patch import MarkerPatch
 from app.api.strict_json import StrictRoute
 from app.errors import InvalidParameter
-from app.geodesy import check_lon_lat
 from app.markers.plate import PlateGeometry, PlateScheme
-from app.registry.markers import MarkerFilter
-from app.registry.spatial import Box
 from app.services.plate_markers import GivenCode, NewPlate
 from app.services.positions import GivenPosition, naming
 
 router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
 
 MAX_PAGE = 1000
-MAX_RADIUS_M = 100_000.0
 FAMILIES = ("plate", "magnet", "cerpm")
 
 
@@ -59,12 +55,6 @@ class NewMarkerIn(
                 cure="leave it out for a plate",
             )
         return body
-
-
-class MarkerPage(BaseModel):
-    """A page of markers; the Link header leads to the next one."""
-
-    items: list[MarkerOut | MagnetMarkerSummary | CerpmMarkerOut]
 
 
 class VersionOut(BaseModel):
@@ -108,41 +98,6 @@ def post_marker(marker: NewMarkerIn, caller: Caller, markers: Markers, idempoten
     if replayed:
         headers["Idempotency-Replayed"] = "true"
     return json_response(document, 201, headers)
-
-
-@router.get("", response_class=Response, responses={200: {"model": MarkerPage}, **problem_responses()})
-def list_markers(
-    request: Request,
-    caller: Caller,
-    markers: Markers,
-    bbox: Annotated[Text | None, Query(max_length=200, examples=["114.1,22.2,114.3,22.4"])] = None,
-    near: Annotated[Text | None, Query(max_length=200, examples=["114.179,22.304,500"])] = None,
-    code: Annotated[
-        Text | None,
-        Query(
-            min_length=1,
-            max_length=64,
-            description="All digits of a plate, the text of a tag, or the number of a CERPM.",
-        ),
-    ] = None,
-    status: Status | None = None,
-    family: Literal["plate", "magnet", "cerpm"] | None = None,
-    limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100,
-    after: Annotated[Identifier | None, Query(description="Last id of the page before.")] = None,
-) -> Response:
-    """Markers in the order they were registered. `bbox` is west,south,east,north; `near` is lon,lat,radius_m.
-
-    Magnets are where their first one lies; lists leave out their lanes, magnets, checks and costs.
-    """
-    narrowed = MarkerFilter(
-        box=parse_box(bbox) if bbox is not None else None,
-        near=_circle(near) if near is not None else None,
-        digits=code,
-        status=status,
-        family=family,
-    )
-    page, last = markers.page(caller, narrowed, after=after, limit=limit)
-    return json_response({"items": page}, headers=next_link(request, after=last) if last else None)
 
 
 @router.get(
@@ -207,33 +162,3 @@ def _new_plate(marker: MarkerIn) -> NewPlate:
 def _geometry(given: GeometryIn) -> PlateGeometry:
     with naming("geometry"):
         return PlateGeometry(given.n, given.unit_mm, given.gap_mm, given.thickness_mm)
-
-
-def _numbers(text: str, field: str, form: str) -> list[float]:
-    parts = text.split(",")
-    if len(parts) != len(form.split(",")):
-        raise InvalidParameter(f"{field} is {form}", field=field, limit=form, cure="separate the numbers by commas")
-    try:
-        return [float(part) for part in parts]
-    except ValueError as error:
-        raise InvalidParameter(f"{field} holds something that is not a number", field=field, limit=form) from error
-
-
-def parse_box(text: str) -> Box:
-    """West, south, east, north as a query writes them."""
-    west, south, east, north = _numbers(text, "bbox", "west,south,east,north")
-    check_lon_lat(west, south, field="bbox")
-    check_lon_lat(east, north, field="bbox")
-    if south > north:
-        raise InvalidParameter("bbox has its south above its north", field="bbox", limit="south <= north")
-    return Box(west, south, east, north)
-
-
-def _circle(text: str) -> tuple[float, float, float]:
-    lon_deg, lat_deg, radius_m = _numbers(text, "near", "lon,lat,radius_m")
-    check_lon_lat(lon_deg, lat_deg, field="near")
-    if not 0 <= radius_m <= MAX_RADIUS_M:
-        raise InvalidParameter(
-            f"a radius of {radius_m:g} m is too large or negative", field="near", limit=f"0 to {MAX_RADIUS_M:g} m"
-        )
-    return lon_deg, lat_deg, radius_m

@@ -43,6 +43,7 @@ PERMISSIONS: dict[str, Allowed] = {
     # --- markers and what is made from them
     "GET /v1/markers": READERS,
     "POST /v1/markers": PLANNERS,
+    "POST /v1/markers/search": READERS,
     "GET /v1/markers/{marker_id}": READERS,
     "PATCH /v1/markers/{marker_id}": SURVEYORS,
     "GET /v1/markers/{marker_id}/versions": READERS,

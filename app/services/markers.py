@@ -12,7 +12,7 @@ from app.registry import markers as store
 from app.registry.audit import recording
 from app.registry.database import Database
 from app.registry.ids import new_id
-from app.registry.markers import MarkerFilter, Row
+from app.registry.markers import Row
 from app.services.access import Caller
 from app.services.audit import author_of
 from app.services.cerpm_markers import Cerpms, NewCerpm
@@ -157,15 +157,6 @@ class Markers:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         return self._family(row).detail(row)
-
-    def page(
-        self, caller: Caller, narrowed: MarkerFilter, *, after: str | None = None, limit: int = 100
-    ) -> tuple[list[dict[str, Any]], str | None]:
-        """A page of markers, and the id to continue after if there may be more."""
-        with self._database.read() as connection:
-            rows = store.list_markers(connection, caller.agency_id, narrowed, after=after, limit=limit + 1)
-        page = [self._family(row).document(row) for row in rows[:limit]]
-        return page, page[-1]["id"] if len(rows) > limit else None
 
     def change(self, caller: Caller, marker_id: str, change: MarkerChange, version: int | None) -> dict[str, Any]:
         """Change a marker that is still at `version`; None changes whatever version is stored.

@@ -1,0 +1,112 @@
+"""Schemas of searches for markers."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from app.api.dependencies import Number, Text
+from app.api.schemas_cerpms import CerpmMarkerOut
+from app.api.schemas_geojson import AnyPolygon, LineStringIn
+from app.api.schemas_magnets import MagnetMarkerSummary
+from app.api.schemas_markers import MarkerOut, Metres, Status
+
+MAX_PAGE = 1000
+MAX_RADIUS_M = 100_000.0
+MAX_CORRIDOR_M = 2_000.0
+
+Nearest = Annotated[int, Field(strict=True, ge=1, le=MAX_PAGE)]
+Radius = Annotated[float, Field(allow_inf_nan=False, ge=0, le=MAX_RADIUS_M)]
+
+
+class PlaceIn(BaseModel):
+    """A place to search from."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    lon_deg: Number = Field(description="Longitude. [deg]")
+    lat_deg: Number = Field(description="Latitude. [deg]")
+
+
+class AlongIn(BaseModel):
+    """A corridor along a line."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    geometry: LineStringIn = Field(description="In the direction of travel, in longitude and latitude.")
+    corridor_m: Annotated[float, Field(allow_inf_nan=False, gt=0, le=MAX_CORRIDOR_M)] = Field(
+        description="Width: half of it to each side. [m]"
+    )
+
+
+class SearchIn(BaseModel):
+    """What to search for; each member narrows further."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "polygon": {
+                        "type": "Polygon",
+                        "coordinates": [[[8.40, 49.00], [8.44, 49.00], [8.42, 49.02], [8.40, 49.00]]],
+                    },
+                    "family": "plate",
+                },
+                {"near": {"lon_deg": 114.1792, "lat_deg": 22.3041}, "nearest": 10, "status": "active"},
+                {
+                    "along": {
+                        "geometry": {"type": "LineString", "coordinates": [[8.40, 49.00], [8.44, 49.01]]},
+                        "corridor_m": 20,
+                    }
+                },
+            ]
+        },
+    )
+
+    bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
+        None, description="west, south, east, north; a west above the east spans the antimeridian. [deg]"
+    )
+    polygon: AnyPolygon | None = Field(None, description="Markers inside or on the edge; up to 10 000 vertices.")
+    near: PlaceIn | None = Field(None, description="With `radius_m`, `nearest` or both.")
+    radius_m: Radius | None = Field(None, description="Geodesic distance from `near`. [m]")
+    nearest: Nearest | None = Field(None, description="How many of the nearest to `near`, nearest first.")
+    along: AlongIn | None = Field(None, description="Markers in the order of a line.")
+    road: Text | None = Field(None, min_length=1, max_length=200)
+    from_m: Metres | None = Field(None, description="Least measure on the road. [m]")
+    to_m: Metres | None = Field(None, description="Greatest measure on the road. [m]")
+    code: Text | None = Field(None, min_length=1, max_length=64)
+    status: Status | None = None
+    family: Literal["plate", "magnet", "cerpm"] | None = None
+
+
+class AlongOut(BaseModel):
+    """Where a marker is along the line that was searched."""
+
+    distance_m: float
+    offset_m: float
+    ambiguous: bool
+
+
+class _Found(BaseModel):
+    distance_m: float | None = Field(None, description="From the place that was searched from. [m]")
+    along: AlongOut | None = None
+
+
+class FoundPlate(MarkerOut, _Found):
+    """A plate that was found."""
+
+
+class FoundMagnets(MagnetMarkerSummary, _Found):
+    """Magnets that were found."""
+
+
+class FoundCerpm(CerpmMarkerOut, _Found):
+    """A CERPM that was found."""
+
+
+class MarkerPage(BaseModel):
+    """A page of markers; the Link header leads to the next one."""
+
+    items: list[FoundPlate | FoundMagnets | FoundCerpm]
