@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import sqlalchemy as sa
 
-from app.registry.audit import AuditEntry, add_versions
+from app.registry.audit import AuditEntry
+from app.registry.bulk_load import large_load, load_rows
 from app.registry.markers import PUBLIC, MarkerFilter, Row, list_markers
 from app.registry.spatial import Box, box_around, within_box
-from app.registry.tables import markers
+from app.registry.tables import marker_versions, markers
 
 _CHUNK = 500
 _INSERT = 2000
@@ -48,7 +50,8 @@ def list_by_digits(connection: sa.Connection, family: str, digits: Sequence[str]
         markers.c.id, markers.c.agency_id, markers.c.digits, markers.c.n, markers.c.scheme, markers.c.status,
         markers.c.lon_deg, markers.c.lat_deg, markers.c.digits_match_position,
     )  # fmt: skip
-    wanted = sorted(set(digits))
+    known = sa.select(sa.literal(1)).where(markers.c.family == family).limit(1)
+    wanted = sorted(set(digits)) if digits and connection.execute(known).first() is not None else []
     for start in range(0, len(wanted), _CHUNK):
         query = sa.select(*columns).where(
             markers.c.digits.in_(wanted[start : start + _CHUNK]), markers.c.family == family
@@ -71,12 +74,17 @@ def add_markers(
     names = [str(column.name) for column in PUBLIC]
     for start in range(0, len(rows), _INSERT):
         chunk = rows[start : start + _INSERT]
-        connection.execute(sa.insert(markers), [{"agency_id": entry.agency_id, **row} for row in chunk])
+        load_rows(connection, markers, [{"agency_id": entry.agency_id, **row} for row in chunk])
         versions = []
         for row in chunk:
             marker = {name: row.get(name) for name in names}
             versions.append(entry.version(row["id"], 1, marker, kind=kind(row["status"]), why=why))
-        add_versions(connection, versions)
+        load_rows(connection, marker_versions, versions)
+
+
+def many_markers(connection: sa.Connection, rows: int) -> AbstractContextManager[None]:
+    """Within it `add_markers` stores about this many, in several calls; the indexes may be filled at its end."""
+    return large_load(connection, (markers, marker_versions), rows)
 
 
 def walk_markers(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -23,15 +22,16 @@ from app.registry.exchange.compare import Comparison, check_residuals, compare_s
 from app.registry.exchange.declaration import ImportDeclaration
 from app.registry.exchange.place import PlacedSurvey, place_survey
 from app.registry.exchange.place_checks import NEAR_M, Neighbours, check_place
-from app.registry.exchange.read import row_flags
 from app.registry.exchange.shape_checks import check_shape
 from app.registry.exchange.table import Fault, Severity, SurveyTable
+from app.registry.ids import new_ids
 from app.registry.spatial import Box
 from app.services.access import Caller
 from app.services.audit import author_of
 from app.services.cerpm_markers import Cerpms
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
-from app.services.import_rows import MarkerDefaults, PreparedRow, common_columns, prepare_rows, settle_codes
+from app.services.import_codes import RowCodes, Rows, settle_codes
+from app.services.import_rows import MarkerDefaults, check_values, common_columns, marker_columns, read_codes
 from app.services.marker_rules import PLANNED, MarkerFamily, MarkerRules
 from app.services.plate_markers import Plates
 from app.services.ports import Clock
@@ -43,6 +43,7 @@ MAX_FAULTS = 1000
 _KNOWN_M = 5_000.0
 _NEIGHBOURS = 50_000
 _BUSY_WAIT_S = 10.0
+_PART = 5_000
 _MARGIN_DEG = NEAR_M / 90_000.0
 
 
@@ -141,8 +142,9 @@ class _Running:
     ) -> None:
         self._caller, self._given, self._survey, self._now = caller, given, survey, now
         self._sha256, self._rules = sha256, rules
-        self._faults: list[Fault] = [*survey.table.faults, *check_shape(survey)]
-        self._prepared: list[PreparedRow] = []
+        self._faults = survey.table.faults
+        self._faults.add(check_shape(survey))
+        self._codes: RowCodes | None = None
         self._known: list[Any] = []
         self._comparison: Comparison | None = None
         self._stored = 0
@@ -151,7 +153,7 @@ class _Running:
         """Hold the survey against the registry's places."""
         neighbours = self._neighbours(connection)
         is_known = partial(self._is_known, connection)
-        self._faults += check_place(self._survey, self._given.declaration, neighbours, is_known)
+        self._faults.add(check_place(self._survey, self._given.declaration, neighbours, is_known))
 
     def prepare(self, connection: sa.Connection) -> None:
         """What would be stored."""
@@ -159,48 +161,52 @@ class _Running:
         if self._given.declaration.compare:
             self._compare(connection, good)
             return
-        self._prepared, wrong = prepare_rows(
-            self._survey, good, self._given.declaration, self._given.defaults, now=self._now, file_sha256=self._sha256
-        )
-        self._faults += wrong
-        self._faults += settle_codes(
-            connection, self._caller, self._prepared, self._given.declaration.family, self._rules
-        )
-        accepted = set(self._good_rows())
-        self._prepared = [row for row in self._prepared if row.row in accepted]
+        family, defaults = self._given.declaration.family, self._given.defaults
+        is_cerpm = family == "cerpm"
+        self._faults.add(check_values(self._survey, good, self._given.declaration, of_cerpms=is_cerpm))
+        codes, wrong = read_codes(self._survey, self._good_rows(), family, defaults)
+        self._faults.add(wrong)
+        self._faults.add(settle_codes(connection, self._caller, codes, self._survey, defaults.geometry, self._rules))
+        self._codes = codes.of(np.isin(codes.rows, self._good_rows()))
 
     @property
     def is_hopeless(self) -> bool:
         """Whether nothing can be stored, whatever the codes are."""
-        return self._refuses_file() or (self._given.mode == ALL and len(self._good_rows()) < self._survey.table.rows)
+        return self._faults.refuses_file or (
+            self._given.mode == ALL and len(self._good_rows()) < self._survey.table.rows
+        )
 
     @property
     def is_refused(self) -> bool:
         """Whether nothing is to be stored."""
-        return self.is_hopeless or not self._good_rows()
+        return self.is_hopeless or not len(self._good_rows())
 
     def store(self, connection: sa.Connection, family: MarkerFamily[Any, Any]) -> None:
         """Store what was prepared."""
         if self._given.declaration.compare:
             self._resurvey(connection, family)
             return
-        with self._recording(connection) as entry:
-            bulk.add_markers(
-                connection,
-                entry,
-                [row.columns for row in self._prepared],
-                kind=kind_of_new,
-                why=self._given.reason or f"import of {self._sha256[:12]}",
-            )
-        self._stored = len(self._prepared)
+        assert self._codes is not None
+        why = self._given.reason or f"import of {self._sha256[:12]}"
+        total = len(self._codes.rows)
+        with self._recording(connection) as entry, bulk.many_markers(connection, total):
+            for number, start in enumerate(range(0, total, _PART)):
+                part = self._codes.of(slice(start, start + _PART))
+                ids = new_ids(self._now, len(part.rows), number)
+                rows = marker_columns(
+                    self._survey, part, self._given.declaration, self._given.defaults,
+                    ids=ids, now=self._now, file_sha256=self._sha256,
+                )  # fmt: skip
+                bulk.add_markers(connection, entry, rows, kind=kind_of_new, why=why)
+                self._stored += len(rows)
 
     def report(self, outcome: str) -> dict[str, Any]:
         """What is to be said of the import."""
         table, placed = self._survey.table, self._survey.placed
-        refused = row_flags(self._faults, table.rows, Severity.REFUSED)
-        warned = row_flags(self._faults, table.rows, Severity.WARNING)
-        shown = sorted(self._faults, key=lambda fault: (fault.severity, fault.row or 0))
-        good = 0 if self._refuses_file() else int((~refused & placed.placed).sum())
+        refused = self._faults.flags(table.rows, Severity.REFUSED)
+        warned = self._faults.flags(table.rows, Severity.WARNING)
+        shown = self._faults.shown(MAX_FAULTS)
+        good = 0 if self._faults.refuses_file else int((~refused & placed.placed).sum())
         lon, lat = placed.lon_deg[placed.placed], placed.lat_deg[placed.placed]
         return {
             "outcome": outcome,
@@ -219,22 +225,19 @@ class _Running:
             "extent_deg": [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]
             if len(lon)
             else None,
-            "counts": dict(Counter(fault.code for fault in self._faults)),
+            "counts": dict(self._faults.counts),
             "comparison": self._comparison_document(),
-            "faults": [{**fault._asdict(), "severity": str(fault.severity)} for fault in shown[:MAX_FAULTS]],
-            "faults_left_out": max(len(shown) - MAX_FAULTS, 0),
+            "faults": [{**fault._asdict(), "severity": str(fault.severity)} for fault in shown],
+            "faults_left_out": len(self._faults) - len(shown),
         }
 
     # --- steps ------------------------------------------------------------------------------------------------------
 
-    def _refuses_file(self) -> bool:
-        return any(fault.row is None and fault.severity is Severity.REFUSED for fault in self._faults)
-
-    def _good_rows(self) -> list[int]:
-        if self._refuses_file():
-            return []
-        refused = row_flags(self._faults, self._survey.table.rows, Severity.REFUSED)
-        return [int(row) for row in np.flatnonzero(~refused & self._survey.placed.placed)]
+    def _good_rows(self) -> Rows:
+        if self._faults.refuses_file:
+            return np.empty(0, dtype=np.intp)
+        refused = self._faults.flags(self._survey.table.rows, Severity.REFUSED)
+        return np.flatnonzero(~refused & self._survey.placed.placed)
 
     def _is_known(self, connection: sa.Connection, lon_deg: float, lat_deg: float) -> bool:
         return bulk.is_any_near(connection, self._caller.agency_id, lon_deg, lat_deg, _KNOWN_M)
@@ -259,7 +262,7 @@ class _Running:
             tuple(row["vertical_datum"] for row in found),
         )
 
-    def _compare(self, connection: sa.Connection, good: Sequence[int]) -> None:
+    def _compare(self, connection: sa.Connection, good: Rows) -> None:
         declaration = self._given.declaration
         codes = self._survey.table.texts.get("code")
         if declaration.match == "code" and codes is None:
@@ -279,13 +282,13 @@ class _Running:
             )
         lon, lat, height = _places(self._known)
         self._comparison = compare_survey(self._survey, lon, lat, height, matched)
-        self._faults += check_residuals(self._comparison, declaration.tolerance_m)
+        self._faults.add(check_residuals(self._comparison, declaration.tolerance_m))
 
-    def _by_code(self, connection: sa.Connection, codes: Sequence[str | None], good: Sequence[int]) -> Any:
+    def _by_code(self, connection: sa.Connection, codes: Sequence[str], good: Rows) -> Any:
         """Index of the marker that each row names: of several with the same digits the nearest."""
-        named = {codes[row] for row in good}
+        named = {codes[row] for row in good.tolist()}
         family, agency_id = self._given.declaration.family, self._caller.agency_id
-        found = bulk.list_by_digits(connection, family, [code for code in named if code is not None])
+        found = bulk.list_by_digits(connection, family, [code for code in named if code])
         ids = [row["id"] for row in found if row["agency_id"] == agency_id and row["status"] != "retired"]
         self._known = list(store.get_markers(connection, agency_id, ids))
         by_digits: dict[str, list[int]] = {}
@@ -294,13 +297,13 @@ class _Running:
         placed = self._survey.placed
         matched = np.full(self._survey.table.rows, -1, dtype=np.intp)
         used: set[int] = set()
-        for row in good:
-            candidates = by_digits.get(codes[row] or "", [])
+        for row in good.tolist():
+            candidates = by_digits.get(codes[row], [])
             if candidates:
                 lon, lat = placed.lon_deg[row], placed.lat_deg[row]
                 best = min(candidates, key=lambda k: _square_deg(self._known[k], lon, lat))
                 if best in used:
-                    self._faults.append(Fault(row + 1, "code", "duplicate_code", "another row has the same code"))
+                    self._faults.add([Fault(row + 1, "code", "duplicate_code", "another row has the same code")])
                 used.add(best)
                 matched[row] = best
         return matched
@@ -308,10 +311,11 @@ class _Running:
     def _resurvey(self, connection: sa.Connection, family: MarkerFamily[Any, Any]) -> None:
         """A new version of every marker that a good row measured."""
         assert self._comparison is not None
-        found = ((self._known[int(self._comparison.matched[index])], index) for index in self._good_rows())
+        rows = self._good_rows()
+        surveyed = common_columns(self._survey, rows, self._given.declaration, file_sha256=self._sha256)
+        markers = [self._known[k] for k in self._comparison.matched[rows].tolist()]
         with self._recording(connection) as entry:
-            for marker, index in sorted(found, key=lambda pair: str(pair[0]["id"])):
-                columns = common_columns(self._survey, index, self._given.declaration, file_sha256=self._sha256)
+            for marker, columns in sorted(zip(markers, surveyed, strict=True), key=lambda pair: str(pair[0]["id"])):
                 kept = ("family", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")
                 values = {name: v for name, v in columns.items() if name not in kept}
                 values["status"] = self._given.declaration.status or "surveyed"

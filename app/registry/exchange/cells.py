@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from app.registry.exchange.table import Fault, Floats
+from app.registry.exchange.table import Fault, Floats, Texts
 
 _PLAIN = re.compile(r"[ \t]*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?[ \t]*")
+_PART = 10_000
 _STRANGE = re.compile(r"[^0-9+\-.eE \x00]")
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+\s*")
 _GROUPED = re.compile(r"\s*[+-]?[0-9]{1,3}(?:[,' \u00a0\u2009][0-9]{3})+(?:\.[0-9]*)?\s*")
@@ -23,12 +24,12 @@ _HEMISPHERE = re.compile(r"\s*(?:([NSEWO])\s*([0-9.]+)|([0-9.]+)\s*°?\s*([NSEWO
 _WITH_UNIT = re.compile(r"\s*([+-]?[0-9.]+)\s*(m|ft|us-?ft|sft|feet|'|cm|mm|km)\.?\s*", re.IGNORECASE)
 
 
-def read_numbers(cells: Sequence[Any], field: str, *, decimal: str = ".", required: bool) -> tuple[Floats, list[Fault]]:
+def read_numbers(cells: Any, field: str, *, decimal: str = ".", required: bool) -> tuple[Floats, list[Fault]]:
     """Numbers of a column, shape (N,); NaN and a fault where a cell holds none.
 
     Parameters
     ----------
-    cells : sequence of str, float or None
+    cells : sequence of str, float or None, Texts, or ndarray
     field : str
         Name of the column in faults.
     decimal : str
@@ -36,29 +37,38 @@ def read_numbers(cells: Sequence[Any], field: str, *, decimal: str = ".", requir
     required : bool
         An empty cell is a fault.
     """
-    fast = _read_fast(cells, decimal)
-    if fast is not None:
-        return fast, []
+    if isinstance(cells, np.ndarray) and cells.dtype.kind in "fi" and np.isfinite(cells).all():
+        return cells.astype(np.float64), []
     values = np.full(len(cells), np.nan)
     faults: list[Fault] = []
-    for index, cell in enumerate(cells):
-        value = _read_one(cell, field, index + 1, decimal, required)
-        if isinstance(value, Fault):
-            faults.append(value)
+    start = 0
+    for part in _parts(cells):
+        fast = _read_fast(part) if decimal == "." else None
+        if fast is not None:
+            values[start : start + len(part)] = fast
         else:
-            values[index] = value
+            for index, cell in enumerate(part, start):
+                value = _read_one(cell, field, index + 1, decimal, required)
+                if isinstance(value, Fault):
+                    faults.append(value)
+                else:
+                    values[index] = value
+        start += len(part)
     return values, faults
 
 
-def _read_fast(cells: Any, decimal: str) -> Floats | None:
+def _parts(cells: Sequence[Any]) -> Iterator[Sequence[Any]]:
+    if isinstance(cells, Texts):
+        return cells.parts()
+    return (cells[start : start + _PART] for start in range(0, len(cells), _PART))
+
+
+def _read_fast(cells: Sequence[Any]) -> Floats | None:
     """All cells at once where they are plain numbers: a million rows go through here."""
     try:
-        if isinstance(cells, np.ndarray) and cells.dtype.kind in "fi":
-            values = cells.astype(np.float64)
-        elif decimal == "." and not _STRANGE.search("\x00".join(cells)):
-            values = np.array(cells, dtype=np.float64)
-        else:
+        if _STRANGE.search("\x00".join(cells)):
             return None
+        values = np.array(cells, dtype=np.float64)
     except (TypeError, ValueError):
         return None
     return values if np.isfinite(values).all() else None

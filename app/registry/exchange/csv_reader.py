@@ -7,11 +7,12 @@ import io
 import re
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import islice
 
 from app.errors import UnreadableUpload
 from app.registry.exchange.declaration import ImportDeclaration
-from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, SourceTable
+from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable, Texts
 
 PNEZD = ("point", "northing", "easting", "height", "description")
 PENZD = ("point", "easting", "northing", "height", "description")
@@ -19,6 +20,7 @@ _DELIMITERS = (";", "\t", ",")
 _MAX_FIELD = 10_000
 _NUMERIC = re.compile(r"\s*[+-]?[0-9][0-9.,]*\s*")
 _SAMPLE_LINES = 50
+_BATCH = 10_000
 
 
 def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
@@ -29,8 +31,12 @@ def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
     UnreadableUpload
         It is not UTF-8, holds NUL or fields without end, names no columns or one twice, or has too many.
     """
-    text = _decode(data)
-    rows = _rows(text, declaration)
+    with _utf8(data):
+        return _read(data, declaration)
+
+
+def _read(data: bytes, declaration: ImportDeclaration) -> SourceTable:
+    rows = _rows(data, declaration)
     first = next(rows, None)
     if first is None:
         raise UnreadableUpload("the file has no rows", field="file", limit="one row at least", cure="send the survey")
@@ -44,25 +50,36 @@ def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
     return _columns(names, rows, last_takes_rest=False)
 
 
-def _decode(data: bytes) -> str:
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise UnreadableUpload(
-            f"byte {error.start} of the file is not UTF-8", field="file", limit="UTF-8", cure="save the file as UTF-8"
-        ) from error
-    if "\x00" in text:
+def _text(data: bytes) -> io.TextIOWrapper:
+    if b"\x00" in data:
         raise UnreadableUpload("the file holds NUL", field="file", limit="text", cure="save the file as UTF-8 text")
-    return text
+    return io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", newline="")
 
 
-def _rows(text: str, declaration: ImportDeclaration) -> Iterator[list[str]]:
-    delimiter = declaration.delimiter or _delimiter(text, declaration.decimal)
+@contextmanager
+def _utf8(data: bytes) -> Iterator[None]:
+    try:
+        yield
+    except UnicodeDecodeError as error:
+        start = 0
+        try:
+            data.decode("utf-8-sig")
+        except UnicodeDecodeError as whole:  # says where in the file, not where in what was read last
+            start = whole.start
+        raise UnreadableUpload(
+            f"byte {start} of the file is not UTF-8", field="file", limit="UTF-8", cure="save the file as UTF-8"
+        ) from error
+
+
+def _rows(data: bytes, declaration: ImportDeclaration) -> Iterator[list[str]]:
+    delimiter = declaration.delimiter or _delimiter(data, declaration.decimal)
+    text = _text(data)
     if delimiter == "space":
-        yield from (line.split() for line in text.splitlines() if line.strip())
+        text.reconfigure(newline=None)
+        yield from (line.split() for line in text if line.strip())
         return
     csv.field_size_limit(_MAX_FIELD)
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    reader = csv.reader(text, delimiter=delimiter, strict=True)
     try:
         for row in reader:
             if row and any(row):
@@ -76,9 +93,9 @@ def _rows(text: str, declaration: ImportDeclaration) -> Iterator[list[str]]:
         ) from error
 
 
-def _delimiter(text: str, decimal: str) -> str:
+def _delimiter(data: bytes, decimal: str) -> str:
     """The delimiter that splits most of the first lines into the same number of fields."""
-    lines = [line for line in islice(io.StringIO(text), _SAMPLE_LINES) if line.strip()]
+    lines = [line for line in islice(_text(data), _SAMPLE_LINES) if line.strip()]
     candidates = [mark for mark in _DELIMITERS if not (mark == "," and decimal == ",")]
     best, score = "space", 0
     for mark in candidates:
@@ -113,25 +130,33 @@ def _check_names(names: tuple[str, ...]) -> None:
 
 
 def _columns(names: tuple[str, ...], rows: Iterator[list[str]], *, last_takes_rest: bool) -> SourceTable:
-    kept: list[list[str]] = []
-    faults: list[Fault] = []
+    columns = tuple(Texts() for _ in names)
+    faults = Faults()
     width = len(names)
-    for number, row in enumerate(rows, 1):
-        if number > MAX_ROWS:
+    for start, batch in _batches(rows):
+        for k, row in enumerate(batch):
+            if len(row) != width:
+                if last_takes_rest and len(row) > width:
+                    batch[k] = [*row[: width - 1], ",".join(row[width - 1 :])]
+                elif last_takes_rest and len(row) >= width - 2:
+                    batch[k] = row + [""] * (width - len(row))
+                else:
+                    faults.add([_ragged(start + k + 1, len(row), width)])
+                    batch[k] = [""] * width
+        for column, cells in zip(columns, zip(*batch, strict=True), strict=True):
+            column.extend(cells)
+    return SourceTable("csv", names, columns, faults=faults)
+
+
+def _batches(rows: Iterator[list[str]]) -> Iterator[tuple[int, list[list[str]]]]:
+    start = 0
+    while batch := list(islice(rows, _BATCH)):
+        if start + len(batch) > MAX_ROWS:
             raise UnreadableUpload(
                 f"the file has more than {MAX_ROWS} rows", field="file", limit=f"{MAX_ROWS} rows", cure="cut it"
             )
-        if len(row) != width:
-            if last_takes_rest and len(row) > width:
-                row = [*row[: width - 1], ",".join(row[width - 1 :])]
-            elif last_takes_rest and len(row) >= width - 2:
-                row = row + [""] * (width - len(row))
-            else:
-                faults.append(_ragged(number, len(row), width))
-                row = [""] * width
-        kept.append(row)
-    columns = tuple(list(column) for column in zip(*kept, strict=True)) if kept else tuple([] for _ in names)
-    return SourceTable("csv", names, columns, faults=tuple(faults))
+        yield start, batch
+        start += len(batch)
 
 
 def _ragged(number: int, count: int, width: int) -> Fault:

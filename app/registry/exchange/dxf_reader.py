@@ -10,7 +10,7 @@ from ezdxf.filemanagement import read
 from ezdxf.lldxf.const import DXFError
 
 from app.errors import UnreadableUpload
-from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, SourceTable
+from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable
 
 _UNITS = {2: "ft-intl", 6: "m", 21: "ft-us"}
 _UNITLESS = 0
@@ -49,7 +49,7 @@ def read_dxf(data: bytes, layer: str | None) -> SourceTable:
     names = tuple(dict.fromkeys(name for row in rows for name in row))[:MAX_COLUMNS]
     xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
     columns = tuple([row.get(name) for row in rows] for name in names)
-    return SourceTable("dxf", names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), unit=unit, faults=tuple(faults))
+    return SourceTable("dxf", names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), unit=unit, faults=Faults(faults))
 
 
 def _unit(code: Any) -> str | None:

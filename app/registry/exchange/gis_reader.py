@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import shapely
-from pyogrio import raw  # type: ignore[import-untyped]
+from pyogrio import raw, read_info  # type: ignore[import-untyped]
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, SourceTable
+from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable, Texts
 
 _SQLITE = b"SQLite format 3\x00"
 _SHAPEFILE_CODE = 9994
@@ -24,6 +24,7 @@ _PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg")
 _MAX_MEMBERS = 50
 MAX_INFLATED = 512 * 1024**2
 _POINT = 0
+_PART = 100_000
 
 
 def read_gpkg(data: bytes, layer: str | None) -> SourceTable:
@@ -151,27 +152,47 @@ def _inflated(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 
 
 def _read(kind: str, data: bytes, layer: str | None) -> SourceTable:
+    points: list[Any] = []
+    columns: list[list[Any]] = []
+    faults = Faults()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it warns of names without suffix, which are ours
-            meta, _ids, geometry, fields = raw.read(
-                data, layer=layer, max_features=MAX_ROWS + 1, datetime_as_string=True
-            )
-            if geometry is None:
-                raise _damaged("the layer has no geometry")
-            shapes = shapely.from_wkb(geometry, on_invalid="ignore")
+            info = read_info(data, layer=layer)
+            if info["features"] > MAX_ROWS or len(info["fields"]) > MAX_COLUMNS:
+                raise _too_large()
+            for start in range(0, max(info["features"], 1), _PART):
+                _meta, _ids, geometry, fields = raw.read(
+                    data, layer=layer, skip_features=start, max_features=_PART, datetime_as_string=True
+                )
+                if geometry is None:
+                    raise _damaged("the layer has no geometry")
+                xyz, wrong = _points(shapely.from_wkb(geometry, on_invalid="ignore"), start)
+                points.append(xyz)
+                columns.append([_plain(column) for column in fields])
+                faults.add(wrong)
     except (RuntimeError, ValueError, IndexError) as error:  # what GDAL says of damage comes as any of these
         raise _damaged(f"the file cannot be read: {str(error)[:200]}") from error
-    if len(shapes) > MAX_ROWS or len(meta["fields"]) > MAX_COLUMNS:
-        raise _too_large()
-    points, faults = _points(shapes)
-    columns = tuple(_plain(column) for column in fields)
-    return SourceTable(
-        kind, tuple(str(n) for n in meta["fields"]), columns, points, crs=_crs_name(meta["crs"]), faults=faults
-    )
+    x, y, z = (np.concatenate(parts) for parts in zip(*points, strict=True))
+    names = tuple(str(name) for name in info["fields"])
+    joined = tuple(_joined([part[k] for part in columns]) for k in range(len(names)))
+    return SourceTable(kind, names, joined, (x, y, z), crs=_crs_name(info["crs"]), faults=faults)
 
 
-def _points(shapes: Any) -> tuple[tuple[Any, Any, Any], tuple[Fault, ...]]:
+def _joined(parts: list[Any]) -> Any:
+    """A column of all parts: numbers as an array, texts as `Texts`, anything else as a list."""
+    if all(isinstance(part, np.ndarray) for part in parts):
+        return np.concatenate(parts)
+    if all(isinstance(part, Texts) for part in parts):
+        whole = Texts()
+        for part in parts:
+            for cells in part.parts():
+                whole.extend(cells)
+        return whole
+    return [value for part in parts for value in part]
+
+
+def _points(shapes: Any, start: int) -> tuple[tuple[Any, Any, Any], list[Fault]]:
     """Coordinates; a multipoint of one point counts as the point."""
     kinds = shapely.get_type_id(shapes)
     single = (kinds == 4) & (shapely.get_num_geometries(shapes) == 1)
@@ -180,17 +201,20 @@ def _points(shapes: Any) -> tuple[tuple[Any, Any, Any], tuple[Fault, ...]]:
     points = np.where(usable, shapes, shapely.Point(np.nan, np.nan))
     x, y, z = shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)
     usable &= np.isfinite(x) & np.isfinite(y)
-    faults = tuple(
-        Fault(int(row) + 1, "geometry", "no_point", "the feature is no point with finite numbers")
+    faults = [
+        Fault(start + int(row) + 1, "geometry", "no_point", "the feature is no point with finite numbers")
         for row in np.flatnonzero(~usable)
-    )
+    ]
     return (x, y, z), faults
 
 
 def _plain(column: Any) -> Any:
     if column.dtype.kind in "fi":
         return column
-    return [None if v is None else v if isinstance(v, str | int | float) else str(v)[:200] for v in column.tolist()]
+    values = column.tolist()
+    if all(isinstance(value, str) and "\x00" not in value for value in values):
+        return Texts(values)
+    return [None if v is None else v if isinstance(v, str | int | float) else str(v)[:200] for v in values]
 
 
 def _crs_name(crs: str | None) -> str | None:

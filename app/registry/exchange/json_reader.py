@@ -8,7 +8,7 @@ import numpy as np
 import orjson
 
 from app.errors import UnreadableUpload
-from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, SourceTable
+from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable
 
 _CURE = "send a FeatureCollection of points"
 
@@ -47,7 +47,7 @@ def read_geojson(data: bytes) -> SourceTable:
     columns = tuple([_plain(_properties(feature).get(name)) for feature in features] for name in names)
     crs = _old_crs(document)
     return SourceTable(
-        "geojson", tuple(names), columns, (points[0], points[1], points[2]), crs=crs, faults=tuple(faults)
+        "geojson", tuple(names), columns, (points[0], points[1], points[2]), crs=crs, faults=Faults(faults)
     )
 
 

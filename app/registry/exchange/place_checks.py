@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,30 +42,25 @@ class Neighbours:
 
 def check_place(
     survey: PlacedSurvey, declaration: ImportDeclaration, neighbours: Neighbours, is_known: IsKnownPlace
-) -> list[Fault]:
+) -> Iterator[Fault]:
     """Faults that the declared area, the CRS and the registered markers show."""
-    faults = _check_range(survey)
+    yield from _check_range(survey)
     outside = _outside(survey, declaration)
-    faults += [
-        Fault(int(row) + 1, "position", "outside_area", "the row lies outside the declared area", _row_cure())
-        for row in np.flatnonzero(outside)
-    ]
-    faults += _check_whole(survey, declaration, outside, is_known, near=len(neighbours.lon_deg) > 0)
-    faults += _check_height_range(survey, declaration)
-    if not survey.placed.placed.any():
-        return faults
-    return faults + _check_neighbours(survey, declaration, neighbours, is_known)
+    for row in np.flatnonzero(outside):
+        yield Fault(int(row) + 1, "position", "outside_area", "the row lies outside the declared area", _row_cure())
+    yield from _check_whole(survey, declaration, outside, is_known, near=len(neighbours.lon_deg) > 0)
+    yield from _check_height_range(survey, declaration)
+    if survey.placed.placed.any():
+        yield from _check_neighbours(survey, declaration, neighbours, is_known)
 
 
-def _check_range(survey: PlacedSurvey) -> list[Fault]:
+def _check_range(survey: PlacedSurvey) -> Iterator[Fault]:
     """Rows whose numbers are read and still lead nowhere."""
     table = survey.table
     lost = np.isfinite(table.first) & np.isfinite(table.second) & ~survey.placed.placed
     message = f"the coordinates lie outside the range or the area of use of {table.crs}"
-    return [
-        Fault(int(row) + 1, "position", "outside_crs", message, _row_cure(table.first[row], table.second[row]))
-        for row in np.flatnonzero(lost)
-    ]
+    for row in np.flatnonzero(lost):
+        yield Fault(int(row) + 1, "position", "outside_crs", message, _row_cure(table.first[row], table.second[row]))
 
 
 def _row_cure(first: float = 0.0, second: float = 0.0) -> str:
@@ -131,39 +126,37 @@ def _whole(hit: Alternative | None, message: str, code: str, cure: str) -> Fault
     return Fault(None, "position", hit.code, message, f"{hit.proposal}; the survey then fits")
 
 
-def _check_height_range(survey: PlacedSurvey, declaration: ImportDeclaration) -> list[Fault]:
+def _check_height_range(survey: PlacedSurvey, declaration: ImportDeclaration) -> Iterator[Fault]:
     if declaration.height_range_m is None:
-        return []
+        return
     low, high = declaration.height_range_m
     with np.errstate(invalid="ignore"):
         outside = np.flatnonzero((survey.height_m < low) | (survey.height_m > high))
     cure = "check the unit of the heights and what they are above (geoid or ellipsoid)"
-    return [
-        Fault(
-            int(row) + 1, "height", "height_out_of_range",
-            f"the height {survey.height_m[row]:.2f} m is outside {low:g} to {high:g} m", cure,
-        )
-        for row in outside
-    ]  # fmt: skip
+    for row in outside:
+        message = f"the height {survey.height_m[row]:.2f} m is outside {low:g} to {high:g} m"
+        yield Fault(int(row) + 1, "height", "height_out_of_range", message, cure)
 
 
 def _check_neighbours(
     survey: PlacedSurvey, declaration: ImportDeclaration, neighbours: Neighbours, is_known: IsKnownPlace
-) -> list[Fault]:
+) -> Iterator[Fault]:
     rows = np.flatnonzero(survey.placed.placed)
     points = np.column_stack([survey.east_m[rows], survey.north_m[rows]])
     others = np.column_stack(local_m(neighbours.lon_deg, neighbours.lat_deg, survey.origin_deg))
     if not len(others):
-        return _only_coarse(declaration, known=is_known(*survey.origin_deg))
+        yield from _only_coarse(declaration, known=is_known(*survey.origin_deg))
+        return
     k = min(3, len(others))
     distance, index = nearest_of(points, others, k)
     close = distance[:, 0] <= NEAR_M
     if close.mean() < 0.3:
-        return _only_coarse(declaration, known=True)
-    faults = [] if declaration.compare else _check_already_there(rows, distance[:, 0])
-    faults += _check_beside(points[close], others[index[close]], distance[close])
-    faults += _check_heights(survey, declaration, neighbours, rows[close], distance[close], index[close])
-    return faults
+        yield from _only_coarse(declaration, known=True)
+        return
+    if not declaration.compare:
+        yield from _check_already_there(rows, distance[:, 0])
+    yield from _check_beside(points[close], others[index[close]], distance[close])
+    yield from _check_heights(survey, declaration, neighbours, rows[close], distance[close], index[close])
 
 
 def _only_coarse(declaration: ImportDeclaration, *, known: bool) -> list[Fault]:
@@ -181,15 +174,15 @@ def _only_coarse(declaration: ImportDeclaration, *, known: bool) -> list[Fault]:
     ]  # fmt: skip
 
 
-def _check_already_there(rows: np.ndarray[tuple[int], np.dtype[np.intp]], distance_m: Floats) -> list[Fault]:
-    return [
+def _check_already_there(rows: np.ndarray[tuple[int], np.dtype[np.intp]], distance_m: Floats) -> Iterator[Fault]:
+    return (
         warn(
             int(rows[k]) + 1, "position", "marker_already_there",
             f"a registered marker lies {distance_m[k]:.2f} m from here",
             "declare compare if the survey measures registered markers",
         )
         for k in np.flatnonzero(distance_m <= _THERE_M)
-    ]  # fmt: skip
+    )  # fmt: skip
 
 
 def _check_beside(points: Floats, nearest: Floats, distance_m: Floats) -> list[Fault]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,17 @@ from app.registry.exchange.cells import read_numbers
 from app.registry.exchange.csv_reader import read_csv
 from app.registry.exchange.declaration import FORMATS, METRES, NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
 from app.registry.exchange.json_reader import read_geojson
-from app.registry.exchange.table import MAX_TEXT, Fault, Floats, Severity, SourceTable, SurveyTable
+from app.registry.exchange.table import (
+    MAX_TEXT,
+    Fault,
+    Faults,
+    Flags,
+    Floats,
+    Severity,
+    SourceTable,
+    SurveyTable,
+    Texts,
+)
 
 _NAMES = {
     "lon_deg": ("lon_deg", "lon", "longitude", "long", "lng"),
@@ -90,8 +99,8 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration) -> SurveyTa
     if not source.rows:
         raise UnreadableUpload("the file has no points", field="file", limit="one row at least", cure="send the survey")
     places = {role: _find_column(source, role, declaration) for role in (*_NAMES, *TEXT_ROLES, *NUMBER_ROLES)}
-    faults = list(source.faults)
-    broken = {fault.row for fault in faults}
+    faults = source.faults
+    broken = source.faults.flags(source.rows, Severity.REFUSED)
     height: Floats | None
     if source.points is not None:
         first, second, z = source.points
@@ -103,7 +112,7 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration) -> SurveyTa
     crs, system = _crs(source, declaration, projected)
     unit, height_unit = _units(source, declaration, system, has_height=height is not None)
     _check_datum(declaration, has_height=height is not None)
-    faults += _unit_names(source, places, unit, height_unit, height_name)
+    faults.add(_unit_names(source, places, unit, height_unit, height_name))
     texts = {role: _texts(source, places[role]) for role in TEXT_ROLES if places[role] is not None}
     numbers: dict[str, Floats] = {}
     for role in NUMBER_ROLES:
@@ -111,10 +120,10 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration) -> SurveyTa
             numbers[role], wrong = read_numbers(
                 source.columns[column], role, decimal=declaration.decimal, required=False
             )
-            faults += wrong
+            faults.add(wrong)
     return SurveyTable(
         source.format, first, second, height, bool(system.is_projected), crs, unit, height_unit, texts, numbers,
-        tuple(faults),
+        faults,
     )  # fmt: skip
 
 
@@ -138,8 +147,8 @@ def _coordinates(
     source: SourceTable,
     declaration: ImportDeclaration,
     places: dict[str, int | None],
-    faults: list[Fault],
-    broken: set[int | None],
+    faults: Faults,
+    broken: Flags,
 ) -> tuple[Floats, Floats, Floats | None, bool, str]:
     pairs = (("lon_deg", "lat_deg"), ("easting", "northing"))
     declared = [pair for pair in pairs if pair[0] in declaration.columns or pair[1] in declaration.columns]
@@ -156,12 +165,12 @@ def _coordinates(
         column = places[role]
         assert column is not None
         read, wrong = read_numbers(source.columns[column], role, decimal=declaration.decimal, required=True)
-        faults += [fault for fault in wrong if fault.row not in broken]
+        faults.add(fault for fault in wrong if not broken[(fault.row or 1) - 1])
         values.append(read)
     height, name = None, "height"
     if (column := places["height"]) is not None and not declaration.ignore_heights:
         height, wrong = read_numbers(source.columns[column], "height", decimal=declaration.decimal, required=False)
-        faults += [fault for fault in wrong if fault.row not in broken]
+        faults.add(fault for fault in wrong if not broken[(fault.row or 1) - 1])
         name = source.names[column]
         if np.isnan(height).all():
             height = None
@@ -275,27 +284,23 @@ def _unit_names(
     return faults
 
 
-def _texts(source: SourceTable, column: int | None) -> list[str | None]:
+def _texts(source: SourceTable, column: int | None) -> Texts:
     assert column is not None
-    return [_text(value) for value in source.columns[column]]
+    cells = source.columns[column]
+    texts = Texts()
+    for part in cells.parts() if isinstance(cells, Texts) else (cells,):
+        texts.extend([_text(value) for value in part])
+    return texts
 
 
-def _text(value: Any) -> str | None:
+def _text(value: Any) -> str:
     if value is None or (isinstance(value, float) and value != value):
-        return None
+        return ""
     if isinstance(value, float | np.floating) and float(value).is_integer():
         value = int(value)
-    text = str(value).strip()[:MAX_TEXT].replace("\x00", "")
-    return text or None
+    return str(value).strip()[:MAX_TEXT].replace("\x00", "")
 
 
 def warn(row: int | None, field: str, code: str, message: str, proposal: str | None = None) -> Fault:
     """A fault that refuses nothing."""
     return Fault(row, field, code, message, proposal, Severity.WARNING)
-
-
-def row_flags(faults: Sequence[Fault], rows: int, severity: Severity) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Which rows have a fault of this severity, shape (N,)."""
-    flags = np.zeros(rows, dtype=bool)
-    flags[[fault.row - 1 for fault in faults if fault.row is not None and fault.severity is severity]] = True
-    return flags

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,28 +28,30 @@ _HEIGHTS_M = (-500.0, 9000.0)
 _GRADE = 0.15
 _ROUNDED_ROWS = 5
 _HEIGHT_STEP_M = 2.0
+_PART = 100_000
 _NO_DATA = (-9999.0, -99999.0, -32768.0, 9999.0, 99999.0)
 
 
-def check_shape(survey: PlacedSurvey) -> list[Fault]:
+def check_shape(survey: PlacedSurvey) -> Iterator[Fault]:
     """Faults that the rows of a survey show by themselves."""
     rows = np.flatnonzero(survey.placed.placed)
     points = np.column_stack([survey.east_m[rows], survey.north_m[rows]])
-    faults = [*_check_zeros(survey), *_check_rounding(survey)]
+    yield from _check_zeros(survey)
+    yield from _check_rounding(survey)
     if len(rows) >= 2:
-        faults += _check_pairs(points, rows)
-    if len(rows) >= 6:
-        order = _order(points)
-        faults += _check_line(points[order], rows[order])
-    return faults + check_heights(survey)
+        distance_m, nearest = nearest_others(points)
+        yield from _check_pairs(distance_m, nearest, rows)
+        if len(rows) >= 6:
+            order = _order(points, float(np.median(distance_m)))
+            yield from _check_line(points[order], rows[order])
+    yield from check_heights(survey)
 
 
-def _check_zeros(survey: PlacedSurvey) -> list[Fault]:
+def _check_zeros(survey: PlacedSurvey) -> Iterator[Fault]:
     zero = (survey.table.first == 0) | (survey.table.second == 0)
-    return [
-        Fault(int(row) + 1, "position", "zero_coordinate", "a coordinate is exactly 0", "fill it in or leave it out")
-        for row in np.flatnonzero(zero)
-    ]
+    cure = "fill it in or leave it out"
+    for row in np.flatnonzero(zero):
+        yield Fault(int(row) + 1, "position", "zero_coordinate", "a coordinate is exactly 0", cure)
 
 
 def _check_rounding(survey: PlacedSurvey) -> list[Fault]:
@@ -65,31 +68,26 @@ def _check_rounding(survey: PlacedSurvey) -> list[Fault]:
     return faults
 
 
-def _check_pairs(points: Floats, rows: npt.NDArray[np.intp]) -> list[Fault]:
+def _check_pairs(nearest_m: Floats, index: npt.NDArray[np.intp], rows: npt.NDArray[np.intp]) -> Iterator[Fault]:
     """Rows at the same place, and rows far from all others."""
-    distance, index = nearest_of(points, points, 2)
-    nearest = distance[:, 1]
-    faults = []
-    for k in np.flatnonzero(nearest <= _SAME_PLACE_M):
-        other = index[k, 1] if index[k, 1] != k else index[k, 0]
-        if k > other or index[other, 1] != k:
+    for k in np.flatnonzero(nearest_m <= _SAME_PLACE_M):
+        other = index[k]
+        if k > other or index[other] != k:
             message = f"the row lies within {_SAME_PLACE_M:g} m of row {rows[other] + 1}"
-            faults.append(warn(int(rows[k]) + 1, "position", "same_place", message, "leave one of the two out"))
-    usual = float(np.median(nearest))
-    for lone in np.flatnonzero(nearest > max(_ISOLATED_M, 8 * usual)):
-        message = f"the nearest other row is {nearest[lone]:.0f} m away, usually {usual:.1f} m"
+            yield warn(int(rows[k]) + 1, "position", "same_place", message, "leave one of the two out")
+    usual = float(np.median(nearest_m))
+    for lone in np.flatnonzero(nearest_m > max(_ISOLATED_M, 8 * usual)):
+        message = f"the nearest other row is {nearest_m[lone]:.0f} m away, usually {usual:.1f} m"
         proposal = "compare the digits of its coordinates with those of the rows beside it"
-        far = nearest[lone] > max(20_000.0, 200 * usual)
+        far = nearest_m[lone] > max(20_000.0, 200 * usual)
         severity = Severity.REFUSED if far else Severity.WARNING
-        faults.append(Fault(int(rows[lone]) + 1, "position", "isolated", message, proposal, severity))
-    return faults
+        yield Fault(int(rows[lone]) + 1, "position", "isolated", message, proposal, severity)
 
 
-def _order(points: Floats) -> npt.NDArray[np.intp]:
+def _order(points: Floats, nearest_m: float) -> npt.NDArray[np.intp]:
     """The order of the file where it follows a line, else one from neighbour to neighbour."""
     steps = np.hypot(*np.diff(points, axis=0).T)
-    nearest = float(np.median(nearest_of(points, points, 2)[0][:, 1]))
-    if np.median(steps) <= 4 * max(nearest, 1.0) or len(points) > 20_000:
+    if np.median(steps) <= 4 * max(nearest_m, 1.0) or len(points) > 20_000:
         return np.arange(len(points))
     around = nearest_of(points, points, min(16, len(points)))[1]
     left = np.ones(len(points), dtype=bool)
@@ -162,7 +160,7 @@ class _Around:
         return spike
 
 
-def _check_line(points: Floats, rows: npt.NDArray[np.intp]) -> list[Fault]:
+def _check_line(points: Floats, rows: npt.NDArray[np.intp]) -> Iterator[Fault]:
     stride = min(
         (s for s in _STRIDES if len(points) >= 5 * s + 1),
         key=lambda s: float(np.median(_Around.of(points, s).off_m)) + 0.2 * s,
@@ -171,20 +169,16 @@ def _check_line(points: Floats, rows: npt.NDArray[np.intp]) -> list[Fault]:
     off_m, usual = around.off_m, float(np.median(around.off_m))
     step_m = float(np.median(_length(np.diff(points[::stride], axis=0))))
     if usual > 0.5 * step_m or step_m == 0:
-        return []  # no line that a row could be off
+        return  # no line that a row could be off
     regular = around.regular
     threshold = min(max(_LEAST_OFF_M, 6 * usual), _OFF_M)
     flagged = regular & (off_m > threshold) | ~regular & around.straight & around.spike
     found = {int(k) + around.first: float(off_m[k]) for k in np.flatnonzero(flagged)}
     found |= _check_ends(points, stride, found)
-    return [
-        warn(
-            int(rows[k]) + 1, "position", "off_the_line",
-            f"the row is about {off_m:.1f} m from where the rows around it lead",
-            "compare the digits of its coordinates with those of the rows beside it",
-        )
-        for k, off_m in sorted(found.items())
-    ]  # fmt: skip
+    for k, off in sorted(found.items()):
+        message = f"the row is about {off:.1f} m from where the rows around it lead"
+        proposal = "compare the digits of its coordinates with those of the rows beside it"
+        yield warn(int(rows[k]) + 1, "position", "off_the_line", message, proposal)
 
 
 def _check_ends(points: Floats, stride: int, known: dict[int, float]) -> dict[int, float]:
@@ -210,36 +204,41 @@ def _check_ends(points: Floats, stride: int, known: dict[int, float]) -> dict[in
     return {k: float(both[k]) for k in ends if np.isfinite(both[k]) and both[k] > _END_OFF_M and k not in known}
 
 
-def check_heights(survey: PlacedSurvey) -> list[Fault]:
+def check_heights(survey: PlacedSurvey) -> Iterator[Fault]:
     """Heights against each other."""
     if survey.table.height is None:
-        return []
+        return
     height, given = survey.height_m, survey.table.height
-    faults = []
     no_data = np.isin(given, _NO_DATA)
     outside = ~no_data & ((height < _HEIGHTS_M[0]) | (height > _HEIGHTS_M[1]))
     zero = (given == 0) & (abs(float(np.nanmedian(height))) > 5)
     for row in np.flatnonzero(no_data | outside | zero):
         code = "height_out_of_range" if outside[row] else "no_height"
         message = f"the height is {given[row]:g} {survey.table.height_unit}"
-        faults.append(Fault(int(row) + 1, "height", code, message, "leave the cell empty where there is no height"))
+        yield Fault(int(row) + 1, "height", code, message, "leave the cell empty where there is no height")
     usable = np.flatnonzero(np.isfinite(height) & survey.placed.placed & ~(no_data | outside | zero))
-    return faults + _check_steps(survey, usable)
+    yield from _check_steps(survey, usable)
 
 
-def _check_steps(survey: PlacedSurvey, rows: npt.NDArray[np.intp]) -> list[Fault]:
+def _check_steps(survey: PlacedSurvey, rows: npt.NDArray[np.intp]) -> Iterator[Fault]:
     if len(rows) < 3:
-        return []
+        return
     points = np.column_stack([survey.east_m[rows], survey.north_m[rows]])
-    distance, near = nearest_of(points, points, min(5, len(rows)))
     height = survey.height_m[rows]
-    rise = np.abs(height[:, None] - height[near])[:, 1:]
-    steep = rise > _GRADE * distance[:, 1:] + _HEIGHT_STEP_M
-    odd = np.flatnonzero(steep.mean(axis=1) >= 0.5)
-    faults = [_height_fault(int(rows[k]), float(np.median(rise[k]))) for k in odd]
-    if not len(odd) and steep.any():
-        faults.append(_height_fault(int(rows[int(np.argmax(steep.any(axis=1)))]), float(rise[steep].max())))
-    return faults
+    tree: Any = cKDTree(points)
+    odd, most = [], (0.0, -1)
+    for start in range(0, len(rows), _PART):
+        part = slice(start, start + _PART)
+        distance, near = tree.query(points[part], k=min(5, len(rows)))
+        rise = np.abs(height[part, None] - height[near])[:, 1:]
+        steep = rise > _GRADE * distance[:, 1:] + _HEIGHT_STEP_M
+        odd += [(start + int(k), float(np.median(rise[k]))) for k in np.flatnonzero(steep.mean(axis=1) >= 0.5)]
+        if steep.any() and float(rise[steep].max()) > most[0]:
+            most = (float(rise[steep].max()), start + int(np.argmax(steep.any(axis=1))))
+    for k, rise_m in odd:
+        yield _height_fault(int(rows[k]), rise_m)
+    if not odd and most[1] >= 0:
+        yield _height_fault(int(rows[most[1]]), most[0])
 
 
 def _height_fault(row: int, rise_m: float) -> Fault:
@@ -247,6 +246,20 @@ def _height_fault(row: int, rise_m: float) -> Fault:
         row + 1, "height", "height_step", f"the height differs by {rise_m:.1f} m from those of the rows beside it",
         "check the unit and the vertical datum (geoid or ellipsoid) of these rows",
     )  # fmt: skip
+
+
+def nearest_others(points: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
+    """Distance [m] and index of the nearest other point of each, shape (N,)."""
+    tree: Any = cKDTree(points)
+    count = len(points)
+    nearest_m, nearest = np.empty(count), np.empty(count, dtype=np.intp)
+    for start in range(0, count, _PART):
+        part = slice(start, min(start + _PART, count))
+        distance, index = tree.query(points[part], k=2)
+        nearest_m[part] = distance[:, 1]
+        itself = index[:, 1] == np.arange(part.start, part.stop)  # of points at one place it need not come first
+        nearest[part] = np.where(itself, index[:, 0], index[:, 1])
+    return nearest_m, nearest
 
 
 def nearest_of(points: Floats, among: Floats, k: int) -> tuple[Floats, npt.NDArray[np.intp]]:

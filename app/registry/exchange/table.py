@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 MAX_ROWS = 1_000_000
 MAX_COLUMNS = 256
 MAX_TEXT = 500
+KEPT_FAULTS = 1000
+"""Faults of one kind that are kept with their texts; all are counted, and every row's are known."""
+_PART = 10_000
 
 
 class Severity(StrEnum):
@@ -48,6 +53,99 @@ class Fault(NamedTuple):
     severity: Severity = Severity.REFUSED
 
 
+class Faults:
+    """What is wrong with a survey: counted by kind, known of every row, and kept with their texts up to a limit."""
+
+    def __init__(self, faults: Iterable[Fault] = ()) -> None:
+        self.counts: Counter[str] = Counter()
+        self.refuses_file = False
+        self._rows = {severity: bytearray() for severity in Severity}
+        self._kept: dict[tuple[str, Severity], list[Fault]] = {}
+        self.add(faults)
+
+    def add(self, faults: Iterable[Fault]) -> None:
+        """Take note of faults, however many."""
+        for fault in faults:
+            self.counts[fault.code] += 1
+            kept = self._kept.setdefault((fault.code, fault.severity), [])
+            if len(kept) < KEPT_FAULTS:
+                kept.append(fault)
+            if fault.row is None:
+                self.refuses_file |= fault.severity is Severity.REFUSED
+                continue
+            flags = self._rows[fault.severity]
+            if len(flags) < fault.row:
+                flags.extend(bytes(max(fault.row - len(flags), len(flags))))
+            flags[fault.row - 1] = 1
+
+    def flags(self, rows: int, severity: Severity) -> Flags:
+        """Which of the first `rows` rows have a fault of this severity, shape (rows,)."""
+        flags = np.zeros(rows, dtype=bool)
+        known = np.frombuffer(bytes(self._rows[severity]), dtype=bool)[:rows]
+        flags[: len(known)] = known
+        return flags
+
+    def shown(self, most: int) -> list[Fault]:
+        """The first ones, what refuses before what warns, by row."""
+        kept = [fault for faults in self._kept.values() for fault in faults]
+        return sorted(kept, key=lambda fault: (fault.severity, fault.row or 0))[:most]
+
+    def __len__(self) -> int:
+        return self.counts.total()
+
+
+class Texts(Sequence[str]):
+    """A column of texts in little memory: ten thousand at a time in one string, with NUL between them."""
+
+    def __init__(self, cells: Iterable[str] = ()) -> None:
+        self._parts: list[str] = []
+        self._rest: list[str] = []
+        self._count = 0
+        self._opened: tuple[int, list[str]] = (-1, [])
+        self.extend(cells)
+
+    def extend(self, cells: Iterable[str]) -> None:
+        """Append texts; none holds NUL."""
+        self._rest.extend(cells)
+        while len(self._rest) >= _PART:
+            part, self._rest = self._rest[:_PART], self._rest[_PART:]
+            self._parts.append("\x00".join(part))
+            self._count += _PART
+
+    def parts(self) -> Iterator[list[str]]:
+        """All texts, ten thousand at a time."""
+        for part in self._parts:
+            yield part.split("\x00")
+        if self._rest:
+            yield self._rest
+
+    def joined(self) -> Iterator[str]:
+        """As `parts`, with NUL between the texts."""
+        yield from self._parts
+        if self._rest:
+            yield "\x00".join(self._rest)
+
+    def __len__(self) -> int:
+        return self._count + len(self._rest)
+
+    @overload
+    def __getitem__(self, index: int) -> str: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[str]: ...
+    def __getitem__(self, index: int | slice) -> str | Sequence[str]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        index = int(index)
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        if index >= self._count:
+            return self._rest[index - self._count]
+        number, within = divmod(index, _PART)
+        if self._opened[0] != number:
+            self._opened = (number, self._parts[number].split("\x00"))
+        return self._opened[1][within]
+
+
 @dataclass(frozen=True, slots=True)
 class SourceTable:
     """The contents of a file: named columns, and the coordinates of its points where it has geometry.
@@ -64,7 +162,7 @@ class SourceTable:
         As the file says, in the form ``EPSG:code``.
     unit : str or None
         Unit of length of the coordinates, as the file says.
-    faults : tuple of Fault
+    faults : Faults
     """
 
     format: str
@@ -73,7 +171,7 @@ class SourceTable:
     points: tuple[Floats, Floats, Floats] | None = None
     crs: str | None = None
     unit: str | None = None
-    faults: tuple[Fault, ...] = ()
+    faults: Faults = field(default_factory=Faults)
 
     @property
     def rows(self) -> int:
@@ -96,11 +194,11 @@ class SurveyTable:
     crs : str
     unit, height_unit : str
         ``m``, ``ft-us``, ``ft-intl`` or ``deg``.
-    texts : dict of lists of str or None
-        By role: point, code, description, road, side, status.
+    texts : dict of Texts
+        By role: point, code, description, road, side, status; empty where there is none.
     numbers : dict of arrays
         By role: heading_deg, measure_m, offset_m, horizontal_rmse_m, vertical_rmse_m.
-    faults : tuple of Fault
+    faults : Faults
     """
 
     format: str
@@ -111,9 +209,9 @@ class SurveyTable:
     crs: str
     unit: str
     height_unit: str
-    texts: dict[str, list[str | None]] = field(default_factory=dict)
+    texts: dict[str, Texts] = field(default_factory=dict)
     numbers: dict[str, Floats] = field(default_factory=dict)
-    faults: tuple[Fault, ...] = ()
+    faults: Faults = field(default_factory=Faults)
 
     @property
     def rows(self) -> int:

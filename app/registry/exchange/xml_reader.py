@@ -12,7 +12,7 @@ from xml.parsers import expat
 import numpy as np
 
 from app.errors import UnreadableUpload
-from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, SourceTable
+from app.registry.exchange.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable
 
 MAX_DEPTH = 100
 MAX_ELEMENTS = 20 * MAX_ROWS
@@ -181,4 +181,4 @@ def _table(
         )
     columns = tuple([row.get(name) for row in rows] for name in names)
     xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
-    return SourceTable(kind, names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), crs, unit, tuple(faults))
+    return SourceTable(kind, names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), crs, unit, Faults(faults))
