@@ -85,6 +85,40 @@ def key(
         typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label))
 
 
+audit = typer.Typer(no_args_is_help=True, help="The log of what changed the registry.")
+cli.add_typer(audit, name="audit")
+
+
+@audit.callback()
+def audit_log() -> None:
+    """The log of what changed the registry."""
+
+
+@audit.command()
+def verify(
+    agency: Annotated[str | None, typer.Argument(help="Name of one agency; all without.")] = None,
+    expect_head: Annotated[
+        str | None, typer.Option(help="NUMBER:HASH of an entry as an earlier run printed it; needs an agency.")
+    ] = None,
+) -> None:
+    """Compute every hash of the history again; names each fault and ends with 1 if there is any."""
+    from app.services.audit import AuditLog, parse_head
+
+    if expect_head is not None and agency is None:
+        raise InvalidParameter("a head belongs to one agency's log", field="expect-head", cure="name the agency")
+    expected = parse_head(expect_head) if expect_head is not None else None
+    is_good = True
+    with _database_beside_a_server(_settings()) as database:
+        for name, report, faults in AuditLog(database).verify(agency, expected):
+            for fault in faults:
+                is_good = False
+                typer.echo(f"{name}: {fault.where}: {fault.what}")
+            head = f", head {report.head[0]}:{report.head[1]}" if report.head is not None else ""
+            typer.echo(f"{name}: {report.entries} entries, {report.versions} versions{head}")
+    if not is_good:
+        raise typer.Exit(1)
+
+
 @cli.command()
 def encode(
     out: Annotated[Path, typer.Option(help="Folder to write to; created if need be.")] = Path("."),
@@ -216,6 +250,22 @@ def _owned_database(settings: Settings) -> Iterator[Database]:
     database = Database(settings.resolved_database_url)
     database.open()
     try:
+        yield database
+    finally:
+        database.close()
+
+
+@contextmanager
+def _database_beside_a_server(settings: Settings) -> Iterator[Database]:
+    """The database for reading only, whoever owns it."""
+    from app.registry.database import Database, head_revision
+
+    database = Database(settings.resolved_database_url)
+    if database.path is not None and not database.path.exists():
+        raise InvalidParameter(f"there is no database {database.name}", cure="set WAYMARK_DATA_DIR or _DATABASE_URL")
+    try:
+        if database.current_revision() != head_revision():
+            raise InvalidParameter(f"{database.name} has an older schema", cure="run waymark migrate")
         yield database
     finally:
         database.close()

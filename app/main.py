@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry
 from app import __version__
 from app.api import (
     artwork,
+    audit,
     cerpms,
     codebooks,
     decodes,
@@ -46,6 +47,7 @@ from app.registry.database import Database
 from app.services.access import Access
 from app.services.agency_secrets import AgencySecrets
 from app.services.artwork import Artworks
+from app.services.audit import AuditLog
 from app.services.cerpm_programs import CerpmPrograms
 from app.services.codebooks import Codebooks
 from app.services.decode_jobs import DecodeJobs
@@ -76,6 +78,7 @@ ROUTERS = (
     decodes.router,
     imports.router,
     exports.router,
+    audit.router,
     vehicles.router,
 )
 
@@ -116,6 +119,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.markers = Markers(database, utc_now, _marker_rules(settings))
     app.state.imports = Imports(database, utc_now, pool, _marker_rules(settings))
     app.state.exports = Exports(database)
+    app.state.audit = AuditLog(database)
     app.state.searches = Searches(database)
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)

@@ -55,6 +55,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/radio-checks": READERS,
     "POST /v1/imports": SURVEYORS,
     "GET /v1/exports/{kind}": READERS,
+    "GET /v1/audit": ADMINS,
     # --- codebooks
     "GET /v1/codebooks": READERS,
     "POST /v1/codebooks": PLANNERS,

@@ -30,6 +30,11 @@ def find_first_agency(connection: sa.Connection) -> str | None:
     return connection.execute(sa.select(agencies.c.id).order_by(agencies.c.id).limit(1)).scalar_one_or_none()
 
 
+def list_agencies(connection: sa.Connection) -> list[Row]:
+    """Ids and names of all agencies, by name."""
+    return list(connection.execute(sa.select(agencies.c.id, agencies.c.name).order_by(agencies.c.name)).mappings())
+
+
 def add_agency(connection: sa.Connection, name: str, now: datetime) -> str:
     """Create an agency and return its id."""
     agency_id = new_id(now)

@@ -96,7 +96,7 @@ def version_sha256(
     return hashlib.sha256(orjson.dumps(values, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
 
-def entry_hash(entry: Mapping[str, Any]) -> str:
+def entry_hash(entry: Mapping[str, Any] | Row) -> str:
     """Hash of an entry: SHA-256 of all its other columns as a JSON array, the hash before it among them."""
     values = [entry[column.name] for column in audit_log.c if column.name != "hash"]
     return hashlib.sha256(orjson.dumps(values, option=orjson.OPT_SORT_KEYS)).hexdigest()

@@ -33,6 +33,11 @@ class Database:
     url : str
         SQLAlchemy URL of a SQLite file, or postgresql+psycopg://... of a database that has PostGIS. Nothing is opened
         or created before `open` or the first transaction.
+
+    Attributes
+    ----------
+    writes : int
+        Write transactions that this process has ended: what was read since the last one is as it was.
     """
 
     def __init__(self, url: str) -> None:
@@ -57,6 +62,7 @@ class Database:
                 limit="sqlite:///PATH or postgresql+psycopg://USER@HOST/DATABASE",
             )
         self._one_writer = threading.Lock()
+        self.writes = 0
         self._lock_fd: int | None = None
 
     @property
@@ -86,10 +92,16 @@ class Database:
             self._lock_fd = None
 
     @contextmanager
-    def read(self) -> Iterator[sa.Connection]:
-        """A read transaction: one consistent snapshot."""
+    def read(self, *, long: bool = False) -> Iterator[sa.Connection]:
+        """A read transaction: one consistent snapshot.
+
+        Parameters
+        ----------
+        long : bool, optional
+            Single statements may take as long as they take: verifying a log.
+        """
         with busy_is_unavailable(), self.engine.connect() as connection:
-            yield connection.execution_options(**isolation(self.url, write=False))
+            yield connection.execution_options(**isolation(self.url, write=False), **{LONG: long})
 
     @contextmanager
     def write(self, *, long: bool = False) -> Iterator[sa.Connection]:
@@ -108,6 +120,7 @@ class Database:
                 with connection.begin():
                     yield connection
         finally:
+            self.writes += 1
             self._one_writer.release()
 
     def migrate(self, revision: str = "head") -> None:
@@ -121,6 +134,11 @@ class Database:
                 command.downgrade(config, revision)
             else:
                 command.upgrade(config, revision)
+
+    def current_revision(self) -> str | None:
+        """The revision of the schema; None without one."""
+        with self.read() as connection:
+            return MigrationContext.configure(connection).get_current_revision()
 
     def is_ready(self) -> bool:
         """Whether the schema is current and a write transaction can start."""

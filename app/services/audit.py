@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from typing import Any
 
+from app.errors import InvalidParameter, NotFound
+from app.registry import agencies
 from app.registry import audit as store
 from app.registry.audit import Author, Row
+from app.registry.audit_check import ChainReport, Fault, check_history
 from app.registry.database import Database
 from app.services.access import Caller
+
+_NUMBER = re.compile(r"[1-9][0-9]{0,14}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 def author_of(caller: Caller) -> Author:
@@ -31,6 +39,40 @@ class AuditLog:
         page = [_entry_document(row) for row in rows[:limit]]
         newest = {"number": head["number"], "hash": head["hash"]} if head is not None else None
         return page, page[-1]["number"] if len(rows) > limit else None, newest
+
+    def verify(
+        self, agency: str | None = None, expected_head: tuple[int, str] | None = None
+    ) -> Iterator[tuple[str, ChainReport, Iterator[Fault]]]:
+        """For each agency, or the one of this name: its name, what was gone through, and the faults as they are found.
+
+        Raises
+        ------
+        NotFound
+            There is no agency of this name.
+        """
+        with self._database.read(long=True) as connection:
+            found = [row for row in agencies.list_agencies(connection) if agency in (None, row["name"])]
+            if agency is not None and not found:
+                raise NotFound(f"there is no agency {agency[:80]!r}", field="agency")
+            for row in found:
+                report = ChainReport()
+                yield row["name"], report, check_history(connection, row["id"], report, expected_head)
+
+
+def parse_head(text: str) -> tuple[int, str]:
+    """An entry's number and hash, written NUMBER:HASH.
+
+    Raises
+    ------
+    InvalidParameter
+        It is written otherwise.
+    """
+    number, _, digest = text.partition(":")
+    if not (_NUMBER.fullmatch(number) and _SHA256.fullmatch(digest)):
+        raise InvalidParameter(
+            f"{text[:90]!r} is no head of a log", field="expect-head", limit="NUMBER:HASH", cure="as verify prints it"
+        )
+    return int(number), digest
 
 
 def _entry_document(row: Row) -> dict[str, Any]:
