@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, JsonValue
 
-from app.api.dependencies import Number, Whole
+from app.api.dependencies import Number, Text, Whole
 from app.api.schemas_packets import DecodedLaneOut, HeardMarkerOut, OverlayOut, PacketReportOut, PacketsIn, SteeringOut
 from app.api.schemas_traces import CrossingOut, MagnetReadingOut, NoiseOut, ReportOut, TagFixOut, TagOut, TraceIn
-from app.services.decode_context import CameraSetup, CoarsePosition, DecodeContext
+from app.services.decode_context import GivenContext
 
 Flag = Annotated[bool, Field(strict=True)]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
@@ -78,23 +78,17 @@ class ContextIn(BaseModel):
         None, description="The file is a packet log of CERPMs, or a ZIP of one with the vehicle's poses and a frame."
     )
 
-    def domain(self) -> DecodeContext:
-        """The context as the use cases know it."""
-        position, camera, counts = self.coarse_position, self.camera, self.thermal_range
-        return DecodeContext(
-            coarse_position=CoarsePosition(**position.model_dump()) if position else None,
-            heading_deg=self.heading_deg,
-            camera=CameraSetup(**{**camera.model_dump(), "distortion": tuple(camera.distortion)}) if camera else None,
-            thermal=self.thermal,
-            thermal_range=(counts[0], counts[1]) if counts else None,
-            captured_at=self.captured_at,
-            trace=_declared(self.trace),
-            packets=_declared(self.packets),
-        )
+    vehicle: Text | None = Field(
+        None,
+        min_length=1,
+        max_length=80,
+        description="Name or id of the vehicle: its profile stands behind what the context says.",
+    )
 
-
-def _declared(given: BaseModel | None) -> dict[str, Any] | None:
-    return None if given is None else given.model_dump(exclude_none=True, exclude_unset=True)
+    def given(self, file_name: str = "") -> GivenContext:
+        """What was said and nothing else; a member that is null is said to be unknown."""
+        stated = self.model_dump(exclude_unset=True, exclude={"vehicle"})
+        return GivenContext(stated, self.vehicle, file_name)
 
 
 class FixOut(BaseModel):

@@ -49,7 +49,7 @@ class PosesIn(BaseModel):
     )
 
 
-class ReceiverIn(BaseModel):
+class PacketReceiverIn(BaseModel):
     """The vehicle's radio receiver."""
 
     model_config = _STRICT
@@ -97,7 +97,7 @@ class PacketsIn(BaseModel):
         None, max_length=32, description="Kinds of files in a ZIP whose content does not show it, by name."
     )
     poses: PosesIn | None = None
-    receiver: ReceiverIn | None = None
+    receiver: PacketReceiverIn | None = None
     freshness: FreshnessIn | None = None
     lane: LaneRulesIn | None = None
     method: Literal["waymark", "paper"] = Field("waymark", description="`paper` is the CERPM paper's own way.")
@@ -202,6 +202,7 @@ class PacketReportOut(BaseModel):
     refused: list[dict[str, Any]]
     left_out: list[dict[str, Any]]
     warnings: list[str]
+    driven_m: float | None
     load_ms: float
     verify_ms: float
     decode_ms: float

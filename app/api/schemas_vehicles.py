@@ -128,7 +128,10 @@ class VehiclePatch(BaseModel):
 class CalibrationChoice(BaseModel):
     """Which calibration a vehicle's camera shall have."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"calibration_id": "019cb624-0000-7000-8000-00000000aaaa"}]},
+    )
 
     calibration_id: Identifier
 

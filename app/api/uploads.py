@@ -15,7 +15,7 @@ from app.api.dependencies import checked_idempotency_key
 from app.api.schemas_decodes import ContextIn
 from app.api.strict_json import parse_json
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
-from app.services.decode_context import DecodeContext
+from app.services.decode_context import GivenContext
 from app.services.idempotency import IdempotencyKey
 
 CONTEXT_HEADER = "waymark-context"
@@ -34,7 +34,7 @@ class UploadedFile:
     """A file with its context, and the client's Idempotency-Key if it sent one."""
 
     data: bytes
-    context: DecodeContext
+    context: GivenContext
     idempotency: IdempotencyKey | None
 
 
@@ -52,9 +52,9 @@ async def get_upload(request: Request) -> UploadedFile:
     """
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == _FORM:
-        data, text, name = await _read_form(request)
+        data, text, name, vehicle = await _read_form(request)
     elif media_type in RAW_TYPES and (media_type != _JSON or CONTEXT_HEADER in request.headers):
-        data, name = await request.body(), ""
+        data, name, vehicle = await request.body(), "", ""
         # headers arrive as Latin-1; the bytes themselves are the JSON text
         text = request.headers.get(CONTEXT_HEADER, "").encode("latin-1")
     else:
@@ -66,18 +66,24 @@ async def get_upload(request: Request) -> UploadedFile:
         )
     if len(text) > MAX_CONTEXT_BYTES:
         raise MalformedRequest("the context is too long", field="context", limit=f"{MAX_CONTEXT_BYTES} bytes")
-    return UploadedFile(data, _named(_read_context(text), name), idempotency_of(request, data, text))
+    context = replace(_read_context(text), file_name=name)
+    if vehicle:
+        context = _of_vehicle(context, vehicle)
+        text += b"\n" + vehicle.encode()
+    return UploadedFile(data, context, idempotency_of(request, data, text))
 
 
-def _named(context: DecodeContext, name: str) -> DecodeContext:
-    """A trace's or a packet log's context with the name of its file: its suffix tells kinds of text apart."""
-    if not name:
-        return context
-    if context.trace is not None:
-        return replace(context, trace={**context.trace, "file_name": name[:120]})
-    if context.packets is not None:
-        return replace(context, packets={**context.packets, "file_name": name[:120]})
-    return context
+def _of_vehicle(context: GivenContext, vehicle: str) -> GivenContext:
+    """The context with the vehicle that the form's part names."""
+    named = _validated({"vehicle": vehicle}, ("form",)).vehicle
+    if context.vehicle not in (None, named):
+        raise MalformedRequest(
+            "the form and the context name different vehicles",
+            field="vehicle",
+            limit="one vehicle",
+            cure="name it once",
+        )
+    return replace(context, vehicle=named)
 
 
 def idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKey | None:
@@ -91,8 +97,8 @@ def idempotency_of(request: Request, data: bytes, text: bytes) -> IdempotencyKey
     return IdempotencyKey(key, digest.hexdigest())
 
 
-async def _read_form(request: Request) -> tuple[bytes, bytes, str]:
-    async with request.form(max_files=2, max_fields=2, max_part_size=MAX_CONTEXT_BYTES) as form:
+async def _read_form(request: Request) -> tuple[bytes, bytes, str, str]:
+    async with request.form(max_files=2, max_fields=3, max_part_size=MAX_CONTEXT_BYTES) as form:
         _check_parts(form)
         file, context = form.get("file"), form.get("context", "")
         if not isinstance(file, UploadFile):
@@ -104,30 +110,39 @@ async def _read_form(request: Request) -> tuple[bytes, bytes, str]:
             )
         data = await file.read()
         text = await context.read() if isinstance(context, UploadFile) else context.encode()
-    return data, text, file.filename or ""
+        vehicle = form.get("vehicle", "")
+        if isinstance(vehicle, UploadFile):
+            raise MalformedRequest(
+                "the vehicle came as a file", field="vehicle", limit="a name", cure="send it as text"
+            )
+    return data, text, file.filename or "", vehicle
 
 
 def _check_parts(form: FormData) -> None:
     names = [name for name, _value in form.multi_items()]
-    wrong = next((name for name in names if name not in ("file", "context") or names.count(name) > 1), None)
+    wrong = next((name for name in names if name not in ("file", "context", "vehicle") or names.count(name) > 1), None)
     if wrong is not None:
         raise MalformedRequest(
             f"the form has an unexpected part {wrong[:80]!r}, or has it twice",
             field="file" if wrong == "file" else "body",
-            limit="one file, one context",
+            limit="one file, one context, one vehicle",
             cure="send several frames as a ZIP archive",
         )
 
 
-def _read_context(text: bytes) -> DecodeContext:
+def _read_context(text: bytes) -> GivenContext:
     if not text.strip():
-        return DecodeContext()
+        return GivenContext()
     value: Any = parse_json(text, "context")
+    return _validated(value, ("context",)).given()
+
+
+def _validated(value: Any, where: tuple[str, ...]) -> ContextIn:
     try:
-        return ContextIn.model_validate(value).domain()
+        return ContextIn.model_validate(value)
     except ValidationError as error:
         # where pydantic says what is wrong inside the context, the problem table expects it inside a request
-        faults = [{**fault, "loc": ("context", *fault["loc"])} for fault in error.errors()]
+        faults = [{**fault, "loc": (*where, *fault["loc"])} for fault in error.errors()]
         raise RequestValidationError(faults) from error
 
 

@@ -79,7 +79,8 @@ def _read_drive(task: DriveTask) -> DriveFiles:
             limit="one packet log at least",
             cure="declare which file it is in packets.files if its content does not show it",
         )
-    return DriveFiles(packets, track, reports, frame, 1e3 * (time.perf_counter() - began))
+    driven_m = None if track is None else round(track.driven_m(), 2)
+    return DriveFiles(packets, track, reports, frame, 1e3 * (time.perf_counter() - began), driven_m)
 
 
 def _kind_of(part: Part, data: bytes) -> str:

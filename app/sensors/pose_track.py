@@ -93,15 +93,15 @@ class PoseTrack:
         Returns
         -------
         float
-            Sum of the straight lines between places that are at least 5 m, and twice the accuracy of the position,
-            apart: a receiver that stands still wanders, and that is no way. A line that would take more than 70 m/s is
-            a gap in the track, and counts nothing. [m]
+            Sum of the straight lines between places that are at least 5 m and eight times the accuracy of the position
+            apart (10 m where it is not known, 50 m at most): a receiver that stands still wanders, and that is no way.
+            A line that would take more than 70 m/s is a gap in the track, and counts nothing. [m]
         """
         if len(self.time_s) < 2:
             return 0.0
         lon, lat = np.radians(np.unwrap(self.lon_deg, period=360.0)), np.radians(self.lat_deg)
         east_per_rad, north_per_rad = metres_per_radian(lat)
-        step_m = np.maximum(LEAST_STEP_M, 2 * np.nan_to_num(self.accuracy_m, nan=0.0))
+        step_m = np.clip(8 * np.nan_to_num(self.accuracy_m, nan=10.0 / 8), LEAST_STEP_M, 50.0)
         total_m, at = 0.0, 0
         for k in range(1, len(lon)):
             leg_m = math.hypot((lon[k] - lon[at]) * east_per_rad[at], (lat[k] - lat[at]) * north_per_rad[at])

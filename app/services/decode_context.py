@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from typing import Any
 
@@ -152,6 +152,25 @@ class CameraSetup:
 
 
 @dataclass(frozen=True, slots=True)
+class GivenContext:
+    """What an upload says of itself, before its vehicle's profile is put behind it.
+
+    Attributes
+    ----------
+    stated : dict
+        Members of the context that were sent and nothing else.
+    vehicle : str or None
+        Name or id of the vehicle.
+    file_name : str
+        Of the file; empty where it has none.
+    """
+
+    stated: dict[str, Any] = field(default_factory=dict)
+    vehicle: str | None = None
+    file_name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class DecodeContext:
     """Everything that comes with an upload.
 
@@ -171,6 +190,8 @@ class DecodeContext:
         The upload is a magnetometer trace, declared like this (`app.services.traces.trace_terms`).
     packets : dict, optional
         The upload is a packet log, declared like this (`app.services.packets.packet_terms`).
+    vehicle : dict, optional
+        Id, name and version of the vehicle, and of each member where it came from (`app.services.profiles.inherit`).
     """
 
     coarse_position: CoarsePosition | None = None
@@ -181,6 +202,7 @@ class DecodeContext:
     captured_at: datetime | None = None
     trace: dict[str, Any] | None = None
     packets: dict[str, Any] | None = None
+    vehicle: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.trace is not None and self.packets is not None:
@@ -217,9 +239,9 @@ class DecodeContext:
 
     def document(self) -> dict[str, Any]:
         """The context as it is stored: what was given and nothing else."""
-        given = _given(asdict(replace(self, trace=None, packets=None)))
+        given = _given(asdict(replace(self, trace=None, packets=None, vehicle=None)))
         document = {name: value for name, value in given.items() if value is not False}
-        declared = {"trace": self.trace, "packets": self.packets}
+        declared = {"trace": self.trace, "packets": self.packets, "vehicle": self.vehicle}
         return {**document, **{name: value for name, value in declared.items() if value is not None}}
 
 
@@ -235,8 +257,9 @@ def context_from_document(document: dict[str, Any]) -> DecodeContext:
         captured_at=datetime.fromisoformat(captured_at) if isinstance(captured_at, str) else captured_at,
         trace=document.get("trace"),
         packets=document.get("packets"),
+        vehicle=document.get("vehicle"),
     )
-    if camera:
+    if camera is not None:
         setup = CameraSetup(**{**camera, "distortion": tuple(camera.get("distortion", ()))})
         context = replace(context, camera=setup)
     return context

@@ -31,6 +31,7 @@ from app.services.packet_decodes import (
 )
 from app.services.ports import Clock
 from app.services.trace_decodes import PICTURES, TRACE, finished_columns, start_trace, store_observations
+from app.services.vehicle_uploads import count_driven
 from app.storage.blobs import new_blob_key
 
 _PATIENCE_S = 60.0
@@ -123,6 +124,7 @@ class DecodeJobs:
         with self._database.write() as connection:
             if store.finish_decode(connection, row["id"], {**done, "finished_at": self._clock()}):
                 store_observations(connection, agency_id, row["id"], trace, context.captured_at or row["created_at"])
+                count_driven(connection, agency_id, row["id"], context, done["result"])
                 return
         self._blobs.delete(done["picture_key"])
 
@@ -142,6 +144,7 @@ class DecodeJobs:
                 newest = is_still_newest(connection, agency_id, drive)
                 if newest and store.finish_decode(connection, row["id"], {**done, "finished_at": self._clock()}):
                     keep_heard(connection, agency_id, row["id"], drive, context.captured_at or received_at)
+                    count_driven(connection, agency_id, row["id"], context, drive.document)
                     return
             self._blobs.delete(picture_key)
             if newest:
@@ -216,11 +219,13 @@ class DecodeJobs:
 
     def _finish(self, row: Row, values: dict[str, Any], frames: Sequence[ReadFrame] = ()) -> None:
         now = self._clock()
-        captured_at = context_from_document(row["context"]).captured_at
+        context = context_from_document(row["context"])
         with self._database.write() as connection:
             if store.finish_decode(connection, row["id"], {**values, "finished_at": now}):
-                seen = observations_of(row["id"], frames, captured_at or row["created_at"])
+                seen = observations_of(row["id"], frames, context.captured_at or row["created_at"])
                 store.add_observations(connection, row["agency_id"], seen)
+                if "result" in values:
+                    count_driven(connection, row["agency_id"], row["id"], context, values["result"])
 
 
 class _Cancelled(Exception):

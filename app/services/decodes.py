@@ -18,7 +18,7 @@ from app.registry.database import Database
 from app.registry.ids import new_id
 from app.services.access import Caller
 from app.services.agency_secrets import AgencySecrets
-from app.services.decode_context import DecodeContext, context_from_document
+from app.services.decode_context import DecodeContext, GivenContext, context_from_document
 from app.services.decode_documents import ReadFrame, decode_document, result_document
 from app.services.decode_rules import DecodeRules
 from app.services.frame_reading import observations_of, read_frame, start_frame
@@ -39,6 +39,7 @@ from app.services.packet_decodes import (
 from app.services.packets import OverlayTask
 from app.services.ports import Clock
 from app.services.trace_decodes import PICTURES, TRACE, finished_columns, start_trace, store_observations
+from app.services.vehicle_uploads import count_driven, count_upload, settle_context
 from app.storage.blobs import new_blob_key
 
 FRAME, ARCHIVE = "frame", "archive"
@@ -85,7 +86,7 @@ class Decodes:
     # --- uploads --------------------------------------------------------------------------------------------------
 
     def decode_upload(
-        self, caller: Caller, data: bytes, context: DecodeContext, key: IdempotencyKey | None = None
+        self, caller: Caller, data: bytes, given: GivenContext, key: IdempotencyKey | None = None
     ) -> tuple[dict[str, Any], bool]:
         """Decode a frame or a short recording now, or queue an archive of frames or a long recording.
 
@@ -99,14 +100,16 @@ class Decodes:
         ------
         UnreadableUpload, UploadTooLarge, UnsupportedUpload, InvalidParameter
             The upload or its context is refused; nothing is stored.
+        NotFound, NotAllowed, Conflict
+            The vehicle is unknown, not this key's, or retired.
         Unavailable
             The decoder processes are busy.
         """
-        if key is not None:
-            with self._database.read() as connection:
-                answer = find_answer(connection, caller.agency_id, key, self._clock())
+        with self._database.read() as connection:
+            answer = find_answer(connection, caller.agency_id, key, self._clock())
             if answer is not None:
                 return answer, True
+            context = settle_context(connection, caller, given, data)
         if not data and (context.trace is not None or context.packets is not None):
             raise UnreadableUpload("the file is empty", field="file", cure="send the recording again, whole")
         if context.trace is not None:
@@ -167,7 +170,7 @@ class Decodes:
             "result": result_document([frame], codebook_plates=len(nearby.codebook)),
             "finished_at": self._clock(),
         }
-        store.add_decode(connection, caller.agency_id, caller.key_id, row)
+        self._add(connection, caller, row, context)
         seen_at = context.captured_at or row["created_at"]
         store.add_observations(connection, caller.agency_id, observations_of(row["id"], [frame], seen_at))
         return decode_document(row)
@@ -190,7 +193,7 @@ class Decodes:
                 if document is None:
                     replayed = False
                     row |= done | {"attempts": 1, "finished_at": self._clock()}
-                    store.add_decode(connection, caller.agency_id, caller.key_id, row)
+                    self._add(connection, caller, row, context)
                     seen_at = context.captured_at or created_at
                     store_observations(connection, caller.agency_id, row["id"], trace, seen_at)
                     document = decode_document(row)
@@ -246,7 +249,7 @@ class Decodes:
     ) -> dict[str, Any]:
         now = self._clock()
         row |= {"state": "done", "progress": 1.0, "attempts": 1, "finished_at": now}
-        store.add_decode(connection, caller.agency_id, caller.key_id, row)
+        self._add(connection, caller, row, context)
         seen_at = context.captured_at or row["created_at"]
         keep_heard(connection, caller.agency_id, row["id"], drive, seen_at)
         document = decode_document(row)
@@ -266,7 +269,7 @@ class Decodes:
                 document = find_answer(connection, caller.agency_id, key, created_at)
                 if document is None:
                     replayed = False
-                    store.add_decode(connection, caller.agency_id, caller.key_id, row)
+                    self._add(connection, caller, row, context)
                     document = decode_document(row)
                     keep_answer(connection, caller.agency_id, key, document, created_at, self._rules.idempotency_ttl)
         except BaseException:
@@ -277,6 +280,12 @@ class Decodes:
         else:
             self._queue.submit(row["id"])
         return document, replayed
+
+    def _add(self, connection: sa.Connection, caller: Caller, row: dict[str, Any], context: DecodeContext) -> None:
+        store.add_decode(connection, caller.agency_id, caller.key_id, row)
+        count_upload(connection, caller.agency_id, row["id"], context, row["created_at"])
+        if row["result"] is not None:
+            count_driven(connection, caller.agency_id, row["id"], context, row["result"])
 
     # --- what is stored -------------------------------------------------------------------------------------------
 

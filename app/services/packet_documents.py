@@ -155,6 +155,7 @@ def _report(files: DriveFiles, read: ReadPackets, result: LaneResult) -> dict[st
         "refused": refused[:MAX_REFUSED],
         "left_out": left_out,
         "warnings": list(dict.fromkeys(warnings)),
+        "driven_m": files.driven_m,
         "load_ms": round(files.load_ms, 1),
         "verify_ms": round(read.verify_ms, 1),
         "decode_ms": round(result.decode_ms, 1),

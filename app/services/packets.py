@@ -102,6 +102,8 @@ class DriveFiles:
         Name and header of the camera frame.
     load_ms : float
         [ms]
+    driven_m : float or None
+        Along the track. [m]
     """
 
     packets: list[HeardPacket]
@@ -109,6 +111,7 @@ class DriveFiles:
     reports: dict[str, LogReport]
     frame: tuple[str, ImageHeader] | None
     load_ms: float
+    driven_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

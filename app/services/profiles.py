@@ -10,13 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from app.decoders.upload_kind import UploadKind
 from app.errors import InvalidParameter
 from app.services.decode_context import CameraSetup, DecodeContext
 from app.services.packets import packet_terms
 from app.services.positions import naming
 from app.services.traces import trace_terms
 
-FRAME, TRACE, PACKETS = "frame", "trace", "packets"
+FRAME, TRACE, PACKETS = (str(kind) for kind in UploadKind)
 NEEDED = {FRAME: "camera", TRACE: "trace", PACKETS: "packets"}
 """Section that an upload of a kind cannot do without."""
 SECTIONS = {
@@ -102,9 +103,11 @@ def inherit(profile: Mapping[str, Any], stated: Mapping[str, Any], kind: str) ->
         The profile's intrinsics are of another size of frame than the upload says.
     """
     ours = {name: profile[name] for name in SECTIONS[kind] if name in profile}
-    said = dict(stated)
+    said = {name: value for name, value in stated.items() if value is not None or name not in NEEDED}
     if "camera" in ours:
         ours["camera"] = _fitting_camera(context_camera(ours["camera"]) or {}, said.get("camera", {}))
+        if kind != FRAME and not has_intrinsics({**ours["camera"], **(said.get("camera") or {})}):
+            del ours["camera"]  # a mount alone lays nothing over a frame
     if said.get("thermal") is False:
         ours.pop("thermal_range", None)
     sources: dict[str, str] = {}
@@ -151,6 +154,7 @@ def _merge(ours: Mapping[str, Any], said: Mapping[str, Any], sources: dict[str, 
                 own if isinstance(own, Mapping) else {}, theirs if name in said else {}, sources, f"{at}."
             )
             continue
-        merged[name] = theirs if name in said else own
+        value = theirs if name in said else own
+        merged[name] = {k: v for k, v in value.items() if v is not None} if isinstance(value, Mapping) else value
         sources[at] = "upload" if name in said else "vehicle"
     return merged

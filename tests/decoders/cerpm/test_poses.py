@@ -347,8 +347,8 @@ def test_the_way_driven_leaves_out_wandering_and_gaps() -> None:
     lat = 50.0 + (along_m + rng.normal(0, 0.7, len(seconds))) / 111_230.0
     lon = 179.9999 + rng.normal(0, 0.7, len(seconds)) / 71_700.0
     nothing = np.full(len(seconds), np.nan)
-    track = PoseTrack(seconds, (lon + 180) % 360 - 180, lat, nothing, np.full(len(seconds), 2.5))
+    track = PoseTrack(seconds, (lon + 180) % 360 - 180, lat, nothing, np.full(len(seconds), 0.7))
     assert track.driven_m() == pytest.approx(1200.0, rel=0.02)
-    far = PoseTrack([0.0, 1.0, 2.0], [10.0, 11.0, 11.0001], [50.0] * 3, [np.nan] * 3, [np.nan] * 3)
-    assert far.driven_m() == pytest.approx(7.17, abs=0.05)
+    far = PoseTrack([0.0, 1.0, 2.0], [10.0, 11.0, 11.0002], [50.0] * 3, [np.nan] * 3, [np.nan] * 3)
+    assert far.driven_m() == pytest.approx(14.34, abs=0.05)
     assert PoseTrack([0.0], [10.0], [50.0], [np.nan], [np.nan]).driven_m() == 0.0
