@@ -142,6 +142,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.add_middleware(
         Guarded,
         authenticate=access.authenticate,
+        recall=access.recall,
         body_limits={
             "": settings.max_json_bytes,
             "/v1/decodes": settings.max_upload_bytes,

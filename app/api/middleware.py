@@ -94,6 +94,8 @@ class Guarded:
     app : ASGIApp
     authenticate : callable
         The caller behind a key; runs in a thread.
+    recall : callable
+        The caller behind a key if that is known without asking anybody.
     body_limits : mapping
         Most bytes of a body by path prefix; the empty prefix is the default. [byte]
     permissions : Permissions
@@ -107,12 +109,14 @@ class Guarded:
         app: ASGIApp,
         *,
         authenticate: Callable[[str], Caller],
+        recall: Callable[[str], Caller | None],
         body_limits: Mapping[str, int],
         permissions: Permissions,
         body_timeout_s: float,
     ) -> None:
         self._app = app
         self._authenticate = authenticate
+        self._recall = recall
         self._body_limits = body_limits
         self._permissions = permissions
         self._body_timeout_s = body_timeout_s
@@ -137,7 +141,10 @@ class Guarded:
         await self._app(scope, _limited(receive, limit, self._body_timeout_s), send)
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
-        caller = await to_thread.run_sync(self._authenticate, _key_in(headers), limiter=self._threads)
+        key = _key_in(headers)
+        caller = self._recall(key)
+        if caller is None:
+            caller = await to_thread.run_sync(self._authenticate, key, limiter=self._threads)
         state = scope.setdefault("state", {})
         state["agency_id"] = caller.agency_id
         allowed = self._permissions.find(scope["method"], scope["path"])

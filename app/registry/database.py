@@ -9,9 +9,10 @@ from __future__ import annotations
 import fcntl
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import sqlalchemy as sa
 from alembic import command
@@ -20,8 +21,17 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
 from app.errors import Unavailable
-from app.registry.engines import BUSY_TIMEOUT_S, LONG, busy_is_unavailable, isolation, postgres_engine, sqlite_engine
+from app.registry.engines import (
+    BUSY_TIMEOUT_S,
+    LONG,
+    asking_engine,
+    busy_is_unavailable,
+    isolation,
+    postgres_engine,
+    sqlite_engine,
+)
 
+Answer = TypeVar("Answer")
 MIGRATIONS = Path(__file__).resolve().parents[2] / "migrations"
 
 
@@ -48,6 +58,7 @@ class Database:
         self.path: Path | None = None
         if self.url.drivername == "postgresql+psycopg" and self.url.database:
             self.engine = postgres_engine(self.url)
+            self._asking = asking_engine(self.url)
         elif (
             self.url.get_backend_name() == "sqlite"
             and self.url.database
@@ -87,6 +98,8 @@ class Database:
     def close(self) -> None:
         """Close the connections and give the file up."""
         self.engine.dispose()
+        if self.path is None:
+            self._asking.dispose()
         if self._lock_fd is not None:
             os.close(self._lock_fd)
             self._lock_fd = None
@@ -102,6 +115,27 @@ class Database:
         """
         with busy_is_unavailable(), self.engine.connect() as connection:
             yield connection.execution_options(**isolation(self.url, write=False), **{LONG: long})
+
+    def ask(self, question: Callable[[sa.Connection], Answer]) -> Answer:
+        """What a single reading statement answers; `read` is for more than one.
+
+        Parameters
+        ----------
+        question : callable
+            Runs one statement on the connection that it gets, and may be called again if the connection was cut.
+        """
+        if self.path is not None:
+            with self.read() as connection:
+                return question(connection)
+        with busy_is_unavailable():
+            try:
+                with self._asking.connect() as connection:
+                    return question(connection)
+            except sa.exc.OperationalError as error:
+                if not error.connection_invalidated:
+                    raise
+            with self._asking.connect() as connection:
+                return question(connection)
 
     @contextmanager
     def write(self, *, long: bool = False) -> Iterator[sa.Connection]:

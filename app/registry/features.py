@@ -108,13 +108,20 @@ class Extent:
 
 
 def list_features(
-    connection: sa.Connection, agency_id: str, narrowed: FeatureFilter, *, after: str | None, limit: int
+    connection: sa.Connection,
+    agency_id: str,
+    narrowed: FeatureFilter,
+    *,
+    after: str | None,
+    limit: int,
+    counted: bool = False,
 ) -> Rows:
-    """Rows of id, longitude, latitude, height and the fields, in the order of ids."""
+    """Rows of id, longitude, latitude, height, how many match if they are counted, and the fields; in order of ids."""
     values = _values(agency_id, narrowed)
     if after is not None:
         values["after"] = after
-    return list(connection.execute(_page(_shape(narrowed, after is not None)), {**values, "most": limit}).all())
+    statement = _page(_shape(narrowed, after is not None), counted)
+    return list(connection.execute(statement, {**values, "most": limit}).all())
 
 
 def count_features(connection: sa.Connection, agency_id: str, narrowed: FeatureFilter) -> int:
@@ -200,16 +207,24 @@ def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
 
 
 _UTC = sa.DateTime()  # read without a zone where the database keeps none: what writes JSON takes such times for UTC
-_PAGE = (
-    *(_C.id, _C.lon_deg, _C.lat_deg, _C.height_m),
-    *((sa.type_coerce(f.column, _UTC) if f.kind == "date-time" else f.column).label(f.name) for f in FIELDS),
+_PLACE = (_C.id, _C.lon_deg, _C.lat_deg, _C.height_m)
+_PROPERTIES = tuple(
+    (sa.type_coerce(f.column, _UTC) if f.kind == "date-time" else f.column).label(f.name) for f in FIELDS
 )
 
 
 @lru_cache(maxsize=1024)
-def _page(shape: _Shape) -> sa.Select[Any]:
+def _page(shape: _Shape, counted: bool) -> sa.Select[Any]:
     most = sa.bindparam("most", type_=sa.Integer)
-    return sa.select(*_PAGE).where(*_conditions(shape)).order_by(_C.id).limit(most)
+    matched: sa.ColumnElement[Any] = sa.null()
+    if counted:  # in the same statement, so that it is the same snapshot
+        matched = _count(shape._replace(after=False)).correlate(None).scalar_subquery()
+    return (
+        sa.select(*_PLACE, matched.label("matched"), *_PROPERTIES)
+        .where(*_conditions(shape))
+        .order_by(_C.id)
+        .limit(most)
+    )
 
 
 @lru_cache(maxsize=1024)
@@ -219,7 +234,7 @@ def _count(shape: _Shape) -> sa.Select[Any]:
 
 @lru_cache(maxsize=2)
 def _one(retired: bool) -> sa.Select[Any]:
-    return sa.select(*_PAGE).where(*owned(retired), _C.id == sa.bindparam("id"))
+    return sa.select(*_PLACE, sa.null(), *_PROPERTIES).where(*owned(retired), _C.id == sa.bindparam("id"))
 
 
 @lru_cache(maxsize=2)

@@ -110,21 +110,22 @@ class Features:
         counted: bool = False,
     ) -> Page:
         """A page of features in the order of their ids, counted if that is asked for or costs little."""
-        with self._database.read() as connection:
-            rows = store.list_features(connection, caller.agency_id, narrowed, after=after, limit=limit + 1)
-            more = len(rows) > limit
-            matched = None
-            if after is None and not more:
-                matched = len(rows)
-            elif counted or (after is None and _is_cheap(narrowed)):
-                matched = store.count_features(connection, caller.agency_id, narrowed)
+        counted = counted or (after is None and _is_cheap(narrowed))
+        rows = self._database.ask(
+            lambda c: store.list_features(c, caller.agency_id, narrowed, after=after, limit=limit + 1, counted=counted)
+        )
+        more = len(rows) > limit
+        matched: int | None = None
+        if after is None and not more:
+            matched = len(rows)
+        elif counted:
+            matched = rows[0].matched if rows else self.count(caller, narrowed)
         features = _features(rows[:limit], crs)
         return Page(features, features[-1]["id"] if more else None, matched)
 
     def count(self, caller: Caller, narrowed: FeatureFilter) -> int:
         """How many features a filter leaves."""
-        with self._database.read() as connection:
-            return store.count_features(connection, caller.agency_id, narrowed)
+        return self._database.ask(lambda connection: store.count_features(connection, caller.agency_id, narrowed))
 
     def get(
         self, caller: Caller, collection: Collection, feature_id: str, crs: FeatureCrs = STORAGE_CRS
@@ -136,8 +137,9 @@ class Features:
         NotFound
             There is none with this id in the collection, or it belongs to another agency.
         """
-        with self._database.read() as connection:
-            row = store.find_feature(connection, caller.agency_id, feature_id, retired=collection.retired)
+        row = self._database.ask(
+            lambda c: store.find_feature(c, caller.agency_id, feature_id, retired=collection.retired)
+        )
         if row is None:
             raise no_feature(collection)
         return _features([row], crs)[0]
@@ -182,8 +184,9 @@ class Features:
 
     def tile(self, caller: Caller, collection: Collection, tile: Tile) -> bytes:
         """A vector tile of a collection; empty without features."""
-        with self._database.read() as connection:
-            return marker_tile(connection, caller.agency_id, tile, retired=collection.retired, layer=collection.id)
+        return self._database.ask(
+            lambda c: marker_tile(c, caller.agency_id, tile, retired=collection.retired, layer=collection.id)
+        )
 
     def extent(self, caller: Caller, collection: Collection) -> Extent | None:
         """What the agency's features cover, as it was within the last minute."""
@@ -233,17 +236,16 @@ def _features(rows: Iterable[Sequence[Any]], crs: FeatureCrs) -> list[dict[str, 
     if crs not in (FeatureCrs.CRS84, FeatureCrs.CRS84H):
         place = crs.from_lon_lat
     features = []
-    for row in rows:
-        lon_deg, lat_deg, height_m = row[1], row[2], row[3]
+    for marker_id, lon_deg, lat_deg, height_m, _, *values in rows:
         spot: tuple[float, ...] = (lon_deg, lat_deg) if place is None else place(lon_deg, lat_deg)
         if height_m is not None:
             spot = (*spot, height_m)
         features.append(
             {
                 "type": "Feature",
-                "id": row[0],
+                "id": marker_id,
                 "geometry": {"type": "Point", "coordinates": spot},
-                "properties": dict(zip(_NAMES, row[4:], strict=True)),
+                "properties": dict(zip(_NAMES, values, strict=True)),
             }
         )
     return features

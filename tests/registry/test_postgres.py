@@ -111,6 +111,27 @@ def test_a_connection_that_was_cut_is_replaced(database: Database, second: Datab
     assert number() != cut
 
 
+def test_a_question_is_asked_again_where_its_connection_was_cut(database: Database, second: Database) -> None:
+    def number(connection: sa.Connection) -> int:
+        return int(connection.exec_driver_sql("SELECT pg_backend_pid()").scalar_one())
+
+    cut = database.ask(number)
+    assert database.ask(number) == cut
+    with second.write() as connection:
+        assert connection.exec_driver_sql(f"SELECT pg_terminate_backend({cut}, 5000)").scalar()
+    assert database.ask(number) != cut
+
+
+def test_a_question_can_neither_write_nor_take_for_ever(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(sa.exc.InternalError, match="read-only"):
+        database.ask(lambda connection: connection.exec_driver_sql("DELETE FROM agencies"))
+    monkeypatch.setitem(engines._SESSION, "statement_timeout", "50")
+    impatient = Database(database.url.render_as_string(hide_password=False))
+    with pytest.raises(Unavailable, match="for one statement"):
+        impatient.ask(lambda connection: connection.exec_driver_sql("SELECT pg_sleep(5)"))
+    impatient.close()
+
+
 def test_a_server_that_is_away_is_unavailable() -> None:
     database = Database("postgresql+psycopg://waymark:secret@127.0.0.1:1/waymark")
     with pytest.raises(Unavailable, match="cannot be reached") as refused:
@@ -119,6 +140,8 @@ def test_a_server_that_is_away_is_unavailable() -> None:
     assert "secret" not in refused.value.message
     with pytest.raises(Unavailable, match="cannot be reached"), database.read():
         pass
+    with pytest.raises(Unavailable, match="cannot be reached"):
+        database.ask(lambda connection: connection.exec_driver_sql("SELECT 1"))
     assert not database.is_ready()
 
 

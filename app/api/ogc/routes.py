@@ -52,5 +52,8 @@ ROUTES = (
 
 
 def mount_ogc(app: FastAPI) -> None:
-    """Add /ogc to an app that has its use cases in `app.state.features` and `app.state.public_url`."""
-    app.router.routes.extend(ROUTES)
+    """Add /ogc to an app that has its use cases in `app.state.features` and `app.state.public_url`.
+
+    It comes first: a map view asks dozens of times, and trying all other routes takes as long as reading a page.
+    """
+    app.router.routes[:0] = ROUTES
