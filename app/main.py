@@ -16,6 +16,7 @@ from app import __version__
 from app.api import (
     artwork,
     audit,
+    bulk,
     cerpms,
     codebooks,
     decodes,
@@ -48,6 +49,7 @@ from app.services.access import Access
 from app.services.agency_secrets import AgencySecrets
 from app.services.artwork import Artworks
 from app.services.audit import AuditLog
+from app.services.bulk_markers import BulkMarkers
 from app.services.cerpm_programs import CerpmPrograms
 from app.services.codebooks import Codebooks
 from app.services.decode_jobs import DecodeJobs
@@ -69,6 +71,7 @@ ROUTERS = (
     ui.router,
     system.router,
     searches.router,
+    bulk.router,
     markers.router,
     artwork.router,
     layouts.router,
@@ -121,6 +124,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.exports = Exports(database)
     app.state.audit = AuditLog(database)
     app.state.searches = Searches(database)
+    app.state.bulk_markers = BulkMarkers(database, utc_now, app.state.markers, rules.idempotency_ttl)
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)
     app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)

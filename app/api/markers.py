@@ -16,6 +16,8 @@ from app.api.schemas_patch import MarkerPatch
 from app.api.strict_json import StrictRoute
 from app.errors import InvalidParameter
 from app.markers.plate import PlateGeometry, PlateScheme
+from app.services.cerpm_markers import NewCerpm
+from app.services.magnet_markers import NewMagnets
 from app.services.plate_markers import GivenCode, NewPlate
 from app.services.positions import GivenPosition, naming
 
@@ -87,13 +89,7 @@ class VersionPage(BaseModel):
 )
 def post_marker(marker: NewMarkerIn, caller: Caller, markers: Markers, idempotency: Idempotency) -> Response:
     """Register a plate, magnets or a CERPM. With an Idempotency-Key a repeated request gets the first answer again."""
-    new = marker.root
-    if isinstance(new, MagnetMarkerIn):
-        document, replayed = markers.register_magnets(caller, new.given(), idempotency)
-    elif isinstance(new, CerpmMarkerIn):
-        document, replayed = markers.register_cerpm(caller, new.given(), idempotency)
-    else:
-        document, replayed = markers.register_plate(caller, _new_plate(new), idempotency)
+    document, replayed = markers.register(caller, given_marker(marker), idempotency)
     headers = {"Location": f"/v1/markers/{document['id']}", "ETag": _etag(document)}
     if replayed:
         headers["Idempotency-Replayed"] = "true"
@@ -145,6 +141,12 @@ def list_marker_versions(
 
 def _etag(document: dict[str, Any]) -> str:
     return f'"{document["version"]}"'
+
+
+def given_marker(marker: NewMarkerIn) -> NewPlate | NewMagnets | NewCerpm:
+    """The marker as the use cases know it."""
+    new = marker.root
+    return _new_plate(new) if isinstance(new, MarkerIn) else new.given()
 
 
 def _new_plate(marker: MarkerIn) -> NewPlate:

@@ -44,6 +44,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/markers": READERS,
     "POST /v1/markers": PLANNERS,
     "POST /v1/markers/search": READERS,
+    "POST /v1/markers/bulk": SURVEYORS,  # registering as POST /v1/markers
     "GET /v1/markers/{marker_id}": READERS,
     "PATCH /v1/markers/{marker_id}": SURVEYORS,
     "GET /v1/markers/{marker_id}/versions": READERS,

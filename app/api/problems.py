@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any, NamedTuple
 
@@ -175,7 +176,7 @@ def install_problem_handlers(app: FastAPI) -> None:
 
     async def on_validation_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
-        faults = [_field_error(item) for item in error.errors()]
+        faults = [validation_fault(item) for item in error.errors()]
         return problem(VALIDATION, faults[0].detail, request.scope, faults)
 
     async def on_http_error(request: Request, error: Exception) -> Response:
@@ -213,7 +214,8 @@ _CONSTRAINTS = {
 }
 
 
-def _field_error(item: dict[str, Any]) -> FieldError:
+def validation_fault(item: Mapping[str, Any]) -> FieldError:
+    """An error of pydantic's as the input at fault."""
     location = [str(part) for part in item["loc"] if not str(part).startswith(UNION_TAG)]
     path = ".".join(location[1:] if len(location) > 1 else location)
     context = item.get("ctx") or {}

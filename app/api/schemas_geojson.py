@@ -17,7 +17,7 @@ class _Geometry(BaseModel):
     model_config = ConfigDict(extra="ignore")  # RFC 7946, section 6.1: foreign members
 
 
-class LineStringIn(_Geometry):
+class GeoLineIn(_Geometry):
     """A line."""
 
     type: Literal["LineString"]
@@ -45,5 +45,5 @@ class MultiPolygonIn(_Geometry):
     coordinates: Annotated[list[Annotated[list[Ring], Field(min_length=1)]], Field(min_length=1)]
 
 
-AnyLine = Annotated[LineStringIn | MultiLineStringIn, Field(discriminator="type")]
+AnyLine = Annotated[GeoLineIn | MultiLineStringIn, Field(discriminator="type")]
 AnyPolygon = Annotated[PolygonIn | MultiPolygonIn, Field(discriminator="type")]

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.dependencies import Number, Text
 from app.api.schemas_cerpms import CerpmMarkerOut
-from app.api.schemas_geojson import AnyPolygon, LineStringIn
+from app.api.schemas_geojson import AnyPolygon, GeoLineIn
 from app.api.schemas_magnets import MagnetMarkerSummary
 from app.api.schemas_markers import MarkerOut, Metres, Status
 
@@ -34,7 +34,7 @@ class AlongIn(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    geometry: LineStringIn = Field(description="In the direction of travel, in longitude and latitude.")
+    geometry: GeoLineIn = Field(description="In the direction of travel, in longitude and latitude.")
     corridor_m: Annotated[float, Field(allow_inf_nan=False, gt=0, le=MAX_CORRIDOR_M)] = Field(
         description="Width: half of it to each side. [m]"
     )

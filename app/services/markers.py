@@ -5,7 +5,10 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any, TypeVar
+
+import sqlalchemy as sa
 
 from app.errors import InvalidParameter, StaleVersion
 from app.registry import markers as store
@@ -27,6 +30,8 @@ from app.services.version_kinds import kind_of_change, kind_of_new
 
 New = TypeVar("New", bound=NewMarker)
 Prepared = TypeVar("Prepared")
+Step = Callable[[sa.Connection], dict[str, Any]]
+"""What is left to do in the transaction: it returns the marker as it is then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,10 +75,10 @@ class Markers:
             "cerpm": self._cerpms,
         }
 
-    def register_plate(
-        self, caller: Caller, plate: NewPlate, key: IdempotencyKey | None = None
+    def register(
+        self, caller: Caller, new: NewPlate | NewMagnets | NewCerpm, key: IdempotencyKey | None = None
     ) -> tuple[dict[str, Any], bool]:
-        """Store a new plate.
+        """Store a new marker.
 
         Returns
         -------
@@ -86,49 +91,40 @@ class Markers:
         InvalidParameter, CodeMismatch, ReferenceSystemError
             The request contradicts itself or a limit.
         CodeTaken
-            Another plate near by carries the code.
-        """
-        return self._register(self._plates, caller, plate, key)
-
-    def register_magnets(
-        self, caller: Caller, magnets: NewMagnets, key: IdempotencyKey | None = None
-    ) -> tuple[dict[str, Any], bool]:
-        """Store a new tag or line of magnets; as `register_plate`.
-
-        Raises
-        ------
-        InvalidParameter, CodeMismatch, ReferenceSystemError
-            The request contradicts itself, or the layout a limit that nothing may break.
+            Another marker carries the code or the number.
         NotFound
             The codebook is not there.
         Conflict
             Magnets of another marker lie too near.
         """
-        return self._register(self._magnets, caller, magnets, key)
-
-    def register_cerpm(
-        self, caller: Caller, cerpm: NewCerpm, key: IdempotencyKey | None = None
-    ) -> tuple[dict[str, Any], bool]:
-        """Store a new CERPM; as `register_plate`.
-
-        Raises
-        ------
-        InvalidParameter, ReferenceSystemError
-            The request contradicts itself, or does not fit a message.
-        CodeTaken
-            Another marker carries the number.
-        """
-        return self._register(self._cerpms, caller, cerpm, key)
-
-    def _register(
-        self, family: MarkerFamily[New, Prepared], caller: Caller, new: New, key: IdempotencyKey | None
-    ) -> tuple[dict[str, Any], bool]:
         now = self._clock()
-        prepared = family.prepare(caller, new, now)
+        store_new = self.prepare_new(caller, new, now)
         with self._database.write() as connection:
             answer = find_answer(connection, caller.agency_id, key, now)
             if answer is not None:
                 return answer, True
+            marker = store_new(connection)
+            keep_answer(connection, caller.agency_id, key, marker, now, self._rules.idempotency_ttl)
+        return marker, False
+
+    def prepare_new(self, caller: Caller, new: NewPlate | NewMagnets | NewCerpm, now: datetime) -> Step:
+        """What takes time before a new marker is stored, and the step that then stores it.
+
+        Raises
+        ------
+        InvalidParameter, CodeMismatch, ReferenceSystemError, NotFound
+            As the family says; its step raises what is known in the transaction only.
+        """
+        if isinstance(new, NewPlate):
+            return self._prepared(self._plates, caller, new, now)
+        if isinstance(new, NewMagnets):
+            return self._prepared(self._magnets, caller, new, now)
+        return self._prepared(self._cerpms, caller, new, now)
+
+    def _prepared(self, family: MarkerFamily[New, Prepared], caller: Caller, new: New, now: datetime) -> Step:
+        prepared = family.prepare(caller, new, now)
+
+        def store_new(connection: sa.Connection) -> dict[str, Any]:
             values = {
                 "id": new_id(now),
                 "status": new.status,
@@ -148,9 +144,9 @@ class Markers:
             ) as entry:
                 row = store.add_marker(connection, entry, values, kind=kind, why=new.reason)
             family.index(connection, caller, row)
-            marker = family.detail(row)
-            keep_answer(connection, caller.agency_id, key, marker, now, self._rules.idempotency_ttl)
-        return marker, False
+            return family.detail(row)
+
+        return store_new
 
     def get(self, caller: Caller, marker_id: str) -> dict[str, Any]:
         """One marker."""
@@ -170,9 +166,23 @@ class Markers:
         Conflict
             At its new place, or back in use, it collides with another marker.
         """
-        now = self._clock()
-        placed = place_given(change.position, self._rules.crs_accuracy_m) if change.position is not None else None
+        change_stored = self.prepare_change(caller, marker_id, change, version, self._clock())
         with self._database.write() as connection:
+            return change_stored(connection)
+
+    def prepare_change(
+        self, caller: Caller, marker_id: str, change: MarkerChange, version: int | None, now: datetime
+    ) -> Step:
+        """The step that changes a marker; its place is worked out before.
+
+        Raises
+        ------
+        InvalidParameter, ReferenceSystemError
+            The new position is none; the step raises as `change` does.
+        """
+        placed = place_given(change.position, self._rules.crs_accuracy_m) if change.position is not None else None
+
+        def change_stored(connection: sa.Connection) -> dict[str, Any]:
             row = store.get_marker(connection, caller.agency_id, marker_id)
             if version is not None and row["version"] != version:
                 raise StaleVersion(
@@ -203,7 +213,9 @@ class Markers:
                 )
             if placed is not None:
                 family.index(connection, caller, changed)
-        return family.detail(changed)
+            return family.detail(changed)
+
+        return change_stored
 
     def history(
         self, caller: Caller, marker_id: str, *, after: int = 0, limit: int = 100

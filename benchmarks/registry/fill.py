@@ -116,8 +116,8 @@ def _register_templates(database: Database, caller: Caller) -> dict[str, dict[st
     place = GivenPosition(lon_deg=-30.0, lat_deg=-30.0, **_SURVEY)
     common: dict[str, Any] = {"status": "surveyed", "heading_deg": 90.0, "heading_rmse_deg": 0.5, "road": "A0"}
     common |= {"measure_m": 0.0, "offset_m": 1.75}
-    use_cases.register_plate(caller, NewPlate(place, **common))
-    use_cases.register_cerpm(caller, NewCerpm(place, **common))
+    use_cases.register(caller, NewPlate(place, **common))
+    use_cases.register(caller, NewCerpm(place, **common))
     with database.read() as connection:
         return {str(row["family"]): dict(row) for row in connection.execute(sa.select(*_COLUMNS)).mappings()}
 

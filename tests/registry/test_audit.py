@@ -59,7 +59,7 @@ def registry(database: Database) -> Registry:
         ids = []
         for j in range(2):
             plate = NewPlate(GivenPosition(lon_deg=7.5 + k + j / 10, lat_deg=1.0, height_m=3.0), reason="Straße 大道")
-            ids.append(str(markers.register_plate(caller, plate)[0]["id"]))
+            ids.append(str(markers.register(caller, plate)[0]["id"]))
         markers.change(caller, ids[0], MarkerChange({"status": "built"}), 1)
         place = GivenPosition(lon_deg=7.50001 + k, lat_deg=1.0, horizontal_rmse_m=0.01)
         markers.change(caller, ids[0], MarkerChange({"status": "surveyed"}, place), 2)

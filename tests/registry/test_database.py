@@ -25,7 +25,7 @@ NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 def _register(database: Database, lon_deg: float) -> dict[str, object]:
     caller = Caller(_agency(database), "key", "tester", Scope.PLANNER)
     plate = NewPlate(GivenPosition(lon_deg=lon_deg, lat_deg=1.0))
-    return Markers(database, lambda: NOW).register_plate(caller, plate)[0]
+    return Markers(database, lambda: NOW).register(caller, plate)[0]
 
 
 def _agency(database: Database) -> str:

@@ -37,7 +37,7 @@ def _register(database: Database, caller: Caller, lon_deg: float = 7.0) -> dict[
     end_deg = (lon_deg + 0.001 + 180.0) % 360.0 - 180.0
     lane = GivenLane(((lon_deg, 1.0), (end_deg, 1.0)), False, "geometry.coordinates")
     new = NewMagnets(lane, GivenTag(PlacedTag(10.0), "SNS_4_0.1_10-30"))
-    return Markers(database, lambda: NOW).register_magnets(caller, new)[0]
+    return Markers(database, lambda: NOW).register(caller, new)[0]
 
 
 def _numbers(database: Database, box: Box, **narrowed: Any) -> list[int]:
@@ -62,7 +62,7 @@ def test_magnets_over_the_antimeridian(database: Database, caller: Caller) -> No
     assert _numbers(database, Box(179.9, 0.9, -179.9, 1.1)) == [1, 2, 3]
     lane = GivenLane(((179.99989, 1.0), (-179.99911, 1.0)), False, "geometry.coordinates")
     beside = NewMagnets(lane, GivenTag(PlacedTag(10.0, offset_m=1.0), "SNS_4_0.1_10-30"))
-    checks = Markers(database, lambda: NOW).register_magnets(caller, beside)[0]["checks"]
+    checks = Markers(database, lambda: NOW).register(caller, beside)[0]["checks"]
     assert next(c for c in checks if c["name"] == "neighbour-tag")["figure"] == pytest.approx(1.0, abs=1e-3)
 
 
@@ -72,7 +72,7 @@ def _signs(marker: dict[str, Any]) -> list[int]:
 
 def test_migration_0002_down_and_up_keeps_plates(database: Database, caller: Caller) -> None:
     plate = NewPlate(GivenPosition(lon_deg=7.0, lat_deg=1.0))
-    plate_id = Markers(database, lambda: NOW).register_plate(caller, plate)[0]["id"]
+    plate_id = Markers(database, lambda: NOW).register(caller, plate)[0]["id"]
     _register(database, caller)
     Codebooks(database, lambda: NOW).make(caller, "b", TagDesign(3, 4.0, 0.1), CodebookRules(), [("arrow", "left")])
     database.migrate("0001")

@@ -67,7 +67,7 @@ def test_the_spatial_index_follows_the_table(database: Database) -> None:
     with database.write() as connection:
         caller = Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.PLANNER)
     plate = NewPlate(GivenPosition(lon_deg=7.5, lat_deg=1.0))
-    marker = Markers(database, lambda: NOW).register_plate(caller, plate)[0]
+    marker = Markers(database, lambda: NOW).register(caller, plate)[0]
 
     def boxes() -> list[tuple[float, ...]]:
         with database.read() as connection:
