@@ -75,14 +75,18 @@ def key(
     agency: Annotated[str, typer.Argument(help="Name of the agency; created if there is none of that name.")],
     scope: Annotated[str, typer.Option(help="admin, planner, surveyor, viewer or vehicle.")] = "planner",
     label: Annotated[str, typer.Option(help="Who or what the key is for; appears in histories.")] = "key",
+    days: Annotated[int | None, typer.Option(min=1, max=3653, help="Days until it expires; never without.")] = None,
 ) -> None:
-    """Make a key for an agency and print it once. The server must not be running."""
+    """Make a key for an agency and print it once. A server on a SQLite file must not be running."""
+    from datetime import timedelta
+
     from app.main import utc_now
     from app.services.access import Access, parse_scope
 
     with _owned_database(_settings()) as database:
         database.migrate()
-        typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label))
+        expires_at = utc_now() + timedelta(days=days) if days else None
+        typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label, expires_at))
 
 
 audit = typer.Typer(no_args_is_help=True, help="The log of what changed the registry.")

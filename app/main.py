@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
@@ -22,6 +23,7 @@ from app.api import (
     decodes,
     exports,
     imports,
+    keys,
     layouts,
     markers,
     radio_checks,
@@ -58,6 +60,7 @@ from app.services.decodes import Decodes
 from app.services.exports import Exports
 from app.services.features import Features
 from app.services.imports import Imports
+from app.services.keys import Keys
 from app.services.layouts import Layouts
 from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
@@ -83,6 +86,7 @@ ROUTERS = (
     exports.router,
     audit.router,
     vehicles.router,
+    keys.router,
 )
 
 
@@ -112,7 +116,8 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
             if settings.warm_decoders:
                 pool.warm()
             queue.open(jobs.run_job, jobs.list_unfinished())
-            yield
+            async with _each_minute(access.write_uses):
+                yield
         finally:
             pool.close()
             queue.close()
@@ -135,6 +140,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.features = Features(database, utc_now)
     app.state.public_url = settings.public_url.rstrip("/")
     app.state.access = access
+    app.state.keys = Keys(database, utc_now, access)
     app.state.readiness = readiness
     app.state.metrics = metrics
     for router in ROUTERS:
@@ -157,6 +163,23 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     )
     app.add_middleware(Observed, registry=metrics)
     return app
+
+
+@asynccontextmanager
+async def _each_minute(work: Callable[[], None]) -> AsyncIterator[None]:
+    """Call `work` in a thread once a minute, and a last time at the end."""
+
+    async def repeat() -> None:
+        while True:
+            await asyncio.sleep(60)
+            await asyncio.to_thread(work)
+
+    task = asyncio.create_task(repeat())
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.to_thread(work)
 
 
 def utc_now() -> datetime:

@@ -83,6 +83,12 @@ PERMISSIONS: dict[str, Allowed] = {
     "PUT /v1/vehicles/{vehicle_id}/calibration": PLANNERS,
     "PUT /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
     "DELETE /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
+    # --- keys
+    "GET /v1/keys": ADMINS,
+    "POST /v1/keys": ADMINS,
+    "GET /v1/keys/{key_id}": ADMINS,
+    "POST /v1/keys/{key_id}/rotate": ADMINS,
+    "DELETE /v1/keys/{key_id}": ADMINS,
     # --- OGC API
     "GET /ogc": READERS,
     "GET /ogc/": READERS,

@@ -1,18 +1,32 @@
-"""Agencies and their keys. A key is stored as the SHA-256 of its text; only its first characters can be shown again."""
+"""Agencies and their keys. A key is stored as the SHA-256 of its text; only what names it can be shown again."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
 import sqlalchemy as sa
 
+from app.errors import NotFound
+from app.registry.audit import Author, record
 from app.registry.ids import new_id
 from app.registry.tables import agencies, api_keys
 
 Row = sa.RowMapping
+OPERATOR = Author("the server's operator")
+"""Who makes keys from the command line and at the first start."""
 _KEY = sa.select(api_keys).where(api_keys.c.sha256 == sa.bindparam("sha256"))  # built once: every request asks
+_USED = (
+    sa.update(api_keys)
+    .where(
+        api_keys.c.id == sa.bindparam("key_id"),
+        sa.or_(api_keys.c.last_used_at.is_(None), api_keys.c.last_used_at < sa.bindparam("at")),
+    )
+    .values(last_used_at=sa.bindparam("at"))
+)
+_SHOWN = [column for column in api_keys.c if column.name not in ("agency_id", "sha256")]
 
 
 def key_sha256(key: str) -> str:
@@ -49,23 +63,33 @@ def add_key(
     agency_id: str,
     scope: str,
     label: str,
+    prefix: str,
     now: datetime,
     expires_at: datetime | None = None,
+    holder_id: str | None = None,
+    author: Author = OPERATOR,
 ) -> str:
-    """Store a key and return its id."""
+    """Store a key, say so in the agency's audit log, and return its id.
+
+    A key that takes over from another has its holder.
+    """
     key_id = new_id(now)
     row: dict[str, Any] = {
         "id": key_id,
-        "holder_id": key_id,
         "agency_id": agency_id,
+        "holder_id": holder_id or key_id,
         "label": label,
-        "prefix": key[:8],
+        "prefix": prefix,
         "sha256": key_sha256(key),
         "scope": scope,
         "created_at": now,
         "expires_at": expires_at,
     }
     connection.execute(sa.insert(api_keys).values(row))
+    detail = {name: row[name] for name in ("holder_id", "label", "scope", "prefix")}
+    detail["expires_at"] = expires_at.isoformat() if expires_at else None
+    action = "key.created" if holder_id is None else "key.rotated"
+    record(connection, agency_id, author, action, now=now, subject=key_id, detail=detail)
     return key_id
 
 
@@ -74,9 +98,66 @@ def find_key(connection: sa.Connection, key: str) -> Row | None:
     return connection.execute(_KEY, {"sha256": key_sha256(key)}).mappings().one_or_none()
 
 
-def touch_key(connection: sa.Connection, key_id: str, now: datetime) -> None:
-    """Remember when a key was last used."""
-    connection.execute(sa.update(api_keys).where(api_keys.c.id == key_id).values(last_used_at=now))
+def get_key(connection: sa.Connection, agency_id: str, key_id: str) -> Row:
+    """One key of an agency.
+
+    Raises
+    ------
+    NotFound
+        There is none with this id, or it belongs to another agency.
+    """
+    query = sa.select(*_SHOWN).where(api_keys.c.id == key_id, api_keys.c.agency_id == agency_id)
+    row = connection.execute(query).mappings().one_or_none()
+    if row is None:
+        raise NotFound(f"there is no key {key_id}", field="key_id", cure="GET /v1/keys lists yours")
+    return row
+
+
+def list_keys(connection: sa.Connection, agency_id: str, *, after: str | None, limit: int) -> list[Row]:
+    """Keys of an agency in the order they were made."""
+    query = sa.select(*_SHOWN).where(api_keys.c.agency_id == agency_id)
+    if after is not None:
+        query = query.where(api_keys.c.id > after)
+    return list(connection.execute(query.order_by(api_keys.c.id).limit(limit)).mappings())
+
+
+def find_successor(connection: sa.Connection, agency_id: str, key: Row) -> str | None:
+    """Id of a key that took over from this one and was not revoked."""
+    query = sa.select(api_keys.c.id).where(
+        api_keys.c.agency_id == agency_id,
+        api_keys.c.holder_id == key["holder_id"],
+        api_keys.c.id > key["id"],
+        api_keys.c.revoked_at.is_(None),
+    )
+    return connection.execute(query.limit(1)).scalar_one_or_none()
+
+
+def has_admin_key(connection: sa.Connection, agency_id: str, *, besides: str, now: datetime) -> bool:
+    """Whether the agency has a valid admin key besides one."""
+    query = sa.select(api_keys.c.id).where(
+        api_keys.c.agency_id == agency_id,
+        api_keys.c.id != besides,
+        api_keys.c.scope == "admin",
+        api_keys.c.revoked_at.is_(None),
+        sa.or_(api_keys.c.expires_at.is_(None), api_keys.c.expires_at > now),
+    )
+    return connection.execute(query.limit(1)).first() is not None
+
+
+def expire_key(connection: sa.Connection, key_id: str, at: datetime) -> None:
+    """Let a key end at a time."""
+    connection.execute(sa.update(api_keys).where(api_keys.c.id == key_id).values(expires_at=at))
+
+
+def revoke_key(connection: sa.Connection, agency_id: str, key_id: str, now: datetime, *, author: Author) -> None:
+    """End a key now, and say so in the agency's audit log."""
+    connection.execute(sa.update(api_keys).where(api_keys.c.id == key_id).values(revoked_at=now))
+    record(connection, agency_id, author, "key.revoked", now=now, subject=key_id)
+
+
+def write_uses(connection: sa.Connection, uses: Mapping[str, datetime]) -> None:
+    """Remember when keys were last used."""
+    connection.execute(_USED, [{"key_id": key_id, "at": at} for key_id, at in uses.items()])
 
 
 def revoke_keys_labelled(connection: sa.Connection, label: str, now: datetime) -> None:

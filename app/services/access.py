@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from app.errors import InvalidParameter, NotAllowed, NotAuthenticated
+import sqlalchemy as sa
+
+from app.errors import InvalidParameter, NotAllowed, NotAuthenticated, Unavailable
 from app.registry import agencies
 from app.registry.database import Database
+from app.services.key_text import check_key, new_key, shown_part
 from app.services.ports import Clock
 
 FIRST_AGENCY = "default"
 _ENVIRONMENT = "WAYMARK_ADMIN_KEY"
-_TOUCH_EVERY = timedelta(hours=1)
 _REMEMBERED_FOR = timedelta(seconds=1)
 _MOST_REMEMBERED = 10_000
 
@@ -96,11 +97,12 @@ class _Remembered(NamedTuple):
 
 
 class Access:
-    """Creates and checks keys."""
+    """Checks keys, and makes those that need no key to make them."""
 
     def __init__(self, database: Database, clock: Clock) -> None:
         self._database = database
         self._clock = clock
+        self._uses: dict[str, datetime] = {}  # of keys, not written yet
         self._remembered: dict[str, _Remembered] = {}
 
     def recall(self, key: str) -> Caller | None:
@@ -119,8 +121,9 @@ class Access:
         Raises
         ------
         NotAuthenticated
-            The key is unknown, expired or revoked.
+            The key is mistyped, unknown, expired or revoked.
         """
+        check_key(key)
         now, writes = self._clock(), self._database.writes
         with self._database.read() as connection:
             row = agencies.find_key(connection, key)
@@ -128,15 +131,30 @@ class Access:
             raise NotAuthenticated(
                 "the key is unknown, expired or revoked", field="Authorization", cure="ask your agency for a valid key"
             )
-        if row["last_used_at"] is None or now - row["last_used_at"] >= _TOUCH_EVERY:
-            with self._database.write() as connection:
-                agencies.touch_key(connection, row["id"], now)
+        self._uses[row["id"]] = now
         caller = Caller(row["agency_id"], row["holder_id"], row["label"], Scope(row["scope"]))
         until = min(now + _REMEMBERED_FOR, row["expires_at"] or now + _REMEMBERED_FOR)
         if len(self._remembered) >= _MOST_REMEMBERED:
             self._remembered.clear()
         self._remembered[key] = _Remembered(caller, now, until, writes)
         return caller
+
+    def last_use(self, key: agencies.Row) -> datetime | None:
+        """When a key was last used, as far as this process knows."""
+        times = (key["last_used_at"], self._uses.get(key["id"]))
+        return max((time for time in times if time is not None), default=None)
+
+    def write_uses(self) -> None:
+        """Store which keys were used since the last time. Called once a minute: no request waits for it."""
+        taken, self._uses = self._uses, {}
+        uses = dict(taken)  # a request may still be adding to it
+        if not uses:
+            return
+        try:
+            with self._database.write() as connection:
+                agencies.write_uses(connection, uses)
+        except (Unavailable, sa.exc.SQLAlchemyError):
+            self._uses = {**uses, **self._uses}  # next time
 
     def ensure_first_key(self, admin_key: str | None = None) -> str | None:
         """On an empty database create an agency with an admin key; afterwards keep `admin_key` in step.
@@ -147,6 +165,8 @@ class Access:
             The key to show once, if one was made up here.
         """
         now = self._clock()
+        if admin_key is not None:
+            _check_given_key(admin_key)
         with self._database.write() as connection:
             first = agencies.find_first_agency(connection)
             agency_id = first or agencies.add_agency(connection, FIRST_AGENCY, now)
@@ -154,16 +174,14 @@ class Access:
                 known = agencies.find_key(connection, admin_key)
                 agencies.revoke_keys_labelled(connection, _ENVIRONMENT, now)
                 if known is None:
-                    agencies.add_key(
-                        connection, admin_key, agency_id=agency_id, scope=Scope.ADMIN, label=_ENVIRONMENT, now=now
-                    )
+                    add_key(connection, admin_key, agency_id=agency_id, scope=Scope.ADMIN, label=_ENVIRONMENT, now=now)
                 elif known["label"] == _ENVIRONMENT:
                     agencies.restore_key(connection, known["id"])
                 return None
             if first is not None:
                 return None
             key = new_key()
-            agencies.add_key(connection, key, agency_id=agency_id, scope=Scope.ADMIN, label="first admin key", now=now)
+            add_key(connection, key, agency_id=agency_id, scope=Scope.ADMIN, label="first admin key", now=now)
             return key
 
     def create_key(self, agency: str, scope: Scope, label: str, expires_at: datetime | None = None) -> str:
@@ -174,12 +192,21 @@ class Access:
         key = new_key()
         with self._database.write() as connection:
             agency_id = agencies.find_agency(connection, agency) or agencies.add_agency(connection, agency, now)
-            agencies.add_key(
-                connection, key, agency_id=agency_id, scope=scope, label=label, now=now, expires_at=expires_at
-            )
+            add_key(connection, key, agency_id=agency_id, scope=scope, label=label, now=now, expires_at=expires_at)
         return key
 
 
-def new_key() -> str:
-    """A key with 256 random bits."""
-    return f"wmk_{secrets.token_urlsafe(32)}"
+def add_key(connection: sa.Connection, key: str, *, agency_id: str, scope: Scope, label: str, **more: Any) -> str:
+    """Store a key with what lists show of it; returns its id."""
+    return agencies.add_key(
+        connection, key, agency_id=agency_id, scope=scope, label=label, prefix=shown_part(key), **more
+    )
+
+
+def _check_given_key(key: str) -> None:
+    try:
+        check_key(key)
+    except NotAuthenticated as error:
+        raise InvalidParameter(
+            error.message, field="WAYMARK_ADMIN_KEY", cure="copy it again, or take a key that does not start with wm_"
+        ) from error

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 WAYMARK = [sys.executable, "-c", "from app.cli import main; main()"]
@@ -68,7 +69,10 @@ def _serving(folder: Path, **extra: str) -> Iterator[_Served]:
 def test_a_fresh_server_prints_its_key_once_and_keeps_what_it_is_told(tmp_path: Path) -> None:
     with _serving(tmp_path / "new" / "var") as first:
         assert httpx.get(f"{first.url}/v1/markers", trust_env=False).status_code == 401
-    key = re.fullmatch(r"Admin key \(shown once, keep it\): (wmk_[\w-]{43})\n", first.output)
+        for elsewhere in ("127.0.0.2", "[::1]"):  # it listens on 127.0.0.1 alone
+            with pytest.raises(httpx.ConnectError):
+                httpx.get(f"{first.url}/healthz".replace("127.0.0.1", elsewhere), trust_env=False)
+    key = re.fullmatch(r"Admin key \(shown once, keep it\): (wm_\w{8}_\w{43}_\w{6})\n", first.output)
     assert key, first.output
     assert key[1] not in first.logs
     headers = {"X-API-Key": key[1]}

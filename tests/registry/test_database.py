@@ -47,7 +47,7 @@ def _is_declared(name: str | None, kind: str, parents: Mapping[str, str | None])
 
 def test_the_connection_is_strict(database: Database) -> None:
     with pytest.raises(sa.exc.IntegrityError), database.write() as connection:
-        agencies.add_key(connection, "x" * 40, agency_id="nobody", scope="viewer", label="x", now=NOW)
+        agencies.add_key(connection, "x" * 40, agency_id="nobody", scope="viewer", label="x", prefix="x", now=NOW)
 
 
 @pytest.mark.filterwarnings("ignore:Did not recognize type 'geometry'")
