@@ -16,14 +16,14 @@ router = APIRouter(prefix="/v1/audit", tags=["audit"])
 MAX_PAGE = 1000
 
 
-class HeadOut(BaseModel):
+class AuditHeadOut(BaseModel):
     """The newest entry. Who keeps it elsewhere can tell later whether the log was cut or written anew."""
 
     number: int
     hash: str
 
 
-class EntryOut(BaseModel):
+class AuditEntryOut(BaseModel):
     """One operation, with the hash of the entry before it."""
 
     number: int
@@ -39,14 +39,14 @@ class EntryOut(BaseModel):
     hash: str
 
 
-class EntryPage(BaseModel):
+class AuditPage(BaseModel):
     """A page of the log, oldest first, and its head."""
 
-    items: list[EntryOut]
-    head: HeadOut | None
+    items: list[AuditEntryOut]
+    head: AuditHeadOut | None
 
 
-@router.get("", response_class=Response, responses={200: {"model": EntryPage}, **problem_responses()})
+@router.get("", response_class=Response, responses={200: {"model": AuditPage}, **problem_responses()})
 def list_entries(
     request: Request,
     caller: Caller,

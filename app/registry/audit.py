@@ -93,13 +93,18 @@ def version_sha256(
 ) -> str:
     """Hash of a version: SHA-256 of these values as a JSON array with sorted keys (RFC 8259, no spaces)."""
     values = (agency_id, marker_id, version, at.astimezone(UTC), who, why, kind, marker)
-    return hashlib.sha256(orjson.dumps(values, option=orjson.OPT_SORT_KEYS)).hexdigest()
+    return content_sha256(values)
+
+
+def content_sha256(content: Any) -> str:
+    """SHA-256 of a value as JSON with sorted keys."""
+    return hashlib.sha256(orjson.dumps(content, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
 
 def entry_hash(entry: Mapping[str, Any] | Row) -> str:
     """Hash of an entry: SHA-256 of all its other columns as a JSON array, the hash before it among them."""
     values = [entry[column.name] for column in audit_log.c if column.name != "hash"]
-    return hashlib.sha256(orjson.dumps(values, option=orjson.OPT_SORT_KEYS)).hexdigest()
+    return content_sha256(values)
 
 
 @contextmanager

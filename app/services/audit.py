@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from datetime import datetime
 from typing import Any
+
+import sqlalchemy as sa
 
 from app.errors import InvalidParameter, NotFound
 from app.registry import agencies
@@ -21,6 +24,35 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 def author_of(caller: Caller) -> Author:
     """Whom the history names for what a caller does."""
     return Author(caller.label, caller.key_id)
+
+
+def log_change(
+    connection: sa.Connection,
+    caller: Caller,
+    action: str,
+    *,
+    now: datetime,
+    subject: str | None = None,
+    document: dict[str, Any] | None = None,
+    **detail: Any,
+) -> None:
+    """Append an entry for a change that writes no versions of markers.
+
+    Parameters
+    ----------
+    connection : Connection
+        Of the transaction that makes the change.
+    caller : Caller
+    action, subject : str
+        What was done, and the id or name of what it was done to.
+    document : dict, optional
+        What it is now; its hash goes into the log.
+    **detail
+        What else there is to say; never a secret.
+    """
+    if document is not None:
+        detail["sha256"] = store.content_sha256(document)
+    store.record(connection, caller.agency_id, author_of(caller), action, now=now, subject=subject, detail=detail)
 
 
 class AuditLog:

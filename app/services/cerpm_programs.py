@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -19,6 +19,7 @@ from app.registry.database import Database
 from app.registry.markers import Row
 from app.services.access import Caller, Scope
 from app.services.agency_secrets import AgencySecrets
+from app.services.audit import log_change
 from app.services.cerpm_markers import FAMILY, message_of, radio_of
 from app.services.marker_rules import RETIRED
 from app.services.marker_selection import Selection, select_markers
@@ -83,7 +84,7 @@ class CerpmPrograms:
             agency_key = self._secrets.find_key(connection, caller.agency_id)
             following = _next_sequences(connection, caller.agency_id, [row])
         if agency_key is None:
-            agency_key = self._make_key(caller.agency_id)
+            agency_key = self._make_key(caller)
         number = int(row["digits"])
         chosen = following[number] if sequence is None else sequence
         key = derive_marker_key(agency_key, number)
@@ -107,7 +108,7 @@ class CerpmPrograms:
             agency_key = self._secrets.find_key(connection, agency_id)
             following = _next_sequences(connection, agency_id, rows)
         if agency_key is None:
-            agency_key = self._make_key(agency_id)
+            agency_key = self._make_key(caller)
         programs = [
             MarkerProgram(
                 message_of(row, following[int(row["digits"])]),
@@ -116,12 +117,19 @@ class CerpmPrograms:
             )
             for row in rows
         ]
+        if with_keys:
+            numbers = sorted(int(row["digits"]) for row in rows)
+            said: dict[str, Any] = {"markers": len(rows), "first": numbers[0], "last": numbers[-1]}
+            with self._database.write() as connection:
+                log_change(connection, caller, "marker-keys.handed-out", now=self._clock(), **said)
         return write_programs_csv(programs, with_keys=with_keys)
 
-    def _make_key(self, agency_id: str) -> bytes:
-        now: datetime = self._clock()
+    def _make_key(self, caller: Caller) -> bytes:
+        now = self._clock()
         with self._database.write() as connection:
-            return self._secrets.ensure_key(connection, agency_id, now)
+            if self._secrets.find_key(connection, caller.agency_id) is None:
+                log_change(connection, caller, "agency-key.made", now=now)
+            return self._secrets.ensure_key(connection, caller.agency_id, now)
 
 
 def _next_sequences(connection: sa.Connection, agency_id: str, rows: list[Row]) -> dict[int, int]:

@@ -15,6 +15,7 @@ from app.registry.codebooks import Row
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.services.access import Caller
+from app.services.audit import log_change
 from app.services.codebook_documents import (
     book_columns,
     book_of,
@@ -104,6 +105,7 @@ class Codebooks:
                 "updated_at": now,
             }
             document = codebook_document(store.add_codebook(connection, caller.agency_id, values))
+            log_change(connection, caller, "codebook.made", now=now, subject=document["id"], document=document)
             keep_answer(connection, caller.agency_id, key, document, now, self._ttl)
         return document, False
 
@@ -137,6 +139,7 @@ class Codebooks:
                         connection, caller.agency_id, codebook_id, entries, version=row["version"], now=now
                     )
                     document = codebook_document(changed)
+                    log_change(connection, caller, "codebook.extended", now=now, subject=codebook_id, document=document)
                     keep_answer(connection, caller.agency_id, key, document, now, self._ttl)
             except StaleVersion:
                 continue

@@ -14,6 +14,7 @@ from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.vehicles import Row
 from app.services.access import Caller
+from app.services.audit import log_change
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
 from app.services.ports import Clock
 from app.services.profiles import INTRINSICS, check_profile
@@ -104,6 +105,7 @@ class Vehicles:
             }
             row = store.add_vehicle(connection, caller.agency_id, values, who=caller.label, why=None)
             document = vehicle_document(row)
+            log_change(connection, caller, "vehicle.added", now=now, subject=row["id"], document=profile)
             keep_answer(connection, caller.agency_id, key, document, now, self._ttl)
         return document, False
 
@@ -219,6 +221,9 @@ class Vehicles:
                         f"{len(linked)} keys speak for the vehicle", field="key_id", limit=f"at most {MAX_KEYS} keys"
                     )
                 store.link_key(connection, caller.agency_id, holder_id, vehicle_id)
+                log_change(
+                    connection, caller, "vehicle.key-linked", now=self._clock(), subject=vehicle_id, key=holder_id
+                )
             return _document(connection, caller, row)
 
     def unlink_key(self, caller: Caller, vehicle_id: str, key_id: str) -> None:
@@ -234,6 +239,7 @@ class Vehicles:
             holder_id = _holder(connection, caller, key_id)
             if not store.unlink_key(connection, caller.agency_id, holder_id, vehicle_id):
                 raise NotFound(f"the key {key_id} does not speak for this vehicle", field="key_id")
+            log_change(connection, caller, "vehicle.key-unlinked", now=self._clock(), subject=vehicle_id, key=holder_id)
 
 
 def vehicle_document(row: Row, keys: list[Row] | None = None) -> dict[str, Any]:
@@ -266,6 +272,8 @@ def _changed(
     changed = store.update_vehicle(
         connection, caller.agency_id, row["id"], changes, version=version, now=now, who=caller.label, why=why
     )
+    said = {"version": changed["version"], "status": changed["status"]}
+    log_change(connection, caller, "vehicle.changed", now=now, subject=row["id"], document=changed["profile"], **said)
     return _document(connection, caller, changed)
 
 

@@ -105,3 +105,36 @@ def test_verify_beside_a_running_server(
     bad = CliRunner().invoke(cli, ["audit", "verify"])
     assert bad.exit_code == 1
     assert f"checked: version 1 of marker {marker_id}: changed" in bad.output
+
+
+def test_other_changes_are_entries_too(server: LiveServer, admin: httpx.Client) -> None:
+    after = admin.get("/v1/audit").json()["head"]["number"]
+    server.agency("audited", Scope.VIEWER).close()
+    design = {"magnets": 3, "length_m": 4, "segment_m": 0.1}
+    meaning = {"kind": "arrow", "value": "straight"}
+    book = admin.post("/v1/codebooks", json={"name": f"book {after}", "design": design, "meanings": []}).json()
+    admin.post(f"/v1/codebooks/{book['id']}/entries", json={"meanings": [meaning]})
+    vehicle = admin.post("/v1/vehicles", json={"name": f"van {after}", "profile": {}}).json()
+    items = admin.get("/v1/audit", params={"after": after}).json()["items"]
+    assert [entry["action"] for entry in items] == [
+        "key.created",
+        "codebook.made",
+        "codebook.extended",
+        "vehicle.added",
+    ]
+    assert items[0]["detail"]["scope"] == "viewer"
+    assert items[0]["who"] == "the server's operator"
+    assert [entry["subject"] for entry in items[1:]] == [book["id"], book["id"], vehicle["id"]]
+    assert items[1]["detail"]["sha256"] != items[2]["detail"]["sha256"]
+    assert all(entry["versions"] == 0 for entry in items)
+
+
+def test_handing_out_keys_of_markers_is_an_entry(admin: httpx.Client, place: Place) -> None:
+    body = {"family": "cerpm", "position": place(), "side": "left"}
+    assert admin.post("/v1/markers", json=body).status_code == 201
+    for with_keys in (True, False):
+        response = admin.post("/v1/programs", json={"with_keys": with_keys})
+        assert response.status_code == 200, response.text
+    items = admin.get("/v1/audit", params={"limit": 1000}).json()["items"]
+    assert [entry["action"] for entry in items].count("marker-keys.handed-out") == 1
+    assert [entry["action"] for entry in items].count("agency-key.made") == 1
