@@ -26,6 +26,7 @@ from app.api import (
     keys,
     layouts,
     markers,
+    observations,
     radio_checks,
     searches,
     system,
@@ -64,6 +65,7 @@ from app.services.keys import Keys
 from app.services.layouts import Layouts
 from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
+from app.services.observations import Observations
 from app.services.searches import Searches
 from app.services.vehicles import Vehicles
 from app.settings import Settings
@@ -75,6 +77,7 @@ ROUTERS = (
     system.router,
     searches.router,
     bulk.router,
+    observations.router,
     markers.router,
     artwork.router,
     layouts.router,
@@ -129,6 +132,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.exports = Exports(database)
     app.state.audit = AuditLog(database)
     app.state.searches = Searches(database)
+    app.state.observations = Observations(database)
     app.state.bulk_markers = BulkMarkers(database, utc_now, app.state.markers, rules.idempotency_ttl)
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)

@@ -48,6 +48,8 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/markers/{marker_id}": READERS,
     "PATCH /v1/markers/{marker_id}": SURVEYORS,
     "GET /v1/markers/{marker_id}/versions": READERS,
+    "GET /v1/markers/{marker_id}/observations": READERS,
+    "GET /v1/markers/{marker_id}/observations/summary": READERS,
     "GET /v1/markers/{marker_id}/artwork.{form}": READERS,
     "GET /v1/markers/{marker_id}/layout.{form}": READERS,
     "GET /v1/markers/{marker_id}/payload.{form}": PLANNERS,  # who has a payload can speak for the marker
