@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from operator import itemgetter
 from typing import Any
 
 import sqlalchemy as sa
@@ -69,15 +70,17 @@ def add_markers(
 ) -> None:
     """Store new markers of the entry's agency, each with the first version of its history.
 
-    Every row has the same columns, and they are in the order of their ids; `kind` tells a version's from the status.
+    Every row has all columns of `PUBLIC`, and they are in the order of their ids; `kind` tells a version's kind from
+    the status.
     """
     names = [str(column.name) for column in PUBLIC]
+    pick = itemgetter(*names)
     for start in range(0, len(rows), _INSERT):
         chunk = rows[start : start + _INSERT]
         load_rows(connection, markers, [{"agency_id": entry.agency_id, **row} for row in chunk])
         versions = []
         for row in chunk:
-            marker = {name: row.get(name) for name in names}
+            marker = dict(zip(names, pick(row), strict=True))
             versions.append(entry.version(row["id"], 1, marker, kind=kind(row["status"]), why=why))
         load_rows(connection, marker_versions, versions)
 

@@ -1,6 +1,6 @@
 """Rows by the hundred thousand: past SQLAlchemy's compiler, by COPY on PostgreSQL, with the indexes filled afterwards.
 
-SQLite gets one prepared statement a table. A load that is large beside what a table holds drops the secondary indexes
+SQLite gets one prepared statement a table. A load that is large beside what a table holds drops indexes
 and the R*Tree's trigger for its transaction: keeping them up row by row costs more than making them anew.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from operator import itemgetter
 from typing import Any
 
@@ -17,12 +17,12 @@ import orjson
 import psycopg
 import sqlalchemy as sa
 
+from app.registry.rtree_pack import fill_rtree
+
 LARGE = 50_000
 """From as many rows on the indexes are made anew, if the table does not hold more than the rows that come."""
 _CACHE_KIB = 96 * 1024
 _RTREE_TRIGGER = "markers_rtree_insert"
-_FILL_RTREE = """INSERT INTO markers_rtree
-    SELECT row, lon_deg, lon_deg, lat_deg, lat_deg FROM markers WHERE row > ? ORDER BY row"""
 
 
 def load_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -32,22 +32,20 @@ def load_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping
     """
     if not rows:
         return
-    names = tuple(name for name in rows[0] if name in table.c)
+    names = tuple(str(name) for name in rows[0] if name in table.c)
     pick = itemgetter(*names)
-    convert = [(k, _converter(table.c[name].type, connection.dialect.name)) for k, name in enumerate(names)]
-    changed = [(k, function) for k, function in convert if function is not None]
-    values = []
-    for row in rows:
-        picked = list(pick(row))
-        for k, function in changed:
-            picked[k] = function(picked[k])
-        values.append(picked)
+    columns = list(zip(*map(pick, rows), strict=True))
+    for k, name in enumerate(names):
+        convert = _converter(table.c[name].type, connection.dialect.name)
+        if convert is not None:
+            columns[k] = tuple(map(convert, columns[k]))
+    values = list(zip(*columns, strict=True))
     if connection.dialect.name == "postgresql":
         _copy(connection, table, names, values)
     else:
         places = ", ".join("?" * len(names))
         statement = f"INSERT INTO {table.name} ({_listed(names)}) VALUES ({places})"
-        connection.exec_driver_sql(statement, [tuple(row) for row in values])
+        connection.exec_driver_sql(statement, values)
 
 
 @contextmanager
@@ -59,15 +57,15 @@ def large_load(connection: sa.Connection, tables: Sequence[sa.Table], rows: int)
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql(f"PRAGMA cache_size = -{_CACHE_KIB}")
     put_off = _put_off_postgresql if connection.dialect.name == "postgresql" else _put_off_sqlite
-    again = [statement for table in tables if _count_up_to(connection, table, rows) <= rows
-             for statement in put_off(connection, table)]  # fmt: skip
+    again = [step for table in tables if _count_up_to(connection, table, rows) <= rows
+             for step in put_off(connection, table)]  # fmt: skip
     try:
         yield
     finally:
         if connection.dialect.name == "sqlite":
             connection.exec_driver_sql("PRAGMA cache_size = -2000")
-    for statement, values in again:
-        connection.exec_driver_sql(statement, values)
+    for step in again:
+        step()
 
 
 def _count_up_to(connection: sa.Connection, table: sa.Table, most: int) -> int:
@@ -75,23 +73,37 @@ def _count_up_to(connection: sa.Connection, table: sa.Table, most: int) -> int:
     return int(connection.execute(sa.select(sa.func.count()).select_from(query)).scalar_one())
 
 
-def _put_off_sqlite(connection: sa.Connection, table: sa.Table) -> list[tuple[str, tuple[Any, ...]]]:
-    """Drop the indexes of a table that have statements of their own; what makes them again."""
+def _put_off_sqlite(connection: sa.Connection, table: sa.Table) -> list[Callable[[], object]]:
+    """Drop the indexes by digits and the R*Tree's trigger; what makes them again.
+
+    The other indexes end in the rising id: keeping them up costs less than reading the table again.
+    """
     query = "SELECT name, type, sql FROM sqlite_master WHERE tbl_name = ? AND sql IS NOT NULL AND type IN (?, ?)"
     found = connection.exec_driver_sql(query, (table.name, "index", "trigger")).all()
-    again: list[tuple[str, tuple[Any, ...]]] = []
+    again: list[Callable[[], object]] = []
     for name, kind, statement in found:
-        if kind == "index":
+        if kind == "index" and "digits" in statement:
             connection.exec_driver_sql(f"DROP INDEX {name}")
-            again.append((statement, ()))
         elif name == _RTREE_TRIGGER:
-            last = connection.exec_driver_sql(f"SELECT coalesce(max(row), 0) FROM {table.name}").scalar_one()
             connection.exec_driver_sql(f"DROP TRIGGER {name}")
-            again += [(_FILL_RTREE, (last,)), (statement, ())]
+            last = connection.exec_driver_sql(f"SELECT coalesce(max(row), 0) FROM {table.name}").scalar_one()
+            again.append(partial(_fill_rtree, connection, table.name, last))
+        else:
+            continue
+        again.append(partial(connection.exec_driver_sql, statement))
     return again
 
 
-def _put_off_postgresql(connection: sa.Connection, table: sa.Table) -> list[tuple[str, tuple[Any, ...]]]:
+def _fill_rtree(connection: sa.Connection, table: str, last: int) -> None:
+    """Put the rows after the `last` one into the R*Tree."""
+    if last:
+        statement = f"INSERT INTO {table}_rtree SELECT row, lon_deg, lon_deg, lat_deg, lat_deg FROM {table}"
+        connection.exec_driver_sql(f"{statement} WHERE row > ?", (last,))
+    else:
+        fill_rtree(connection, table)
+
+
+def _put_off_postgresql(connection: sa.Connection, table: sa.Table) -> list[Callable[[], object]]:
     """Drop the indexes and foreign keys of a table that is empty and ours; what makes them again.
 
     Nobody waits for the lock: there is nothing to read in an empty table.
@@ -116,10 +128,11 @@ def _put_off_postgresql(connection: sa.Connection, table: sa.Table) -> list[tupl
         connection.exec_driver_sql(f"ALTER TABLE {table.name} DROP CONSTRAINT {name}")
     for name, _definition in indexes:
         connection.exec_driver_sql(f"DROP INDEX {name}")
-    return [
-        *((definition, ()) for _name, definition in indexes),
-        *((f"ALTER TABLE {table.name} ADD CONSTRAINT {name} {definition}", ()) for name, definition in keys),
+    statements = [
+        *(definition for _name, definition in indexes),
+        *(f"ALTER TABLE {table.name} ADD CONSTRAINT {name} {definition}" for name, definition in keys),
     ]
+    return [partial(connection.exec_driver_sql, statement) for statement in statements]
 
 
 def _copy(connection: sa.Connection, table: sa.Table, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -9,7 +9,7 @@ from datetime import datetime
 
 
 def new_ids(now: datetime, count: int, part: int = 0) -> list[str]:
-    """Many UUIDs version 7, rising; those of a later `part` (0 to 2047) of the same time come after.
+    """Many UUIDs version 7, rising; those of a later `part` (0 to 4095) of the same time come after.
 
     Notes
     -----

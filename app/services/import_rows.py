@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import orjson
 
 from app.encoders.cerpm.settings import RadioSettings
 from app.markers.cerpm import HEIGHT_M, LaneSide, SpeedLimit
@@ -108,15 +109,20 @@ def marker_columns(
     }
     digits = [code.decode() for code in codes.digits.tolist()]
     made = [
-        {**fixed, **columns, "id": marker_id, "digits": code}
+        {**fixed, **columns, "id": marker_id, "digits": code, "original": _prepared(columns["original"])}
         for marker_id, columns, code in zip(ids, common, digits, strict=True)
     ]
     if declaration.family == "cerpm":
-        specs = _specs(defaults)
+        specs = {name: _prepared(spec) for name, spec in _specs(defaults).items()}
         sides = _texts_of(survey, codes.rows, "side")
         for columns, side in zip(made, sides, strict=True):
             columns["spec"] = specs[side.upper()]
     return made
+
+
+def _prepared(value: dict[str, Any]) -> orjson.Fragment:
+    """JSON that goes into the marker and into its history, made once; its keys sorted as the history's hashes want."""
+    return orjson.Fragment(orjson.dumps(value, option=orjson.OPT_SORT_KEYS))
 
 
 def _family_columns(codes: RowCodes, declaration: ImportDeclaration, defaults: MarkerDefaults) -> dict[str, Any]:

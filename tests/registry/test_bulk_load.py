@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
+import numpy as np
 import orjson
 import pytest
 import sqlalchemy as sa
@@ -14,6 +15,7 @@ from app.registry.bulk_load import large_load, load_rows
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, list_markers
+from app.registry.rtree_pack import fill_rtree
 from app.registry.spatial import box_around
 from app.registry.tables import marker_versions, markers
 
@@ -90,6 +92,8 @@ def test_a_large_load_leaves_every_index_and_finds_what_it_stored(database: Data
             load_rows(connection, markers, rows)
     assert _schema(database) == schema
     with database.read() as connection:
+        if database.path is not None:
+            assert connection.exec_driver_sql("SELECT rtreecheck('markers_rtree')").scalar_one() == "ok"
         for lon_deg in (8.0, 20.0):
             near = MarkerFilter(box=box_around(lon_deg, 49.123456789, 50.0))
             found = list_markers(connection, agency, near, after=None, limit=100)
@@ -110,3 +114,31 @@ def test_a_large_load_that_fails_leaves_nothing(database: Database, agency: str)
     assert _schema(database) == schema
     with database.read() as connection:
         assert _stored(connection, agency) == []
+
+
+@pytest.mark.parametrize("count", [0, 1, 51, 52, 2_700, 140_000])
+def test_a_packed_rtree_is_sound_and_proposes_every_row(count: int) -> None:
+    rng = np.random.default_rng(count)
+    places = np.column_stack([rng.uniform(-180, 180, count), rng.uniform(-90, 90, count)])
+    places[::7] = places[:1]  # many at one place
+    engine = sa.create_engine("sqlite://")
+    with engine.begin() as connection:
+        connection.exec_driver_sql("CREATE TABLE markers (row INTEGER PRIMARY KEY, lon_deg, lat_deg)")
+        connection.exec_driver_sql(
+            "CREATE VIRTUAL TABLE markers_rtree USING rtree(row, min_lon, max_lon, min_lat, max_lat)"
+        )
+        if count:
+            connection.exec_driver_sql(
+                "INSERT INTO markers (lon_deg, lat_deg) VALUES (?, ?)", list(map(tuple, places.tolist()))
+            )
+        fill_rtree(connection, "markers")
+        assert connection.exec_driver_sql("SELECT rtreecheck('markers_rtree')").scalar_one() == "ok"
+        query = "SELECT row FROM markers_rtree WHERE max_lon >= ? AND min_lon <= ? AND max_lat >= ? AND min_lat <= ?"
+        for west, south in rng.uniform((-180, -90), (170, 80), (20, 2)).tolist():
+            found = set(connection.exec_driver_sql(query, (west, west + 10, south, south + 10)).scalars())
+            inside = (places >= (west, south)).all(axis=1) & (places <= (west + 10, south + 10)).all(axis=1)
+            assert found >= set((np.flatnonzero(inside) + 1).tolist())
+        connection.exec_driver_sql("INSERT INTO markers_rtree VALUES (999999, 1, 1, 1, 1)")
+        connection.exec_driver_sql("DELETE FROM markers_rtree WHERE row = 1")
+        assert connection.exec_driver_sql("SELECT rtreecheck('markers_rtree')").scalar_one() == "ok"
+    engine.dispose()

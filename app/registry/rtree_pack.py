@@ -1,0 +1,115 @@
+"""An R*Tree of SQLite filled in one go: points sorted into full nodes, not put in one after another.
+
+SQLite keeps an R*Tree in three ordinary tables (https://www.sqlite.org/rtree.html, "Shadow Tables"). A node is a blob:
+its depth (of the root, else zero) and its number of cells as two big-endian 16-bit numbers, then cells of a 64-bit id
+(of a row, or of the node below) and the box as 32-bit floats: least and greatest of each axis, rounded outward.
+Packing: Leutenegger, Lopez, Edgington, "STR: a simple and efficient algorithm for R-tree packing", ICDE 1997.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import sqlalchemy as sa
+
+_CELL = np.dtype([("id", ">i8"), ("box", ">f4", (4,))])
+_HEADER = np.dtype([("depth", ">u2"), ("cells", ">u2")])
+_ROOT = 1
+
+Ids = npt.NDArray[np.int64]
+Boxes = npt.NDArray[np.float32]
+
+
+def fill_rtree(connection: sa.Connection, table: str) -> None:
+    """Fill the empty R*Tree of a table with the places of all its rows."""
+    rtree = f"{table}_rtree"
+    rows = _places(connection, table)
+    if not len(rows):
+        return
+    size = connection.exec_driver_sql(f"SELECT length(data) FROM {rtree}_node WHERE nodeno = 1").scalar_one()
+    ids, boxes, depth, next_node = rows[:, 0].astype(np.int64), _outward(rows[:, 1:]), 0, _ROOT + 1
+    most = (int(size) - _HEADER.itemsize) // _CELL.itemsize
+    while len(ids) > most:
+        order, starts = _packed(boxes, most)
+        nodes = np.arange(next_node, next_node + len(starts), dtype=np.int64)
+        counts = np.diff([*starts, len(order)])
+        _store(connection, rtree, ids[order], boxes[order], nodes, starts, size=size, is_leaf=depth == 0)
+        least, greatest = (f.reduceat(boxes[order], starts) for f in (np.minimum, np.maximum))
+        boxes = np.stack([least[:, 0], greatest[:, 1], least[:, 2], greatest[:, 3]], axis=1)
+        ids, depth, next_node = nodes, depth + 1, next_node + len(counts)
+    root = np.array([_ROOT], dtype=np.int64)
+    _store(connection, rtree, ids, boxes, root, np.zeros(1, dtype=np.intp), size=size, is_leaf=depth == 0, depth=depth)
+
+
+def _places(connection: sa.Connection, table: str) -> npt.NDArray[np.float64]:
+    """Row, longitude and latitude of all rows, shape (N, 3)."""
+    driver = connection.connection.driver_connection
+    assert driver is not None
+    cursor = driver.execute(f"SELECT row, lon_deg, lat_deg FROM {table}")
+    parts = [np.empty((0, 3))]
+    while part := cursor.fetchmany(20_000):
+        parts.append(np.array(part, dtype=np.float64))
+    return np.concatenate(parts)
+
+
+def _outward(places: npt.NDArray[np.float64]) -> Boxes:
+    """Boxes of points, shape (N, 4): each side the next 32-bit float that is not inside."""
+    near = places.astype(np.float32)
+    low = np.where(near > places, np.nextafter(near, np.float32(-np.inf)), near)
+    high = np.where(near < places, np.nextafter(near, np.float32(np.inf)), near)
+    return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], axis=1).astype(np.float32)
+
+
+def _packed(boxes: Boxes, most: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Order of the entries and the first of each node: slices of longitude, in each runs of latitude."""
+    nodes = math.ceil(len(boxes) / most)
+    slices = math.ceil(math.sqrt(nodes))
+    by_lon = np.argsort(boxes[:, 0], kind="stable")
+    number = np.empty(len(boxes), dtype=np.intp)
+    number[by_lon] = np.arange(len(boxes)) * slices // len(boxes)
+    order = np.lexsort((boxes[:, 2], number))
+    starts = []
+    for first, last in zip(*_edges(number[order]), strict=True):
+        parts = math.ceil((last - first) / most)
+        starts.append(first + np.arange(parts) * (last - first) // parts)
+    return order, np.concatenate(starts)
+
+
+def _edges(number: npt.NDArray[np.intp]) -> tuple[list[int], list[int]]:
+    changes = (np.flatnonzero(np.diff(number)) + 1).tolist()
+    return [0, *changes], [*changes, len(number)]
+
+
+def _store(
+    connection: sa.Connection,
+    rtree: str,
+    ids: Ids,
+    boxes: Boxes,
+    nodes: Ids,
+    starts: npt.NDArray[np.intp],
+    *,
+    size: int,
+    is_leaf: bool,
+    depth: int = 0,
+) -> None:
+    """Write nodes, and which node each of their entries is in."""
+    counts = np.diff([*starts, len(ids)])
+    cells = np.empty(len(ids), dtype=_CELL)
+    cells["id"], cells["box"] = ids, boxes
+    blobs = (
+        _node(cells[start : start + count], depth, size) for start, count in zip(starts.tolist(), counts, strict=True)
+    )
+    connection.exec_driver_sql(
+        f"INSERT OR REPLACE INTO {rtree}_node VALUES (?, ?)", list(zip(nodes.tolist(), blobs, strict=True))
+    )
+    child = f"{rtree}_rowid" if is_leaf else f"{rtree}_parent"
+    order = np.argsort(ids, kind="stable")
+    within = zip(ids[order].tolist(), np.repeat(nodes, counts)[order].tolist(), strict=True)
+    connection.exec_driver_sql(f"INSERT INTO {child} VALUES (?, ?)", list(within))
+
+
+def _node(cells: npt.NDArray[np.void], depth: int, size: int) -> bytes:
+    header = np.array((depth, len(cells)), dtype=_HEADER)
+    return (header.tobytes() + cells.tobytes()).ljust(size, b"\x00")
