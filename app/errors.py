@@ -88,6 +88,22 @@ class NotAllowed(WaymarkError):
     """The key is valid, but its scope does not cover this."""
 
 
+class TooManyRequests(WaymarkError):
+    """More was asked for in a time than is allowed.
+
+    Parameters
+    ----------
+    retry_after_s : int
+        When asking again can work, > 0. [s]
+    """
+
+    def __init__(
+        self, message: str, *, limit: str | None = None, cure: str | None = None, retry_after_s: int = 1
+    ) -> None:
+        super().__init__(message, limit=limit, cure=cure)
+        self.retry_after_s = retry_after_s
+
+
 class Unavailable(WaymarkError):
     """A part the request needs is busy or down; trying again later can work."""
 

@@ -38,6 +38,7 @@ from app.api.ogc import mount_ogc
 from app.api.openapi import describe
 from app.api.permissions import Permissions
 from app.api.problems import install_problem_handlers
+from app.api.rate_limits import RateLimit
 from app.decoders.archives import ArchiveLimits
 from app.decoders.images import ImageLimits
 from app.decoders.plate import decode_plates
@@ -157,6 +158,9 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         Guarded,
         authenticate=access.authenticate,
         recall=access.recall,
+        was_valid=access.was_valid,
+        requests=_request_limit(settings),
+        failures=_failure_limit(settings),
         body_limits={
             "": settings.max_json_bytes,
             "/v1/decodes": settings.max_upload_bytes,
@@ -193,6 +197,30 @@ def utc_now() -> datetime:
 
 def _admin_key(settings: Settings) -> str | None:
     return settings.admin_key.get_secret_value() if settings.admin_key is not None else None
+
+
+def _request_limit(settings: Settings) -> RateLimit | None:
+    if not settings.requests_per_s:
+        return None
+    return RateLimit(
+        settings.requests_per_s,
+        settings.requests_at_once,
+        name="key",
+        said="too many requests came with this key",
+        cure="wait as long as Retry-After says, or ask for more at a time: larger pages, bulk requests, ZIP uploads",
+    )
+
+
+def _failure_limit(settings: Settings) -> RateLimit | None:
+    if not settings.wrong_keys_per_minute:
+        return None
+    return RateLimit(
+        settings.wrong_keys_per_minute / 60,
+        max(1, round(settings.wrong_keys_per_minute)),
+        name="wrong-keys",
+        said="too many wrong keys came from this address",
+        cure="wait as long as Retry-After says, and check the key",
+    )
 
 
 def _marker_rules(settings: Settings) -> MarkerRules:

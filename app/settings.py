@@ -56,6 +56,14 @@ class Settings(BaseSettings):
     )
     idempotency_ttl_h: float = Field(default=24.0, gt=0, description="How long an Idempotency-Key is remembered. [h]")
 
+    requests_per_s: float = Field(
+        default=200.0, ge=0, le=1e6, description="Requests of one key in the long run; 0: no limit. [1/s]"
+    )
+    requests_at_once: int = Field(default=1000, ge=1, le=1_000_000, description="Requests of one key in a burst.")
+    wrong_keys_per_minute: float = Field(
+        default=30.0, ge=0, le=1e6, description="Wrong keys from one address; 0: no limit. [1/min]"
+    )
+
     log_format: Literal["console", "json"] = Field(default="console", description="How log lines are written.")
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(default="INFO", description="Least level logged.")
 

@@ -73,6 +73,7 @@ class Server:
         self._environment = os.environ | {
             "WAYMARK_DATA_DIR": str(folder),
             "WAYMARK_ADMIN_KEY": KEY,
+            "WAYMARK_REQUESTS_PER_S": "0",
             "WAYMARK_LOG_FORMAT": "json",
         }
 

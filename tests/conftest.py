@@ -20,6 +20,8 @@ from app.settings import Settings
 from tests.databases import PostgresServer, postgres_server
 
 ADMIN_KEY = "an-admin-key-for-tests-only"
+UNLIMITED: dict[str, Any] = {"requests_per_s": 0.0, "wrong_keys_per_minute": 0.0}
+"""Settings of servers that tests ask faster than a key may."""
 
 
 class LiveServer:
@@ -84,7 +86,7 @@ def settings(tmp_path: Path, new_database_url: Callable[[Path], str]) -> Setting
     """Settings of a server with an empty folder and an empty database of its own."""
     folder = tmp_path / "var"
     url = new_database_url(folder)
-    return Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, warm_decoders=False)
+    return Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, warm_decoders=False, **UNLIMITED)
 
 
 @pytest.fixture
@@ -112,7 +114,7 @@ def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[
     """A server that the tests of a module share; each test has an agency of its own."""
     folder = tmp_path_factory.mktemp("server") / "var"
     url = new_database_url(folder)
-    settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, warm_decoders=False)
+    settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, warm_decoders=False, **UNLIMITED)
     with LiveServer(create_app(settings)) as running:
         yield running
 

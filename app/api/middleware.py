@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api.permissions import Permissions
 from app.api.problems import BodyRefused, problem_from, unexpected
+from app.api.rate_limits import RateLimit, address_of
 from app.errors import MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
 from app.services.access import Caller
 
@@ -58,7 +59,9 @@ class Observed:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                MutableHeaders(scope=message)["X-Request-ID"] = request_id
+                headers = MutableHeaders(scope=message)
+                headers["X-Request-ID"] = request_id
+                headers.raw.extend(scope["state"].get("rate_limit", ()))
             await send(message)
 
         try:
@@ -96,6 +99,10 @@ class Guarded:
         The caller behind a key; runs in a thread.
     recall : callable
         The caller behind a key if that is known without asking anybody.
+    was_valid : callable
+        Whether a key was valid when it was last asked about.
+    requests, failures : RateLimit or None
+        Of requests by key, and of wrong keys by address; None: as many as they like.
     body_limits : mapping
         Most bytes of a body by path prefix; the empty prefix is the default. [byte]
     permissions : Permissions
@@ -110,6 +117,9 @@ class Guarded:
         *,
         authenticate: Callable[[str], Caller],
         recall: Callable[[str], Caller | None],
+        was_valid: Callable[[str], bool],
+        requests: RateLimit | None,
+        failures: RateLimit | None,
         body_limits: Mapping[str, int],
         permissions: Permissions,
         body_timeout_s: float,
@@ -117,6 +127,9 @@ class Guarded:
         self._app = app
         self._authenticate = authenticate
         self._recall = recall
+        self._was_valid = was_valid
+        self._requests = requests
+        self._failures = failures
         self._body_limits = body_limits
         self._permissions = permissions
         self._body_timeout_s = body_timeout_s
@@ -144,14 +157,30 @@ class Guarded:
         key = _key_in(headers)
         caller = self._recall(key)
         if caller is None:
-            caller = await to_thread.run_sync(self._authenticate, key, limiter=self._threads)
+            caller = await self._authenticated(scope, key)
         state = scope.setdefault("state", {})
         state["agency_id"] = caller.agency_id
+        if self._requests is not None:
+            left = self._requests.take(caller.key_id)
+            state["rate_limit"] = ((b"ratelimit-policy", self._requests.policy), (b"ratelimit", left))
         allowed = self._permissions.find(scope["method"], scope["path"])
         if allowed is None:
             return  # nothing there: 404 or 405. Should there be a route after all, it finds no caller and refuses
         caller.require(allowed)
         state["caller"] = caller
+
+    async def _authenticated(self, scope: Scope, key: str) -> Caller:
+        if self._failures is None:
+            return await to_thread.run_sync(self._authenticate, key, limiter=self._threads)
+        client = scope.get("client")
+        address = address_of(client[0]) if client else "unknown"
+        if not self._was_valid(key):  # those who share an address with a guesser go on with what they have
+            self._failures.check(address)
+        try:
+            return await to_thread.run_sync(self._authenticate, key, limiter=self._threads)
+        except NotAuthenticated:
+            self._failures.take(address)
+            raise
 
 
 def _by_prefix(table: Mapping[str, int], path: str) -> int:

@@ -50,6 +50,7 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     errors.ReferenceSystemError: ProblemKind(422, "reference-system", "The reference system cannot be used"),
     errors.UnreadableUpload: ProblemKind(422, "unreadable-upload", "The upload cannot be read"),
     errors.VersionRequired: ProblemKind(428, "version-required", "The change needs a version"),
+    errors.TooManyRequests: ProblemKind(429, "too-many-requests", "Too much was asked for in a short time"),
     errors.ProofFailed: ProblemKind(500, "proof-failed", "The artwork did not read back"),
     errors.Unavailable: ProblemKind(503, "unavailable", "Try again later"),
 }
@@ -108,7 +109,7 @@ class Problem(BaseModel):
 def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """OpenAPI description of the problems that a route can answer with, besides those of every /v1 route."""
     documented: dict[int | str, dict[str, Any]] = {}
-    for status in sorted({400, 401, 403, 413, 422, 500, 503, *statuses}):
+    for status in sorted({400, 401, 403, 413, 422, 429, 500, 503, *statuses}):
         kinds = [kind for kind in PROBLEMS.values() if kind.status == status]
         titles = "; ".join(f"`{kind.slug}`: {kind.title}" for kind in kinds) or HTTPStatus(status).phrase
         documented[status] = {
@@ -157,7 +158,8 @@ def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
     if kind.status >= 500:
         _LOG.error("request failed", error=type(error).__name__, detail=error.message)
     fault = FieldError(field=error.field, detail=error.message, limit=error.limit, cure=error.cure)
-    return problem(kind, error.message, scope, [fault])
+    wait = {"Retry-After": str(error.retry_after_s)} if isinstance(error, errors.TooManyRequests) else None
+    return problem(kind, error.message, scope, [fault], wait)
 
 
 def unexpected(error: Exception, scope: Any) -> Response:

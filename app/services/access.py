@@ -115,6 +115,10 @@ class Access:
             return None
         return known.caller
 
+    def was_valid(self, key: str) -> bool:
+        """Whether a key was valid when it was last asked about, as far as is remembered."""
+        return key in self._remembered
+
     def authenticate(self, key: str) -> Caller:
         """The caller behind a key.
 
@@ -128,6 +132,7 @@ class Access:
         with self._database.read() as connection:
             row = agencies.find_key(connection, key)
         if row is None or row["revoked_at"] is not None or (row["expires_at"] is not None and row["expires_at"] <= now):
+            self._remembered.pop(key, None)
             raise NotAuthenticated(
                 "the key is unknown, expired or revoked", field="Authorization", cure="ask your agency for a valid key"
             )

@@ -60,7 +60,7 @@ def _connected(url: sa.URL) -> Iterator[sa.Connection]:
 def waymark(url: str, folder: Path) -> Iterator[int]:
     """`waymark serve` on a database; gives its port."""
     environment = {"WAYMARK_DATABASE_URL": url, "WAYMARK_DATA_DIR": str(folder), "WAYMARK_LOG_FORMAT": "json"}
-    environment |= {"WAYMARK_WARM_DECODERS": "false"}
+    environment |= {"WAYMARK_WARM_DECODERS": "false", "WAYMARK_REQUESTS_PER_S": "0"}
     code = "from app.cli import main; main()"
     with _running([sys.executable, "-c", code, "serve", "--port"], environment, "/healthz") as port:
         yield port

@@ -23,7 +23,7 @@ from app.services.access import Scope
 from app.settings import Settings
 from tests.api.test_cerpm_markers import cerpm
 from tests.api.test_codebooks import DESIGN, MEANINGS
-from tests.conftest import ADMIN_KEY, LiveServer
+from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
 from tests.jobs import standin
 from tests.uploads.pictures import corner_frame, png
 
@@ -60,7 +60,8 @@ def backend(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Any) -> Iterator[LiveServer]:
     folder: Path = tmp_path_factory.mktemp("permissions") / "var"
-    settings = Settings(data_dir=folder, database_url=new_database_url(folder), admin_key=ADMIN_KEY, decode_workers=1)
+    url = new_database_url(folder)
+    settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, decode_workers=1, **UNLIMITED)
     with LiveServer(create_app(settings, decode=standin.decode)) as running:
         yield running
 
