@@ -150,6 +150,17 @@ sa.Index(
     postgresql_where=markers.c.family == "cerpm",
 )
 
+# a marker's place on its road; most markers of a survey name none
+sa.Index(
+    "ix_markers_agency_id_road_measure_m_id",
+    markers.c.agency_id,
+    markers.c.road,
+    markers.c.measure_m,
+    markers.c.id,
+    sqlite_where=markers.c.road.is_not(None),
+    postgresql_where=markers.c.road.is_not(None),
+)
+
 marker_versions = sa.Table(
     "marker_versions",
     metadata,
@@ -288,6 +299,39 @@ idempotency_keys = sa.Table(
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("expires_at", UtcTime, nullable=False),
     sa.Index("ix_idempotency_keys_expires_at", "expires_at"),
+)
+
+roads = sa.Table(
+    "roads",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    _agency(),
+    sa.Column("name", sa.String(200), nullable=False),
+    sa.Column("parts", sa.JSON, nullable=False),  # of the axis: lines of longitude and latitude
+    sa.Column("given", sa.JSON, nullable=False),  # frame of the geometry as it came
+    sa.Column("calibration", sa.JSON, nullable=False),
+    sa.Column("length_m", sa.Double, nullable=False),
+    sa.Column("from_m", sa.Double, nullable=False),
+    sa.Column("to_m", sa.Double, nullable=False),
+    sa.Column("localization_grade", sa.String(64), nullable=False),
+    sa.Column("transform_note", sa.String(500)),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.UniqueConstraint("agency_id", "name"),
+    sa.Index("ix_roads_agency_id_id", "agency_id", "id"),
+)
+
+road_versions = sa.Table(
+    "road_versions",
+    metadata,
+    sa.Column("road_id", ID, sa.ForeignKey("roads.id"), primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    _agency(),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("why", sa.String(500)),
+    sa.Column("road", sa.JSON, nullable=False),
 )
 
 VEHICLE_STATUSES = ("active", "retired")

@@ -1,0 +1,159 @@
+"""Measures of a road: what its signs say, against the chainages of its axis.
+
+Measures rise along the axis, straight between calibration points and in true metres beyond them. At an equation of
+stationing they jump: `measure_m` is what the sign says coming from before, `ahead_m` what it says going on. Where the
+jump is forward, the measures between are on no road; where it is back, or where parts overlap, one measure is at
+several places. Sections, between jumps and ends of parts, are where measures are unique.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from app.errors import InvalidParameter
+
+FloatArray = npt.NDArray[np.float64]
+SCALES = (0.5, 2.0)
+"""Least and greatest metres of measure to a metre of road."""
+_SAME_M = 1e-6
+_ON_END_M = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationPoint:
+    """A place whose measure is known.
+
+    Attributes
+    ----------
+    part : int
+        Part of the axis, from 0.
+    chainage_m : float
+        Along the axis. [m]
+    measure_m : float
+        What is signed there. [m]
+    ahead_m : float or None
+        At an equation of stationing, what is signed going on. [m]
+    """
+
+    part: int
+    chainage_m: float
+    measure_m: float
+    ahead_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Section:
+    """A stretch of one part with rising measures; both arrays have the shape (K,) and rise. [m]"""
+
+    part: int
+    chainages_m: FloatArray
+    measures_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Measures:
+    """Measures of a whole axis, by sections in the order of their chainages."""
+
+    sections: tuple[Section, ...]
+
+    def measure_at(self, part: int, chainage_m: float) -> float:
+        """Measure of a place on the axis; at an equation the one going on. [m]"""
+        found = self._section_at(part, chainage_m)
+        return float(np.interp(chainage_m, found.chainages_m, found.measures_m))
+
+    def section_at(self, part: int, chainage_m: float) -> int:
+        """Number of the section of a place on the axis."""
+        return self.sections.index(self._section_at(part, chainage_m))
+
+    def places_of(self, measure_m: float) -> list[tuple[int, int, float]]:
+        """Section, part and chainage of each place with a measure; none where it is on no road."""
+        places = []
+        for number, section in enumerate(self.sections):
+            if section.measures_m[0] - _ON_END_M <= measure_m <= section.measures_m[-1] + _ON_END_M:
+                chainage_m = float(np.interp(measure_m, section.measures_m, section.chainages_m))
+                places.append((number, section.part, chainage_m))
+        return places
+
+    def _section_at(self, part: int, chainage_m: float) -> Section:
+        own = [section for section in self.sections if section.part == part]
+        after = [section for section in own if section.chainages_m[0] <= chainage_m]
+        return after[-1] if after else own[0]
+
+
+def calibrate(part_ranges_m: Sequence[tuple[float, float]], points: Sequence[CalibrationPoint]) -> Measures:
+    """Measures of an axis.
+
+    Parameters
+    ----------
+    part_ranges_m : sequence of (start_m, end_m)
+        Chainages of each part's ends. [m]
+    points : sequence of CalibrationPoint
+        In any order. A part without any goes on from the end of the one before it, the first from 0.
+
+    Raises
+    ------
+    InvalidParameter
+        Two points at one place, measures that do not rise, or metres of measure beyond 0.5 to 2 metres of road.
+    """
+    sections: list[Section] = []
+    for part, (start_m, end_m) in enumerate(part_ranges_m):
+        own = sorted((p for p in points if p.part == part), key=lambda p: p.chainage_m)
+        _check_places(own)
+        if not own:
+            ahead_m = float(sections[-1].measures_m[-1]) if sections else 0.0
+            own = [CalibrationPoint(part, start_m, ahead_m)]
+        sections += _sections(part, start_m, end_m, own)
+    return Measures(tuple(sections))
+
+
+def _sections(part: int, start_m: float, end_m: float, points: list[CalibrationPoint]) -> list[Section]:
+    first, sections = points[0], []
+    knots = [(start_m, first.measure_m - (first.chainage_m - start_m))]
+    for point in points:
+        _add_knot(knots, point.chainage_m, point.measure_m)
+        if point.ahead_m is not None:
+            sections.append(knots)
+            knots = [(point.chainage_m, point.ahead_m)]
+    _add_knot(knots, end_m, knots[-1][1] + (end_m - knots[-1][0]))
+    sections.append(knots)
+    made = [np.array(knots) for knots in sections if knots[-1][0] - knots[0][0] > _SAME_M]
+    for knots_m in made:
+        _check_rising(knots_m)
+    return [Section(part, knots_m[:, 0], knots_m[:, 1]) for knots_m in made]
+
+
+def _add_knot(knots: list[tuple[float, float]], chainage_m: float, measure_m: float) -> None:
+    if chainage_m - knots[-1][0] > _SAME_M:
+        knots.append((chainage_m, measure_m))
+    else:
+        knots[-1] = (knots[-1][0], measure_m) if len(knots) == 1 else knots[-1]
+
+
+def _check_places(points: list[CalibrationPoint]) -> None:
+    for one, other in pairwise(points):
+        if other.chainage_m - one.chainage_m < 1e-3:
+            raise InvalidParameter(
+                f"two calibration points lie at one place, with {one.measure_m:g} m and {other.measure_m:g} m",
+                field="calibration",
+                limit="a millimetre apart",
+                cure="leave one out; an equation of stationing is one point with measure_m and ahead_m",
+            )
+
+
+def _check_rising(knots_m: FloatArray) -> None:
+    scales = np.diff(knots_m[:, 1]) / np.diff(knots_m[:, 0])
+    wrong = np.flatnonzero((scales < SCALES[0]) | (scales > SCALES[1]))
+    if len(wrong):
+        k = int(wrong[0])
+        (start_m, from_m), (end_m, to_m) = knots_m[k].tolist(), knots_m[k + 1].tolist()
+        raise InvalidParameter(
+            f"from measure {from_m:g} m to {to_m:g} m there are {end_m - start_m:.3f} m of road",
+            field="calibration",
+            limit=f"{SCALES[0]:g} to {SCALES[1]:g} m of measure to a metre of road, rising",
+            cure="give measures in metres along the line; where signs jump, give measure_m and ahead_m at one point",
+        )
