@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Discriminator, RootModel, Tag, model_validator
 
 from app.api.dependencies import Caller, Idempotency, Markers, Version, json_response, next_link
@@ -137,6 +137,21 @@ def list_marker_versions(
     """The marker's history, oldest first."""
     page, last = markers.history(caller, marker_id, after=after, limit=limit)
     return json_response({"items": page}, headers=next_link(request, after=last) if last else None)
+
+
+@router.get(
+    "/{marker_id}/versions/{version}",
+    response_class=Response,
+    responses={200: {"model": VersionOut}, **problem_responses(404)},
+)
+def get_marker_version(
+    marker_id: MarkerId,
+    version: Annotated[int, Path(ge=1, lt=2**31, description="Number of the version, 1 for the first.")],
+    caller: Caller,
+    markers: Markers,
+) -> Response:
+    """The marker as one version has it."""
+    return json_response(markers.version(caller, marker_id, version))
 
 
 def _etag(document: dict[str, Any]) -> str:

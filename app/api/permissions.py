@@ -48,6 +48,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/markers/{marker_id}": READERS,
     "PATCH /v1/markers/{marker_id}": SURVEYORS,
     "GET /v1/markers/{marker_id}/versions": READERS,
+    "GET /v1/markers/{marker_id}/versions/{version}": READERS,
     "GET /v1/markers/{marker_id}/observations": READERS,
     "GET /v1/markers/{marker_id}/observations/summary": READERS,
     "GET /v1/markers/{marker_id}/artwork.{form}": READERS,

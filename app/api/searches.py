@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -14,6 +15,7 @@ from app.api.problems import problem_responses
 from app.api.schemas_markers import Status
 from app.api.schemas_searches import MAX_PAGE, MAX_RADIUS_M, AlongIn, MarkerPage, SearchIn
 from app.api.strict_json import StrictRoute
+from app.api.times import parse_time
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.registry.markers import MarkerFilter
@@ -47,6 +49,7 @@ class _Search:
     radius_m: float | None = None
     nearest: int | None = None
     along: AlongIn | None = None
+    as_of: datetime | None = None
 
     def __post_init__(self) -> None:
         far = self.radius_m is not None or self.nearest is not None
@@ -63,6 +66,13 @@ class _Search:
                 field="along",
                 limit="near or along",
                 cure="search twice",
+            )
+        if self.as_of is not None and self.nearest is not None:
+            raise InvalidParameter(
+                "the nearest are found among the markers of today",
+                field="as_of",
+                limit="as_of without nearest",
+                cure="ask for the markers within a radius",
             )
         narrowed = self.narrowed
         if narrowed.road is None and (narrowed.from_m is not None or narrowed.to_m is not None):
@@ -87,7 +97,10 @@ class _Search:
             narrowed = self.narrowed
             if self.place is not None and self.radius_m is not None:
                 narrowed = circle(narrowed, self.place, self.radius_m)
-            page, last = searches.page(caller, narrowed, after=_id(after), limit=limit)
+            if self.as_of is not None:
+                page, last = searches.page_as_of(caller, narrowed, self.as_of, after=_id(after), limit=limit)
+            else:
+                page, last = searches.page(caller, narrowed, after=_id(after), limit=limit)
         return json_response({"items": page}, headers=next_link(request, after=last) if last else None)
 
     def _nearest(self, caller: Caller, searches: SearchesService, after: str | None) -> list[dict[str, Any]]:
@@ -125,6 +138,9 @@ def list_markers(
     ] = None,
     status: Status | None = None,
     family: Literal["plate", "magnet", "cerpm"] | None = None,
+    as_of: Annotated[
+        Text | None, Query(max_length=40, description="The registry as it was at this time (RFC 3339).")
+    ] = None,
     limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100,
     after: Annotated[Identifier | None, Query(description="Last id of the page before.")] = None,
 ) -> Response:
@@ -132,6 +148,8 @@ def list_markers(
 
     `bbox` is west,south,east,north, and spans the antimeridian where its west is above its east. `near` is lon,lat with
     `radius_m` or `nearest`, or lon,lat,radius_m. `from_m` and `to_m` are measures on a `road`.
+    With `as_of` the filter is about the markers as they were then; a page may hold fewer than `limit` though `Link`
+    leads on.
 
     Magnets are where their first one lies; lists leave out their lanes, magnets, checks and costs.
     """
@@ -150,7 +168,8 @@ def list_markers(
         status=status,
         family=family,
     )
-    search = _Search(narrowed, place, said_m if radius_m is None else radius_m, nearest)
+    at = parse_time(as_of, "as_of") if as_of is not None else None
+    search = _Search(narrowed, place, said_m if radius_m is None else radius_m, nearest, as_of=at)
     return search.answer(request, caller, searches, limit=limit, after=after)
 
 

@@ -180,6 +180,11 @@ def _by_postgis(element: _Covered, compiler: SQLCompiler, **how: Any) -> str:
     return compiler.process(sa.func.ST_Covers(area, point), **how)
 
 
+def covers(area: Area, lon_deg: float, lat_deg: float) -> bool:
+    """Whether a place is inside an area or on its edge."""
+    return _covers(area.wkb, lon_deg, lat_deg)
+
+
 def _covers(wkb: bytes, lon_deg: float, lat_deg: float) -> bool:
     return bool(shapely.intersects_xy(_prepared(wkb), lon_deg, lat_deg))
 

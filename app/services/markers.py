@@ -14,6 +14,7 @@ from app.errors import InvalidParameter, StaleVersion
 from app.registry import markers as store
 from app.registry.audit import recording
 from app.registry.database import Database
+from app.registry.history import get_version, marker_of
 from app.registry.ids import new_id
 from app.registry.markers import Row
 from app.services.access import Caller
@@ -224,8 +225,23 @@ class Markers:
         with self._database.read() as connection:
             store.get_marker(connection, caller.agency_id, marker_id)
             rows = store.list_versions(connection, caller.agency_id, marker_id, after=after, limit=limit + 1)
-        page = [version_document(row, self._family(row["marker"]).document(row["marker"])) for row in rows[:limit]]
+        page = [self._version(row) for row in rows[:limit]]
         return page, page[-1]["version"] if len(rows) > limit else None
+
+    def version(self, caller: Caller, marker_id: str, version: int) -> dict[str, Any]:
+        """One version of a marker: the marker as it was then, who made it so, when and why.
+
+        Raises
+        ------
+        NotFound
+            There is none, or it belongs to another agency.
+        """
+        with self._database.read() as connection:
+            return self._version(get_version(connection, caller.agency_id, marker_id, version))
+
+    def _version(self, row: Row) -> dict[str, Any]:
+        marker = marker_of(row)
+        return version_document(row, self._family(marker).document(marker))
 
     def _family(self, row: Row | dict[str, Any]) -> MarkerFamily[Any, Any]:
         return self._families[row["family"]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from app.errors import InvalidParameter
 from app.registry import markers as store
 from app.registry.database import Database
+from app.registry.history import list_as_of
 from app.registry.markers import MarkerFilter, Row
 from app.registry.nearest import list_nearest
 from app.registry.searches import list_places
@@ -29,7 +31,7 @@ Place = tuple[float, float]
 Page = tuple[list[dict[str, Any]], str | None]
 
 
-def marker_document(row: Row) -> dict[str, Any]:
+def marker_document(row: Row | dict[str, Any]) -> dict[str, Any]:
     """A marker of any family as lists show it."""
     return _DOCUMENTS[row["family"]](row)
 
@@ -47,12 +49,16 @@ class Searches:
         """
         with self._database.read() as connection:
             rows = store.list_markers(connection, caller.agency_id, narrowed, after=after, limit=limit + 1)
-        page = [marker_document(row) for row in rows[:limit]]
-        if narrowed.near is not None and page:
-            lon, lat = (np.array([row[name] for row in rows[:limit]]) for name in ("lon_deg", "lat_deg"))
-            for document, distance in zip(page, distances_m(*narrowed.near[:2], lon, lat).tolist(), strict=True):
-                document["distance_m"] = distance
+        page = _documents(rows[:limit], narrowed)
         return page, page[-1]["id"] if len(rows) > limit else None
+
+    def page_as_of(
+        self, caller: Caller, narrowed: MarkerFilter, at: datetime, *, after: str | None = None, limit: int = 100
+    ) -> Page:
+        """As `page`, of the markers as they were at a time; a page may be short though there are more."""
+        with self._database.read() as connection:
+            rows, last = list_as_of(connection, caller.agency_id, narrowed, at, after=after, limit=limit)
+        return _documents(rows, narrowed), last
 
     def nearest(
         self, caller: Caller, narrowed: MarkerFilter, place: Place, count: int, within_m: float | None = None
@@ -114,6 +120,15 @@ class Searches:
         ]
         more = len(onward) > limit
         return documents, f"{page[-1][0]!r},{page[-1][1]}" if more else None
+
+
+def _documents(rows: Sequence[Row | dict[str, Any]], narrowed: MarkerFilter) -> list[dict[str, Any]]:
+    page = [marker_document(row) for row in rows]
+    if narrowed.near is not None and page:
+        lon, lat = (np.array([row[name] for row in rows]) for name in ("lon_deg", "lat_deg"))
+        for document, distance in zip(page, distances_m(*narrowed.near[:2], lon, lat).tolist(), strict=True):
+            document["distance_m"] = distance
+    return page
 
 
 def circle(narrowed: MarkerFilter, place: Place, radius_m: float) -> MarkerFilter:

@@ -131,9 +131,9 @@ def test_other_changes_are_entries_too(server: LiveServer, admin: httpx.Client) 
 
 def test_handing_out_keys_of_markers_is_an_entry(admin: httpx.Client, place: Place) -> None:
     body = {"family": "cerpm", "position": place(), "side": "left"}
-    assert admin.post("/v1/markers", json=body).status_code == 201
+    marker_id = admin.post("/v1/markers", json=body).json()["id"]
     for with_keys in (True, False):
-        response = admin.post("/v1/programs", json={"with_keys": with_keys})
+        response = admin.post("/v1/programs", json={"marker_ids": [marker_id], "with_keys": with_keys})
         assert response.status_code == 200, response.text
     items = admin.get("/v1/audit", params={"limit": 1000}).json()["items"]
     assert [entry["action"] for entry in items].count("marker-keys.handed-out") == 1
