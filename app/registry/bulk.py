@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from app.registry.audit import AuditEntry
 from app.registry.bulk_load import large_load, load_rows
-from app.registry.markers import PUBLIC, MarkerFilter, Row, list_markers
+from app.registry.markers import PUBLIC, MarkerFilter, Row, conditions_of
 from app.registry.spatial import Box, box_around, within_box
 from app.registry.tables import marker_versions, markers
 
@@ -90,11 +90,28 @@ def many_markers(connection: sa.Connection, rows: int) -> AbstractContextManager
     return large_load(connection, (markers, marker_versions), rows)
 
 
-def walk_markers(
-    connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, *, page: int = 2000
-) -> Iterator[list[Row]]:
-    """All markers of a filter in the order of their ids, a page at a time."""
-    after: str | None = None
-    while rows := list_markers(connection, agency_id, narrowed, after=after, limit=page):
-        yield rows
-        after = rows[-1]["id"]
+def list_records(
+    connection: sa.Connection,
+    agency_id: str,
+    narrowed: MarkerFilter,
+    fields: Sequence[str],
+    *,
+    after: str | None,
+    limit: int,
+) -> list[dict[str, Any]]:
+    """Markers in the order of their ids as flat records of these fields: columns, `code`, and `side` of CERPMs."""
+    own = {"code": markers.c.digits, "side": markers.c.spec["side"].as_string()}
+    columns = [own[name].label(name) if name in own else markers.c[name] for name in fields]
+    query = sa.select(*columns).where(markers.c.agency_id == agency_id, *conditions_of(narrowed))
+    if after is not None:
+        query = query.where(markers.c.id > after)
+    rows = connection.execute(query.order_by(markers.c.id).limit(limit)).all()
+    return [dict(zip(fields, row, strict=True)) for row in rows]
+
+
+def has_heights(connection: sa.Connection, agency_id: str, narrowed: MarkerFilter) -> bool:
+    """Whether a marker of the filter has a height."""
+    query = sa.select(markers.c.row).where(
+        markers.c.agency_id == agency_id, markers.c.height_m.is_not(None), *conditions_of(narrowed)
+    )
+    return connection.execute(query.limit(1)).first() is not None

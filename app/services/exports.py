@@ -1,15 +1,18 @@
-"""Markers go out: streamed as CSV and GeoJSON, or as one file for GIS and surveyors."""
+"""Markers go out as files for GIS and surveyors."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from app.errors import InvalidParameter
-from app.registry import markers as store
+from app.registry import bulk
 from app.registry.database import Database
 from app.registry.exchange import write
-from app.registry.markers import MarkerFilter, Row
+from app.registry.markers import MarkerFilter
 from app.services.access import Caller
 
 STREAMED = {"csv": "text/csv; charset=utf-8", "geojson": "application/geo+json"}
@@ -20,8 +23,11 @@ WHOLE = {
     "landxml": "application/xml",
     "dxf": "image/vnd.dxf",
 }
-MAX_WHOLE = 200_000
-_PAGE = 2000
+KINDS = (*STREAMED, *WHOLE)
+MAX_WHOLE = {"gpkg": 10_000_000, "shapefile": 2_000_000, "kml": 200_000, "landxml": 200_000, "dxf": 200_000}
+_PAGE = 5_000
+_GIS_PAGE = 50_000
+_BLOCK = 2**20
 
 
 class Exports:
@@ -35,44 +41,75 @@ class Exports:
         pages = self._pages(caller, narrowed)
         return write.write_csv(pages) if kind == "csv" else write.write_geojson(pages)
 
-    def whole(self, caller: Caller, kind: str, narrowed: MarkerFilter) -> bytes:
-        """One file.
+    def whole(self, caller: Caller, kind: str, narrowed: MarkerFilter) -> Iterator[bytes]:
+        """One file, written before this returns and gone when it has been read.
 
         Raises
         ------
         InvalidParameter
             There are none, too many for one file, or too far apart for one zone.
         """
-        records: list[dict[str, Any]] = []
-        for page in self._pages(caller, narrowed):
-            records += page
-            if len(records) > MAX_WHOLE:
-                raise InvalidParameter(
-                    "too many markers for one file",
-                    field="bbox",
-                    limit=f"{MAX_WHOLE} markers",
-                    cure="export a smaller box, or CSV or GeoJSON",
-                )
-        if not records:
+        folder = TemporaryDirectory(prefix="waymark-export-")
+        try:
+            path = self.write_file(caller, kind, narrowed, Path(folder.name))
+        except BaseException:
+            folder.cleanup()
+            raise
+        return _blocks(path, folder)
+
+    def write_file(self, caller: Caller, kind: str, narrowed: MarkerFilter, folder: Path) -> Path:
+        """One file of any kind, in an empty folder; raises as `whole`."""
+        if kind in STREAMED:
+            path = folder / f"markers.{kind}"
+            with path.open("wb") as file:
+                file.writelines(self.stream(caller, kind, narrowed))
+            return path
+        pages = self._pages(caller, narrowed, most=MAX_WHOLE[kind])
+        first = next(pages, None)
+        if first is None:
             raise InvalidParameter(
                 "no marker is in the selection", field="bbox", limit="one at least", cure="widen the filter"
             )
-        if kind == "landxml":
-            return write.write_landxml(records)
-        return write.write_dxf(records) if kind == "dxf" else write.write_gis(records, kind)
+        records = chain.from_iterable(chain((first,), pages))
+        if kind in ("landxml", "dxf"):
+            path = folder / f"markers.{kind}"
+            path.write_bytes((write.write_landxml if kind == "landxml" else write.write_dxf)(list(records)))
+            return path
+        with self._database.read() as connection:
+            has_heights = bulk.has_heights(connection, caller.agency_id, narrowed)
+        batches = _batched(records, MAX_WHOLE["kml"] if kind == "kml" else _GIS_PAGE)
+        return write.write_gis(batches, kind, folder, has_heights=has_heights)
 
-    def _pages(self, caller: Caller, narrowed: MarkerFilter) -> Iterator[list[dict[str, Any]]]:
+    def _pages(
+        self, caller: Caller, narrowed: MarkerFilter, *, most: int | None = None
+    ) -> Iterator[list[dict[str, Any]]]:
         after: str | None = None
+        count = 0
         while True:
             with self._database.read() as connection:
-                rows = store.list_markers(connection, caller.agency_id, narrowed, after=after, limit=_PAGE)
-            if not rows:
+                page = bulk.list_records(connection, caller.agency_id, narrowed, write.FIELDS, after=after, limit=_PAGE)
+            if not page:
                 return
-            yield [_record(row) for row in rows]
-            after = rows[-1]["id"]
+            count += len(page)
+            if most is not None and count > most:
+                raise InvalidParameter(
+                    "too many markers for one file",
+                    field="bbox",
+                    limit=f"{most} markers",
+                    cure="export a smaller box, or CSV or GeoJSON",
+                )
+            for record in page:
+                record["updated_at"] = record["updated_at"].isoformat()
+            yield page
+            after = page[-1]["id"]
 
 
-def _record(row: Row) -> dict[str, Any]:
-    spec = row["spec"] or {}
-    own = {"code": row["digits"], "side": spec.get("side"), "updated_at": row["updated_at"].isoformat()}
-    return {name: own[name] if name in own else row[name] for name in write.FIELDS}
+def _batched(records: Iterator[dict[str, Any]], count: int) -> Iterator[list[dict[str, Any]]]:
+    while batch := list(islice(records, count)):
+        yield batch
+
+
+def _blocks(path: Path, folder: TemporaryDirectory[str]) -> Iterator[bytes]:
+    with folder, path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            yield block

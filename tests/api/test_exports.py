@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -12,14 +13,20 @@ import ezdxf
 import httpx
 import pytest
 import shapely
-from pyogrio import raw
+from pyogrio import raw, read_info
 
 from app.registry.exchange.declaration import ImportDeclaration
 from app.registry.exchange.place import place_survey
 from app.registry.exchange.read import read_survey
 from app.registry.exchange.write import FIELDS, SHAPEFILE_NAMES, write_csv
+from app.services import exports
 
 LON, LAT = 8.416412345, 49.005112345
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
 @pytest.fixture
@@ -106,3 +113,53 @@ def test_filters_and_refusals(client: httpx.Client, markers: list[dict[str, floa
     assert client.get("/v1/exports/gpkg", params={"status": "retired"}).status_code == 422
     assert client.get("/v1/exports/gpkg", params={"bbox": "1,2"}).json()["field"] == "bbox"
     assert client.get("/v1/exports/exe").status_code == 422
+
+
+def test_the_filters_are_those_of_the_list(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    around = f"POLYGON(({LON - 1e-4} 49, {LON + 1e-4} 49, {LON + 1e-4} 49.1, {LON - 1e-4} 49.1, {LON - 1e-4} 49))"
+    for wanted, params in (
+        (["2", "3"], {"road": "B 10"}),
+        (["2"], {"code": "2"}),
+        (["1"], {"polygon": around}),
+        ([], {"family": "plate"}),
+        (["1", "2", "3"], {"status": "planned", "family": "cerpm"}),
+    ):
+        rows = list(csv.DictReader(io.StringIO(client.get("/v1/exports/csv", params=params).text)))
+        assert [row["code"] for row in rows] == wanted, params
+        listed = client.get("/v1/markers", params=params).json()["items"]
+        assert [row["id"] for row in rows] == [marker["id"] for marker in listed]
+    assert client.get("/v1/exports/csv", params={"from_m": 3}).json()["field"] == "road"
+    assert client.get("/v1/exports/csv", params={"road": "A", "to_m": "nan"}).status_code == 422
+
+
+@pytest.mark.parametrize("kind", ["gpkg", "shapefile"])
+def test_files_of_several_pages_hold_every_value(
+    client: httpx.Client, markers: list[dict[str, float]], kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(exports, "_PAGE", 2)
+    monkeypatch.setattr(exports, "_GIS_PAGE", 2)
+    low = {"family": "cerpm", "position": {"lon_deg": -77.15, "lat_deg": -1e-9}, "road": "Straße =1"}
+    assert client.post("/v1/markers", json=low).status_code == 201
+    path = tmp_path / ("markers.gpkg" if kind == "gpkg" else "markers.zip")
+    path.write_bytes(client.get(f"/v1/exports/{kind}").content)
+    meta, _, geometry, fields = raw.read(path)
+    names = {name: SHAPEFILE_NAMES[name] if kind == "shapefile" else name for name in FIELDS}
+    of = {name: fields[list(meta["fields"]).index(given)].tolist() for name, given in names.items()}
+    assert of["code"] == ["1", "2", "3", "4"]
+    assert of["road"] == ["=HYPERLINK(1)", "B 10", "B 10", "Straße =1"]
+    assert of["side"][:1] == ["left"]
+    assert of["lon_deg"] == pytest.approx([*(m["lon_deg"] for m in markers), -77.15], abs=1e-9)
+    assert of["horizontal_rmse_m"][:3] == pytest.approx([0.01] * 3)
+    points = shapely.from_wkb(geometry)
+    assert shapely.get_y(points) == pytest.approx([m["lat_deg"] for m in markers] + [-1e-9], abs=1e-12)
+    assert shapely.get_z(points).tolist() == [160.25, 161.25, 162.25, 0.0]
+    info = read_info(path)
+    assert info["features"] == 4
+    assert info["geometry_type"] == "Point Z"
+
+
+def test_no_file_is_left_behind(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    before = set(Path(tempfile.gettempdir()).glob("waymark-export-*"))
+    assert client.get("/v1/exports/gpkg").status_code == 200
+    assert client.get("/v1/exports/kml", params={"status": "retired"}).status_code == 422
+    assert set(Path(tempfile.gettempdir()).glob("waymark-export-*")) <= before

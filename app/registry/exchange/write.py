@@ -8,7 +8,6 @@ import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
@@ -83,40 +82,54 @@ def _feature(record: Record) -> dict[str, Any]:
     return {"type": "Feature", "id": record["id"], "geometry": geometry, "properties": properties}
 
 
-def write_gis(records: Sequence[Record], driver: str) -> bytes:
-    """A GeoPackage, a zipped Shapefile (names of `SHAPEFILE_NAMES`) or KML, by GDAL.
+def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, has_heights: bool) -> Path:
+    """A GeoPackage, a zipped Shapefile (names of `SHAPEFILE_NAMES`) or KML in a folder, by GDAL, a page at a time.
 
     Parameters
     ----------
-    records : sequence of mapping
+    pages : iterable of sequences of mapping
+        One page at least; of KML, one page.
     driver : str
         ``gpkg``, ``shapefile`` or ``kml``.
+    folder : Path
+        An empty one.
+    has_heights : bool
+        Whether points have a z; zero where a marker has no height. KML has none: it takes them to be above the geoid.
     """
     name, suffix = {"gpkg": ("GPKG", "gpkg"), "shapefile": ("ESRI Shapefile", "shp"), "kml": ("KML", "kml")}[driver]
     names = [SHAPEFILE_NAMES[n] for n in FIELDS] if driver == "shapefile" else list(FIELDS)
-    height = np.array([r["height_m"] if r["height_m"] is not None else 0.0 for r in records], dtype=np.float64)
-    lon, lat = (np.array([r[n] for r in records], dtype=np.float64) for n in ("lon_deg", "lat_deg"))
-    flat = driver == "kml" or not any(r["height_m"] is not None for r in records)
-    points = shapely.points(lon, lat) if flat else shapely.points(lon, lat, height)
-    columns = [np.array([r[n] for r in records], dtype=object) for n in TEXTS]
-    columns += [np.array([np.nan if r[n] is None else r[n] for r in records], dtype=np.float64) for n in NUMBERS]
-    kind = "Point" if flat else "Point Z"
-    with TemporaryDirectory() as folder, warnings.catch_warnings():
+    kind = "Point Z" if has_heights and driver != "kml" else "Point"
+    path = folder / f"markers.{suffix}"
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # KML has a name of its own for some fields
-        path = Path(folder) / f"markers.{suffix}"
-        raw.write(
-            path, shapely.to_wkb(points), columns, names, driver=name, geometry_type=kind, crs="EPSG:4326",
-            layer="markers", encoding="UTF-8",
-        )  # fmt: skip
-        return _zipped(Path(folder)) if driver == "shapefile" else path.read_bytes()
+        for number, page in enumerate(pages):
+            geometry, columns = _gis_columns(page, flat=kind == "Point")
+            raw.write(
+                path, geometry, columns, names, driver=name, geometry_type=kind, crs="EPSG:4326",
+                layer="markers", encoding="UTF-8", append=number > 0,
+            )  # fmt: skip
+    return _zipped(folder) if driver == "shapefile" else path
 
 
-def _zipped(folder: Path) -> bytes:
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for part in sorted(folder.iterdir()):
+def _gis_columns(page: Sequence[Record], *, flat: bool) -> tuple[Any, list[Any]]:
+    """Points as WKB, and the columns of `FIELDS`."""
+    values = list(zip(*(record.values() for record in page), strict=True))
+    of = dict(zip(page[0], values, strict=True))
+    columns = [np.array(of[n], dtype=object) for n in TEXTS]
+    columns += [np.array([np.nan if v is None else v for v in of[n]], dtype=np.float64) for n in NUMBERS]
+    lon, lat = (columns[FIELDS.index(n)] for n in ("lon_deg", "lat_deg"))
+    height = np.nan_to_num(columns[FIELDS.index("height_m")])
+    points = shapely.points(lon, lat) if flat else shapely.points(lon, lat, height)
+    return shapely.to_wkb(points), columns
+
+
+def _zipped(folder: Path) -> Path:
+    path = folder / "markers.shp.zip"
+    parts = sorted(folder.iterdir())
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for part in parts:
             archive.write(part, part.name)
-    return packed.getvalue()
+    return path
 
 
 def write_landxml(records: Sequence[Record]) -> bytes:
