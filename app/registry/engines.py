@@ -37,8 +37,8 @@ def sqlite_engine(url: sa.URL) -> sa.Engine:
         connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False},
         json_serializer=_json,
         json_deserializer=orjson.loads,
-        pool_size=8,
-        max_overflow=40,
+        pool_size=40,  # one for each thread that answers requests: opening one costs more than most queries
+        max_overflow=8,
     )
 
     @event.listens_for(engine, "connect")
@@ -78,7 +78,7 @@ def asking_engine(url: sa.URL) -> sa.Engine:
         isolation_level="AUTOCOMMIT",
         json_deserializer=orjson.loads,
         pool_size=10,
-        max_overflow=20,
+        max_overflow=30,
         pool_timeout=BUSY_TIMEOUT_S,
         pool_reset_on_return=None,
     )

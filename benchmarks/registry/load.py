@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -52,6 +53,8 @@ async def _ask(port: int, requests: Iterator[bytes], seconds: float, connections
     begin = time.perf_counter() + min(1.0, seconds)
     samples: list[tuple[float, int]] = []
     await asyncio.gather(*(_connection(port, requests, begin, begin + seconds, samples) for _ in range(connections)))
+    if not samples:
+        return Timing(0.0, math.inf, math.inf, 0.0)
     took_ms = np.array([took for took, _ in samples]) * 1e3
     sizes = np.array([size for _, size in samples])
     p50, p99 = np.percentile(took_ms, (50, 99))

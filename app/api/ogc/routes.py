@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+from functools import wraps
 from typing import Any
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
+from starlette.requests import Request
+from starlette.responses import Response
 from starlette.routing import Match, Route
 from starlette.types import Scope
 
@@ -12,6 +17,17 @@ from app.api.ogc import documents, edits, items, tiles
 
 _ITEMS = "/ogc/collections/{collection}/items"
 _TILES = "/ogc/collections/{collection}/tiles"
+_THREADS = 4
+
+
+def _few_at_once(answer: Callable[[Request], Response]) -> Callable[[Request], Awaitable[Response]]:
+    """An endpoint that a few threads run: more would only wait for each other, and each for a connection."""
+
+    @wraps(answer)
+    async def endpoint(request: Request) -> Response:
+        return await to_thread.run_sync(answer, request, limiter=request.app.state.ogc_threads)
+
+    return endpoint
 
 
 class _NamedRoute(Route):
@@ -36,7 +52,7 @@ ROUTES = (
     _route("/ogc/collections", documents.collections),
     _route("/ogc/collections/{collection}", documents.collection),
     _route("/ogc/collections/{collection}/schema", documents.schema),
-    _route(_ITEMS, items.list_items),
+    _route(_ITEMS, _few_at_once(items.list_items)),
     _route(f"{_ITEMS}/{{feature}}", items.get_item),
     _route(_ITEMS, edits.post_item, "POST"),
     _route(_ITEMS, edits.item_options, "OPTIONS"),
@@ -47,7 +63,7 @@ ROUTES = (
     _route("/ogc/tileMatrixSets/{matrix_set}", tiles.get_matrix_set),
     _route(_TILES, tiles.list_tilesets),
     _route(f"{_TILES}/{{matrix_set}}", tiles.get_tileset),
-    _route(f"{_TILES}/{{matrix_set}}/{{zoom}}/{{row}}/{{column}}", tiles.get_tile),
+    _route(f"{_TILES}/{{matrix_set}}/{{zoom}}/{{row}}/{{column}}", _few_at_once(tiles.get_tile)),
 )
 
 
@@ -56,4 +72,5 @@ def mount_ogc(app: FastAPI) -> None:
 
     It comes first: a map view asks dozens of times, and trying all other routes takes as long as reading a page.
     """
+    app.state.ogc_threads = CapacityLimiter(_THREADS)
     app.router.routes[:0] = ROUTES
