@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -10,24 +10,23 @@ import numpy.typing as npt
 EXTENT = 4096
 _POINT = 1
 _MOVE_TO_ONCE = 9  # 4.3.1: command 1, count 1
+# keys of fields in a message, 4.1 and the .proto: number << 3 | kind
+_FEATURE, _TAGS, _TYPE, _GEOMETRY = 0x12, 0x12, 0x18, 0x22
 Value = str | int | float | bool
+Numbers = npt.NDArray[np.int64]
 
 
-def write_layer(
-    name: str, names: Sequence[str], points_px: npt.NDArray[np.int64], values: Iterable[Sequence[Value | None]]
-) -> bytes:
+def write_layer(name: str, columns: Mapping[str, Sequence[Value | None]], points_px: Numbers) -> bytes:
     """A tile with one layer of points.
 
     Parameters
     ----------
     name : str
         Name of the layer.
-    names : sequence of str
-        Names of the properties.
+    columns : mapping of sequences, each of length N
+        Values of each property, by its name; None is left out.
     points_px : ndarray of int64, shape (N, 2)
         Right of and down from the tile's north-west corner; the tile is `EXTENT` wide. [px]
-    values : iterable of sequences, length N
-        Values of the properties of each point; None is left out.
 
     Returns
     -------
@@ -36,24 +35,61 @@ def write_layer(
     """
     if not len(points_px):
         return b""
-    zigzag = (points_px << 1) ^ (points_px >> 63)  # 4.3.2
-    numbers: dict[tuple[type, Value], int] = {}
-    parts = [b"\x0a", _text(name)]
-    for (right, down), row in zip(zigzag.tolist(), values, strict=True):
-        tags = bytearray()
-        for k, value in enumerate(row):
-            if value is not None:
-                tags += _varint(k)
-                tags += _varint(numbers.setdefault((type(value), value), len(numbers)))
-        geometry = bytes((_MOVE_TO_ONCE,)) + _varint(right) + _varint(down)
-        feature = b"\x12" + _sized(bytes(tags)) + bytes((0x18, _POINT)) + b"\x22" + _sized(geometry)
-        parts += (b"\x12", _sized(feature))
-    for key in names:
+    values: dict[tuple[type, Value], int] = {}
+    parts = [b"\x0a", _text(name), _features(list(columns.values()), points_px, values)]
+    for key in columns:
         parts += (b"\x1a", _text(key))
-    for _, value in numbers:
+    for _, value in values:
         parts += (b"\x22", _sized(_value(value)))
     parts.append(b"\x28" + _varint(EXTENT) + b"\x78\x02")  # extent, version 2
     return b"\x1a" + _sized(b"".join(parts))
+
+
+def _features(
+    columns: Sequence[Sequence[Value | None]], points_px: Numbers, values: dict[tuple[type, Value], int]
+) -> bytes:
+    """All features; `values` gets what they refer to. A feature of a point is nothing but varints."""
+    count, width = len(points_px), len(columns)
+    pairs = np.empty((count, width, 2), np.int64)
+    for k, column in enumerate(columns):
+        pairs[:, k, 0] = k
+        pairs[:, k, 1] = [-1 if v is None else values.setdefault((type(v), v), len(values)) for v in column]
+    pairs[pairs[:, :, 1] < 0] = -1
+    tags = pairs.reshape(count, 2 * width)
+    zigzag = (points_px << 1) ^ (points_px >> 63)  # 4.3.2
+    tag_bytes = _lengths(tags).sum(axis=1)
+    geometry_bytes = 1 + _lengths(zigzag).sum(axis=1)
+    body_bytes = 1 + _lengths(tag_bytes) + tag_bytes + 3 + _lengths(geometry_bytes) + geometry_bytes
+    numbers = np.column_stack(
+        (
+            *(np.full(count, _FEATURE), body_bytes, np.full(count, _TAGS), tag_bytes, tags),
+            *(np.full((count, 3), (_TYPE, _POINT, _GEOMETRY)), geometry_bytes),
+            *(np.full(count, _MOVE_TO_ONCE), zigzag),
+        )
+    )
+    return _varints(numbers[numbers >= 0])
+
+
+def _lengths(numbers: Numbers) -> Numbers:
+    """Bytes of each as a varint; 0 for a negative one, which is left out."""
+    lengths = (numbers >= 0).astype(np.int64)
+    for bits in range(7, 64, 7):
+        more = numbers >= np.int64(1) << np.int64(bits)
+        if not more.any():
+            break
+        lengths += more
+    return lengths
+
+
+def _varints(numbers: Numbers) -> bytes:
+    lengths = _lengths(numbers)
+    ends = lengths.cumsum()
+    out = np.empty(int(ends[-1]), np.uint8)
+    for k in range(int(lengths.max())):
+        has = lengths > k
+        part = numbers[has] >> (7 * k) & 0x7F
+        out[(ends - lengths)[has] + k] = part | np.where(lengths[has] > k + 1, 0x80, 0)
+    return out.tobytes()
 
 
 def _value(value: Value) -> bytes:
