@@ -160,6 +160,31 @@ def encode(
 
 
 @cli.command()
+def board(
+    out: Annotated[Path, typer.Option(help="Folder to write to; created if need be.")] = Path("."),
+    columns: Annotated[int, typer.Option(help="Squares across.")] = 7,
+    rows: Annotated[int, typer.Option(help="Squares down.")] = 10,
+    square_mm: Annotated[float, typer.Option(help="Side of a square. [mm]")] = 25.0,
+    marker_mm: Annotated[float, typer.Option(help="Side of a marker. [mm]")] = 18.0,
+    form: Annotated[list[str] | None, typer.Option("--format", help="svg, pdf, dxf or png; may be repeated.")] = None,
+) -> None:
+    """Write a board to calibrate cameras with, at true size; print it at 100 %."""
+    from app.encoders.calibration_board import encode_board
+    from app.encoders.plate import ArtworkFormat, write_artwork
+    from app.sensors.calibration_board import CalibrationBoard
+
+    unknown = sorted(set(form or ()) - set(ArtworkFormat))
+    if unknown:
+        raise InvalidParameter(f"there is no format {unknown[0]}", limit=", ".join(ArtworkFormat))
+    drawing = encode_board(CalibrationBoard(columns, rows, square_mm, marker_mm))
+    out.mkdir(parents=True, exist_ok=True)
+    for name in form or ("pdf",):
+        path = out / f"waymark-board-{columns}x{rows}-{square_mm:g}mm.{name}"
+        path.write_bytes(write_artwork(drawing, ArtworkFormat(name)).content)
+        typer.echo(path)
+
+
+@cli.command()
 def decode(
     pictures: Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="JPEG or PNG files.")],
     thermal: Annotated[bool, typer.Option(help="The pictures come from a thermal camera.")] = False,

@@ -26,6 +26,8 @@ class WaymarkError(Exception):
         self.field = field
         self.limit = limit
         self.cure = cure
+        self.parts: tuple[WaymarkError, ...] = ()
+        """What is wrong with parts of the input, where more than one thing is."""
 
 
 class InvalidParameter(WaymarkError, ValueError):
@@ -50,6 +52,10 @@ class UploadTooLarge(UnreadableUpload):
 
 class UnsupportedUpload(UnreadableUpload):
     """An upload is of a kind that no decoder reads."""
+
+
+class CalibrationRefused(UnreadableUpload):
+    """Photos do not calibrate a camera well enough; begins with the name of the reason, `parts` has the photos."""
 
 
 class NotFound(WaymarkError):

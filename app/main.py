@@ -18,6 +18,7 @@ from app.api import (
     artwork,
     audit,
     bulk,
+    calibrations,
     cerpms,
     codebooks,
     decodes,
@@ -56,6 +57,7 @@ from app.services.audit import AuditLog
 from app.services.bulk_markers import BulkMarkers
 from app.services.cerpm_programs import CerpmPrograms
 from app.services.codebooks import Codebooks
+from app.services.calibrations import Calibrations
 from app.services.decode_jobs import DecodeJobs
 from app.services.decode_rules import DecodeRules
 from app.services.decodes import Decodes
@@ -97,6 +99,7 @@ ROUTERS = (
 def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> FastAPI:
     """An app with its own database, use cases, metrics and limits. Files are opened when it starts.
 
+    calibrations.router,
     `decode` is imported by name in the decoder processes, so it must be a function of a module.
     """
     database = Database(settings.resolved_database_url)
@@ -149,6 +152,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.readiness = readiness
     app.state.metrics = metrics
     for router in ROUTERS:
+    app.state.calibrations = Calibrations(database, utc_now, pool, rules.images, rules.idempotency_ttl)
         app.include_router(router)
     mount_ogc(app)
     ui.mount_static(app)
@@ -176,6 +180,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
 @asynccontextmanager
 async def _each_minute(work: Callable[[], None]) -> AsyncIterator[None]:
     """Call `work` in a thread once a minute, and a last time at the end."""
+            "/v1/calibrations": settings.max_upload_bytes,
 
     async def repeat() -> None:
         while True:

@@ -131,3 +131,15 @@ def test_a_file_that_is_no_picture(waymark: Run, tmp_path: Path) -> None:
     status, out, error = waymark("decode", str(file))
     assert (status, out) == (1, "")
     assert error.startswith("waymark: ")
+
+
+def test_a_calibration_board(waymark: Run, tmp_path: Path) -> None:
+    status, printed, _ = waymark("board", "--out", str(tmp_path / "b"), "--format", "svg", "--format", "pdf")
+    assert status == 0
+    names = [Path(line).name for line in printed.split()]
+    assert names == ["waymark-board-7x10-25mm.svg", "waymark-board-7x10-25mm.pdf"]
+    assert (tmp_path / "b" / "waymark-board-7x10-25mm.pdf").read_bytes().startswith(b"%PDF")
+    for arguments, told in ((["--columns", "3"], "4 to 24"), (["--format", "gif"], "svg, pdf, dxf, png")):
+        status, _, error = waymark("board", "--out", str(tmp_path), *arguments)
+        assert status == 1
+        assert told in error

@@ -48,6 +48,7 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     errors.InvalidParameter: ProblemKind(422, "invalid-parameter", "A value is not allowed"),
     errors.CodeMismatch: ProblemKind(422, "code-mismatch", "The digits do not fit"),
     errors.ReferenceSystemError: ProblemKind(422, "reference-system", "The reference system cannot be used"),
+    errors.CalibrationRefused: ProblemKind(422, "calibration-refused", "The photos do not calibrate the camera"),
     errors.UnreadableUpload: ProblemKind(422, "unreadable-upload", "The upload cannot be read"),
     errors.VersionRequired: ProblemKind(428, "version-required", "The change needs a version"),
     errors.TooManyRequests: ProblemKind(429, "too-many-requests", "Too much was asked for in a short time"),
@@ -157,9 +158,9 @@ def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
         return unexpected(error, scope)
     if kind.status >= 500:
         _LOG.error("request failed", error=type(error).__name__, detail=error.message)
-    fault = FieldError(field=error.field, detail=error.message, limit=error.limit, cure=error.cure)
+    faults = [FieldError(field=e.field, detail=e.message, limit=e.limit, cure=e.cure) for e in (error, *error.parts)]
     wait = {"Retry-After": str(error.retry_after_s)} if isinstance(error, errors.TooManyRequests) else None
-    return problem(kind, error.message, scope, [fault], wait)
+    return problem(kind, error.message, scope, faults, wait)
 
 
 def unexpected(error: Exception, scope: Any) -> Response:

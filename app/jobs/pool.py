@@ -8,13 +8,16 @@ import threading
 from concurrent.futures import Future
 from typing import Any
 
+from app.decoders.calibration.calibrate import CameraCalibration
 from app.errors import Unavailable
+from app.jobs.calibration_child import calibrate_photos
 from app.jobs.child import ONE_THREAD, ChildLimits, DecodePlates, annotate_frame, find_plates, load_frame, process_id
 from app.jobs.keeper import Keeper, Pending, Step
 from app.jobs.packet_child import draw_overlay, lay_lane, read_drive
 from app.jobs.survey_child import read_survey_file
 from app.jobs.trace_child import decode_recording
 from app.registry.exchange.table import SurveyTable
+from app.services.calibrations import CalibrationTask
 from app.services.frames import AnnotationTask, FrameResult, FrameTask, PlateSearch
 from app.services.imports import SurveyTask
 from app.services.packets import DriveFiles, DriveTask, LaneResult, LaneTask, OverlayTask
@@ -109,6 +112,10 @@ class DecodePool:
     def start_survey(self, task: SurveyTask, *, wait_s: float = 0.0) -> Pending[SurveyTable]:
         """Hand a survey over to be read, at once or as soon as there is a place within `wait_s`."""
         return self._start(((read_survey_file, task),), wait_s, self._limits.trace_timeout_s)
+
+    def start_calibration(self, task: CalibrationTask, *, wait_s: float = 0.0) -> Pending[CameraCalibration]:
+        """Hand photos of a board over, at once or as soon as there is a place within `wait_s`."""
+        return self._start(((calibrate_photos, task),), wait_s, self._limits.trace_timeout_s)
 
     def draw_overlay(self, task: OverlayTask) -> bytes:
         """Camera frame with a lane, encoded."""

@@ -1,0 +1,258 @@
+"""One photo -> the corners of the board in it, or why it is left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.sensors.calibration_board import CalibrationBoard, board_dictionary
+
+Floats = npt.NDArray[np.float64]
+Grey = npt.NDArray[np.uint8]
+
+LEAST_CORNERS = 8
+LEAST_SHARE = 0.2
+"""Of the board's corners."""
+BLURRED_PX, BLURRED_SHARE = 8.0, 0.25
+"""Width of an edge between black and white above which a photo is blurred: absolute, and of a square. [px]"""
+_SEARCH_PX = 2400
+"""Markers are searched for in a photo that is at most this long; corners are refined in the whole one. [px]"""
+_LEAST_PX = 64
+_OTHER_DICTIONARIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
+
+
+class ViewFault(StrEnum):
+    """Why a photo is left out."""
+
+    NO_BOARD = "no-board"
+    WRONG_BOARD = "wrong-board"
+    MIRRORED = "mirrored"
+    TOO_FEW_CORNERS = "too-few-corners"
+    BLURRED = "blurred"
+    OTHER_SIZE = "other-size"
+    ALIKE = "alike"
+    DOES_NOT_FIT = "does-not-fit"
+    NOT_A_PICTURE = "not-a-picture"
+    UNREADABLE = "unreadable"
+    TOO_LARGE = "too-large"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardView:
+    """What a photo shows of the board.
+
+    Attributes
+    ----------
+    corner : ndarray of int, shape (K,)
+        Which inner corners, counted row by row from the upper left.
+    corners_px : ndarray, shape (K, 2)
+        Pixel centres at integers. [px]
+    edge_width_px : float
+        Of edges between black and white, the wider of both directions; NaN without corners. [px]
+    fault : ViewFault or None
+        Why it cannot be used.
+    detail : str
+        The same in words, with the figures.
+    """
+
+    corner: npt.NDArray[np.intp]
+    corners_px: Floats
+    edge_width_px: float = float("nan")
+    fault: ViewFault | None = None
+    detail: str = ""
+
+
+def find_board(grey: Grey, board: CalibrationBoard) -> BoardView:
+    """Find the inner corners of a board in a photo.
+
+    Parameters
+    ----------
+    grey : ndarray of uint8, shape (H, W)
+    board : CalibrationBoard
+
+    Returns
+    -------
+    BoardView
+        With `fault` where it cannot be used: no marker of the board, markers of another one, a mirrored or blurred
+        photo, too few corners.
+    """
+    scale = min(1.0, _SEARCH_PX / max(grey.shape))
+    if min(grey.shape) * scale < _LEAST_PX:
+        return _nothing(ViewFault.NO_BOARD, f"the photo is {grey.shape[1]} x {grey.shape[0]} px")
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+    corners, ids, marks, numbers = _detector(board).detectBoard(small)
+    if numbers is None or len(numbers) < 2:
+        return _nothing(*_why_nothing(small, board))
+    if other := _is_other_board(marks, numbers, board):
+        return _nothing(ViewFault.WRONG_BOARD, other)
+    count = 0 if ids is None else len(ids)
+    least = max(LEAST_CORNERS, int(np.ceil(LEAST_SHARE * board.corner_count)))
+    if count < least:
+        detail = f"{count} of {board.corner_count} corners of the board are to be seen, {least} are needed"
+        return _nothing(ViewFault.TOO_FEW_CORNERS, detail)
+    corner = np.asarray(ids, np.intp).ravel()
+    rough = (np.asarray(corners, float).reshape(-1, 2) + 0.5) / scale - 0.5
+    square_px = _square_px(corner, rough, board)
+    refined = _refine(grey, corner, rough, board)
+    width_px = edge_width_px(grey, corner, refined, board)
+    limit_px = min(BLURRED_PX, BLURRED_SHARE * square_px)
+    if not width_px <= limit_px:
+        detail = f"edges are {width_px:.1f} px wide, {limit_px:.1f} px at most"
+        return BoardView(corner, refined, width_px, ViewFault.BLURRED, detail)
+    return BoardView(corner, refined, width_px)
+
+
+@lru_cache(maxsize=8)
+def _detector(board: CalibrationBoard) -> Any:
+    size = (board.columns, board.rows)
+    theirs = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, board_dictionary())
+    return cv2.aruco.CharucoDetector(theirs)
+
+
+def _nothing(fault: ViewFault, detail: str) -> BoardView:
+    return BoardView(np.empty(0, np.intp), np.empty((0, 2)), fault=fault, detail=detail)
+
+
+def _why_nothing(small: Grey, board: CalibrationBoard) -> tuple[ViewFault, str]:
+    """What else the photo shows, where no marker of the board was found."""
+    detector = _detector(board)
+    flipped = detector.detectBoard(np.ascontiguousarray(small[:, ::-1]))[3]
+    if flipped is not None and len(flipped) >= 4:
+        return ViewFault.MIRRORED, "the board is mirrored: its markers only read in a mirror"
+    if (width_px := _steepest_px(small)) > BLURRED_PX:
+        return ViewFault.BLURRED, f"no marker was found, and the sharpest edges are {width_px:.0f} px wide"
+    for name in _OTHER_DICTIONARIES:
+        other = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)))
+        found = other.detectMarkers(small)[1]
+        if found is not None and len(found) >= 4:
+            return ViewFault.WRONG_BOARD, f"its markers are of {name}, those of the board of DICT_5X5_100"
+    return ViewFault.NO_BOARD, "no marker of the board was found: is it whole, flat, lit and in focus?"
+
+
+def _steepest_px(grey: Grey) -> float:
+    """Width of a photo's steepest edges across the direction in which they are widest; 0 without contrast. [px]"""
+    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA).astype(np.float32)
+    low, high = np.percentile(half, (2, 98))
+    if high - low < 40:
+        return 0.0
+    across = cv2.Sobel(half, cv2.CV_32F, 1, 0, scale=1 / 8)
+    down = cv2.Sobel(half, cv2.CV_32F, 0, 1, scale=1 / 8)
+    turned = ((1.0, 0.0), (0.7071, 0.7071), (0.0, 1.0), (-0.7071, 0.7071))
+    slopes = [float(np.percentile(np.abs(x * across + y * down), 99.9)) for x, y in turned]
+    return 2 * float(high - low) / max(min(slopes), 1e-3)
+
+
+def _is_other_board(marks: Any, numbers: Any, board: CalibrationBoard) -> str | None:
+    """Why the markers are not this board's: numbers that it does not have, or places that do not fit."""
+    found = np.asarray(numbers).ravel()
+    known = found < len(board.marker_squares)
+    if not known.all():
+        return f"it has marker {found.max()}, the board's go to {len(board.marker_squares) - 1}"
+    if len(found) < 4:
+        return None
+    image = np.concatenate([np.asarray(mark, float).reshape(4, 2) for mark in marks])
+    plane = np.concatenate([board.marker_corners_mm(int(number)) for number in found])
+    homography, _inliers = cv2.findHomography(plane, image, cv2.RANSAC, 0.02 * float(np.ptp(image, axis=0).max()))
+    if homography is None:
+        return "its markers do not lie as on the board"
+    back = cv2.perspectiveTransform(image.reshape(-1, 1, 2), np.linalg.pinv(homography)).reshape(-1, 2)
+    off = np.linalg.norm(back - plane, axis=1) / board.square_mm
+    fits = float((off < 0.5).mean())  # a wide lens bends a board by less
+    return None if fits > 0.7 else f"{1 - fits:.0%} of its markers do not lie where they do on the board"
+
+
+def _square_px(corner: npt.NDArray[np.intp], corners_px: Floats, board: CalibrationBoard) -> float:
+    """Side of a square in the photo, the middle of those along rows and columns. [px]"""
+    sides = [np.linalg.norm(corners_px[b] - corners_px[a], axis=1) for a, b in _neighbours(corner, board)]
+    both = np.concatenate(sides)
+    return float(np.median(both)) if len(both) else 0.0
+
+
+def _neighbours(
+    corner: npt.NDArray[np.intp], board: CalibrationBoard
+) -> tuple[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]], ...]:
+    """Indices of corners beside each other along a row, and along a column."""
+    across = board.columns - 1
+    at = np.full(board.corner_count, -1)
+    at[corner] = np.arange(len(corner))
+    grid = at.reshape(board.rows - 1, across)
+    pairs = ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:]))
+    found = []
+    for first, second in pairs:
+        both = (first >= 0) & (second >= 0)
+        found.append((first[both], second[both]))
+    return tuple(found)
+
+
+def _refine(grey: Grey, corner: npt.NDArray[np.intp], corners_px: Floats, board: CalibrationBoard) -> Floats:
+    """Corners to a fraction of a pixel, each in a window that holds no marker, however the board is tilted."""
+    free = (board.square_mm - board.marker_mm) / 2 / board.square_mm
+    half = np.clip((0.8 * free * _heights_px(corner, corners_px, board)).astype(int), 2, 12)
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    refined = corners_px.copy()
+    for size in np.unique(half):
+        at = half == size
+        points = corners_px[at].astype(np.float32).reshape(-1, 1, 2)
+        found = cv2.cornerSubPix(grey, points, (int(size), int(size)), (-1, -1), criteria)
+        refined[at] = np.asarray(found, float).reshape(-1, 2)
+    moved = np.linalg.norm(refined - corners_px, axis=1)
+    return np.where((moved <= 0.5 * half)[:, None], refined, corners_px)
+
+
+def _heights_px(corner: npt.NDArray[np.intp], corners_px: Floats, board: CalibrationBoard) -> Floats:
+    """Least height of the squares about each corner, taken as parallelograms. [px]"""
+    steps = []
+    for first, second in _neighbours(corner, board):
+        step = np.full((2, len(corner), 2), np.nan)
+        step[0, first] = corners_px[second] - corners_px[first]
+        step[1, second] = corners_px[second] - corners_px[first]
+        steps.append(step)
+    heights = np.full(len(corner), np.inf)
+    for along in steps[0]:
+        for down in steps[1]:
+            area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
+            longest = np.maximum(np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1))
+            heights = np.fmin(heights, area / longest)
+    return np.where(np.isfinite(heights), heights, 0.0)
+
+
+def edge_width_px(grey: Grey, corner: npt.NDArray[np.intp], corners_px: Floats, board: CalibrationBoard) -> float:
+    """Width of the board's edges: contrast over the steepest slope, the wider of both directions.
+
+    A Gaussian blur of sigma gives 2.5 sigma; a sharp edge about 1.5 px. Inf where nothing can be measured.
+    """
+    low, high = np.percentile(grey[_region(corners_px, grey.shape)], (5, 95)).astype(float)
+    if high - low < 10:
+        return float("inf")
+    reach = (board.square_mm - board.marker_mm) / 2 / board.square_mm
+    widths = []
+    for first, second in _neighbours(corner, board):
+        if not len(first):
+            continue
+        start, end = corners_px[first], corners_px[second]
+        along = end - start
+        length = np.linalg.norm(along, axis=1)
+        normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None]
+        offsets = np.linspace(-1, 1, 25)[None] * np.clip(reach * length, 1.5, 25)[:, None]
+        # several places of an edge, each with its own profile across it
+        places = start[:, None] + np.array([0.3, 0.4, 0.5, 0.6, 0.7])[None, :, None] * along[:, None]
+        points = places[:, :, None] + offsets[:, None, :, None] * normal[:, None, None]
+        values = cv2.remap(
+            grey, points[..., 0].reshape(len(first), -1).astype(np.float32),
+            points[..., 1].reshape(len(first), -1).astype(np.float32), cv2.INTER_LINEAR,
+        ).reshape(*points.shape[:3]).astype(float).mean(axis=1)  # fmt: skip
+        slope = np.abs(np.gradient(values, axis=1) / np.gradient(offsets, axis=1)).max(axis=1)
+        widths.append(float(np.median((high - low) / np.maximum(slope, 1e-6))))
+    return max(widths) if widths else float("inf")
+
+
+def _region(corners_px: Floats, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    left, top = np.floor(corners_px.min(axis=0)).astype(int)
+    right, bottom = np.ceil(corners_px.max(axis=0)).astype(int) + 1
+    return slice(max(int(top), 0), min(int(bottom), shape[0])), slice(max(int(left), 0), min(int(right), shape[1]))
