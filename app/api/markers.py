@@ -11,7 +11,15 @@ from app.api.dependencies import Caller, Idempotency, Markers, Version, json_res
 from app.api.problems import UNION_TAG, problem_responses
 from app.api.schemas_cerpms import CERPM_EXAMPLES, CerpmMarkerIn, CerpmMarkerOut
 from app.api.schemas_magnets import MAGNET_EXAMPLES, MagnetMarkerIn, MagnetMarkerOut, MagnetMarkerSummary
-from app.api.schemas_markers import PLATE_EXAMPLES, GeometryIn, MarkerId, MarkerIn, MarkerOut, VersionKind
+from app.api.schemas_markers import (
+    PLATE_EXAMPLES,
+    AccuracyOut,
+    GeometryIn,
+    MarkerId,
+    MarkerIn,
+    MarkerOut,
+    VersionKind,
+)
 from app.api.schemas_patch import MarkerPatch
 from app.api.strict_json import StrictRoute
 from app.errors import InvalidParameter
@@ -121,6 +129,14 @@ def patch_marker(
     """Change a marker that is still at the version named by If-Match."""
     document = markers.change(caller, marker_id, patch.change(), version)
     return json_response(document, headers={"ETag": _etag(document)})
+
+
+@router.get(
+    "/{marker_id}/accuracy", response_class=Response, responses={200: {"model": AccuracyOut}, **problem_responses(404)}
+)
+def get_marker_accuracy(marker_id: MarkerId, caller: Caller, markers: Markers) -> Response:
+    """How good the marker's survey is: NSSDA and ASPRS figures of its RMSE, and whether enough points were checked."""
+    return json_response(markers.accuracy(caller, marker_id))
 
 
 @router.get(

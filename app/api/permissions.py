@@ -47,6 +47,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/markers/bulk": SURVEYORS,  # registering as POST /v1/markers
     "GET /v1/markers/{marker_id}": READERS,
     "PATCH /v1/markers/{marker_id}": SURVEYORS,
+    "GET /v1/markers/{marker_id}/accuracy": READERS,
     "GET /v1/markers/{marker_id}/versions": READERS,
     "GET /v1/markers/{marker_id}/versions/{version}": READERS,
     "GET /v1/markers/{marker_id}/observations": READERS,

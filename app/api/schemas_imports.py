@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.dependencies import Number, Text, Whole
 from app.api.schemas_cerpms import SpeedLimitIn
-from app.api.schemas_markers import Accuracy, GeometryIn, Status
+from app.api.schemas_markers import Accuracy, AccuracyOut, GeometryIn, Status
 from app.errors import InvalidParameter
 from app.markers.cerpm import LaneSide, SpeedLimit, SpeedUnit
 from app.markers.plate import PlateGeometry, PlateScheme
@@ -139,6 +139,7 @@ class ImportReportOut(BaseModel):
     crs: str
     localization_grade: str
     transform_note: str | None
+    accuracy: AccuracyOut = Field(description="Of the RMSE that was declared for the whole survey.")
     rows: Whole
     good_rows: Whole
     refused_rows: Whole

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, WithJsonSchema, model_validator
 
 from app.api.dependencies import Identifier, Number, Text
-from app.api.schemas_markers import Accuracy, Height, Metres, PlacementIn, PositionOut, Status
+from app.api.schemas_markers import Accuracy, CheckPoints, Height, Metres, PlacementIn, PositionOut, Sha256, Status
 from app.errors import InvalidParameter
 from app.markers.magnet import LineStyle
 from app.services.magnet_layouts import GivenLane, PlacedLine, PlacedTag
@@ -82,6 +82,10 @@ class LaneIn(BaseModel):
     horizontal_rmse_m: Accuracy | None = Field(None, description="Horizontal accuracy, RMSE. [m]")
     vertical_rmse_m: Accuracy | None = Field(None, description="Vertical accuracy, RMSE. [m]")
     survey_method: Text | None = Field(None, min_length=1, max_length=200, description="How it was surveyed.")
+    check_points: CheckPoints | None = Field(None, description="Independent points that the RMSE was tested at.")
+    surveyor: Text | None = Field(None, min_length=1, max_length=200, description="Who surveyed.")
+    instrument: Text | None = Field(None, min_length=1, max_length=200, description="With what.")
+    survey_file_sha256: Sha256 | None = Field(None, description="SHA-256 of the survey's file, lower-case hex.")
 
     @model_validator(mode="after")
     def _one_line(self) -> LaneIn:

@@ -15,6 +15,8 @@ Heading = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, lt=360)
 Accuracy = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6)]
 Metres = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e8, le=1e8)]
 Height = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-12_000, le=100_000)]
+CheckPoints = Annotated[int, Field(strict=True, ge=0, le=10**6)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 MarkerId = Annotated[Identifier, Path(description="Id of the marker.")]
 
 
@@ -42,6 +44,10 @@ class PositionIn(BaseModel):
     horizontal_rmse_m: Accuracy | None = Field(None, description="Horizontal accuracy, RMSE. [m]")
     vertical_rmse_m: Accuracy | None = Field(None, description="Vertical accuracy, RMSE. [m]")
     survey_method: Text | None = Field(None, min_length=1, max_length=200, description="How it was surveyed.")
+    check_points: CheckPoints | None = Field(None, description="Independent points that the RMSE was tested at.")
+    surveyor: Text | None = Field(None, min_length=1, max_length=200, description="Who surveyed.")
+    instrument: Text | None = Field(None, min_length=1, max_length=200, description="With what.")
+    survey_file_sha256: Sha256 | None = Field(None, description="SHA-256 of the survey's file, lower-case hex.")
 
 
 class CodeIn(BaseModel):
@@ -160,7 +166,12 @@ class PositionOut(BaseModel):
     horizontal_rmse_m: float | None
     vertical_rmse_m: float | None
     survey_method: str | None
+    check_points: int | None
+    surveyor: str | None
+    instrument: str | None
+    survey_file_sha256: str | None
     localization_grade: Literal["exact", "approximate, not for localization"]
+    transform_accuracy_m: float | None
     transform_note: str | None
     original: dict[str, Any]
 
@@ -182,3 +193,35 @@ class MarkerOut(BaseModel):
     offset_m: float | None
     created_at: str
     updated_at: str
+
+
+class _Tested(BaseModel):
+    is_tested: bool
+    needed_check_points: int
+    source: str
+
+
+class NssdaOut(_Tested):
+    """Accuracy at 95 % confidence. [m]"""
+
+    horizontal_95_m: float | None
+    vertical_95_m: float | None
+    statement: str | None
+
+
+class AsprsOut(_Tested):
+    """Accuracy classes. [cm]"""
+
+    horizontal_class_cm: float | None
+    vertical_class_cm: float | None
+
+
+class AccuracyOut(BaseModel):
+    """Accuracy figures of a survey, each with its source."""
+
+    horizontal_rmse_m: float | None
+    vertical_rmse_m: float | None
+    check_points: int | None
+    nssda: NssdaOut
+    asprs_2014: AsprsOut
+    asprs_2023: AsprsOut

@@ -78,7 +78,7 @@ def fix_from_match(pose: PlatePose, camera: Camera, match: Match, vehicle_headin
         lat_deg=row["lat_deg"],
         height_m=row["height_m"] or 0.0,
         heading_deg=heading_deg,
-        horizontal_rmse_m=_or_assumed(row["horizontal_rmse_m"], ASSUMED_HORIZONTAL_RMSE_M),
+        horizontal_rmse_m=_or_assumed(horizontal_rmse_m(row), ASSUMED_HORIZONTAL_RMSE_M),
         vertical_rmse_m=_or_assumed(row["vertical_rmse_m"], ASSUMED_VERTICAL_RMSE_M),
         heading_rmse_deg=_or_assumed(heading_rmse_deg, ASSUMED_HEADING_RMSE_DEG),
     )
@@ -131,6 +131,12 @@ def position_doubts(row: Row, what: str) -> list[str]:
     if row["status"] not in SURVEYED:
         doubts.append(f"the {what} is {row['status']}, its position is not surveyed")
     return doubts
+
+
+def horizontal_rmse_m(row: Row) -> float | None:
+    """What a marker's position is good to: its survey, and the stated bound of what brought it to WGS 84 / ITRF. [m]"""
+    stated, bound_m = row["horizontal_rmse_m"], row["transform_accuracy_m"]
+    return None if stated is None else math.hypot(stated, bound_m or 0.0)
 
 
 def _or_assumed(value: float | None, assumed: float) -> float:

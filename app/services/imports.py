@@ -27,6 +27,7 @@ from app.registry.exchange.table import Fault, Severity, SurveyTable
 from app.registry.ids import new_ids
 from app.registry.spatial import Box
 from app.services.access import Caller
+from app.services.accuracy import accuracy_document
 from app.services.audit import author_of
 from app.services.cerpm_markers import Cerpms
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
@@ -217,6 +218,12 @@ class _Running:
             "crs": table.crs,
             "localization_grade": str(placed.grade),
             "transform_note": placed.note,
+            "accuracy": accuracy_document(
+                *(
+                    self._given.declaration.survey.get(name)
+                    for name in ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
+                )
+            ),
             "rows": table.rows,
             "good_rows": good,
             "refused_rows": int(refused.sum()),

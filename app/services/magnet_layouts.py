@@ -60,6 +60,10 @@ class GivenLane:
     horizontal_rmse_m: float | None = None
     vertical_rmse_m: float | None = None
     survey_method: str | None = None
+    check_points: int | None = None
+    surveyor: str | None = None
+    instrument: str | None = None
+    survey_file_sha256: str | None = None
 
     @property
     def provenance(self) -> GivenPosition:
@@ -73,6 +77,10 @@ class GivenLane:
             horizontal_rmse_m=self.horizontal_rmse_m,
             vertical_rmse_m=self.vertical_rmse_m,
             survey_method=self.survey_method,
+            check_points=self.check_points,
+            surveyor=self.surveyor,
+            instrument=self.instrument,
+            survey_file_sha256=self.survey_file_sha256,
         )
 
 

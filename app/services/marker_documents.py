@@ -66,7 +66,12 @@ def _position(row: Row | dict[str, Any]) -> dict[str, Any]:
         "horizontal_rmse_m": row["horizontal_rmse_m"],
         "vertical_rmse_m": row["vertical_rmse_m"],
         "survey_method": row["survey_method"],
+        "check_points": row["check_points"],
+        "surveyor": row["surveyor"],
+        "instrument": row["instrument"],
+        "survey_file_sha256": row["survey_file_sha256"],
         "localization_grade": row["localization_grade"],
+        "transform_accuracy_m": row["transform_accuracy_m"],
         "transform_note": row["transform_note"],
         "original": row["original"],
     }

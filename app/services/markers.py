@@ -18,6 +18,7 @@ from app.registry.history import get_version, marker_of
 from app.registry.ids import new_id
 from app.registry.markers import Row
 from app.services.access import Caller
+from app.services.accuracy import accuracy_document
 from app.services.audit import author_of
 from app.services.cerpm_markers import Cerpms, NewCerpm
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
@@ -27,6 +28,7 @@ from app.services.marker_rules import MarkerFamily, MarkerRules, NewMarker
 from app.services.plate_markers import NewPlate, Plates
 from app.services.ports import Clock
 from app.services.positions import GivenPosition, place_given, position_columns
+from app.services.road_routes import linear_reference
 from app.services.version_kinds import kind_of_change, kind_of_new
 
 New = TypeVar("New", bound=NewMarker)
@@ -138,6 +140,8 @@ class Markers:
                 "updated_at": now,
                 **family.columns(connection, caller, new, prepared),
             }
+            if new.measure_m is None:
+                values |= linear_reference(connection, caller.agency_id, values)
             kind = kind_of_new(new.status, new.kind)
             who = author_of(caller)
             with recording(
@@ -154,6 +158,12 @@ class Markers:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         return self._family(row).detail(row)
+
+    def accuracy(self, caller: Caller, marker_id: str) -> dict[str, Any]:
+        """How good a marker's survey is, by the standards that agencies know."""
+        with self._database.read() as connection:
+            row = store.get_marker(connection, caller.agency_id, marker_id)
+        return accuracy_document(row["horizontal_rmse_m"], row["vertical_rmse_m"], row["check_points"])
 
     def change(self, caller: Caller, marker_id: str, change: MarkerChange, version: int | None) -> dict[str, Any]:
         """Change a marker that is still at `version`; None changes whatever version is stored.
@@ -204,6 +214,9 @@ class Markers:
                     cure="leave it out",
                 )
             values |= family.revised(connection, caller, row, values, moved=placed is not None)
+            if (placed is not None or "road" in values) and values.get("measure_m") is None:
+                merged = {**row, **values}
+                values |= linear_reference(connection, caller.agency_id, merged, row["measure_m"])
             kind = kind_of_change(
                 row["status"], values.get("status", row["status"]), moved=placed is not None, said=change.kind
             )

@@ -25,7 +25,7 @@ from app.registry import cerpms
 from app.registry.markers import Row
 from app.services.agency_secrets import AgencySecrets
 from app.services.cerpm_markers import radio_of, side_of, speed_limit_of
-from app.services.fixes import position_doubts
+from app.services.fixes import horizontal_rmse_m, position_doubts
 from app.services.marker_rules import RETIRED
 from app.services.packets import DriveFiles, PacketTerms
 
@@ -151,7 +151,7 @@ def _span(row: Row) -> SequenceSpan:
 
 
 def _registered(row: Row) -> RegisteredMarker:
-    limit, rmse_m = speed_limit_of(row), row["horizontal_rmse_m"]
+    limit, rmse_m = speed_limit_of(row), horizontal_rmse_m(row)
     return RegisteredMarker(
         row["lon_deg"],
         row["lat_deg"],

@@ -27,6 +27,10 @@ class GivenPosition:
     horizontal_rmse_m: float | None = None
     vertical_rmse_m: float | None = None
     survey_method: str | None = None
+    check_points: int | None = None
+    surveyor: str | None = None
+    instrument: str | None = None
+    survey_file_sha256: str | None = None
 
 
 @contextmanager
@@ -85,6 +89,11 @@ def position_columns(given: GivenPosition, placed: PlacedPosition) -> dict[str, 
         "horizontal_rmse_m": given.horizontal_rmse_m,
         "vertical_rmse_m": given.vertical_rmse_m,
         "survey_method": given.survey_method,
+        "check_points": given.check_points,
+        "surveyor": given.surveyor,
+        "instrument": given.instrument,
+        "survey_file_sha256": given.survey_file_sha256,
+        "transform_accuracy_m": placed.transform_accuracy_m,
         "original": {name: value for name, value in asdict(given).items() if value is not None},
         "localization_grade": str(placed.grade),
         "transform_note": placed.note,

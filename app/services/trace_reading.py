@@ -21,7 +21,7 @@ from app.registry.markers import MarkerFilter, Row
 from app.registry.spatial import distance_m
 from app.sensors.magnetometer_bar import MagnetometerBar
 from app.services.decode_context import CoarsePosition
-from app.services.fixes import ASSUMED_HORIZONTAL_RMSE_M, position_doubts
+from app.services.fixes import ASSUMED_HORIZONTAL_RMSE_M, horizontal_rmse_m, position_doubts
 from app.services.magnet_layouts import INFORMATION_TAG, layout_of
 
 Floats = npt.NDArray[np.float64]
@@ -197,7 +197,7 @@ def fix_from_tag(reading: TagReading, row: Row, layout: MagnetLayout, bar: Magne
     bar_m = np.array([array[:, 0].mean(), (array[:, 1].max() + array[:, 1].min()) / 2])
     place = middles.mean(axis=0) - bar_m[0] * forward - bar_m[1] * left
     notes = position_doubts(row, "tag")
-    survey_m = float(row["horizontal_rmse_m"] or ASSUMED_HORIZONTAL_RMSE_M) / math.sqrt(2)
+    survey_m = float(horizontal_rmse_m(row) or ASSUMED_HORIZONTAL_RMSE_M) / math.sqrt(2)
     clearance_m = float(np.median([magnet.clearance_cm for magnet in reading.magnets])) / 100
     lateral_std_m = LATERAL_STD_M * max(clearance_m / LATERAL_STD_CLEARANCE_M, 0.5) ** 2
     count = len(reading.magnets)

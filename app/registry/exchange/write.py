@@ -24,11 +24,11 @@ Record = Mapping[str, Any]
 
 TEXTS = (
     "id", "family", "status", "scheme", "code", "side", "road", "realization", "vertical_datum", "survey_method",
-    "localization_grade", "updated_at",
+    "crs", "surveyor", "instrument", "survey_file_sha256", "localization_grade", "transform_note", "updated_at",
 )  # fmt: skip
 NUMBERS = (
     "lon_deg", "lat_deg", "height_m", "heading_deg", "measure_m", "offset_m", "epoch", "horizontal_rmse_m",
-    "vertical_rmse_m", "version",
+    "vertical_rmse_m", "check_points", "transform_accuracy_m", "version",
 )  # fmt: skip
 FIELDS = (*TEXTS, *NUMBERS)
 SHAPEFILE_NAMES = {
@@ -37,6 +37,8 @@ SHAPEFILE_NAMES = {
     "localization_grade": "loc_grade", "updated_at": "updated_at", "lon_deg": "lon_deg", "lat_deg": "lat_deg",
     "height_m": "height_m", "heading_deg": "headng_deg", "measure_m": "measure_m", "offset_m": "offset_m",
     "epoch": "epoch", "horizontal_rmse_m": "h_rmse_m", "vertical_rmse_m": "v_rmse_m", "version": "version",
+    "crs": "crs", "surveyor": "surveyor", "instrument": "instrument", "survey_file_sha256": "survy_file",
+    "transform_note": "trans_note", "check_points": "check_pts", "transform_accuracy_m": "trans_acc",
 }  # fmt: skip
 """Ten characters a name, the same in every file."""
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
