@@ -29,6 +29,7 @@ from app.api import (
     markers,
     observations,
     radio_checks,
+    roads,
     searches,
     system,
     ui,
@@ -55,9 +56,9 @@ from app.services.agency_secrets import AgencySecrets
 from app.services.artwork import Artworks
 from app.services.audit import AuditLog
 from app.services.bulk_markers import BulkMarkers
+from app.services.calibrations import Calibrations
 from app.services.cerpm_programs import CerpmPrograms
 from app.services.codebooks import Codebooks
-from app.services.calibrations import Calibrations
 from app.services.decode_jobs import DecodeJobs
 from app.services.decode_rules import DecodeRules
 from app.services.decodes import Decodes
@@ -69,6 +70,7 @@ from app.services.layouts import Layouts
 from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
 from app.services.observations import Observations
+from app.services.roads import Roads
 from app.services.searches import Searches
 from app.services.vehicles import Vehicles
 from app.settings import Settings
@@ -81,6 +83,7 @@ ROUTERS = (
     searches.router,
     bulk.router,
     observations.router,
+    roads.router,
     markers.router,
     artwork.router,
     layouts.router,
@@ -92,6 +95,7 @@ ROUTERS = (
     exports.router,
     audit.router,
     vehicles.router,
+    calibrations.router,
     keys.router,
 )
 
@@ -99,7 +103,6 @@ ROUTERS = (
 def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> FastAPI:
     """An app with its own database, use cases, metrics and limits. Files are opened when it starts.
 
-    calibrations.router,
     `decode` is imported by name in the decoder processes, so it must be a function of a module.
     """
     database = Database(settings.resolved_database_url)
@@ -136,11 +139,13 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.exports = Exports(database)
     app.state.audit = AuditLog(database)
     app.state.searches = Searches(database)
+    app.state.roads = Roads(database, utc_now, settings.crs_accuracy_m, rules.idempotency_ttl)
     app.state.observations = Observations(database)
     app.state.bulk_markers = BulkMarkers(database, utc_now, app.state.markers, rules.idempotency_ttl)
     app.state.programs = CerpmPrograms(database, utc_now, secrets)
     app.state.layouts = Layouts(database)
     app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)
+    app.state.calibrations = Calibrations(database, utc_now, pool, rules.images, rules.idempotency_ttl)
     app.state.vehicles = Vehicles(database, utc_now, rules.idempotency_ttl)
     app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, secrets=secrets, rules=rules)
     app.state.jobs = jobs
@@ -152,7 +157,6 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.readiness = readiness
     app.state.metrics = metrics
     for router in ROUTERS:
-    app.state.calibrations = Calibrations(database, utc_now, pool, rules.images, rules.idempotency_ttl)
         app.include_router(router)
     mount_ogc(app)
     ui.mount_static(app)
@@ -169,6 +173,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
             "": settings.max_json_bytes,
             "/v1/decodes": settings.max_upload_bytes,
             "/v1/imports": settings.max_upload_bytes,
+            "/v1/calibrations": settings.max_upload_bytes,
         },
         permissions=Permissions(),
         body_timeout_s=settings.body_timeout_s,
@@ -180,7 +185,6 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
 @asynccontextmanager
 async def _each_minute(work: Callable[[], None]) -> AsyncIterator[None]:
     """Call `work` in a thread once a minute, and a last time at the end."""
-            "/v1/calibrations": settings.max_upload_bytes,
 
     async def repeat() -> None:
         while True:

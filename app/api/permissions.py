@@ -61,6 +61,17 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/imports": SURVEYORS,
     "GET /v1/exports/{kind}": READERS,
     "GET /v1/audit": ADMINS,
+    # --- roads
+    "GET /v1/roads": READERS,
+    "POST /v1/roads": PLANNERS,
+    "GET /v1/roads/{road_id}": READERS,
+    "PATCH /v1/roads/{road_id}": PLANNERS,
+    "GET /v1/roads/{road_id}/versions": READERS,
+    "GET /v1/roads/{road_id}/locate": READERS,
+    "POST /v1/roads/{road_id}/locate": READERS,
+    "GET /v1/roads/{road_id}/position": READERS,
+    "POST /v1/roads/{road_id}/position": READERS,
+    "GET /v1/roads/{road_id}/markers": READERS,
     # --- codebooks
     "GET /v1/codebooks": READERS,
     "POST /v1/codebooks": PLANNERS,

@@ -46,7 +46,15 @@ BODIES: dict[str, Any] = {
     "POST /v1/codebooks/{codebook_id}/entries": {"meanings": [{"kind": "speed-limit-mph", "value": 45}]},
     "PATCH /v1/vehicles/{vehicle_id}": {"note": "seen"},
     "PUT /v1/vehicles/{vehicle_id}/calibration": {"calibration_id": NOBODY_ID},
+    "PATCH /v1/roads/{road_id}": {"calibration": []},
+    "POST /v1/roads/{road_id}/locate": {"positions": [[33.501, 43.5]]},
+    "POST /v1/roads/{road_id}/position": {"references": [{"measure_m": 10}]},
     "PATCH /ogc/collections/{collection}/items/{feature}": {"type": "Feature", "properties": {"status": "active"}},
+}
+# and such queries
+QUERIES = {
+    "GET /v1/roads/{road_id}/locate": "?lon=33.501&lat=43.5",
+    "GET /v1/roads/{road_id}/position": "?measure_m=10",
 }
 # what the things made below do not have
 NOT_MADE = ("/artwork.{form}", "/plot.svg", "/lane.geojson", "/overlay.{suffix}")
@@ -107,7 +115,7 @@ def ask(client: httpx.Client, route: str, path: str) -> httpx.Response:
     method = route.partition(" ")[0]
     headers = {"If-Match": '"1"'}
     if method not in ("POST", "PUT", "PATCH"):
-        return client.request(method, path, headers=headers)
+        return client.request(method, path + QUERIES.get(route, ""), headers=headers)
     if route == UPLOAD:
         return client.post(path, content=b"this is no picture", headers={"Content-Type": "image/png"})
     body = json.dumps(BODIES.get(route, {}))
@@ -221,11 +229,13 @@ def things(server: LiveServer) -> dict[str, list[str]]:
         way = {"type": "LineString", "coordinates": [[33.5, 43.5], [33.502, 43.5]]}
         line = {"family": "magnet", "lane": {"geometry": way}, "line": {"style": "solid"}}
         magnets = _made(owner.post("/v1/markers", json=line))["id"]
+        road = _made(owner.post("/v1/roads", json={"name": "r", "geometry": way}))["id"]
         book = _made(owner.post("/v1/codebooks", json={"name": "b", "design": DESIGN, "meanings": MEANINGS}))
         decode = _made(owner.post("/v1/decodes", content=png(corner_frame()), headers={"Content-Type": "image/png"}))
         vehicle = _made(owner.post("/v1/vehicles", json={"name": "v", "profile": {}}))["id"]
     key_id = server.app.state.access.authenticate(owner.headers["authorization"].split()[1]).key_id
     return {
+        "road_id": [road],
         "vehicle_id": [vehicle],
         "key_id": [key_id],
         "marker_id": [plate, magnets, radio],
