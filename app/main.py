@@ -31,6 +31,7 @@ from app.api import (
     radio_checks,
     roads,
     searches,
+    snapshots,
     system,
     ui,
     vehicles,
@@ -72,10 +73,12 @@ from app.services.markers import Markers
 from app.services.observations import Observations
 from app.services.roads import Roads
 from app.services.searches import Searches
+from app.services.snapshots import Snapshots
 from app.services.vehicles import Vehicles
 from app.settings import Settings
 from app.storage.blobs import Blobs
 from app.storage.master_key import load_master_key
+from app.storage.signing_key import load_signing_key
 
 ROUTERS = (
     ui.router,
@@ -93,6 +96,7 @@ ROUTERS = (
     decodes.router,
     imports.router,
     exports.router,
+    snapshots.router,
     audit.router,
     vehicles.router,
     calibrations.router,
@@ -137,6 +141,9 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.markers = Markers(database, utc_now, _marker_rules(settings))
     app.state.imports = Imports(database, utc_now, pool, _marker_rules(settings))
     app.state.exports = Exports(database)
+    app.state.snapshots = Snapshots(
+        database, utc_now, lru_cache(lambda: load_signing_key(settings.resolved_signing_key_file))
+    )
     app.state.audit = AuditLog(database)
     app.state.searches = Searches(database)
     app.state.roads = Roads(database, utc_now, settings.crs_accuracy_m, rules.idempotency_ttl)

@@ -32,6 +32,9 @@ class Settings(BaseSettings):
     master_key_file: Path | None = Field(
         default=None, description="File of the 32 bytes that agencies' keys are stored under; made up if missing."
     )
+    signing_key_file: Path | None = Field(
+        default=None, description="File of the 32 bytes that snapshots are signed under (Ed25519); made up if missing."
+    )
     admin_key: SecretStr | None = Field(default=None, description="Admin key to use instead of a generated one.")
 
     max_json_bytes: int = Field(default=1024**2, ge=1024, description="Largest JSON body. [byte]")
@@ -94,6 +97,11 @@ class Settings(BaseSettings):
     def resolved_master_key_file(self) -> Path:
         """File of the server's key with the default filled in."""
         return self.master_key_file or self.data_dir / "master.key"
+
+    @property
+    def resolved_signing_key_file(self) -> Path:
+        """File of the key that snapshots are signed under with the default filled in."""
+        return self.signing_key_file or self.data_dir / "signing.key"
 
     @property
     def resolved_public_url(self) -> str:

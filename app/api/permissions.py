@@ -60,6 +60,8 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/radio-checks": READERS,
     "POST /v1/imports": SURVEYORS,
     "GET /v1/exports/{kind}": READERS,
+    "GET /v1/snapshots": EVERYBODY,  # what a vehicle takes along instead of asking the decoder
+    "GET /v1/snapshots/public-key": EVERYBODY,
     "GET /v1/audit": ADMINS,
     # --- roads
     "GET /v1/roads": READERS,

@@ -115,3 +115,27 @@ def has_heights(connection: sa.Connection, agency_id: str, narrowed: MarkerFilte
         markers.c.agency_id == agency_id, markers.c.height_m.is_not(None), *conditions_of(narrowed)
     )
     return connection.execute(query.limit(1)).first() is not None
+
+
+_SNAPSHOT = (
+    "id", "family", "status", "scheme", "digits", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm", "lon_deg",
+    "lat_deg", "height_m", "vertical_datum", "heading_deg", "horizontal_rmse_m", "vertical_rmse_m", "heading_rmse_deg",
+    "localization_grade",
+)  # fmt: skip
+
+
+def list_for_snapshot(connection: sa.Connection, agency_id: str, box: Box, *, limit: int) -> list[Row]:
+    """The agency's markers in a box that may be on the road, with what vehicles need of them; in the order of ids."""
+    spec = markers.c.spec
+    limit_of = spec["speed_limit"]
+    query = (
+        sa.select(
+            *(markers.c[name] for name in _SNAPSHOT),
+            spec["side"].as_string().label("side"),
+            limit_of["value"].as_integer().label("speed_limit_value"),
+            limit_of["unit"].as_string().label("speed_limit_unit"),
+        )
+        .where(markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box))
+        .order_by(markers.c.id)
+    )
+    return list(connection.execute(query.limit(limit)).mappings())

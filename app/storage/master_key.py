@@ -19,16 +19,7 @@ def load_master_key(path: Path) -> bytes:
     Unavailable
         The file is not a key. Making a new one would lose every secret under the old.
     """
-    try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except FileExistsError:
-        key = path.read_bytes()
-    else:
-        key = secrets.token_bytes(MASTER_KEY_BYTES)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(key)
-            file.flush()
-            os.fsync(file.fileno())
+    key = load_secret(path)
     if len(key) != MASTER_KEY_BYTES:
         raise Unavailable(
             f"{path} is not a master key: it has {len(key)} bytes",
@@ -37,3 +28,17 @@ def load_master_key(path: Path) -> bytes:
             cure="restore the file that was made with the database; without it keys of CERPMs cannot be read",
         )
     return key
+
+
+def load_secret(path: Path) -> bytes:
+    """What is in a file that only its owner may read; 32 random bytes where there is none."""
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        return path.read_bytes()
+    secret = secrets.token_bytes(MASTER_KEY_BYTES)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(secret)
+        file.flush()
+        os.fsync(file.fileno())
+    return secret

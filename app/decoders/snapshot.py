@@ -1,0 +1,266 @@
+"""A signed snapshot -> the codebooks of the decoders, on board, without a connection.
+
+Of the parts of Waymark this needs the definitions in `app.markers` and what the decoders take; no store, no network, no
+clock. `open_snapshot` verifies before it reads, and refuses by a named error whatever it cannot vouch for.
+"""
+
+from __future__ import annotations
+
+import math
+import uuid
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import orjson
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from pyproj import Geod
+
+from app.decoders.cerpm.merge_types import RegisteredMarker
+from app.markers import snapshot as layout
+from app.markers.cerpm import LaneSide
+from app.markers.magnet import InformationTag, parse_tag
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+
+_GEOD = Geod(ellps="WGS84")
+_M_PER_DEG = 110_574.0  # least length of a degree of latitude on WGS 84
+_CLOCK_SLACK = timedelta(minutes=10)
+_KM_H = {"km/h": 1.0, "mph": 1.609344}
+_CURE = "fetch the snapshot again"
+
+
+@dataclass(frozen=True, slots=True)
+class SnapshotMarker:
+    """A marker of a snapshot.
+
+    Attributes
+    ----------
+    marker_id, family, status, code : str
+        The code is digits of a plate, text of a tag, or number of a CERPM.
+    lon_deg, lat_deg : float
+        WGS 84 / ITRF. [deg]
+    height_m, heading_deg, horizontal_rmse_m, vertical_rmse_m, heading_rmse_deg : float or None
+    ellipsoidal : bool
+        The height is above the ellipsoid.
+    exact : bool
+        Fit for localization by its survey's frame.
+    kind : mapping
+        What it has in common with others: scheme and geometry, or side and speed limit.
+    distance_m : float
+        From the place it was looked for. [m]
+    """
+
+    marker_id: str
+    family: str
+    status: str
+    code: str
+    lon_deg: float
+    lat_deg: float
+    height_m: float | None
+    heading_deg: float | None
+    horizontal_rmse_m: float | None
+    vertical_rmse_m: float | None
+    heading_rmse_deg: float | None
+    ellipsoidal: bool
+    exact: bool
+    kind: Mapping[str, Any]
+    distance_m: float
+
+    @property
+    def plate_code(self) -> PlateCode:
+        """Code of a plate."""
+        return PlateCode(self.code, PlateScheme(self.kind["scheme"]), self.kind["n"], self.kind["check_digits"] or 1)
+
+    @property
+    def plate_geometry(self) -> PlateGeometry:
+        """Dimensions of a plate."""
+        return PlateGeometry(self.kind["n"], self.kind["unit_mm"], self.kind["gap_mm"], self.kind["thickness_mm"])
+
+
+class Snapshot:
+    """The markers of an area, verified. `open_snapshot` makes one."""
+
+    def __init__(self, header: Any, columns: dict[str, Any], kinds: list[dict[str, Any]], codes: bytes) -> None:
+        self.made_at_s = int(header["made_at_s"])
+        self.expires_at_s = int(header["expires_at_s"])
+        self.agency_id = str(uuid.UUID(bytes=bytes(header["agency_id"])))
+        self.area_deg = tuple(float(header[name]) for name in ("west_deg", "south_deg", "east_deg", "north_deg"))
+        self._columns = columns
+        self._kinds = kinds
+        self._codes = codes
+        self._ends = np.cumsum(columns["code_bytes"], dtype=np.int64)
+        self._lon_deg = columns["lon_step"] * layout.DEGREE_STEP
+        self._lat_deg = columns["lat_step"] * layout.DEGREE_STEP
+        self._family = np.array([layout.FAMILIES.index(kind["family"]) for kind in kinds] or [0])[columns["kind"]]
+
+    def __len__(self) -> int:
+        return len(self._lon_deg)
+
+    def covers(self, lon_deg: float, lat_deg: float) -> bool:
+        """Whether a place is in the snapshot's area: outside of it, that no marker is near means nothing."""
+        west, south, east, north = self.area_deg
+        inside = west <= lon_deg <= east if west <= east else lon_deg >= west or lon_deg <= east
+        return inside and south <= lat_deg <= north
+
+    def near(self, family: str, lon_deg: float, lat_deg: float, reach_m: float) -> list[SnapshotMarker]:
+        """Markers of a family within a distance, nearest first."""
+        reach_deg = reach_m / _M_PER_DEG * 1.001
+        across_deg = reach_deg / max(math.cos(math.radians(min(abs(lat_deg) + reach_deg, 89.9))), 1e-3)
+        off_deg = np.abs((self._lon_deg - lon_deg + 180.0) % 360.0 - 180.0)
+        proposed = np.flatnonzero(
+            (self._family == layout.FAMILIES.index(family))
+            & (np.abs(self._lat_deg - lat_deg) <= reach_deg)
+            & (off_deg <= across_deg)
+        )
+        return [marker for marker in self._markers(proposed, lon_deg, lat_deg) if marker.distance_m <= reach_m]
+
+    def plate_codebook(self, lon_deg: float, lat_deg: float, reach_m: float) -> tuple[PlateCode, ...]:
+        """Codes for `decode_plates(..., codebook=)`."""
+        return tuple(dict.fromkeys(marker.plate_code for marker in self.near("plate", lon_deg, lat_deg, reach_m)))
+
+    def plate_geometries(self, lon_deg: float, lat_deg: float, reach_m: float) -> tuple[PlateGeometry, ...]:
+        """Dimensions for `decode_plates(..., geometries=)`."""
+        return tuple(dict.fromkeys(marker.plate_geometry for marker in self.near("plate", lon_deg, lat_deg, reach_m)))
+
+    def match_plate(self, code: PlateCode, lon_deg: float, lat_deg: float, reach_m: float) -> SnapshotMarker | None:
+        """The nearest plate with these digits within reach."""
+        found = self.near("plate", lon_deg, lat_deg, reach_m)
+        return next((m for m in found if m.code == code.digits and m.kind["n"] == code.n), None)
+
+    def tags(self, lon_deg: float, lat_deg: float, reach_m: float) -> tuple[InformationTag, ...]:
+        """Designs for `TagBook` and `decode_trace`."""
+        found = (parse_tag(marker.code) for marker in self.near("magnet", lon_deg, lat_deg, reach_m))
+        return tuple(dict.fromkeys(tag for tag in found if isinstance(tag, InformationTag)))
+
+    def match_tag(self, tag: InformationTag, lon_deg: float, lat_deg: float, reach_m: float) -> SnapshotMarker | None:
+        """The tag with this text within reach; None where there are several, as the server has it."""
+        found = [m for m in self.near("magnet", lon_deg, lat_deg, reach_m) if m.code == tag.text]
+        return found[0] if len(found) == 1 else None
+
+    def registered_cerpms(self, lon_deg: float, lat_deg: float, reach_m: float) -> dict[int, RegisteredMarker]:
+        """What `merge_markers` holds packets against, by number. Keys are not in a snapshot."""
+        registered = {}
+        for marker in self.near("cerpm", lon_deg, lat_deg, reach_m):
+            limit = marker.kind["speed_limit"]
+            rmse_m = marker.horizontal_rmse_m
+            registered[int(marker.code)] = RegisteredMarker(
+                marker.lon_deg,
+                marker.lat_deg,
+                marker.height_m,
+                LaneSide[str(marker.kind["side"]).upper()],
+                math.nan if limit is None else limit["value"] * _KM_H[limit["unit"]],
+                math.nan if rmse_m is None else rmse_m / math.sqrt(2),  # horizontal RMSE is of both axes together
+            )
+        return registered
+
+    def _markers(self, rows: npt.NDArray[np.intp], lon_deg: float, lat_deg: float) -> list[SnapshotMarker]:
+        lons, lats = self._lon_deg[rows], self._lat_deg[rows]
+        distance_m = _GEOD.inv(np.full(len(rows), lon_deg), np.full(len(rows), lat_deg), lons, lats)[2]
+        made = [self._marker(int(row), float(m)) for row, m in zip(rows, distance_m, strict=True)]
+        return sorted(made, key=lambda marker: (marker.distance_m, marker.marker_id))
+
+    def _marker(self, row: int, distance_m: float) -> SnapshotMarker:
+        column = {name: self._columns[name][row] for name, _form in layout.COLUMNS}
+        end, kind = int(self._ends[row]), self._kinds[int(column["kind"])]
+        height, heading = int(column["height_mm"]), int(column["heading_step"])
+        return SnapshotMarker(
+            marker_id=str(uuid.UUID(bytes=bytes(column["id"]))),
+            family=kind["family"],
+            status=layout.STATUSES[int(column["status"])],
+            code=self._codes[end - int(column["code_bytes"]) : end].decode(),
+            lon_deg=round(float(self._lon_deg[row]), 9),
+            lat_deg=round(float(self._lat_deg[row]), 9),
+            height_m=None if height == layout.NO_HEIGHT else height / 1000,
+            heading_deg=None if heading == layout.NO_HEADING else round(heading * layout.HEADING_STEP_DEG, 4),
+            horizontal_rmse_m=_value(column["horizontal_rmse_mm"], 1e-3),
+            vertical_rmse_m=_value(column["vertical_rmse_mm"], 1e-3),
+            heading_rmse_deg=_value(column["heading_rmse_step"], layout.HEADING_RMSE_STEP_DEG),
+            ellipsoidal=bool(column["flags"] & layout.ELLIPSOIDAL_FLAG),
+            exact=bool(column["flags"] & layout.EXACT_FLAG),
+            kind=kind,
+            distance_m=distance_m,
+        )
+
+
+def open_snapshot(data: bytes, public_key: bytes, now: datetime) -> Snapshot:
+    """Verify a snapshot and read it.
+
+    Parameters
+    ----------
+    data : bytes
+    public_key : bytes
+        The server's Ed25519 key, 32 bytes; it comes to the vehicle by another way than the snapshot.
+    now : datetime
+        Aware; by a clock that nobody on the road can set.
+
+    Raises
+    ------
+    NoSnapshot, TruncatedSnapshot, FutureSnapshot, ForeignSnapshot, ForgedSnapshot, ExpiredSnapshot
+        In this order; all are `SnapshotRefused`.
+    """
+    header = _header(data)
+    if bytes(header["key_id"]) != layout.key_id_of(public_key):
+        raise layout.ForeignSnapshot("the snapshot was signed under another key", limit="the key given", cure=_CURE)
+    signed, signature = data[: -layout.SIGNATURE_BYTES], data[-layout.SIGNATURE_BYTES :]
+    try:
+        Ed25519PublicKey.from_public_bytes(public_key).verify(signature, signed)
+    except InvalidSignature as error:
+        raise layout.ForgedSnapshot(
+            "the signature does not fit: the snapshot was changed or damaged", limit="Ed25519", cure=_CURE
+        ) from error
+    _check_time(header, now)
+    return _read(header, signed[layout.HEADER.itemsize :])
+
+
+def _header(data: bytes) -> Any:
+    if data[:8] != layout.MAGIC[: len(data)] or not data:
+        raise layout.NoSnapshot("this is no snapshot", limit=f"begins with {layout.MAGIC.decode()}", cure=_CURE)
+    if len(data) >= 10 and (version := int.from_bytes(data[8:10], "little")) != layout.VERSION:
+        raise layout.FutureSnapshot(
+            f"the snapshot is of version {version}", limit=f"version {layout.VERSION}", cure="update the reader"
+        )
+    least = layout.HEADER.itemsize + layout.SIGNATURE_BYTES
+    header = np.frombuffer(data, dtype=layout.HEADER, count=1)[0] if len(data) >= least else None
+    wanted = least + int(header["body_bytes"]) if header is not None else least
+    if header is None or len(data) != wanted:
+        raise layout.TruncatedSnapshot(f"the snapshot has {len(data)} bytes", limit=f"{wanted} bytes", cure=_CURE)
+    return header
+
+
+def _check_time(header: Any, now: datetime) -> None:
+    now_s = now.timestamp()
+    if now_s >= int(header["expires_at_s"]):
+        raise layout.ExpiredSnapshot(
+            f"the snapshot expired {now_s - int(header['expires_at_s']):.0f} s ago", limit="its time", cure=_CURE
+        )
+    if now_s < int(header["made_at_s"]) - _CLOCK_SLACK.total_seconds():
+        raise layout.ExpiredSnapshot(
+            "the snapshot is from the future", limit="a clock that is right", cure="set the clock"
+        )
+
+
+def _read(header: Any, packed: bytes) -> Snapshot:
+    count = int(header["markers"])
+    kinds_bytes, codes_bytes = int(header["kinds_bytes"]), int(header["codes_bytes"])
+    size = count * layout.ROW_BYTES + kinds_bytes + codes_bytes
+    try:
+        body = zlib.decompressobj().decompress(packed, size + 1)
+    except zlib.error as error:
+        raise layout.TruncatedSnapshot("the body cannot be inflated", limit="zlib", cure=_CURE) from error
+    if len(body) != size or count > layout.MAX_MARKERS:
+        raise layout.TruncatedSnapshot(f"the body has {len(body)} bytes", limit=f"{size} bytes", cure=_CURE)
+    columns, start = {}, 0
+    for name, form in layout.COLUMNS:
+        columns[name] = np.frombuffer(body, dtype=form, count=count, offset=start)
+        start += columns[name].nbytes
+    kinds = orjson.loads(body[start : start + kinds_bytes])
+    return Snapshot(header, columns, kinds, body[start + kinds_bytes :])
+
+
+def _value(steps: Any, step: float) -> float | None:
+    return None if int(steps) == layout.NO_RMSE else round(int(steps) * step, 6)
