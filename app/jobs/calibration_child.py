@@ -9,7 +9,8 @@ import numpy as np
 
 from app.decoders.archives import is_archive, read_members
 from app.decoders.calibration.board_view import BoardView, ViewFault, find_board
-from app.decoders.calibration.calibrate import CameraCalibration, Photo, calibrate_camera
+from app.decoders.calibration.calibrate import calibrate_camera
+from app.decoders.calibration.results import CameraCalibration, Photo
 from app.decoders.images import load_image
 from app.errors import UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.jobs.memory import memory_is_the_limit
@@ -47,8 +48,8 @@ def _look(name: str, content: bytes | WaymarkError, task: CalibrationTask) -> Ph
             raise content
         with memory_is_the_limit(*_PHOTO):
             frame = load_image(content, task.images)
-            grey = cv2.cvtColor(frame.pixels, cv2.COLOR_BGR2GRAY) if frame.pixels.ndim == 3 else frame.pixels
-            view = find_board(grey, task.board)
+            grey = cv2.cvtColor(frame.pixels, cv2.COLOR_BGR2GRAY)
+            view = find_board(np.asarray(grey, np.uint8), task.board)
     except WaymarkError as error:
         fault = ViewFault.UNREADABLE
         if isinstance(error, UploadTooLarge):

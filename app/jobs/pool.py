@@ -8,7 +8,7 @@ import threading
 from concurrent.futures import Future
 from typing import Any
 
-from app.decoders.calibration.calibrate import CameraCalibration
+from app.decoders.calibration.results import CameraCalibration
 from app.errors import Unavailable
 from app.jobs.calibration_child import calibrate_photos
 from app.jobs.child import ONE_THREAD, ChildLimits, DecodePlates, annotate_frame, find_plates, load_frame, process_id

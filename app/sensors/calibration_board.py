@@ -109,7 +109,8 @@ class CalibrationBoard:
     def corners_mm(self) -> Floats:
         """Inner corners, row by row, shape (corner_count, 2). [mm]"""
         column, row = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-        return np.stack([column.ravel(), row.ravel()], axis=1) * self.square_mm
+        corners: Floats = np.stack([column.ravel(), row.ravel()], axis=1).astype(float) * self.square_mm
+        return corners
 
     def marker_corners_mm(self, number: int) -> Floats:
         """Corners of a marker, clockwise from its upper left, shape (4, 2). [mm]"""

@@ -9,7 +9,8 @@ from typing import Any, Protocol
 
 from app import __version__
 from app.decoders.archives import ArchiveLimits
-from app.decoders.calibration.calibrate import COEFFICIENTS, VERSION, CameraCalibration, ViewReport
+from app.decoders.calibration.calibrate import COEFFICIENTS, VERSION
+from app.decoders.calibration.results import CameraCalibration, ViewReport
 from app.decoders.images import ImageLimits
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
 from app.registry import vehicles as store

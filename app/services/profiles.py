@@ -151,7 +151,10 @@ def _merge(ours: Mapping[str, Any], said: Mapping[str, Any], sources: dict[str, 
             continue  # said to be unknown
         if isinstance(theirs if name in said else own, Mapping) and at not in _WHOLE:
             merged[name] = _merge(
-                own if isinstance(own, Mapping) else {}, theirs if name in said else {}, sources, f"{at}."
+                own if isinstance(own, Mapping) else {},
+                theirs if isinstance(theirs, Mapping) else {},
+                sources,
+                f"{at}.",
             )
             continue
         value = theirs if name in said else own

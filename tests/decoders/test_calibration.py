@@ -11,13 +11,8 @@ import numpy.typing as npt
 import pytest
 
 from app.decoders.calibration.board_view import ViewFault, find_board
-from app.decoders.calibration.calibrate import (
-    CalibrationRules,
-    CameraCalibration,
-    Photo,
-    calibrate_camera,
-    is_invertible,
-)
+from app.decoders.calibration.calibrate import calibrate_camera, is_invertible
+from app.decoders.calibration.results import CalibrationRules, CameraCalibration, Photo
 from app.errors import CalibrationRefused, InvalidParameter
 from app.sensors.calibration_board import CalibrationBoard
 from tests.fleet.board_photos import BOARD, Pose, TrueCamera, good_photos, photo, poses, true_corners_px

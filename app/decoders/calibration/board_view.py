@@ -85,7 +85,9 @@ def find_board(grey: Grey, board: CalibrationBoard) -> BoardView:
     scale = min(1.0, _SEARCH_PX / max(grey.shape))
     if min(grey.shape) * scale < _LEAST_PX:
         return _nothing(ViewFault.NO_BOARD, f"the photo is {grey.shape[1]} x {grey.shape[0]} px")
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+    small = grey
+    if scale < 1:
+        small = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     corners, ids, marks, numbers = _detector(board).detectBoard(small)
     if numbers is None or len(numbers) < 2:
         return _nothing(*_why_nothing(small, board))
@@ -158,7 +160,7 @@ def _is_other_board(marks: Any, numbers: Any, board: CalibrationBoard) -> str | 
         return None
     image = np.concatenate([np.asarray(mark, float).reshape(4, 2) for mark in marks])
     plane = np.concatenate([board.marker_corners_mm(int(number)) for number in found])
-    homography, _inliers = cv2.findHomography(plane, image, cv2.RANSAC, 0.02 * float(np.ptp(image, axis=0).max()))
+    homography: Any = cv2.findHomography(plane, image, cv2.RANSAC, 0.02 * float(np.ptp(image, axis=0).max()))[0]
     if homography is None:
         return "its markers do not lie as on the board"
     back = cv2.perspectiveTransform(image.reshape(-1, 1, 2), np.linalg.pinv(homography)).reshape(-1, 2)
