@@ -46,6 +46,7 @@ from app.decoders.archives import ArchiveLimits
 from app.decoders.images import ImageLimits
 from app.decoders.plate import decode_plates
 from app.encoders.plate import PlateReader
+from app.geodesy import use_grids
 from app.jobs.child import ChildLimits, DecodePlates
 from app.jobs.local import LocalQueue
 from app.jobs.pool import DecodePool
@@ -109,6 +110,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
 
     `decode` is imported by name in the decoder processes, so it must be a function of a module.
     """
+    use_grids(settings.proj_grids_dir)
     database = Database(settings.resolved_database_url)
     blobs = Blobs(settings.resolved_blobs_url)
     pool = _decode_pool(settings, decode)

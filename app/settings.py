@@ -57,6 +57,9 @@ class Settings(BaseSettings):
     crs_accuracy_m: float = Field(
         default=0.1, ge=0, le=1, description="Worst stated accuracy of a transformation that still counts as exact. [m]"
     )
+    proj_grids_dir: Path | None = Field(
+        default=None, description="Folder of PROJ grids to transform positions with; nothing is fetched from a network."
+    )
     idempotency_ttl_h: float = Field(default=24.0, gt=0, description="How long an Idempotency-Key is remembered. [h]")
 
     requests_per_s: float = Field(
@@ -76,6 +79,13 @@ class Settings(BaseSettings):
         if key is not None and len(key.get_secret_value()) < MIN_ADMIN_KEY_CHARACTERS:
             raise ValueError(f"an admin key has at least {MIN_ADMIN_KEY_CHARACTERS} characters")
         return key
+
+    @field_validator("proj_grids_dir")
+    @classmethod
+    def _is_folder(cls, folder: Path | None) -> Path | None:
+        if folder is not None and not folder.is_dir():
+            raise ValueError(f"{folder} is not a folder")
+        return folder
 
     @model_validator(mode="after")
     def _supported_database(self) -> Self:

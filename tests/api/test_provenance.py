@@ -5,14 +5,19 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
 import orjson
 import pytest
 
+from app.services.access import Scope
 from app.services.accuracy import accuracy_document
 from app.services.fixes import horizontal_rmse_m
+from app.settings import Settings
+from tests.conftest import LiveServer
+from tests.test_geodesy import GRID, ntv2
 
 Place = Callable[[], dict[str, Any]]
 SHA256 = "0123456789abcdef" * 4
@@ -138,3 +143,26 @@ def test_the_bound_of_a_transformation_makes_a_position_worse() -> None:
     assert horizontal_rmse_m(exact) == pytest.approx(0.05)
     assert horizontal_rmse_m(exact | {"transform_accuracy_m": None}) == 0.03
     assert horizontal_rmse_m(exact | {"horizontal_rmse_m": None}) is None
+
+
+def test_a_folder_of_grids_reaches_the_server(
+    serve: Callable[[Settings], LiveServer], settings: Settings, tmp_path: Path
+) -> None:
+    (tmp_path / GRID).write_bytes(ntv2(-38.0, -30.0, 145.0, 155.0))
+    position = {"lon_deg": 151.2, "lat_deg": -33.9, "crs": "EPSG:4283", "epoch": 2020.0}
+    grades = []
+    for folder in (tmp_path, None):
+        server = serve(
+            settings.model_copy(update={"proj_grids_dir": folder, "data_dir": tmp_path / f"{folder is None}"})
+        )
+        with server.agency("with grids", Scope.PLANNER) as client:
+            marker = _post(client, position=position)
+            grades.append(marker["position"]["localization_grade"])
+            client.patch(f"/v1/markers/{marker['id']}", json={"status": "retired"}, headers={"If-Match": "*"})
+        server.__exit__()
+    assert grades == ["exact", "approximate, not for localization"]
+
+
+def test_a_folder_of_grids_has_to_be_there(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="is not a folder"):
+        Settings(proj_grids_dir=tmp_path / "nothing")

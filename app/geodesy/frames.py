@@ -1,0 +1,45 @@
+"""Local frames, bearings, and longitudes and latitudes that can be."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pymap3d
+
+from app.errors import InvalidParameter
+
+
+def enu_from_wgs84(
+    lon_deg: float, lat_deg: float, height_m: float, origin: tuple[float, float, float]
+) -> npt.NDArray[np.float64]:
+    """East, north, up from an origin (lon_deg, lat_deg, ellipsoidal height_m), shape (3,). [m]"""
+    return np.array(pymap3d.geodetic2enu(lat_deg, lon_deg, height_m, origin[1], origin[0], origin[2]), dtype=float)
+
+
+def wgs84_from_enu(
+    position_enu_m: npt.NDArray[np.float64], origin: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Longitude [deg], latitude [deg], ellipsoidal height [m] of a point in a local east, north, up frame."""
+    east, north, up = (float(v) for v in position_enu_m)
+    lat, lon, height = pymap3d.enu2geodetic(east, north, up, origin[1], origin[0], origin[2])
+    return (float(lon) + 180.0) % 360.0 - 180.0, float(lat), float(height)
+
+
+def enu_from_heading(heading_deg: float) -> npt.NDArray[np.float64]:
+    """Rotation from (right, forward, up) of something with this heading to (east, north, up), shape (3, 3)."""
+    h = math.radians(heading_deg)
+    return np.array([[math.cos(h), math.sin(h), 0], [-math.sin(h), math.cos(h), 0], [0, 0, 1.0]])
+
+
+def check_lon_lat(lon_deg: float, lat_deg: float, field: str = "position") -> None:
+    """Refuse a longitude or latitude that is out of range or not finite."""
+    for name, value, bound in (("lon_deg", lon_deg, 180.0), ("lat_deg", lat_deg, 90.0)):
+        if not math.isfinite(value) or not -bound <= value <= bound:
+            raise InvalidParameter(
+                f"{name} is {value}, outside -{bound:g} to {bound:g} degrees",
+                field=f"{field}.{name}",
+                limit=f"-{bound:g} to {bound:g} deg",
+                cure="positions are longitude, latitude in degrees; check for swapped axes or another CRS",
+            )

@@ -1,0 +1,123 @@
+"""Transformations to ITRF2014 that state an accuracy, and the grids that they need."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from pyproj import Transformer, datadir, network
+from pyproj.transformer import TransformerGroup
+
+from app.geodesy.systems import best_effort, covers, named_system
+
+_ITRF2014_2D, _ITRF2014_3D = "EPSG:9000", "EPSG:7912"
+_TIMELY = ("t_epoch", "defmodel")
+_MAX_NAME = 300
+
+
+@dataclass(frozen=True, slots=True)
+class BoundedOperation:
+    """A transformation to ITRF2014.
+
+    Attributes
+    ----------
+    transformer : Transformer
+    bound_m : float
+        Its stated accuracy. [m]
+    name : str
+        What PROJ calls it.
+    needs_epoch : bool
+        It depends on time: PROJ fills in an epoch of its own where none is given.
+    """
+
+    transformer: Transformer
+    bound_m: float
+    name: str
+    needs_epoch: bool
+
+    def covers(self, lon_deg: npt.NDArray[np.float64], lat_deg: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        """Which places its stated accuracy holds for: those in its area of use."""
+        return covers(self.transformer.area_of_use, lon_deg, lat_deg)
+
+
+@lru_cache(maxsize=256)
+def bounded_operations(name: str, three_d: bool) -> tuple[BoundedOperation, ...]:
+    """Operations from a system's longitudes and latitudes to ITRF2014 that can be run here and state an accuracy.
+
+    The best comes first. From a projected system PROJ does not find those that need a system between: it knows none
+    from ETRS89 / UTM zone 32N, but four from ETRS89.
+    """
+    target = _ITRF2014_3D if three_d else _ITRF2014_2D
+    geographic = named_system(name).geodetic_crs
+    assert geographic is not None
+    source = geographic.to_3d() if three_d else geographic.to_2d()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it warns of missing grids, which only narrow the choice
+        try:
+            group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
+        except IndexError:  # how pyproj says that PROJ knows no operation at all
+            return ()
+    stated = [
+        BoundedOperation(
+            transformer,
+            float(transformer.accuracy),
+            str(transformer.description)[:_MAX_NAME],
+            any(word in transformer.definition for word in _TIMELY),
+        )
+        for transformer in group.transformers
+        if transformer.accuracy >= 0
+    ]
+    return tuple(sorted(stated, key=lambda operation: operation.bound_m))
+
+
+def list_operations(
+    name: str, lon_deg: float, lat_deg: float, *, three_d: bool, epoch: float | None, accuracy_m: float
+) -> list[BoundedOperation] | str:
+    """Operations that may bring a place to ITRF2014 as exact, the best first; or why there are none.
+
+    Parameters
+    ----------
+    name : str
+        Of the system, as `normalize_crs` writes it.
+    lon_deg, lat_deg : float
+        About where the place is. [deg]
+    three_d : bool
+        With an ellipsoidal height.
+    epoch : float or None
+        [decimal year]
+    accuracy_m : float
+        Worst stated accuracy. [m]
+    """
+    known = bounded_operations(name, three_d)
+    if not known:
+        return "no transformation with a stated accuracy to WGS 84 / ITRF is available"
+    here = [one for one in known if one.covers(np.array([lon_deg]), np.array([lat_deg]))[0]]
+    if not here:
+        return "no transformation with a stated accuracy is made for this place"
+    good = [one for one in here if one.bound_m <= accuracy_m]
+    if not good:
+        return f"the best transformation states {here[0].bound_m:g} m, the limit is {accuracy_m:g} m"
+    timely = [one for one in good if epoch is not None or not one.needs_epoch]
+    return timely or "the transformation depends on time and no epoch was given"
+
+
+def use_grids(folder: Path | None) -> None:
+    """Let PROJ find an operator's grids in a folder, besides its own data; None takes that back.
+
+    Call it before positions are placed. Nothing is ever fetched from a network.
+    """
+    network.set_network_enabled(False)  # type: ignore[attr-defined]
+    own = _own_folders()
+    datadir.set_data_dir(own if folder is None else f"{own}{os.pathsep}{folder}")
+    bounded_operations.cache_clear()
+    best_effort.cache_clear()
+
+
+@lru_cache(maxsize=1)
+def _own_folders() -> str:
+    return datadir.get_data_dir()
