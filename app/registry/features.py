@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.registry.conditions import Condition, condition_sql
 from app.registry.spatial import Box, proposed_by_index
 from app.registry.tables import markers
 
@@ -54,6 +55,7 @@ FIELDS = (
     Field("updated_at", "date-time", _C.updated_at, "When it was last changed"),
 )
 FIELDS_BY_NAME = {field.name: field for field in FIELDS}
+_COLUMNS = {field.name: field.column for field in FIELDS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,8 @@ class FeatureFilter:
         Bounds of the last change, both inclusive.
     equal : tuple of (name, value)
         Properties with a value.
+    where : Condition or None
+        Anything else that is asked of the properties.
     """
 
     retired: bool = False
@@ -79,6 +83,7 @@ class FeatureFilter:
     since: datetime | None = None
     until: datetime | None = None
     equal: tuple[tuple[str, str | float], ...] = ()
+    where: Condition | None = None
 
 
 class _Shape(NamedTuple):
@@ -90,6 +95,7 @@ class _Shape(NamedTuple):
     since: bool
     until: bool
     equal: tuple[str, ...]
+    where: Condition | None
     after: bool
 
 
@@ -152,6 +158,7 @@ def _shape(narrowed: FeatureFilter, after: bool) -> _Shape:
         narrowed.since is not None,
         narrowed.until is not None,
         tuple(name for name, _ in narrowed.equal),
+        narrowed.where,
         after,
     )
 
@@ -201,6 +208,8 @@ def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
     for k, name in enumerate(shape.equal):
         column = FIELDS_BY_NAME[name].column
         conditions.append(column == sa.bindparam(f"v{k}", type_=column.type))
+    if shape.where is not None:
+        conditions.append(condition_sql(shape.where, _COLUMNS))
     if shape.after:
         conditions.append(_C.id > sa.bindparam("after"))
     return conditions

@@ -45,6 +45,11 @@ class Collection:
         """Whether there are vector tiles of it."""
         return self.geometry == "Point"
 
+    @property
+    def has_expressions(self) -> bool:
+        """Whether filter expressions are understood."""
+        return self.geometry == "Point"
+
 
 MARKERS = Collection(
     "markers",
@@ -227,8 +232,8 @@ def _line(line: Line, crs: FeatureCrs) -> dict[str, Any]:
 
 
 def _is_cheap(narrowed: FeatureFilter) -> bool:
-    rest = (narrowed.box, narrowed.heights_m, narrowed.since, narrowed.until)
-    return rest == (None, None, None, None) and {name for name, _ in narrowed.equal} <= _CHEAP_TO_COUNT
+    rest = (narrowed.box, narrowed.heights_m, narrowed.since, narrowed.until, narrowed.where)
+    return rest == (None,) * 5 and {name for name, _ in narrowed.equal} <= _CHEAP_TO_COUNT
 
 
 def _features(rows: Iterable[Sequence[Any]], crs: FeatureCrs) -> list[dict[str, Any]]:

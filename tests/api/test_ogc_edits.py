@@ -32,7 +32,7 @@ def _post(client: httpx.Client, feature: dict[str, Any], **headers: str) -> str:
 
 def test_options_say_what_the_key_may_do(server: LiveServer, client: httpx.Client) -> None:
     assert "POST" in client.options(ITEMS).headers["allow"]
-    assert {"PATCH", "DELETE"} <= set(client.options(f"{ITEMS}/x").headers["allow"].split(", "))
+    assert {"PUT", "PATCH", "DELETE"} <= set(client.options(f"{ITEMS}/x").headers["allow"].split(", "))
     assert "POST" not in client.options("/ogc/collections/marker_lines/items").headers["allow"]
     with server.agency("edit lookers", Scope.VIEWER) as reader:
         assert "POST" not in reader.options(ITEMS).headers["allow"]
@@ -57,6 +57,31 @@ def test_a_marker_is_registered_changed_moved_and_deleted(client: httpx.Client) 
     assert client.get(f"{ITEMS}/{marker}").status_code == 404
     assert marker in ids(get(client, "/ogc/collections/retired_markers/items"))
     assert len(client.get(f"/v1/markers/{marker}/versions").json()["items"]) == 4
+
+
+def test_a_put_replaces_what_a_marker_need_not_have(client: httpx.Client) -> None:
+    survey = {"epoch": 2025.5, "survey_method": "RTK", "horizontal_rmse_m": 0.01}
+    marker = _post(client, _feature(32.5, 42.5, road="A7", measure_m=5.0, status="surveyed", **survey))
+    url = f"{ITEMS}/{marker}"
+    original = client.get(f"/v1/markers/{marker}").json()["position"]["original"]
+    whole = get(client, url)
+    same = {name: whole[name] for name in ("type", "id", "geometry", "properties")}
+    assert client.put(url, json=same, headers=SEND).status_code == 204
+    assert client.get(f"/v1/markers/{marker}").json()["position"]["original"] == original
+    slim = _feature(32.5, 42.5, road="A8", **survey)
+    assert client.put(url, json=slim, headers=SEND).status_code == 204
+    properties = get(client, url)["properties"]
+    assert (properties["road"], properties["measure_m"], properties["status"]) == ("A8", None, "surveyed")
+    assert (properties["survey_method"], properties["code"]) == ("RTK", whole["properties"]["code"])
+    assert client.put(url, json=_feature(32.6, 42.5), headers=SEND).status_code == 204
+    moved = get(client, url)
+    assert moved["geometry"]["coordinates"] == [32.6, 42.5]
+    assert (moved["properties"]["survey_method"], moved["properties"]["road"]) == (None, None)
+    refused = client.put(url, json=_feature(32.6, 42.5, code="0" * 12), headers=SEND)
+    assert refused.status_code == 422
+    nowhere = client.put(url, json={"type": "Feature", "geometry": None, "properties": {}}, headers=SEND)
+    assert (nowhere.status_code, nowhere.json()["errors"][0]["field"]) == (422, "geometry")
+    assert client.put(f"{ITEMS}/{'0' * 8}-0000-7000-8000-{'0' * 12}", json=slim, headers=SEND).status_code == 404
 
 
 def test_a_cerpm_in_web_mercator(client: httpx.Client) -> None:

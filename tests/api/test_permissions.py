@@ -49,6 +49,11 @@ BODIES: dict[str, Any] = {
     "PATCH /v1/roads/{road_id}": {"calibration": []},
     "POST /v1/roads/{road_id}/locate": {"positions": [[33.501, 43.5]]},
     "POST /v1/roads/{road_id}/position": {"references": [{"measure_m": 10}]},
+    "PUT /ogc/collections/{collection}/items/{feature}": {
+        "type": "Feature",
+        "geometry": {"type": "Point", "coordinates": [9.0, 49.0]},
+        "properties": {},
+    },
     "PATCH /ogc/collections/{collection}/items/{feature}": {"type": "Feature", "properties": {"status": "active"}},
 }
 # and such queries

@@ -18,12 +18,23 @@ from app.services.features import COLLECTIONS, Collection, Features, get_collect
 _OFFERED = ("f",)
 _SCHEMES_REL = "http://www.opengis.net/def/rel/ogc/1.0/tiling-schemes"
 _FEATURES = "http://www.opengis.net/spec/ogcapi-features"
+_FILTER = "http://www.opengis.net/spec/ogcapi-features-3/1.0/conf"
+_CQL2 = "http://www.opengis.net/spec/cql2/1.0/conf"
+QUERYABLES_REL = "http://www.opengis.net/def/rel/ogc/1.0/queryables"
 _TILES = "http://www.opengis.net/spec/ogcapi-tiles-1/1.0/conf"
 CONFORMANCE = (
     f"{_FEATURES}-1/1.0/conf/core",
     f"{_FEATURES}-1/1.0/conf/oas30",
     f"{_FEATURES}-1/1.0/conf/geojson",
     f"{_FEATURES}-2/1.0/conf/crs",
+    f"{_FILTER}/queryables",
+    f"{_FILTER}/queryables-query-parameters",
+    f"{_FILTER}/filter",
+    f"{_FILTER}/features-filter",
+    f"{_CQL2}/cql2-text",
+    f"{_CQL2}/cql2-json",
+    f"{_CQL2}/basic-cql2",
+    f"{_CQL2}/advanced-comparison-operators",
     f"{_TILES}/core",
     f"{_TILES}/tileset",
     f"{_TILES}/tilesets-list",
@@ -97,6 +108,22 @@ def schema(request: Request) -> Response:
     return answer(document, SCHEMA)
 
 
+def queryables(request: Request) -> Response:
+    """The JSON Schema of what filters can ask of a collection's features."""
+    found = get_collection(request.path_params["collection"])
+    negotiate(request, known_parameters(request, _OFFERED), SCHEMA, JSON)
+    asked = [field for field in found.fields if found.has_expressions or field.name in found.filters]
+    document = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"{base_url(request)}/collections/{found.id}/queryables",
+        "title": found.title,
+        "type": "object",
+        "properties": {field.name: schema_type(field.kind) | {"title": field.text} for field in asked},
+        "additionalProperties": False,
+    }
+    return answer(document, SCHEMA)
+
+
 def schema_type(kind: str) -> dict[str, Any]:
     """JSON Schema of a kind of property."""
     return {"type": "string", "format": "date-time"} if kind == "date-time" else {"type": kind}
@@ -118,6 +145,7 @@ def _described(request: Request, found: Collection, base: str) -> dict[str, Any]
             link(f"{url}/items", "items", GEOJSON, found.title),
             *([link(f"{url}/tiles", TILES_REL, JSON, "Vector tiles")] if found.has_tiles else []),
             link(f"{url}/schema", "describedby", SCHEMA, "Schema of the features"),
+            link(f"{url}/queryables", QUERYABLES_REL, SCHEMA, "What filters can ask"),
             link(f"{url}/schema", "describedBy", SCHEMA, "Schema of the features, for older clients"),
         ],
     }

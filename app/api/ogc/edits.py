@@ -25,6 +25,7 @@ from app.services.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.features import Features, get_collection
 
 _PLAIN = ("status", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m", "side")
+_CLEARED = ("heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")  # by a PUT without them
 _SURVEYED = ("realization", "epoch", "vertical_datum", "horizontal_rmse_m", "vertical_rmse_m", "survey_method")
 _FIXED = ("family", "scheme", "code")
 _READ_ONLY = ("localization_grade", "version", "updated_at")
@@ -37,7 +38,7 @@ async def item_options(request: Request) -> Response:
     allowed = ["GET", "HEAD", "OPTIONS"]
     if collection.editable:
         scope, path = caller_of(request).scope, request.scope["route"].path
-        edits = ("PATCH", "DELETE") if "feature" in request.path_params else ("POST",)
+        edits = ("PUT", "PATCH", "DELETE") if "feature" in request.path_params else ("POST",)
         allowed += [method for method in edits if scope in PERMISSIONS[f"{method} {path}"]]
     return Response(headers={"Allow": ", ".join(allowed)})
 
@@ -52,6 +53,12 @@ async def patch_item(request: Request) -> Response:
     """Change properties or the place of a marker."""
     body = await _body(request)
     return await run_in_threadpool(_change, request, body)
+
+
+async def put_item(request: Request) -> Response:
+    """Replace a marker: what is left out is cleared, but for what a marker always has."""
+    body = await _body(request)
+    return await run_in_threadpool(_replace, request, body)
 
 
 def delete_item(request: Request) -> Response:
@@ -88,6 +95,19 @@ def _create(request: Request, feature: dict[str, Any]) -> Response:
     return Response(
         status_code=201, headers={"Location": f"{base_url(request)}/collections/{collection}/items/{marker_id}"}
     )
+
+
+def _replace(request: Request, feature: dict[str, Any]) -> Response:
+    _, stored = _stored(request)
+    known_parameters(request, ())
+    given = {**dict.fromkeys((*_CLEARED, *_SURVEYED)), **_properties(feature)}
+    place = _place(feature.get("geometry"), request)
+    before, properties = stored["geometry"]["coordinates"], stored["properties"]
+    if tuple(place.values()) == tuple(before) and all(given[name] == properties[name] for name in _SURVEYED):
+        for name in _SURVEYED:  # the position is as it was, and stays as it was given
+            del given[name]
+        return _change(request, {"properties": given})
+    return _change(request, {"properties": given, "geometry": feature["geometry"]})
 
 
 def _change(request: Request, feature: dict[str, Any]) -> Response:

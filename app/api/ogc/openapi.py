@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 from app import __version__
-from app.api.ogc.query import DEFAULT_LIMIT, LIST_PARAMETERS, MAX_LIMIT
+from app.api.ogc.cql2 import LANGUAGES
+from app.api.ogc.query import DEFAULT_LIMIT, MAX_LIMIT, list_parameters
 from app.api.ogc.responses import GEOJSON, JSON, SCHEMA
 from app.registry.features import FIELDS_BY_NAME
 from app.services.feature_crs import STORAGE_CRS, FeatureCrs
@@ -55,12 +56,13 @@ def api_document(base: str) -> dict[str, Any]:
 
 def _paths(collection: Collection) -> dict[str, Any]:
     url, name = f"/collections/{collection.id}", collection.title
-    items = _read(f"{name}: a page", GEOJSON, (*LIST_PARAMETERS, *collection.filters))
+    items = _read(f"{name}: a page", GEOJSON, list_parameters(collection))
     item = _read(f"{name}: one", GEOJSON, ("f", "crs"))
     item["parameters"] = [{"$ref": "#/components/parameters/featureId"}]
     return {
         url: _read(name),
         f"{url}/schema": _read(f"{name}: schema", SCHEMA),
+        f"{url}/queryables": _read(f"{name}: what can be asked of the properties", SCHEMA),
         f"{url}/items": items,
         f"{url}/items/{{featureId}}": item,
     }
@@ -106,6 +108,11 @@ def _parameters() -> dict[str, Any]:
         "after": _query("after", {"type": "string"}, "Last id of the page before; next links have it"),
         "resultType": _query("resultType", whole, "hits: only numberMatched"),
         "count": _query("count", {"type": "boolean", "default": False}, "numberMatched with every page"),
+        "filter": _query("filter", {"type": "string"}, "An expression on the properties, as filter-lang says"),
+        "filter-lang": _query(
+            "filter-lang", {"type": "string", "enum": LANGUAGES, "default": LANGUAGES[0]}, "Language"
+        ),
+        "filter-crs": _query("filter-crs", crs, "CRS of places in filter, of which there are none"),
         "featureId": {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}},
     }
     for name in sorted({name for collection in COLLECTIONS.values() for name in collection.filters}):

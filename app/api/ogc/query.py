@@ -12,7 +12,9 @@ from urllib.parse import parse_qsl
 
 from starlette.requests import Request
 
+from app.api.ogc.cql2 import LANGUAGES, Reader
 from app.errors import MalformedRequest
+from app.registry.conditions import Condition
 from app.registry.features import FIELDS_BY_NAME, FeatureFilter
 from app.registry.spatial import Box
 from app.services.feature_crs import STORAGE_CRS, FeatureCrs
@@ -89,7 +91,14 @@ def known_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
 
 
 ITEM_PARAMETERS = ("f", "crs")
+_EXPRESSION_PARAMETERS = ("filter", "filter-lang", "filter-crs")
 LIST_PARAMETERS = ("f", "crs", "bbox", "bbox-crs", "datetime", "limit", "after", "resultType", "count")
+
+
+def list_parameters(collection: Collection) -> tuple[str, ...]:
+    """Names of the parameters that a request for items of a collection may have."""
+    expressions = _EXPRESSION_PARAMETERS if collection.has_expressions else ()
+    return (*LIST_PARAMETERS, *expressions, *collection.filters)
 
 
 def items_query(request: Request, collection: Collection) -> ItemsQuery:
@@ -100,7 +109,7 @@ def items_query(request: Request, collection: Collection) -> ItemsQuery:
     MalformedRequest
         One is unknown or cannot be.
     """
-    found = known_parameters(request, (*LIST_PARAMETERS, *collection.filters))
+    found = known_parameters(request, list_parameters(collection))
     box, heights_m = _bbox(found)
     since, until = _datetime(found["datetime"]) if "datetime" in found else (None, None)
     kind = found.get("resultType", "results")
@@ -116,6 +125,7 @@ def items_query(request: Request, collection: Collection) -> ItemsQuery:
         since=since,
         until=until,
         equal=tuple((name, _value(name, text)) for name, text in found.items() if name in collection.filters),
+        where=_where(found, collection),
     )
     return ItemsQuery(
         narrowed, _limit(found), after, crs_parameter(found, "crs"), kind == "hits", _flag(found, "count")
@@ -180,6 +190,18 @@ def _value(name: str, text: str) -> str | float:
     return int(value)
 
 
+def _where(found: dict[str, str], collection: Collection) -> Condition | None:
+    language = found.get("filter-lang", LANGUAGES[0])
+    if language not in LANGUAGES:
+        refuse("filter-lang", "filters are not read in this language", ", ".join(LANGUAGES))
+    crs_parameter(found, "filter-crs")  # there are no places in filters: none makes a difference
+    if "filter" not in found:
+        return None
+    kinds = {field.name: field.kind for field in collection.fields}
+    reader = Reader(kinds, lambda text: _moment(text, last=False, name="filter"), lambda text: number("filter", text))
+    return reader.read(found["filter"], language)
+
+
 def _bbox(found: dict[str, str]) -> tuple[Box | None, tuple[float, float] | None]:
     crs = crs_parameter(found, "bbox-crs")
     text = found.get("bbox")
@@ -232,11 +254,11 @@ _FIRST = datetime.min.replace(tzinfo=UTC)
 _LAST = datetime.max.replace(tzinfo=UTC)
 
 
-def _moment(text: str, *, last: bool) -> datetime:
+def _moment(text: str, *, last: bool, name: str = "datetime") -> datetime:
     """A moment; of a date or a whole second, its first or last one. Years without a datetime become the nearest."""
     match = _TIME.fullmatch(text)
     if match is None:
-        refuse("datetime", "datetime is not in RFC 3339", "2026-03-04T05:06:07Z or 2026-03-04")
+        refuse(name, f"{name} holds a time that is not in RFC 3339", "2026-03-04T05:06:07Z or 2026-03-04")
     year = int(match["year"])
     leap_second = match["second"] == "60"
     try:
@@ -251,7 +273,7 @@ def _moment(text: str, *, last: bool) -> datetime:
             tzinfo=_zone(match["zone"]),
         )
     except ValueError:
-        refuse("datetime", "there is no such moment", "RFC 3339")
+        refuse(name, "there is no such moment", "RFC 3339")
     if year == 0:
         return _FIRST
     try:

@@ -1,0 +1,306 @@
+"""Filter expressions of clients: Common Query Language (OGC 21-065r2), basic-cql2 and LIKE, BETWEEN, IN, text and JSON.
+
+A property stands on one side of a comparison, a value of its kind on the other. Old clients say "cql-text" of the same.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from typing import Any, NoReturn
+
+from app.api.strict_json import parse_json
+from app.errors import MalformedRequest
+from app.registry.conditions import COMPARISONS, Compared, Condition, Constant, Joined, Missing, Not, Value
+
+LANGUAGES = ("cql2-text", "cql2-json", "cql-text")
+MAX_DEPTH = 20
+MAX_CONDITIONS = 200
+_TOKEN = re.compile(
+    r"""\s*(?:
+    (?P<text>'(?:[^']|'')*')
+    | (?P<name>"[^"]{1,80}"|[A-Za-z_][A-Za-z0-9_]{0,79})
+    | (?P<number>[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)
+    | (?P<sign><>|<=|>=|[=<>(),])
+    )""",
+    re.ASCII | re.VERBOSE,
+)
+_WORDS = ("AND", "OR", "NOT", "IS", "NULL", "LIKE", "BETWEEN", "IN", "TRUE", "FALSE", "TIMESTAMP", "DATE")
+_MIRRORED = {"<": ">", ">": "<", "<=": ">=", ">=": "<="}
+Token = tuple[str, str]
+Moment = Callable[[str], datetime]
+Number = Callable[[str], float]
+
+
+class Reader:
+    """Reads expressions over properties of given kinds.
+
+    Parameters
+    ----------
+    kinds : mapping
+        string, number, integer or date-time, by the name of each property.
+    moment, number : callable
+        The moment or the number that a text says.
+    """
+
+    def __init__(self, kinds: Mapping[str, str], moment: Moment, number: Number) -> None:
+        self._kinds = kinds
+        self._moment = moment
+        self._number = number
+
+    def read(self, expression: str, language: str) -> Condition:
+        """The condition that an expression says.
+
+        Raises
+        ------
+        MalformedRequest
+            It cannot be read, or is about a property or a kind of value that there is not.
+        """
+        condition = _Json(self).read(expression) if language == "cql2-json" else _Text(self, expression).read()
+        if _size(condition) > MAX_CONDITIONS:
+            refuse_filter("the filter has too many conditions", f"{MAX_CONDITIONS} conditions")
+        return condition
+
+    def compared(self, name: str, symbol: str, value: Any) -> Compared:
+        """A comparison, its value of the property's kind."""
+        kind = self.kind_of(name)
+        if symbol == "like" and (kind != "string" or not isinstance(value, str)):
+            refuse_filter(f"LIKE compares {name} with a pattern", "a property that is text, a pattern that is text")
+        return Compared(name, symbol, self._of_kind(name, kind, value))
+
+    def kind_of(self, name: str) -> str:
+        """Kind of a property that there is."""
+        if name not in self._kinds:
+            refuse_filter(f"there is no property {name[:80]!r}", ", ".join(self._kinds))
+        return self._kinds[name]
+
+    def number(self, text: str) -> float:
+        """The number that a text says."""
+        return self._number(text)
+
+    def _of_kind(self, name: str, kind: str, value: Any) -> Value:
+        if kind == "date-time" and isinstance(value, str):
+            return self._moment(value)
+        if kind in ("number", "integer") and isinstance(value, int | float) and not isinstance(value, bool):
+            return self._number(repr(value))
+        if kind == "string" and isinstance(value, str):
+            return value
+        return refuse_filter(f"{name} is compared with something of another kind", f"a {kind}")
+
+
+def refuse_filter(message: str, limit: str) -> NoReturn:
+    """Refuse a filter."""
+    raise MalformedRequest(message, field="filter", limit=limit, cure="/ogc/api describes the parameters")
+
+
+def _size(condition: Condition) -> int:
+    if isinstance(condition, Joined):
+        return sum(_size(inner) for inner in condition.conditions)
+    return _size(condition.condition) if isinstance(condition, Not) else 1
+
+
+class _Text:
+    """Recursive descent over the tokens of a text."""
+
+    def __init__(self, reader: Reader, text: str) -> None:
+        self._reader = reader
+        self._tokens = _tokens(text)
+        self._at = 0
+
+    def read(self) -> Condition:
+        condition = self._any(0)
+        if self._at < len(self._tokens):
+            self._unexpected()
+        return condition
+
+    def _any(self, depth: int) -> Condition:
+        if depth > MAX_DEPTH:
+            refuse_filter("the filter is nested too deeply", f"{MAX_DEPTH} levels")
+        return self._joined(False, "OR", lambda: self._joined(True, "AND", lambda: self._negated(depth)))
+
+    def _joined(self, every: bool, word: str, part: Callable[[], Condition]) -> Condition:
+        parts = [part()]
+        while self._takes(word):
+            parts.append(part())
+        return parts[0] if len(parts) == 1 else Joined(every, tuple(parts))
+
+    def _negated(self, depth: int) -> Condition:
+        negated = False
+        while self._takes("NOT"):
+            negated = not negated
+        condition = self._single(depth)
+        return Not(condition) if negated else condition
+
+    def _single(self, depth: int) -> Condition:
+        if self._takes("("):
+            condition = self._any(depth + 1)
+            self._expect(")")
+            return condition
+        if self._peek() in (("word", "TRUE"), ("word", "FALSE")):
+            return Constant(self._next()[1] == "TRUE")
+        if self._peek()[0] == "name":
+            return self._about(self._next()[1])
+        value = self._value()
+        symbol = self._comparison()
+        kind, name = self._next()
+        if kind != "name":
+            self._unexpected()
+        return self._reader.compared(name, _MIRRORED.get(symbol, symbol), value)
+
+    def _about(self, name: str) -> Condition:
+        if self._takes("IS"):
+            negated = self._takes("NOT")
+            self._expect("NULL")
+            self._reader.kind_of(name)
+            return Not(Missing(name)) if negated else Missing(name)
+        negated = self._takes("NOT")
+        condition = self._ranged(name, negated)
+        return Not(condition) if negated else condition
+
+    def _ranged(self, name: str, negated: bool) -> Condition:
+        if self._takes("LIKE"):
+            return self._reader.compared(name, "like", self._value())
+        if self._takes("BETWEEN"):
+            low = self._value()
+            self._expect("AND")
+            high = self._value()
+            return _between(self._reader, name, low, high)
+        if self._takes("IN"):
+            self._expect("(")
+            values = [self._value()]
+            while self._takes(","):
+                values.append(self._value())
+            self._expect(")")
+            return Joined(False, tuple(self._reader.compared(name, "=", value) for value in values))
+        if negated:
+            self._unexpected()
+        return self._reader.compared(name, self._comparison(), self._value())
+
+    def _comparison(self) -> str:
+        kind, symbol = self._next()
+        if kind != "sign" or symbol not in COMPARISONS:
+            self._at -= 1
+            self._unexpected()
+        return symbol
+
+    def _value(self) -> str | float:
+        kind, text = self._next()
+        if kind == "text":
+            return text
+        if kind == "number":
+            return self._reader.number(text)
+        if text in ("TIMESTAMP", "DATE") and kind == "word":
+            self._expect("(")
+            inner, moment = self._next()
+            self._expect(")")
+            if inner == "text":
+                return moment
+        self._at -= 1
+        return self._unexpected()
+
+    def _peek(self) -> Token:
+        return self._tokens[self._at] if self._at < len(self._tokens) else ("end", "the end")
+
+    def _next(self) -> Token:
+        token = self._peek()
+        self._at += 1
+        return token
+
+    def _takes(self, text: str) -> bool:
+        if self._peek() not in (("word", text), ("sign", text)):
+            return False
+        self._at += 1
+        return True
+
+    def _expect(self, text: str) -> None:
+        if not self._takes(text):
+            self._unexpected()
+
+    def _unexpected(self) -> NoReturn:
+        kind, text = self._peek()
+        refuse_filter(
+            f"the filter cannot be read at {text[:40] if kind != 'end' else 'its end'!r}",
+            "e.g. road = 'A7' AND measure_m BETWEEN 0 AND 500 AND NOT status IN ('planned', 'retired')",
+        )
+
+
+def _tokens(text: str) -> list[Token]:
+    tokens: list[Token] = []
+    at, text = 0, text.rstrip()
+    while at < len(text):
+        match = _TOKEN.match(text, at)
+        if match is None or match.lastgroup is None:
+            refuse_filter(f"the filter cannot be read at {text[at : at + 40]!r}", "CQL2 text")
+        kind, found = match.lastgroup, match[match.lastgroup]
+        if kind == "text":
+            found = found[1:-1].replace("''", "'")
+        elif kind == "name" and found.startswith('"'):
+            found = found[1:-1]
+        elif kind == "name" and found.upper() in _WORDS:
+            kind, found = "word", found.upper()
+        tokens.append((kind, found))
+        at = match.end()
+    return tokens
+
+
+class _Json:
+    """Recursive descent over a JSON document."""
+
+    def __init__(self, reader: Reader) -> None:
+        self._reader = reader
+
+    def read(self, text: str) -> Condition:
+        try:
+            document = parse_json(text.encode(), "filter")
+        except MalformedRequest as error:
+            error.field = "filter"
+            raise
+        return self._condition(document, 0)
+
+    def _condition(self, node: Any, depth: int) -> Condition:
+        if depth > MAX_DEPTH:
+            refuse_filter("the filter is nested too deeply", f"{MAX_DEPTH} levels")
+        if isinstance(node, bool):
+            return Constant(node)
+        if not (isinstance(node, dict) and set(node) == {"op", "args"} and isinstance(node["args"], list)):
+            refuse_filter(
+                "the filter holds something that is no condition", 'true, false or {"op": ..., "args": [...]}'
+            )
+        symbol, arguments = node["op"], node["args"]
+        if symbol in ("and", "or") and len(arguments) >= 2:
+            return Joined(symbol == "and", tuple(self._condition(inner, depth + 1) for inner in arguments))
+        if symbol == "not" and len(arguments) == 1:
+            return Not(self._condition(arguments[0], depth + 1))
+        return self._predicate(symbol, arguments)
+
+    def _predicate(self, symbol: Any, arguments: list[Any]) -> Condition:
+        match symbol, arguments:
+            case "isNull", [{"property": str(name)}]:
+                self._reader.kind_of(name)
+                return Missing(name)
+            case "between", [{"property": str(name)}, low, high]:
+                return _between(self._reader, name, _literal(low), _literal(high))
+            case "in", [{"property": str(name)}, [*values]] if values:
+                return Joined(False, tuple(self._reader.compared(name, "=", _literal(value)) for value in values))
+            case "like", [{"property": str(name)}, str(pattern)]:
+                return self._reader.compared(name, "like", pattern)
+            case str(), [{"property": str(name)}, value] if symbol in COMPARISONS:
+                return self._reader.compared(name, symbol, _literal(value))
+            case str(), [value, {"property": str(name)}] if symbol in COMPARISONS:
+                return self._reader.compared(name, _MIRRORED.get(symbol, symbol), _literal(value))
+        return refuse_filter(
+            f"the filter has an operation that is not offered: {str(symbol)[:40]!r}",
+            f"and, or, not, isNull, between, in, like, {', '.join(COMPARISONS)}; a property and values",
+        )
+
+
+def _between(reader: Reader, name: str, low: Any, high: Any) -> Condition:
+    return Joined(True, (reader.compared(name, ">=", low), reader.compared(name, "<=", high)))
+
+
+def _literal(value: Any) -> Any:
+    match value:
+        case {"timestamp": str(text)} | {"date": str(text)}:
+            return text
+    return value

@@ -1,0 +1,148 @@
+"""Conditions on properties, as a filter expression says them, as SQL that both databases answer alike.
+
+Values are bound parameters; which properties there are, and of which kind a value must be, whoever reads the expression
+has checked.
+"""
+
+from __future__ import annotations
+
+import operator
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.compiler import SQLCompiler
+from sqlalchemy.sql.functions import FunctionElement
+
+Value = str | float | datetime
+COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
+    "=": operator.eq,
+    "<>": operator.ne,
+    "<": operator.lt,
+    ">": operator.gt,
+    "<=": operator.le,
+    ">=": operator.ge,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """A property beside a value, by an operator of `COMPARISONS`; `like` takes a pattern with % and _ and \\."""
+
+    name: str
+    operator: str
+    value: Value
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """A property has no value."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """True or false, whatever the row."""
+
+    value: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Not:
+    """The opposite, by SQL's logic: of what is unknown, unknown."""
+
+    condition: Condition
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """All or any of several conditions."""
+
+    every: bool
+    conditions: tuple[Condition, ...]
+
+
+Condition = Compared | Missing | Constant | Not | Joined
+
+
+def condition_sql(condition: Condition, columns: dict[str, sa.ColumnElement[Any]]) -> sa.ColumnElement[bool]:
+    """The condition on these columns by their properties' names."""
+    match condition:
+        case Constant(value):
+            return sa.literal(1, sa.Integer) == sa.literal(int(value), sa.Integer)
+        case Missing(name):
+            return columns[name].is_(None)
+        case Not(inner):
+            return sa.not_(condition_sql(inner, columns).self_group())
+        case Joined(every, conditions):
+            join = sa.and_ if every else sa.or_
+            return join(*(condition_sql(inner, columns).self_group() for inner in conditions)).self_group()
+        case Compared(name, "like", value):
+            return _Like(columns[name], sa.literal(str(value)), sa.literal(_glob(str(value))))
+        case Compared(name, symbol, value):
+            column = columns[name]
+            bound = sa.literal(value, column.type if isinstance(value, datetime) else None)
+            if isinstance(value, str) and symbol not in ("=", "<>"):
+                column = _Bytewise(column)
+            result: sa.ColumnElement[bool] = COMPARISONS[symbol](column, bound)
+            return result
+
+
+class _Bytewise(FunctionElement[str]):
+    """A text in the order of its code points, which is SQLite's; PostgreSQL's is that of the database's language."""
+
+    name = "waymark_bytewise"
+    type = sa.String()
+    inherit_cache = True
+
+
+@compiles(_Bytewise, "sqlite")
+def _plain(element: _Bytewise, compiler: SQLCompiler, **how: Any) -> str:
+    return compiler.process(next(iter(element.clauses)), **how)
+
+
+@compiles(_Bytewise, "postgresql")
+def _in_c(element: _Bytewise, compiler: SQLCompiler, **how: Any) -> str:
+    return f'({compiler.process(next(iter(element.clauses)), **how)} COLLATE "C")'
+
+
+class _Like(FunctionElement[bool]):
+    """A text like a pattern, upper case apart from lower: SQLite's LIKE takes them for the same, its GLOB does not."""
+
+    name = "waymark_like"
+    type = sa.Boolean()
+    inherit_cache = True
+
+    def self_group(self, against: Any = None) -> _Like:
+        """Itself: SQLAlchemy would compare it with 1."""
+        return self
+
+
+@compiles(_Like, "sqlite")
+def _by_glob(element: _Like, compiler: SQLCompiler, **how: Any) -> str:
+    text, _, pattern = element.clauses
+    return f"({compiler.process(text, **how)} GLOB {compiler.process(pattern, **how)})"
+
+
+@compiles(_Like, "postgresql")
+def _by_like(element: _Like, compiler: SQLCompiler, **how: Any) -> str:
+    text, pattern, _ = element.clauses
+    return f"({compiler.process(text, **how)} LIKE {compiler.process(pattern, **how)} ESCAPE '\\')"
+
+
+def _glob(like: str) -> str:
+    """A pattern of LIKE as one of GLOB."""
+
+    def part(match: re.Match[str]) -> str:
+        text = match[0]
+        if text in "%_":
+            return {"%": "*", "_": "?"}[text]
+        text = text[-1]
+        return f"[{text}]" if text in "*?[" else text
+
+    return re.sub(r"\\.|[%_*?\[]", part, like, flags=re.DOTALL)
