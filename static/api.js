@@ -85,6 +85,30 @@ export async function decode(file, context) {
   return (await ask("/v1/decodes", { method: "POST", body: form })).json();
 }
 
+export async function listVehicles() {
+  return (await (await ask("/v1/vehicles?limit=1000")).json()).items;
+}
+
+export async function addVehicle(body) {
+  return (await ask("/v1/vehicles", json(body))).json();
+}
+
+export async function calibrate(photos, declaration) {
+  const form = new FormData();
+  for (const photo of photos) form.append("photos", photo, photo.name);
+  form.append("declaration", JSON.stringify(declaration));
+  return (await ask("/v1/calibrations", { method: "POST", body: form })).json();
+}
+
+export async function putCalibration(vehicle, id) {
+  const headers = { "Content-Type": "application/json", "If-Match": `"${vehicle.version}"` };
+  return (await ask(`/v1/vehicles/${vehicle.id}/calibration`, { method: "PUT", headers, body: JSON.stringify({ calibration_id: id }) })).json();
+}
+
+export async function fetchBoard(board) {
+  return (await ask(`/v1/calibration-boards/board.pdf?${new URLSearchParams(board)}`)).blob();
+}
+
 export async function getDecode(id) {
   return (await ask(`/v1/decodes/${id}`)).json();
 }

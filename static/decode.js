@@ -76,6 +76,7 @@ function contextOf(form) {
   }
   if (fields.heading_deg !== undefined) context.heading_deg = fields.heading_deg;
   if (fields.thermal) context.thermal = true;
+  if (fields.vehicle) context.vehicle = fields.vehicle;
   return context;
 }
 

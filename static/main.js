@@ -3,12 +3,13 @@
 import { key } from "./api.js";
 import { startCerpms } from "./cerpms.js";
 import { startDecode } from "./decode.js";
+import { showFleet, startFleet } from "./fleet.js";
 import { showMagnets, startMagnets } from "./magnets.js";
 import { showMarkers, startMarkers } from "./markers.js";
 import { $, clearProblem, say } from "./page.js";
 import { startRegister } from "./register.js";
 
-const VIEWS = ["markers", "register", "magnets", "cerpms", "decode"];
+const VIEWS = ["markers", "register", "magnets", "cerpms", "decode", "fleet"];
 
 function showView() {
   const [asked, id] = location.hash.slice(1).split("/");
@@ -26,6 +27,8 @@ function showView() {
     showMarkers(id);
   } else if (name === "magnets") {
     showMagnets();
+  } else if (name === "fleet") {
+    showFleet(id);
   }
 }
 
@@ -55,5 +58,6 @@ startRegister();
 startMagnets();
 startCerpms();
 startDecode();
+startFleet();
 showKey();
 showView();

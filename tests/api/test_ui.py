@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from app.demo.cerpms import build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import drive_over, list_plates, registered_code
 from tests.browser import Browser
 from tests.conftest import ADMIN_KEY, LiveServer
+from tests.fleet.board_photos import good_photos, jpeg
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -239,4 +241,58 @@ def test_a_packet_log_is_decoded_to_its_lane(page: Browser, server: LiveServer, 
     assert "Steering check" in told
     assert "median ±" in page.run("document.querySelector('#fix').innerText")
     assert page.run("document.querySelectorAll('#fix-map .marker').length") > 20
+    assert page.complaints == []
+
+
+def test_a_vehicle_is_added_and_listed(page: Browser, server: LiveServer) -> None:
+    page.click("a[href='#fleet']")
+    page.until("!document.querySelector('#view-fleet').hidden")
+    page.fill("#vehicle-form [name='name']", "BUS <7>")
+    page.fill("#vehicle-form [name='profile']", "{")
+    page.click("#vehicle-form button")
+    told = page.until("!document.querySelector('#problem').hidden && document.querySelector('#problem').innerText")
+    assert "profile cannot be read" in told
+    page.fill("#vehicle-form [name='profile']", '{"camera": {"height_m": 0}}')
+    page.click("#vehicle-form button")
+    told = page.until("(t => /height_m must/.test(t) && t)(document.querySelector('#problem').innerText)")
+    assert "profile.camera.height_m" in told
+    page.complaints.clear()  # the browser itself complains of the 422
+    page.fill("#vehicle-form [name='profile']", '{"camera": {"height_m": 1.4, "horizontal_fov_deg": 70}, "trace": {}}')
+    page.click("#vehicle-form button")
+    detail = page.until(
+        "/70° wide/.test(document.querySelector('#vehicle').innerText) && document.querySelector('#vehicle').innerText"
+    )
+    for part in ("BUS <7>", "active, version 1", "1.4 m up", "0.000 km driven", "never"):
+        assert part in detail
+    assert "BUS <7>" in page.run("document.querySelector('#vehicle-rows').innerText")
+    page.click("#vehicle form button")
+    assert "Choose photos" in page.until("document.querySelector('#problem').innerText")
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_a_camera_is_calibrated_and_its_errors_shown(page: Browser, server: LiveServer, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
+        for k, grey in enumerate(good_photos()):
+            archive.writestr(f"{k}.jpg", jpeg(grey))
+        archive.writestr("mirrored.jpg", jpeg(good_photos()[0][:, ::-1].copy()))
+    with server.client() as client:
+        mount = {"camera": {"height_m": 1.4, "depression_deg": 12.0}}
+        vehicle = client.post("/v1/vehicles", json={"name": "To calibrate", "profile": mount}).json()
+        page.click("a[href='#fleet']")
+        page.run(f"location.hash = '#fleet/{vehicle['id']}'")
+        page.until("/To calibrate/.test(document.querySelector('#vehicle').innerText)")
+        page.choose_file("#vehicle input[type=file]", tmp_path / "photos.zip")
+        page.click("#vehicle form button")
+        told = page.until(
+            "document.querySelectorAll('.coverage span').length === 48 && document.querySelector('#vehicle').innerText"
+        )
+        assert re.search(r"Reprojection error 0\.\d{3} px over 14 of 15 photos", told)
+        assert "mirrored" in told
+        assert "±" in told
+        page.click("#calibration button")
+        page.until("/version 2/.test(document.querySelector('#vehicle').innerText)")
+        camera = client.get(f"/v1/vehicles/{vehicle['id']}").json()["profile"]["camera"]
+    assert camera["fx_px"] == pytest.approx(754.0, rel=0.003)
+    assert camera["depression_deg"] == 12.0
     assert page.complaints == []
