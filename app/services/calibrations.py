@@ -19,6 +19,7 @@ from app.registry.ids import new_id
 from app.registry.vehicles import Row
 from app.sensors.calibration_board import DICTIONARY, CalibrationBoard
 from app.services.access import Caller
+from app.services.audit import log_change
 from app.services.idempotency import IdempotencyKey, find_answer, keep_answer
 from app.services.ports import Clock
 
@@ -132,6 +133,7 @@ class Calibrations:
                 return answer, True
             store.add_calibration(connection, caller.agency_id, row)
             document = calibration_document(row)
+            log_change(connection, caller, "calibration.made", now=now, subject=row["id"], document=row["result"])
             keep_answer(connection, caller.agency_id, key, document, now, self._ttl)
         return document, False
 
