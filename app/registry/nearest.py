@@ -1,30 +1,86 @@
 """The markers nearest to a place, by geodesic distance, from the spatial index of either database.
 
 Both look for a radius that holds enough markers, and then take the nearest of all inside it. PostGIS has an order of
-nearness on its GiST index; it is one of degrees, so the distance of its last row bounds the radius, no more. SQLite's
-R*Tree has none: a circle grows until it holds enough.
+nearness on its GiST index, though one of degrees: what comes first in it is enough where it holds a whole box round the
+farthest that is taken. SQLite's R*Tree has no order: a circle grows until it holds enough. A few near by, which is what
+vehicles and crews ask for, are mostly found by one statement; `list_nearest` finds any number anywhere.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import sqlalchemy as sa
 
+from app.registry.features import in_box
 from app.registry.markers import PUBLIC, MarkerFilter, Row, conditions_of
-from app.registry.spatial import FloatArray, box_around, distances_m, within_box
+from app.registry.spatial import Box, FloatArray, box_around, distances_m
 from app.registry.tables import markers
 
-_FIRST_M = 100.0
+Found = list[tuple[Row, float]]
+_Rows = npt.NDArray[np.int64]
+
+AT_ONCE = 30
+_FIRST_M = 250.0
 _FAR_M = 5_000.0
 _WORLD_M = 20_038_000.0  # no two places are farther apart
+_WIDE_DEG2 = 2_500.0  # from here on reading all is quicker than asking the index
 _FEW = 2_000
 _MANY = 4_000
+_ALL = 2**31 - 1
 _HALVINGS = 16
 _CHUNK = 500
 _C = markers.c
+_PLACES = (_C.row, _C.lon_deg, _C.lat_deg)
+
+
+def find_nearest_at_once(
+    connection: sa.Connection,
+    agency_id: str,
+    narrowed: MarkerFilter,
+    lon_deg: float,
+    lat_deg: float,
+    count: int,
+    within_m: float | None = None,
+) -> Found | None:
+    """As `list_nearest`, by one statement; None where that does not tell."""
+    most_m = _WORLD_M if within_m is None else within_m
+    if count > AT_ONCE:
+        return None
+    limit = 10 + math.ceil(3 * count / max(math.cos(math.radians(lat_deg)), 0.1))
+    narrowed = replace(narrowed, near=None)
+    if connection.dialect.name == "postgresql":
+        values: dict[str, Any] = {"agency": agency_id, "most": limit, "lon": lon_deg, "lat": lat_deg}
+        rows = connection.execute(_in_order(narrowed, True), values).mappings().all()
+    else:
+        parts = box_around(lon_deg, lat_deg, min(_FIRST_M, most_m)).parts
+        values = {"agency": agency_id, "most": 3 * limit, **_sides(parts)}
+        rows = connection.execute(_inside(narrowed, _wide(parts), True), values).mappings().all()
+        if len(rows) == 3 * limit:
+            return None
+    lon, lat = (np.array([row[name] for row in rows], dtype=np.float64) for name in ("lon_deg", "lat_deg"))
+    distances = distances_m(lon_deg, lat_deg, lon, lat)
+    chosen = sorted((d, row["row"], k) for k, (d, row) in enumerate(zip(distances.tolist(), rows, strict=True)))
+    chosen = [item for item in chosen[:count] if item[0] <= most_m]
+    far_m = chosen[-1][0] if len(chosen) == count else most_m
+    if connection.dialect.name == "postgresql":
+        enough = len(rows) < limit or _holds_box(lon_deg, lat_deg, far_m, float(lon[-1]), float(lat[-1]))
+    else:
+        enough = far_m <= min(_FIRST_M, most_m)
+    return [(rows[k], distance) for distance, _, k in chosen] if enough else None
+
+
+def _holds_box(lon_deg: float, lat_deg: float, radius_m: float, last_lon_deg: float, last_lat_deg: float) -> bool:
+    """Whether all in a box round a circle is nearer, in degrees, than the last row in the order of degrees."""
+    (box, *more) = box_around(lon_deg, lat_deg, radius_m).parts
+    half_lon, half_lat = (box.east_deg - box.west_deg) / 2, (box.north_deg - box.south_deg) / 2
+    far_deg = math.hypot(last_lon_deg - lon_deg, last_lat_deg - lat_deg)
+    return not more and half_lon < 90.0 and math.hypot(half_lon, half_lat) < far_deg
 
 
 def list_nearest(
@@ -35,7 +91,7 @@ def list_nearest(
     lat_deg: float,
     count: int,
     within_m: float | None = None,
-) -> list[tuple[Row, float]]:
+) -> Found:
     """The agency's nearest markers that a filter leaves, with their distances in metres, nearest first.
 
     Parameters
@@ -47,10 +103,8 @@ def list_nearest(
     """
     search = _Search(connection, agency_id, replace(narrowed, near=None), lon_deg, lat_deg)
     most_m = _WORLD_M if within_m is None else within_m
-    found = (
-        search.by_order(count, most_m) if connection.dialect.name == "postgresql" else search.by_radius(count, most_m)
-    )
-    rows, distances = found
+    has_order = connection.dialect.name == "postgresql"
+    rows, distances = search.by_order(count, most_m) if has_order else search.by_radius(count, most_m)
     chosen = sorted(zip(distances.tolist(), rows.tolist(), strict=True))[:count]
     by_row = search.rows_of([row for _, row in chosen])
     return [(by_row[row], distance) for distance, row in chosen]
@@ -60,28 +114,24 @@ class _Search:
     def __init__(
         self, connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, lon_deg: float, lat_deg: float
     ) -> None:
-        self._connection, self._lon, self._lat = connection, lon_deg, lat_deg
-        self._agency_id = agency_id
-        self._places = sa.select(_C.row, _C.lon_deg, _C.lat_deg).where(
-            _C.agency_id == agency_id, *conditions_of(narrowed)
-        )
+        self._connection, self._agency_id, self._narrowed = connection, agency_id, narrowed
+        self._lon, self._lat = lon_deg, lat_deg
 
-    def by_order(self, count: int, most_m: float) -> tuple[FloatArray, FloatArray]:
+    def by_order(self, count: int, most_m: float) -> tuple[_Rows, FloatArray]:
         """Rows and distances inside a radius that the order of the index bounds."""
-        geom = sa.table("markers", sa.column("geom")).c.geom
-        place = sa.func.ST_SetSRID(sa.func.ST_MakePoint(self._lon, self._lat), sa.literal_column("4326"))
-        rows, distances = self._measured(self._places.order_by(geom.op("<->")(place)).limit(count))
+        values = {"lon": self._lon, "lat": self._lat, "most": count}
+        rows, distances = self._measured(_in_order(self._narrowed, False), values)
         if len(rows) < count:  # that is all of them
             return rows[distances <= most_m], distances[distances <= most_m]
-        return self._inside(min(float(distances.max()), most_m))
+        return self._circle(min(float(distances.max()), most_m))
 
-    def by_radius(self, count: int, most_m: float) -> tuple[FloatArray, FloatArray]:
+    def by_radius(self, count: int, most_m: float) -> tuple[_Rows, FloatArray]:
         """Rows and distances inside a radius that grew until it held enough."""
         radius_m, below_m, halvings, counted = min(_FIRST_M, most_m), 0.0, 0, False
         while True:
-            limit = _MANY + 4 * count if halvings < _HALVINGS and radius_m > _FIRST_M else None
-            rows, distances = self._inside(radius_m, limit)
-            if limit is not None and len(rows) == limit:  # more than are worth reading: between the two radii
+            limit = _MANY + 4 * count if halvings < _HALVINGS and radius_m > _FIRST_M else _ALL
+            rows, distances = self._circle(radius_m, limit)
+            if len(rows) == limit:  # more than are worth reading: between the two radii
                 radius_m, halvings = math.sqrt(max(below_m, 1.0) * radius_m), halvings + 1
                 continue
             if len(rows) >= count or radius_m >= most_m:
@@ -89,7 +139,7 @@ class _Search:
             below_m = radius_m
             if radius_m > _FAR_M and not counted:
                 counted = True
-                rows, distances = self._measured(self._places.limit(_FEW + 1))
+                rows, distances = self._measured(_anywhere(self._narrowed), {"most": _FEW + 1})
                 if len(rows) <= _FEW:
                     return rows[distances <= most_m], distances[distances <= most_m]
             radius_m = min(radius_m * (4.0 if halvings == 0 else 1.4), most_m)
@@ -102,15 +152,56 @@ class _Search:
             found.update({row["row"]: row for row in self._connection.execute(query).mappings()})
         return found
 
-    def _inside(self, radius_m: float, limit: int | None = None) -> tuple[FloatArray, FloatArray]:
-        query = self._places.where(within_box(box_around(self._lon, self._lat, radius_m)))
-        rows, distances = self._measured(query.limit(limit) if limit is not None else query)
-        if limit is not None and len(rows) == limit:
+    def _circle(self, radius_m: float, limit: int = _ALL) -> tuple[_Rows, FloatArray]:
+        parts = box_around(self._lon, self._lat, radius_m).parts
+        statement = _inside(self._narrowed, _wide(parts), False)
+        rows, distances = self._measured(statement, {**_sides(parts), "most": limit})
+        if len(rows) == limit:
             return rows, distances
         near = distances <= radius_m
         return rows[near], distances[near]
 
-    def _measured(self, query: sa.Select[tuple[int, float, float]]) -> tuple[FloatArray, FloatArray]:
-        found = self._connection.execute(query).all()
+    def _measured(self, statement: sa.Select[Any], values: dict[str, Any]) -> tuple[_Rows, FloatArray]:
+        found = self._connection.execute(statement, {**values, "agency": self._agency_id}).all()
         places = np.array([tuple(row) for row in found], dtype=np.float64).reshape(-1, 3)
         return places[:, 0].astype(np.int64), distances_m(self._lon, self._lat, places[:, 1], places[:, 2])
+
+
+# --- statements: built once for each filter, which costs more than running them -----------------------------------
+
+
+def _wide(parts: tuple[Box, ...]) -> tuple[bool, ...]:
+    return tuple((p.east_deg - p.west_deg) * (p.north_deg - p.south_deg) >= _WIDE_DEG2 for p in parts)
+
+
+def _sides(parts: tuple[Box, ...]) -> dict[str, float]:
+    return {
+        f"{side}{k}": value
+        for k, p in enumerate(parts)
+        for side, value in zip("wsen", (p.west_deg, p.south_deg, p.east_deg, p.north_deg), strict=True)
+    }
+
+
+@lru_cache(maxsize=256)
+def _inside(narrowed: MarkerFilter, wide: tuple[bool, ...], whole: bool) -> sa.Select[Any]:
+    """Markers in the boxes of `_sides`."""
+    return _owned(narrowed, whole).where(sa.or_(*(in_box(k, is_wide) for k, is_wide in enumerate(wide))))
+
+
+@lru_cache(maxsize=256)
+def _in_order(narrowed: MarkerFilter, whole: bool) -> sa.Select[Any]:
+    """Markers in the order of their distance in degrees (PostGIS)."""
+    geom = sa.table("markers", sa.column("geom")).c.geom
+    point = sa.func.ST_MakePoint(sa.bindparam("lon", type_=sa.Double), sa.bindparam("lat", type_=sa.Double))
+    return _owned(narrowed, whole).order_by(geom.op("<->")(sa.func.ST_SetSRID(point, sa.literal_column("4326"))))
+
+
+@lru_cache(maxsize=256)
+def _anywhere(narrowed: MarkerFilter) -> sa.Select[Any]:
+    return _owned(narrowed, False)
+
+
+def _owned(narrowed: MarkerFilter, whole: bool) -> sa.Select[Any]:
+    columns = (_C.row, *PUBLIC) if whole else _PLACES
+    most = sa.bindparam("most", type_=sa.Integer)
+    return sa.select(*columns).where(_C.agency_id == sa.bindparam("agency"), *conditions_of(narrowed)).limit(most)

@@ -14,7 +14,7 @@ from app.registry import markers as store
 from app.registry.database import Database
 from app.registry.history import list_as_of
 from app.registry.markers import MarkerFilter, Row
-from app.registry.nearest import list_nearest
+from app.registry.nearest import find_nearest_at_once, list_nearest
 from app.registry.searches import list_places
 from app.registry.spatial import distances_m
 from app.roads.axis import Axis, Foot
@@ -47,8 +47,9 @@ class Searches:
 
         Each marker has its `distance_m` where the filter has a circle.
         """
-        with self._database.read() as connection:
-            rows = store.list_markers(connection, caller.agency_id, narrowed, after=after, limit=limit + 1)
+        rows = self._database.ask(
+            lambda connection: store.list_markers(connection, caller.agency_id, narrowed, after=after, limit=limit + 1)
+        )
         page = _documents(rows[:limit], narrowed)
         return page, page[-1]["id"] if len(rows) > limit else None
 
@@ -64,8 +65,11 @@ class Searches:
         self, caller: Caller, narrowed: MarkerFilter, place: Place, count: int, within_m: float | None = None
     ) -> list[dict[str, Any]]:
         """The markers nearest to a place (lon_deg, lat_deg), nearest first, each with its `distance_m`."""
-        with self._database.read() as connection:
-            found = list_nearest(connection, caller.agency_id, narrowed, *place, count, within_m)
+        asked = (caller.agency_id, narrowed, *place, count, within_m)
+        found = self._database.ask(lambda connection: find_nearest_at_once(connection, *asked))
+        if found is None:
+            with self._database.read() as connection:
+                found = list_nearest(connection, *asked)
         return [{**marker_document(row), "distance_m": distance} for row, distance in found]
 
     def along(

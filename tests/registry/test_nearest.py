@@ -18,7 +18,7 @@ from app.registry import agencies, nearest
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, list_markers
-from app.registry.nearest import list_nearest
+from app.registry.nearest import find_nearest_at_once, list_nearest
 from app.registry.tables import markers
 from app.services.search_areas import area_of
 
@@ -95,8 +95,12 @@ def _expected(store: Store, place: tuple[float, float], count: int, family: str 
 
 def _check(store: Store, place: tuple[float, float], count: int, family: str | None, within_m: float | None) -> None:
     database, agency_id, _, _ = store
+    asked = (agency_id, MarkerFilter(family=family), *place, count, within_m)
     with database.read() as connection:
-        found = list_nearest(connection, agency_id, MarkerFilter(family=family), *place, count, within_m)
+        found = list_nearest(connection, *asked)
+        at_once = find_nearest_at_once(connection, *asked)
+    if at_once is not None:
+        assert [(row["id"], distance) for row, distance in at_once] == [(row["id"], d) for row, d in found]
     distances = [distance for _, distance in found]
     expected = _expected(store, place, count, family, np.inf if within_m is None else within_m)
     assert distances == pytest.approx(expected, abs=1e-6)
@@ -121,6 +125,13 @@ def test_the_nearest_are_those_that_every_distance_says(
     store: Store, place: tuple[float, float], count: int, family: str | None, within_m: float | None
 ) -> None:
     _check(store, place, count, family, within_m)
+
+
+def test_a_few_near_by_are_found_by_one_statement(store: Store) -> None:
+    database, agency_id, _, _ = store
+    for place in ((8.4, 49.0), (0.0, 0.0)):
+        with database.read() as connection:
+            assert find_nearest_at_once(connection, agency_id, MarkerFilter(), *place, 10) is not None
 
 
 @pytest.mark.parametrize("place", PLACES)
