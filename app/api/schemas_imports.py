@@ -92,12 +92,26 @@ class DeclarationIn(BaseModel):
     speed_limit: SpeedLimitIn | None = Field(None, description="Of CERPMs.")
     dry_run: Annotated[bool, Field(strict=True)] = Field(False, description="Report only; nothing is stored.")
     mode: Literal["all", "good"] = Field("all", description="Store all rows or none, or the good ones.")
+    warnings: Literal["store", "refuse"] = Field(
+        "store", description="What a warning means: its row is stored, or refused as a faulty one is."
+    )
     reason: Annotated[Text, Field(min_length=1, max_length=500)] | None = None
 
     def given(self, data: bytes) -> GivenImport:
         """The import as the use case knows it."""
         limit = self.speed_limit
-        own = {"scheme", "check_digits", "geometry", "side", "speed_limit", "dry_run", "mode", "reason", "survey"}
+        own = {
+            "scheme",
+            "check_digits",
+            "geometry",
+            "side",
+            "speed_limit",
+            "dry_run",
+            "mode",
+            "reason",
+            "survey",
+            "warnings",
+        }
         values = self.model_dump(exclude=own)
         for name in ("area_deg", "height_range_m"):
             values[name] = tuple(values[name]) if values[name] is not None else None
@@ -114,7 +128,8 @@ class DeclarationIn(BaseModel):
                 SpeedLimit(limit.value, SpeedUnit(limit.unit)) if limit is not None else None,
             )
             declaration = ImportDeclaration(**values, survey=self.survey.model_dump())
-        return GivenImport(data, declaration, defaults, self.dry_run, self.mode, self.reason)
+        strict = self.warnings == "refuse"
+        return GivenImport(data, declaration, defaults, self.dry_run, self.mode, self.reason, strict)
 
 
 class FaultOut(BaseModel):
@@ -134,6 +149,7 @@ class ImportReportOut(BaseModel):
     outcome: Literal["checked", "stored", "refused"]
     dry_run: bool
     mode: str
+    warnings: str
     format: str
     file_sha256: str
     crs: str
@@ -147,6 +163,8 @@ class ImportReportOut(BaseModel):
     stored: Whole
     extent_deg: list[float] | None
     counts: dict[str, int] = Field(description="Faults by code.")
-    comparison: dict[str, Any] | None
+    comparison: dict[str, Any] | None = Field(
+        description="Figures, residuals row by row, and `map_svg`, a map of them."
+    )
     faults: list[FaultOut] = Field(description="The first thousand, refusals first.")
     faults_left_out: int

@@ -17,11 +17,13 @@ from app.errors import InvalidParameter
 from app.registry import bulk
 from app.registry import markers as store
 from app.registry.audit import AuditEntry, recording
+from app.registry.bulk_load import LARGE
 from app.registry.database import Database
 from app.registry.exchange.compare import Comparison, check_residuals, compare_survey
 from app.registry.exchange.declaration import ImportDeclaration
 from app.registry.exchange.place import PlacedSurvey, place_survey
 from app.registry.exchange.place_checks import NEAR_M, Neighbours, check_place
+from app.registry.exchange.residual_map import draw_residuals
 from app.registry.exchange.shape_checks import check_shape
 from app.registry.exchange.table import Fault, Severity, SurveyTable
 from app.registry.ids import new_ids
@@ -45,6 +47,9 @@ _KNOWN_M = 5_000.0
 _NEIGHBOURS = 50_000
 _BUSY_WAIT_S = 10.0
 _PART = 500
+_ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
+_STANDING = "place_by_area_only"
+"""The caution that every survey of a new road gets, however well it is declared."""
 _MARGIN_DEG = NEAR_M / 90_000.0
 
 
@@ -80,6 +85,7 @@ class GivenImport:
     dry_run: bool = False
     mode: str = ALL
     reason: str | None = None
+    refuse_warnings: bool = False
 
 
 class Imports:
@@ -123,7 +129,7 @@ class Imports:
                 return running.report("checked"), False
         if running.is_hopeless:
             return running.report("refused"), False
-        with self._database.write() as connection:
+        with self._database.write(long=survey.table.rows >= LARGE) as connection:
             if (answer := find_answer(connection, caller.agency_id, key, now)) is not None:
                 return answer, True
             running.prepare(connection)
@@ -173,9 +179,7 @@ class _Running:
     @property
     def is_hopeless(self) -> bool:
         """Whether nothing can be stored, whatever the codes are."""
-        return self._faults.refuses_file or (
-            self._given.mode == ALL and len(self._good_rows()) < self._survey.table.rows
-        )
+        return self._refuses_file or (self._given.mode == ALL and len(self._good_rows()) < self._survey.table.rows)
 
     @property
     def is_refused(self) -> bool:
@@ -207,23 +211,19 @@ class _Running:
         refused = self._faults.flags(table.rows, Severity.REFUSED)
         warned = self._faults.flags(table.rows, Severity.WARNING)
         shown = self._faults.shown(MAX_FAULTS)
-        good = 0 if self._faults.refuses_file else int((~refused & placed.placed).sum())
+        good = len(self._good_rows())
         lon, lat = placed.lon_deg[placed.placed], placed.lat_deg[placed.placed]
         return {
             "outcome": outcome,
             "dry_run": self._given.dry_run,
             "mode": self._given.mode,
+            "warnings": "refuse" if self._given.refuse_warnings else "store",
             "format": table.format,
             "file_sha256": self._sha256,
             "crs": table.crs,
             "localization_grade": str(placed.grade),
             "transform_note": placed.note,
-            "accuracy": accuracy_document(
-                *(
-                    self._given.declaration.survey.get(name)
-                    for name in ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
-                )
-            ),
+            "accuracy": accuracy_document(*(self._given.declaration.survey.get(name) for name in _ACCURACY)),
             "rows": table.rows,
             "good_rows": good,
             "refused_rows": int(refused.sum()),
@@ -240,11 +240,19 @@ class _Running:
 
     # --- steps ------------------------------------------------------------------------------------------------------
 
+    @property
+    def _refuses_file(self) -> bool:
+        strict = self._given.refuse_warnings and self._faults.file_warnings - {_STANDING}
+        return self._faults.refuses_file or bool(strict)
+
     def _good_rows(self) -> Rows:
-        if self._faults.refuses_file:
+        if self._refuses_file:
             return np.empty(0, dtype=np.intp)
-        refused = self._faults.flags(self._survey.table.rows, Severity.REFUSED)
-        return np.flatnonzero(~refused & self._survey.placed.placed)
+        rows = self._survey.table.rows
+        bad = self._faults.flags(rows, Severity.REFUSED)
+        if self._given.refuse_warnings:
+            bad |= self._faults.flags(rows, Severity.WARNING)
+        return np.flatnonzero(~bad & self._survey.placed.placed)
 
     def _is_known(self, connection: sa.Connection, lon_deg: float, lat_deg: float) -> bool:
         return bulk.is_any_near(connection, self._caller.agency_id, lon_deg, lat_deg, _KNOWN_M)
@@ -367,7 +375,9 @@ class _Running:
             }
             for row in np.flatnonzero(np.isfinite(found.east_m))[:MAX_FAULTS]
         ]
-        return {**found.document(self._given.declaration.tolerance_m), "residuals": residuals}
+        tolerance_m = self._given.declaration.tolerance_m
+        drawn = draw_residuals(self._survey, found, tolerance_m)
+        return {**found.document(tolerance_m), "residuals": residuals, "map_svg": drawn}
 
 
 def _places(rows: Sequence[Any]) -> tuple[Any, Any, Any]:

@@ -1,19 +1,16 @@
-"""``python -m benchmarks.imports [--short] [--seed N]``: planted faults, clean surveys, rows a second."""
+"""``python -m benchmarks.imports [--short] [--seed N] [--rows N]``: planted faults, clean surveys, rows a second."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import resource
-import time
 from collections import Counter, defaultdict
 
 import numpy as np
 
-from app.registry.exchange.declaration import ImportDeclaration
-from app.services.imports import GivenImport
 from benchmarks.imports.faults import plant_faults
 from benchmarks.imports.judge import STANDING, VERDICTS, Judge, open_judge
+from benchmarks.imports.speed import print_speed
 from benchmarks.imports.surveys import EVIDENCE, LANES, make_survey
 
 GOAL = 0.98
@@ -25,12 +22,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.imports", description=__doc__)
     parser.add_argument("--short", action="store_true")
     parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--rows", type=int, help="Only the speed, with this many rows.")
     arguments = parser.parse_args()
-    faults, clean, rows = (60, 20, 5_000) if arguments.short else (200, 120, 100_000)
+    if arguments.rows:
+        return 0 if print_speed(arguments.rows) else 1
+    faults, clean, rows = (60, 20, 20_000) if arguments.short else (200, 120, 1_000_000)
     with open_judge() as judge:
         met = _print_faults(judge, arguments.seed, faults)
         met &= _print_clean(judge, arguments.seed + 1_000_000, clean)
-        _print_speed(judge, rows)
+    met &= print_speed(rows)
     return 0 if met else 1
 
 
@@ -43,7 +43,7 @@ def _print_faults(judge: Judge, seed: int, count: int) -> bool:
         if not math.isnan(judged.moved_m) and judged.moved_m > _MUST_M:
             far[judged.verdict] += 1
     total: Counter[str] = sum(found.values(), Counter())
-    print(f"### imports: {count} planted faults (seed {seed})\n")
+    print(f"### imports-faults\n\n{count} planted faults, seed {seed}.\n")
     print(f"| fault | planted | {' | '.join(VERDICTS)} |\n|---|---|{'---|' * len(VERDICTS)}")
     for kind, verdicts in found.items():
         print(f"| {kind} | {verdicts.total()} | {' | '.join(str(verdicts[v]) for v in VERDICTS)} |")
@@ -66,36 +66,12 @@ def _print_clean(judge: Judge, seed: int, count: int) -> bool:
         alarmed += own > 0
         warnings += own
         standing += any(code in STANDING for code in codes)
-    print("### imports: clean surveys\n")
+    print("### imports-clean\n")
     print(
         "| surveys | refused | with a false warning | false warnings | with a standing caution |\n|---|---|---|---|---|"
     )
     print(f"| {count} | {refused} | {alarmed} | {warnings} | {standing} |\n")
     return refused == 0
-
-
-def _print_speed(judge: Judge, rows: int) -> None:
-    rng = np.random.default_rng(5)
-    survey = make_survey(rng, LANES[0], "none", "EPSG:4326")
-    side = math.isqrt(rows) + 1
-    lines = [
-        f"{k + 1},{8.0 + k % side * 2e-4 + 1e-9:.9f},{49.0 + k // side * 2e-4 + 1e-9:.9f},{120 + k % 7 / 10:.3f}"
-        for k in range(rows)
-    ]
-    data = "\n".join(["number,lon,lat,height", *lines]).encode()
-    caller = judge.caller(survey)
-    declaration = ImportDeclaration(
-        crs="EPSG:4326", vertical_datum="ellipsoid", family="cerpm", columns={"code": "number"}
-    )
-    began, cpu_began = time.perf_counter(), time.process_time()
-    report, _ = judge.store(caller, GivenImport(data, declaration))
-    took_s, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print("### imports: speed\n")
-    print("| rows | stored | s | CPU s | rows/s | rows/CPU s | peak memory of the process [MiB] |")
-    print("|---|---|---|---|---|---|---|")
-    rates = f"{took_s:.1f} | {cpu_s:.1f} | {rows / took_s:.0f} | {rows / cpu_s:.0f}"
-    print(f"| {rows} | {report['stored']} | {rates} | {peak:.0f} |")
 
 
 if __name__ == "__main__":

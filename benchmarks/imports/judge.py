@@ -59,8 +59,8 @@ class Judge:
     """Imports into one registry, an agency a survey."""
 
     def __init__(self, database: Database) -> None:
-        self._access = Access(database, _now)
-        self._imports = Imports(database, _now, InProcess(), MarkerRules())
+        self._access = Access(database, now)
+        self._imports = Imports(database, now, InProcess(), MarkerRules())
         self._count = 0
 
     def caller(self, survey: Survey) -> Caller:
@@ -143,5 +143,5 @@ def _plain(value: Any) -> Any:
     return int(value) if isinstance(value, str) else value
 
 
-def _now() -> datetime:
+def now() -> datetime:
     return datetime.now(UTC)

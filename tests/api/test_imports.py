@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import ezdxf
 import httpx
@@ -140,6 +141,54 @@ def test_as_built_is_compared_with_the_plan_and_makes_new_versions(client: httpx
     assert marker["position"]["lat_deg"] == pytest.approx(LAT + 1e-8 + north, abs=1e-9)
     old = client.get(f"/v1/markers/{marker['id']}/versions").json()["items"][0]["marker"]
     assert old["position"]["lat_deg"] == pytest.approx(LAT + 1e-8, abs=1e-9)
+
+
+def test_the_residuals_are_drawn(client: httpx.Client) -> None:
+    assert _post(client, _csv(), DEGREES).status_code == 201
+    lines = [f"{k},{LON + k * STEP:.9f},{LAT + k % 3 * 1e-8 + (2e-6 if k == 5 else 2e-7):.9f}" for k in range(1, 9)]
+    data = "\n".join(["number,lon,lat", *lines]).encode()
+    declared = {**DEGREES, "compare": True, "tolerance_m": 0.1, "dry_run": True}
+    drawn = _post(client, data, declared).json()["comparison"]["map_svg"]
+    root = ElementTree.fromstring(drawn)
+    strokes = [path.get("stroke") for path in root.iter("{http://www.w3.org/2000/svg}path")]
+    assert (strokes.count("#2b6cb0"), strokes.count("#c53030")) == (7, 1)
+    texts = " ".join(text.text or "" for text in root.iter("{http://www.w3.org/2000/svg}text"))
+    assert "Residuals of 8 markers" in texts
+    assert "row 5: 222 mm" in texts
+    assert "map: " in texts
+    assert "arrows: " in texts
+    assert " N" in texts
+
+
+def test_warnings_can_keep_a_survey_out(client: httpx.Client) -> None:
+    off = _csv(20, row9=f"9,{LON + 9 * STEP:.9f},{LAT + 1e-4:.9f}")
+    near = {**DEGREES, "dry_run": True}
+    faults = _post(client, off, near).json()["faults"]
+    warned = {fault["row"] for fault in faults if fault["row"] is not None}
+    assert 9 in warned
+    assert {fault["severity"] for fault in faults} == {"warning"}
+    strict = {**DEGREES, "warnings": "refuse"}
+    refused = _post(client, off, strict)
+    assert refused.status_code == 422
+    assert refused.json()["report"]["warnings"] == "refuse"
+    assert _markers(client) == []
+    good = _post(client, off, {**strict, "mode": "good"})
+    assert (good.status_code, good.json()["stored"], good.json()["good_rows"]) == (
+        201,
+        20 - len(warned),
+        20 - len(warned),
+    )
+    assert [m["code"]["number"] for m in _markers(client)] == [k for k in range(1, 21) if k not in warned]
+    # a sound survey of a new road passes; one that nothing can be held against does not
+    for k, status in ((0, 422), (1, 201)):  # beside those that are there, and 4 km from them
+        moved = _csv().replace(f"{LAT:.4f}".encode(), f"{LAT + 0.04 * k:.4f}".encode()).replace(b"\n", b"\n10", 8)
+        assert _post(client, moved, strict).status_code == status
+    nowhere = {name: value for name, value in strict.items() if name != "area_deg"}
+    far = _csv().replace(b"8.4", b"9.4").replace(b"\n", b"\n20", 8)
+    answer = _post(client, far, nowhere)
+    assert answer.status_code == 422
+    assert "place_unchecked" in answer.json()["report"]["counts"]
+    assert _post(client, _csv(), {**DEGREES, "warnings": "shout"}).status_code == 422
 
 
 def test_swapped_axes_are_refused_with_the_cure(client: httpx.Client) -> None:

@@ -59,6 +59,7 @@ class Faults:
     def __init__(self, faults: Iterable[Fault] = ()) -> None:
         self.counts: Counter[str] = Counter()
         self.refuses_file = False
+        self.file_warnings: set[str] = set()
         self._rows = {severity: bytearray() for severity in Severity}
         self._kept: dict[tuple[str, Severity], list[Fault]] = {}
         self.add(faults)
@@ -72,6 +73,8 @@ class Faults:
                 kept.append(fault)
             if fault.row is None:
                 self.refuses_file |= fault.severity is Severity.REFUSED
+                if fault.severity is Severity.WARNING:
+                    self.file_warnings.add(fault.code)
                 continue
             flags = self._rows[fault.severity]
             if len(flags) < fault.row:
