@@ -1,7 +1,8 @@
-"""The clients that agencies use: GDAL 3.12 through pyogrio, and the GDAL that is installed as ogrinfo."""
+"""The clients that agencies use: GDAL 3.12 through pyogrio, the GDAL that is installed as ogrinfo, and OWSLib."""
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import shutil
@@ -14,6 +15,7 @@ import numpy as np
 import pyogrio
 import pytest
 import shapely
+from owslib.ogcapi.features import Features
 
 from app.services.access import Scope
 from tests.api.test_ogc_features import ROW, add
@@ -106,7 +108,7 @@ def _ogrinfo(url: str, key: str, *arguments: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     assert "ERROR" not in done.stderr, done.stderr
-    return done.stdout
+    return done.stdout + done.stderr
 
 
 def test_ogrinfo(server: LiveServer, road: str) -> None:
@@ -117,3 +119,72 @@ def test_ogrinfo(server: LiveServer, road: str) -> None:
         assert field in summary
     assert _ogrinfo(server.url, road, "-al", "-where", "road = 'A1'").count("OGRFeature(") == 4
     assert _ogrinfo(server.url, road, "-al", "-spat", "5.05", "44", "5.45", "46").count("OGRFeature(") == 4
+
+
+@pytest.mark.parametrize(
+    ("where", "count"),
+    [
+        ("measure_m >= 8", 4),
+        ("measure_m > 2 AND measure_m < 5", 2),
+        ("road <> 'A1'", 8),
+        ("road LIKE 'A_' AND NOT (road = 'A0')", 8),
+        ("road IN ('A1', 'A2') OR measure_m = 0", 9),
+        ("road IS NULL", 0),
+    ],
+)
+def test_gdal_filters_by_any_expression(gdal: Gdal, where: str, count: int) -> None:
+    assert len(gdal(pyogrio.raw.read, layer="markers", where=where)[2]) == count
+
+
+def test_ogrinfo_leaves_filtering_to_the_server(server: LiveServer, road: str) -> None:
+    told = _ogrinfo(server.url, road, "-al", "-where", "measure_m >= 8", "--debug", "on")
+    assert told.count("OGRFeature(") == 4
+    assert "filter=measure_m%20%3E%3D%208&filter-lang=cql-text" in told
+
+
+# --- OWSLib ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def owslib(server: LiveServer, road: str, monkeypatch: pytest.MonkeyPatch) -> Features:
+    monkeypatch.setattr("owslib.ogcapi.REQUEST_HEADERS", {"Accept": "application/json"})
+    return Features(f"{server.url}/ogc", headers={"X-API-Key": road})
+
+
+def test_owslib_finds_its_way(owslib: Features) -> None:
+    assert owslib.feature_collections() == ["markers", "retired_markers", "marker_lines"]
+    assert owslib.api()["openapi"] == "3.0.3"
+    assert any(uri.endswith("/conf/cql2-text") for uri in owslib.conformance()["conformsTo"])
+    assert owslib.collection("markers")["storageCrs"].endswith("CRS84")
+    assert owslib.collection_queryables("markers")["properties"]["measure_m"]["type"] == "number"
+    assert owslib.collection_schema("markers")["properties"]["geometry"]["$ref"].endswith("Point.json")
+
+
+def test_owslib_reads_and_filters(owslib: Features) -> None:
+    everything = owslib.collection_items("markers", limit=5)
+    assert (everything["numberMatched"], everything["numberReturned"]) == (12, 5)
+    boxed = owslib.collection_items("markers", bbox=[5.05, 44, 5.45, 46])
+    assert len(boxed["features"]) == 4
+    assert len(owslib.collection_items("markers", datetime_="../0000-12-31T23:59:59Z")["features"]) == 0
+    assert len(owslib.collection_items("markers", datetime_="0000-01-01/9999-12-31")["features"]) == 12
+    assert len(owslib.collection_items("markers", filter="road = 'A1' AND measure_m > 3")["features"]) == 3
+    first = boxed["features"][0]
+    assert owslib.collection_item("markers", first["id"])["properties"] == first["properties"]
+
+
+def test_owslib_edits(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("owslib.ogcapi.REQUEST_HEADERS", {"Accept": "application/json"})
+    key = str(server.app.state.access.create_key("owslib", Scope.PLANNER, label="owslib"))
+    headers = {"X-API-Key": key, "Content-Type": "application/geo+json"}  # OWSLib would say text/xml
+    client = Features(f"{server.url}/ogc", headers=headers)
+    point = {"type": "Point", "coordinates": [12.5, 55.5]}
+    feature = {"type": "Feature", "geometry": point, "properties": {"road": "E20", "measure_m": 7.0}}
+    assert client.collection_item_create("markers", json.dumps(feature))
+    (made,) = client.collection_items("markers")["features"]
+    assert (made["geometry"], made["properties"]["road"]) == (point, "E20")
+    del feature["properties"]["measure_m"]  # type: ignore[attr-defined]
+    assert client.collection_item_update("markers", made["id"], json.dumps(feature))
+    (replaced,) = client.collection_items("markers")["features"]
+    assert (replaced["id"], replaced["properties"]["measure_m"]) == (made["id"], None)
+    assert client.collection_item_delete("markers", made["id"])
+    assert client.collection_items("markers")["features"] == []
