@@ -1,4 +1,4 @@
-"""``python -m benchmarks.readme FILE``: put the tables that the benchmarks printed into the README.
+"""``python -m benchmarks.readme FILE``: put what the benchmarks printed into the README and docs/benchmarks.md.
 
 A section ``### NAME`` of the file replaces what stands between ``<!-- bench:NAME -->`` and ``<!-- /bench -->``; blocks
 without a section stay as they are.
@@ -10,7 +10,8 @@ import argparse
 import re
 from pathlib import Path
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md")
 _BLOCK = re.compile(r"(<!-- bench:(?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
 
 
@@ -20,14 +21,14 @@ def read_sections(text: str) -> dict[str, str]:
     return {name: _without_lists(body) for name, body in zip(parts[1::2], parts[2::2], strict=True)}
 
 
-def fill_blocks(readme: str, sections: dict[str, str]) -> str:
-    """The README with its blocks filled."""
+def fill_blocks(page: str, sections: dict[str, str]) -> str:
+    """A page with its blocks filled."""
 
     def fill(block: re.Match[str]) -> str:
         body = sections.get(block["name"])
         return block[0] if body is None else f"{block[1]}\n{body}\n\n{block[4]}"
 
-    return _BLOCK.sub(fill, readme)
+    return _BLOCK.sub(fill, page)
 
 
 def _without_lists(body: str) -> str:
@@ -36,17 +37,17 @@ def _without_lists(body: str) -> str:
 
 
 def main() -> None:
-    """Fill the README."""
+    """Fill the pages."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.readme", description=__doc__)
     parser.add_argument("file", type=Path, nargs="+", help="output of the benchmarks")
     sections: dict[str, str] = {}
     for path in parser.parse_args().file:
         sections |= read_sections(path.read_text())
-    text = README.read_text()
-    filled = fill_blocks(text, sections)
-    README.write_text(filled)
-    wanted = [block["name"] for block in _BLOCK.finditer(text)]
-    print(f"filled: {', '.join(name for name in wanted if name in sections) or 'nothing'}")
+    for page in PAGES:
+        text = page.read_text()
+        page.write_text(fill_blocks(text, sections))
+        filled = [block["name"] for block in _BLOCK.finditer(text) if block["name"] in sections]
+        print(f"{page.name}: {', '.join(filled) or 'nothing'}")
 
 
 if __name__ == "__main__":
