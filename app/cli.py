@@ -275,11 +275,13 @@ def mqtt(
 @contextmanager
 def _owned_database(settings: Settings) -> Iterator[Database]:
     from app.registry.database import Database
+    from app.registry.tenancy import across_agencies
 
     database = Database(settings.resolved_database_url)
     database.open()
     try:
-        yield database
+        with across_agencies():
+            yield database
     finally:
         database.close()
 
@@ -288,6 +290,7 @@ def _owned_database(settings: Settings) -> Iterator[Database]:
 def _database_beside_a_server(settings: Settings) -> Iterator[Database]:
     """The database for reading only, whoever owns it."""
     from app.registry.database import Database, head_revision
+    from app.registry.tenancy import across_agencies
 
     database = Database(settings.resolved_database_url)
     if database.path is not None and not database.path.exists():
@@ -295,7 +298,8 @@ def _database_beside_a_server(settings: Settings) -> Iterator[Database]:
     try:
         if database.current_revision() != head_revision():
             raise InvalidParameter(f"{database.name} has an older schema", cure="run waymark migrate")
-        yield database
+        with across_agencies():
+            yield database
     finally:
         database.close()
 

@@ -15,6 +15,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from app.main import create_app
+from app.registry.tenancy import across_agencies
 from app.services.access import Scope
 from app.settings import Settings
 from tests.databases import PostgresServer, postgres_server
@@ -64,6 +65,13 @@ def postgres() -> Iterator[PostgresServer]:
     """A PostgreSQL server to make databases on."""
     with postgres_server() as server:
         yield server
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _operator() -> Iterator[None]:
+    """Tests that open a database themselves see the rows of all agencies; servers run in threads, which do not."""
+    with across_agencies():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,14 @@ import sqlalchemy as sa
 
 from app.registry.database import Database
 
+LEAKPROOF = "ALTER FUNCTION geometry_overlaps(geometry, geometry) LEAKPROOF"
 LOCAL_SERVER = "postgresql+psycopg://postgres@127.0.0.1:5432/postgres"
 
 
 class PostgresServer:
     """A server and the databases that were made on it.
+
+    Schemas belong to a role that is no superuser, so that the policies on rows bind every test.
 
     Making and dropping a database writes the whole server to its disk. So a run makes one (each worker of pytest-xdist
     its own), and every module and every test that wants an empty one gets an empty schema in it.
@@ -29,6 +32,7 @@ class PostgresServer:
         self._prefix = f"waymark_test_{secrets.token_hex(4)}"
         self._made: list[str] = []
         self._shared: sa.URL | None = None
+        self._password = secrets.token_hex(16)
         self._schemas = itertools.count(1)
 
     def empty(self) -> str:
@@ -37,10 +41,13 @@ class PostgresServer:
             self._shared = sa.make_url(self.create())
             with _connected(self._shared) as connection:
                 connection.exec_driver_sql("CREATE EXTENSION postgis")
+                connection.exec_driver_sql(LEAKPROOF)
+                connection.exec_driver_sql(f"CREATE ROLE {self._prefix} LOGIN PASSWORD '{self._password}'")
         schema = f"test_{next(self._schemas)}"
         with _connected(self._shared) as connection:
-            connection.exec_driver_sql(f"CREATE SCHEMA {schema}")
+            connection.exec_driver_sql(f"CREATE SCHEMA {schema} AUTHORIZATION {self._prefix}")
         url = self._shared.update_query_dict({"options": f"-c search_path={schema},public"})
+        url = url.set(username=self._prefix, password=self._password)
         return url.render_as_string(hide_password=False)
 
     def create(self) -> str:
@@ -56,6 +63,7 @@ class PostgresServer:
         with _connected(self.url) as connection:
             while self._made:
                 connection.exec_driver_sql(f"DROP DATABASE {self._made.pop()} WITH (FORCE)")
+            connection.exec_driver_sql(f"DROP ROLE IF EXISTS {self._prefix}")
 
 
 @contextmanager
@@ -95,7 +103,8 @@ def query_plan(database: Database, ask: Callable[[sa.Connection], object]) -> st
     statements: list[tuple[str, Any]] = []
 
     def keep(_c: object, _cursor: object, statement: str, parameters: Any, *_: object) -> None:
-        statements.append((statement, parameters))
+        if "set_config" not in statement:
+            statements.append((statement, parameters))
 
     with database.read() as connection:
         sa.event.listen(connection, "before_cursor_execute", keep)

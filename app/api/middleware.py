@@ -19,6 +19,7 @@ from app.api.permissions import Permissions
 from app.api.problems import BodyRefused, problem_from, unexpected
 from app.api.rate_limits import RateLimit, address_of
 from app.errors import MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
+from app.registry.tenancy import acting_for
 from app.services.access import Caller
 
 PROTECTED = ("/v1", "/ogc")
@@ -151,7 +152,8 @@ class Guarded:
             response.headers["Connection"] = "close"
             await response(scope, receive, send)
             return
-        await self._app(scope, _limited(receive, limit, self._body_timeout_s), send)
+        with acting_for(scope.get("state", {}).get("agency_id", "")):
+            await self._app(scope, _limited(receive, limit, self._body_timeout_s), send)
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
         key = _key_in(headers)

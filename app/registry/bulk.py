@@ -14,6 +14,7 @@ from app.registry.bulk_load import large_load, load_rows
 from app.registry.markers import PUBLIC, MarkerFilter, Row, conditions_of
 from app.registry.spatial import Box, box_around, within_box
 from app.registry.tables import marker_versions, markers
+from app.registry.tenancy import seeing_every_agency
 
 _CHUNK = 500
 _INSERT = 2000
@@ -52,12 +53,15 @@ def list_by_digits(connection: sa.Connection, family: str, digits: Sequence[str]
         markers.c.lon_deg, markers.c.lat_deg, markers.c.digits_match_position,
     )  # fmt: skip
     known = sa.select(sa.literal(1)).where(markers.c.family == family).limit(1)
-    wanted = sorted(set(digits)) if digits and connection.execute(known).first() is not None else []
+    with seeing_every_agency(connection):
+        wanted = sorted(set(digits)) if digits and connection.execute(known).first() is not None else []
     for start in range(0, len(wanted), _CHUNK):
         query = sa.select(*columns).where(
             markers.c.digits.in_(wanted[start : start + _CHUNK]), markers.c.family == family
         )
-        yield from connection.execute(query).mappings()
+        with seeing_every_agency(connection):
+            found = connection.execute(query).mappings().all()
+        yield from found
 
 
 def add_markers(

@@ -30,6 +30,7 @@ from app.registry.engines import (
     postgres_engine,
     sqlite_engine,
 )
+from app.registry.tenancy import SETTING, across_agencies, set_whose, whose_rows
 
 Answer = TypeVar("Answer")
 MIGRATIONS = Path(__file__).resolve().parents[2] / "migrations"
@@ -129,13 +130,19 @@ class Database:
                 return question(connection)
         with busy_is_unavailable():
             try:
-                with self._asking.connect() as connection:
-                    return question(connection)
+                return self._ask(question)
             except sa.exc.OperationalError as error:
                 if not error.connection_invalidated:
                     raise
-            with self._asking.connect() as connection:
-                return question(connection)
+            return self._ask(question)
+
+    def _ask(self, question: Callable[[sa.Connection], Answer]) -> Answer:
+        with self._asking.connect() as connection:
+            whose = whose_rows()
+            if connection.info.get(SETTING) != whose:  # of the session: each statement is a transaction of its own
+                set_whose(connection, whose, local=False)
+                connection.info[SETTING] = whose
+            return question(connection)
 
     @contextmanager
     def write(self, *, long: bool = False) -> Iterator[sa.Connection]:
@@ -159,7 +166,7 @@ class Database:
 
     def migrate(self, revision: str = "head") -> None:
         """Bring the schema to a revision, up or down, in one transaction."""
-        with self.write(long=True) as connection:
+        with across_agencies(), self.write(long=True) as connection:
             config = alembic_config()
             config.attributes["connection"] = connection
             now = MigrationContext.configure(connection).get_current_revision()

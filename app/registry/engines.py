@@ -13,6 +13,7 @@ from sqlalchemy import event
 
 from app.errors import Unavailable
 from app.registry.spatial import register_functions
+from app.registry.tenancy import set_whose, whose_rows
 
 BUSY_TIMEOUT_S = 10.0
 STATEMENT_TIMEOUT_S = 60.0
@@ -113,9 +114,9 @@ def postgres_engine(url: sa.URL) -> sa.Engine:
         if options.get(LONG, False):
             connection.exec_driver_sql("SET LOCAL statement_timeout = 0")
             connection.exec_driver_sql("SET LOCAL lock_timeout = 0")
-        if not options.get(WRITE, False):
-            return
-        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_ONE_WRITER})")
+        if options.get(WRITE, False):
+            connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_ONE_WRITER})")
+        set_whose(connection, whose_rows())
 
     return engine
 

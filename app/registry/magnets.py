@@ -9,6 +9,7 @@ import sqlalchemy as sa
 
 from app.registry.spatial import Box, within_box
 from app.registry.tables import magnets, markers
+from app.registry.tenancy import seeing_every_agency
 
 Row = sa.RowMapping
 
@@ -32,4 +33,5 @@ def list_magnets_in(connection: sa.Connection, box: Box, *, ignoring: str | None
     )
     if ignoring is not None:
         query = query.where(magnets.c.marker_id != ignoring)
-    return list(connection.execute(query).mappings())
+    with seeing_every_agency(connection):
+        return list(connection.execute(query).mappings())

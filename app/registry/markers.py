@@ -22,6 +22,7 @@ from app.registry.spatial import (
     within_radius,
 )
 from app.registry.tables import marker_versions, markers
+from app.registry.tenancy import seeing_every_agency
 
 Row = sa.RowMapping
 PUBLIC = [column for column in markers.c if column.name not in ("row", "agency_id")]
@@ -167,7 +168,8 @@ def find_code_near(
     )
     if ignoring is not None:
         query = query.where(markers.c.id != ignoring)
-    return connection.execute(query.limit(1)).mappings().one_or_none()
+    with seeing_every_agency(connection):
+        return connection.execute(query.limit(1)).mappings().one_or_none()
 
 
 def find_id_code(connection: sa.Connection, digits: str, n: int) -> Row | None:
@@ -175,7 +177,8 @@ def find_id_code(connection: sa.Connection, digits: str, n: int) -> Row | None:
     query = sa.select(markers.c.id, markers.c.agency_id).where(
         markers.c.digits == digits, markers.c.n == n, markers.c.scheme == "id"
     )
-    return connection.execute(query).mappings().one_or_none()
+    with seeing_every_agency(connection):
+        return connection.execute(query).mappings().one_or_none()
 
 
 def add_marker(

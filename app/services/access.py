@@ -13,6 +13,7 @@ import sqlalchemy as sa
 from app.errors import InvalidParameter, NotAllowed, NotAuthenticated, Unavailable
 from app.registry import agencies
 from app.registry.database import Database
+from app.registry.tenancy import across_agencies
 from app.services.key_text import check_key, new_key, shown_part
 from app.services.ports import Clock
 
@@ -129,7 +130,7 @@ class Access:
         """
         check_key(key)
         now, writes = self._clock(), self._database.writes
-        with self._database.read() as connection:
+        with across_agencies(), self._database.read() as connection:
             row = agencies.find_key(connection, key)
         if row is None or row["revoked_at"] is not None or (row["expires_at"] is not None and row["expires_at"] <= now):
             self._remembered.pop(key, None)
@@ -156,7 +157,7 @@ class Access:
         if not uses:
             return
         try:
-            with self._database.write() as connection:
+            with across_agencies(), self._database.write() as connection:
                 agencies.write_uses(connection, uses)
         except (Unavailable, sa.exc.SQLAlchemyError):
             self._uses = {**uses, **self._uses}  # next time
@@ -172,7 +173,7 @@ class Access:
         now = self._clock()
         if admin_key is not None:
             _check_given_key(admin_key)
-        with self._database.write() as connection:
+        with across_agencies(), self._database.write() as connection:
             first = agencies.find_first_agency(connection)
             agency_id = first or agencies.add_agency(connection, FIRST_AGENCY, now)
             if admin_key is not None:
@@ -195,7 +196,7 @@ class Access:
             raise InvalidParameter("an agency's name has 1 to 200 characters", field="agency", limit="1 to 200")
         now = self._clock()
         key = new_key()
-        with self._database.write() as connection:
+        with across_agencies(), self._database.write() as connection:
             agency_id = agencies.find_agency(connection, agency) or agencies.add_agency(connection, agency, now)
             add_key(connection, key, agency_id=agency_id, scope=scope, label=label, now=now, expires_at=expires_at)
         return key

@@ -13,6 +13,7 @@ from app.errors import Unavailable, UnreadableUpload, WaymarkError
 from app.registry import decodes as store
 from app.registry.database import Database
 from app.registry.decodes import Row
+from app.registry.tenancy import across_agencies, acting_for
 from app.services.agency_secrets import AgencySecrets
 from app.services.decode_context import DecodeContext, context_from_document
 from app.services.decode_documents import ReadFrame, error_document, result_document
@@ -79,10 +80,13 @@ class DecodeJobs:
         Unavailable
             The decoder processes or the stores do not answer; the job stays unfinished and can be run again.
         """
-        with self._database.write() as connection:
+        with across_agencies(), self._database.write() as connection:
             row = store.start_decode(connection, decode_id)
-        if row is None:
-            return
+        if row is not None:
+            with acting_for(row["agency_id"]):
+                self._run(row)
+
+    def _run(self, row: Row) -> None:
         if row["attempts"] > self._rules.max_attempts:
             self._fail(row, _given_up(self._rules.max_attempts))
             return
@@ -101,7 +105,7 @@ class DecodeJobs:
         except WaymarkError as error:
             self._fail(row, error)
         except Exception:  # noqa: BLE001 - a defect must not leave a job that runs for ever
-            _LOG.exception("a decode job failed on a defect", decode_id=decode_id)
+            _LOG.exception("a decode job failed on a defect", decode_id=row["id"])
             self._fail(row, WaymarkError("the job failed on a defect of the server; its log has the details"))
         else:
             result = result_document(frames, codebook_plates=codebook_plates)
@@ -109,7 +113,7 @@ class DecodeJobs:
 
     def list_unfinished(self) -> list[str]:
         """Jobs that an earlier process left; main submits them again."""
-        with self._database.read() as connection:
+        with across_agencies(), self._database.read() as connection:
             return store.list_unfinished(connection)
 
     def _run_trace(self, row: Row) -> None:

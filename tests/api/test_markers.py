@@ -389,4 +389,5 @@ def test_a_read_key_reads_only(server: LiveServer, place: Place) -> None:
     with server.agency("readers", Scope.VIEWER) as reader:
         assert reader.get("/v1/markers").status_code == 200
         problem = _refused(reader.post("/v1/markers", json={"position": place()}), 403, "not-allowed")
-        assert "write" in problem["detail"]
+        assert "viewer" in problem["detail"]
+        assert "planner" in problem["limit"]

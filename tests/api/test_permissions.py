@@ -18,7 +18,7 @@ from starlette.routing import Mount
 
 from app.api.permissions import EVERYBODY, PERMISSIONS, PUBLIC, Permissions
 from app.main import create_app
-from app.registry.tables import api_keys
+from app.registry.tables import api_keys, calibrations
 from app.services.access import Scope
 from app.settings import Settings
 from tests.api.test_cerpm_markers import cerpm
@@ -30,8 +30,9 @@ from tests.uploads.pictures import corner_frame, png
 NOBODY_ID = "019cb624-0000-7000-8000-00000000ffff"
 UPLOAD = "POST /v1/decodes"
 # what a parameter of a path may be where it names no row
-FORMS = {"artwork": "svg", "layout": "csv", "payload": "json"}
+FORMS = {"artwork": "svg", "board": "svg", "layout": "csv", "payload": "json"}
 VALUES = {
+    "version": ("1",),
     "kind": ("geojson",),
     "suffix": ("png",),
     "collection": ("markers",),
@@ -238,11 +239,17 @@ def things(server: LiveServer) -> dict[str, list[str]]:
         book = _made(owner.post("/v1/codebooks", json={"name": "b", "design": DESIGN, "meanings": MEANINGS}))
         decode = _made(owner.post("/v1/decodes", content=png(corner_frame()), headers={"Content-Type": "image/png"}))
         vehicle = _made(owner.post("/v1/vehicles", json={"name": "v", "profile": {}}))["id"]
-    key_id = server.app.state.access.authenticate(owner.headers["authorization"].split()[1]).key_id
+    access = server.app.state.access
+    caller = access.authenticate(owner.headers["authorization"].split()[1])
+    calibration = {"id": "019cb624-0000-7000-8000-00000000cccc", "who": "w", "result": {}}
+    with access._database.write() as connection:  # from photos it takes long
+        row = {**calibration, "agency_id": caller.agency_id, "created_at": datetime.now(UTC)}
+        connection.execute(sa.insert(calibrations).values(row))
     return {
+        "calibration_id": [calibration["id"]],
         "road_id": [road],
         "vehicle_id": [vehicle],
-        "key_id": [key_id],
+        "key_id": [caller.key_id],
         "marker_id": [plate, magnets, radio],
         "feature": [plate],
         "codebook_id": [book["id"]],
