@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from app.sensors.calibration_board import CalibrationBoard
 from tests.fleet.board_photos import BOARD, Pose, TrueCamera, good_photos, photo, poses, true_corners_px
 
 CAMERA = TrueCamera()
+ROOT = Path(__file__).resolve().parents[2]
 Grey = npt.NDArray[np.uint8]
 
 
@@ -113,6 +115,8 @@ def test_traps_are_left_out_by_name() -> None:
     assert _fault(grey[::-1].copy()) is ViewFault.MIRRORED
     assert _fault(cv2.rotate(grey, cv2.ROTATE_180)) is None
     assert _fault(np.full((480, 640), 90, np.uint8)) is ViewFault.NO_BOARD
+    road = cv2.imread(str(ROOT / "docs/images/frame.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert _fault(np.asarray(road, np.uint8)) is ViewFault.NO_BOARD
     assert _fault(np.random.default_rng(1).integers(0, 255, (480, 640), dtype=np.uint8)) is ViewFault.NO_BOARD
     for size in ((1, 1), (2, 3000), (1, 60_000)):
         assert _fault(np.zeros(size, np.uint8)) is ViewFault.NO_BOARD

@@ -24,6 +24,8 @@ BLURRED_PX, BLURRED_SHARE = 8.0, 0.25
 _SEARCH_PX = 2400
 """Markers are searched for in a photo that is at most this long; corners are refined in the whole one. [px]"""
 _LEAST_PX = 64
+_NOTHING_SHARP_PX = 10.0
+"""Width of the sharpest edges above which a photo without a marker is called blurred; road photos have 4 to 8. [px]"""
 _OTHER_DICTIONARIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
 
 
@@ -127,7 +129,7 @@ def _why_nothing(small: Grey, board: CalibrationBoard) -> tuple[ViewFault, str]:
     flipped = detector.detectBoard(np.ascontiguousarray(small[:, ::-1]))[3]
     if flipped is not None and len(flipped) >= 4:
         return ViewFault.MIRRORED, "the board is mirrored: its markers only read in a mirror"
-    if (width_px := _steepest_px(small)) > BLURRED_PX:
+    if (width_px := _steepest_px(small)) > _NOTHING_SHARP_PX:
         return ViewFault.BLURRED, f"no marker was found, and the sharpest edges are {width_px:.0f} px wide"
     for name in _OTHER_DICTIONARIES:
         other = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)))
@@ -146,7 +148,7 @@ def _steepest_px(grey: Grey) -> float:
     across = cv2.Sobel(half, cv2.CV_32F, 1, 0, scale=1 / 8)
     down = cv2.Sobel(half, cv2.CV_32F, 0, 1, scale=1 / 8)
     turned = ((1.0, 0.0), (0.7071, 0.7071), (0.0, 1.0), (-0.7071, 0.7071))
-    slopes = [float(np.percentile(np.abs(x * across + y * down), 99.9)) for x, y in turned]
+    slopes = [float(np.percentile(np.abs(x * across + y * down), 99.99)) for x, y in turned]
     return 2 * float(high - low) / max(min(slopes), 1e-3)
 
 
