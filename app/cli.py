@@ -15,6 +15,7 @@ from app.settings import Settings
 
 if TYPE_CHECKING:
     from app.registry.database import Database
+    from app.services.access import Caller
 
 cli = typer.Typer(name="waymark", no_args_is_help=True, add_completion=False, pretty_exceptions_show_locals=False)
 
@@ -87,6 +88,71 @@ def key(
         database.migrate()
         expires_at = utc_now() + timedelta(days=days) if days else None
         typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label, expires_at))
+
+
+@cli.command("import")
+def import_survey(
+    survey: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="CSV, GeoJSON, GeoPackage, ...")],
+    agency: Annotated[str, typer.Option(help="Name of the agency whose markers these are.")],
+    declared: Annotated[str, typer.Option(help="What is declared of it, JSON; see docs/imports.md.")] = "{}",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Report only; nothing is stored.")] = False,
+    map_file: Annotated[Path | None, typer.Option("--map", help="SVG of the residuals of a comparison.")] = None,
+) -> None:
+    """Import a survey of any size; prints the report, and ends with 1 if it is refused.
+
+    A server on a SQLite file must not be running.
+    """
+    import orjson
+
+    from app.api.schemas_imports import DeclarationIn
+    from app.jobs.survey_child import SurveysHere
+    from app.main import marker_rules, utc_now
+    from app.services.imports import Imports
+
+    try:
+        declaration = DeclarationIn.model_validate_json(declared)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InvalidParameter(f"--declared {place}: {first['msg']}", cure="see docs/imports.md") from error
+    given = declaration.model_copy(update={"dry_run": dry_run or declaration.dry_run}).given(survey.read_bytes())
+    settings = _settings()
+    with _owned_database(settings) as database:
+        database.migrate()
+        caller = _operator(database, agency)
+        report, _ = Imports(database, utc_now, SurveysHere(), marker_rules(settings)).run(caller, given)
+    if map_file is not None and report["comparison"] is not None:
+        map_file.write_text(report["comparison"].pop("map_svg") or "")
+    typer.echo(orjson.dumps(report, option=orjson.OPT_INDENT_2))
+    if report["outcome"] == "refused":
+        raise typer.Exit(1)
+
+
+@cli.command()
+def export(
+    out: Annotated[Path, typer.Argument(dir_okay=False, help="File to write; it must not be there.")],
+    agency: Annotated[str, typer.Option(help="Name of the agency whose markers are wanted.")],
+    kind: Annotated[str, typer.Option("--format", help="csv, geojson, gpkg, shapefile, kml, landxml or dxf.")] = "gpkg",
+    bbox: Annotated[str | None, typer.Option(help="west,south,east,north. [deg]")] = None,
+    status: Annotated[str | None, typer.Option(help="Only markers with this status.")] = None,
+    family: Annotated[str | None, typer.Option(help="Only plates, magnets or cerpms: plate, magnet or cerpm.")] = None,
+) -> None:
+    """Write an agency's markers to a file. A server on a SQLite file must not be running."""
+    from tempfile import TemporaryDirectory
+
+    from app.api.searches import parse_box
+    from app.registry.markers import MarkerFilter
+    from app.services.exports import KINDS, Exports
+
+    if kind not in KINDS:
+        raise InvalidParameter(f"there is no format {kind[:40]!r}", limit=", ".join(KINDS))
+    if out.exists():
+        raise InvalidParameter(f"{out} is there already", cure="remove it, or choose another name")
+    narrowed = MarkerFilter(box=parse_box(bbox) if bbox else None, status=status, family=family)
+    with _owned_database(_settings()) as database, TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder:
+        database.migrate()
+        Exports(database).write_file(_operator(database, agency), kind, narrowed, Path(folder)).rename(out)
+    typer.echo(out)
 
 
 audit = typer.Typer(no_args_is_help=True, help="The log of what changed the registry.")
@@ -302,6 +368,18 @@ def _database_beside_a_server(settings: Settings) -> Iterator[Database]:
             yield database
     finally:
         database.close()
+
+
+def _operator(database: Database, agency: str) -> Caller:
+    """Whoever may use the command line of the server, on behalf of an agency."""
+    from app.registry.agencies import find_agency
+    from app.services.access import Caller, Scope
+
+    with database.read() as connection:
+        agency_id = find_agency(connection, agency)
+    if agency_id is None:
+        raise InvalidParameter(f"there is no agency {agency[:80]!r}", cure="waymark key makes one")
+    return Caller(agency_id, "command-line", "command line", Scope.ADMIN)
 
 
 def _settings(**given: object) -> Settings:

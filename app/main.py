@@ -140,8 +140,8 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
             database.close()
 
     app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
-    app.state.markers = Markers(database, utc_now, _marker_rules(settings))
-    app.state.imports = Imports(database, utc_now, pool, _marker_rules(settings))
+    app.state.markers = Markers(database, utc_now, marker_rules(settings))
+    app.state.imports = Imports(database, utc_now, pool, marker_rules(settings))
     app.state.exports = Exports(database)
     app.state.snapshots = Snapshots(
         database, utc_now, lru_cache(lambda: load_signing_key(settings.resolved_signing_key_file))
@@ -241,7 +241,7 @@ def _failure_limit(settings: Settings) -> RateLimit | None:
     )
 
 
-def _marker_rules(settings: Settings) -> MarkerRules:
+def marker_rules(settings: Settings) -> MarkerRules:
     return MarkerRules(
         explicit_code_radius_m=settings.explicit_code_radius_m,
         position_code_radius_m=settings.position_code_radius_m,

@@ -143,3 +143,53 @@ def test_a_calibration_board(waymark: Run, tmp_path: Path) -> None:
         status, _, error = waymark("board", "--out", str(tmp_path), *arguments)
         assert status == 1
         assert told in error
+
+
+SURVEY = "number,lon,lat\n" + "".join(f"{k},{8.4 + k * 1e-4:.7f},49.0000{k % 3}1\n" for k in range(1, 9))
+DECLARED = '{"crs": "EPSG:4326", "family": "cerpm", "columns": {"code": "number"}}'
+
+
+def test_a_survey_goes_in_and_markers_come_out(waymark: Run, tmp_path: Path) -> None:
+    survey, out = tmp_path / "survey.csv", tmp_path / "markers.geojson"
+    survey.write_text(SURVEY)
+    waymark("key", "Roads")
+    arguments = ("import", str(survey), "--agency", "Roads", "--declared", DECLARED)
+    status, printed, _ = waymark(*arguments, "--dry-run")
+    assert (status, orjson.loads(printed)["outcome"], orjson.loads(printed)["stored"]) == (0, "checked", 0)
+    status, printed, _ = waymark(*arguments)
+    assert (status, orjson.loads(printed)["stored"]) == (0, 8)
+    status, printed, _ = waymark(*arguments)
+    assert (status, orjson.loads(printed)["counts"]["code_taken"]) == (1, 8)
+    status, printed, _ = waymark("export", str(out), "--agency", "Roads", "--format", "geojson")
+    assert (status, printed.strip()) == (0, str(out))
+    assert len(orjson.loads(out.read_bytes())["features"]) == 8
+    assert not list(tmp_path.glob(".waymark-*"))
+    compare = '{"crs": "EPSG:4326", "family": "cerpm", "columns": {"code": "number"}, "compare": true}'
+    drawn = tmp_path / "residuals.svg"
+    status, printed, _ = waymark(*arguments[:-1], compare, "--dry-run", "--map", str(drawn))
+    assert (status, orjson.loads(printed)["comparison"]["matched"]) == (0, 8)
+    assert drawn.read_text().startswith("<svg")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("import", "SURVEY", "--agency", "Nobody", "--declared", DECLARED), "there is no agency 'Nobody'"),
+        (("import", "SURVEY", "--agency", "Roads", "--declared", '{"family": "dragon"}'), "--declared family"),
+        (("import", "SURVEY", "--agency", "Roads", "--declared", "{"), "--declared"),
+        (("export", "OUT", "--agency", "Roads", "--format", "exe"), "there is no format 'exe'"),
+        (("export", "SURVEY", "--agency", "Roads"), "is there already"),
+        (("export", "OUT", "--agency", "Roads", "--bbox", "1,2"), "bbox"),
+        (("export", "OUT", "--agency", "Roads", "--format", "gpkg"), "no marker is in the selection"),
+    ],
+)
+def test_imports_and_exports_that_cannot_be(
+    waymark: Run, tmp_path: Path, arguments: tuple[str, ...], what: str
+) -> None:
+    (tmp_path / "survey.csv").write_text(SURVEY)
+    waymark("key", "Roads")
+    places = {"SURVEY": str(tmp_path / "survey.csv"), "OUT": str(tmp_path / "out.gpkg")}
+    status, _, said = waymark(*(places.get(argument, argument) for argument in arguments))
+    assert status == 1
+    assert what in said
+    assert not (tmp_path / "out.gpkg").exists()
