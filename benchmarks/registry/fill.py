@@ -17,6 +17,7 @@ import sqlalchemy as sa
 from scipy.spatial import cKDTree
 
 from app.markers.plate import PlateCode
+from app.registry.bulk_load import large_load, load_rows
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.tables import markers
@@ -90,24 +91,10 @@ def fill(database: Database, network: Network) -> str:
     key = access.create_key("roads", Scope.ADMIN, label="benchmark")
     caller = access.authenticate(key)
     templates = _register_templates(database, caller)
-    for chunk in _chunks(templates, network, datetime.now(UTC) + timedelta(minutes=1)):
-        with database.write(long=True) as connection:
-            _store(connection, chunk)
+    with database.write(long=True) as connection, large_load(connection, (markers,), len(network.lon_deg)):
+        for chunk in _chunks(templates, network, datetime.now(UTC) + timedelta(minutes=1)):
+            load_rows(connection, markers, chunk)
     return key
-
-
-def _store(connection: sa.Connection, rows: list[dict[str, Any]]) -> None:
-    if connection.dialect.name == "sqlite":
-        connection.execute(sa.insert(markers), rows)
-        return
-    processors = [
-        (c.name, c.type.dialect_impl(connection.dialect).bind_processor(connection.dialect)) for c in _COLUMNS
-    ]
-    names = ", ".join(c.name for c in _COLUMNS)
-    raw = connection.connection.cursor()
-    with raw.copy(f"COPY markers ({names}) FROM STDIN") as copy:  # type: ignore[attr-defined]
-        for row in rows:
-            copy.write_row([row[name] if process is None else process(row[name]) for name, process in processors])
 
 
 def _register_templates(database: Database, caller: Caller) -> dict[str, dict[str, Any]]:

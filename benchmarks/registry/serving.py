@@ -80,7 +80,9 @@ def measure_boxes(registry: Registry, peer_folder: Path, seconds: float) -> bool
         timings = _take_turns(asked, seconds)
     rows = len(registry.network.lon_deg)
     print(f"### registry-boxes\n\n{rows:,} markers; pages of {PAGE} of {BOX_FEATURES} in a box; 16 connections.\n")
-    return _print(timings, lambda name: GOALS[name.partition(", ")[2]])
+    met = _print(timings, lambda name: GOALS[name.partition(", ")[2]])
+    print()
+    return met
 
 
 def measure_tiles(registry: Registry, peer_folder: Path, seconds: float) -> bool:
@@ -104,6 +106,7 @@ def measure_tiles(registry: Registry, peer_folder: Path, seconds: float) -> bool
                 print("### registry-tiles\n")
             met &= _print(timings, lambda _: GOALS["tiles"], heading=heading)
             heading = False
+    print()
     return met
 
 
