@@ -50,6 +50,16 @@ log = sa.table(
     *(sa.column(name, sa.String) for name in ("who", "action", "digest", "previous_hash", "hash")),
     sa.column("versions", sa.BigInteger),
 )
+UPDATE_ONE = sa.text(
+    "UPDATE marker_versions SET kind = :kind, audit_number = 1, sha256 = :sha256"
+    " WHERE marker_id = :marker AND version = :version"
+)
+UPDATE_MANY = sa.text(
+    """UPDATE marker_versions v SET kind = n.kind, audit_number = 1, sha256 = n.sha256
+       FROM unnest(CAST(:markers AS varchar[]), CAST(:versions AS integer[]), CAST(:kinds AS varchar[]),
+                   CAST(:sha256s AS varchar[])) AS n(marker_id, version, kind, sha256)
+       WHERE v.marker_id = n.marker_id AND v.version = n.version"""
+)
 
 
 def upgrade() -> None:
@@ -93,11 +103,6 @@ def downgrade() -> None:
 
 def _hash_history(connection: sa.Connection) -> None:
     """Hash every version, agency by agency, in the order of the markers' ids and the versions' numbers."""
-    statement = (
-        sa.update(versions)
-        .where(versions.c.marker_id == sa.bindparam("of_marker"), versions.c.version == sa.bindparam("of_version"))
-        .values({name: sa.bindparam(f"new_{name}") for name, _ in NEW})
-    )
     digests: dict[str, Any] = {}
     counts: dict[str, int] = {}
     for page in _pages(connection):
@@ -106,11 +111,17 @@ def _hash_history(connection: sa.Connection) -> None:
             sha256 = _sha256(row, kind)
             digests.setdefault(row.agency_id, hashlib.sha256()).update(sha256.encode())
             counts[row.agency_id] = counts.get(row.agency_id, 0) + 1
-            new = {"new_kind": kind, "new_audit_number": 1, "new_sha256": sha256}
-            rows.append({"of_marker": row.marker_id, "of_version": row.version, **new})
-        connection.execute(statement, rows)
+            rows.append({"marker": row.marker_id, "version": row.version, "kind": kind, "sha256": sha256})
+        _keep(connection, rows)
     for agency_id, digest in digests.items():
         connection.execute(sa.insert(log).values(_first_entry(agency_id, counts[agency_id], digest.hexdigest())))
+
+
+def _keep(connection: sa.Connection, rows: list[dict[str, Any]]) -> None:
+    if connection.dialect.name == "postgresql":
+        connection.execute(UPDATE_MANY, {f"{name}s": [row[name] for row in rows] for name in rows[0]})
+    else:
+        connection.execute(UPDATE_ONE, rows)
 
 
 def _pages(connection: sa.Connection) -> Iterator[list[tuple[Any, str]]]:
