@@ -119,8 +119,8 @@ def import_survey(
     settings = _settings()
     with _owned_database(settings) as database:
         database.migrate()
-        caller = _operator(database, agency)
-        report, _ = Imports(database, utc_now, SurveysHere(), marker_rules(settings)).run(caller, given)
+        with _operator(database, agency) as caller:
+            report, _ = Imports(database, utc_now, SurveysHere(), marker_rules(settings)).run(caller, given)
     if map_file is not None and report["comparison"] is not None:
         map_file.write_text(report["comparison"].pop("map_svg") or "")
     typer.echo(orjson.dumps(report, option=orjson.OPT_INDENT_2))
@@ -151,7 +151,8 @@ def export(
     narrowed = MarkerFilter(box=parse_box(bbox) if bbox else None, status=status, family=family)
     with _owned_database(_settings()) as database, TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder:
         database.migrate()
-        Exports(database).write_file(_operator(database, agency), kind, narrowed, Path(folder)).rename(out)
+        with _operator(database, agency) as caller:
+            Exports(database).write_file(caller, kind, narrowed, Path(folder)).rename(out)
     typer.echo(out)
 
 
@@ -370,16 +371,19 @@ def _database_beside_a_server(settings: Settings) -> Iterator[Database]:
         database.close()
 
 
-def _operator(database: Database, agency: str) -> Caller:
+@contextmanager
+def _operator(database: Database, agency: str) -> Iterator[Caller]:
     """Whoever may use the command line of the server, on behalf of an agency."""
     from app.registry.agencies import find_agency
+    from app.registry.tenancy import across_agencies, acting_for
     from app.services.access import Caller, Scope
 
-    with database.read() as connection:
+    with across_agencies(), database.read() as connection:
         agency_id = find_agency(connection, agency)
     if agency_id is None:
         raise InvalidParameter(f"there is no agency {agency[:80]!r}", cure="waymark key makes one")
-    return Caller(agency_id, "command-line", "command line", Scope.ADMIN)
+    with acting_for(agency_id):
+        yield Caller(agency_id, "command-line", "command line", Scope.ADMIN)
 
 
 def _settings(**given: object) -> Settings:

@@ -18,6 +18,7 @@ import psycopg
 import sqlalchemy as sa
 
 from app.registry.rtree_pack import fill_rtree
+from app.registry.tenancy import seeing_every_agency
 
 LARGE = 50_000
 """From as many rows on the indexes are made anew, if the table does not hold more than the rows that come."""
@@ -57,8 +58,13 @@ def large_load(connection: sa.Connection, tables: Sequence[sa.Table], rows: int)
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql(f"PRAGMA cache_size = -{_CACHE_KIB}")
     put_off = _put_off_postgresql if connection.dialect.name == "postgresql" else _put_off_sqlite
-    again = [step for table in tables if _count_up_to(connection, table, rows) <= rows
-             for step in put_off(connection, table)]  # fmt: skip
+    with seeing_every_agency(connection):  # the rows of others count too
+        again = [
+            step
+            for table in tables
+            if _count_up_to(connection, table, rows) <= rows
+            for step in put_off(connection, table)
+        ]
     try:
         yield
     finally:

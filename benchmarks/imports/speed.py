@@ -183,4 +183,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from app.registry.tenancy import across_agencies
+
+    with across_agencies():
+        main()
