@@ -59,6 +59,16 @@ def list_lines(connection: sa.Connection, agency_id: str, box: Box | None = None
     return sorted(lines, key=lambda line: line.id)
 
 
+def find_line(connection: sa.Connection, agency_id: str, line_id: str) -> Line | None:
+    """The agency's line with an id. Only the road that its first marker is on is read."""
+    first = sa.select(_C.lon_deg, _C.lat_deg).where(_C.agency_id == agency_id, _C.id == line_id)
+    place = connection.execute(first).one_or_none()
+    if place is None:
+        return None
+    there = Box(place.lon_deg, place.lat_deg, place.lon_deg, place.lat_deg)
+    return next((line for line in list_lines(connection, agency_id, there) if line.id == line_id), None)
+
+
 def _magnet_lines(connection: sa.Connection, agency_id: str, box: Box | None) -> Iterator[Line]:
     query = (
         sa.select(_C.id, _C.digits, _C.road, _C.status, magnets.c.lon_deg, magnets.c.lat_deg)

@@ -14,7 +14,7 @@ from app.errors import NotFound
 from app.registry import features as store
 from app.registry.database import Database
 from app.registry.features import FIELDS, Extent, FeatureFilter, Field
-from app.registry.line_runs import LINE_FIELDS, Line, list_lines
+from app.registry.line_runs import LINE_FIELDS, Line, find_line, list_lines
 from app.registry.spatial import Box
 from app.registry.tiles import Tile, marker_tile
 from app.services.access import Caller
@@ -181,11 +181,10 @@ class Features:
             There is none with this id, or it belongs to another agency.
         """
         with self._database.read() as connection:
-            lines = list_lines(connection, caller.agency_id)
-        for line in lines:
-            if line.id == line_id:
-                return _line(line, crs)
-        raise no_feature(LINES)
+            line = find_line(connection, caller.agency_id, line_id)
+        if line is None:
+            raise no_feature(LINES)
+        return _line(line, crs)
 
     def tile(self, caller: Caller, collection: Collection, tile: Tile) -> bytes:
         """A vector tile of a collection; empty without features."""
