@@ -6,10 +6,11 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
+import structlog
 from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
@@ -53,7 +54,7 @@ from app.jobs.pool import DecodePool
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlateReading
 from app.registry.database import Database
-from app.services.access import Access
+from app.services.access import Access, Bearer
 from app.services.agency_secrets import AgencySecrets
 from app.services.artwork import Artworks
 from app.services.audit import AuditLog
@@ -72,15 +73,18 @@ from app.services.layouts import Layouts
 from app.services.marker_rules import MarkerRules
 from app.services.markers import Markers
 from app.services.observations import Observations
+from app.services.oidc import Issuer, KeySet, Tokens
 from app.services.roads import Roads
 from app.services.searches import Searches
 from app.services.snapshots import Snapshots
 from app.services.vehicles import Vehicles
 from app.settings import Settings
 from app.storage.blobs import Blobs
+from app.storage.jwks import read_jwks
 from app.storage.master_key import load_master_key
 from app.storage.signing_key import load_signing_key
 
+_LOG = structlog.get_logger("waymark")
 ROUTERS = (
     ui.router,
     system.router,
@@ -118,7 +122,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     rules = _decode_rules(settings)
     secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
     jobs = DecodeJobs(database, utc_now, blobs=blobs, decoder=pool, secrets=secrets, rules=rules)
-    access = Access(database, utc_now)
+    access = Access(database, utc_now, _token_check(settings))
     metrics = CollectorRegistry()
     readiness: dict[str, Callable[[], bool]] = {"database": database.is_ready, "decoders": pool.is_ready}
 
@@ -127,6 +131,8 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         database.open()
         try:
             database.migrate()
+            for warning in database.list_warnings():
+                _LOG.warning(warning)
             blobs.open()
             _show_once(access.ensure_first_key(_admin_key(settings)))
             if settings.warm_decoders:
@@ -215,6 +221,13 @@ def utc_now() -> datetime:
 
 def _admin_key(settings: Settings) -> str | None:
     return settings.admin_key.get_secret_value() if settings.admin_key is not None else None
+
+
+def _token_check(settings: Settings) -> Callable[[str], Bearer] | None:
+    if not settings.oidc_issuer:
+        return None
+    issuer = Issuer(settings.oidc_issuer, settings.oidc_audience, settings.oidc_agency_claim, settings.oidc_scope_claim)
+    return Tokens(issuer, KeySet(partial(read_jwks, settings.oidc_jwks))).verify
 
 
 def _request_limit(settings: Settings) -> RateLimit | None:

@@ -9,6 +9,7 @@ from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 MIN_ADMIN_KEY_CHARACTERS = 24
+_LOOPBACK = ("http://127.0.0.1:", "http://localhost:", "http://[::1]:")
 
 
 class Settings(BaseSettings):
@@ -70,6 +71,12 @@ class Settings(BaseSettings):
         default=30.0, ge=0, le=1e6, description="Wrong keys from one address; 0: no limit. [1/min]"
     )
 
+    oidc_issuer: str = Field(default="", description="OpenID Connect issuer whose tokens are taken; empty: none.")
+    oidc_audience: str = Field(default="", description="What its tokens have to be for.")
+    oidc_jwks: str = Field(default="", description="Where its public keys are: https://..., or a file.")
+    oidc_agency_claim: str = Field(default="waymark_agency", description="Claim that names the agency.")
+    oidc_scope_claim: str = Field(default="waymark_scope", description="Claim that names the scope.")
+
     log_format: Literal["console", "json"] = Field(default="console", description="How log lines are written.")
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(default="INFO", description="Least level logged.")
 
@@ -91,6 +98,14 @@ class Settings(BaseSettings):
     def _supported_database(self) -> Self:
         if self.database_url and not self.database_url.startswith(("sqlite:///", "postgresql+psycopg://")):
             raise ValueError("database_url must be sqlite:///PATH or postgresql+psycopg://USER@HOST/DATABASE")
+        return self
+
+    @model_validator(mode="after")
+    def _whole_issuer(self) -> Self:
+        if self.oidc_issuer and not (self.oidc_audience and self.oidc_jwks):
+            raise ValueError("an oidc_issuer needs an oidc_audience and oidc_jwks")
+        if self.oidc_jwks.startswith("http://") and not self.oidc_jwks.startswith(_LOOPBACK):
+            raise ValueError("oidc_jwks is fetched by https")
         return self
 
     @property

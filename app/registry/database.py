@@ -189,6 +189,24 @@ class Database:
         except (Unavailable, sa.exc.SQLAlchemyError):
             return False
 
+    def list_warnings(self) -> list[str]:
+        """What an operator should know of a PostgreSQL server: the policies on rows do not bind, or cost too much."""
+        if self.path is not None:
+            return []
+        with self.engine.connect() as connection:
+            bound = connection.exec_driver_sql(
+                "SELECT NOT (rolsuper OR rolbypassrls) FROM pg_roles WHERE rolname = current_user"
+            ).scalar_one()
+            fast = connection.exec_driver_sql(
+                "SELECT proleakproof FROM pg_proc WHERE oid = to_regprocedure('geometry_overlaps(geometry, geometry)')"
+            ).scalar()
+        if not bound:
+            return ["row level security does not bind this role; connect as one that is no superuser (docs/access.md)"]
+        if not fast:
+            statement = "ALTER FUNCTION geometry_overlaps(geometry, geometry) LEAKPROOF"
+            return [f"searches cannot use the spatial index until a superuser runs: {statement} (docs/access.md)"]
+        return []
+
     def _see_the_server(self) -> None:
         try:
             with self.engine.connect() as connection:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
@@ -88,6 +88,16 @@ class Caller:
         return self.key_id if self.scope is Scope.VEHICLE else None
 
 
+class Bearer(NamedTuple):
+    """Who a token speaks for: the agency by its name, and when the token ends."""
+
+    agency: str
+    holder_id: str
+    label: str
+    scope: Scope
+    expires_at: datetime
+
+
 class _Remembered(NamedTuple):
     """A caller, when that was known, until when it holds, and after how many writes it was read."""
 
@@ -98,11 +108,20 @@ class _Remembered(NamedTuple):
 
 
 class Access:
-    """Checks keys, and makes those that need no key to make them."""
+    """Checks keys, and makes those that need no key to make them.
 
-    def __init__(self, database: Database, clock: Clock) -> None:
+    Parameters
+    ----------
+    database : Database
+    clock : Clock
+    verify : callable, optional
+        Who a token speaks for, where an issuer's tokens are taken.
+    """
+
+    def __init__(self, database: Database, clock: Clock, verify: Callable[[str], Bearer] | None = None) -> None:
         self._database = database
         self._clock = clock
+        self._verify = verify
         self._uses: dict[str, datetime] = {}  # of keys, not written yet
         self._remembered: dict[str, _Remembered] = {}
 
@@ -121,29 +140,52 @@ class Access:
         return key in self._remembered
 
     def authenticate(self, key: str) -> Caller:
-        """The caller behind a key.
+        """The caller behind a key, or behind a token where an issuer's are taken.
 
         Raises
         ------
         NotAuthenticated
-            The key is mistyped, unknown, expired or revoked.
+            The key is mistyped, unknown, expired or revoked; the token is not valid.
+        NotAllowed
+            The token names no agency that is here, or no scope.
         """
-        check_key(key)
         now, writes = self._clock(), self._database.writes
-        with across_agencies(), self._database.read() as connection:
-            row = agencies.find_key(connection, key)
-        if row is None or row["revoked_at"] is not None or (row["expires_at"] is not None and row["expires_at"] <= now):
+        ends_at: datetime | None
+        try:
+            if self._verify is not None and is_token(key):
+                caller, ends_at = self._token_caller(self._verify(key))
+            else:
+                caller, ends_at = self._key_caller(key, now)
+        except NotAuthenticated:
             self._remembered.pop(key, None)
-            raise NotAuthenticated(
-                "the key is unknown, expired or revoked", field="Authorization", cure="ask your agency for a valid key"
-            )
-        self._uses[row["id"]] = now
-        caller = Caller(row["agency_id"], row["holder_id"], row["label"], Scope(row["scope"]))
-        until = min(now + _REMEMBERED_FOR, row["expires_at"] or now + _REMEMBERED_FOR)
+            raise
+        until = min(now + _REMEMBERED_FOR, ends_at or now + _REMEMBERED_FOR)
         if len(self._remembered) >= _MOST_REMEMBERED:
             self._remembered.clear()
         self._remembered[key] = _Remembered(caller, now, until, writes)
         return caller
+
+    def _key_caller(self, key: str, now: datetime) -> tuple[Caller, datetime | None]:
+        check_key(key)
+        with across_agencies(), self._database.read() as connection:
+            row = agencies.find_key(connection, key)
+        if row is None or row["revoked_at"] is not None or (row["expires_at"] is not None and row["expires_at"] <= now):
+            raise NotAuthenticated(
+                "the key is unknown, expired or revoked", field="Authorization", cure="ask your agency for a valid key"
+            )
+        self._uses[row["id"]] = now
+        return Caller(row["agency_id"], row["holder_id"], row["label"], Scope(row["scope"])), row["expires_at"]
+
+    def _token_caller(self, bearer: Bearer) -> tuple[Caller, datetime]:
+        with across_agencies(), self._database.read() as connection:
+            agency_id = agencies.find_agency(connection, bearer.agency)
+        if agency_id is None:
+            raise NotAllowed(
+                "the token's agency is not on this server",
+                limit="the name of an agency that has a key here",
+                cure="have the operator make a key for it: waymark key AGENCY",
+            )
+        return Caller(agency_id, bearer.holder_id, bearer.label, bearer.scope), bearer.expires_at
 
     def last_use(self, key: agencies.Row) -> datetime | None:
         """When a key was last used, as far as this process knows."""
@@ -200,6 +242,11 @@ class Access:
             agency_id = agencies.find_agency(connection, agency) or agencies.add_agency(connection, agency, now)
             add_key(connection, key, agency_id=agency_id, scope=scope, label=label, now=now, expires_at=expires_at)
         return key
+
+
+def is_token(key: str) -> bool:
+    """Whether a key has the form of a JWT: three parts, the first a JSON object in base64."""
+    return key.startswith("eyJ") and key.count(".") == 2
 
 
 def add_key(connection: sa.Connection, key: str, *, agency_id: str, scope: Scope, label: str, **more: Any) -> str:

@@ -151,3 +151,22 @@ def test_a_database_without_postgis_is_refused(postgres: PostgresServer) -> None
         database.open()
     assert "CREATE EXTENSION postgis" in str(refused.value.cure)
     database.close()
+
+
+def test_the_operator_is_told_where_the_policies_do_not_bind_or_cost_too_much(postgres: PostgresServer) -> None:
+    bound = sa.make_url(postgres.empty())
+    database = Database(bound.render_as_string(hide_password=False))
+    assert database.list_warnings() == []
+    database.close()
+    own = Database(postgres.url.set(database=bound.database).render_as_string(hide_password=False))
+    assert "does not bind" in own.list_warnings()[0]
+    change = "ALTER FUNCTION geometry_overlaps(geometry, geometry) {}LEAKPROOF"
+    try:
+        with own.write() as connection:
+            connection.exec_driver_sql(change.format("NOT "))
+        assert "ALTER FUNCTION" in database.list_warnings()[0]
+    finally:
+        with own.write() as connection:
+            connection.exec_driver_sql(change.format(""))
+        own.close()
+        database.close()
