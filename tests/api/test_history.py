@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -11,8 +12,11 @@ import httpx
 import pytest
 
 from app.registry import history
+from app.services.access import Scope
+from tests.conftest import LiveServer
 
 Place = Callable[[], dict[str, Any]]
+NOBODY = "00000000-0000-7000-8000-000000000000"
 
 
 @pytest.fixture(scope="module", params=["sqlite", "postgresql"])
@@ -173,3 +177,34 @@ def test_the_nearest_of_another_time_are_not_offered(client: httpx.Client) -> No
     asked = {"as_of": "2026-03-04T05:06:07Z", "near": "7,50", "nearest": 3}
     response = client.get("/v1/markers", params=asked)
     assert (response.status_code, response.json()["field"]) == (422, "as_of")
+
+
+WITHOUT_VERSION = {
+    "PUT /v1/vehicles/{vehicle_id}/keys/{key_id}": "links, which are there or not",
+    "DELETE /v1/vehicles/{vehicle_id}/keys/{key_id}": "links, which are there or not",
+    "DELETE /v1/keys/{key_id}": "keys only end",
+}
+
+
+def test_every_route_that_changes_something_asks_for_its_version(server: LiveServer, client: httpx.Client) -> None:
+    """428 without If-Match; a route that is new has to answer it, or say above why not."""
+    paths = client.get("/openapi.json").json()["paths"]
+    changing = {f"{method.upper()} {path}" for path, operations in paths.items() for method in operations}
+    changing = {route for route in changing if route.split()[0] in ("PATCH", "PUT", "DELETE") and "/v1/" in route}
+    assert set(WITHOUT_VERSION) <= changing
+    bodies: dict[str, Any] = {"/v1/vehicles/{vehicle_id}/calibration": {"calibration_id": NOBODY}}
+    with server.agency("changes", Scope.ADMIN) as admin:
+        for route in sorted(changing - set(WITHOUT_VERSION)):
+            method, path = route.split()
+            where = re.sub(r"{[a-z_]+}", NOBODY, path)
+            body = bodies.get(path, {"reason": "why", "status": "retired"})
+            if "roads" in path:
+                body = {"name": "A 7"}
+            response = admin.request(method, where, **({} if method == "DELETE" else {"json": body}))
+            assert response.status_code == 428, (route, response.text)
+            assert response.json()["field"] == "If-Match"
+    marker = _post(client, position={"lon_deg": -3.25, "lat_deg": 3.5})
+    path = f"/v1/markers/{marker['id']}"
+    assert client.patch(path, json={"status": "built"}, headers={"If-Match": '"2"'}).status_code == 412
+    assert client.patch(path, json={"status": "built"}, headers={"If-Match": '"1"'}).status_code == 200
+    assert client.patch(path, json={"status": "active"}, headers={"If-Match": '"1"'}).status_code == 412

@@ -138,6 +138,19 @@ def test_a_position_that_is_not_exact_gives_no_fix_for_localization(real_client:
     assert fix["notes"] == ["the plate is planned, its position is not surveyed"]
 
 
+def test_a_place_without_a_stated_bound_gives_no_fix_for_localization(real_client: httpx.Client, place: Place) -> None:
+    """Coordinates said to be NAD83 in a system of WGS 84: stored, flagged, and every fix says why."""
+    road = Road(real_client, place(), (5.0, 0.0, 0.0)).register()
+    marker = road.markers[0]
+    position = marker["position"]["original"] | {"realization": "NAD83(2011)"}
+    change = {"position": position, "heading_deg": marker["heading_deg"]}
+    answer = real_client.patch(f"/v1/markers/{marker['id']}", json=change, headers={"If-Match": '"1"'})
+    assert answer.json()["position"]["localization_grade"] == "approximate, not for localization"
+    decode = post_frame(real_client, road.frame(), road.context()).json()
+    assert decode["fix"]["localization_grade"] == "approximate, not for localization"
+    assert "NAD83(2011)" in " ".join(decode["fix"]["notes"])
+
+
 def test_a_plate_without_heading_needs_the_vehicles(real_client: httpx.Client, place: Place) -> None:
     road = Road(real_client, place(), (5.0, 0.0, 20.0)).register(heading_deg=None)
     frame = road.frame()
