@@ -27,12 +27,15 @@ class Timing:
         Time from the request to the last byte of its answer. [ms]
     size_kb : float
         Mean size of a body. [kB]
+    answered : int
+        Requests, with those of the warm-up.
     """
 
     per_s: float
     p50_ms: float
     p99_ms: float
     size_kb: float
+    answered: int
 
 
 def ask(port: int, paths: Sequence[str], *, key: str = "", seconds: float, connections: int = CONNECTIONS) -> Timing:
@@ -51,26 +54,26 @@ def ask(port: int, paths: Sequence[str], *, key: str = "", seconds: float, conne
 
 async def _ask(port: int, requests: Iterator[bytes], seconds: float, connections: int) -> Timing:
     begin = time.perf_counter() + min(1.0, seconds)
-    samples: list[tuple[float, int]] = []
-    await asyncio.gather(*(_connection(port, requests, begin, begin + seconds, samples) for _ in range(connections)))
+    samples: list[tuple[float, float, int]] = []  # when it was asked, how long that took, how much came
+    await asyncio.gather(*(_connection(port, requests, begin + seconds, samples) for _ in range(connections)))
     if not samples:
-        return Timing(0.0, math.inf, math.inf, 0.0)
-    took_ms = np.array([took for took, _ in samples]) * 1e3
-    sizes = np.array([size for _, size in samples])
-    p50, p99 = np.percentile(took_ms, (50, 99))
-    return Timing(len(samples) / seconds, float(p50), float(p99), float(sizes.mean()) / 1e3)
+        return Timing(0.0, math.inf, math.inf, 0.0, 0)
+    began, took, sizes = np.array(samples).T
+    inside = (began >= begin) & (began + took <= begin + seconds)
+    if not inside.any():
+        return Timing(0.0, math.inf, math.inf, 0.0, len(samples))
+    p50, p99 = np.percentile(took[inside] * 1e3, (50, 99))
+    return Timing(inside.sum() / seconds, float(p50), float(p99), float(sizes[inside].mean()) / 1e3, len(samples))
 
 
 async def _connection(
-    port: int, requests: Iterator[bytes], begin: float, end: float, samples: list[tuple[float, int]]
+    port: int, requests: Iterator[bytes], end: float, samples: list[tuple[float, float, int]]
 ) -> None:
     reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=2**22)
     while (began := time.perf_counter()) < end:
         writer.write(next(requests))
         size = len(await _answer(reader))
-        ended = time.perf_counter()
-        if begin <= began and ended <= end:
-            samples.append((ended - began, size))
+        samples.append((began, time.perf_counter() - began, size))
     writer.close()
 
 

@@ -9,9 +9,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import psutil
 import sqlalchemy as sa
 
 PEER = ("tipg==1.6.1", "uvicorn==0.54.0", "uvloop==0.23.0", "httptools==0.9.0")
@@ -54,6 +55,24 @@ def _connected(url: sa.URL) -> Iterator[sa.Connection]:
             yield connection
     finally:
         engine.dispose()
+
+
+def cpu_s(port: int, url: str) -> float:
+    """CPU time so far of the server on a port and of the backends of a database on this machine. [s]"""
+    processes = [child for child in psutil.Process().children() if str(port) in child.cmdline()]
+    processes += [worker for server in processes for worker in server.children(recursive=True)]
+    with _connected(sa.make_url(url)) as connection:
+        query = "SELECT pid FROM pg_stat_activity WHERE datname = current_database() AND pid <> pg_backend_pid()"
+        pids = [row[0] for row in connection.exec_driver_sql(query)]
+    for pid in pids:
+        with suppress(psutil.Error):
+            processes.append(psutil.Process(pid))
+    total = 0.0
+    for process in processes:
+        with suppress(psutil.Error):
+            times = process.cpu_times()
+            total += times.user + times.system
+    return total
 
 
 @contextmanager
