@@ -121,6 +121,7 @@ def test_traps_are_left_out_by_name() -> None:
     for size in ((1, 1), (2, 3000), (1, 60_000)):
         assert _fault(np.zeros(size, np.uint8)) is ViewFault.NO_BOARD
     assert _fault(photo(CAMERA, pose, blur_px=4.0)) is ViewFault.BLURRED
+    assert _fault(np.asarray(cv2.resize(grey, (4000, 3000), interpolation=cv2.INTER_CUBIC), np.uint8)) is None
     moving = np.zeros((1, 15), np.float32)
     moving[:] = 1 / 15
     assert _fault(cv2.filter2D(grey, -1, moving)) is ViewFault.BLURRED

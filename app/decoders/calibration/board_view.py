@@ -20,7 +20,7 @@ LEAST_CORNERS = 8
 LEAST_SHARE = 0.2
 """Of the board's corners."""
 BLURRED_PX, BLURRED_SHARE = 8.0, 0.25
-"""Width of an edge between black and white above which a photo is blurred: absolute, and of a square. [px]"""
+"""Width of an edge above which a photo is blurred: of one of 2000 px [px], and as a share of a square."""
 _SEARCH_PX = 2400
 """Markers are searched for in a photo that is at most this long; corners are refined in the whole one. [px]"""
 _LEAST_PX = 64
@@ -105,7 +105,7 @@ def find_board(grey: Grey, board: CalibrationBoard) -> BoardView:
     square_px = _square_px(corner, rough, board)
     refined = _refine(grey, corner, rough, board)
     width_px = edge_width_px(grey, corner, refined, board)
-    limit_px = min(BLURRED_PX, BLURRED_SHARE * square_px)
+    limit_px = min(BLURRED_PX * max(1.0, max(grey.shape) / 2000), BLURRED_SHARE * square_px)
     if not width_px <= limit_px:
         detail = f"edges are {width_px:.1f} px wide, {limit_px:.1f} px at most"
         return BoardView(corner, refined, width_px, ViewFault.BLURRED, detail)
