@@ -42,6 +42,7 @@ from app.api.ogc import mount_ogc
 from app.api.openapi import describe
 from app.api.permissions import Permissions
 from app.api.problems import install_problem_handlers
+from app.api.schemas_imports import parse_declaration
 from app.api.rate_limits import RateLimit
 from app.decoders.archives import ArchiveLimits
 from app.decoders.images import ImageLimits
@@ -67,6 +68,7 @@ from app.services.decode_rules import DecodeRules
 from app.services.decodes import Decodes
 from app.services.exports import Exports
 from app.services.features import Features
+from app.services.import_jobs import ImportJobs
 from app.services.imports import Imports
 from app.services.keys import Keys
 from app.services.layouts import Layouts
@@ -121,7 +123,13 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     queue = LocalQueue()
     rules = _decode_rules(settings)
     secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
-    jobs = DecodeJobs(database, utc_now, blobs=blobs, decoder=pool, secrets=secrets, rules=rules)
+    imports_service = Imports(database, utc_now, pool, marker_rules(settings))
+    import_jobs = ImportJobs(
+        database, utc_now, blobs, queue, marker_rules(settings), imports=imports_service, parse=parse_declaration
+    )
+    jobs = DecodeJobs(
+        database, utc_now, blobs=blobs, decoder=pool, secrets=secrets, rules=rules, run_import=import_jobs.run
+    )
     access = Access(database, utc_now, _token_check(settings))
     metrics = CollectorRegistry()
     readiness: dict[str, Callable[[], bool]] = {"database": database.is_ready, "decoders": pool.is_ready}
@@ -147,7 +155,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
 
     app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
     app.state.markers = Markers(database, utc_now, marker_rules(settings))
-    app.state.imports = Imports(database, utc_now, pool, marker_rules(settings))
+    app.state.imports, app.state.import_jobs = imports_service, import_jobs
     app.state.exports = Exports(database)
     app.state.snapshots = Snapshots(
         database, utc_now, lru_cache(lambda: load_signing_key(settings.resolved_signing_key_file))
@@ -187,7 +195,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         body_limits={
             "": settings.max_json_bytes,
             "/v1/decodes": settings.max_upload_bytes,
-            "/v1/imports": settings.max_upload_bytes,
+            "/v1/imports": settings.max_import_bytes,
             "/v1/calibrations": settings.max_upload_bytes,
         },
         permissions=Permissions(),

@@ -40,6 +40,7 @@ class Settings(BaseSettings):
 
     max_json_bytes: int = Field(default=1024**2, ge=1024, description="Largest JSON body. [byte]")
     max_upload_bytes: int = Field(default=32 * 1024**2, ge=1024, description="Largest upload. [byte]")
+    max_import_bytes: int = Field(default=256 * 1024**2, ge=1024, description="Largest survey to import. [byte]")
     max_image_pixels: int = Field(default=50_000_000, ge=1, description="Largest picture. [px]")
     body_timeout_s: float = Field(default=30.0, gt=0, description="Longest wait for the next part of a body. [s]")
     max_archive_frames: int = Field(default=500, ge=1, le=10_000, description="Most frames in one archive.")

@@ -11,13 +11,14 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.datastructures import UploadFile
 
-from app.api.dependencies import Caller, json_response
+from app.api.dependencies import Caller, Identifier, json_response
 from app.api.problems import MEDIA_TYPE, problem_responses
-from app.api.schemas_imports import DECLARATION_EXAMPLE, DeclarationIn, ImportReportOut
+from app.api.schemas_imports import DECLARATION_EXAMPLE, DeclarationIn, ImportJobOut, ImportReportOut
 from app.api.strict_json import parse_json
 from app.api.uploads import idempotency_of
 from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, UnsupportedUpload
 from app.services.idempotency import IdempotencyKey
+from app.services.import_jobs import AT_ONCE_BYTES, ImportJobs
 from app.services.imports import GivenImport
 from app.services.imports import Imports as ImportsService
 
@@ -51,7 +52,9 @@ _BODY: dict[str, Any] = {
 @dataclass(frozen=True, slots=True)
 class _Asked:
     given: GivenImport
+    declaration: DeclarationIn
     idempotency: IdempotencyKey | None
+    as_job: bool
 
 
 async def get_imports(request: Request) -> ImportsService:
@@ -92,7 +95,9 @@ async def get_asked(request: Request) -> _Asked:
         raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
     if len(text) > MAX_DECLARATION_BYTES:
         raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
-    return _Asked(_declared(text).given(data), idempotency_of(request, data, text))
+    declaration = _declared(text)
+    as_job = len(data) > AT_ONCE_BYTES or "respond-async" in request.headers.get("prefer", "").lower()
+    return _Asked(declaration.given(data), declaration, idempotency_of(request, data, text), as_job)
 
 
 def _declared(text: bytes) -> DeclarationIn:
@@ -115,6 +120,7 @@ Imports = Annotated[ImportsService, Depends(get_imports)]
     responses={
         200: {"model": ImportReportOut, "description": "Checked; nothing was stored"},
         201: {"model": ImportReportOut, "description": "Stored"},
+        202: {"model": ImportJobOut, "description": "Queued; Location leads to its progress and its report"},
         **problem_responses(409, 415),
     },
 )
@@ -122,8 +128,16 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
     """Import a survey: CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, LandXML or DXF.
 
     With `dry_run` the report says what would be stored. A refused import answers 422 with the report in the problem;
-    nothing of it is stored.
+    nothing of it is stored. A file of more than 8 MiB becomes a job, and so does one that is sent with
+    `Prefer: respond-async`: 202, the report comes at Location.
     """
+    if asked.as_job:
+        jobs: ImportJobs = request.app.state.import_jobs
+        document, replayed = jobs.submit(
+            caller, asked.declaration.model_dump(mode="json"), asked.given.data, asked.idempotency
+        )
+        where = {"Location": document["links"]["self"], "Retry-After": "1"}
+        return json_response(document, 202, where | ({"Idempotency-Replayed": "true"} if replayed else {}))
     try:
         report, replayed = imports.run(caller, asked.given, asked.idempotency)
     except InvalidParameter as error:
@@ -134,6 +148,13 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
         return _refused(request, report)
     headers = {"Idempotency-Replayed": "true"} if replayed else None
     return json_response(report, 200 if report["dry_run"] else 201, headers)
+
+
+@router.get("/{import_id}", response_class=Response, responses={200: {"model": ImportJobOut}, **problem_responses(404)})
+def get_import(request: Request, import_id: Identifier, caller: Caller) -> Response:
+    """An import that was queued: its state, and its report once it is done. A refused one is done too."""
+    jobs: ImportJobs = request.app.state.import_jobs
+    return json_response(jobs.get(caller, import_id))
 
 
 def _refused(request: Request, report: dict[str, Any]) -> Response:

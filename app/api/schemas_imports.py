@@ -132,6 +132,11 @@ class DeclarationIn(BaseModel):
         return GivenImport(data, declaration, defaults, self.dry_run, self.mode, self.reason, strict)
 
 
+def parse_declaration(document: dict[str, Any], data: bytes) -> GivenImport:
+    """The import of a file that was kept with what was declared of it."""
+    return DeclarationIn.model_validate(document).given(data)
+
+
 class FaultOut(BaseModel):
     """Something wrong with a row, or with the file where row is null."""
 
@@ -168,3 +173,17 @@ class ImportReportOut(BaseModel):
     )
     faults: list[FaultOut] = Field(description="The first thousand, refusals first.")
     faults_left_out: int
+
+
+class ImportJobOut(BaseModel):
+    """An import that is or was a job."""
+
+    id: str
+    state: Literal["queued", "running", "done", "failed", "cancelled"]
+    progress: float = Field(description="0 to 1.")
+    attempts: int
+    created_at: str
+    finished_at: str | None
+    error: dict[str, Any] | None = Field(description="Why the file or its declaration cannot be used.")
+    report: ImportReportOut | None
+    links: dict[str, str]

@@ -14,6 +14,8 @@ from app.registry.tables import decodes, observations
 
 Row = sa.RowMapping
 UNFINISHED = ("queued", "running")
+IMPORT = "import"
+"""Kind of the jobs that are imports of surveys: they wait in the same queue, and nobody lists them as decodes."""
 _PUBLIC = [column for column in decodes.c if column.name not in ("agency_id", "holder_id")]
 _ADD_DECODE = sa.insert(decodes)  # built once: building a statement costs more than running it
 _ADD_OBSERVATIONS = {
@@ -36,12 +38,31 @@ def get_decode(connection: sa.Connection, agency_id: str, decode_id: str, *, hol
     NotFound
         There is none with this id, or it belongs to another.
     """
-    query = sa.select(*_PUBLIC).where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
+    query = sa.select(*_PUBLIC).where(
+        decodes.c.id == decode_id, decodes.c.agency_id == agency_id, decodes.c.kind != IMPORT
+    )
     if holder_id is not None:
         query = query.where(decodes.c.holder_id == holder_id)
     row = connection.execute(query).mappings().one_or_none()
     if row is None:
         raise NotFound(f"there is no decode {decode_id}", field="decode_id", cure="GET /v1/decodes lists yours")
+    return row
+
+
+def get_import(connection: sa.Connection, agency_id: str, import_id: str) -> Row:
+    """One import of the agency that is or was a job.
+
+    Raises
+    ------
+    NotFound
+        There is none with this id, or it belongs to another.
+    """
+    query = sa.select(*_PUBLIC).where(
+        decodes.c.id == import_id, decodes.c.agency_id == agency_id, decodes.c.kind == IMPORT
+    )
+    row = connection.execute(query).mappings().one_or_none()
+    if row is None:
+        raise NotFound(f"there is no import {import_id}", field="import_id")
     return row
 
 
@@ -55,7 +76,7 @@ def list_decodes(
     holder_id: str | None = None,
 ) -> list[Row]:
     """Decodes without their results, newest first; of anybody in the agency or of one holder of a key."""
-    query = sa.select(*_SHORT).where(decodes.c.agency_id == agency_id)
+    query = sa.select(*_SHORT).where(decodes.c.agency_id == agency_id, decodes.c.kind != IMPORT)
     if holder_id is not None:
         query = query.where(decodes.c.holder_id == holder_id)
     if state is not None:

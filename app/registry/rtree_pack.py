@@ -17,6 +17,7 @@ import sqlalchemy as sa
 _CELL = np.dtype([("id", ">i8"), ("box", ">f4", (4,))])
 _HEADER = np.dtype([("depth", ">u2"), ("cells", ">u2")])
 _ROOT = 1
+_PART = 20_000
 
 Ids = npt.NDArray[np.int64]
 Boxes = npt.NDArray[np.float32]
@@ -101,13 +102,16 @@ def _store(
     blobs = (
         _node(cells[start : start + count], depth, size) for start, count in zip(starts.tolist(), counts, strict=True)
     )
-    connection.exec_driver_sql(
-        f"INSERT OR REPLACE INTO {rtree}_node VALUES (?, ?)", list(zip(nodes.tolist(), blobs, strict=True))
-    )
     child = f"{rtree}_rowid" if is_leaf else f"{rtree}_parent"
     order = np.argsort(ids, kind="stable")
-    within = zip(ids[order].tolist(), np.repeat(nodes, counts)[order].tolist(), strict=True)
-    connection.exec_driver_sql(f"INSERT INTO {child} VALUES (?, ?)", list(within))
+    parents = np.repeat(nodes, counts)
+    driver = connection.connection.driver_connection
+    assert driver is not None
+    driver.executemany(f"INSERT OR REPLACE INTO {rtree}_node VALUES (?, ?)", zip(nodes.tolist(), blobs, strict=True))
+    for start in range(0, len(order), _PART):
+        part = order[start : start + _PART]
+        within = zip(ids[part].tolist(), parents[part].tolist(), strict=True)
+        driver.executemany(f"INSERT INTO {child} VALUES (?, ?)", within)
 
 
 def _node(cells: npt.NDArray[np.void], depth: int, size: int) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import structlog
@@ -53,6 +53,8 @@ class DecodeJobs:
     secrets : AgencySecrets
         Keys of CERPMs.
     rules : DecodeRules, optional
+    run_import : callable, optional
+        Does the jobs that are imports of surveys.
     """
 
     def __init__(
@@ -64,7 +66,9 @@ class DecodeJobs:
         decoder: FrameDecoder,
         secrets: AgencySecrets,
         rules: DecodeRules | None = None,
+        run_import: Callable[[Row], None] | None = None,
     ) -> None:
+        self._run_import = run_import
         self._database = database
         self._clock = clock
         self._blobs = blobs
@@ -91,6 +95,9 @@ class DecodeJobs:
             self._fail(row, _given_up(self._rules.max_attempts))
             return
         try:
+            if row["kind"] == store.IMPORT and self._run_import is not None:
+                self._run_import(row)
+                return
             if row["kind"] == TRACE:
                 self._run_trace(row)
                 return

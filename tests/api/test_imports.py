@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,7 +32,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
     """A server that the tests of this module share."""
     folder = tmp_path_factory.mktemp("server")
     settings = Settings(
-        data_dir=folder / "var", admin_key=ADMIN_KEY, warm_decoders=False, decode_workers=1, max_upload_bytes=2**22
+        data_dir=folder / "var", admin_key=ADMIN_KEY, warm_decoders=False, decode_workers=1, max_import_bytes=2**24
     )
     with LiveServer(create_app(settings)) as running:
         yield running
@@ -369,7 +370,52 @@ def test_a_viewer_cannot_import_and_a_large_file_is_refused_unread(server: LiveS
 
     with server.agency("viewers", Scope.VIEWER) as viewer:
         assert _post(viewer, _csv(), DEGREES).status_code == 403
-    assert _post(client, b"x" * 2**23, DEGREES).status_code == 413
+    assert _post(client, b"x" * 2**25, DEGREES).status_code == 413
+
+
+def _finished(client: httpx.Client, answer: httpx.Response) -> dict[str, Any]:
+    """A queued import when it is done."""
+    assert answer.status_code == 202, answer.text
+    assert answer.json()["state"] == "queued"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        job = client.get(answer.headers["location"]).json()
+        if job["state"] not in ("queued", "running"):
+            return dict(job)
+        time.sleep(0.05)
+    raise AssertionError("the import does not end")
+
+
+def test_an_import_can_be_a_job(server: LiveServer, client: httpx.Client) -> None:
+    later = {"Prefer": "respond-async", "Idempotency-Key": "once"}
+    job = _finished(client, _post(client, _csv(), DEGREES, **later))
+    assert (job["state"], job["progress"], job["error"], job["report"]["stored"]) == ("done", 1.0, None, 8)
+    again = _post(client, _csv(), DEGREES, **later)
+    assert (again.status_code, again.json()["id"]) == (202, job["id"])
+    assert again.headers["idempotency-replayed"] == "true"
+    assert len(_markers(client)) == 8
+    versions = client.get(f"/v1/markers/{_markers(client)[0]['id']}/versions").json()["items"]
+    assert [version["who"] for version in versions] == [versions[0]["who"]]
+    refused = _finished(client, _post(client, _csv(), DEGREES, Prefer="respond-async"))
+    assert (refused["state"], refused["report"]["outcome"]) == ("done", "refused")
+    assert refused["report"]["counts"]["code_taken"] == 8
+    failed = _finished(client, _post(client, b"\x00\x01", DEGREES, Prefer="respond-async"))
+    assert (failed["state"], failed["report"]) == ("failed", None)
+    assert failed["error"]["field"] == "file"
+    assert client.get("/v1/decodes").json()["items"] == []
+    assert client.get(f"/v1/decodes/{job['id']}").status_code == 404
+    with server.agency("imports of another") as other:
+        assert other.get(f"/v1/imports/{job['id']}").status_code == 404
+
+
+def test_a_large_file_becomes_a_job_and_runs_once(server: LiveServer, client: httpx.Client) -> None:
+    blank = b"\n" * (8 * 2**20)  # empty lines count for nothing but bytes
+    job = _finished(client, _post(client, _csv(20) + blank, DEGREES))
+    assert job["report"]["stored"] == 20
+    jobs = server.app.state.jobs
+    jobs.run_job(job["id"])  # once more, as after a crash
+    assert client.get(f"/v1/imports/{job['id']}").json() == job
+    assert len(_markers(client)) == 20
 
 
 def test_form_parts_are_checked(client: httpx.Client) -> None:
@@ -378,3 +424,22 @@ def test_form_parts_are_checked(client: httpx.Client) -> None:
     assert client.post("/v1/imports", data={"declaration": "{}"}, files={"x": ("", b"")}).status_code == 400
     twice = [("file", ("a", b"b")), ("file", ("a", b"b"))]
     assert client.post("/v1/imports", files=twice).status_code == 400
+
+
+def test_rows_on_a_registered_road_get_its_measures_and_keep_them_right_when_they_are_surveyed(
+    client: httpx.Client,
+) -> None:
+    line = {"type": "LineString", "coordinates": [[LON, LAT], [LON + 10 * STEP, LAT]]}
+    road = {"name": "K 1", "geometry": line, "calibration": [{"measure_m": 500, "vertex": 0}]}
+    length_m = client.post("/v1/roads", json=road).json()["length_m"]
+    assert _post(client, _csv(), {**DEGREES, "road": "K 1"}).status_code == 201
+
+    def measures() -> list[float]:
+        return [m["measure_m"] for m in sorted(_markers(client), key=lambda m: m["code"]["number"])]
+
+    expected = [500 + length_m * k / 10 for k in range(1, 9)]
+    assert measures() == pytest.approx(expected, abs=1e-3)
+    moved = "\n".join(["number,lon,lat", *(f"{k},{LON + (k + 0.01) * STEP:.9f},{LAT:.9f}" for k in range(1, 9))])
+    built = {**DEGREES, "compare": True, "tolerance_m": 5.0, "status": "surveyed"}
+    assert _post(client, moved.encode(), built).status_code == 201
+    assert measures() == pytest.approx([m + length_m / 1000 for m in expected], abs=1e-3)

@@ -239,6 +239,8 @@ def things(server: LiveServer) -> dict[str, list[str]]:
         book = _made(owner.post("/v1/codebooks", json={"name": "b", "design": DESIGN, "meanings": MEANINGS}))
         decode = _made(owner.post("/v1/decodes", content=png(corner_frame()), headers={"Content-Type": "image/png"}))
         vehicle = _made(owner.post("/v1/vehicles", json={"name": "v", "profile": {}}))["id"]
+        survey, later = {"file": ("survey.csv", b"lon,lat\n1,2\n")}, {"Prefer": "respond-async"}
+        queued = owner.post("/v1/imports", files=survey, headers=later).json()["id"]
     access = server.app.state.access
     caller = access.authenticate(owner.headers["authorization"].split()[1])
     calibration = {"id": "019cb624-0000-7000-8000-00000000cccc", "who": "w", "result": {}}
@@ -255,6 +257,7 @@ def things(server: LiveServer) -> dict[str, list[str]]:
         "codebook_id": [book["id"]],
         "code": [book["entries"][0]["code"]],
         "decode_id": [decode["id"]],
+        "import_id": [queued],
     }
 
 
