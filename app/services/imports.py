@@ -38,6 +38,7 @@ from app.services.import_rows import MarkerDefaults, check_values, common_column
 from app.services.marker_rules import PLANNED, MarkerFamily, MarkerRules
 from app.services.plate_markers import Plates
 from app.services.ports import Clock
+from app.services.road_routes import linear_references
 from app.services.version_kinds import kind_of_change, kind_of_new
 
 ALL, GOOD = "all", "good"
@@ -202,6 +203,10 @@ class _Running:
                     self._survey, part, self._given.declaration, self._given.defaults,
                     ids=ids, now=self._now, file_sha256=self._sha256,
                 )  # fmt: skip
+                measured = linear_references(connection, self._caller.agency_id, rows, [None] * len(rows))
+                for row, reference in zip(rows, measured, strict=True):
+                    if row["measure_m"] is None:
+                        row |= reference
                 bulk.add_markers(connection, entry, rows, kind=kind_of_new, why=why)
                 self._stored += len(rows)
 
@@ -329,10 +334,14 @@ class _Running:
         rows = self._good_rows()
         surveyed = common_columns(self._survey, rows, self._given.declaration, file_sha256=self._sha256)
         markers = [self._known[k] for k in self._comparison.matched[rows].tolist()]
+        kept_measures = [marker["measure_m"] for marker in markers]
+        moved = [{**columns, "road": marker["road"]} for marker, columns in zip(markers, surveyed, strict=True)]
+        measured = linear_references(connection, self._caller.agency_id, moved, kept_measures)
+        found = sorted(zip(markers, surveyed, measured, strict=True), key=lambda item: str(item[0]["id"]))
         with self._recording(connection) as entry:
-            for marker, columns in sorted(zip(markers, surveyed, strict=True), key=lambda pair: str(pair[0]["id"])):
+            for marker, columns, reference in found:
                 kept = ("family", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")
-                values = {name: v for name, v in columns.items() if name not in kept}
+                values = {name: v for name, v in columns.items() if name not in kept} | reference
                 values["status"] = self._given.declaration.status or "surveyed"
                 # what stands on the road keeps its digits, whatever was planned
                 built = {**marker, "status": "built" if marker["status"] == PLANNED else marker["status"]}

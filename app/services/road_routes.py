@@ -177,10 +177,27 @@ def linear_reference(
     connection: sa.Connection, agency_id: str, values: Mapping[str, Any], before_m: float | None = None
 ) -> dict[str, Any]:
     """Measure and offset of a marker whose columns name a road with an axis: None where it has no place on it."""
-    if values.get("road") is None:
-        return {}
-    row = store.find_road(connection, agency_id, values["road"])
-    if row is None:
-        return {}
-    (reference,) = references_of(route_of(row), [(values["lon_deg"], values["lat_deg"])], [before_m])
-    return {"measure_m": reference.measure_m, "offset_m": reference.offset_m}
+    return linear_references(connection, agency_id, [values], [before_m])[0]
+
+
+def linear_references(
+    connection: sa.Connection,
+    agency_id: str,
+    markers: Sequence[Mapping[str, Any]],
+    before_m: Sequence[float | None],
+) -> list[dict[str, Any]]:
+    """As `linear_reference`, for each of many markers; empty for those on no registered road."""
+    found: list[dict[str, Any]] = [{} for _ in markers]
+    named: dict[str, list[int]] = {}
+    for k, marker in enumerate(markers):
+        if marker.get("road") is not None:
+            named.setdefault(marker["road"], []).append(k)
+    for name, own in named.items():
+        row = store.find_road(connection, agency_id, name)
+        if row is None:
+            continue
+        positions = [(markers[k]["lon_deg"], markers[k]["lat_deg"]) for k in own]
+        references = references_of(route_of(row), positions, [before_m[k] for k in own])
+        for k, reference in zip(own, references, strict=True):
+            found[k] = {"measure_m": reference.measure_m, "offset_m": reference.offset_m}
+    return found
