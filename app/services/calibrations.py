@@ -126,7 +126,8 @@ class Calibrations:
         _check_count(photos)
         task = CalibrationTask(photos, board, coefficients, self._images)
         found = self._calibrator.start_calibration(task, wait_s=_BUSY_WAIT_S).result()
-        row = {"id": new_id(now), "who": caller.label, "result": calibration_result(found, board), "created_at": now}
+        result = calibration_result(found, board)
+        row: dict[str, Any] = {"id": new_id(now), "who": caller.label, "result": result, "created_at": now}
         with self._database.write() as connection:
             answer = find_answer(connection, caller.agency_id, key, now)
             if answer is not None:
