@@ -114,7 +114,6 @@ class _Around:
     c: Floats
     d: Floats
     at: Floats
-    first: int
 
     @classmethod
     def of(cls, points: Floats, stride: int) -> _Around:
@@ -125,8 +124,18 @@ class _Around:
             points[3 * s : n - s],
             points[4 * s :],
             points[2 * s : n - 2 * s],
-            2 * s,
         )
+
+    @classmethod
+    def pieces(cls, points: Floats, stride: int) -> Iterator[_Around]:
+        """A hundred thousand rows at a time: what is worked out of them takes many times their memory."""
+        for start in range(0, len(points) - 4 * stride, _PART):
+            yield cls.of(points[start : start + _PART + 4 * stride], stride)
+
+    def is_off(self, threshold_m: float) -> Flags:
+        """Rows that are not where the four lead."""
+        off: Flags = self.regular & (self.off_m > threshold_m) | ~self.regular & self.straight & self.spike
+        return off
 
     @property
     def off_m(self) -> Floats:
@@ -160,20 +169,23 @@ class _Around:
         return spike
 
 
+def _off_m(points: Floats, stride: int) -> Floats:
+    return np.concatenate([around.off_m for around in _Around.pieces(points, stride)])
+
+
 def _check_line(points: Floats, rows: npt.NDArray[np.intp]) -> Iterator[Fault]:
     stride = min(
         (s for s in _STRIDES if len(points) >= 5 * s + 1),
-        key=lambda s: float(np.median(_Around.of(points, s).off_m)) + 0.2 * s,
+        key=lambda s: float(np.median(_off_m(points, s))) + 0.2 * s,
     )
-    around = _Around.of(points, stride)
-    off_m, usual = around.off_m, float(np.median(around.off_m))
+    off_m = _off_m(points, stride)
+    usual = float(np.median(off_m))
     step_m = float(np.median(_length(np.diff(points[::stride], axis=0))))
     if usual > 0.5 * step_m or step_m == 0:
         return  # no line that a row could be off
-    regular = around.regular
     threshold = min(max(_LEAST_OFF_M, 6 * usual), _OFF_M)
-    flagged = regular & (off_m > threshold) | ~regular & around.straight & around.spike
-    found = {int(k) + around.first: float(off_m[k]) for k in np.flatnonzero(flagged)}
+    flagged = np.concatenate([around.is_off(threshold) for around in _Around.pieces(points, stride)])
+    found = {int(k) + 2 * stride: float(off_m[k]) for k in np.flatnonzero(flagged)}
     found |= _check_ends(points, stride, found)
     for k, off in sorted(found.items()):
         message = f"the row is about {off:.1f} m from where the rows around it lead"
