@@ -16,6 +16,7 @@ from fastapi import FastAPI
 
 from app.main import create_app
 from app.registry.tenancy import across_agencies
+from app.registry.tenancy import across_agencies
 from app.services.access import Scope
 from app.settings import Settings
 from tests.databases import PostgresServer, postgres_server
@@ -125,6 +126,9 @@ def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[
     settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, warm_decoders=False, **UNLIMITED)
     with LiveServer(create_app(settings)) as running:
         yield running
+        with across_agencies():
+            faults = [(name, fault) for name, _, found in running.app.state.audit.verify() for fault in found]
+        assert faults == [], "what the module did is not as its history says"
 
 
 _AGENCIES = itertools.count(1)
