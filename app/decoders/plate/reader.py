@@ -27,7 +27,7 @@ from app.decoders.plate.quads import MARKER_RATIO, MarkerQuad, detect_marker_qua
 from app.decoders.plate.thermal import ORIENTATION_EVIDENCE, fit_warm_plates
 from app.decoders.plate.weighing import weigh_units
 from app.errors import InvalidParameter
-from app.markers.plate import PlateCode, PlateGeometry
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading
 from app.sensors.camera import Camera
 
@@ -38,6 +38,7 @@ MOST_FITS = 5  # candidates that are fitted in one pass
 LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
 LEAST_EXPLAINED_ALONE = 0.83  # the same for digits that no registry confirms
 LEAST_EXPLAINED_SMALL, SMALL_UNIT_PX = 0.9, 2.5  # the same where a grid that lies wrong explains nearly as much
+LEAST_ROWS_ALONE = 1.5  # of the image over a unit, for digits that neither a check of 16 bits nor a registry confirms
 CLEAN_EXPLAINED = 0.93  # from which a word may be corrected without a registry
 STRONG_RANK = 3.5  # of a candidate that deserves a second geometry when the first explains nothing
 LEAST_MARGIN = 1.0  # colour margin of a marker that is there
@@ -292,6 +293,10 @@ def _judge(
         return replace(reading, outcome=outcome, reason=reason)
     least = LEAST_EXPLAINED_SMALL if fit.unit_px < SMALL_UNIT_PX else LEAST_EXPLAINED_ALONE
     weak = missing is not None or fit.explained < least
+    small = decoded.code.scheme is not PlateScheme.ID and float(extent.min()) < LEAST_ROWS_ALONE * geometry.n
+    if small and not weak and not decoded.confirmed:
+        reason = f"a plate of less than {LEAST_ROWS_ALONE * geometry.n:g} rows, and nothing checks these digits"
+        return replace(reading, outcome=PlateOutcome.UNSURE, reason=reason)
     if weak and not decoded.confirmed:
         outcome, reason = missing or (PlateOutcome.UNSURE, "the plate's pattern explains too little of the image")
         return replace(reading, outcome=outcome, reason=reason)

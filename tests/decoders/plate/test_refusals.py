@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from app.decoders.plate import decode_plates
 from app.markers.plate import PlateCode, code_cells
 from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.plate_face import Face, PlateWear
-from app.simulation.plate_scene import PlacedFace
+from app.simulation.plate_scene import PlacedFace, Sensor
 from tests.decoders.plate.scenes import PAPER, face_of, marker_units, painted, shoot, shoot_plate
 
 BLACK, GREY, WHITE = (0.04,) * 3, (0.2,) * 3, (0.75,) * 3
@@ -161,3 +163,20 @@ def test_black_or_unreadable_cells_of_a_decimal_plate_are_refused(cells: tuple[i
         readings = read_face(with_damage(PAPER, cells, how))
         assert digits_in(readings) == []
         assert {r.outcome for r in readings} <= {PlateOutcome.UNSURE, *PAPERS_CASES}
+
+
+@pytest.mark.parametrize(("ahead_m", "turn_deg"), [(6.0, 0.0), (6.0, 4.0), (6.3, 4.0), (6.15, -5.0)])
+def test_digits_that_nothing_checks_need_rows_enough(ahead_m: float, turn_deg: float) -> None:
+    """A worn unit of a row and a half looks like the other level now and then (one frame in 2,600)."""
+
+    def read(code: PlateCode, *known: PlateCode) -> PlateReading:
+        face = PlacedFace(face_of(code), ahead_m, 0.1, turn_deg)
+        still = shoot(face, seed=3, sensor=Sensor(blur_px=0.6), change=lambda scene: replace(scene, speed_m_s=0.0))
+        return decode_plates(still.image, codebook=known)[0]
+
+    small = read(PAPER)
+    assert small.outcome is PlateOutcome.UNSURE
+    assert 0 < (small.height_px or 0) < 12
+    assert "rows" in small.reason
+    assert read(PAPER, PAPER).digits == PAPER.digits
+    assert read(ID).digits == ID.digits
