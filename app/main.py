@@ -11,7 +11,7 @@ from functools import lru_cache, partial
 import numpy as np
 import numpy.typing as npt
 import structlog
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
@@ -37,13 +37,14 @@ from app.api import (
     ui,
     vehicles,
 )
+from app.api.dependencies import refuse_unknown_parameters
 from app.api.middleware import Guarded, Observed
 from app.api.ogc import mount_ogc
 from app.api.openapi import describe
 from app.api.permissions import Permissions
 from app.api.problems import install_problem_handlers
-from app.api.schemas_imports import parse_declaration
 from app.api.rate_limits import RateLimit
+from app.api.schemas_imports import parse_declaration
 from app.decoders.archives import ArchiveLimits
 from app.decoders.images import ImageLimits
 from app.decoders.plate import decode_plates
@@ -88,8 +89,6 @@ from app.storage.signing_key import load_signing_key
 
 _LOG = structlog.get_logger("waymark")
 ROUTERS = (
-    ui.router,
-    system.router,
     searches.router,
     bulk.router,
     observations.router,
@@ -179,8 +178,10 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.keys = Keys(database, utc_now, access)
     app.state.readiness = readiness
     app.state.metrics = metrics
-    for router in ROUTERS:
+    for router in (ui.router, system.router):
         app.include_router(router)
+    for router in ROUTERS:
+        app.include_router(router, dependencies=[Depends(refuse_unknown_parameters)])
     mount_ogc(app)
     ui.mount_static(app)
     install_problem_handlers(app)

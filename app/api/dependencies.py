@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import orjson
 from fastapi import Depends, Request, Response
+from fastapi.dependencies.models import Dependant
 from pydantic import AfterValidator, Field
 
 from app.errors import InvalidParameter, NotAuthenticated, VersionRequired
@@ -94,6 +95,32 @@ async def get_version(request: Request) -> int | None:
             cure="send the ETag as it came",
         )
     return int(digits)
+
+
+async def refuse_unknown_parameters(request: Request) -> None:
+    """Refuse query parameters that the route does not know: a filter with a slip in its name would let all through.
+
+    Raises
+    ------
+    InvalidParameter
+        There is one.
+    """
+    if not request.query_params:
+        return
+    known = _query_names(request.scope["route"].dependant)
+    unknown = next((name for name in request.query_params if name not in known), None)
+    if unknown is not None:
+        raise InvalidParameter(
+            f"there is no parameter {unknown[:40]!r} here",
+            field=unknown[:40],
+            limit=", ".join(sorted(known)) or "no query parameters",
+            cure=f"leave {unknown[:40]} out, or mend its name",
+        )
+
+
+def _query_names(dependant: Dependant) -> set[str]:
+    names = {parameter.alias for parameter in dependant.query_params}
+    return names.union(*(_query_names(inner) for inner in dependant.dependencies))
 
 
 Caller = Annotated[CallerValue, Depends(get_caller)]
