@@ -16,7 +16,6 @@ from fastapi import FastAPI
 
 from app.main import create_app
 from app.registry.tenancy import across_agencies
-from app.registry.tenancy import across_agencies
 from app.services.access import Scope
 from app.settings import Settings
 from tests.databases import PostgresServer, postgres_server
