@@ -32,7 +32,6 @@ class PostgresServer:
         self._prefix = f"waymark_test_{secrets.token_hex(4)}"
         self._made: list[str] = []
         self._shared: sa.URL | None = None
-        self._password = secrets.token_hex(16)
         self._schemas = itertools.count(1)
 
     def empty(self) -> str:
@@ -42,12 +41,12 @@ class PostgresServer:
             with _connected(self._shared) as connection:
                 connection.exec_driver_sql("CREATE EXTENSION postgis")
                 connection.exec_driver_sql(LEAKPROOF)
-                connection.exec_driver_sql(f"CREATE ROLE {self._prefix} LOGIN PASSWORD '{self._password}'")
+                connection.exec_driver_sql(f"CREATE ROLE {self._prefix}")
         schema = f"test_{next(self._schemas)}"
         with _connected(self._shared) as connection:
             connection.exec_driver_sql(f"CREATE SCHEMA {schema} AUTHORIZATION {self._prefix}")
-        url = self._shared.update_query_dict({"options": f"-c search_path={schema},public"})
-        url = url.set(username=self._prefix, password=self._password)
+        options = f"-c search_path={schema},public -c role={self._prefix}"
+        url = self._shared.update_query_dict({"options": options})
         return url.render_as_string(hide_password=False)
 
     def create(self) -> str:
