@@ -59,7 +59,7 @@ async def _ask(port: int, requests: Iterator[bytes], seconds: float, connections
     if not samples:
         return Timing(0.0, math.inf, math.inf, 0.0, 0)
     began, took, sizes = np.array(samples).T
-    inside = (began >= begin) & (began + took <= begin + seconds)
+    inside = (began + took >= begin) & (began + took <= begin + seconds)
     if not inside.any():
         return Timing(0.0, math.inf, math.inf, 0.0, len(samples))
     p50, p99 = np.percentile(took[inside] * 1e3, (50, 99))
