@@ -103,6 +103,8 @@ def test_every_benchmark_has_its_block() -> None:
 
     magnets = [f"magnets-{item}" for item in ("run", *MAGNETS)]
     cerpm = [f"cerpm-{item}" for item in ("run", *CERPM)]
-    blocks = ["demo", "run", *PLATES, *magnets, *cerpm, "bundle", "http"]
+    imports = [f"imports-{item}" for item in ("faults", "clean", "speed")]
+    registry = [f"registry-{item}" for item in ("boxes", "tiles", "searches", "growth")]
+    blocks = ["demo", "run", *PLATES, *magnets, *cerpm, *imports, *registry, "bundle", "http"]
     filled = [name for page in PAGES for name in re.findall(r"<!-- bench:([\w-]+) -->", page.read_text())]
     assert sorted(filled) == sorted(blocks)
