@@ -307,9 +307,7 @@ def test_a_bug_is_a_problem_without_details(serve: Callable[[Settings], LiveServ
         assert client.get("/healthz").status_code == 200
 
 
-@pytest.mark.parametrize(
-    "path", ["/v1/markers?stauts=active", "/v1/markers?limit=1&Limit=2", "/v1/vehicles?x=%00"]
-)
+@pytest.mark.parametrize("path", ["/v1/markers?stauts=active", "/v1/markers?limit=1&Limit=2", "/v1/vehicles?x=%00"])
 def test_parameters_that_a_route_does_not_know_are_refused(client: httpx.Client, path: str) -> None:
     response = client.get(path)
     assert response.status_code == 422, response.text
