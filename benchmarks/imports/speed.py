@@ -40,7 +40,7 @@ class Figure:
 
 def print_speed(rows: int) -> bool:
     """The table; whether imports and the GeoPackage keep the goals, which are for a million rows."""
-    with TemporaryDirectory(prefix="waymark-bench-") as name:
+    with TemporaryDirectory(prefix="waymark-bench-imports-") as name:
         survey = Path(name) / "survey.csv"
         _write_survey(survey, rows)
         print(f"### imports-speed\n\n{rows} rows, {survey.stat().st_size / 1e6:.0f} MB of CSV.\n")

@@ -66,7 +66,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 def filled(rows: int) -> Iterator[Filled]:
     """Both databases with so many markers, dropped afterwards."""
     network, name = lay_roads(rows), f"waymark_bench_{rows}"
-    folder = Path(tempfile.mkdtemp(prefix="waymark-bench-"))
+    folder = Path(tempfile.mkdtemp(prefix="waymark-bench-registry-"))
     try:
         urls = {"PostgreSQL": make_database(name), "SQLite": f"sqlite:///{folder / 'waymark.sqlite3'}"}
         keys = {}
