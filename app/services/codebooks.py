@@ -7,7 +7,7 @@ from datetime import datetime, timedelta
 from typing import Any
 
 from app.encoders.magnet import CodebookRules, allocate_codes
-from app.errors import Conflict, InvalidParameter, NotFound, StaleVersion, Unavailable
+from app.errors import Conflict, InvalidParameter, NotFound, StaleVersion, Unavailable, WaymarkError
 from app.markers.magnet_codebook import Codebook, Meaning
 from app.markers.magnet_design import TagDesign
 from app.registry import codebooks as store
@@ -127,8 +127,13 @@ class Codebooks:
                 return replayed, True
             row = self._get(caller, codebook_id)
             book = book_of(row)
-            _check_size(len(book.entries) + len(meanings))
-            longer = _allocated(book, meanings, rules_of(row))
+            try:
+                _check_size(len(book.entries) + len(meanings))
+                longer = _allocated(book, meanings, rules_of(row))
+            except WaymarkError:  # what is in the way may be what the same request added meanwhile
+                if replayed := self._find_answer(caller, key, now):
+                    return replayed, True
+                raise
             try:
                 with self._database.write() as connection:
                     answer = find_answer(connection, caller.agency_id, key, now)
