@@ -50,7 +50,7 @@ def _zip(**files: bytes) -> bytes:
         (b"", None),
         (b"1,2,3\n", None),
     ],
-    ids=str,
+    ids=lambda value: "upload" if isinstance(value, bytes) else str(value),
 )
 def test_an_upload_is_told_by_its_content(data: bytes, kind: UploadKind | None) -> None:
     assert guess_kind("upload", data) is kind

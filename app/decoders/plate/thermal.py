@@ -26,6 +26,7 @@ LEAST_CONTRAST = 6.0  # grey levels
 SHARES = (0.3, 0.5)  # of the strongest warmth around, at which regions are cut out
 CLOSINGS = (1, 3, 7, 15, 27)  # px, from unit to unit
 ORIENTATION_EVIDENCE = 12.0  # log likelihood by which the best orientation must beat the next
+LEAST_MISFIT_RATIO = 1.3  # of the next orientation's unexplained variance to the best one's; pixels err together
 
 
 def fit_warm_plates(image: Frame, geometry: PlateGeometry) -> Iterator[tuple[list[PlateFit], float]]:
@@ -42,7 +43,8 @@ def fit_warm_plates(image: Frame, geometry: PlateGeometry) -> Iterator[tuple[lis
             continue
         fits.sort(key=lambda fit: -fit.explained)
         second = fits[1].explained if len(fits) > 1 else 0.0
-        evidence = 0.5 * fits[0].pixels * float(np.log((1 - second) / max(1 - fits[0].explained, 1e-6)))
+        ratio = (1 - second) / max(1 - fits[0].explained, 1e-6)
+        evidence = 0.5 * fits[0].pixels * float(np.log(ratio)) if ratio >= LEAST_MISFIT_RATIO else 0.0
         yield fits, evidence
 
 
