@@ -140,7 +140,7 @@ def export(
     """Write an agency's markers to a file. A server on a SQLite file must not be running."""
     from tempfile import TemporaryDirectory
 
-    from app.api.searches import parse_box
+    from app.api.marker_filter import parse_box
     from app.registry.markers import MarkerFilter
     from app.services.exports import KINDS, Exports
 

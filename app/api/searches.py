@@ -6,29 +6,26 @@ import math
 import re
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from app.api.dependencies import Caller, Identifier, Text, json_response, next_link
+from app.api.marker_filter import Narrowed, check_measures, checked_box, parse_numbers
 from app.api.problems import problem_responses
-from app.api.schemas_markers import Status
 from app.api.schemas_searches import MAX_PAGE, MAX_RADIUS_M, AlongIn, MarkerPage, SearchIn
 from app.api.strict_json import StrictRoute
 from app.api.times import parse_time
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.registry.markers import MarkerFilter
-from app.registry.spatial import Box
-from app.services.search_areas import area_of, area_of_text
+from app.services.search_areas import area_of
 from app.services.searches import Searches as SearchesService
 from app.services.searches import circle
 
 router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
 
 _CURSOR = re.compile(r"([0-9]{1,7}(?:\.[0-9]{1,20})?(?:e-[0-9]{1,3})?),([0-9a-f-]{36})")
-_MAX_POLYGON_TEXT = 8_000
-_MetresQuery = Annotated[float | None, Query(ge=-1e8, le=1e8, allow_inf_nan=False)]
 
 
 async def get_searches(request: Request) -> SearchesService:
@@ -74,11 +71,7 @@ class _Search:
                 limit="as_of without nearest",
                 cure="ask for the markers within a radius",
             )
-        narrowed = self.narrowed
-        if narrowed.road is None and (narrowed.from_m is not None or narrowed.to_m is not None):
-            raise InvalidParameter(
-                "measures belong to a road", field="road", limit="a road with from_m, to_m", cure="name the road"
-            )
+        check_measures(self.narrowed)
 
     def answer(
         self, request: Request, caller: Caller, searches: SearchesService, *, limit: int, after: str | None
@@ -118,26 +111,10 @@ def list_markers(
     request: Request,
     caller: Caller,
     searches: Searches,
-    bbox: Annotated[Text | None, Query(max_length=200, examples=["114.1,22.2,114.3,22.4"])] = None,
-    polygon: Annotated[
-        Text | None, Query(max_length=_MAX_POLYGON_TEXT, description="WKT of a POLYGON or MULTIPOLYGON.")
-    ] = None,
+    narrowed: Narrowed,
     near: Annotated[Text | None, Query(max_length=200, examples=["114.179,22.304,500"])] = None,
     radius_m: Annotated[float | None, Query(ge=0, le=MAX_RADIUS_M, allow_inf_nan=False)] = None,
     nearest: Annotated[int | None, Query(ge=1, le=MAX_PAGE)] = None,
-    road: Annotated[Text | None, Query(min_length=1, max_length=200)] = None,
-    from_m: _MetresQuery = None,
-    to_m: _MetresQuery = None,
-    code: Annotated[
-        Text | None,
-        Query(
-            min_length=1,
-            max_length=64,
-            description="All digits of a plate, the text of a tag, or the number of a CERPM.",
-        ),
-    ] = None,
-    status: Status | None = None,
-    family: Literal["plate", "magnet", "cerpm"] | None = None,
     as_of: Annotated[
         Text | None, Query(max_length=40, description="The registry as it was at this time (RFC 3339).")
     ] = None,
@@ -158,16 +135,6 @@ def list_markers(
         raise InvalidParameter(
             "the radius is said twice", field="near", limit="one radius", cure="leave radius_m out, or the third number"
         )
-    narrowed = MarkerFilter(
-        box=parse_box(bbox) if bbox is not None else None,
-        area=area_of_text(polygon) if polygon is not None else None,
-        road=road,
-        from_m=from_m,
-        to_m=to_m,
-        digits=code,
-        status=status,
-        family=family,
-    )
     at = parse_time(as_of, "as_of") if as_of is not None else None
     search = _Search(narrowed, place, said_m if radius_m is None else radius_m, nearest, as_of=at)
     return search.answer(request, caller, searches, limit=limit, after=after)
@@ -203,44 +170,8 @@ def search_markers(
     return search.answer(request, caller, searches, limit=limit, after=after)
 
 
-def parse_box(text: str) -> Box:
-    """West, south, east, north as a query writes them."""
-    return checked_box(*_numbers(text, "bbox", "west,south,east,north"))
-
-
-def checked_box(west_deg: float, south_deg: float, east_deg: float, north_deg: float) -> Box:
-    """A box; a west above the east spans the antimeridian.
-
-    Raises
-    ------
-    InvalidParameter
-        A side is out of range, or the south is above the north.
-    """
-    check_lon_lat(west_deg, south_deg, field="bbox")
-    check_lon_lat(east_deg, north_deg, field="bbox")
-    if south_deg > north_deg:
-        raise InvalidParameter(
-            "bbox has its south above its north",
-            field="bbox",
-            limit="south <= north",
-            cure="send west,south,east,north; only the longitudes may be the other way round, over the antimeridian",
-        )
-    return Box(west_deg, south_deg, east_deg, north_deg)
-
-
-def _numbers(text: str, field: str, *forms: str) -> list[float]:
-    parts = text.split(",")
-    if len(parts) not in [len(form.split(",")) for form in forms]:
-        form = " or ".join(forms)
-        raise InvalidParameter(f"{field} is {form}", field=field, limit=form, cure="separate the numbers by commas")
-    try:
-        return [float(part) for part in parts]
-    except ValueError as error:
-        raise InvalidParameter(f"{field} holds something that is not a number", field=field, limit=forms[0]) from error
-
-
 def _near(text: str) -> tuple[tuple[float, float], float | None]:
-    lon_deg, lat_deg, *rest = _numbers(text, "near", "lon,lat", "lon,lat,radius_m")
+    lon_deg, lat_deg, *rest = parse_numbers(text, "near", "lon,lat", "lon,lat,radius_m")
     check_lon_lat(lon_deg, lat_deg, field="near")
     radius_m = rest[0] if rest else None
     if radius_m is not None and not 0 <= radius_m <= MAX_RADIUS_M:

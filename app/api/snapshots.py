@@ -8,8 +8,8 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from app.api.dependencies import Caller, Text, json_response
+from app.api.marker_filter import parse_box
 from app.api.problems import problem_responses
-from app.api.searches import parse_box
 from app.markers.snapshot import MEDIA_TYPE, VERSION
 from app.services.snapshots import MAX_HOURS
 from app.services.snapshots import Snapshots as SnapshotsService
