@@ -1,4 +1,4 @@
-"""Whose rows a transaction may see: the second lock, row level security on PostgreSQL (migration 0010).
+"""Whose rows a transaction may see: the second lock, row level security on PostgreSQL (migration 0009).
 
 The first lock is the `agency_id` in every query. Should one be forgotten, the policies still hide what belongs to
 others: a transaction says at its start for whom it is, and one that says nothing sees no rows. For whom is a matter of
