@@ -178,6 +178,13 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.keys = Keys(database, utc_now, access)
     app.state.readiness = readiness
     app.state.metrics = metrics
+    _add_routes(app)
+    _add_guard(app, settings, access)
+    app.add_middleware(Observed, registry=metrics)
+    return app
+
+
+def _add_routes(app: FastAPI) -> None:
     for router in (ui.router, system.router):
         app.include_router(router)
     for router in ROUTERS:
@@ -186,6 +193,9 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     ui.mount_static(app)
     install_problem_handlers(app)
     describe(app)
+
+
+def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
     app.add_middleware(
         Guarded,
         authenticate=access.authenticate,
@@ -202,8 +212,6 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         permissions=Permissions(),
         body_timeout_s=settings.body_timeout_s,
     )
-    app.add_middleware(Observed, registry=metrics)
-    return app
 
 
 @asynccontextmanager
