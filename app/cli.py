@@ -278,9 +278,9 @@ def decode_trace(
     """Read the magnets and tags in a magnetometer trace; prints one JSON object."""
     import orjson
 
+    from app.decoders.magnet.registered import match_tags
     from app.jobs.trace_child import decode_recording
     from app.services.trace_documents import trace_document
-    from app.services.trace_reading import NearbyTags, match_tags
     from app.services.traces import TraceTask, trace_terms
 
     try:
@@ -290,7 +290,7 @@ def decode_trace(
     if not isinstance(terms, dict):
         raise InvalidParameter("--declared is no JSON object", field="declared", cure="send {} at least")
     result = decode_recording(TraceTask(recording.name, recording.read_bytes(), terms), None)
-    trace = match_tags(result.findings, NearbyTags(), trace_terms(terms).bar)
+    trace = match_tags(result.findings, (), trace_terms(terms).bar)
     if plot is not None:
         plot.write_bytes(result.plot)
     document = trace_document(result, trace, codebook_tags=0)

@@ -9,6 +9,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from app.decoders.magnet.book import TagFormat
+from app.decoders.magnet.registered import ReadTrace, match_tags
 from app.registry import codebooks
 from app.registry import decodes as store
 from app.services.codebook_documents import book_of
@@ -16,7 +17,7 @@ from app.services.decode_context import DecodeContext
 from app.services.decode_rules import DecodeRules
 from app.services.frames import Blobs
 from app.services.trace_documents import trace_document
-from app.services.trace_reading import NearbyTags, ReadTrace, find_nearby_tags, match_tags, trace_observations
+from app.services.trace_reading import NearbyTags, find_nearby_tags, trace_observations
 from app.services.traces import PendingTrace, TraceDecoder, TraceResult, TraceTask, trace_terms
 from app.storage.blobs import new_blob_key
 
@@ -63,7 +64,7 @@ def finished_columns(
     result: TraceResult, started: StartedTrace, context: DecodeContext, blobs: Blobs
 ) -> tuple[dict[str, Any], ReadTrace]:
     """Columns of a decode that is done, its plot stored, and what was read."""
-    trace = match_tags(result.findings, started.nearby, trace_terms(context.trace or {}).bar)
+    trace = match_tags(result.findings, started.nearby.tags, trace_terms(context.trace or {}).bar)
     document = trace_document(result, trace, codebook_tags=len(started.nearby.texts))
     picture_key = new_blob_key(PICTURES)
     blobs.put(picture_key, result.plot)

@@ -10,8 +10,8 @@ import numpy as np
 
 from app import __version__
 from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFinding, TagReading
+from app.decoders.magnet.registered import ReadTag, ReadTrace, TagFix, TagMatch
 from app.services.decode_documents import count_of
-from app.services.trace_reading import ReadTag, ReadTrace, TagFix, TagMatch
 from app.services.traces import TraceResult
 
 MAX_NOISE = 500
@@ -55,7 +55,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _summary(result: TraceResult, trace: ReadTrace) -> dict[str, Any]:
-    matched = sum(tag.match is not None and tag.match.row is not None for tag in trace.tags)
+    matched = sum(tag.match is not None and tag.match.tag is not None for tag in trace.tags)
     wrong_way = sum(tag.reading.wrong_way for tag in trace.tags)
     solid = sum(crossing.style.value == "solid" for crossing in trace.crossings)
     text = f"{count_of(len(trace.magnets), 'magnet')} over {result.length_m:.0f} m: {count_of(len(trace.tags), 'tag')}"
@@ -104,14 +104,14 @@ def _tag(tag: ReadTag) -> dict[str, Any]:
 def _match(match: TagMatch | None) -> dict[str, Any] | None:
     if match is None:
         return None
-    row = match.row
-    meaning = row["spec"].get("meaning") if row is not None else None
+    tag = match.tag
+    meaning = tag.meaning if tag is not None else None
     return {
-        "registered": row is not None,
-        "marker_id": row["id"] if row is not None else None,
-        "status": row["status"] if row is not None else None,
-        "localization_grade": row["localization_grade"] if row is not None else None,
-        "meaning": meaning,
+        "registered": tag is not None,
+        "marker_id": tag.marker_id if tag is not None else None,
+        "status": tag.status if tag is not None else None,
+        "localization_grade": tag.grade if tag is not None else None,
+        "meaning": {"kind": meaning.kind.value, "value": meaning.value} if meaning is not None else None,
         "ambiguous": bool(match.others),
         "other_marker_ids": list(match.others),
         "note": match.note or None,
