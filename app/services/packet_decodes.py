@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
+from app.decoders.cerpm.known import numbers_in
 from app.decoders.cerpm.track_places import vehicle_places
 from app.errors import Unavailable
 from app.registry import cerpms
@@ -23,7 +24,6 @@ from app.services.packet_reading import (
     ReadPackets,
     find_known,
     lane_markers,
-    numbers_in,
     read_packets_of,
     spans_of,
 )
@@ -84,7 +84,7 @@ def decode_packets(
     terms = packet_terms(context.packets or {})
     camera, pose = _view(files, context)
     with database.read() as connection:
-        known = find_known(connection, agency_id, secrets, numbers_in(files))
+        known = find_known(connection, agency_id, secrets, numbers_in(files.packets))
     read = read_packets_of(files, known, terms, received_at.timestamp())
     result = decoder.start_lane(_lane_task(files, read, terms, camera, pose), wait_s=wait_s).result()
     return DecodedDrive(packets_document(files, read, result), result.plot, read, result)
