@@ -89,7 +89,7 @@ def test_a_fresh_server_prints_its_key_once_and_keeps_what_it_is_told(tmp_path: 
             timeout=120,
         )
     assert second.output == ""
-    assert '"path": "/v1/markers"' in second.logs
+    assert '"path":"/v1/markers"' in second.logs
     assert rival.returncode == 1
     assert "in use by another Waymark process" in rival.stderr
     assert "Traceback" not in rival.stderr
