@@ -50,7 +50,7 @@ def get_snapshot(
 ) -> Response:
     """The markers of an area, signed, for vehicles that decode without a connection; all but the retired ones.
 
-    Keys of CERPMs are not in it.
+    With the agency's codebooks. Keys of CERPMs are not in it.
     """
     headers = {"Content-Disposition": 'attachment; filename="markers.waymark"', "Cache-Control": "private, no-store"}
     return Response(snapshots.make(caller, parse_box(bbox), hours), headers=headers, media_type=MEDIA_TYPE)

@@ -1,4 +1,4 @@
-"""A signed snapshot -> the codebooks of the decoders, on board, without a connection.
+"""A signed snapshot -> what the decoders hold readings against, on board, without a connection.
 
 Of the parts of Waymark this needs the definitions in `app.markers` and what the decoders take; no store, no network, no
 clock. `open_snapshot` verifies before it reads, and refuses by a named error whatever it cannot vouch for.
@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import uuid
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,17 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from pyproj import Geod
 
+from app.decoders.cerpm.freshness import SequenceSpan
+from app.decoders.cerpm.known import KnownCerpms
 from app.decoders.cerpm.merge_types import RegisteredMarker
+from app.decoders.magnet.book import TagBook, TagFormat
+from app.decoders.magnet.registered import RegisteredTag, tag_book
+from app.geodesy import LocalizationGrade
 from app.markers import snapshot as layout
 from app.markers.cerpm import LaneSide
+from app.markers.doubts import position_doubts
 from app.markers.magnet import InformationTag, parse_tag
+from app.markers.magnet_codebook import Codebook, Meaning
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 
 _GEOD = Geod(ellps="WGS84")
@@ -53,6 +61,10 @@ class SnapshotMarker:
         What it has in common with others: scheme and geometry, or side and speed limit.
     distance_m : float
         From the place it was looked for. [m]
+    lane_start_deg : (float, float) or None
+        Longitude and latitude of where the lane of an information tag begins. [deg]
+    heard_before : SequenceSpan or None
+        First and last transmission of a CERPM that the server accepted.
     """
 
     marker_id: str
@@ -70,6 +82,8 @@ class SnapshotMarker:
     exact: bool
     kind: Mapping[str, Any]
     distance_m: float
+    lane_start_deg: tuple[float, float] | None = None
+    heard_before: SequenceSpan | None = None
 
     @property
     def plate_code(self) -> PlateCode:
@@ -81,25 +95,49 @@ class SnapshotMarker:
         """Dimensions of a plate."""
         return PlateGeometry(self.kind["n"], self.kind["unit_mm"], self.kind["gap_mm"], self.kind["thickness_mm"])
 
+    @property
+    def grade(self) -> LocalizationGrade:
+        """What its position is fit for."""
+        return LocalizationGrade.EXACT if self.exact else LocalizationGrade.APPROXIMATE
+
+    def doubts(self, what: str) -> tuple[str, ...]:
+        """What makes its position unfit for localization; `what` is what it is called."""
+        note = self.kind.get("transform_note")
+        rmse_m = self.horizontal_rmse_m
+        return tuple(
+            position_doubts(what, grade=self.grade, transform_note=note, horizontal_rmse_m=rmse_m, status=self.status)
+        )
+
 
 class Snapshot:
     """The markers of an area, verified. `open_snapshot` makes one."""
 
-    def __init__(self, header: Any, columns: dict[str, Any], kinds: list[dict[str, Any]], codes: bytes) -> None:
+    def __init__(
+        self, header: Any, columns: dict[str, Any], kinds: list[dict[str, Any]], codes: bytes, books: list[Any]
+    ) -> None:
+        self.version = int(header["version"])
         self.made_at_s = int(header["made_at_s"])
         self.expires_at_s = int(header["expires_at_s"])
         self.agency_id = str(uuid.UUID(bytes=bytes(header["agency_id"])))
         self.area_deg = tuple(float(header[name]) for name in ("west_deg", "south_deg", "east_deg", "north_deg"))
+        self._books = books
         self._columns = columns
         self._kinds = kinds
         self._codes = codes
         self._ends = np.cumsum(columns["code_bytes"], dtype=np.int64)
         self._lon_deg = columns["lon_step"] * layout.DEGREE_STEP
         self._lat_deg = columns["lat_step"] * layout.DEGREE_STEP
+        self._stands = columns["status"] != layout.STATUSES.index(layout.RETIRED)
         self._family = np.array([layout.FAMILIES.index(kind["family"]) for kind in kinds] or [0])[columns["kind"]]
 
     def __len__(self) -> int:
-        return len(self._lon_deg)
+        """Markers that may be on the road."""
+        return int(np.count_nonzero(self._stands))
+
+    @cached_property
+    def codebooks(self) -> tuple[Codebook, ...]:
+        """The agency's codebooks: what tags look like, and what their codes mean."""
+        return tuple(Codebook.from_document(book) for book in self._books)
 
     def covers(self, lon_deg: float, lat_deg: float) -> bool:
         """Whether a place is in the snapshot's area: outside of it, that no marker is near means nothing."""
@@ -113,7 +151,8 @@ class Snapshot:
         across_deg = reach_deg / max(math.cos(math.radians(min(abs(lat_deg) + reach_deg, 89.9))), 1e-3)
         off_deg = np.abs((self._lon_deg - lon_deg + 180.0) % 360.0 - 180.0)
         proposed = np.flatnonzero(
-            (self._family == layout.FAMILIES.index(family))
+            self._stands
+            & (self._family == layout.FAMILIES.index(family))
             & (np.abs(self._lat_deg - lat_deg) <= reach_deg)
             & (off_deg <= across_deg)
         )
@@ -134,29 +173,45 @@ class Snapshot:
 
     def tags(self, lon_deg: float, lat_deg: float, reach_m: float) -> tuple[InformationTag, ...]:
         """Designs for `TagBook` and `decode_trace`."""
-        found = (parse_tag(marker.code) for marker in self.near("magnet", lon_deg, lat_deg, reach_m))
-        return tuple(dict.fromkeys(tag for tag in found if isinstance(tag, InformationTag)))
+        return tuple(dict.fromkeys(tag.tag for tag in self.registered_tags(lon_deg, lat_deg, reach_m)))
 
-    def match_tag(self, tag: InformationTag, lon_deg: float, lat_deg: float, reach_m: float) -> SnapshotMarker | None:
-        """The tag with this text within reach; None where there are several, as the server has it."""
-        found = [m for m in self.near("magnet", lon_deg, lat_deg, reach_m) if m.code == tag.text]
-        return found[0] if len(found) == 1 else None
+    def registered_tags(self, lon_deg: float, lat_deg: float, reach_m: float) -> tuple[RegisteredTag, ...]:
+        """What `match_tags` holds a trace against, within a distance, in the order of the markers' ids."""
+        found = (_registered_tag(marker) for marker in self.near("magnet", lon_deg, lat_deg, reach_m))
+        return tuple(sorted((tag for tag in found if tag is not None), key=lambda tag: tag.marker_id))
+
+    def tag_book(self, lon_deg: float, lat_deg: float, reach_m: float) -> TagBook:
+        """What `decode_trace` looks for: the tags within a distance; without any, the codebooks' formats."""
+        designs = (book.design for book in self.codebooks)
+        formats = (TagFormat(design.magnets, design.length_m, design.segment_m) for design in designs)
+        return tag_book(self.registered_tags(lon_deg, lat_deg, reach_m), formats)
 
     def registered_cerpms(self, lon_deg: float, lat_deg: float, reach_m: float) -> dict[int, RegisteredMarker]:
-        """What `merge_markers` holds packets against, by number. Keys are not in a snapshot."""
-        registered = {}
-        for marker in self.near("cerpm", lon_deg, lat_deg, reach_m):
-            limit = marker.kind["speed_limit"]
-            rmse_m = marker.horizontal_rmse_m
-            registered[int(marker.code)] = RegisteredMarker(
-                marker.lon_deg,
-                marker.lat_deg,
-                marker.height_m,
-                LaneSide[str(marker.kind["side"]).upper()],
-                math.nan if limit is None else limit["value"] * _KM_H[limit["unit"]],
-                math.nan if rmse_m is None else rmse_m / math.sqrt(2),  # horizontal RMSE is of both axes together
-            )
-        return registered
+        """What `merge_markers` holds packets against, by number, within a distance."""
+        return {int(marker.code): _registered(marker) for marker in self.near("cerpm", lon_deg, lat_deg, reach_m)}
+
+    def known_cerpms(self, numbers: Iterable[int]) -> KnownCerpms:
+        """What `hold_against_known` takes, of the markers with these numbers wherever they are."""
+        wanted = list(numbers)
+        rows = [(number, self._cerpm_rows[number]) for number in wanted if number in self._cerpm_rows]
+        markers = {number: self._marker(row, math.nan) for number, row in rows}
+        intervals = {number: marker.kind.get("least_interval_s") for number, marker in markers.items()}
+        return KnownCerpms(
+            {number: _registered(marker) for number, marker in markers.items()},
+            {n: [marker.heard_before] for n, marker in markers.items() if marker.heard_before is not None},
+            {number: interval for number, interval in intervals.items() if interval is not None},
+            {number: marker.doubts("marker") for number, marker in markers.items()},
+            frozenset(number for number, marker in markers.items() if marker.status == layout.RETIRED),
+        )
+
+    @cached_property
+    def _cerpm_rows(self) -> dict[int, int]:
+        """Rows of the CERPMs by their numbers."""
+        rows = np.flatnonzero(self._family == layout.FAMILIES.index("cerpm"))
+        ends = self._ends[rows]
+        starts = ends - self._columns["code_bytes"][rows]
+        places = zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True)
+        return {int(self._codes[start:end]): row for row, start, end in places}
 
     def _markers(self, rows: npt.NDArray[np.intp], lon_deg: float, lat_deg: float) -> list[SnapshotMarker]:
         lons, lats = self._lon_deg[rows], self._lat_deg[rows]
@@ -165,7 +220,7 @@ class Snapshot:
         return sorted(made, key=lambda marker: (marker.distance_m, marker.marker_id))
 
     def _marker(self, row: int, distance_m: float) -> SnapshotMarker:
-        column = {name: self._columns[name][row] for name, _form in layout.COLUMNS}
+        column = {name: self._columns[name][row] for name, _form in layout.COLUMNS[self.version]}
         end, kind = int(self._ends[row]), self._kinds[int(column["kind"])]
         height, heading = int(column["height_mm"]), int(column["heading_step"])
         return SnapshotMarker(
@@ -184,7 +239,15 @@ class Snapshot:
             exact=bool(column["flags"] & layout.EXACT_FLAG),
             kind=kind,
             distance_m=distance_m,
+            lane_start_deg=self._lane_start_deg(column),
+            heard_before=_heard_before(column),
         )
+
+    def _lane_start_deg(self, column: Mapping[str, Any]) -> tuple[float, float] | None:
+        if "lane_lon_step" not in column or self._kinds[int(column["kind"])].get("scheme") != "information-tag":
+            return None
+        steps = int(column["lane_lon_step"]), int(column["lane_lat_step"])
+        return round(steps[0] * layout.DEGREE_STEP, 9), round(steps[1] * layout.DEGREE_STEP, 9)
 
 
 def open_snapshot(data: bytes, public_key: bytes, now: datetime) -> Snapshot:
@@ -214,18 +277,20 @@ def open_snapshot(data: bytes, public_key: bytes, now: datetime) -> Snapshot:
             "the signature does not fit: the snapshot was changed or damaged", limit="Ed25519", cure=_CURE
         ) from error
     _check_time(header, now)
-    return _read(header, signed[layout.HEADER.itemsize :])
+    return _read(header, signed[header.dtype.itemsize :])
 
 
 def _header(data: bytes) -> Any:
     if data[:8] != layout.MAGIC[: len(data)] or not data:
         raise layout.NoSnapshot("this is no snapshot", limit=f"begins with {layout.MAGIC.decode()}", cure=_CURE)
-    if len(data) >= 10 and (version := int.from_bytes(data[8:10], "little")) != layout.VERSION:
+    version = int.from_bytes(data[8:10], "little") if len(data) >= 10 else layout.VERSION
+    if version not in layout.HEADERS:
         raise layout.FutureSnapshot(
-            f"the snapshot is of version {version}", limit=f"version {layout.VERSION}", cure="update the reader"
+            f"the snapshot is of version {version}", limit=f"versions 1 to {layout.VERSION}", cure="update the reader"
         )
-    least = layout.HEADER.itemsize + layout.SIGNATURE_BYTES
-    header = np.frombuffer(data, dtype=layout.HEADER, count=1)[0] if len(data) >= least else None
+    form = layout.HEADERS[version]
+    least = form.itemsize + layout.SIGNATURE_BYTES
+    header = np.frombuffer(data, dtype=form, count=1)[0] if len(data) >= least else None
     wanted = least + int(header["body_bytes"]) if header is not None else least
     if header is None or len(data) != wanted:
         raise layout.TruncatedSnapshot(f"the snapshot has {len(data)} bytes", limit=f"{wanted} bytes", cure=_CURE)
@@ -246,8 +311,9 @@ def _check_time(header: Any, now: datetime) -> None:
 
 def _read(header: Any, packed: bytes) -> Snapshot:
     count = int(header["markers"])
-    kinds_bytes, codes_bytes = int(header["kinds_bytes"]), int(header["codes_bytes"])
-    size = count * layout.ROW_BYTES + kinds_bytes + codes_bytes
+    version, kinds_bytes, codes_bytes = (int(header[name]) for name in ("version", "kinds_bytes", "codes_bytes"))
+    books_bytes = int(header["books_bytes"]) if version > 1 else 0
+    size = count * layout.row_bytes(version) + kinds_bytes + codes_bytes + books_bytes
     try:
         body = zlib.decompressobj().decompress(packed, size + 1)
     except zlib.error as error:
@@ -255,11 +321,50 @@ def _read(header: Any, packed: bytes) -> Snapshot:
     if len(body) != size or count > layout.MAX_MARKERS:
         raise layout.TruncatedSnapshot(f"the body has {len(body)} bytes", limit=f"{size} bytes", cure=_CURE)
     columns, start = {}, 0
-    for name, form in layout.COLUMNS:
+    for name, form in layout.COLUMNS[version]:
         columns[name] = np.frombuffer(body, dtype=form, count=count, offset=start)
         start += columns[name].nbytes
-    kinds = orjson.loads(body[start : start + kinds_bytes])
-    return Snapshot(header, columns, kinds, body[start + kinds_bytes :])
+    codes_at, books_at = start + kinds_bytes, start + kinds_bytes + codes_bytes
+    kinds = orjson.loads(body[start:codes_at])
+    books = orjson.loads(body[books_at:]) if version > 1 else []
+    return Snapshot(header, columns, kinds, body[codes_at:books_at], books)
+
+
+def _registered_tag(marker: SnapshotMarker) -> RegisteredTag | None:
+    """An information tag; None of a line."""
+    tag = parse_tag(marker.code)
+    if not isinstance(tag, InformationTag):
+        return None
+    lane_lon_deg, lane_lat_deg = marker.lane_start_deg or (marker.lon_deg, marker.lat_deg)
+    meaning = marker.kind.get("meaning")
+    return RegisteredTag(
+        marker.marker_id, marker.status, tag, marker.lon_deg, marker.lat_deg, marker.height_m,
+        marker.heading_deg or 0.0, lane_lon_deg, lane_lat_deg, marker.horizontal_rmse_m, marker.grade,
+        marker.doubts("tag"), None if meaning is None else Meaning(**meaning),
+    )  # fmt: skip
+
+
+def _registered(marker: SnapshotMarker) -> RegisteredMarker:
+    limit, rmse_m = marker.kind["speed_limit"], marker.horizontal_rmse_m
+    return RegisteredMarker(
+        marker.lon_deg,
+        marker.lat_deg,
+        marker.height_m,
+        LaneSide[str(marker.kind["side"]).upper()],
+        math.nan if limit is None else limit["value"] * _KM_H[limit["unit"]],
+        math.nan if not rmse_m else rmse_m / math.sqrt(2),  # horizontal RMSE is of both axes together
+    )
+
+
+def _heard_before(column: Mapping[str, Any]) -> SequenceSpan | None:
+    if not column["flags"] & layout.HEARD_FLAG:
+        return None
+    times_s = (math.nan if int(ms) == layout.NO_TIME else int(ms) / 1000 for ms in _times_ms(column))
+    return SequenceSpan(int(column["first_sequence"]), int(column["last_sequence"]), *times_s)
+
+
+def _times_ms(column: Mapping[str, Any]) -> tuple[Any, Any]:
+    return column["first_heard_ms"], column["last_heard_ms"]
 
 
 def _value(steps: Any, step: float) -> float | None:

@@ -27,6 +27,7 @@ def write_snapshot(
     made_at: datetime,
     expires_at: datetime,
     key: Ed25519PrivateKey,
+    codebooks: Sequence[Mapping[str, Any]] = (),
 ) -> bytes:
     """A signed snapshot.
 
@@ -34,13 +35,17 @@ def write_snapshot(
     ----------
     markers : sequence of mapping
         id, family, status, code, kind (what markers have in common, a mapping), lon_deg, lat_deg, height_m,
-        vertical_datum, heading_deg, horizontal_rmse_m, vertical_rmse_m, heading_rmse_deg, localization_grade.
+        vertical_datum, heading_deg, horizontal_rmse_m, vertical_rmse_m, heading_rmse_deg, localization_grade; of
+        information tags lane_lon_deg and lane_lat_deg, where their lane begins; of CERPMs that were heard before
+        first_sequence, last_sequence, and first_heard_s, last_heard_s (None where that is not known).
     agency_id : str
     area_deg : tuple of float
         west, south, east, north.
     made_at, expires_at : datetime
         Aware; kept to the second.
     key : Ed25519PrivateKey
+    codebooks : sequence of mapping
+        As `Codebook.to_document` writes them.
 
     Raises
     ------
@@ -64,7 +69,8 @@ def write_snapshot(
     body = zlib.compress(
         b"".join(column.tobytes() for column in _columns(markers, numbers, codes))
         + (kinds_text := b"[" + b",".join(kinds) + b"]")
-        + (codes_text := b"".join(codes)),
+        + (codes_text := b"".join(codes))
+        + (books_text := orjson.dumps(list(codebooks))),
         level=6,
     )
     header = np.zeros((), dtype=layout.HEADER)
@@ -75,6 +81,7 @@ def write_snapshot(
     for name, value in zip(("west_deg", "south_deg", "east_deg", "north_deg"), area_deg, strict=True):
         header[name] = value
     header["kinds_bytes"], header["codes_bytes"], header["body_bytes"] = len(kinds_text), len(codes_text), len(body)
+    header["books_bytes"] = len(books_text)
     signed = header.tobytes() + body
     return signed + key.sign(signed)
 
@@ -99,8 +106,14 @@ def _columns(
         "status": [layout.STATUSES.index(marker["status"]) for marker in markers],
         "flags": [_flags(marker) for marker in markers],
         "code_bytes": [len(code) for code in codes],
+        "lane_lon_step": [round((marker.get("lane_lon_deg") or 0.0) / layout.DEGREE_STEP) for marker in markers],
+        "lane_lat_step": [round((marker.get("lane_lat_deg") or 0.0) / layout.DEGREE_STEP) for marker in markers],
+        "first_sequence": [marker.get("first_sequence") or 0 for marker in markers],
+        "last_sequence": [marker.get("last_sequence") or 0 for marker in markers],
+        "first_heard_ms": [_heard_ms(marker.get("first_heard_s")) for marker in markers],
+        "last_heard_ms": [_heard_ms(marker.get("last_heard_s")) for marker in markers],
     }
-    return [np.array(values[name], dtype=form) for name, form in layout.COLUMNS]
+    return [np.array(values[name], dtype=form) for name, form in layout.COLUMNS[layout.VERSION]]
 
 
 def _height_mm(height_m: float | None) -> int:
@@ -118,6 +131,11 @@ def _rmse(value: float | None, step: float) -> int:
     return layout.NO_RMSE if value is None else min(math.ceil(value / step - 1e-6), layout.NO_RMSE - 1)
 
 
+def _heard_ms(time_s: float | None) -> int:
+    return layout.NO_TIME if time_s is None or not math.isfinite(time_s) else round(time_s * 1000)
+
+
 def _flags(marker: Mapping[str, Any]) -> int:
-    exact = layout.EXACT_FLAG if marker["localization_grade"] == "exact" else 0
-    return exact | (layout.ELLIPSOIDAL_FLAG if marker["vertical_datum"] in (None, "ellipsoid") else 0)
+    flags = layout.EXACT_FLAG if marker["localization_grade"] == "exact" else 0
+    flags |= layout.ELLIPSOIDAL_FLAG if marker["vertical_datum"] in (None, "ellipsoid") else 0
+    return flags | (layout.HEARD_FLAG if marker.get("last_sequence") is not None else 0)

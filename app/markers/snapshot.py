@@ -14,33 +14,35 @@ import numpy as np
 from app.errors import UnreadableUpload
 
 MAGIC: Final = b"WAYMARKS"
-VERSION: Final = 1
+VERSION: Final = 2
+"""That is written; older ones are read too."""
 SIGNATURE_BYTES: Final = 64
 MEDIA_TYPE: Final = "application/vnd.waymark.snapshot"
 MAX_MARKERS: Final = 1_000_000
 
-HEADER = np.dtype(
-    [
-        ("magic", "S8"),
-        ("version", "<u2"),
-        ("reserved", "<u2"),
-        ("markers", "<u4"),
-        ("made_at_s", "<i8"),
-        ("expires_at_s", "<i8"),
-        ("key_id", "V8"),
-        ("agency_id", "V16"),
-        ("west_deg", "<f8"),
-        ("south_deg", "<f8"),
-        ("east_deg", "<f8"),
-        ("north_deg", "<f8"),
-        ("kinds_bytes", "<u4"),
-        ("codes_bytes", "<u4"),
-        ("body_bytes", "<u4"),
-    ]
-)
-"""First bytes of the file."""
+_FIELDS = [
+    ("magic", "S8"),
+    ("version", "<u2"),
+    ("reserved", "<u2"),
+    ("markers", "<u4"),
+    ("made_at_s", "<i8"),
+    ("expires_at_s", "<i8"),
+    ("key_id", "V8"),
+    ("agency_id", "V16"),
+    ("west_deg", "<f8"),
+    ("south_deg", "<f8"),
+    ("east_deg", "<f8"),
+    ("north_deg", "<f8"),
+    ("kinds_bytes", "<u4"),
+    ("codes_bytes", "<u4"),
+    ("body_bytes", "<u4"),
+]
 
-COLUMNS: Final = (
+HEADERS: Final = {1: np.dtype(_FIELDS), 2: np.dtype([*_FIELDS, ("books_bytes", "<u4")])}
+"""First bytes of a file, by its version."""
+HEADER = HEADERS[VERSION]
+
+_COLUMNS = (
     ("id", "V16"),
     ("lon_step", "<i8"),
     ("lat_step", "<i8"),
@@ -54,8 +56,22 @@ COLUMNS: Final = (
     ("flags", "u1"),
     ("code_bytes", "u1"),
 )
-"""Columns of the body, each whole before the next."""
-ROW_BYTES: Final = sum(np.dtype(form).itemsize for _name, form in COLUMNS)
+_COLUMNS_OF_TAGS_AND_CERPMS = (
+    ("lane_lon_step", "<i8"),
+    ("lane_lat_step", "<i8"),
+    ("first_sequence", "<u4"),
+    ("last_sequence", "<u4"),
+    ("first_heard_ms", "<i8"),
+    ("last_heard_ms", "<i8"),
+)
+COLUMNS: Final = {1: _COLUMNS, 2: (*_COLUMNS, *_COLUMNS_OF_TAGS_AND_CERPMS)}
+"""Columns of the body by the file's version, each whole before the next."""
+
+
+def row_bytes(version: int) -> int:
+    """Of one marker in all columns. [bytes]"""
+    return sum(np.dtype(form).itemsize for _name, form in COLUMNS[version])
+
 
 DEGREE_STEP: Final = 1e-9
 """Of longitude and latitude; 0.1 mm. [deg]"""
@@ -64,13 +80,18 @@ HEADING_RMSE_STEP_DEG: Final = 1e-3
 NO_HEIGHT: Final = -(2**31)
 NO_HEADING: Final = 2**32 - 1
 NO_RMSE: Final = 2**16 - 1
+NO_TIME: Final = -(2**63)
 EXACT_FLAG: Final = 1
 """The position is fit for localization, by its survey's frame."""
 ELLIPSOIDAL_FLAG: Final = 2
 """The height is above the ellipsoid."""
+HEARD_FLAG: Final = 4
+"""Transmissions of the CERPM were heard before."""
 
 FAMILIES: Final = ("plate", "magnet", "cerpm")
-STATUSES: Final = ("planned", "built", "surveyed", "active", "suspect")
+RETIRED: Final = "retired"
+"""Only CERPMs: what they say counts no more, whoever has their keys."""
+STATUSES: Final = ("planned", "built", "surveyed", "active", "suspect", RETIRED)
 
 
 class SnapshotRefused(UnreadableUpload):

@@ -124,22 +124,37 @@ def has_heights(connection: sa.Connection, agency_id: str, narrowed: MarkerFilte
 _SNAPSHOT = (
     "id", "family", "status", "scheme", "digits", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm", "lon_deg",
     "lat_deg", "height_m", "vertical_datum", "heading_deg", "horizontal_rmse_m", "vertical_rmse_m", "heading_rmse_deg",
-    "localization_grade",
+    "localization_grade", "transform_accuracy_m", "transform_note",
 )  # fmt: skip
 
 
-def list_for_snapshot(connection: sa.Connection, agency_id: str, box: Box, *, limit: int) -> list[Row]:
-    """The agency's markers in a box that may be on the road, with what vehicles need of them; in the order of ids."""
+def list_for_snapshot(connection: sa.Connection, agency_id: str, family: str, box: Box, *, limit: int) -> list[Row]:
+    """The agency's markers of a family in a box with what vehicles need of them: all but the retired ones.
+
+    Retired CERPMs are among them: whoever has their keys can still send. Of magnets also lane_lon_deg, lane_lat_deg and
+    meaning; of CERPMs side, speed_limit, interval_s and jitter_share.
+    """
     spec = markers.c.spec
-    limit_of = spec["speed_limit"]
-    query = (
-        sa.select(
-            *(markers.c[name] for name in _SNAPSHOT),
+    lane_start, radio = spec["lane"]["points_deg"][0], spec["radio"]
+    own: dict[str, tuple[sa.ColumnElement[Any], ...]] = {
+        "plate": (),
+        "magnet": (
+            lane_start[0].as_float().label("lane_lon_deg"),
+            lane_start[1].as_float().label("lane_lat_deg"),
+            spec["meaning"].label("meaning"),
+        ),
+        "cerpm": (
             spec["side"].as_string().label("side"),
-            limit_of["value"].as_integer().label("speed_limit_value"),
-            limit_of["unit"].as_string().label("speed_limit_unit"),
-        )
-        .where(markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box))
-        .order_by(markers.c.id)
+            spec["speed_limit"].label("speed_limit"),
+            radio["interval_s"].as_float().label("interval_s"),
+            radio["jitter_share"].as_float().label("jitter_share"),
+        ),
+    }
+    query = sa.select(*(markers.c[name] for name in _SNAPSHOT), *own[family]).where(
+        markers.c.agency_id == agency_id,
+        markers.c.family == family,
+        within_box(box),
     )
+    if family != "cerpm":
+        query = query.where(markers.c.status != "retired")
     return list(connection.execute(query.limit(limit)).mappings())

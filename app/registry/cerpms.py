@@ -63,6 +63,40 @@ def list_spans(connection: sa.Connection, agency_id: str, numbers: Iterable[int]
     return found
 
 
+def list_span_ends(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, Row]:
+    """First and last transmission of each of these markers that was ever heard, and when, by number.
+
+    Rows have number, first_sequence, first_heard_s, last_sequence, last_heard_s; of markers that were heard.
+    """
+    wanted, mine = list(numbers), cerpm_spans.c
+    first, last = sa.func.min(mine.first_sequence), sa.func.max(mine.last_sequence)
+    found: dict[int, Row] = {}
+    for start in range(0, len(wanted), _CHUNK):
+        chosen = (mine.agency_id == agency_id, mine.number.in_(wanted[start : start + _CHUNK]))
+        ends = sa.select(mine.number, first.label("first"), last.label("last")).where(*chosen).group_by(mine.number)
+        end = ends.subquery()
+        query = (
+            sa.select(
+                mine.number,
+                end.c.first.label("first_sequence"),
+                end.c.last.label("last_sequence"),
+                _time_of(mine.first_sequence == end.c.first, mine.first_heard_s).label("first_heard_s"),
+                _time_of(mine.last_sequence == end.c.last, mine.last_heard_s).label("last_heard_s"),
+            )
+            .join(end, end.c.number == mine.number)
+            .where(*chosen)
+            .group_by(mine.number, end.c.first, end.c.last)
+        )
+        found.update({row["number"]: row for row in connection.execute(query).mappings()})
+    return found
+
+
+def _time_of(end: sa.ColumnElement[bool], heard_s: sa.ColumnElement[float]) -> sa.ColumnElement[float | None]:
+    """When an end was heard first; null where one log that has it had no times."""
+    untimed = sa.func.count(sa.case((sa.and_(end, heard_s.is_(None)), 1)))
+    return sa.case((untimed > 0, None), else_=sa.func.min(sa.case((end, heard_s))))
+
+
 def last_span_row(connection: sa.Connection, agency_id: str) -> int:
     """The row of the agency's newest span; a reader sees by it whether others were added since."""
     query = sa.select(sa.func.max(cerpm_spans.c.row)).where(cerpm_spans.c.agency_id == agency_id)

@@ -15,6 +15,8 @@ from app.services.marker_documents import meaning_document
 
 MOST_COUNTED = 200
 """Up to which the codes that fit are counted, so that no request takes long."""
+MAX_BOOKS_SEARCHED = 50
+"""Of an agency's codebooks the oldest, whose formats are looked for where no tag is registered."""
 _ACCURACY = 0.99
 
 

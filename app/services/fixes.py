@@ -10,12 +10,12 @@ import numpy as np
 
 from app.decoders.plate.pose import VehicleFix, fix_vehicle
 from app.geodesy import LocalizationGrade, enu_from_wgs84, wgs84_from_enu
+from app.markers import doubts
 from app.markers.reading import PlatePose
 from app.registry.markers import Row
 from app.sensors.camera import Camera
 from app.services.matching import Match
 
-SURVEYED = ("surveyed", "active")
 # what stands in for an accuracy that nobody stated; fixes that rest on one are only approximate
 ASSUMED_HORIZONTAL_RMSE_M = 1.0
 ASSUMED_VERTICAL_RMSE_M = 1.0
@@ -123,14 +123,10 @@ def fuse_fixes(fixes: Sequence[Fix]) -> Fix | None:
 
 def position_doubts(row: Row, what: str) -> list[str]:
     """What makes the position of a plate or a tag unfit for localization."""
-    doubts = []
-    if row["localization_grade"] != LocalizationGrade.EXACT:
-        doubts.append(row["transform_note"] or f"the {what}'s position is approximate")
-    if row["horizontal_rmse_m"] is None:
-        doubts.append(f"the {what}'s position has no stated accuracy")
-    if row["status"] not in SURVEYED:
-        doubts.append(f"the {what} is {row['status']}, its position is not surveyed")
-    return doubts
+    return doubts.position_doubts(
+        what, grade=row["localization_grade"], transform_note=row["transform_note"],
+        horizontal_rmse_m=row["horizontal_rmse_m"], status=row["status"],
+    )  # fmt: skip
 
 
 def horizontal_rmse_m(row: Row) -> float | None:

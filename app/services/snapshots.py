@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
+import sqlalchemy as sa
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from app.encoders.snapshot import write_snapshot
 from app.errors import InvalidParameter
-from app.markers.snapshot import MAX_MARKERS, key_id_of
-from app.registry import bulk
+from app.geodesy import LocalizationGrade
+from app.markers.snapshot import FAMILIES, MAX_MARKERS, key_id_of
+from app.registry import bulk, cerpms, codebooks
 from app.registry.database import Database
 from app.registry.markers import Row
 from app.registry.spatial import Box
 from app.services.access import Caller
+from app.services.codebook_documents import MAX_BOOKS_SEARCHED, book_of
+from app.services.fixes import horizontal_rmse_m
 from app.services.ports import Clock
 
 MAX_HOURS = 24.0 * 366
@@ -48,7 +52,9 @@ class Snapshots:
         self._signing_key = signing_key
 
     def make(self, caller: Caller, box: Box, hours: float) -> bytes:
-        """A signed snapshot of the agency's markers in a box, all but the retired ones.
+        """A signed snapshot of the agency's markers in a box, all but the retired ones, and its codebooks.
+
+        It holds no secret: the keys of CERPMs are symmetric, who can verify with one can sign with it.
 
         Raises
         ------
@@ -61,14 +67,16 @@ class Snapshots:
             )
         now = self._clock()
         with self._database.read() as connection:
-            rows = bulk.list_for_snapshot(connection, caller.agency_id, box, limit=MAX_MARKERS + 1)
+            markers = list_markers(connection, caller.agency_id, box)
+            books = codebooks.list_codebooks(connection, caller.agency_id, after=None, limit=MAX_BOOKS_SEARCHED)
         return write_snapshot(
-            [_marker(row) for row in rows],
+            markers,
             agency_id=caller.agency_id,
             area_deg=(box.west_deg, box.south_deg, box.east_deg, box.north_deg),
             made_at=now,
             expires_at=now + timedelta(hours=hours),
             key=self._signing_key(),
+            codebooks=[book_of(row).to_document() for row in books],
         )
 
     def public_key(self) -> PublicKey:
@@ -77,12 +85,28 @@ class Snapshots:
         return PublicKey(key_id_of(public), public)
 
 
-def _marker(row: Row) -> dict[str, Any]:
+def list_markers(connection: sa.Connection, agency_id: str, box: Box) -> list[dict[str, Any]]:
+    """The agency's markers in a box as a snapshot holds them, in the order of their ids; one too many tells of more."""
+    rows: list[Row] = []
+    for family in FAMILIES:
+        left = MAX_MARKERS + 1 - len(rows)
+        rows += bulk.list_for_snapshot(connection, agency_id, family, box, limit=left) if left > 0 else []
+    numbers = [int(row["digits"]) for row in rows if row["family"] == "cerpm"] if len(rows) <= MAX_MARKERS else []
+    heard = cerpms.list_span_ends(connection, agency_id, numbers)
+    rows.sort(key=lambda row: str(row["id"]))
+    return [_marker(row, heard) for row in rows]
+
+
+def _marker(row: Row, heard: Mapping[int, Row]) -> dict[str, Any]:
+    marker = {**row, "code": row["digits"], "horizontal_rmse_m": horizontal_rmse_m(row)}
     kind: dict[str, Any] = {}
     if row["family"] == "plate":
         kind = {name: row[name] for name in _PLATE}
-    elif row["family"] == "cerpm":
-        limit = row["speed_limit_value"]
-        speed_limit = None if limit is None else {"value": limit, "unit": row["speed_limit_unit"]}
-        kind = {"side": row["side"], "speed_limit": speed_limit}
-    return {**row, "code": row["digits"], "kind": kind}
+    elif row["family"] == "magnet":
+        kind = {"scheme": row["scheme"], "meaning": row["meaning"]}
+    else:
+        least_interval_s = row["interval_s"] * (1 - row["jitter_share"])
+        kind = {"side": row["side"], "speed_limit": row["speed_limit"], "least_interval_s": least_interval_s}
+        marker |= heard.get(int(row["digits"]), {})
+    note = None if row["localization_grade"] == LocalizationGrade.EXACT else row["transform_note"]
+    return {**marker, "kind": {**kind, "transform_note": note}}

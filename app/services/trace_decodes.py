@@ -12,7 +12,7 @@ from app.decoders.magnet.book import TagFormat
 from app.decoders.magnet.registered import ReadTrace, match_tags
 from app.registry import codebooks
 from app.registry import decodes as store
-from app.services.codebook_documents import book_of
+from app.services.codebook_documents import MAX_BOOKS_SEARCHED, book_of
 from app.services.decode_context import DecodeContext
 from app.services.decode_rules import DecodeRules
 from app.services.frames import Blobs
@@ -23,7 +23,6 @@ from app.storage.blobs import new_blob_key
 
 TRACE = "trace"
 PICTURES = "pictures"
-_MAX_BOOKS = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,7 @@ def start_trace(
 
 def _book_formats(connection: sa.Connection, agency_id: str) -> tuple[TagFormat, ...]:
     """Formats of the agency's codebooks: what tags look like where none is registered near by."""
-    rows = codebooks.list_codebooks(connection, agency_id, after=None, limit=_MAX_BOOKS)
+    rows = codebooks.list_codebooks(connection, agency_id, after=None, limit=MAX_BOOKS_SEARCHED)
     designs = [book_of(row).design for row in rows]
     return tuple(dict.fromkeys(TagFormat(d.magnets, d.length_m, d.segment_m) for d in designs))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import UTC, datetime, timedelta
 
 import httpx
@@ -49,13 +50,33 @@ def test_a_vehicle_gets_its_agencys_markers_and_no_others(server: LiveServer, cl
     assert (plate.marker_id, plate.code) == (made[0]["id"], made[0]["code"]["digits"])
     assert (plate.lon_deg, plate.lat_deg, plate.height_m) == (8.412345678, 49.012345678, 120.5)
     known = {marker.code: marker.kind for marker in snapshot.near("cerpm", 8.4123, 49.0123, 100.0)}
-    assert known["1"] == {"family": "cerpm", "side": "right", "speed_limit": limit}
-    assert known["2"] == {"family": "cerpm", "side": "unknown", "speed_limit": None}
+    said = {"family": "cerpm", "least_interval_s": 0.8, "transform_note": None}
+    assert known["1"] == {**said, "side": "right", "speed_limit": limit}
+    assert known["2"] == {**said, "side": "unknown", "speed_limit": None}
     with pytest.raises(ExpiredSnapshot):
         open_snapshot(answer.content, _public_key(server), datetime.now(UTC) + timedelta(hours=2))
     with server.agency("snapshots of another", Scope.VEHICLE) as other:
         foreign = other.get("/v1/snapshots", params={"bbox": BOX})
-        assert len(open_snapshot(foreign.content, _public_key(server), datetime.now(UTC))) == 0
+        nothing = open_snapshot(foreign.content, _public_key(server), datetime.now(UTC))
+        assert (len(nothing), nothing.codebooks) == (0, ())
+
+
+def test_a_survey_in_another_frame_is_as_good_as_its_transformation(server: LiveServer, client: httpx.Client) -> None:
+    place = {"lon_deg": 8.41, "lat_deg": 49.01, "horizontal_rmse_m": 0.02}
+    exact = client.post("/v1/markers", json={"position": {**place, "crs": "EPSG:4258", "epoch": 2020.0}}).json()
+    vague = client.post("/v1/markers", json={"position": {**place, "lon_deg": 8.42, "crs": "EPSG:4258"}}).json()
+    answer = client.get("/v1/snapshots", params={"bbox": BOX})
+    snapshot = open_snapshot(answer.content, _public_key(server), datetime.now(UTC))
+    for marker in (exact, vague):
+        position = marker["position"]
+        (found,) = snapshot.near("plate", position["lon_deg"], position["lat_deg"], 1.0)
+        bound_m = position["transform_accuracy_m"] or 0.0
+        assert found.horizontal_rmse_m == pytest.approx(math.hypot(0.02, bound_m), abs=0.001)
+        assert found.horizontal_rmse_m >= math.hypot(0.02, bound_m) - 1e-9
+        assert found.grade == position["localization_grade"]
+        approximate = [] if found.grade == "exact" else [position["transform_note"]]
+        assert found.doubts("plate") == (*approximate, "the plate is planned, its position is not surveyed")
+    assert {exact["position"]["localization_grade"], vague["position"]["localization_grade"]} > {"exact"}
 
 
 @pytest.mark.parametrize(

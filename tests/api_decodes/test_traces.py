@@ -8,7 +8,7 @@ import json
 import math
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import httpx
@@ -39,8 +39,10 @@ def _tag(code: str) -> InformationTag:
     return tag
 
 
-def _drive(seed: int = 1, *, wrong_way: bool = False, road: Road | None = None, **scene: Any) -> SimulatedDrive:
-    tags = [PlacedTag(_tag(code), at, 0.05) for code, at in zip(_CODES, _AT_M, strict=True)]
+def _drive(
+    seed: int = 1, *, wrong_way: bool = False, road: Road | None = None, codes: Sequence[str] = _CODES, **scene: Any
+) -> SimulatedDrive:
+    tags = [PlacedTag(_tag(code), at, 0.05) for code, at in zip(codes, _AT_M, strict=True)]
     return simulate_drive(
         Scene(
             road or Road(LENGTH_M), Vehicle.compact(), Course(speed_m_s=12.0), tags=tags, wrong_way=wrong_way, **scene
@@ -60,13 +62,13 @@ def _zipped(files: dict[str, bytes]) -> bytes:
 class Place:
     """A lane somewhere on earth that is the simulation's road, with its tags registered."""
 
-    def __init__(self, client: httpx.Client) -> None:
+    def __init__(self, client: httpx.Client, codes: Sequence[str] = _CODES, codebook_id: str | None = None) -> None:
         self.client = client
         self.road = Road(LENGTH_M)
         self.origin = (-80.0 + next(_PLACES) * 0.7, 42.0, 100.0)
         lane = [self._lon_lat(s) for s in np.arange(0.0, LENGTH_M + 1, 10.0)]
         self.ids = []
-        for code, at in zip(_CODES, _AT_M, strict=True):
+        for code, at in zip(codes, _AT_M, strict=True):
             body = {
                 "family": "magnet",
                 "lane": {
@@ -77,7 +79,7 @@ class Place:
                     "horizontal_rmse_m": 0.01,
                 },
                 "status": "surveyed",
-                "tag": {"code": code, "chainage_m": at, "offset_m": 0.05},
+                "tag": {"code": code, "codebook_id": codebook_id, "chainage_m": at, "offset_m": 0.05},
             }
             answer = client.post("/v1/markers", json=body)
             assert answer.status_code == 201, answer.text

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import math
 import uuid
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -10,10 +12,14 @@ import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from app.decoders.magnet.book import TagFormat
 from app.decoders.snapshot import Snapshot, open_snapshot
 from app.encoders.snapshot import write_snapshot
 from app.errors import InvalidParameter
 from app.markers import snapshot as layout
+from app.markers.magnet import parse_tag
+from app.markers.magnet_codebook import Codebook, Meaning
+from app.markers.magnet_design import TagDesign
 from app.markers.plate import PlateCode, PlateScheme
 
 NOW = datetime(2026, 5, 4, 8, 0, 0, tzinfo=UTC)
@@ -38,19 +44,18 @@ def _plate(lon_deg: float, lat_deg: float, code: PlateCode | None = None, **more
 
 def _cerpm(number: int, lon_deg: float, lat_deg: float, **more: Any) -> dict[str, Any]:
     limit = {"value": 50, "unit": "mph"} if number % 2 else None
-    return _plate(
-        lon_deg, lat_deg, family="cerpm", code=None, kind={"side": "left", "speed_limit": limit}, **more
-    ) | {"code": str(number)}  # fmt: skip
+    more = {"kind": {"side": "left", "speed_limit": limit}, **more}
+    return _plate(lon_deg, lat_deg, family="cerpm", code=None, **more) | {"code": str(number)}
 
 
-def _tag(text: str, lon_deg: float, lat_deg: float) -> dict[str, Any]:
-    return _plate(lon_deg, lat_deg, family="magnet", kind={}) | {"code": text}
+def _tag(text: str, lon_deg: float, lat_deg: float, **more: Any) -> dict[str, Any]:
+    return _plate(lon_deg, lat_deg, family="magnet", **{"kind": {}, **more}) | {"code": text}
 
 
-def _write(markers: list[dict[str, Any]], hours: float = 24.0) -> bytes:
+def _write(markers: list[dict[str, Any]], hours: float = 24.0, **more: Any) -> bytes:
     return write_snapshot(
         markers, agency_id=str(uuid.UUID(int=7)), area_deg=AREA, made_at=NOW,
-        expires_at=NOW + timedelta(hours=hours), key=KEY,
+        expires_at=NOW + timedelta(hours=hours), key=KEY, **more,
     )  # fmt: skip
 
 
@@ -138,8 +143,8 @@ def test_each_refusal_has_its_name() -> None:
         _open(b"")
     with pytest.raises(layout.NoSnapshot):
         _open(b"SQLite format 3\x00" + data[16:])
-    with pytest.raises(layout.FutureSnapshot, match="version 2"):
-        _open(data[:8] + b"\x02\x00" + data[10:])
+    with pytest.raises(layout.FutureSnapshot, match="version 3"):
+        _open(data[:8] + b"\x03\x00" + data[10:])
     other = Ed25519PrivateKey.generate()
     with pytest.raises(layout.ForeignSnapshot):
         open_snapshot(data, other.public_key().public_bytes_raw(), NOW)
@@ -164,10 +169,83 @@ def test_too_many_markers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_layout_is_as_documented() -> None:
     """docs/snapshots.md gives these numbers; a change of any is another version."""
-    assert layout.HEADER.itemsize == 100
-    assert [(name, layout.HEADER.fields[name][1]) for name in layout.HEADER.names] == [
+    first = [
         ("magic", 0), ("version", 8), ("reserved", 10), ("markers", 12), ("made_at_s", 16), ("expires_at_s", 24),
         ("key_id", 32), ("agency_id", 40), ("west_deg", 56), ("south_deg", 64), ("east_deg", 72), ("north_deg", 80),
         ("kinds_bytes", 88), ("codes_bytes", 92), ("body_bytes", 96),
     ]  # fmt: skip
-    assert layout.ROW_BYTES == 51
+    places = {
+        version: [(name, form.fields[name][1]) for name in form.names] for version, form in layout.HEADERS.items()
+    }
+    assert places == {1: first, 2: [*first, ("books_bytes", 100)]}
+    assert {version: form.itemsize for version, form in layout.HEADERS.items()} == {1: 100, 2: 104}
+    assert (layout.row_bytes(1), layout.row_bytes(2)) == (51, 91)
+
+
+VERSION_1 = base64.b64decode(
+    "V0FZTUFSS1MBAAAAAwAAAABS+GkAAAAAgKP5aQAAAABWR1qnVGNHTAAAAAAAAAAAAAAAAAAAAAcAAAAAAAAgQAAAAAAAAEhAAAAAAAAAIkAAAAAA"
+    "AABJQM8AAAAcAAAA8QAAAHicbY3BSgMxEIazu0cV7x7nHEtqW5Q8hJceRULYTXeHJmkwWUGWfZeeBZ/AF/ABxCfxrkmEli3OMAw/8/3/EDKpYipJ"
+    "eaIr8vn2naHT/brvzv7ZV1/FYfbvF4f5659cHyR1el6SsiyrqjovLh8GqDtVb0WDLQYP3PZaU9hIg/oFODgtgwIKrXTCGOCrGaNggd9R8NFoVGJ2"
+    "HgPubMRCh/XWKu8zfMMS3VsMWS6ieaTDMbxWT85El8cm5Wi1CUk5pRqh0WAAPmR7PBrXxduz1H1EV2ycBBnZWhVgfFyyY92u79diKdhsLubsesF+"
+    "AYV7ZlWWeBkXHJ95xXW+epzzX0c4VbrahLf/+YmDGMHbyDGydvL0NVg/iZZmUlJ2sDgeOMRvB+9FBwlW7qsWVIFENjoL"
+)
+"""What the writer of version 1 made of a plate, a tag and a CERPM, hours=24 from NOW."""
+
+
+def test_a_snapshot_of_version_1_is_read() -> None:
+    snapshot = _open(VERSION_1)
+    assert (snapshot.version, len(snapshot), snapshot.codebooks) == (1, 3, ())
+    assert snapshot.plate_codebook(8.4, 49.0, 10.0) == (PlateCode.from_position(8.4, 49.0),)
+    (tag,) = snapshot.registered_tags(8.4, 49.0, 10.0)
+    assert (tag.tag.text, tag.bearing_deg, tag.meaning) == ("SNS_4_0.1_10-30", 90.0, None)
+    known = snapshot.known_cerpms([7, 8])
+    assert known.registered[7].speed_limit_km_h == pytest.approx(80.4672)
+    assert (known.heard_before, known.least_interval_s) == ({}, {})
+    forged = VERSION_1[:8] + layout.VERSION.to_bytes(2, "little") + VERSION_1[10:]
+    with pytest.raises(layout.SnapshotRefused):
+        _open(forged)
+
+
+# --- what the decoders need besides places ----------------------------------------------------------------------
+
+
+def test_tags_carry_their_lane_and_meaning_and_books_their_formats() -> None:
+    meaning = {"kind": "bend-right", "value": 125.0}
+    placed = _tag(
+        "SNS_4_0.1_10-30", 8.4, 49.0, kind={"scheme": "information-tag", "meaning": meaning},
+        lane_lon_deg=8.3987654321, lane_lat_deg=48.9987654321,
+    )  # fmt: skip
+    line = _tag("N_90", 8.4, 49.0, kind={"scheme": "line-tag", "meaning": None})
+    design = TagDesign(magnets=3, length_m=4.0, segment_m=0.1)
+    book = Codebook("streets", design, ((parse_tag("SNS_4_0.1_10-30"), Meaning("bend-right", 125.0)),))  # type: ignore[arg-type]
+    snapshot = _open(_write([placed, line], codebooks=[book.to_document()]))
+    assert snapshot.codebooks == (book,)
+    (tag,) = snapshot.registered_tags(8.4, 49.0, 10.0)
+    assert (tag.lane_lon_deg, tag.lane_lat_deg) == (8.398765432, 48.998765432)
+    assert tag.meaning == Meaning("bend-right", 125.0)  # type: ignore[arg-type]
+    assert not snapshot.tag_book(8.4, 49.0, 10.0).formats
+    assert snapshot.tag_book(8.5, 49.0, 10.0).formats == (TagFormat(3, 4.0, 0.1),)
+
+
+def test_cerpms_carry_what_was_heard_of_them() -> None:
+    heard = {"first_sequence": 3, "last_sequence": 2**32 - 1, "first_heard_s": 1.7e9 + 0.1234, "last_heard_s": None}
+    limit = {"value": 30, "unit": "km/h"}
+    kind = {"side": "right", "speed_limit": limit, "least_interval_s": 0.8, "transform_note": "a datum's bound"}
+    markers = [
+        _cerpm(4_000_000_000, 8.4, 49.0, kind=kind, localization_grade="approximate", **heard),
+        _cerpm(5, 8.41, 49.0), _cerpm(6, 8.41, 49.0, status="retired"),
+    ]  # fmt: skip
+    snapshot = _open(_write(markers))
+    assert len(snapshot) == 2
+    assert [marker.code for marker in snapshot.near("cerpm", 8.41, 49.0, 10.0)] == ["5"]
+    known = snapshot.known_cerpms([4_000_000_000, 5, 6, 7])
+    assert sorted(known.registered) == [5, 6, 4_000_000_000]
+    (span,) = known.heard_before[4_000_000_000]
+    assert (span.first_sequence, span.last_sequence, span.first_heard_s) == (3, 2**32 - 1, 1.7e9 + 0.123)
+    assert math.isnan(span.last_heard_s)
+    assert list(known.heard_before) == [4_000_000_000]
+    assert known.least_interval_s == {4_000_000_000: 0.8}
+    assert known.doubts == {
+        4_000_000_000: ("a datum's bound",), 5: (), 6: ("the marker is retired, its position is not surveyed",)
+    }  # fmt: skip
+    assert known.retired == {6}
