@@ -156,6 +156,67 @@ def export(
     typer.echo(out)
 
 
+snapshot = typer.Typer(no_args_is_help=True, help="Files of an area for vehicles without a connection.")
+cli.add_typer(snapshot, name="snapshot")
+
+
+@snapshot.callback()
+def snapshots() -> None:
+    """Files of an area for vehicles without a connection."""
+
+
+@snapshot.command("make")
+def make_snapshot(
+    out: Annotated[Path, typer.Argument(dir_okay=False, help="File to write; it must not be there.")],
+    agency: Annotated[str, typer.Option(help="Name of the agency whose markers are wanted.")],
+    bbox: Annotated[str, typer.Option(help="west,south,east,north. [deg]")],
+    hours: Annotated[float, typer.Option(help="How long it holds. [h]")] = 24.0,
+) -> None:
+    """Write the signed snapshot of an area; prints the public key that vehicles verify it with."""
+    from app.api.marker_filter import parse_box
+    from app.main import utc_now
+    from app.services.snapshots import Snapshots
+    from app.storage.signing_key import load_signing_key
+
+    if out.exists():
+        raise InvalidParameter(f"{out} is there already", cure="remove it, or choose another name")
+    box, settings = parse_box(bbox), _settings()
+    with _database_beside_a_server(settings) as database, _operator(database, agency) as caller:
+        service = Snapshots(database, utc_now, lambda: load_signing_key(settings.resolved_signing_key_file))
+        content = service.make(caller, box, hours)
+        public_key = service.public_key().public_key.hex()
+    with out.open("xb") as file:
+        file.write(content)
+    typer.echo(f"{out}: {len(content)} bytes, public key {public_key}")
+
+
+@snapshot.command("verify")
+def verify_snapshot(
+    file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A snapshot.")],
+    key: Annotated[
+        str | None, typer.Option(help="Public key, hexadecimal; without, that of this server's signing key.")
+    ] = None,
+) -> None:
+    """Verify a snapshot as a vehicle does; prints what it holds, and ends with 1 if it is refused."""
+    import orjson
+
+    from app.decoders.snapshot import open_snapshot
+    from app.main import utc_now
+    from app.storage.signing_key import load_signing_key
+
+    path = _settings().resolved_signing_key_file
+    if key is None and not path.exists():
+        raise InvalidParameter(f"there is no signing key {path}", cure="give the server's public key with --key")
+    try:
+        public_key = bytes.fromhex(key) if key is not None else load_signing_key(path).public_key().public_bytes_raw()
+    except ValueError as error:
+        raise InvalidParameter("--key is not hexadecimal", limit="32 bytes, 64 digits") from error
+    if len(public_key) != 32:
+        raise InvalidParameter(f"--key has {len(public_key)} bytes", limit="32 bytes, 64 digits")
+    held = open_snapshot(file.read_bytes(), public_key, utc_now()).summary()
+    typer.echo(orjson.dumps(held, option=orjson.OPT_INDENT_2))
+
+
 audit = typer.Typer(no_args_is_help=True, help="The log of what changed the registry.")
 cli.add_typer(audit, name="audit")
 

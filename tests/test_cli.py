@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import cv2
@@ -193,3 +194,64 @@ def test_imports_and_exports_that_cannot_be(
     assert status == 1
     assert what in said
     assert not (tmp_path / "out.gpkg").exists()
+
+
+@pytest.mark.parametrize("backend", ["sqlite", "postgresql"], scope="module")
+def test_a_snapshot_is_made_and_verified(
+    waymark: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new_database_url: Callable[[Path], str]
+) -> None:
+    monkeypatch.setenv("WAYMARK_DATABASE_URL", new_database_url(tmp_path))
+    survey, out = tmp_path / "survey.csv", tmp_path / "area.waymark"
+    survey.write_text(SURVEY)
+    waymark("key", "Roads")
+    waymark("import", str(survey), "--agency", "Roads", "--declared", DECLARED)
+    box = "8.40005,48.9,8.40045,49.1"
+    status, printed, _ = waymark("snapshot", "make", str(out), "--agency", "Roads", "--bbox", box, "--hours", "2")
+    assert status == 0
+    assert printed.startswith(f"{out}: {out.stat().st_size} bytes, public key ")
+    public_key = printed.split()[-1]
+    for key in ((), ("--key", public_key)):
+        status, printed, _ = waymark("snapshot", "verify", str(out), *key)
+        assert status == 0
+        held = orjson.loads(printed)
+        assert (held["markers"], held["retired_cerpms"]) == ({"plate": 0, "magnet": 0, "cerpm": 4}, 0)
+        assert held["bbox_deg"] == [8.40005, 48.9, 8.40045, 49.1]
+        ends = [datetime.fromisoformat(held[name]) for name in ("made_at", "expires_at")]
+        assert ends[1] - ends[0] == timedelta(hours=2)
+    refused = {
+        ("--key", "00" * 32): "signed under another key",
+        ("--key", "00"): "--key has 1 bytes",
+        ("--key", "no"): "not hexadecimal",
+    }
+    for key, what in refused.items():
+        status, printed, said = waymark("snapshot", "verify", str(out), *key)
+        assert (status, printed) == (1, "")
+        assert what in said
+    out.write_bytes(out.read_bytes()[:-1] + bytes([out.read_bytes()[-1] ^ 1]))
+    status, printed, said = waymark("snapshot", "verify", str(out))
+    assert (status, printed) == (1, "")
+    assert "changed or damaged" in said
+    (tmp_path / "signing.key").unlink()
+    assert "there is no signing key" in waymark("snapshot", "verify", str(out))[2]
+    assert not (tmp_path / "signing.key").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("OUT", "--agency", "Nobody", "--bbox", "8,48,9,50"), "there is no agency 'Nobody'"),
+        (("OUT", "--agency", "Roads", "--bbox", "1,2"), "bbox"),
+        (("OUT", "--agency", "Roads", "--bbox", "8,48,9,50", "--hours", "0"), "cannot hold for 0 h"),
+        (("OUT", "--agency", "Roads", "--bbox", "8,48,9,50", "--hours", "nan"), "cannot hold for nan h"),
+        (("FILE", "--agency", "Roads", "--bbox", "8,48,9,50"), "is there already"),
+    ],
+)
+def test_snapshots_that_cannot_be(waymark: Run, tmp_path: Path, arguments: tuple[str, ...], what: str) -> None:
+    waymark("key", "Roads")
+    (tmp_path / "there").write_bytes(b"kept")
+    places = {"OUT": str(tmp_path / "out"), "FILE": str(tmp_path / "there")}
+    status, _, said = waymark("snapshot", "make", *(places.get(argument, argument) for argument in arguments))
+    assert status == 1
+    assert what in said
+    assert not (tmp_path / "out").exists()
+    assert (tmp_path / "there").read_bytes() == b"kept"

@@ -11,7 +11,7 @@ import uuid
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from typing import Any
 
@@ -138,6 +138,22 @@ class Snapshot:
     def codebooks(self) -> tuple[Codebook, ...]:
         """The agency's codebooks: what tags look like, and what their codes mean."""
         return tuple(Codebook.from_document(book) for book in self._books)
+
+    def summary(self) -> dict[str, Any]:
+        """What it holds, as plain values: whose, where, from when to when, and how many of what."""
+        families = {name: self._family == number for number, name in enumerate(layout.FAMILIES)}
+        heard = self._columns["flags"] & layout.HEARD_FLAG != 0
+        return {
+            "version": self.version,
+            "agency_id": self.agency_id,
+            "made_at": datetime.fromtimestamp(self.made_at_s, UTC),
+            "expires_at": datetime.fromtimestamp(self.expires_at_s, UTC),
+            "bbox_deg": self.area_deg,
+            "markers": {name: int(np.count_nonzero(mine & self._stands)) for name, mine in families.items()},
+            "retired_cerpms": int(np.count_nonzero(~self._stands)),
+            "heard_cerpms": int(np.count_nonzero(heard)),
+            "codebooks": [{"name": book.name, "entries": len(book.entries)} for book in self.codebooks],
+        }
 
     def covers(self, lon_deg: float, lat_deg: float) -> bool:
         """Whether a place is in the snapshot's area: outside of it, that no marker is near means nothing."""
