@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import orjson
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from starlette.datastructures import UploadFile
 
-from app.api.dependencies import Caller, Identifier, json_response
+from app.api.dependencies import Caller, Identifier, json_response, next_link
 from app.api.problems import MEDIA_TYPE, problem_responses
-from app.api.schemas_imports import DECLARATION_EXAMPLE, DeclarationIn, ImportJobOut, ImportReportOut
+from app.api.schemas_decodes import State
+from app.api.schemas_imports import DECLARATION_EXAMPLE, DeclarationIn, ImportJobOut, ImportJobPage, ImportReportOut
 from app.api.strict_json import parse_json
 from app.api.uploads import idempotency_of
 from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, UnsupportedUpload
@@ -24,6 +25,7 @@ from app.services.imports import Imports as ImportsService
 
 router = APIRouter(prefix="/v1/imports", tags=["imports"])
 
+MAX_PAGE = 1000
 MAX_DECLARATION_BYTES = 64 * 1024
 _FORM = "multipart/form-data"
 _CURE = "send multipart/form-data with the parts file and declaration"
@@ -150,11 +152,39 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
     return json_response(report, 200 if report["dry_run"] else 201, headers)
 
 
+@router.get("", response_class=Response, responses={200: {"model": ImportJobPage}, **problem_responses()})
+def list_imports(
+    request: Request,
+    caller: Caller,
+    state: State | None = None,
+    limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = 100,
+    before: Annotated[Identifier | None, Query(description="Last id of the page before.")] = None,
+) -> Response:
+    """Imports that are or were jobs, without their reports, newest first. Those that were answered at once are none."""
+    jobs: ImportJobs = request.app.state.import_jobs
+    page, last = jobs.page(caller, state=state, before=before, limit=limit)
+    return json_response({"items": page}, headers=next_link(request, before=last) if last else None)
+
+
 @router.get("/{import_id}", response_class=Response, responses={200: {"model": ImportJobOut}, **problem_responses(404)})
 def get_import(request: Request, import_id: Identifier, caller: Caller) -> Response:
     """An import that was queued: its state, and its report once it is done. A refused one is done too."""
     jobs: ImportJobs = request.app.state.import_jobs
     return json_response(jobs.get(caller, import_id))
+
+
+@router.post(
+    "/{import_id}/cancel",
+    response_class=Response,
+    responses={200: {"model": ImportJobOut}, **problem_responses(404, 409)},
+)
+def cancel_import(request: Request, import_id: Identifier, caller: Caller) -> Response:
+    """Call an import off: a queued one never starts, a running one stops before it stores anything.
+
+    409 where it is too late: it is storing already, or finished.
+    """
+    jobs: ImportJobs = request.app.state.import_jobs
+    return json_response(jobs.cancel(caller, import_id))
 
 
 def _refused(request: Request, report: dict[str, Any]) -> Response:

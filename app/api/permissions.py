@@ -58,8 +58,10 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/artwork": READERS,
     "POST /v1/programs": PLANNERS,  # with the markers' keys: admins, see app/services/cerpm_programs.py
     "POST /v1/radio-checks": READERS,
+    "GET /v1/imports": SURVEYORS,
     "POST /v1/imports": SURVEYORS,
     "GET /v1/imports/{import_id}": SURVEYORS,
+    "POST /v1/imports/{import_id}/cancel": SURVEYORS,
     "GET /v1/exports/{kind}": READERS,
     "GET /v1/snapshots": EVERYBODY,  # what a vehicle takes along instead of asking the decoder
     "GET /v1/snapshots/public-key": EVERYBODY,

@@ -175,15 +175,27 @@ class ImportReportOut(BaseModel):
     faults_left_out: int
 
 
-class ImportJobOut(BaseModel):
-    """An import that is or was a job."""
+class ImportJobSummary(BaseModel):
+    """An import that is or was a job, without its report."""
 
     id: str
     state: Literal["queued", "running", "done", "failed", "cancelled"]
     progress: float = Field(description="0 to 1.")
     attempts: int
+    cancel_requested: bool = Field(description="It was called off; a running one stops before it stores anything.")
     created_at: str
     finished_at: str | None
     error: dict[str, Any] | None = Field(description="Why the file or its declaration cannot be used.")
-    report: ImportReportOut | None
     links: dict[str, str]
+
+
+class ImportJobOut(ImportJobSummary):
+    """An import that is or was a job."""
+
+    report: ImportReportOut | None
+
+
+class ImportJobPage(BaseModel):
+    """A page of imports, newest first; the Link header leads to the next one."""
+
+    items: list[ImportJobSummary]

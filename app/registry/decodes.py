@@ -86,6 +86,18 @@ def list_decodes(
     return list(connection.execute(query.order_by(decodes.c.id.desc()).limit(limit)).mappings())
 
 
+def list_imports(
+    connection: sa.Connection, agency_id: str, *, state: str | None, before: str | None, limit: int
+) -> list[Row]:
+    """Imports of the agency that are or were jobs, without their reports, newest first."""
+    query = sa.select(*_SHORT).where(decodes.c.agency_id == agency_id, decodes.c.kind == IMPORT)
+    if state is not None:
+        query = query.where(decodes.c.state == state)
+    if before is not None:
+        query = query.where(decodes.c.id < before)
+    return list(connection.execute(query.order_by(decodes.c.id.desc()).limit(limit)).mappings())
+
+
 def list_unfinished(connection: sa.Connection) -> list[str]:
     """Ids of the decodes of all agencies that are still to be done, oldest first."""
     query = sa.select(decodes.c.id).where(decodes.c.state.in_(UNFINISHED)).order_by(decodes.c.id)
@@ -122,6 +134,27 @@ def request_cancel(connection: sa.Connection, agency_id: str, decode_id: str, no
         .values(state="cancelled", cancel_requested=True, finished_at=now)
     )
     connection.execute(sa.update(decodes).where(*own, decodes.c.state == "running").values(cancel_requested=True))
+
+
+def begin_step(connection: sa.Connection, decode_id: str, progress: float) -> bool:
+    """Note how far a running job is, unless somebody asked it to stop; returns whether it goes on."""
+    statement = sa.update(decodes).where(
+        decodes.c.id == decode_id, decodes.c.state == "running", decodes.c.cancel_requested.is_(False)
+    )
+    return connection.execute(statement.values(progress=progress)).rowcount == 1
+
+
+def request_cancel_before(
+    connection: sa.Connection, agency_id: str, decode_id: str, now: datetime, *, progress: float
+) -> bool:
+    """Ask a job to stop that is not so far yet; one that waits is cancelled at once. Returns whether it will stop."""
+    own = (decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
+    waiting = sa.update(decodes).where(*own, decodes.c.state == "queued")
+    stopped = waiting.values(state="cancelled", cancel_requested=True, finished_at=now)
+    if connection.execute(stopped).rowcount == 1:
+        return True
+    running = sa.update(decodes).where(*own, decodes.c.state == "running", decodes.c.progress < progress)
+    return connection.execute(running.values(cancel_requested=True)).rowcount == 1
 
 
 def finish_decode(connection: sa.Connection, decode_id: str, values: Mapping[str, Any]) -> bool:

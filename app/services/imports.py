@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -43,6 +43,8 @@ from app.services.version_kinds import kind_of_change, kind_of_new
 
 ALL, GOOD = "all", "good"
 FAMILIES = ("plate", "cerpm")
+READ, SETTLED = 0.3, 0.5
+"""How far an import is when its file was read, and when it goes to store what is good."""
 MAX_FAULTS = 1000
 _KNOWN_M = 5_000.0
 _NEIGHBOURS = 50_000
@@ -99,8 +101,21 @@ class Imports:
         self._rules = rules
         self._families: dict[str, MarkerFamily[Any, Any]] = {"plate": Plates(rules), "cerpm": Cerpms(rules)}
 
-    def run(self, caller: Caller, given: GivenImport, key: IdempotencyKey | None = None) -> tuple[dict[str, Any], bool]:
+    def run(
+        self,
+        caller: Caller,
+        given: GivenImport,
+        key: IdempotencyKey | None = None,
+        step: Callable[[float], None] = lambda progress: None,
+    ) -> tuple[dict[str, Any], bool]:
         """Import a survey, or say what an import would do.
+
+        Parameters
+        ----------
+        caller, given, key
+        step : callable, optional
+            Called with `READ` when the file was read, and with `SETTLED` before anything is stored, outside of any
+            transaction; what it raises stops the import.
 
         Returns
         -------
@@ -122,12 +137,15 @@ class Imports:
                 return answer, True
         pending = self._reader.start_survey(SurveyTask(given.data, given.declaration), wait_s=_BUSY_WAIT_S)
         survey = place_survey(pending.result(), given.declaration, self._rules.crs_accuracy_m)
+        step(READ)
         running = _Running(caller, given, survey, now, hashlib.sha256(given.data).hexdigest(), self._rules)
         with self._database.read() as connection:
             running.check(connection)
-            if given.dry_run:
+        step(SETTLED)
+        if given.dry_run:
+            with self._database.read() as connection:
                 running.prepare(connection)
-                return running.report("checked"), False
+            return running.report("checked"), False
         if running.is_hopeless:
             return running.report("refused"), False
         with self._database.write(long=survey.table.rows >= LARGE) as connection:
