@@ -9,15 +9,17 @@ Writes come one after another on both databases (decision 0010), so nobody else 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from operator import ge
 from typing import Any
 
 import orjson
 import sqlalchemy as sa
 
+from app.registry.columns import Columns, JsonTexts
 from app.registry.tables import audit_log, marker_versions
 
 Row = sa.RowMapping
@@ -74,6 +76,48 @@ class AuditEntry:
             "sha256": sha256,
             "marker": text,
         }
+
+    def first_versions(
+        self, ids: Sequence[str], markers: JsonTexts, *, kinds: Sequence[str], why: str | None
+    ) -> Columns:
+        """The first versions of many markers as columns of `marker_versions`, counted and covered by this entry.
+
+        Parameters
+        ----------
+        ids : sequence of str
+            UUIDs, rising.
+        markers : JsonTexts
+            The markers.
+        kinds : sequence of str
+            Kind of each version.
+
+        Raises
+        ------
+        ValueError
+            They do not come after the version before them.
+        """
+        if any(map(ge, [self._last[0], *ids], ids)):
+            raise ValueError("versions of one entry are in the order of their markers' ids")
+        self._last = (ids[-1], 1)
+        before = orjson.dumps([self.agency_id])[:-1].decode()
+        after = {
+            kind: orjson.dumps([1, self.at.astimezone(UTC), self.who, why, kind])[1:-1].decode() for kind in set(kinds)
+        }
+        hashes = [
+            hashlib.sha256(f'{before},"{marker_id}",{after[kind]},{marker}]'.encode()).hexdigest()
+            for marker_id, kind, marker in zip(ids, kinds, markers, strict=True)
+        ]
+        self.versions += len(ids)
+        self._hashes.update("".join(hashes).encode())
+        same = {
+            "version": 1,
+            "agency_id": self.agency_id,
+            "at": self.at,
+            "who": self.who,
+            "why": why,
+            "audit_number": self.number,
+        }
+        return Columns.of(len(ids), same, {"marker_id": ids, "kind": kinds, "sha256": hashes, "marker": markers})
 
     @property
     def digest(self) -> str:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from operator import itemgetter
 from typing import Any
 
 import sqlalchemy as sa
 
 from app.registry.audit import AuditEntry
-from app.registry.bulk_load import large_load, load_rows
+from app.registry.bulk_load import large_load, load_columns
+from app.registry.columns import Columns, json_objects
 from app.registry.markers import PUBLIC, MarkerFilter, Row, conditions_of
 from app.registry.spatial import Box, box_around, within_box
 from app.registry.tables import marker_versions, markers
 from app.registry.tenancy import seeing_every_agency
 
 _CHUNK = 500
-_INSERT = 2000
 _PLACE = (markers.c.lon_deg, markers.c.lat_deg, markers.c.height_m, markers.c.vertical_datum)
 
 
@@ -65,28 +64,18 @@ def list_by_digits(connection: sa.Connection, family: str, digits: Sequence[str]
 
 
 def add_markers(
-    connection: sa.Connection,
-    entry: AuditEntry,
-    rows: Sequence[Mapping[str, Any]],
-    *,
-    kind: Callable[[str], str],
-    why: str | None,
+    connection: sa.Connection, entry: AuditEntry, columns: Columns, *, kind: Callable[[str], str], why: str | None
 ) -> None:
     """Store new markers of the entry's agency, each with the first version of its history.
 
-    Every row has all columns of `PUBLIC`, and they are in the order of their ids; `kind` tells a version's kind from
-    the status.
+    The columns are those of `PUBLIC`, the rows in the order of their ids; `kind` tells a version's kind from the
+    status.
     """
-    names = [str(column.name) for column in PUBLIC]
-    pick = itemgetter(*names)
-    for start in range(0, len(rows), _INSERT):
-        chunk = rows[start : start + _INSERT]
-        load_rows(connection, markers, [{"agency_id": entry.agency_id, **row} for row in chunk])
-        versions = []
-        for row in chunk:
-            marker = dict(zip(names, pick(row), strict=True))
-            versions.append(entry.version(row["id"], 1, marker, kind=kind(row["status"]), why=why))
-        load_rows(connection, marker_versions, versions)
+    kinds = [str(kind(status)) for status in columns.values("status")]
+    versions = entry.first_versions(columns.values("id"), json_objects(columns), kinds=kinds, why=why)
+    owned = Columns(columns.count, {**columns.same, "agency_id": entry.agency_id}, columns.own)
+    load_columns(connection, markers, owned)
+    load_columns(connection, marker_versions, versions)
 
 
 def many_markers(connection: sa.Connection, rows: int) -> AbstractContextManager[None]:

@@ -1,7 +1,8 @@
 """Rows by the hundred thousand: past SQLAlchemy's compiler, by COPY on PostgreSQL, with the indexes filled afterwards.
 
-SQLite gets one prepared statement a table. A load that is large beside what a table holds drops indexes
-and the R*Tree's trigger for its transaction: keeping them up row by row costs more than making them anew.
+SQLite gets one prepared statement for hundreds of rows; what they have in common is bound once. A load that is large
+beside what a table holds drops indexes and the R*Tree's trigger for its transaction: keeping them up row by row costs
+more than making them anew.
 """
 
 from __future__ import annotations
@@ -10,19 +11,23 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from functools import lru_cache, partial
-from operator import itemgetter
+from itertools import chain
 from typing import Any
 
 import orjson
 import psycopg
 import sqlalchemy as sa
 
+from app.registry.columns import Columns, JsonTexts
 from app.registry.rtree_pack import fill_rtree
 from app.registry.tenancy import seeing_every_agency
 
 LARGE = 50_000
 """From as many rows on the indexes are made anew, if the table does not hold more than the rows that come."""
 _CACHE_KIB = 96 * 1024
+_AT_ONCE = 500
+_MOST_VALUES = 30_000
+"""SQLite takes 32 766 values a statement."""
 _RTREE_TRIGGER = "markers_rtree_insert"
 
 
@@ -33,20 +38,71 @@ def load_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping
     """
     if not rows:
         return
-    names = tuple(str(name) for name in rows[0] if name in table.c)
-    pick = itemgetter(*names)
-    columns = list(zip(*map(pick, rows), strict=True))
-    for k, name in enumerate(names):
-        convert = _converter(table.c[name].type, connection.dialect.name)
-        if convert is not None:
-            columns[k] = tuple(map(convert, columns[k]))
-    values = list(zip(*columns, strict=True))
+    lists = {
+        name: _stored(connection, table, name, [row[name] for row in rows])
+        for name in map(str, rows[0])
+        if name in table.c
+    }
+    _load(connection, table, Columns.of(len(rows), {}, lists))
+
+
+def load_columns(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
+    """Insert rows given by column; JSON columns take values or `JsonTexts`, times are aware."""
+    if not columns.count:
+        return
+    same = {name: _stored(connection, table, name, [value])[0] for name, value in columns.same.items()}
+    own = {name: _stored(connection, table, name, values) for name, values in columns.own.items()}
+    _load(connection, table, Columns(columns.count, same, own))
+
+
+def _stored(connection: sa.Connection, table: sa.Table, name: str, values: Sequence[Any]) -> Sequence[Any]:
+    """Values as the driver takes them."""
+    kind = table.c[name].type
+    if isinstance(kind, sa.JSON):
+        return values if isinstance(values, JsonTexts) else list(map(_json, values))
+    is_time = isinstance(kind, sa.TypeDecorator) and isinstance(kind.impl, sa.DateTime)
+    return list(map(_sqlite_time, values)) if is_time and connection.dialect.name == "sqlite" else values
+
+
+def _load(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
+    """Insert values as the driver takes them; None in all rows is left to the table."""
+    same = {
+        name: value
+        for name, value in columns.same.items()
+        if value is not None or table.c[name].server_default is not None
+    }
+    own = dict(columns.own)
+    if not own:
+        name, value = same.popitem()
+        own[name] = [value] * columns.count
+    said = Columns(columns.count, same, own)
     if connection.dialect.name == "postgresql":
-        _copy(connection, table, names, values)
+        _copy(connection, table, said)
     else:
-        places = ", ".join("?" * len(names))
-        statement = f"INSERT INTO {table.name} ({_listed(names)}) VALUES ({places})"
-        connection.exec_driver_sql(statement, values)
+        _insert(connection, table, said)
+
+
+def _insert(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
+    at_once = min(_AT_ONCE, (_MOST_VALUES - len(columns.same)) // len(columns.own))
+    for start in range(0, columns.count, at_once):
+        part = [values[start : start + at_once] for values in columns.own.values()]
+        statement = _insert_statement(table.name, tuple(columns.own), tuple(columns.same), len(part[0]))
+        connection.exec_driver_sql(statement, (*chain.from_iterable(zip(*part, strict=True)), *columns.same.values()))
+
+
+@lru_cache(maxsize=16)
+def _insert_statement(table: str, own: tuple[str, ...], same: tuple[str, ...], rows: int) -> str:
+    """Rows of values of their own, then one of what they have in common."""
+    row = f"({_places(len(own))})"
+    rest = f", {_places(len(same))}" if same else ""
+    return (
+        f"WITH given AS (VALUES {', '.join([row] * rows)}) "
+        f"INSERT INTO {table} ({_listed((*own, *same))}) SELECT given.*{rest} FROM given"
+    )
+
+
+def _places(count: int) -> str:
+    return ", ".join("?" * count)
 
 
 @contextmanager
@@ -144,21 +200,36 @@ def _put_off_postgresql(connection: sa.Connection, table: sa.Table) -> list[Call
     return [partial(connection.exec_driver_sql, statement) for statement in statements]
 
 
-def _copy(connection: sa.Connection, table: sa.Table, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+def _copy(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
     driver = connection.connection.driver_connection
     assert driver is not None
+    names = (*columns.own, *columns.same)
     target = _copied_into(connection, table, names)
     statement = f"COPY {target} ({_listed(names)}) FROM STDIN"
     try:
         with driver.cursor() as cursor, cursor.copy(statement) as copy:
-            for row in rows:
-                copy.write_row(row)
+            copy.write(_copy_text(columns))
     except psycopg.Error as error:  # as SQLAlchemy names what goes wrong in its own statements
         raise sa.exc.DBAPIError.instance(statement, None, error, psycopg.Error) from error
     if target != table.name:
         listed = _listed(names)
         connection.exec_driver_sql(f"INSERT INTO {table.name} ({listed}) SELECT {listed} FROM {target}")
         connection.exec_driver_sql(f"DROP TABLE {target}")
+
+
+def _copy_text(columns: Columns) -> str:
+    """Rows in the text format of COPY (https://www.postgresql.org/docs/current/sql-copy.html, "File Formats")."""
+    same = "".join(f"\t{_copy_value(value)}" for value in columns.same.values()) + "\n"
+    own = [list(map(_copy_value, values)) for values in columns.own.values()]
+    return same.join(map("\t".join, zip(*own, strict=True))) + same
+
+
+def _copy_value(value: Any) -> str:
+    if isinstance(value, str):
+        return value.replace("\\", "\\\\").replace("\t", "\\t").replace("\n", "\\n").replace("\r", "\\r")
+    if isinstance(value, bytes):
+        return f"\\\\x{value.hex()}"
+    return "\\N" if value is None else str(value)
 
 
 def _copied_into(connection: sa.Connection, table: sa.Table, names: Sequence[str]) -> str:
@@ -174,14 +245,6 @@ def _copied_into(connection: sa.Connection, table: sa.Table, names: Sequence[str
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(f'"{name}"' for name in names)
-
-
-def _converter(kind: sa.types.TypeEngine[Any], dialect: str) -> Callable[[Any], Any] | None:
-    if isinstance(kind, sa.JSON):
-        return _json
-    if isinstance(kind, sa.TypeDecorator) and isinstance(kind.impl, sa.DateTime) and dialect == "sqlite":
-        return _sqlite_time
-    return None
 
 
 def _json(value: Any) -> str | None:

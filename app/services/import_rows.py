@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import orjson
 
 from app.encoders.cerpm.settings import RadioSettings
 from app.markers.cerpm import HEIGHT_M, LaneSide, SpeedLimit
 from app.markers.plate import PlateGeometry, PlateScheme
+from app.registry.columns import Columns, JsonTexts, json_objects
 from app.registry.exchange.declaration import ImportDeclaration
 from app.registry.exchange.place import PlacedSurvey
-from app.registry.exchange.table import Fault, Texts
+from app.registry.exchange.table import Fault, Floats, Texts
 from app.services.cerpm_markers import speed_limit_document
 from app.services.import_codes import RowCodes, Rows, read_cerpm_codes, read_id_codes, read_position_codes
 from app.services.marker_rules import PLANNED
@@ -97,32 +97,25 @@ def marker_columns(
     ids: list[str],
     now: datetime,
     file_sha256: str,
-) -> list[dict[str, Any]]:
-    """Columns of new markers; all have the same names."""
+) -> Columns:
+    """Columns of new markers."""
     common = common_columns(survey, codes.rows, declaration, file_sha256=file_sha256)
-    fixed = {
+    same = {
         **_EMPTY,
+        **common.same,
         **_family_columns(codes, declaration, defaults),
         "version": 1,
         "created_at": now,
         "updated_at": now,
     }
-    digits = [code.decode() for code in codes.digits.tolist()]
-    made = [
-        {**fixed, **columns, "id": marker_id, "digits": code, "original": _prepared(columns["original"])}
-        for marker_id, columns, code in zip(ids, common, digits, strict=True)
-    ]
+    own: dict[str, Sequence[Any]] = {"id": ids, "digits": [code.decode() for code in codes.digits.tolist()]}
     if declaration.family == "cerpm":
-        specs = {name: _prepared(spec) for name, spec in _specs(defaults).items()}
-        sides = _texts_of(survey, codes.rows, "side")
-        for columns, side in zip(made, sides, strict=True):
-            columns["spec"] = specs[side.upper()]
-    return made
-
-
-def _prepared(value: dict[str, Any]) -> orjson.Fragment:
-    """JSON that goes into the marker and into its history, made once; its keys sorted as the history's hashes want."""
-    return orjson.Fragment(orjson.dumps(value, option=orjson.OPT_SORT_KEYS))
+        specs = _specs(defaults)
+        if "side" in survey.table.texts:
+            own["spec"] = [specs[side.upper()] for side in _texts_of(survey, codes.rows, "side")]
+        else:
+            same["spec"] = specs[""]
+    return Columns(len(ids), same, dict(common.own)).but(**own)
 
 
 def _family_columns(codes: RowCodes, declaration: ImportDeclaration, defaults: MarkerDefaults) -> dict[str, Any]:
@@ -155,14 +148,17 @@ def _default_radio() -> dict[str, Any]:
     return asdict(RadioSettings())
 
 
-def common_columns(
-    survey: PlacedSurvey, rows: Rows, declaration: ImportDeclaration, *, file_sha256: str
-) -> list[dict[str, Any]]:
+def common_columns(survey: PlacedSurvey, rows: Rows, declaration: ImportDeclaration, *, file_sha256: str) -> Columns:
     """Columns that markers of every family have: place, provenance, road."""
-    placed, said = survey.placed, declaration.survey
-    fixed = {
+    placed, said, texts, numbers = survey.placed, declaration.survey, survey.table.texts, survey.table.numbers
+    same = {
         "family": declaration.family,
+        "status": declaration.status or PLANNED,
+        "road": declaration.road,
+        "heading_deg": None,
         "heading_rmse_deg": None,
+        "horizontal_rmse_m": said.get("horizontal_rmse_m"),
+        "vertical_rmse_m": said.get("vertical_rmse_m"),
         "crs": placed.crs,
         "realization": placed.realization,
         "epoch": declaration.epoch,
@@ -174,79 +170,75 @@ def common_columns(
         "transform_accuracy_m": placed.transform_accuracy_m,
         "localization_grade": str(placed.grade),
         "transform_note": placed.note,
+        "measure_m": None,
+        "offset_m": None,
     }
-    numbers = {name: _optional(survey.table.numbers.get(name), rows) for name in _NUMBERS}
-    texts = {name: _texts_of(survey, rows, name) for name in ("status", "road")}
-    heights = _optional(placed.height_m, rows)
-    datum, status, road = declaration.vertical_datum, declaration.status or PLANNED, declaration.road
-    rmse = said.get("horizontal_rmse_m"), said.get("vertical_rmse_m")
-    return [
-        {
-            **fixed, "lon_deg": lon, "lat_deg": lat, "height_m": height, "original": original,
-            "vertical_datum": None if height is None else datum, "status": own_status or status,
-            "road": own_road or road, "heading_deg": heading, "measure_m": measure, "offset_m": offset,
-            "horizontal_rmse_m": across or rmse[0], "vertical_rmse_m": up or rmse[1],
-        }
-        for lon, lat, height, original, own_status, own_road, heading, measure, offset, across, up in zip(
-            placed.lon_deg[rows].tolist(), placed.lat_deg[rows].tolist(), heights,
-            _originals(survey, rows, declaration, file_sha256), texts["status"], texts["road"],
-            *(numbers[name] for name in _NUMBERS), strict=True,
-        )
-    ]  # fmt: skip
+    heights, datum = _optional(placed.height_m, rows), declaration.vertical_datum
+    own: dict[str, Sequence[Any]] = {
+        "lon_deg": placed.lon_deg[rows].tolist(),
+        "lat_deg": placed.lat_deg[rows].tolist(),
+        "height_m": heights,
+        "vertical_datum": [None if height is None else datum for height in heights],
+        "original": _originals(survey, rows, declaration, file_sha256),
+    }
+    for name in ("status", "road"):
+        if name in texts:
+            own[name] = [text or same[name] for text in _texts_of(survey, rows, name)]
+    for name in ("heading_deg", "measure_m", "offset_m"):
+        if name in numbers:
+            own[name] = _optional(numbers[name], rows)
+    for name in ("horizontal_rmse_m", "vertical_rmse_m"):
+        if name in numbers:
+            own[name] = [value or same[name] for value in _optional(numbers[name], rows)]
+    return Columns(len(rows), same, {}).but(**own)
 
 
-_NUMBERS = ("heading_deg", "measure_m", "offset_m", "horizontal_rmse_m", "vertical_rmse_m")
-
-
-def _originals(survey: PlacedSurvey, rows: Rows, declaration: ImportDeclaration, sha256: str) -> list[dict[str, Any]]:
+def _originals(survey: PlacedSurvey, rows: Rows, declaration: ImportDeclaration, sha256: str) -> JsonTexts:
     """The rows exactly as they were given, and the survey they belong to."""
     table = survey.table
     names = ("easting", "northing") if table.projected else ("lon_deg", "lat_deg")
     if table.projected and table.unit == "m":
         names = ("easting_m", "northing_m")
-    fixed = _known(
+    same = _known(
         unit=table.unit if table.projected and table.unit != "m" else None,
         crs=table.crs,
         realization=declaration.realization,
         epoch=declaration.epoch,
         vertical_datum=declaration.vertical_datum,
     )
-    in_metres = table.height_unit == "m"
-    height_name = "height_m" if in_metres else "height"
     of_survey = {**_known(**declaration.survey), "file_sha256": sha256, "format": table.format}
-    made: list[dict[str, Any]] = [
-        {names[0]: x, names[1]: y, **fixed, "survey": {**of_survey, "row": row + 1}}
-        for x, y, row in zip(table.first[rows].tolist(), table.second[rows].tolist(), rows.tolist(), strict=True)
-    ]
+    own: dict[str, Sequence[Any]] = {
+        names[0]: table.first[rows].tolist(),
+        names[1]: table.second[rows].tolist(),
+        "survey": json_objects(Columns(len(rows), of_survey, {"row": (rows + 1).tolist()})),
+    }
     if table.height is not None:
-        for original, height in zip(made, _optional(table.height, rows), strict=True):
-            if height is not None:
-                original |= (
-                    {height_name: height} if in_metres else {height_name: height, "height_unit": table.height_unit}
-                )
+        heights = _optional(table.height, rows)
+        if table.height_unit == "m":
+            own["height_m"] = heights
+        else:
+            own["height"] = heights
+            own["height_unit"] = [None if height is None else table.height_unit for height in heights]
     for name in ("point", "description"):
         if name in table.texts:
-            for original, text in zip(made, _texts_of(survey, rows, name), strict=True):
-                if text:
-                    original[name] = text
-    return made
+            own[name] = [text or None for text in _texts_of(survey, rows, name)]
+    return json_objects(
+        Columns(len(rows), same, own), optional=("height_m", "height", "height_unit", "point", "description")
+    )
 
 
-def _known(**values: Any) -> Mapping[str, Any]:
+def _known(**values: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
 def _texts_of(survey: PlacedSurvey, rows: Rows, name: str) -> list[str]:
-    texts = survey.table.texts.get(name)
-    return [""] * len(rows) if texts is None else [texts[row] for row in rows.tolist()]
+    texts = survey.table.texts[name]
+    return [texts[row] for row in rows.tolist()]
 
 
-def _optional(values: Any, rows: Rows) -> list[float | None]:
+def _optional(values: Floats, rows: Rows) -> list[float | None]:
     """Values of rows, None where there is none."""
-    if values is None:
-        return [None] * len(rows)
     chosen = values[rows]
-    listed: list[float | None] = chosen.tolist()
-    if not np.isfinite(chosen).all():
-        return [value if np.isfinite(value) else None for value in chosen.tolist()]
-    return listed
+    if np.isfinite(chosen).all():
+        return chosen.tolist()  # type: ignore[no-any-return]
+    return [value if np.isfinite(value) else None for value in chosen.tolist()]

@@ -18,6 +18,7 @@ from app.registry import bulk
 from app.registry import markers as store
 from app.registry.audit import AuditEntry, recording
 from app.registry.bulk_load import LARGE
+from app.registry.columns import Columns
 from app.registry.database import Database
 from app.registry.exchange.compare import Comparison, check_residuals, compare_survey
 from app.registry.exchange.declaration import ImportDeclaration
@@ -217,16 +218,13 @@ class _Running:
             for number, start in enumerate(range(0, total, _PART)):
                 part = self._codes.of(slice(start, start + _PART))
                 ids = new_ids(self._now, len(part.rows), number)
-                rows = marker_columns(
+                columns = marker_columns(
                     self._survey, part, self._given.declaration, self._given.defaults,
                     ids=ids, now=self._now, file_sha256=self._sha256,
                 )  # fmt: skip
-                measured = linear_references(connection, self._caller.agency_id, rows, [None] * len(rows))
-                for row, reference in zip(rows, measured, strict=True):
-                    if row["measure_m"] is None:
-                        row |= reference
-                bulk.add_markers(connection, entry, rows, kind=kind_of_new, why=why)
-                self._stored += len(rows)
+                columns = self._measured(connection, columns)
+                bulk.add_markers(connection, entry, columns, kind=kind_of_new, why=why)
+                self._stored += columns.count
 
     def report(self, outcome: str) -> dict[str, Any]:
         """What is to be said of the import."""
@@ -346,11 +344,24 @@ class _Running:
                 matched[row] = best
         return matched
 
+    def _measured(self, connection: sa.Connection, columns: Columns) -> Columns:
+        """With the measures and offsets of rows that name a registered road and give no measure."""
+        if columns.same.get("road", "") is None:
+            return columns
+        names = ("road", "lon_deg", "lat_deg")
+        rows = [dict(zip(names, row, strict=True)) for row in zip(*map(columns.values, names), strict=True)]
+        measures, offsets = columns.values("measure_m"), columns.values("offset_m")
+        found = linear_references(connection, self._caller.agency_id, rows, [None] * columns.count)
+        for k, reference in enumerate(found):
+            if measures[k] is None and reference:
+                measures[k], offsets[k] = reference["measure_m"], reference["offset_m"]
+        return columns.but(measure_m=measures, offset_m=offsets)
+
     def _resurvey(self, connection: sa.Connection, family: MarkerFamily[Any, Any]) -> None:
         """A new version of every marker that a good row measured."""
         assert self._comparison is not None
         rows = self._good_rows()
-        surveyed = common_columns(self._survey, rows, self._given.declaration, file_sha256=self._sha256)
+        surveyed = common_columns(self._survey, rows, self._given.declaration, file_sha256=self._sha256).rows()
         markers = [self._known[k] for k in self._comparison.matched[rows].tolist()]
         kept_measures = [marker["measure_m"] for marker in markers]
         moved = [{**columns, "road": marker["road"]} for marker, columns in zip(markers, surveyed, strict=True)]

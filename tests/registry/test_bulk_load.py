@@ -11,7 +11,8 @@ import pytest
 import sqlalchemy as sa
 
 from app.registry import agencies, bulk_load
-from app.registry.bulk_load import large_load, load_rows
+from app.registry.bulk_load import large_load, load_columns, load_rows
+from app.registry.columns import Columns, JsonTexts
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, list_markers
@@ -68,6 +69,29 @@ def test_rows_are_stored_as_sqlalchemy_stores_them(database: Database, agency: s
         assert _stored(connection, agency) == wanted == rows
         nulls = sa.select(sa.func.count()).where(markers.c.spec.is_(sa.null()))
         assert connection.execute(nulls).scalar_one() == 15
+
+
+@pytest.mark.parametrize("count", [1, 3, 1700])
+def test_columns_are_stored_as_rows_are(database: Database, agency: str, count: int) -> None:
+    rows = _rows(agency, count)
+    lists: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
+    lists["original"] = JsonTexts([orjson.dumps(value).decode() for value in lists["original"]])
+    with database.write() as connection:
+        load_columns(connection, markers, Columns.of(count, {}, lists))
+        load_columns(connection, markers, Columns(0, {}, {}))
+    with database.read() as connection:
+        assert _stored(connection, agency) == rows
+
+
+def test_rows_that_are_all_the_same(database: Database) -> None:
+    table = sa.Table("alike", sa.MetaData(), sa.Column("a", sa.Integer, server_default="5"), sa.Column("b", sa.Text))
+    with database.write() as connection:
+        table.create(connection)
+        load_columns(connection, table, Columns(3, {"a": None, "b": "x"}, {}))
+        load_columns(connection, table, Columns(2, {"b": None}, {"a": [1, 2]}))
+        stored = connection.execute(sa.select(table)).all()
+        table.drop(connection)
+    assert sorted(stored, key=str) == [(1, None), (2, None), (None, "x"), (None, "x"), (None, "x")]
 
 
 def _schema(database: Database) -> list[tuple[Any, ...]]:
