@@ -153,6 +153,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
             database.close()
 
     app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
+    app.state.database = database
     app.state.markers = Markers(database, utc_now, marker_rules(settings))
     app.state.imports, app.state.import_jobs = imports_service, import_jobs
     app.state.exports = Exports(database)

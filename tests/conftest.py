@@ -11,10 +11,13 @@ from typing import Any
 
 import httpx
 import pytest
+import sqlalchemy as sa
 import uvicorn
 from fastapi import FastAPI
 
 from app.main import create_app
+from app.registry.feature_text import feature_text
+from app.registry.tables import markers
 from app.registry.tenancy import across_agencies
 from app.services.access import Scope
 from app.settings import Settings
@@ -46,9 +49,18 @@ class LiveServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.should_exit = True
-        self._thread.join(30)
-        assert not self._thread.is_alive(), "the server did not stop"
+        try:
+            self.check_features()
+        finally:
+            self._server.should_exit = True
+            self._thread.join(30)
+            assert not self._thread.is_alive(), "the server did not stop"
+
+    def check_features(self) -> None:
+        """Whatever a test did: the feature that is kept beside a marker is that of its columns."""
+        with across_agencies(), self.app.state.database.read() as connection:
+            for row in connection.execute(sa.select(markers).limit(5000)).mappings():
+                assert row["feature"] == feature_text(row)
 
     def client(self, key: str | None = ADMIN_KEY) -> httpx.Client:
         """A client that sends a key."""

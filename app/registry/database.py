@@ -24,10 +24,11 @@ from app.errors import Unavailable
 from app.registry.engines import (
     BUSY_TIMEOUT_S,
     LONG,
-    asking_engine,
     busy_is_unavailable,
     isolation,
+    postgres_asking_engine,
     postgres_engine,
+    sqlite_asking_engine,
     sqlite_engine,
 )
 from app.registry.tenancy import SETTING, across_agencies, set_whose, whose_rows
@@ -59,7 +60,7 @@ class Database:
         self.path: Path | None = None
         if self.url.drivername == "postgresql+psycopg" and self.url.database:
             self.engine = postgres_engine(self.url)
-            self._asking = asking_engine(self.url)
+            self._asking = postgres_asking_engine(self.url)
         elif (
             self.url.get_backend_name() == "sqlite"
             and self.url.database
@@ -67,6 +68,7 @@ class Database:
         ):
             self.path = Path(self.url.database)
             self.engine = sqlite_engine(self.url)
+            self._asking = sqlite_asking_engine(self.url)
         else:
             raise Unavailable(
                 f"{self.name} is neither a SQLite file nor a PostgreSQL database",
@@ -99,8 +101,7 @@ class Database:
     def close(self) -> None:
         """Close the connections and give the file up."""
         self.engine.dispose()
-        if self.path is None:
-            self._asking.dispose()
+        self._asking.dispose()
         if self._lock_fd is not None:
             os.close(self._lock_fd)
             self._lock_fd = None
@@ -125,9 +126,6 @@ class Database:
         question : callable
             Runs one statement on the connection that it gets, and may be called again if the connection was cut.
         """
-        if self.path is not None:
-            with self.read() as connection:
-                return question(connection)
         with busy_is_unavailable():
             try:
                 return self._ask(question)
@@ -138,9 +136,8 @@ class Database:
 
     def _ask(self, question: Callable[[sa.Connection], Answer]) -> Answer:
         with self._asking.connect() as connection:
-            whose = whose_rows()
-            if connection.info.get(SETTING) != whose:  # of the session: each statement is a transaction of its own
-                set_whose(connection, whose, local=False)
+            if self.path is None and connection.info.get(SETTING) != (whose := whose_rows()):
+                set_whose(connection, whose, local=False)  # of the session: each statement is its own transaction
                 connection.info[SETTING] = whose
             return question(connection)
 

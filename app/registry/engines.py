@@ -33,6 +33,22 @@ _CANNOT_BE_REACHED = "the database cannot be reached"
 
 def sqlite_engine(url: sa.URL) -> sa.Engine:
     """Engine of a SQLite file: WAL, synchronous FULL, foreign keys on; writes start with BEGIN IMMEDIATE."""
+    engine = _sqlite_engine(url, "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON")
+
+    @event.listens_for(engine, "begin")
+    def begin(connection: sa.Connection) -> None:
+        immediate = connection.get_execution_options().get(WRITE, False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+
+    return engine
+
+
+def sqlite_asking_engine(url: sa.URL) -> sa.Engine:
+    """Engine of a SQLite file for single statements: each is a transaction by itself."""
+    return _sqlite_engine(url, "query_only = ON", pool_reset_on_return=None)
+
+
+def _sqlite_engine(url: sa.URL, *pragmas: str, **options: Any) -> sa.Engine:
     engine = sa.create_engine(
         url,
         connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False},
@@ -40,19 +56,15 @@ def sqlite_engine(url: sa.URL) -> sa.Engine:
         json_deserializer=orjson.loads,
         pool_size=40,  # one for each thread that answers requests: opening one costs more than most queries
         max_overflow=8,
+        **options,
     )
 
     @event.listens_for(engine, "connect")
     def configure(connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # the driver starts no transaction of its own; `begin` below does
+        connection.isolation_level = None  # the driver starts no transaction of its own
         register_functions(connection)
-        for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+        for pragma in pragmas:
             connection.execute(f"PRAGMA {pragma}")
-
-    @event.listens_for(engine, "begin")
-    def begin(connection: sa.Connection) -> None:
-        immediate = connection.get_execution_options().get(WRITE, False)
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
 
     return engine
 
@@ -65,7 +77,7 @@ class _BinaryCursor(psycopg.Cursor[Any]):
         self.format = psycopg.pq.Format.BINARY
 
 
-def asking_engine(url: sa.URL) -> sa.Engine:
+def postgres_asking_engine(url: sa.URL) -> sa.Engine:
     """Engine of a PostgreSQL database for single statements: nothing is sent but these.
 
     A statement sees one snapshot by itself. Before it a ping, a BEGIN and after it a ROLLBACK cost more than it does.

@@ -18,7 +18,6 @@ from app.registry.conditions import Condition, condition_sql
 from app.registry.spatial import Box, proposed_by_index
 from app.registry.tables import markers
 
-Rows = list[sa.Row[Any]]
 _WIDE_DEG2 = 2_500.0  # from here on most markers are inside, and the order of the page finds them sooner than the index
 
 
@@ -121,13 +120,14 @@ def list_features(
     after: str | None,
     limit: int,
     counted: bool = False,
-) -> Rows:
-    """Rows of id, longitude, latitude, height, how many match if they are counted, and the fields; in order of ids."""
+) -> tuple[list[str], int | None]:
+    """Features as `feature_text` writes them, in the order of their ids, and how many match if they are counted."""
     values = _values(agency_id, narrowed)
     if after is not None:
         values["after"] = after
     statement = _page(_shape(narrowed, after is not None), counted)
-    return list(connection.execute(statement, {**values, "most": limit}).all())
+    text, matched = connection.execute(statement, {**values, "most": limit}).one()
+    return text.split("\n") if text else [], matched
 
 
 def count_features(connection: sa.Connection, agency_id: str, narrowed: FeatureFilter) -> int:
@@ -135,9 +135,9 @@ def count_features(connection: sa.Connection, agency_id: str, narrowed: FeatureF
     return int(connection.execute(_count(_shape(narrowed, False)), _values(agency_id, narrowed)).scalar_one())
 
 
-def find_feature(connection: sa.Connection, agency_id: str, marker_id: str, *, retired: bool) -> sa.Row[Any] | None:
-    """One row as `list_features` has them."""
-    return connection.execute(_one(retired), {"agency": agency_id, "id": marker_id}).one_or_none()
+def find_feature(connection: sa.Connection, agency_id: str, marker_id: str, *, retired: bool) -> str | None:
+    """One feature as `list_features` has them."""
+    return connection.execute(_one(retired), {"agency": agency_id, "id": marker_id}).scalar_one_or_none()
 
 
 def find_extent(connection: sa.Connection, agency_id: str, *, retired: bool) -> Extent | None:
@@ -215,25 +215,15 @@ def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
     return conditions
 
 
-_UTC = sa.DateTime()  # read without a zone where the database keeps none: what writes JSON takes such times for UTC
-_PLACE = (_C.id, _C.lon_deg, _C.lat_deg, _C.height_m)
-_PROPERTIES = tuple(
-    (sa.type_coerce(f.column, _UTC) if f.kind == "date-time" else f.column).label(f.name) for f in FIELDS
-)
-
-
 @lru_cache(maxsize=1024)
 def _page(shape: _Shape, counted: bool) -> sa.Select[Any]:
+    """One row: a line for each feature. A driver that fetches a hundred rows gives way to other threads at each."""
     most = sa.bindparam("most", type_=sa.Integer)
     matched: sa.ColumnElement[Any] = sa.null()
     if counted:  # in the same statement, so that it is the same snapshot
         matched = _count(shape._replace(after=False)).correlate(None).scalar_subquery()
-    return (
-        sa.select(*_PLACE, matched.label("matched"), *_PROPERTIES)
-        .where(*_conditions(shape))
-        .order_by(_C.id)
-        .limit(most)
-    )
+    page = sa.select(_C.feature).where(*_conditions(shape)).order_by(_C.id).limit(most).subquery()
+    return sa.select(sa.func.aggregate_strings(page.c.feature, "\n"), matched)
 
 
 @lru_cache(maxsize=1024)
@@ -243,7 +233,7 @@ def _count(shape: _Shape) -> sa.Select[Any]:
 
 @lru_cache(maxsize=2)
 def _one(retired: bool) -> sa.Select[Any]:
-    return sa.select(*_PLACE, sa.null(), *_PROPERTIES).where(*owned(retired), _C.id == sa.bindparam("id"))
+    return sa.select(_C.feature).where(*owned(retired), _C.id == sa.bindparam("id"))
 
 
 @lru_cache(maxsize=2)

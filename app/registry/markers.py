@@ -11,6 +11,7 @@ import sqlalchemy as sa
 
 from app.errors import NotFound, StaleVersion
 from app.registry.audit import AuditEntry, add_versions
+from app.registry.feature_text import feature_text
 from app.registry.spatial import (
     Area,
     Box,
@@ -25,7 +26,8 @@ from app.registry.tables import marker_versions, markers
 from app.registry.tenancy import seeing_every_agency
 
 Row = sa.RowMapping
-PUBLIC = [column for column in markers.c if column.name not in ("row", "agency_id")]
+PUBLIC = [column for column in markers.c if column.name not in ("row", "agency_id", "feature")]
+_UNKNOWN = dict.fromkeys(column.name for column in PUBLIC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +187,8 @@ def add_marker(
     connection: sa.Connection, entry: AuditEntry, values: Mapping[str, Any], *, kind: str, why: str | None
 ) -> Row:
     """Store a new marker of the entry's agency with the first version of its history."""
-    connection.execute(sa.insert(markers).values(agency_id=entry.agency_id, **values))
+    feature = feature_text({**_UNKNOWN, **values})
+    connection.execute(sa.insert(markers).values(agency_id=entry.agency_id, feature=feature, **values))
     return _recorded(connection, entry, values["id"], kind=kind, why=why)
 
 
@@ -206,10 +209,12 @@ def update_marker(
     StaleVersion
         It was changed since.
     """
+    changes = {**changes, "version": version + 1, "updated_at": entry.at}
+    feature = feature_text({**get_marker(connection, entry.agency_id, marker_id), **changes})
     statement = (
         sa.update(markers)
         .where(markers.c.id == marker_id, markers.c.agency_id == entry.agency_id, markers.c.version == version)
-        .values(**changes, version=version + 1, updated_at=entry.at)
+        .values(**changes, feature=feature)
     )
     if connection.execute(statement).rowcount != 1:
         raise StaleVersion(f"marker {marker_id} is no longer at version {version}", field="If-Match")

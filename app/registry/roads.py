@@ -9,6 +9,7 @@ import sqlalchemy as sa
 
 from app.errors import NotFound, StaleVersion
 from app.registry.audit import AuditEntry, add_versions
+from app.registry.feature_text import feature_text
 from app.registry.markers import PUBLIC
 from app.registry.tables import markers, road_versions, roads
 
@@ -182,13 +183,15 @@ def remeasure(
             offset_m=sa.bindparam("offset"),
             version=c.version + 1,
             updated_at=sa.bindparam("now", entry.at, type_=c.updated_at.type),
+            feature=sa.bindparam("text"),
         )
     )
     versions, values = [], []
     for row, (measure_m, offset_m) in zip(rows, references, strict=True):
-        values.append({"marker": row["id"], "measure": measure_m, "offset": offset_m, "now": entry.at})
         changes = {"measure_m": measure_m, "offset_m": offset_m, "version": row["version"] + 1, "updated_at": entry.at}
         marker = {**{str(name): value for name, value in row.items()}, **changes}
+        values.append({"marker": row["id"], "measure": measure_m, "offset": offset_m, "now": entry.at})
+        values[-1]["text"] = feature_text(marker)
         versions.append(entry.version(row["id"], row["version"] + 1, marker, kind=kind, why=why))
     connection.execute(statement, values)
     add_versions(connection, versions)

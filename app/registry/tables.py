@@ -122,6 +122,8 @@ markers = sa.Table(
     sa.Column("version", sa.Integer, nullable=False),
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("updated_at", UtcTime, nullable=False),
+    # the GeoJSON feature that GIS clients read, written with every change of the row: registry/feature_text.py
+    sa.Column("feature", sa.Text, nullable=False, server_default=""),
     _one_of("status", STATUSES),
     sa.CheckConstraint("lon_deg BETWEEN -180 AND 180 AND lat_deg BETWEEN -90 AND 90", name="position"),
     sa.Index("ix_markers_agency_id_id", "agency_id", "id"),

@@ -17,6 +17,11 @@ class FeatureCrs(StrEnum):
     WGS84 = "http://www.opengis.net/def/crs/EPSG/0/4326"
     WEB_MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"
 
+    @property
+    def is_storage(self) -> bool:
+        """Whether places are written as longitude and latitude."""
+        return self in (FeatureCrs.CRS84, FeatureCrs.CRS84H)
+
     def from_lon_lat(self, lon_deg: float, lat_deg: float) -> tuple[float, float]:
         """First and second coordinate of a place."""
         if self is FeatureCrs.WGS84:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
+import orjson
 import shapely
 
 from app.errors import NotFound
@@ -24,7 +24,6 @@ from app.services.ports import Clock
 _EXTENT_AGE = timedelta(seconds=60)
 _MAX_EXTENTS = 4096
 _CHEAP_TO_COUNT = frozenset({"family", "code"})
-_NAMES = tuple(field.name for field in FIELDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +73,12 @@ COLLECTIONS = {collection.id: collection for collection in (MARKERS, RETIRED, LI
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page of features, the id to continue after if there are more, and how many match if that is known."""
+    """A page of features as JSON, how many it has, the id to continue after if there are more, and how many match if
+    that is known.
+    """
 
-    features: list[dict[str, Any]]
+    features: orjson.Fragment
+    returned: int
     after: str | None
     matched: int | None
 
@@ -116,17 +118,17 @@ class Features:
     ) -> Page:
         """A page of features in the order of their ids, counted if that is asked for or costs little."""
         counted = counted or (after is None and _is_cheap(narrowed))
-        rows = self._database.ask(
+        texts, matched = self._database.ask(
             lambda c: store.list_features(c, caller.agency_id, narrowed, after=after, limit=limit + 1, counted=counted)
         )
-        more = len(rows) > limit
-        matched: int | None = None
+        more = len(texts) > limit
         if after is None and not more:
-            matched = len(rows)
-        elif counted:
-            matched = rows[0].matched if rows else self.count(caller, narrowed)
-        features = _features(rows[:limit], crs)
-        return Page(features, features[-1]["id"] if more else None, matched)
+            matched = len(texts)
+        del texts[limit:]
+        last = orjson.loads(texts[-1])["id"] if more else None
+        if not crs.is_storage:
+            texts = [orjson.dumps(_in_crs(orjson.loads(text), crs)).decode() for text in texts]
+        return Page(_joined(texts), len(texts), last, matched)
 
     def count(self, caller: Caller, narrowed: FeatureFilter) -> int:
         """How many features a filter leaves."""
@@ -142,12 +144,12 @@ class Features:
         NotFound
             There is none with this id in the collection, or it belongs to another agency.
         """
-        row = self._database.ask(
+        text = self._database.ask(
             lambda c: store.find_feature(c, caller.agency_id, feature_id, retired=collection.retired)
         )
-        if row is None:
+        if text is None:
             raise no_feature(collection)
-        return _features([row], crs)[0]
+        return _in_crs(orjson.loads(text), crs)
 
     def lines(
         self,
@@ -170,7 +172,8 @@ class Features:
         ]
         onward = [line for line in found if after is None or line.id > after]
         page = onward[:limit]
-        return Page([_line(line, crs) for line in page], page[-1].id if len(onward) > limit else None, len(found))
+        texts = [orjson.dumps(_line(line, crs)).decode() for line in page]
+        return Page(_joined(texts), len(page), page[-1].id if len(onward) > limit else None, len(found))
 
     def get_line(self, caller: Caller, line_id: str, crs: FeatureCrs = STORAGE_CRS) -> dict[str, Any]:
         """One line.
@@ -235,21 +238,11 @@ def _is_cheap(narrowed: FeatureFilter) -> bool:
     return rest == (None,) * 5 and {name for name, _ in narrowed.equal} <= _CHEAP_TO_COUNT
 
 
-def _features(rows: Iterable[Sequence[Any]], crs: FeatureCrs) -> list[dict[str, Any]]:
-    place: Callable[[float, float], tuple[float, float]] | None = None
-    if crs not in (FeatureCrs.CRS84, FeatureCrs.CRS84H):
-        place = crs.from_lon_lat
-    features = []
-    for marker_id, lon_deg, lat_deg, height_m, _, *values in rows:
-        spot: tuple[float, ...] = (lon_deg, lat_deg) if place is None else place(lon_deg, lat_deg)
-        if height_m is not None:
-            spot = (*spot, height_m)
-        features.append(
-            {
-                "type": "Feature",
-                "id": marker_id,
-                "geometry": {"type": "Point", "coordinates": spot},
-                "properties": dict(zip(_NAMES, values, strict=True)),
-            }
-        )
-    return features
+def _joined(features: list[str]) -> orjson.Fragment:
+    return orjson.Fragment(f"[{','.join(features)}]")
+
+
+def _in_crs(feature: dict[str, Any], crs: FeatureCrs) -> dict[str, Any]:
+    lon_deg, lat_deg, *height_m = feature["geometry"]["coordinates"]
+    feature["geometry"]["coordinates"] = (*crs.from_lon_lat(lon_deg, lat_deg), *height_m)
+    return feature

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from app.markers.plate import PlateCode
 from app.registry.bulk_load import large_load, load_rows
 from app.registry.database import Database
+from app.registry.feature_text import feature_text
 from app.registry.ids import new_id
 from app.registry.tables import markers
 from app.services.access import Access, Caller, Scope
@@ -34,7 +35,7 @@ SPACING_M = 25.0
 PER_ROAD = 1000
 CERPM_EVERY = 5
 _CHUNK = 20_000
-_COLUMNS = [column for column in markers.c if column.name != "row"]
+_COLUMNS = [column for column in markers.c if column.name not in ("row", "feature")]
 _M_PER_DEG = 111_195.0
 _SURVEY: dict[str, Any] = {
     "height_m": 212.345,
@@ -125,7 +126,7 @@ def _row(
 ) -> dict[str, Any]:
     template = templates["plate" if k % CERPM_EVERY else "cerpm"]
     digits = PlateCode.from_position(lon_deg, lat_deg).digits if k % CERPM_EVERY else str(k // CERPM_EVERY + 2)
-    return {
+    marker = {
         **template,
         "id": marker_id,
         "digits": digits,
@@ -136,3 +137,4 @@ def _row(
         "measure_m": k % PER_ROAD * SPACING_M,
         "original": {**template["original"], "lon_deg": lon_deg, "lat_deg": lat_deg},
     }
+    return {**marker, "feature": feature_text(marker)}

@@ -36,7 +36,7 @@ def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _rows(agency: str, count: int, lon_deg: float = 8.0) -> list[dict[str, Any]]:
-    empty = {column.name: None for column in markers.c if column.name not in ("row",)}
+    empty = {**{column.name: None for column in markers.c if column.name != "row"}, "feature": "{}"}
     return [
         {
             **empty, "id": new_id(NOW), "agency_id": agency, "family": "cerpm", "status": "planned", "digits": str(k),

@@ -17,6 +17,7 @@ from app.registry.audit import find_head
 from app.registry.audit_check import ChainReport, check_history
 from app.registry.bulk_load import load_rows
 from app.registry.database import Database
+from app.registry.feature_text import feature_text
 from app.registry.magnets import list_magnets_in
 from app.registry.markers import MarkerFilter, list_markers
 from app.registry.spatial import Box
@@ -45,7 +46,7 @@ def database(tmp_path: Path, new_database_url: Callable[[Path], str]) -> Iterato
 
 def _marker(k: int, lon_deg: float, lat_deg: float) -> dict[str, Any]:
     family = FAMILIES[k % 3]
-    return {
+    marker = {
         "row": k + 1,
         "id": f"019cb624-0000-7000-8000-{k:012x}",
         "agency_id": AGENCY,
@@ -66,6 +67,7 @@ def _marker(k: int, lon_deg: float, lat_deg: float) -> dict[str, Any]:
         "created_at": NOW,
         "updated_at": NOW + timedelta(microseconds=k),
     }
+    return {**marker, "feature": feature_text({**dict.fromkeys(markers.c.keys()), **marker})}
 
 
 def _made(count: int) -> Made:
@@ -73,7 +75,7 @@ def _made(count: int) -> Made:
     rng = np.random.default_rng(17)
     places = zip(rng.uniform(-180, 180, count).tolist(), rng.uniform(-90, 90, count).tolist(), strict=True)
     made = [_marker(k, *place) for k, place in enumerate(places)]
-    made[0] |= {"lon_deg": 180.0, "lat_deg": -90.0, "original": made[0]["original"] | {"lon_deg": 180.0}}
+    made[0] = _marker(0, 180.0, -90.0)
     owned = {"agency_id": AGENCY, "created_at": NOW}
     decode = {"id": DECODE, "state": "done", "kind": "frame", "context": {"z": 1, "a": 2}, "result": {"n": None}}
     span = {"row": 1, "number": 2, "first_sequence": 3, "last_sequence": 2**40, "decode_id": DECODE}

@@ -30,10 +30,12 @@ def list_items(request: Request) -> Response:
     negotiate(request, dict(query_pairs(request)), GEOJSON, JSON, names=_NAMES)
     features: Features = request.app.state.features
     caller = caller_of(request)
+    if collection is LINES and asked.hits:
+        return answer(_hits(features.count_lines(caller, asked.narrowed)), GEOJSON)
     if collection is LINES:
-        page = features.lines(caller, asked.narrowed, after=asked.after, limit=asked.limit, crs=asked.crs)
-        if asked.hits:
-            return answer(_hits(page.matched or 0), GEOJSON)
+        page = features.lines(
+            caller, asked.narrowed, after=asked.after, limit=asked.limit, crs=asked.crs, counted=asked.counted
+        )
     elif asked.hits:
         return answer(_hits(features.count(caller, asked.narrowed)), GEOJSON)
     else:
@@ -43,7 +45,7 @@ def list_items(request: Request) -> Response:
     document: dict[str, Any] = {
         "type": "FeatureCollection",
         "timeStamp": datetime.now(UTC),
-        "numberReturned": len(page.features),
+        "numberReturned": page.returned,
     }
     if page.matched is not None:
         document["numberMatched"] = page.matched
