@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -93,6 +93,43 @@ def condition_sql(condition: Condition, columns: dict[str, sa.ColumnElement[Any]
             return result
 
 
+def holds(condition: Condition, values: Mapping[str, Any]) -> bool | None:
+    """Whether the condition holds of these values by their properties' names, as `condition_sql` has it; None of what
+    is unknown.
+    """
+    match condition:
+        case Constant(value):
+            return value
+        case Missing(name):
+            return values[name] is None
+        case Not(inner):
+            found = holds(inner, values)
+            return None if found is None else not found
+        case Joined(every, conditions):
+            parts = [holds(inner, values) for inner in conditions]
+            if (not every) in parts:
+                return not every
+            return None if None in parts else every
+        case Compared(name, symbol, value):
+            known = values[name]
+            if known is None:
+                return None
+            if symbol == "like":
+                return _is_like(str(known), _pattern_parts(str(value)))
+            return bool(COMPARISONS[symbol](known, value))
+
+
+def pinned_values(condition: Condition | None) -> dict[str, Value]:
+    """Properties that must have one value for the condition to hold; there may be more."""
+    match condition:
+        case Compared(name, "=", value):
+            return {name: value}
+        case Joined(True, conditions):
+            return {name: value for inner in conditions for name, value in pinned_values(inner).items()}
+        case _:
+            return {}
+
+
 class _Bytewise(FunctionElement[str]):
     """A text in the order of its code points, which is SQLite's; PostgreSQL's is that of the database's language."""
 
@@ -146,3 +183,29 @@ def _glob(like: str) -> str:
         return f"[{text}]" if text in "*?[" else text
 
     return re.sub(r"\\.|[%_*?\[]", part, like, flags=re.DOTALL)
+
+
+def _pattern_parts(like: str) -> list[str | None]:
+    """A pattern of LIKE by characters: None for any text, an empty one for any character."""
+    return [
+        {"%": None, "_": ""}.get(part, part[-1])  # what is escaped is itself
+        for part in re.findall(r"\\.|.", like, flags=re.DOTALL)
+    ]
+
+
+def _is_like(text: str, parts: Sequence[str | None]) -> bool:
+    """Whether a text is like a pattern; goes back to the last % only, so it takes their lengths' product at most."""
+    at = part = 0
+    last, resumed = -1, 0
+    while at < len(text):
+        if part < len(parts) and parts[part] is None:
+            last, resumed = part, at
+            part += 1
+        elif part < len(parts) and parts[part] in ("", text[at]):
+            at, part = at + 1, part + 1
+        elif last >= 0:
+            resumed += 1
+            at, part = resumed, last + 1
+        else:
+            return False
+    return all(rest is None for rest in parts[part:])

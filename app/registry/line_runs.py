@@ -7,15 +7,18 @@ of its first CERPM.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 from pyproj import Geod
 
+from app.errors import MalformedRequest
 from app.registry.features import Field
 from app.registry.spatial import Box, box_around, within_box
 from app.registry.tables import magnets, markers
@@ -24,6 +27,10 @@ MAX_GAP_M = 100.0
 _MARGIN_M = 2 * MAX_GAP_M
 _GEOD = Geod(ellps="WGS84")
 _C = markers.c
+_PAINTED = (_C.family == "magnet", _C.scheme == "line-tag", _C.status != "retired")
+_MAGNET_LINES = 100
+"""Of so many lines the magnets are read at once."""
+_STREAMED = {"stream_results": True, "yield_per": 1000}
 
 
 LINE_FIELDS = tuple(
@@ -53,75 +60,193 @@ class Line:
     points: list[tuple[float, float]]
 
 
-def list_lines(connection: sa.Connection, agency_id: str, box: Box | None = None) -> list[Line]:
-    """The agency's lines, in the order of their ids; those that are not near a box may be left out."""
-    lines = [*_magnet_lines(connection, agency_id, box), *_runs(connection, agency_id, box)]
-    return sorted(lines, key=lambda line: line.id)
+@dataclass(slots=True)
+class _Run:
+    """A run that is being read; of one that is not wanted only the last row is kept."""
+
+    is_wanted: bool
+    rows: list[Any]
+
+
+def read_lines(
+    connection: sa.Connection,
+    agency_id: str,
+    *,
+    box: Box | None = None,
+    pinned: Mapping[str, Any] | None = None,
+    after: str | None = None,
+) -> Generator[Line]:
+    """The agency's lines one after the other: of magnets in the order of ids, then runs in that of roads and measures.
+
+    Only what is taken is read, and little more than the longest line is held. Close it before the transaction ends.
+
+    Parameters
+    ----------
+    connection, agency_id
+    box : Box, optional
+        Lines that are not near it may be left out.
+    pinned : mapping of str to value, optional
+        Lines whose `family` or `road` is another may be left out.
+    after : str, optional
+        Id of the line to go on after.
+
+    Raises
+    ------
+    MalformedRequest
+        There is no marker to go on after, or it is on no road any more.
+    """
+    pinned = pinned or {}
+    place = None if after is None else _place(connection, agency_id, after)
+    if after is not None and (place is None or (place.family == "cerpm" and None in (place.road, place.measure_m))):
+        raise MalformedRequest(
+            "there is no line to go on after", field="after", limit="the id of a line", cure="begin with the first page"
+        )
+    if pinned.get("family", "magnet") == "magnet" and (place is None or place.family == "magnet"):
+        yield from _magnet_lines(connection, agency_id, box, after)
+    if pinned.get("family", "cerpm") == "cerpm":
+        begin = place if place is not None and place.family == "cerpm" else None
+        for run in _runs(connection, agency_id, box, road=pinned.get("road"), after=begin):
+            yield _line_of_run(run)
 
 
 def find_line(connection: sa.Connection, agency_id: str, line_id: str) -> Line | None:
-    """The agency's line with an id. Only the road that its first marker is on is read."""
-    first = sa.select(_C.lon_deg, _C.lat_deg).where(_C.agency_id == agency_id, _C.id == line_id)
-    place = connection.execute(first).one_or_none()
+    """The agency's line with an id."""
+    place = _place(connection, agency_id, line_id)
     if place is None:
         return None
-    there = Box(place.lon_deg, place.lat_deg, place.lon_deg, place.lat_deg)
-    return next((line for line in list_lines(connection, agency_id, there) if line.id == line_id), None)
+    if place.family == "magnet":
+        rows = connection.execute(_magnets_of(agency_id).where(_C.id == line_id)).all()
+        return _line_of_magnets(rows) if len(rows) >= 2 else None
+    if place.road is None or place.measure_m is None:
+        return None
+    with closing(_runs(connection, agency_id, None, road=place.road, first=place)) as runs:
+        run = next(runs, None)
+    return _line_of_run(run) if run is not None and run[0].id == line_id else None
 
 
-def _magnet_lines(connection: sa.Connection, agency_id: str, box: Box | None) -> Iterator[Line]:
-    query = (
-        sa.select(_C.id, _C.digits, _C.road, _C.status, magnets.c.lon_deg, magnets.c.lat_deg)
-        .join(magnets, magnets.c.marker_id == _C.id)
-        .where(_C.agency_id == agency_id, _C.family == "magnet", _C.scheme == "line-tag", _C.status != "retired")
-        .order_by(_C.id, magnets.c.number)
-    )
+def _place(connection: sa.Connection, agency_id: str, marker_id: str) -> Any:
+    query = sa.select(_C.id, _C.family, _C.road, _C.measure_m).where(_C.agency_id == agency_id, _C.id == marker_id)
+    return connection.execute(query).one_or_none()
+
+
+# --- magnets --------------------------------------------------------------------------------------------------------
+
+
+def _magnet_lines(connection: sa.Connection, agency_id: str, box: Box | None, after: str | None) -> Iterator[Line]:
+    ids = sa.select(_C.id).where(_C.agency_id == agency_id, *_PAINTED).order_by(_C.id).limit(_MAGNET_LINES)
     if box is not None:
         near = sa.or_(*(within_box(part, magnets) for part in _widened(box)))
-        query = query.where(_C.id.in_(sa.select(magnets.c.marker_id).where(magnets.c.agency_id == agency_id, near)))
-    for _, group in groupby(connection.execute(query), key=lambda row: row.id):
-        rows = list(group)
-        if len(rows) >= 2:
-            first = rows[0]
-            yield _line(first.id, rows, family="magnet", code=first.digits, side=None, measures=(None, None))
+        ids = ids.where(_C.id.in_(sa.select(magnets.c.marker_id).where(magnets.c.agency_id == agency_id, near)))
+    while True:
+        chunk = connection.execute(ids if after is None else ids.where(_C.id > after)).scalars().all()
+        if not chunk:
+            return
+        rows = connection.execute(_magnets_of(agency_id).where(_C.id.in_(chunk))).all()
+        for _, group in groupby(rows, key=lambda row: row.id):
+            if len(line := list(group)) >= 2:
+                yield _line_of_magnets(line)
+        after = chunk[-1]
 
 
-def _runs(connection: sa.Connection, agency_id: str, box: Box | None) -> Iterator[Line]:
+def _magnets_of(agency_id: str) -> sa.Select[Any]:
+    return (
+        sa.select(_C.id, _C.digits, _C.road, _C.status, magnets.c.lon_deg, magnets.c.lat_deg)
+        .join(magnets, magnets.c.marker_id == _C.id)
+        .where(_C.agency_id == agency_id, *_PAINTED)
+        .order_by(_C.id, magnets.c.number)
+    )
+
+
+def _line_of_magnets(rows: Sequence[Any]) -> Line:
+    first = rows[0]
+    return _line(first.id, rows, family="magnet", code=first.digits, side=None, measures=(None, None))
+
+
+# --- CERPMs ---------------------------------------------------------------------------------------------------------
+
+
+def _runs(
+    connection: sa.Connection,
+    agency_id: str,
+    box: Box | None,
+    *,
+    road: str | None = None,
+    after: Any = None,
+    first: Any = None,
+) -> Generator[list[Any]]:
+    """Runs in the order of the roads, measures and ids of their first CERPMs: all, or from one on, or after one."""
     side = _C.spec["side"].as_string().label("side")
-    listed = (
+    listed = [
         _C.agency_id == agency_id,
         _C.family == "cerpm",
         _C.status != "retired",
         _C.road.is_not(None),
         _C.measure_m.is_not(None),
-    )
+    ]
+    if road is not None:
+        listed.append(_C.road == road)
     query = sa.select(_C.id, _C.road, _C.status, _C.lon_deg, _C.lat_deg, _C.measure_m, side).where(*listed)
     if box is not None:
         near = sa.or_(*(within_box(part) for part in _widened(box)))
         roads = connection.execute(sa.select(_C.road).where(*listed, near).distinct()).scalars().all()
         query = query.where(_C.road.in_(roads))
-    rows = connection.execute(query.order_by(_C.road, side, _C.measure_m, _C.id))
-    for _, group in groupby(rows, key=lambda row: (row.road, row.side)):
-        for run in _cut(list(group)):
-            measures = (run[0].measure_m, run[-1].measure_m)
-            yield _line(run[0].id, run, family="cerpm", code=None, side=run[0].side, measures=measures)
+    begin = after or first
+    if begin is not None:  # what belongs to a run that began before has a neighbour at most a gap before
+        least = sa.tuple_(sa.literal(begin.road), sa.literal(begin.measure_m - MAX_GAP_M))
+        query = query.where(sa.tuple_(_C.road, _C.measure_m) >= least)
+    rows = connection.execute(query.order_by(_C.road, _C.measure_m, _C.id), execution_options=_STREAMED)
+    with closing(rows):
+        yield from _cut(rows, lambda row: _is_before(row, begin, or_at=after is not None))
 
 
-def _cut(rows: list[Any]) -> Iterator[list[Any]]:
-    run = rows[:1]
-    for before, row in pairwise(rows):
-        if row.measure_m - before.measure_m > MAX_GAP_M:
-            if len(run) >= 2:
-                yield run
-            run = []
-        run.append(row)
-    if len(run) >= 2:
-        yield run
+def _is_before(row: Any, begin: Any, *, or_at: bool) -> bool:
+    if begin is None or row.road != begin.road:
+        return False
+    at, limit = (row.measure_m, row.id), (begin.measure_m, begin.id)
+    return bool(at <= limit if or_at else at < limit)
+
+
+def _cut(rows: Iterable[Any], is_before: Callable[[Any], bool]) -> Iterator[list[Any]]:
+    """Runs of rows in the order of roads and measures, but those that begin before; each as soon as it is complete."""
+    begun: deque[_Run] = deque()
+    growing: dict[str, _Run] = {}
+    road = None
+    for row in rows:
+        if row.road != road:
+            road = row.road
+            growing.clear()
+        run = growing.get(row.side)
+        if run is None or row.measure_m - run.rows[-1].measure_m > MAX_GAP_M:
+            run = growing[row.side] = _Run(not is_before(row), [])
+            begun.append(run)
+        if run.is_wanted:
+            run.rows.append(row)
+        else:
+            run.rows = [row]
+        while begun and _is_complete(begun[0], growing, row):
+            yield from _wanted(begun.popleft())
+    while begun:
+        yield from _wanted(begun.popleft())
+
+
+def _is_complete(run: _Run, growing: Mapping[str, _Run], row: Any) -> bool:
+    last = run.rows[-1]
+    return growing.get(last.side) is not run or row.measure_m - last.measure_m > MAX_GAP_M
+
+
+def _wanted(run: _Run) -> Iterator[list[Any]]:
+    if run.is_wanted and len(run.rows) >= 2:
+        yield run.rows
+
+
+def _line_of_run(run: list[Any]) -> Line:
+    measures = (run[0].measure_m, run[-1].measure_m)
+    return _line(run[0].id, run, family="cerpm", code=None, side=run[0].side, measures=measures)
 
 
 def _line(
     line_id: str,
-    rows: list[Any],
+    rows: Sequence[Any],
     *,
     family: str,
     code: str | None,

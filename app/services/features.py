@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from itertools import islice
 from typing import Any
 
 import orjson
 import shapely
+import sqlalchemy as sa
 
 from app.errors import NotFound
 from app.registry import features as store
+from app.registry.conditions import holds, pinned_values
 from app.registry.database import Database
 from app.registry.features import FIELDS, Extent, FeatureFilter, Field
-from app.registry.line_runs import LINE_FIELDS, Line, find_line, list_lines
+from app.registry.line_runs import LINE_FIELDS, Line, find_line, read_lines
 from app.registry.spatial import Box
 from app.registry.tiles import Tile, marker_tile
 from app.services.access import Caller
@@ -42,11 +47,6 @@ class Collection:
     @property
     def has_tiles(self) -> bool:
         """Whether there are vector tiles of it."""
-        return self.geometry == "Point"
-
-    @property
-    def has_expressions(self) -> bool:
-        """Whether filter expressions are understood."""
         return self.geometry == "Point"
 
 
@@ -159,21 +159,31 @@ class Features:
         after: str | None = None,
         limit: int = 1000,
         crs: FeatureCrs = STORAGE_CRS,
+        counted: bool = False,
     ) -> Page:
-        """A page of lines in the order of their ids, always counted."""
-        with self._database.read() as connection:
-            lines = list_lines(connection, caller.agency_id, narrowed.box)
-        wanted = dict(narrowed.equal)
-        found = [
-            line
-            for line in lines
-            if all(line.properties[name] == value for name, value in wanted.items())
-            and (narrowed.box is None or _crosses(line, narrowed.box))
-        ]
-        onward = [line for line in found if after is None or line.id > after]
-        page = onward[:limit]
+        """A page of lines, those of magnets before runs of CERPMs, counted if that is asked for or costs nothing.
+
+        Raises
+        ------
+        MalformedRequest
+            There is no line to go on after.
+        """
+        matched: int | None = None
+        with self._database.read() as connection, closing(_matching(connection, caller, narrowed, after)) as lines:
+            page = list(islice(lines, limit + 1))
+            more = len(page) > limit
+            if after is None and (counted or not more):
+                matched = len(page) + sum(1 for _ in lines)
+        if after is not None and counted:
+            matched = self.count_lines(caller, narrowed)
+        del page[limit:]
         texts = [orjson.dumps(_line(line, crs)).decode() for line in page]
-        return Page(_joined(texts), len(page), page[-1].id if len(onward) > limit else None, len(found))
+        return Page(_joined(texts), len(page), page[-1].id if more else None, matched)
+
+    def count_lines(self, caller: Caller, narrowed: FeatureFilter) -> int:
+        """How many lines a filter leaves."""
+        with self._database.read() as connection, closing(_matching(connection, caller, narrowed, None)) as lines:
+            return sum(1 for _ in lines)
 
     def get_line(self, caller: Caller, line_id: str, crs: FeatureCrs = STORAGE_CRS) -> dict[str, Any]:
         """One line.
@@ -214,6 +224,19 @@ class Features:
 def no_feature(collection: Collection) -> NotFound:
     """The same for a row that is not there and for another agency's."""
     return NotFound(f"there is no such feature in {collection.id}", field="featureId")
+
+
+def _matching(connection: sa.Connection, caller: Caller, narrowed: FeatureFilter, after: str | None) -> Generator[Line]:
+    wanted, box = dict(narrowed.equal), narrowed.box
+    pinned = {**pinned_values(narrowed.where), **wanted}
+    with closing(read_lines(connection, caller.agency_id, box=box, pinned=pinned, after=after)) as lines:
+        for line in lines:
+            if (
+                all(line.properties[name] == value for name, value in wanted.items())
+                and (narrowed.where is None or holds(narrowed.where, line.properties))
+                and (box is None or _crosses(line, box))
+            ):
+                yield line
 
 
 def _crosses(line: Line, box: Box) -> bool:

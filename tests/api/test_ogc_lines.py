@@ -8,6 +8,7 @@ import httpx
 import pytest
 from pyproj import Geod
 
+from app.registry import line_runs
 from tests.api.test_ogc_features import MERCATOR, get, ids
 from tests.conftest import LiveServer
 
@@ -84,6 +85,100 @@ def test_filters_boxes_and_pages(client: httpx.Client) -> None:
     assert {*ids(first), *ids(client.get(onward).json())} == firsts
     x, y = get(client, ITEMS, crs=MERCATOR)["features"][0]["geometry"]["coordinates"][0]
     assert (x, y) == pytest.approx((890555.926, 5942074.072), abs=2000)
+
+
+def test_pages_one_by_one_are_the_whole(client: httpx.Client) -> None:
+    """Runs of both sides begin and end in turns, at equal measures, across roads; some are cut, some are no runs."""
+    places = [
+        ("A7", "left", (0.0, 95.0, 190.0, 285.0, 380.0)), ("A7", "right", (0.0, 50.0, 151.0, 250.0, 360.0, 400.0)),
+        ("A7", "unknown", (10.0, 300.0, 400.0)), ("A8", "left", (0.0,)), ("A8", "right", (380.0, 390.0)),
+        ("B1", "left", (385.0, 395.0)),
+    ]  # fmt: skip
+    for road, side, measures in places:
+        for measure_m in measures:
+            _cerpm(client, measure_m, side, road)
+    lons = [GEOD.fwd(20.0 + k, 41.0, 90.0, 60.0)[0] for k in range(2)]
+    for k, lon in enumerate(lons):
+        lane = {"geometry": {"type": "LineString", "coordinates": [[20.0 + k, 41.0], [lon, 41.0]]}}
+        body = {"family": "magnet", "lane": lane, "line": {"style": "solid"}}
+        assert client.post("/v1/markers", json=body).status_code == 201
+    whole = get(client, ITEMS)
+    told = [
+        (line["properties"]["road"], line["properties"]["from_measure_m"], line["properties"]["count"])
+        for line in whole["features"]
+    ]
+    assert told[:2] == [(None, None, 11)] * 2
+    assert told[2:] == [
+        ("A7", 0.0, 5), ("A7", 0.0, 2), ("A7", 151.0, 2), ("A7", 300.0, 2), ("A7", 360.0, 2), ("A8", 380.0, 2),
+        ("B1", 385.0, 2),
+    ]  # fmt: skip
+    for limit in (1, 2, 3, 4):
+        found, page = [], get(client, ITEMS, limit=limit)
+        assert "numberMatched" not in page
+        while True:
+            found += page["features"]
+            onward = [link["href"] for link in page["links"] if link["rel"] == "next"]
+            if not onward:
+                break
+            page = client.get(onward[0]).json()
+        assert found == whole["features"]
+    assert get(client, ITEMS, limit=1, count="true")["numberMatched"] == 9
+    last = whole["features"][-1]["id"]
+    assert get(client, ITEMS, after=last, count="true")["numberMatched"] == 9
+    assert get(client, ITEMS, resultType="hits")["numberMatched"] == 9
+    for line in whole["features"]:
+        assert get(client, f"{ITEMS}/{line['id']}")["properties"] == line["properties"]
+    # the line that a page ended with is gone: the next one goes on where it was
+    second = whole["features"][3]["id"]
+    client.patch(f"/v1/markers/{second}", json={"status": "retired"}, headers={"If-Match": '"1"'})
+    assert ids(get(client, ITEMS, after=second))[-4:] == ids(whole)[-4:]
+    for nobodys in ("019cb624-0000-7000-8000-00000000ffff", "x"):
+        refused = client.get(ITEMS, params={"after": nobodys})
+        assert (refused.status_code, refused.json()["errors"][0]["field"]) == (400, "after")
+
+
+def test_filter_expressions_ask_lines(client: httpx.Client) -> None:
+    short = [_cerpm(client, m, road="A7") for m in (0.0, 12.0)]
+    long = [_cerpm(client, m, "right", road="A8") for m in (0.0, 90.0, 180.0)]
+    asked = {
+        "count > 2": {long[0]},
+        "length_m < 100 AND road = 'A7'": {short[0]},
+        "road = 'A7' AND road = 'A8'": set(),
+        "road = 'A7' OR side = 'right'": {short[0], long[0]},
+        "family = 'magnet'": set(),
+        "NOT family = 'magnet'": {short[0], long[0]},
+        "code IS NULL AND longest_gap_m BETWEEN 89.9 AND 90.1": {long[0]},
+        "road LIKE 'A_' AND status <> 'mixed'": {short[0], long[0]},
+    }
+    for text, expected in asked.items():
+        assert set(ids(get(client, ITEMS, filter=text))) == expected, text
+        assert get(client, ITEMS, filter=text, resultType="hits")["numberMatched"] == len(expected)
+    as_json = '{"op": ">", "args": [{"property": "count"}, 2]}'
+    assert ids(get(client, ITEMS, **{"filter": as_json, "filter-lang": "cql2-json"})) == [long[0]]
+    assert ids(get(client, ITEMS, filter="count > 2", road="A7")) == []
+    assert client.get(ITEMS, params={"filter": "measure_m > 2"}).status_code == 400
+
+
+def test_a_page_reads_no_more_than_it_needs(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    for road in ("A1", "A2", "A3", "A4"):
+        for measure_m in (0.0, 12.0, 24.0):
+            _cerpm(client, measure_m, road=road)
+    read: list[Any] = []
+    is_complete = line_runs._is_complete
+
+    def counting(run: Any, growing: Any, row: Any) -> bool:
+        read.append(row.id)
+        return is_complete(run, growing, row)
+
+    monkeypatch.setattr(line_runs, "_is_complete", counting)
+    first = get(client, ITEMS, limit=1)
+    rows = set(read)
+    read.clear()
+    get(client, ITEMS, limit=1, after=ids(first)[0])
+    assert (len(rows), len(set(read))) == (7, 10)  # the line, the next one to know of more, and what ends it
+    read.clear()
+    get(client, ITEMS, filter="road = 'A3'")
+    assert len(set(read)) == 3
 
 
 def test_a_painted_line_of_magnets_is_a_line(client: httpx.Client) -> None:

@@ -112,13 +112,12 @@ def queryables(request: Request) -> Response:
     """The JSON Schema of what filters can ask of a collection's features."""
     found = get_collection(request.path_params["collection"])
     negotiate(request, known_parameters(request, _OFFERED), SCHEMA, JSON)
-    asked = [field for field in found.fields if found.has_expressions or field.name in found.filters]
     document = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": f"{base_url(request)}/collections/{found.id}/queryables",
         "title": found.title,
         "type": "object",
-        "properties": {field.name: schema_type(field.kind) | {"title": field.text} for field in asked},
+        "properties": {field.name: schema_type(field.kind) | {"title": field.text} for field in found.fields},
         "additionalProperties": False,
     }
     return answer(document, SCHEMA)

@@ -97,8 +97,7 @@ LIST_PARAMETERS = ("f", "crs", "bbox", "bbox-crs", "datetime", "limit", "after",
 
 def list_parameters(collection: Collection) -> tuple[str, ...]:
     """Names of the parameters that a request for items of a collection may have."""
-    expressions = _EXPRESSION_PARAMETERS if collection.has_expressions else ()
-    return (*LIST_PARAMETERS, *expressions, *collection.filters)
+    return (*LIST_PARAMETERS, *_EXPRESSION_PARAMETERS, *collection.filters)
 
 
 def items_query(request: Request, collection: Collection) -> ItemsQuery:
