@@ -97,7 +97,7 @@ def read_lines(
     """
     pinned = pinned or {}
     place = None if after is None else _place(connection, agency_id, after)
-    if after is not None and (place is None or (place.family == "cerpm" and None in (place.road, place.measure_m))):
+    if after is not None and not _begins_line(place):
         raise MalformedRequest(
             "there is no line to go on after", field="after", limit="the id of a line", cure="begin with the first page"
         )
@@ -127,6 +127,13 @@ def find_line(connection: sa.Connection, agency_id: str, line_id: str) -> Line |
 def _place(connection: sa.Connection, agency_id: str, marker_id: str) -> Any:
     query = sa.select(_C.id, _C.family, _C.road, _C.measure_m).where(_C.agency_id == agency_id, _C.id == marker_id)
     return connection.execute(query).one_or_none()
+
+
+def _begins_line(place: Any) -> bool:
+    """Whether a marker can be a line's first one, or could be before it was retired."""
+    if place is None or place.family == "plate":
+        return False
+    return place.family == "magnet" or None not in (place.road, place.measure_m)
 
 
 # --- magnets --------------------------------------------------------------------------------------------------------

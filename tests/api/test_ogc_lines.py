@@ -132,8 +132,9 @@ def test_pages_one_by_one_are_the_whole(client: httpx.Client) -> None:
     second = whole["features"][3]["id"]
     client.patch(f"/v1/markers/{second}", json={"status": "retired"}, headers={"If-Match": '"1"'})
     assert ids(get(client, ITEMS, after=second))[-4:] == ids(whole)[-4:]
-    for nobodys in ("019cb624-0000-7000-8000-00000000ffff", "x"):
-        refused = client.get(ITEMS, params={"after": nobodys})
+    plate = client.post("/v1/markers", json={"position": {"lon_deg": 1.0, "lat_deg": 1.0}}).json()["id"]
+    for none in ("019cb624-0000-7000-8000-00000000ffff", "x", plate, _cerpm(client, None)):
+        refused = client.get(ITEMS, params={"after": none})
         assert (refused.status_code, refused.json()["errors"][0]["field"]) == (400, "after")
 
 
