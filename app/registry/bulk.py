@@ -11,7 +11,7 @@ import sqlalchemy as sa
 from app.registry.audit import AuditEntry
 from app.registry.bulk_load import large_load, load_columns
 from app.registry.columns import Columns, json_objects
-from app.registry.feature_text import feature_text
+from app.registry.feature_text import feature_texts
 from app.registry.markers import PUBLIC, MarkerFilter, Row, conditions_of
 from app.registry.spatial import Box, box_around, within_box
 from app.registry.tables import marker_versions, markers
@@ -74,8 +74,8 @@ def add_markers(
     """
     kinds = [str(kind(status)) for status in columns.values("status")]
     versions = entry.first_versions(columns.values("id"), json_objects(columns), kinds=kinds, why=why)
-    features = [feature_text(row) for row in columns.rows()]
-    owned = Columns(columns.count, {**columns.same, "agency_id": entry.agency_id}, {**columns.own, "feature": features})
+    same = {**columns.same, "agency_id": entry.agency_id}
+    owned = Columns(columns.count, same, {**columns.own, "feature": feature_texts(columns)})
     load_columns(connection, markers, owned)
     load_columns(connection, marker_versions, versions)
 

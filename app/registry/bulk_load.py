@@ -24,7 +24,7 @@ from app.registry.tenancy import seeing_every_agency
 
 LARGE = 50_000
 """From as many rows on the indexes are made anew, if the table does not hold more than the rows that come."""
-_CACHE_KIB = 96 * 1024
+_CACHE_KIB = 32 * 1024
 _AT_ONCE = 500
 _MOST_VALUES = 30_000
 """SQLite takes 32 766 values a statement."""
@@ -83,6 +83,9 @@ def _load(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
 
 
 def _insert(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
+    # keeps the schema's pages in memory: were one written now and again with the indexes at the end, SQLite would
+    # compute the checksums of its whole log a second time (sqlite3WalFrames, iReCksum)
+    connection.exec_driver_sql("SELECT count(*) FROM sqlite_schema").scalar_one()
     at_once = min(_AT_ONCE, (_MOST_VALUES - len(columns.same)) // len(columns.own))
     for start in range(0, columns.count, at_once):
         part = [values[start : start + at_once] for values in columns.own.values()]

@@ -64,18 +64,20 @@ class Columns:
         return [{**self.same, **dict(zip(self.own, row, strict=True))} for row in zip(*lists, strict=True)]
 
 
-def json_objects(columns: Columns, *, optional: Collection[str] = ()) -> JsonTexts:
+def json_objects(columns: Columns, *, names: Sequence[str] | None = None, optional: Collection[str] = ()) -> JsonTexts:
     """Each row as a JSON object: byte by byte what `orjson.dumps` with sorted keys writes.
 
     Parameters
     ----------
     columns : Columns
+    names : sequence of str, optional
+        All columns in the order of the members, instead of sorted.
     optional : collection of str
         Columns of `own` that a row leaves out where its value is None.
     """
     template: list[str] = []
     texts: list[Sequence[str]] = []
-    for name in sorted({*columns.same, *columns.own}):
+    for name in names or sorted({*columns.same, *columns.own}):
         key = f",{_text(name)}:".replace("%", "%%")
         if name in columns.same:
             template.append(key + _text(columns.same[name]).replace("%", "%%"))

@@ -7,12 +7,15 @@ anew.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from datetime import datetime
 from functools import lru_cache
 from operator import itemgetter
 from typing import Any
 
 import orjson
+
+from app.registry.columns import Columns, JsonTexts, json_objects, json_texts
 
 PROPERTIES = {
     "family": "family",
@@ -54,6 +57,31 @@ def feature_text(marker: Mapping[str, Any]) -> str:
         "properties": properties,
     }
     return orjson.dumps(feature, option=orjson.OPT_UTC_Z).decode()
+
+
+def feature_texts(columns: Columns) -> list[str]:
+    """As `feature_text`, of markers given by column."""
+    same, own = (
+        {name: of[column] for name, column in PROPERTIES.items() if column in of} for of in (columns.same, columns.own)
+    )
+    kinds = zip(columns.values("family"), columns.values("spec"), strict=True)
+    properties = Columns(columns.count, same, own).but(
+        side=[_side(spec) if family == "cerpm" else None for family, spec in kinds],
+        updated_at=list(map(_time, columns.values("updated_at"))),
+    )
+    places = zip(*(json_texts(columns.values(name)) for name in ("lon_deg", "lat_deg", "height_m")), strict=True)
+    coordinates = (f"{lon},{lat}" if height == "null" else f"{lon},{lat},{height}" for lon, lat, height in places)
+    members: dict[str, Sequence[Any]] = {
+        "id": columns.values("id"),
+        "geometry": JsonTexts([f'{{"type":"Point","coordinates":[{place}]}}' for place in coordinates]),
+        "properties": json_objects(properties, names=tuple(PROPERTIES)),
+    }
+    return json_objects(Columns(columns.count, {"type": "Feature"}, members), names=("type", *members))
+
+
+@lru_cache(maxsize=64)  # the rows of an import have the same
+def _time(at: datetime) -> orjson.Fragment:
+    return orjson.Fragment(orjson.dumps(at, option=orjson.OPT_UTC_Z))
 
 
 def _side(spec: Any) -> str | None:

@@ -26,33 +26,35 @@ Boxes = npt.NDArray[np.float32]
 def fill_rtree(connection: sa.Connection, table: str) -> None:
     """Fill the empty R*Tree of a table with the places of all its rows."""
     rtree = f"{table}_rtree"
-    rows = _places(connection, table)
-    if not len(rows):
+    ids, boxes = _places(connection, table)
+    if not len(ids):
         return
     size = connection.exec_driver_sql(f"SELECT length(data) FROM {rtree}_node WHERE nodeno = 1").scalar_one()
-    ids, boxes, depth, next_node = rows[:, 0].astype(np.int64), _outward(rows[:, 1:]), 0, _ROOT + 1
+    depth, next_node = 0, _ROOT + 1
     most = (int(size) - _HEADER.itemsize) // _CELL.itemsize
     while len(ids) > most:
         order, starts = _packed(boxes, most)
+        ids, boxes = ids[order], boxes[order]
         nodes = np.arange(next_node, next_node + len(starts), dtype=np.int64)
-        counts = np.diff([*starts, len(order)])
-        _store(connection, rtree, ids[order], boxes[order], nodes, starts, size=size, is_leaf=depth == 0)
-        least, greatest = (f.reduceat(boxes[order], starts) for f in (np.minimum, np.maximum))
+        _store(connection, rtree, ids, boxes, nodes, starts, size=size, is_leaf=depth == 0)
+        least, greatest = (f.reduceat(boxes, starts) for f in (np.minimum, np.maximum))
         boxes = np.stack([least[:, 0], greatest[:, 1], least[:, 2], greatest[:, 3]], axis=1)
-        ids, depth, next_node = nodes, depth + 1, next_node + len(counts)
+        ids, depth, next_node = nodes, depth + 1, next_node + len(nodes)
     root = np.array([_ROOT], dtype=np.int64)
     _store(connection, rtree, ids, boxes, root, np.zeros(1, dtype=np.intp), size=size, is_leaf=depth == 0, depth=depth)
 
 
-def _places(connection: sa.Connection, table: str) -> npt.NDArray[np.float64]:
-    """Row, longitude and latitude of all rows, shape (N, 3)."""
+def _places(connection: sa.Connection, table: str) -> tuple[Ids, Boxes]:
+    """Rows, shape (N,), and the boxes of their places, shape (N, 4)."""
     driver = connection.connection.driver_connection
     assert driver is not None
     cursor = driver.execute(f"SELECT row, lon_deg, lat_deg FROM {table}")
-    parts = [np.empty((0, 3))]
-    while part := cursor.fetchmany(20_000):
-        parts.append(np.array(part, dtype=np.float64))
-    return np.concatenate(parts)
+    ids, boxes = [np.empty(0, dtype=np.int64)], [np.empty((0, 4), dtype=np.float32)]
+    while rows := cursor.fetchmany(_PART):
+        part = np.array(rows, dtype=np.float64)
+        ids.append(part[:, 0].astype(np.int64))
+        boxes.append(_outward(part[:, 1:]))
+    return np.concatenate(ids), np.concatenate(boxes)
 
 
 def _outward(places: npt.NDArray[np.float64]) -> Boxes:
@@ -68,7 +70,7 @@ def _packed(boxes: Boxes, most: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[
     nodes = math.ceil(len(boxes) / most)
     slices = math.ceil(math.sqrt(nodes))
     by_lon = np.argsort(boxes[:, 0], kind="stable")
-    number = np.empty(len(boxes), dtype=np.intp)
+    number = np.empty(len(boxes), dtype=np.int32)
     number[by_lon] = np.arange(len(boxes)) * slices // len(boxes)
     order = np.lexsort((boxes[:, 2], number))
     starts = []
@@ -78,7 +80,7 @@ def _packed(boxes: Boxes, most: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[
     return order, np.concatenate(starts)
 
 
-def _edges(number: npt.NDArray[np.intp]) -> tuple[list[int], list[int]]:
+def _edges(number: npt.NDArray[np.int32]) -> tuple[list[int], list[int]]:
     changes = (np.flatnonzero(np.diff(number)) + 1).tolist()
     return [0, *changes], [*changes, len(number)]
 
@@ -102,15 +104,16 @@ def _store(
     blobs = (
         _node(cells[start : start + count], depth, size) for start, count in zip(starts.tolist(), counts, strict=True)
     )
-    child = f"{rtree}_rowid" if is_leaf else f"{rtree}_parent"
-    order = np.argsort(ids, kind="stable")
-    parents = np.repeat(nodes, counts)
     driver = connection.connection.driver_connection
     assert driver is not None
     driver.executemany(f"INSERT OR REPLACE INTO {rtree}_node VALUES (?, ?)", zip(nodes.tolist(), blobs, strict=True))
+    del cells, blobs
+    child = f"{rtree}_rowid" if is_leaf else f"{rtree}_parent"
+    order = np.argsort(ids, kind="stable")
+    parents = np.repeat(nodes, counts)[order]
     for start in range(0, len(order), _PART):
-        part = order[start : start + _PART]
-        within = zip(ids[part].tolist(), parents[part].tolist(), strict=True)
+        part = slice(start, start + _PART)
+        within = zip(ids[order[part]].tolist(), parents[part].tolist(), strict=True)
         driver.executemany(f"INSERT INTO {child} VALUES (?, ?)", within)
 
 

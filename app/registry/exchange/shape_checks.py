@@ -194,26 +194,23 @@ def _check_line(points: Floats, rows: npt.NDArray[np.intp]) -> Iterator[Fault]:
 
 
 def _check_ends(points: Floats, stride: int, known: dict[int, float]) -> dict[int, float]:
-    """Rows that neither what comes after nor what came before leads to."""
-    n, s = len(points), stride
-    offs = np.full((2, n), np.nan)
-    for side, sign in ((0, 1), (1, -1)):
-        line = points[::sign]
-        b, c, d = line[s : n - 2 * s], line[2 * s : n - s], line[3 * s :]
-        here = line[: n - 3 * s]
+    """Rows at the beginning and at the end that what comes after, or before, does not lead to."""
+    s, found = stride, {}
+    for sign in (1, -1):
+        line = points[::sign][: 5 * s]
+        here, b, c, d = line[: 2 * s], line[s : 3 * s], line[2 * s : 4 * s], line[3 * s :]
         first, second = _length(c - b), _length(d - c)
         fits = (np.abs(first - second) <= _REGULAR * second + 0.5) & (_cosine(c - b, d - c) > _STRAIGHT_COS)
-        ahead = (b - here) * np.sign(1.0)
+        ahead = b - here
         unit = (c - b) / np.maximum(first, 1e-6)[:, None]
         along = (ahead * unit).sum(axis=1)
         across = np.abs(ahead[:, 0] * unit[:, 1] - ahead[:, 1] * unit[:, 0])
         off = np.where((across > 0.6 * first) | (along < -1.0), _length(here - (2 * b - c)), across)
-        values = np.where(fits, off, np.nan)
-        offs[side, : n - 3 * s] = values
-        offs[side] = offs[side][::sign]
-    both = np.nanmin(np.where(np.isnan(offs), np.inf, offs), axis=0)
-    ends = [*range(2 * s), *range(n - 2 * s, n)]
-    return {k: float(both[k]) for k in ends if np.isfinite(both[k]) and both[k] > _END_OFF_M and k not in known}
+        for k in np.flatnonzero(fits & (off > _END_OFF_M)).tolist():
+            row = k if sign == 1 else len(points) - 1 - k
+            if row not in known:
+                found[row] = float(off[k])
+    return found
 
 
 def check_heights(survey: PlacedSurvey) -> Iterator[Fault]:
