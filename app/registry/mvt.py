@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from types import NoneType
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +14,7 @@ _POINT = 1
 _MOVE_TO_ONCE = 9  # 4.3.1: command 1, count 1
 # keys of fields in a message, 4.1 and the .proto: number << 3 | kind
 _FEATURE, _TAGS, _TYPE, _GEOMETRY = 0x12, 0x12, 0x18, 0x22
+_DOUBLE = struct.Struct("<d").pack
 Value = str | int | float | bool
 Numbers = npt.NDArray[np.int64]
 
@@ -35,27 +38,38 @@ def write_layer(name: str, columns: Mapping[str, Sequence[Value | None]], points
     """
     if not len(points_px):
         return b""
-    values: dict[tuple[type, Value], int] = {}
-    parts = [b"\x0a", _text(name), _features(list(columns.values()), points_px, values)]
+    distinct = [_distinct(column) for column in columns.values()]
+    parts = [b"\x0a", _text(name), _features(_tags(columns.values(), distinct), points_px)]
     for key in columns:
         parts += (b"\x1a", _text(key))
-    for _, value in values:
-        parts += (b"\x22", _sized(_value(value)))
+    for values in distinct:
+        parts += map(_value, values)
     parts.append(b"\x28" + _varint(EXTENT) + b"\x78\x02")  # extent, version 2
     return b"\x1a" + _sized(b"".join(parts))
 
 
-def _features(
-    columns: Sequence[Sequence[Value | None]], points_px: Numbers, values: dict[tuple[type, Value], int]
-) -> bytes:
-    """All features; `values` gets what they refer to. A feature of a point is nothing but varints."""
-    count, width = len(points_px), len(columns)
-    pairs = np.empty((count, width, 2), np.int64)
-    for k, column in enumerate(columns):
-        pairs[:, k, 0] = k
-        pairs[:, k, 1] = [-1 if v is None else values.setdefault((type(v), v), len(values)) for v in column]
-    pairs[pairs[:, :, 1] < 0] = -1
-    tags = pairs.reshape(count, 2 * width)
+def _distinct(column: Sequence[Value | None]) -> list[Value]:
+    """The values of a column, each once: a number is not a truth value, nor 1 the same as 1.0."""
+    if len({type(value) for value in column} - {NoneType}) > 1:
+        raise ValueError("the values of a property are of one type")
+    return [value for value in dict.fromkeys(column) if value is not None]
+
+
+def _tags(columns: Iterable[Sequence[Value | None]], distinct: Sequence[Sequence[Value]]) -> Numbers:
+    """Key and value of each property of each feature, shape (N, 2 x properties); -1 twice for what is left out."""
+    tags, first = [], 0
+    for k, (column, values) in enumerate(zip(columns, distinct, strict=True)):
+        index: dict[Value | None, int] = dict(zip(values, range(first, first + len(values)), strict=True))
+        index[None] = -1
+        chosen = np.fromiter(map(index.__getitem__, column), np.int64, len(column))
+        tags += [np.where(chosen < 0, -1, k), chosen]
+        first += len(values)
+    return np.column_stack(tags)
+
+
+def _features(tags: Numbers, points_px: Numbers) -> bytes:
+    """All features. One of a point is nothing but varints."""
+    count = len(points_px)
     zigzag = (points_px << 1) ^ (points_px >> 63)  # 4.3.2
     tag_bytes = _lengths(tags).sum(axis=1)
     geometry_bytes = 1 + _lengths(zigzag).sum(axis=1)
@@ -93,13 +107,18 @@ def _varints(numbers: Numbers) -> bytes:
 
 
 def _value(value: Value) -> bytes:
+    """A value of the layer, with its key and size."""
     if isinstance(value, str):
-        return b"\x0a" + _text(value)
+        text = value.encode()
+        size = len(text)
+        if size < 126:  # both sizes are varints of one byte
+            return b"\x22%c\x0a%c%b" % (size + 2, size, text)
+        return b"\x22" + _sized(b"\x0a" + _sized(text))
+    if isinstance(value, float):
+        return b"\x22\x09\x19" + _DOUBLE(value)
     if isinstance(value, bool):
-        return b"\x38" + bytes((value,))
-    if isinstance(value, int):
-        return b"\x30" + _varint((value << 1) ^ (value >> 63))
-    return b"\x19" + np.float64(value).tobytes()
+        return b"\x22\x02\x38" + bytes((value,))
+    return b"\x22" + _sized(b"\x30" + _varint((value << 1) ^ (value >> 63)))
 
 
 def _text(text: str) -> bytes:
