@@ -60,7 +60,7 @@ def test_a_marker_is_registered_changed_moved_and_deleted(client: httpx.Client) 
 
 
 def test_a_put_replaces_what_a_marker_need_not_have(client: httpx.Client) -> None:
-    survey = {"epoch": 2025.5, "survey_method": "RTK", "horizontal_rmse_m": 0.01}
+    survey = {"epoch": 2025.5, "survey_method": "RTK", "horizontal_rmse_m": 0.01, "check_points": 24, "surveyor": "Å"}
     marker = _post(client, _feature(32.5, 42.5, road="A7", measure_m=5.0, status="surveyed", **survey))
     url = f"{ITEMS}/{marker}"
     original = client.get(f"/v1/markers/{marker}").json()["position"]["original"]

@@ -26,9 +26,12 @@ from app.services.features import Features, get_collection
 
 _PLAIN = ("status", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m", "side")
 _CLEARED = ("heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")  # by a PUT without them
-_SURVEYED = ("realization", "epoch", "vertical_datum", "horizontal_rmse_m", "vertical_rmse_m", "survey_method")
+_SURVEYED = (
+    *("realization", "epoch", "vertical_datum", "horizontal_rmse_m", "vertical_rmse_m", "survey_method"),
+    *("check_points", "surveyor", "instrument"),
+)
 _FIXED = ("family", "scheme", "code")
-_READ_ONLY = ("localization_grade", "version", "updated_at")
+_READ_ONLY = ("transform_accuracy_m", "localization_grade", "version", "updated_at")
 _BODY_TYPES = (GEOJSON, JSON, "application/merge-patch+json")
 
 
