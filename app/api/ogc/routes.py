@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from functools import wraps
 from typing import Any
 
-from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from starlette.requests import Request
 from starlette.responses import Response
@@ -25,7 +27,8 @@ def _few_at_once(answer: Callable[[Request], Response]) -> Callable[[Request], A
 
     @wraps(answer)
     async def endpoint(request: Request) -> Response:
-        return await to_thread.run_sync(answer, request, limiter=request.app.state.ogc_threads)
+        threads: ThreadPoolExecutor = request.app.state.ogc_threads
+        return await asyncio.get_running_loop().run_in_executor(threads, copy_context().run, answer, request)
 
     return endpoint
 
@@ -74,5 +77,5 @@ def mount_ogc(app: FastAPI) -> None:
 
     It comes first: a map view asks dozens of times, and trying all other routes takes as long as reading a page.
     """
-    app.state.ogc_threads = CapacityLimiter(_THREADS)
+    app.state.ogc_threads = ThreadPoolExecutor(_THREADS, "ogc")
     app.router.routes[:0] = ROUTES
