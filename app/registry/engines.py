@@ -28,12 +28,16 @@ _SESSION = {
     "jit": "off",  # compiling costs more than any of these queries
     "plan_cache_mode": "force_custom_plan",  # a plan for any box reads the whole agency for a small one
 }
+_PAGE_BYTES = 16_384
+"""Of a new SQLite file. Rows have 2 kB; and looking a page up takes time with the pages of a log, which has all of an
+import in it."""
 _CANNOT_BE_REACHED = "the database cannot be reached"
 
 
 def sqlite_engine(url: sa.URL) -> sa.Engine:
     """Engine of a SQLite file: WAL, synchronous FULL, foreign keys on; writes start with BEGIN IMMEDIATE."""
-    engine = _sqlite_engine(url, "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON")
+    pragmas = (f"page_size = {_PAGE_BYTES}", "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON")
+    engine = _sqlite_engine(url, *pragmas)
 
     @event.listens_for(engine, "begin")
     def begin(connection: sa.Connection) -> None:

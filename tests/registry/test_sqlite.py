@@ -36,6 +36,11 @@ def test_the_connection_is_durable(database: Database) -> None:
     assert numbers == [2, 1]
 
 
+def test_a_new_file_has_large_pages(database: Database) -> None:
+    with database.read() as connection:
+        assert connection.exec_driver_sql("PRAGMA page_size").scalar() == 16_384
+
+
 def test_a_write_takes_the_lock_at_its_start(database: Database) -> None:
     rival = sa.create_engine(database.url, connect_args={"timeout": 0})
     with database.write(), rival.connect() as connection, pytest.raises(sa.exc.OperationalError, match="locked"):
