@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
@@ -19,7 +20,7 @@ from app.api.ogc import documents, edits, items, tiles
 
 _ITEMS = "/ogc/collections/{collection}/items"
 _TILES = "/ogc/collections/{collection}/tiles"
-_THREADS = 4
+_THREADS = max(2, min(os.cpu_count() or 1, 4))
 
 
 def _few_at_once(answer: Callable[[Request], Response]) -> Callable[[Request], Awaitable[Response]]:
