@@ -50,7 +50,7 @@ MAX_FAULTS = 1000
 _KNOWN_M = 5_000.0
 _NEIGHBOURS = 50_000
 _BUSY_WAIT_S = 10.0
-_PART = 500
+_PART = 2000
 _ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
 _STANDING = "place_by_area_only"
 """The caution that every survey of a new road gets, however well it is declared."""
