@@ -50,7 +50,8 @@ class LiveServer:
 
     def __exit__(self, *_: object) -> None:
         try:
-            self.check_features()
+            if self._thread.is_alive():  # a test may have stopped it
+                self.check_features()
         finally:
             self._server.should_exit = True
             self._thread.join(30)
