@@ -22,6 +22,8 @@ _LEAST_OFF_M = 2.5
 _END_OFF_M = 9.5
 _REGULAR = 0.35
 _STRAIGHT_COS = np.cos(np.radians(25.0))
+_EVEN = 0.03
+_BEND_COS = np.cos(np.radians(40.0))
 _ISOLATED_M = 150.0
 _SAME_PLACE_M = 0.3
 _HEIGHTS_M = (-500.0, 9000.0)
@@ -206,7 +208,9 @@ def _check_ends(points: Floats, stride: int, known: dict[int, float]) -> dict[in
         along = (ahead * unit).sum(axis=1)
         across = np.abs(ahead[:, 0] * unit[:, 1] - ahead[:, 1] * unit[:, 0])
         off = np.where((across > 0.6 * first) | (along < -1.0), _length(here - (2 * b - c)), across)
-        for k in np.flatnonzero(fits & (off > _END_OFF_M)).tolist():
+        even = (np.abs(_length(ahead) - first) <= _EVEN * first) & (np.abs(first - second) <= _EVEN * second)
+        bend = even & (_cosine(ahead, c - b) > _BEND_COS)  # a row moved by mistake hardly keeps its distance
+        for k in np.flatnonzero(fits & (off > _END_OFF_M) & ~bend).tolist():
             row = k if sign == 1 else len(points) - 1 - k
             if row not in known:
                 found[row] = float(off[k])
