@@ -1,3 +1,3 @@
 """Waymark: the registry of machine-readable roads."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -1,6 +1,9 @@
-"""The domain's errors. They know no HTTP: app/api/problems.py maps them in one table."""
+"""The domain's errors. They know no HTTP: app/api/http/problems.py maps them in one table."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class WaymarkError(Exception):
@@ -116,3 +119,14 @@ class Unavailable(WaymarkError):
 
 class ProofFailed(WaymarkError):
     """An artwork was rendered and did not read back as its own code."""
+
+
+@contextmanager
+def naming(part: str) -> Iterator[None]:
+    """Complete the field of an error that a part of the request caused."""
+    try:
+        yield
+    except InvalidParameter as error:
+        if error.field is not None and not error.field.startswith(f"{part}."):
+            error.field = f"{part}.{error.field}"
+        raise

@@ -5,82 +5,79 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import structlog
-from fastapi import Depends, FastAPI
+from fastapi import Depends, FastAPI, Response
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import (
-    artwork,
-    audit,
-    bulk,
-    calibrations,
-    cerpms,
-    codebooks,
-    decodes,
-    exports,
-    imports,
-    keys,
-    layouts,
-    markers,
-    observations,
-    radio_checks,
-    roads,
-    searches,
-    snapshots,
-    system,
-    ui,
-    vehicles,
-)
-from app.api.dependencies import refuse_unknown_parameters
-from app.api.middleware import Guarded, Observed
+from app.api.access import audit, keys
+from app.api.decodes import decodes
+from app.api.fleet import calibrations, snapshots, vehicles
+from app.api.http import system, ui
+from app.api.http.dependencies import refuse_unknown_parameters
+from app.api.http.middleware import Guarded, Observed
+from app.api.http.openapi import describe, operation_id
+from app.api.http.permissions import Permissions
+from app.api.http.problems import install_problem_handlers
+from app.api.http.rate_limits import RateLimit
+from app.api.markers import artwork, bulk, cerpms, codebooks, layouts, markers, observations, searches
 from app.api.ogc import mount_ogc
-from app.api.openapi import describe
-from app.api.permissions import Permissions
-from app.api.problems import install_problem_handlers
-from app.api.rate_limits import RateLimit
-from app.api.schemas_imports import parse_declaration
-from app.decoders.archives import ArchiveLimits
-from app.decoders.images import ImageLimits
+from app.api.plans import alignments, plans, radio_checks
+from app.api.roads import roads
+from app.api.surveys import exports, imports
 from app.decoders.plate import decode_plates
 from app.encoders.plate import PlateReader
+from app.families.rules import MarkerRules
+from app.formats.archives import ArchiveLimits
+from app.formats.images import ImageLimits
 from app.geodesy import use_grids
-from app.jobs.child import ChildLimits, DecodePlates
-from app.jobs.local import LocalQueue
+from app.jobs.decoder_process import ProcessLimits
+from app.jobs.frame_tasks import DecodePlates
+from app.jobs.local_queue import LocalQueue
 from app.jobs.pool import DecodePool
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlateReading
 from app.registry.database import Database
-from app.services.access import Access, Bearer
-from app.services.agency_secrets import AgencySecrets
-from app.services.artwork import Artworks
-from app.services.audit import AuditLog
-from app.services.bulk_markers import BulkMarkers
-from app.services.calibrations import Calibrations
-from app.services.cerpm_programs import CerpmPrograms
-from app.services.codebooks import Codebooks
-from app.services.decode_jobs import DecodeJobs
-from app.services.decode_rules import DecodeRules
-from app.services.decodes import Decodes
-from app.services.exports import Exports
-from app.services.features import Features
-from app.services.import_jobs import ImportJobs
-from app.services.imports import Imports
-from app.services.keys import Keys
-from app.services.layouts import Layouts
-from app.services.marker_rules import MarkerRules
-from app.services.markers import Markers
-from app.services.observations import Observations
-from app.services.oidc import Issuer, KeySet, Tokens
-from app.services.roads import Roads
-from app.services.searches import Searches
-from app.services.snapshots import Snapshots
-from app.services.vehicles import Vehicles
+from app.registry.jobs import JobKind
+from app.services.access.access import Access, Bearer
+from app.services.access.agency_secrets import AgencySecrets
+from app.services.access.audit import AuditLog
+from app.services.access.keys import Keys
+from app.services.access.oidc import Issuer, KeySet, Tokens
+from app.services.decodes.archive_handler import ArchiveHandler
+from app.services.decodes.decodes import Decodes
+from app.services.decodes.frame_handler import FrameHandler
+from app.services.decodes.outputs import DecodeOutputs
+from app.services.decodes.packet_handler import PacketHandler
+from app.services.decodes.rules import DecodeRules
+from app.services.decodes.trace_handler import TraceHandler
+from app.services.decodes.upload_path import UploadHandler
+from app.services.fleet.calibrations import Calibrations
+from app.services.fleet.snapshots import Snapshots
+from app.services.fleet.vehicles import Vehicles
+from app.services.jobs import Jobs
+from app.services.markers.artwork import Artworks
+from app.services.markers.bulk import BulkMarkers
+from app.services.markers.cerpm_programs import CerpmPrograms
+from app.services.markers.codebooks import Codebooks
+from app.services.markers.features import Features
+from app.services.markers.layouts import Layouts
+from app.services.markers.markers import Markers
+from app.services.markers.observations import Observations
+from app.services.markers.searches import Searches
+from app.services.plans.alignments import Alignments
+from app.services.plans.plans import Plans
+from app.services.roads.roads import Roads
+from app.services.surveys.exports import Exports
+from app.services.surveys.import_jobs import ImportJobs
+from app.services.surveys.imports import Imports
 from app.settings import Settings
 from app.storage.blobs import Blobs
 from app.storage.jwks import read_jwks
@@ -98,6 +95,8 @@ ROUTERS = (
     layouts.router,
     cerpms.router,
     radio_checks.router,
+    alignments.router,
+    plans.router,
     codebooks.router,
     decodes.router,
     imports.router,
@@ -110,79 +109,110 @@ ROUTERS = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class _Outside:
+    """What is opened when the server starts, and closed when it ends."""
+
+    database: Database
+    blobs: Blobs
+    pool: DecodePool
+    queue: LocalQueue
+
+
 def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> FastAPI:
     """An app with its own database, use cases, metrics and limits. Files are opened when it starts.
 
     `decode` is imported by name in the decoder processes, so it must be a function of a module.
     """
     use_grids(settings.proj_grids_dir)
-    database = Database(settings.resolved_database_url)
-    blobs = Blobs(settings.resolved_blobs_url)
-    pool = _decode_pool(settings, decode)
-    queue = LocalQueue()
-    rules = _decode_rules(settings)
-    secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
-    imports_service = Imports(database, utc_now, pool, marker_rules(settings))
-    import_jobs = ImportJobs(
-        database, utc_now, blobs, queue, marker_rules(settings), imports=imports_service, parse=parse_declaration
+    outside = _Outside(
+        Database(settings.resolved_database_url),
+        Blobs(settings.resolved_blobs_url),
+        _decode_pool(settings, decode),
+        LocalQueue(),
     )
-    jobs = DecodeJobs(
-        database, utc_now, blobs=blobs, decoder=pool, secrets=secrets, rules=rules, run_import=import_jobs.run
+    use_cases = _use_cases(settings, outside, decode)
+    app = FastAPI(
+        title="Waymark",
+        version=__version__,
+        lifespan=lambda _app: _running(settings, outside, use_cases["jobs"], use_cases["access"]),
+        default_response_class=Response,
+        generate_unique_id_function=operation_id,
     )
-    access = Access(database, utc_now, _token_check(settings))
-    metrics = CollectorRegistry()
-    readiness: dict[str, Callable[[], bool]] = {"database": database.is_ready, "decoders": pool.is_ready}
-
-    @asynccontextmanager
-    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        database.open()
-        try:
-            database.migrate()
-            for warning in database.list_warnings():
-                _LOG.warning(warning)
-            blobs.open()
-            _show_once(access.ensure_first_key(_admin_key(settings)))
-            if settings.warm_decoders:
-                pool.warm()
-            queue.open(jobs.run_job, jobs.list_unfinished())
-            async with _each_minute(access.write_uses):
-                yield
-        finally:
-            pool.close()
-            queue.close()
-            database.close()
-
-    app = FastAPI(title="Waymark", version=__version__, lifespan=lifespan)
-    app.state.database = database
-    app.state.markers = Markers(database, utc_now, marker_rules(settings))
-    app.state.imports, app.state.import_jobs = imports_service, import_jobs
-    app.state.exports = Exports(database)
-    app.state.snapshots = Snapshots(
-        database, utc_now, lru_cache(lambda: load_signing_key(settings.resolved_signing_key_file))
-    )
-    app.state.audit = AuditLog(database)
-    app.state.searches = Searches(database)
-    app.state.roads = Roads(database, utc_now, settings.crs_accuracy_m, rules.idempotency_ttl)
-    app.state.observations = Observations(database)
-    app.state.bulk_markers = BulkMarkers(database, utc_now, app.state.markers, rules.idempotency_ttl)
-    app.state.programs = CerpmPrograms(database, utc_now, secrets)
-    app.state.layouts = Layouts(database)
-    app.state.codebooks = Codebooks(database, utc_now, rules.idempotency_ttl)
-    app.state.calibrations = Calibrations(database, utc_now, pool, rules.images, rules.idempotency_ttl)
-    app.state.vehicles = Vehicles(database, utc_now, rules.idempotency_ttl)
-    app.state.decodes = Decodes(database, utc_now, blobs=blobs, decoder=pool, queue=queue, secrets=secrets, rules=rules)
-    app.state.jobs = jobs
-    app.state.artworks = Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode))
-    app.state.features = Features(database, utc_now)
+    for name, use_case in use_cases.items():
+        setattr(app.state, name, use_case)
+    app.state.database = outside.database
     app.state.public_url = settings.public_url.rstrip("/")
-    app.state.access = access
-    app.state.keys = Keys(database, utc_now, access)
-    app.state.readiness = readiness
-    app.state.metrics = metrics
+    app.state.readiness = {"database": outside.database.is_ready, "decoders": outside.pool.is_ready}
+    app.state.metrics = CollectorRegistry()
     _add_routes(app)
-    _add_guard(app, settings, access)
-    app.add_middleware(Observed, registry=metrics)
+    _add_guard(app, settings, app.state.access)
+    app.add_middleware(Observed, registry=app.state.metrics)
     return app
+
+
+def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> dict[str, Any]:
+    """The use cases by the names under which routes ask for them."""
+    database, blobs, pool, queue = outside.database, outside.blobs, outside.pool, outside.queue
+    rules = _decode_rules(settings)
+    ttl = rules.idempotency_ttl
+    secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
+    signing_key = lru_cache(lambda: load_signing_key(settings.resolved_signing_key_file))
+    handlers = _handlers(database, pool, secrets, rules)
+    marker_cases = Markers(database, utc_now, marker_rules(settings))
+    import_cases = Imports(database, utc_now, pool, marker_rules(settings))
+    import_jobs = ImportJobs(database, utc_now, blobs, queue, imports=import_cases, idempotency_ttl=ttl)
+    decode_cases = Decodes(database, utc_now, blobs=blobs, queue=queue, handlers=handlers, rules=rules)
+    access = Access(database, utc_now, _token_check(settings))
+    return {
+        "access": access,
+        "artworks": Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode)),
+        "alignments": Alignments(
+            database, utc_now, blobs, pool, accuracy_m=settings.crs_accuracy_m, idempotency_ttl=ttl
+        ),
+        "audit": AuditLog(database),
+        "bulk_markers": BulkMarkers(database, utc_now, marker_cases, ttl),
+        "calibrations": Calibrations(database, utc_now, pool, rules.images, ttl),
+        "codebooks": Codebooks(database, utc_now, ttl),
+        "decode_outputs": DecodeOutputs(database, blobs=blobs, processes=pool, rules=rules),
+        "decodes": decode_cases,
+        "exports": Exports(database),
+        "features": Features(database, utc_now),
+        "import_jobs": import_jobs,
+        "imports": import_cases,
+        "jobs": Jobs(database, utc_now, {JobKind.DECODE: decode_cases, JobKind.IMPORT: import_jobs}),
+        "keys": Keys(database, utc_now, access),
+        "layouts": Layouts(database),
+        "markers": marker_cases,
+        "observations": Observations(database),
+        "plans": Plans(database, utc_now, blobs, pool, marker_rules(settings)),
+        "programs": CerpmPrograms(database, utc_now, secrets),
+        "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
+        "searches": Searches(database),
+        "snapshots": Snapshots(database, utc_now, signing_key),
+        "vehicles": Vehicles(database, utc_now, ttl),
+    }
+
+
+@asynccontextmanager
+async def _running(settings: Settings, outside: _Outside, jobs: Jobs, access: Access) -> AsyncIterator[None]:
+    """The time between the server's start and its end."""
+    outside.database.open()
+    try:
+        outside.database.migrate()
+        for warning in outside.database.list_warnings():
+            _LOG.warning(warning)
+        outside.blobs.open()
+        _show_once(access.ensure_first_key(_admin_key(settings)))
+        if settings.warm_decoders:
+            outside.pool.warm()
+        outside.queue.open(jobs.run_job, jobs.list_unfinished())
+        async with _each_minute(access.write_uses):
+            yield
+    finally:
+        outside.pool.close()
+        outside.queue.close()
+        outside.database.close()
 
 
 def _add_routes(app: FastAPI) -> None:
@@ -208,6 +238,7 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
             "": settings.max_json_bytes,
             "/v1/decodes": settings.max_upload_bytes,
             "/v1/imports": settings.max_import_bytes,
+            "/v1/alignments": settings.max_import_bytes,
             "/v1/calibrations": settings.max_upload_bytes,
         },
         permissions=Permissions(),
@@ -255,8 +286,8 @@ def _request_limit(settings: Settings) -> RateLimit | None:
         settings.requests_per_s,
         settings.requests_at_once,
         name="key",
-        said="too many requests came with this key",
-        cure="wait as long as Retry-After says, or ask for more at a time: larger pages, bulk requests, ZIP uploads",
+        message="too many requests were sent with this key",
+        cure="wait for the time in Retry-After, and combine requests: larger pages, bulk requests, ZIP uploads",
     )
 
 
@@ -267,8 +298,8 @@ def _failure_limit(settings: Settings) -> RateLimit | None:
         settings.wrong_keys_per_minute / 60,
         max(1, round(settings.wrong_keys_per_minute)),
         name="wrong-keys",
-        said="too many wrong keys came from this address",
-        cure="wait as long as Retry-After says, and check the key",
+        message="too many wrong keys were sent from this address",
+        cure="wait for the time in Retry-After, and check the key",
     )
 
 
@@ -294,8 +325,20 @@ def _decode_pool(settings: Settings, decode: DecodePlates) -> DecodePool:
     return DecodePool(
         decode,
         workers=settings.decode_workers,
-        limits=ChildLimits(settings.decode_memory_bytes, settings.decode_timeout_s, settings.trace_timeout_s),
+        limits=ProcessLimits(settings.decode_memory_bytes, settings.decode_timeout_s, settings.trace_timeout_s),
         max_pixels=settings.max_image_pixels,
+    )
+
+
+def _handlers(
+    database: Database, pool: DecodePool, secrets: AgencySecrets, rules: DecodeRules
+) -> tuple[UploadHandler[Any], ...]:
+    """Kinds of uploads; the first one that accepts an upload decodes it."""
+    return (
+        TraceHandler(database, pool, rules),
+        PacketHandler(database, pool, secrets, rules),
+        ArchiveHandler(database, utc_now, pool, rules),
+        FrameHandler(database, pool, rules),
     )
 
 

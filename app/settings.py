@@ -1,4 +1,4 @@
-"""Settings: one class, read from `WAYMARK_*` when an entry point asks for it, never at import."""
+"""Settings of the server and the command line, read from `WAYMARK_*` by the entry points, never at import."""
 
 from __future__ import annotations
 
@@ -13,73 +13,101 @@ _LOOPBACK = ("http://127.0.0.1:", "http://localhost:", "http://[::1]:")
 
 
 class Settings(BaseSettings):
-    """Everything that can be set; the defaults run the embedded server on a fresh machine."""
+    """All settings. The defaults run the embedded server on a new machine."""
 
     model_config = SettingsConfigDict(env_prefix="WAYMARK_", frozen=True, extra="ignore", env_ignore_empty=True)
 
-    data_dir: Path = Field(default=Path("var"), description="Folder of the embedded database and of uploads.")
+    data_dir: Path = Field(default=Path("var"), description="Folder for the embedded database and the uploads.")
     database_url: str = Field(
         default="",
         repr=False,
-        description="sqlite:///PATH or postgresql+psycopg://USER@HOST/DATABASE with PostGIS; empty means a SQLite file "
+        description="sqlite:///PATH, or postgresql+psycopg://USER@HOST/DATABASE with PostGIS; empty: an SQLite file "
         "in the data folder.",
     )
     blobs_url: str = Field(
-        default="", description="file:///FOLDER or s3://BUCKET/PREFIX; empty means a folder in the data folder."
+        default="", description="file:///FOLDER or s3://BUCKET/PREFIX; empty: a folder in the data folder."
     )
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
-    public_url: str = Field(default="", description="Where clients reach the server; goes into QR codes and links.")
+    public_url: str = Field(
+        default="", description="Address at which clients reach the server; used in QR codes and links."
+    )
     master_key_file: Path | None = Field(
-        default=None, description="File of the 32 bytes that agencies' keys are stored under; made up if missing."
+        default=None, description="File with the 32 bytes that encrypt the agencies' secret keys; created if missing."
     )
     signing_key_file: Path | None = Field(
-        default=None, description="File of the 32 bytes that snapshots are signed under (Ed25519); made up if missing."
+        default=None, description="File with the 32 bytes that sign snapshots (Ed25519); created if missing."
     )
-    admin_key: SecretStr | None = Field(default=None, description="Admin key to use instead of a generated one.")
+    admin_key: SecretStr | None = Field(
+        default=None, description="Admin key of the server; without it, one is generated for an empty database."
+    )
 
-    max_json_bytes: int = Field(default=1024**2, ge=1024, description="Largest JSON body. [byte]")
-    max_upload_bytes: int = Field(default=32 * 1024**2, ge=1024, description="Largest upload. [byte]")
-    max_import_bytes: int = Field(default=256 * 1024**2, ge=1024, description="Largest survey to import. [byte]")
-    max_image_pixels: int = Field(default=50_000_000, ge=1, description="Largest picture. [px]")
-    body_timeout_s: float = Field(default=30.0, gt=0, description="Longest wait for the next part of a body. [s]")
-    max_archive_frames: int = Field(default=500, ge=1, le=10_000, description="Most frames in one archive.")
-    decode_memory_bytes: int = Field(default=3 * 1024**3, ge=2**28, description="Address space of a decoder. [byte]")
-    decode_timeout_s: float = Field(default=20.0, gt=0, description="Longest decode of one frame. [s]")
-    trace_timeout_s: float = Field(default=300.0, gt=0, description="Longest decode of one recording. [s]")
-    decode_workers: int = Field(default=2, ge=1, le=256, description="Decoder processes.")
-    warm_decoders: bool = Field(default=True, description="Start them with the server, not with the first upload.")
+    max_json_bytes: int = Field(default=1024**2, ge=1024, description="Maximum size of a JSON body. [byte]")
+    max_upload_bytes: int = Field(default=32 * 1024**2, ge=1024, description="Maximum size of an upload. [byte]")
+    max_import_bytes: int = Field(
+        default=256 * 1024**2, ge=1024, description="Maximum size of a survey to import. [byte]"
+    )
+    max_image_pixels: int = Field(default=50_000_000, ge=1, description="Maximum size of a picture. [px]")
+    body_timeout_s: float = Field(
+        default=30.0, gt=0, description="Maximum time to wait for the next part of a body. [s]"
+    )
+    max_archive_frames: int = Field(
+        default=500, ge=1, le=10_000, description="Maximum number of frames in one archive."
+    )
+    decode_memory_bytes: int = Field(
+        default=3 * 1024**3, ge=2**28, description="Maximum address space of a decoder process. [byte]"
+    )
+    decode_timeout_s: float = Field(default=20.0, gt=0, description="Maximum time to decode one frame. [s]")
+    trace_timeout_s: float = Field(default=300.0, gt=0, description="Maximum time to decode one recording. [s]")
+    decode_workers: int = Field(default=2, ge=1, le=256, description="Number of decoder processes.")
+    warm_decoders: bool = Field(
+        default=True, description="Start the decoder processes with the server, not with the first upload."
+    )
 
     explicit_code_radius_m: float = Field(
-        default=20_000.0, ge=0, le=1e6, description="No two plates with the same given digits within this. [m]"
+        default=20_000.0, ge=0, le=1e6, description="Minimum distance between plates with the same chosen digits. [m]"
     )
     position_code_radius_m: float = Field(
-        default=1_000.0, ge=0, le=1e6, description="No two position plates with the same digits within this. [m]"
+        default=1_000.0, ge=0, le=1e6, description="Minimum distance between position plates with the same digits. [m]"
     )
     crs_accuracy_m: float = Field(
-        default=0.1, ge=0, le=1, description="Worst stated accuracy of a transformation that still counts as exact. [m]"
+        default=0.1,
+        ge=0,
+        le=1,
+        description="Maximum stated error of a coordinate transformation that counts as exact. [m]",
     )
     proj_grids_dir: Path | None = Field(
-        default=None, description="Folder of PROJ grids to transform positions with; nothing is fetched from a network."
+        default=None, description="Folder with PROJ grids for coordinate transformations; none are downloaded."
     )
-    idempotency_ttl_h: float = Field(default=24.0, gt=0, description="How long an Idempotency-Key is remembered. [h]")
+    idempotency_ttl_h: float = Field(
+        default=24.0, gt=0, description="Time for which the response to an Idempotency-Key is stored. [h]"
+    )
 
     requests_per_s: float = Field(
-        default=200.0, ge=0, le=1e6, description="Requests of one key in the long run; 0: no limit. [1/s]"
+        default=200.0,
+        ge=0,
+        le=1e6,
+        description="Maximum rate of requests with one key in the long run; 0: unlimited. [1/s]",
     )
-    requests_at_once: int = Field(default=1000, ge=1, le=1_000_000, description="Requests of one key in a burst.")
+    requests_at_once: int = Field(
+        default=1000, ge=1, le=1_000_000, description="Maximum number of requests with one key in a burst."
+    )
     wrong_keys_per_minute: float = Field(
-        default=30.0, ge=0, le=1e6, description="Wrong keys from one address; 0: no limit. [1/min]"
+        default=30.0, ge=0, le=1e6, description="Maximum rate of wrong keys from one address; 0: unlimited. [1/min]"
     )
 
-    oidc_issuer: str = Field(default="", description="OpenID Connect issuer whose tokens are taken; empty: none.")
-    oidc_audience: str = Field(default="", description="What its tokens have to be for.")
-    oidc_jwks: str = Field(default="", description="Where its public keys are: https://..., or a file.")
+    oidc_issuer: str = Field(default="", description="OpenID Connect issuer whose tokens are accepted; empty: none.")
+    oidc_audience: str = Field(default="", description="Audience that its tokens must contain.")
+    oidc_jwks: str = Field(default="", description="Its public keys (JWKS): https://..., or a file.")
     oidc_agency_claim: str = Field(default="waymark_agency", description="Claim that names the agency.")
     oidc_scope_claim: str = Field(default="waymark_scope", description="Claim that names the scope.")
 
-    log_format: Literal["console", "json"] = Field(default="console", description="How log lines are written.")
-    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(default="INFO", description="Least level logged.")
+    log_format: Literal["console", "json"] = Field(
+        default="console", description="Format of log lines: console or json."
+    )
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = Field(
+        default="INFO", description="Lowest level that is logged: DEBUG, INFO, WARNING or ERROR."
+    )
 
     @field_validator("admin_key")
     @classmethod

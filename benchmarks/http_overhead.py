@@ -29,12 +29,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from app.decoders.images import load_image
 from app.decoders.plate import decode_plates
-from app.jobs.child import keep_memory
+from app.families.plate.frames import DEFAULT_GEOMETRIES
+from app.formats.images import load_image
+from app.jobs.decoder_process import keep_memory
 from app.markers.plate import PlateCode
 from app.sensors.camera import Camera
-from app.services.frame_reading import DEFAULT_GEOMETRIES
 
 KEY = "benchmark-key-that-is-long-enough"
 LON_DEG, LAT_DEG = 8.412345, 49.012345

@@ -18,9 +18,9 @@ import numpy as np
 from app.demo.cerpms import build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import drive_over, list_plates, registered_code
 from app.demo.server import LocalServer
-from app.jobs.trace_child import decode_recording
+from app.jobs.trace_tasks import decode_recording
 from app.markers.magnet import InformationTag, Polarity, parse_tag
-from app.services.traces import TraceTask
+from app.services.decodes.trace_task import TraceTask
 from app.simulation.magnetic.drive import Scene, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
@@ -69,11 +69,11 @@ def _write_lane(client: httpx.Client) -> None:
     (IMAGES / "lane.svg").write_bytes(client.get(decode["links"]["plot"]).raise_for_status().content)
     overlay = client.get(decode["links"]["overlay"]).raise_for_status().content
     (IMAGES / "overlay.jpg").write_bytes(_recoded(overlay, 0.5, 80))
-    heard = drive_past(built.lane, built.laid, np.random.default_rng(_SEED), sign=None)
+    heard = drive_past(built.lane, built.installed, np.random.default_rng(_SEED), sign=None)
     rows = ["id,latitude,longitude,altitude,side,rssi,snr,timestamp"]
     first = {packet.claim.number: packet for packet in reversed(heard.packets) if packet.claim is not None}
     for number, packet in sorted(first.items()):
-        at, claim = datetime.fromtimestamp(packet.heard_at_s, UTC), packet.claim
+        at, claim = datetime.fromtimestamp(packet.received_at_s, UTC), packet.claim
         assert claim is not None
         rows.append(
             f"{number},{claim.lat_deg:.7f},{claim.lon_deg:.7f},0.0,{claim.side.name.lower()},{packet.rssi_dbm:.0f},"

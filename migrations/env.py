@@ -1,4 +1,4 @@
-"""Runs migrations on the connection that app/registry/database.py hands over, inside its transaction."""
+"""Runs migrations on the connection that app/registry/database.py passes in, inside its transaction."""
 
 from __future__ import annotations
 

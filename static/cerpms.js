@@ -1,11 +1,11 @@
-// Register a CERPM; show one with its message, byte by byte; a decoded drive's lane.
+// Register a CERPM, show its message byte by byte, and show the lane of a decoded packet log.
 
 import * as api from "./api.js";
 import { drawMap } from "./map.js";
-import { $, attempt, facts, make, readForm, say } from "./page.js";
+import { $, attempt, facts, make, readForm, showStatus } from "./page.js";
 
 const VERDICTS = { authentic: "read", duplicate: "read" };
-const MAP_STEP = 10; // stations from one tick of the map to the next
+const MAP_STEP = 10; // stations between two ticks of the map
 
 export function isPacketLog(file) {
   return /\.(jsonl|ndjson|json)$/i.test(file.name) || (/\.(csv|zip|bin|txt)$/i.test(file.name) && /packet|uplink|cerpm|lora/i.test(file.name));
@@ -20,7 +20,7 @@ export function startCerpms() {
       const { value } = body.speed_limit || {};
       if (value === undefined) delete body.speed_limit;
       const marker = await api.registerMarker(body);
-      say(`Registered CERPM ${marker.code.number}.`);
+      showStatus(`Registered CERPM ${marker.code.number}.`);
       location.hash = `#markers/${marker.id}`;
     });
   });
@@ -39,7 +39,7 @@ export async function drawCerpm(box, marker) {
       ["Height", position.height_m === null ? null : `${position.height_m.toFixed(3)} m`],
       ["Accuracy", position.horizontal_rmse_m === null ? "not stated" : `${position.horizontal_rmse_m} m horizontal`],
       ["Grade", position.localization_grade],
-      ["Sends", `every ${radio.interval_s} s, SF${radio.spreading_factor}, ${radio.bandwidth_hz / 1000} kHz at ${radio.frequency_hz / 1e6} MHz`],
+      ["Transmission", `every ${radio.interval_s} s, SF${radio.spreading_factor}, ${radio.bandwidth_hz / 1000} kHz at ${radio.frequency_hz / 1e6} MHz`],
       ["DevEUI", marker.dev_eui],
       ["Road", marker.road],
       ["Id", marker.id],
@@ -82,19 +82,19 @@ export function drawPackets(decoded) {
     ["Packets", `${report.packets}: ${counts.join(", ")}`],
     ["Left out", report.left_out.map((entry) => `${entry.what}: ${entry.reason}`).join("; ")],
     ["Path", lane && !lane.refusal ? `${lane.length_m.toFixed(0)} m, ± ${(100 * lane.sigma_median_m).toFixed(1)} cm` : lane && lane.refusal],
-    ["Mind", [...report.warnings, ...(lane ? lane.doubts : [])].join("; ")],
-    ["Steering check", steering && !steering.refusal ? `${steering.controller}: RMS ${(100 * steering.rms_m).toFixed(1)} cm, most ${(100 * steering.max_m).toFixed(1)} cm` : steering && steering.refusal],
+    ["Warnings", [...report.warnings, ...(lane ? lane.localization_warnings : [])].join("; ")],
+    ["Steering check", steering && !steering.refusal ? `${steering.controller}: RMS ${(100 * steering.rms_m).toFixed(1)} cm, maximum ${(100 * steering.max_m).toFixed(1)} cm` : steering && steering.refusal],
   ])];
-  const named = markers.filter((marker) => marker.left_out || marker.notes.length);
-  for (const marker of named) {
+  const noted = markers.filter((marker) => marker.left_out || marker.notes.length);
+  for (const marker of noted) {
     parts.push(make(
       "div",
       { class: "reading" },
-      make("h3", {}, make("span", { class: marker.left_out ? "refused" : "unsure" }, marker.left_out ? "left out" : "mind"), " ", make("span", { class: "digits" }, `CERPM ${marker.number}`)),
-      facts([["Why", [marker.left_out, ...marker.notes].filter(Boolean).join("; ")], ["Packets", marker.packets], ["Health", marker.health && marker.health.verdict]]),
+      make("h3", {}, make("span", { class: marker.left_out ? "refused" : "unsure" }, marker.left_out ? "left out" : "warning"), " ", make("span", { class: "digits" }, `CERPM ${marker.number}`)),
+      facts([["Reason", [marker.left_out, ...marker.notes].filter(Boolean).join("; ")], ["Packets", marker.packets], ["Health", marker.health && marker.health.verdict]]),
     ));
   }
-  if (!named.length) parts.push(make("p", { class: "reading" }, make("span", { class: VERDICTS.authentic }, "all markers agree"), ` ${markers.length} CERPMs heard`));
+  if (!noted.length) parts.push(make("p", { class: "reading" }, make("span", { class: VERDICTS.authentic }, "all markers agree"), ` ${markers.length} CERPMs received`));
   return parts;
 }
 
@@ -102,16 +102,16 @@ export function drawLane(decoded) {
   const { lane } = decoded;
   const shown = Boolean(lane && !lane.refusal);
   $("#fix-map").toggleAttribute("hidden", !shown);
-  if (!shown) return make("p", { class: "empty" }, lane && lane.refusal ? lane.refusal : "No path.");
+  if (!shown) return make("p", { class: "empty" }, lane && lane.refusal ? lane.refusal : "No path was estimated.");
   const places = lane.stations.lon_deg.flatMap((lon_deg, k) => (k % MAP_STEP ? [] : [{
     lon_deg, lat_deg: lane.stations.lat_deg[k], heading_deg: lane.stations.heading_deg[k], label: `${lane.stations.station_m[k].toFixed(0)} m`,
   }]));
   drawMap($("#fix-map"), places, null);
-  const save = make("button", { type: "button", class: "quiet" }, "Path as GeoJSON");
+  const save = make("button", { type: "button", class: "quiet" }, "Download path (GeoJSON)");
   save.addEventListener("click", () => attempt(save, null, async () => api.save(await api.fetchPicture(decoded.links.lane), `lane-${decoded.id}.geojson`)));
   return make("div", {}, save, facts([
     ["Length", `${lane.length_m.toFixed(1)} m`],
-    ["Accuracy", `median ± ${(100 * lane.sigma_median_m).toFixed(1)} cm, worst ± ${(100 * lane.sigma_max_m).toFixed(1)} cm`],
+    ["Accuracy", `median ± ${(100 * lane.sigma_median_m).toFixed(1)} cm, maximum ± ${(100 * lane.sigma_max_m).toFixed(1)} cm`],
     ["Speed limit", lane.speed_limits_km_h.length ? `${lane.speed_limits_km_h.map((limit) => limit.toFixed(0)).join(", ")} km/h` : null],
     ["Sharpest bend", lane.min_radius_m === null ? null : `radius ${lane.min_radius_m.toFixed(0)} m`],
     ["Grade", lane.localization_grade],

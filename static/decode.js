@@ -1,9 +1,9 @@
-// Decode a frame or a trace: its picture, each reading, the vehicle's position.
+// Decode an upload, and show its picture, its readings and the vehicle's position.
 
 import * as api from "./api.js";
 import { drawLane, drawPackets, isPacketLog } from "./cerpms.js";
 import { drawMap } from "./map.js";
-import { $, attempt, facts, fillForm, make, readForm, say } from "./page.js";
+import { $, attempt, facts, fillForm, make, readForm, showStatus } from "./page.js";
 import { drawTagFix, drawTags, isTrace, waitFor } from "./traces.js";
 
 let pictureUrl = null;
@@ -51,24 +51,24 @@ function kindOf(file) {
 }
 
 async function upload(form) {
-  if (!frame) throw new api.Problem({ title: "There is no file", detail: "Choose a picture or a recording first.", field: "file", limit: "JPEG, PNG; a recording", cure: "drop one on the dashed field" });
-  say("Decoding …");
+  if (!frame) throw new api.Problem({ title: "No file is selected", detail: "Choose a picture, a recording or a packet log first.", field: "file", limit: "JPEG, PNG, recording or packet log", cure: "drop a file on the dashed area, or choose one" });
+  showStatus("Decoding …");
   const context = contextOf(form);
   const kind = $("#kind").value;
   if (kind !== "frame" && !context.trace && !context.packets) context[kind] = {};
   const decoded = await waitFor(await api.decode(frame, context));
   await SHOWN[decoded.kind](decoded);
-  say(decoded.summary.text);
+  showStatus(decoded.summary.text);
   $("#decoded").scrollIntoView({ block: "start" });
 }
 
-// The fields, and what only the JSON can say (intrinsics, time); the fields win.
+// The context from the JSON text (which alone can hold intrinsics and times), overridden by the form fields.
 function contextOf(form) {
   let context = {};
   try {
     context = JSON.parse($("#context").value || "{}");
   } catch {
-    throw new api.Problem({ title: "The context cannot be read", detail: "It is not JSON.", field: "context", cure: "correct it or empty the field" });
+    throw new api.Problem({ title: "The context cannot be read", detail: "The text is not valid JSON.", field: "context", cure: "correct the JSON, or empty the field" });
   }
   const fields = readForm(form);
   for (const part of ["coarse_position", "camera"]) {
@@ -82,19 +82,19 @@ function contextOf(form) {
 
 async function show(decoded) {
   $("#decoded").hidden = false;
-  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.frames[0].decode_ms.toFixed(1)} ms, ${decoded.codebook_plates} registered plates within reach.`;
-  $("#readings").replaceChildren(...(decoded.readings.length ? decoded.readings.map(drawReading) : [make("p", { class: "empty" }, "No plate in this frame.")]));
+  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.frames[0].decode_ms.toFixed(1)} ms, registered plates near the approximate position: ${decoded.codebook_plates}.`;
+  $("#readings").replaceChildren(...(decoded.readings.length ? decoded.readings.map(drawReading) : [make("p", { class: "empty" }, "No plate was found in this frame.")]));
   drawFix(decoded);
-  const text = `The frame with what was found in it: ${decoded.summary.text}`;
+  const text = `The frame with the plates that were found: ${decoded.summary.text}`;
   drawCrops(decoded.readings, await showPicture(decoded.links.annotated, text));
 }
 
 async function showTrace(decoded) {
   $("#decoded").hidden = false;
-  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.report.decode_ms.toFixed(0)} ms, registered tags within reach: ${decoded.codebook_tags}.`;
+  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.report.decode_ms.toFixed(0)} ms, registered tags near the approximate position: ${decoded.codebook_tags}.`;
   $("#readings").replaceChildren(...drawTags(decoded));
   $("#fix").replaceChildren(drawTagFix(decoded));
-  await showPicture(decoded.links.plot, `The trace with what was found in it: ${decoded.summary.text}`);
+  await showPicture(decoded.links.plot, `The trace with the magnets and tags that were found: ${decoded.summary.text}`);
 }
 
 async function showPackets(decoded) {
@@ -102,7 +102,7 @@ async function showPackets(decoded) {
   $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, ${decoded.report.decode_ms.toFixed(0)} ms.`;
   $("#readings").replaceChildren(...drawPackets(decoded));
   $("#fix").replaceChildren(drawLane(decoded));
-  await showPicture(decoded.links.plot, `The lane that the markers give: ${decoded.summary.text}`);
+  await showPicture(decoded.links.plot, `The lane estimated from the markers: ${decoded.summary.text}`);
 }
 
 const SHOWN = { frame: show, archive: show, trace: showTrace, packets: showPackets };
@@ -126,10 +126,10 @@ function drawReading(reading) {
     { class: "reading" },
     make("h3", {}, make("span", { class: level }, reading.outcome), " ", make("span", { class: "digits" }, reading.digits || "")),
     facts([
-      ["Why", reading.reason],
-      ["Confidence", `${(100 * reading.confidence).toFixed(3)} %${reading.from_codebook ? ", with the registry as codebook" : ""}`],
+      ["Reason", reading.reason],
+      ["Confidence", `${(100 * reading.confidence).toFixed(3)} %${reading.from_codebook ? ", chosen among the registered plates near by" : ""}`],
       ["Scheme", reading.scheme],
-      ["Height", `${reading.height_px} px`],
+      ["Height in the frame", `${reading.height_px} px`],
       ["Grade", grade && `${grade.letter} (${grade.overall.toFixed(1)})`],
       ["Match", match && (match.registered ? `marker ${match.marker_id}, ${match.distance_m} m away` : "not registered here")],
       ["Note", match && match.note],
@@ -138,7 +138,7 @@ function drawReading(reading) {
   );
 }
 
-// Each reading's part of the frame, enlarged.
+// The part of the frame around each plate, enlarged.
 function drawCrops(readings, image) {
   const canvases = document.querySelectorAll("#readings canvas");
   readings.filter((reading) => reading.corners_px).forEach((reading, k) => {
@@ -159,16 +159,16 @@ function drawCells(reading) {
   let k = 0;
   for (let row = 0; row < across; row += 1) {
     for (let column = 0; column < across; column += 1) {
-      const edge = (row === 0 || row === across - 1) && (column === 0 || column === across - 1);
-      if (edge) {
+      const isBoundaryMarker = (row === 0 || row === across - 1) && (column === 0 || column === across - 1);
+      if (isBoundaryMarker) {
         grid.append(make("span", { class: row === 0 && column === 0 ? "triangle" : "square" }));
         continue;
       }
-      const sure = reading.cell_confidence[k];
+      const confidence = reading.cell_confidence[k];
       const cell = make("span", { class: reading.corrected_cells.includes(k) ? "corrected" : null }, make("b", {}, reading.digits[k]));
-      if (sure !== undefined) {
-        cell.append(`${(100 * sure).toFixed(sure > 0.999 ? 0 : 1)} %`);
-        cell.style.backgroundColor = `hsl(${Math.round(130 * Math.max(0, 2 * sure - 1))} 55% 72%)`;
+      if (confidence !== undefined) {
+        cell.append(`${(100 * confidence).toFixed(confidence > 0.999 ? 0 : 1)} %`);
+        cell.style.backgroundColor = `hsl(${Math.round(130 * Math.max(0, 2 * confidence - 1))} 55% 72%)`;
       }
       grid.append(cell);
       k += 1;
@@ -181,7 +181,7 @@ function drawFix(decoded) {
   const { fix } = decoded;
   $("#fix-map").toggleAttribute("hidden", !fix);
   if (!fix) {
-    $("#fix").replaceChildren(make("p", { class: "empty" }, "No position: it takes a matched plate, a camera and a coarse position."));
+    $("#fix").replaceChildren(make("p", { class: "empty" }, "No position: this needs a plate that matches a registered one, the camera and an approximate position."));
     return;
   }
   const { sigma } = fix;

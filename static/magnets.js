@@ -1,8 +1,8 @@
-// Plan a magnet tag from a codebook's meaning, and show one with its checks and its layout to download.
+// Plan a magnet tag from a meaning of a codebook; show a tag with its checks and download its drilling layout.
 
 import * as api from "./api.js";
 import { drawMap } from "./map.js";
-import { $, attempt, facts, make, readForm, say } from "./page.js";
+import { $, attempt, facts, make, readForm, showStatus } from "./page.js";
 
 const FORMATS = ["pdf", "csv", "geojson"];
 let entries = [];
@@ -14,7 +14,7 @@ export function startMagnets() {
     event.preventDefault();
     attempt(form.querySelector("button"), form, async () => {
       const marker = await api.registerMarker(bodyOf(form));
-      say(`Planned ${marker.code.text}${marker.warnings.length ? `, with warnings: ${marker.warnings.join(", ")}` : ""}.`);
+      showStatus(`Planned ${marker.code.text}${marker.warnings.length ? `, with warnings: ${marker.warnings.join(", ")}` : ""}.`);
       location.hash = `#markers/${marker.id}`;
     });
   });
@@ -49,11 +49,11 @@ function bodyOf(form) {
   return body;
 }
 
-// A GeoJSON geometry, a feature or a collection, or a longitude and a latitude on each line.
+// Reads a GeoJSON geometry, feature or collection, or one longitude and latitude per line.
 function readLine(text) {
   try {
-    const given = JSON.parse(text);
-    const feature = given.type === "FeatureCollection" ? given.features[0] : given;
+    const document = JSON.parse(text);
+    const feature = document.type === "FeatureCollection" ? document.features[0] : document;
     return feature.geometry || feature;
   } catch {
     const rows = text.split("\n").filter((row) => row.trim());
@@ -82,7 +82,7 @@ export function drawMagnets(box, marker) {
       ["Meaning", code.meaning ? code.meaning.text : null],
       ["Line", code.style],
       ["Magnets", `${marker.magnets.length} over ${marker.length_m} m`],
-      ["Place", place],
+      ["Place in the lane", place],
       ["Status", `${marker.status}, version ${marker.version}`],
       ["First magnet", `${position.lon_deg.toFixed(8)}, ${position.lat_deg.toFixed(8)}`],
       ["Grade", position.localization_grade],

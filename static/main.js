@@ -1,4 +1,4 @@
-// Views, and the key that every request needs.
+// Chooses the view from the address, and stores the API key that every request needs.
 
 import { key } from "./api.js";
 import { startCerpms } from "./cerpms.js";
@@ -6,14 +6,14 @@ import { startDecode } from "./decode.js";
 import { showFleet, startFleet } from "./fleet.js";
 import { showMagnets, startMagnets } from "./magnets.js";
 import { showMarkers, startMarkers } from "./markers.js";
-import { $, clearProblem, say } from "./page.js";
+import { $, clearProblem, showStatus } from "./page.js";
 import { startRegister } from "./register.js";
 
 const VIEWS = ["markers", "register", "magnets", "cerpms", "decode", "fleet"];
 
 function showView() {
-  const [asked, id] = location.hash.slice(1).split("/");
-  const name = VIEWS.includes(asked) ? asked : "markers";
+  const [requested, id] = location.hash.slice(1).split("/");
+  const name = VIEWS.includes(requested) ? requested : "markers";
   for (const view of VIEWS) $(`#view-${view}`).hidden = view !== name;
   for (const link of document.querySelectorAll(".bar nav a")) {
     if (link.getAttribute("href") === `#${name}`) link.setAttribute("aria-current", "page");
@@ -21,7 +21,7 @@ function showView() {
   }
   clearProblem();
   if (!key.get()) {
-    say("Enter a key: the server printed an admin key at its first start, and `waymark key` makes more.");
+    showStatus("Enter an API key. The server printed an admin key at its first start; the command `waymark key` creates more.");
     $("#key").focus();
   } else if (name === "markers") {
     showMarkers(id);
@@ -40,7 +40,7 @@ function showKey() {
 $("#key-form").addEventListener("submit", (event) => {
   event.preventDefault();
   key.set($("#key").value.trim());
-  say("");
+  showStatus("");
   showKey();
   showView();
 });
@@ -49,7 +49,7 @@ $("#forget").addEventListener("click", () => {
   location.reload();
 });
 window.addEventListener("hashchange", () => {
-  if (key.get()) say("");
+  if (key.get()) showStatus("");
   showView();
 });
 

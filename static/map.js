@@ -1,4 +1,4 @@
-// Places on a plain plot: metres east and north of the middle, no tiles.
+// Draws positions on a plain plot without map tiles, in metres east and north of the centre.
 
 const SVG = "http://www.w3.org/2000/svg";
 const M_PER_DEG = 111_320;

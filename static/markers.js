@@ -1,10 +1,10 @@
-// The list of markers, their plot, one marker's artwork or layout, a ZIP of many.
+// The list of markers and their plot; the artwork or layout of one marker; the artwork of several as a ZIP.
 
 import * as api from "./api.js";
 import { drawCerpm } from "./cerpms.js";
 import { drawMagnets } from "./magnets.js";
 import { drawMap } from "./map.js";
-import { $, attempt, facts, make, say } from "./page.js";
+import { $, attempt, facts, make, showStatus } from "./page.js";
 
 const FORMATS = ["svg", "pdf", "dxf", "png"];
 const state = { markers: [], selected: new Set(), chosen: null };
@@ -32,7 +32,7 @@ export async function showMarkers(chosenId = null) {
     state.selected = new Set([...state.selected].filter((id) => items.some((marker) => marker.id === id)));
     $("#no-markers").hidden = items.length > 0;
     $("#map-caption").textContent = items.length
-      ? `${items.length}${more ? " and more" : ""} markers; ticks point in the direction of travel, amber is not for localization.`
+      ? `${items.length}${more ? " and more" : ""} markers. Ticks point in the direction of travel. Amber markers have an approximate position that is not for localization.`
       : "";
     const chosen = items.find((marker) => marker.id === (chosenId || state.chosen)) || null;
     state.chosen = chosen && chosen.id;
@@ -105,39 +105,42 @@ function choose(marker) {
 }
 
 async function showDetail(marker) {
-  if (marker.family === "plate") return showPlate(marker);
   if (marker.family === "cerpm") return drawCerpm($("#detail"), marker);
+  if (marker.family !== "magnet") return showArtwork(marker);
   const whole = await api.getMarker(marker.id);
   if (state.chosen === marker.id) drawMagnets($("#detail"), whole);
   return undefined;
 }
 
-async function showPlate(marker) {
+// Plates, and every family whose view is its artwork.
+async function showArtwork(marker) {
   const { position, geometry, code } = marker;
-  const picture = make("img", { class: "preview", alt: `Artwork of the plate ${code.digits}` });
+  const title = codeOf(marker);
+  const units = geometry.n ? `${geometry.n} × ${geometry.n} units, ` : "";
+  const picture = make("img", { class: "preview", alt: `Artwork of the ${marker.family} ${title}` });
   const proof = make("p", { class: "hint" });
   const buttons = FORMATS.map((form) => {
     const button = make("button", { type: "button", class: "quiet" }, form.toUpperCase());
     button.addEventListener("click", () => attempt(button, null, async () => {
       const artwork = await api.fetchArtwork(marker.id, form);
-      api.save(artwork.blob, `${code.digits}.${form}`);
+      api.save(artwork.blob, `${title}.${form}`);
     }));
     return button;
   });
   $("#detail").replaceChildren(
-    make("h2", { class: "digits" }, code.digits),
+    make("h2", { class: "digits" }, title),
     picture,
     proof,
     make("div", { class: "buttons", role: "group", "aria-label": "Download the artwork" }, ...buttons),
     facts([
-      ["Scheme", code.scheme + (code.registry_number === null ? "" : `, number ${code.registry_number}`)],
+      ["Scheme", code.scheme + (code.registry_number == null ? "" : `, number ${code.registry_number}`)],
       ["Status", `${marker.status}, version ${marker.version}`],
       ["Position", `${position.lon_deg.toFixed(8)}, ${position.lat_deg.toFixed(8)}`],
       ["Height", position.height_m === null ? null : `${position.height_m.toFixed(3)} m`],
       ["Accuracy", position.horizontal_rmse_m === null ? "not stated" : `${position.horizontal_rmse_m} m horizontal`],
       ["Grade", position.localization_grade],
       ["Heading", marker.heading_deg === null ? null : `${marker.heading_deg.toFixed(2)}°`],
-      ["Plate", `${geometry.n} × ${geometry.n} units, ${geometry.side_mm} mm square`],
+      ["Size", `${units}${geometry.side_mm} mm square`],
       ["Road", marker.road],
       ["Id", marker.id],
     ]),
@@ -146,15 +149,15 @@ async function showPlate(marker) {
   if (previewUrl) URL.revokeObjectURL(previewUrl);
   previewUrl = URL.createObjectURL(artwork.blob);
   picture.src = previewUrl;
-  proof.textContent = `Read back by the decoder before it was sent: ${artwork.proof}`;
+  proof.textContent = `Read back by the decoder before delivery: ${artwork.proof}`;
 }
 
 function saveBundle(form) {
   const formats = [...form.querySelectorAll("[name=formats]:checked")].map((box) => box.value);
   attempt(form.querySelector("button"), form, async () => {
-    say("Making the artwork …");
+    showStatus("Creating the artwork …");
     const bundle = await api.fetchBundle([...state.selected], formats);
     api.save(bundle.blob, "waymark-artwork.zip");
-    say(`Artwork ready: ${bundle.proof}`);
+    showStatus(`The artwork is ready: ${bundle.proof}`);
   }).then(showCount);
 }

@@ -1,4 +1,4 @@
-// Small things every view needs: elements, problems, forms.
+// Shared by all views: creating elements, showing problems, reading forms.
 
 import { Problem } from "./api.js";
 
@@ -19,7 +19,7 @@ export function facts(pairs) {
   return make("dl", { class: "facts" }, ...rows.flatMap(([name, value]) => [make("dt", {}, name), make("dd", {}, value)]));
 }
 
-export function say(text) {
+export function showStatus(text) {
   $("#status").textContent = text;
 }
 
@@ -29,22 +29,22 @@ export function clearProblem() {
 }
 
 export function showProblem(error, form) {
-  const told = error instanceof Problem ? error.document : { title: "Something went wrong in this page", detail: String(error) };
-  const faults = told.errors && told.errors.length ? told.errors : [told];
+  const problem = error instanceof Problem ? error.document : { title: "This page failed", detail: String(error) };
+  const faults = problem.errors && problem.errors.length ? problem.errors : [problem];
   const box = $("#problem");
-  box.replaceChildren(make("h2", {}, told.title));
+  box.replaceChildren(make("h2", {}, problem.title));
   for (const fault of faults) {
-    box.append(make("p", {}, fault.detail || told.detail || ""));
-    const named = [["Field", fault.field], ["Limit", fault.limit], ["Cure", fault.cure]];
-    if (named.some(([, value]) => value)) box.append(facts(named));
-    mark(form, fault.field);
+    box.append(make("p", {}, fault.detail || problem.detail || ""));
+    const details = [["Field", fault.field], ["Limit", fault.limit], ["How to fix it", fault.cure]];
+    if (details.some(([, value]) => value)) box.append(facts(details));
+    markInvalid(form, fault.field);
   }
-  if (told.request_id && told.status >= 500) box.append(make("p", {}, `Request ${told.request_id}`));
+  if (problem.request_id && problem.status >= 500) box.append(make("p", {}, `Request ${problem.request_id}`));
   box.hidden = false;
   box.scrollIntoView({ block: "nearest" });
 }
 
-function mark(form, path) {
+function markInvalid(form, path) {
   if (!form || !path) return;
   const inputs = [...form.elements].filter((element) => element.name);
   const bare = path.replace(/^context\./, "");
@@ -52,14 +52,14 @@ function mark(form, path) {
   if (input) input.setAttribute("aria-invalid", "true");
 }
 
-// While `work` runs the button waits; a problem is shown where everybody looks.
+// Runs `work` with the button disabled, and shows the problem if it fails.
 export async function attempt(button, form, work) {
   clearProblem();
   if (button) button.disabled = true;
   try {
     return await work();
   } catch (error) {
-    say("");
+    showStatus("");
     showProblem(error, form);
     return undefined;
   } finally {
@@ -67,7 +67,7 @@ export async function attempt(button, form, work) {
   }
 }
 
-// Inputs are named by their path in the JSON body; empty ones are left out.
+// Reads a form into a JSON body. The names of the inputs are paths in the body; empty inputs are left out.
 export function readForm(form) {
   const body = {};
   for (const input of form.elements) {
@@ -89,7 +89,7 @@ function valueOf(input) {
   if (!text) return undefined;
   if (input.dataset.kind !== "number") return text;
   const value = Number(text.replace(",", "."));
-  return Number.isFinite(value) ? value : text; // what is no number is for the server to name
+  return Number.isFinite(value) ? value : text; // the server names the field that is not a number
 }
 
 export function fillForm(form, body) {

@@ -1,7 +1,7 @@
 // Register a plate.
 
 import * as api from "./api.js";
-import { $, attempt, readForm, say } from "./page.js";
+import { $, attempt, readForm, showStatus } from "./page.js";
 
 export function startRegister() {
   const form = $("#register-form");
@@ -12,7 +12,7 @@ export function startRegister() {
       const body = readForm(form);
       body.position ??= {};
       const marker = await api.registerMarker(body);
-      say(`Registered ${marker.code.digits}.`);
+      showStatus(`Registered ${marker.code.digits}.`);
       location.hash = `#markers/${marker.id}`;
     });
   });

@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from tests.http import WITHIN_S
+
 _FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -21,7 +23,6 @@ _FLAGS = (
     "--hide-scrollbars",
     "--remote-debugging-pipe",
 )
-_TIMEOUT_S = 60.0
 
 
 class Browser:
@@ -62,7 +63,7 @@ class Browser:
 
     def __exit__(self, *_: object) -> None:
         self._process.terminate()
-        self._process.wait(30)
+        self._process.wait(WITHIN_S)
         os.close(self._write)
         os.close(self._read)
 
@@ -73,7 +74,7 @@ class Browser:
         if self._session:
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
-        deadline = time.monotonic() + _TIMEOUT_S
+        deadline = time.monotonic() + WITHIN_S
         while True:
             answer = self._next(deadline)
             if answer.get("id") == self._last:
@@ -95,7 +96,7 @@ class Browser:
 
     def until(self, condition: str) -> Any:
         """Wait until an expression is true in the page."""
-        deadline = time.monotonic() + _TIMEOUT_S
+        deadline = time.monotonic() + WITHIN_S
         while not (value := self.run(condition)):
             assert time.monotonic() < deadline, f"never came true: {condition}; {self.complaints}"
             time.sleep(0.05)

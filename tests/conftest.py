@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import itertools
+import os
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 import sqlalchemy as sa
+import structlog
 import uvicorn
 from fastapi import FastAPI
 
 from app.main import create_app
 from app.registry.feature_text import feature_text
+from app.registry.marker_rows import MarkerRow
+from app.registry.rows import row_of
 from app.registry.tables import markers
 from app.registry.tenancy import across_agencies
-from app.services.access import Scope
+from app.services.access.access import Scope
 from app.settings import Settings
 from tests.databases import PostgresServer, postgres_server
+from tests.documented import DEVIATIONS, CheckedResponses
+from tests.http import WITHIN_S
 
 ADMIN_KEY = "an-admin-key-for-tests-only"
 UNLIMITED: dict[str, Any] = {"requests_per_s": 0.0, "wrong_keys_per_minute": 0.0}
@@ -33,13 +41,15 @@ class LiveServer:
 
     def __init__(self, app: FastAPI) -> None:
         self.app = app
-        config = uvicorn.Config(app, host="127.0.0.1", port=0, log_config=None, access_log=False, lifespan="on")
+        config = uvicorn.Config(
+            CheckedResponses(app), host="127.0.0.1", port=0, log_config=None, access_log=False, lifespan="on"
+        )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
 
     def __enter__(self) -> LiveServer:
         self._thread.start()
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + WITHIN_S
         while not self._server.started:
             assert self._thread.is_alive(), "the server did not start"
             assert time.monotonic() < deadline, "the server did not start in time"
@@ -54,19 +64,19 @@ class LiveServer:
                 self.check_features()
         finally:
             self._server.should_exit = True
-            self._thread.join(30)
+            self._thread.join(WITHIN_S)
             assert not self._thread.is_alive(), "the server did not stop"
 
     def check_features(self) -> None:
         """Whatever a test did: the feature that is kept beside a marker is that of its columns."""
         with across_agencies(), self.app.state.database.read() as connection:
             for row in connection.execute(sa.select(markers).limit(5000)).mappings():
-                assert row["feature"] == feature_text(row)
+                assert row["feature"] == feature_text(row_of(MarkerRow, row))
 
     def client(self, key: str | None = ADMIN_KEY) -> httpx.Client:
         """A client that sends a key."""
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        return httpx.Client(base_url=self.url, headers=headers, timeout=60, trust_env=False)
+        return httpx.Client(base_url=self.url, headers=headers, timeout=280, trust_env=False)
 
     def agency(self, name: str, scope: Scope = Scope.PLANNER) -> httpx.Client:
         """A client of an agency, which is created if need be."""
@@ -80,6 +90,22 @@ def postgres() -> Iterator[PostgresServer]:
         yield server
 
 
+@pytest.fixture(scope="session")
+def require_tool() -> Callable[..., str]:
+    """Path of a program; without it the test is skipped, on CI it fails."""
+
+    def find(*names: str) -> str:
+        for name in names:
+            if path := shutil.which(name):
+                return path
+        reason = f"none of {', '.join(names)} is installed"
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+    return find
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _operator() -> Iterator[None]:
     """Tests that open a database themselves see the rows of all agencies; servers run in threads, which do not."""
@@ -87,10 +113,38 @@ def _operator() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _short_tracebacks() -> None:
+    """Log tracebacks as servers do (app/logs.py): structlog's default shows local variables, which takes seconds."""
+    plain = structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
+    structlog.configure(processors=[*structlog.get_config()["processors"][:-1], plain])
+
+
+@pytest.fixture(autouse=True)
+def _responses_are_documented() -> Iterator[None]:
+    """Every response that the servers sent during a test is as the OpenAPI document says."""
+    yield
+    deviations = list(dict.fromkeys(DEVIATIONS))
+    DEVIATIONS.clear()
+    assert deviations == [], "responses deviate from the OpenAPI document"
+
+
 @pytest.fixture(scope="module")
 def backend() -> str:
-    """The kind of database that the tests of a module run on; a module that runs on both overrides this."""
+    """The kind of database that the tests of a module run on; the marker `both_databases` runs them on both."""
     return "sqlite"
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run tests with the marker `both_databases` once on each database."""
+    if "backend" in metafunc.fixturenames and metafunc.definition.get_closest_marker("both_databases"):
+        metafunc.parametrize("backend", ["sqlite", "postgresql"], scope="module")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run files with slow tests first: processes that share the tests then end at about the same time."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
 
 
 @pytest.fixture(scope="module")
@@ -130,17 +184,25 @@ def fresh_server(serve: Callable[[Settings], LiveServer], settings: Settings) ->
     return serve(settings)
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str]) -> Iterator[LiveServer]:
-    """A server that the tests of a module share; each test has an agency of its own."""
-    folder = tmp_path_factory.mktemp("server") / "var"
-    url = new_database_url(folder)
-    settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, warm_decoders=False, **UNLIMITED)
+@contextmanager
+def verified_server(folder: Path, database_url: str) -> Iterator[LiveServer]:
+    """A server whose history is verified at the end."""
+    settings = Settings(
+        data_dir=folder, database_url=database_url, admin_key=ADMIN_KEY, warm_decoders=False, **UNLIMITED
+    )
     with LiveServer(create_app(settings)) as running:
         yield running
         with across_agencies():
             faults = [(name, fault) for name, _, found in running.app.state.audit.verify() for fault in found]
-        assert faults == [], "what the module did is not as its history says"
+        assert faults == [], "what the tests did is not as its history says"
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str]) -> Iterator[LiveServer]:
+    """A server that the tests of a module share; each test has an agency of its own."""
+    folder = tmp_path_factory.mktemp("server") / "var"
+    with verified_server(folder, new_database_url(folder)) as running:
+        yield running
 
 
 _AGENCIES = itertools.count(1)

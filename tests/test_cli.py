@@ -140,10 +140,10 @@ def test_a_calibration_board(waymark: Run, tmp_path: Path) -> None:
     names = [Path(line).name for line in printed.split()]
     assert names == ["waymark-board-7x10-25mm.svg", "waymark-board-7x10-25mm.pdf"]
     assert (tmp_path / "b" / "waymark-board-7x10-25mm.pdf").read_bytes().startswith(b"%PDF")
-    for arguments, told in ((["--columns", "3"], "4 to 24"), (["--format", "gif"], "svg, pdf, dxf, png")):
+    for arguments, limit in ((["--columns", "3"], "4 to 24"), (["--format", "gif"], "svg, pdf, dxf, png")):
         status, _, error = waymark("board", "--out", str(tmp_path), *arguments)
         assert status == 1
-        assert told in error
+        assert limit in error
 
 
 SURVEY = "number,lon,lat\n" + "".join(f"{k},{8.4 + k * 1e-4:.7f},49.0000{k % 3}1\n" for k in range(1, 9))
@@ -154,7 +154,7 @@ def test_a_survey_goes_in_and_markers_come_out(waymark: Run, tmp_path: Path) -> 
     survey, out = tmp_path / "survey.csv", tmp_path / "markers.geojson"
     survey.write_text(SURVEY)
     waymark("key", "Roads")
-    arguments = ("import", str(survey), "--agency", "Roads", "--declared", DECLARED)
+    arguments = ("import", str(survey), "--agency", "Roads", "--declaration", DECLARED)
     status, printed, _ = waymark(*arguments, "--dry-run")
     assert (status, orjson.loads(printed)["outcome"], orjson.loads(printed)["stored"]) == (0, "checked", 0)
     status, printed, _ = waymark(*arguments)
@@ -175,11 +175,11 @@ def test_a_survey_goes_in_and_markers_come_out(waymark: Run, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
-        (("import", "SURVEY", "--agency", "Nobody", "--declared", DECLARED), "there is no agency 'Nobody'"),
-        (("import", "SURVEY", "--agency", "Roads", "--declared", '{"family": "dragon"}'), "--declared family"),
-        (("import", "SURVEY", "--agency", "Roads", "--declared", "{"), "--declared"),
+        (("import", "SURVEY", "--agency", "Nobody", "--declaration", DECLARED), "there is no agency 'Nobody'"),
+        (("import", "SURVEY", "--agency", "Roads", "--declaration", '{"family": "dragon"}'), "--declaration family"),
+        (("import", "SURVEY", "--agency", "Roads", "--declaration", "{"), "--declaration"),
         (("export", "OUT", "--agency", "Roads", "--format", "exe"), "there is no format 'exe'"),
-        (("export", "SURVEY", "--agency", "Roads"), "is there already"),
+        (("export", "SURVEY", "--agency", "Roads"), "already exists"),
         (("export", "OUT", "--agency", "Roads", "--bbox", "1,2"), "bbox"),
         (("export", "OUT", "--agency", "Roads", "--format", "gpkg"), "no marker is in the selection"),
     ],
@@ -204,7 +204,7 @@ def test_a_snapshot_is_made_and_verified(
     survey, out = tmp_path / "survey.csv", tmp_path / "area.waymark"
     survey.write_text(SURVEY)
     waymark("key", "Roads")
-    waymark("import", str(survey), "--agency", "Roads", "--declared", DECLARED)
+    waymark("import", str(survey), "--agency", "Roads", "--declaration", DECLARED)
     box = "8.40005,48.9,8.40045,49.1"
     status, printed, _ = waymark("snapshot", "make", str(out), "--agency", "Roads", "--bbox", box, "--hours", "2")
     assert status == 0
@@ -214,7 +214,7 @@ def test_a_snapshot_is_made_and_verified(
         status, printed, _ = waymark("snapshot", "verify", str(out), *key)
         assert status == 0
         held = orjson.loads(printed)
-        assert (held["markers"], held["retired_cerpms"]) == ({"plate": 0, "magnet": 0, "cerpm": 4}, 0)
+        assert (held["markers"], held["retired_cerpms"]) == ({"cerpm": 4}, 0)
         assert held["bbox_deg"] == [8.40005, 48.9, 8.40045, 49.1]
         ends = [datetime.fromisoformat(held[name]) for name in ("made_at", "expires_at")]
         assert ends[1] - ends[0] == timedelta(hours=2)
@@ -243,7 +243,7 @@ def test_a_snapshot_is_made_and_verified(
         (("OUT", "--agency", "Roads", "--bbox", "1,2"), "bbox"),
         (("OUT", "--agency", "Roads", "--bbox", "8,48,9,50", "--hours", "0"), "cannot hold for 0 h"),
         (("OUT", "--agency", "Roads", "--bbox", "8,48,9,50", "--hours", "nan"), "cannot hold for nan h"),
-        (("FILE", "--agency", "Roads", "--bbox", "8,48,9,50"), "is there already"),
+        (("FILE", "--agency", "Roads", "--bbox", "8,48,9,50"), "already exists"),
     ],
 )
 def test_snapshots_that_cannot_be(waymark: Run, tmp_path: Path, arguments: tuple[str, ...], what: str) -> None:

@@ -28,6 +28,7 @@ from app.demo.traces import drive_and_judge, judge_drive
 from app.geodesy import enu_from_wgs84
 from app.markers.plate import PlateCode
 from app.simulation.magnetic.drive import simulate_drive
+from tests.http import WITHIN_S
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,7 +36,7 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.mark.slow
 def test_the_demo_reads_every_plate_and_tag(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from app.cli import main; main()", "demo", "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=290)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WITHIN_S)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = re.findall(r"^\d +[\w-]+ +\w{12} +(\d+) +(\d+) +(\d+) +(\d+) +([\d.]+)", done.stdout, re.MULTILINE)
     assert len(rows) == 6

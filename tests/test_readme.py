@@ -1,4 +1,4 @@
-"""The README's tour is run as it stands, against a real server, and must print what the README says it prints."""
+"""The README's tour runs unchanged against a real server, and must print what the README shows."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.readme import PAGES, fill_blocks, read_sections
+from tests.http import WITHIN_S
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
@@ -37,7 +38,8 @@ def free_port() -> int:
 
 
 @pytest.mark.slow
-def test_the_tour_prints_what_it_says(tmp_path: Path) -> None:
+@pytest.mark.timeout(3600)  # a loaded machine compiles the decoders for minutes
+def test_the_tour_prints_what_the_readme_shows(tmp_path: Path) -> None:
     require("curl")
     require("bash")
     assert len(BLOCKS) == len(re.findall(r"^```sh$", README, re.MULTILINE)) >= 6
@@ -56,7 +58,7 @@ def test_the_tour_prints_what_it_says(tmp_path: Path) -> None:
     stop = "trap 'kill $(jobs -p) 2> /dev/null || true; wait' EXIT\n"
     done = subprocess.run(
         ["bash", "-c", f"set -euo pipefail\n{stop}{script}"],
-        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=280,
+        cwd=tmp_path, env=environment, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     printed = done.stdout.split(f"{END}\n")
@@ -67,14 +69,14 @@ def test_the_tour_prints_what_it_says(tmp_path: Path) -> None:
 def assert_same(got: str, expected: str, commands: str) -> None:
     """Texts are equal but for the last digits of measured numbers."""
     assert NUMBER.sub("#", got) == NUMBER.sub("#", expected), commands
-    for mine, told in zip(NUMBER.findall(got), NUMBER.findall(expected), strict=True):
-        assert float(mine) == pytest.approx(float(told), abs=0.02), f"{mine} in place of {told}: {commands}"
+    for mine, shown in zip(NUMBER.findall(got), NUMBER.findall(expected), strict=True):
+        assert float(mine) == pytest.approx(float(shown), abs=0.02), f"{mine} in place of {shown}: {commands}"
 
 
 @pytest.mark.parametrize("name", re.findall(r"python -m ([\w.]+)", README))
 def test_documented_modules_can_be_run(name: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", name, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120
+        [sys.executable, "-m", name, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=WITHIN_S
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "usage" in done.stdout

@@ -23,17 +23,19 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from pyproj import Geod
 
 from app.decoders.cerpm.freshness import SequenceSpan
-from app.decoders.cerpm.known import KnownCerpms
-from app.decoders.cerpm.merge_types import RegisteredMarker
-from app.decoders.magnet.book import TagBook, TagFormat
-from app.decoders.magnet.registered import RegisteredTag, tag_book
+from app.decoders.cerpm.match import KnownCerpms
+from app.decoders.cerpm.merged_markers import RegisteredMarker
+from app.decoders.magnet.identify import TagCandidates, TagFormat
+from app.decoders.magnet.match import tag_candidates
+from app.decoders.magnet.registered_tag import RegisteredTag
 from app.geodesy import LocalizationGrade
 from app.markers import snapshot as layout
 from app.markers.cerpm import LaneSide
-from app.markers.doubts import position_doubts
+from app.markers.localization_warnings import position_warnings
 from app.markers.magnet import InformationTag, parse_tag
 from app.markers.magnet_codebook import Codebook, Meaning
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.status import STATUSES
 
 _GEOD = Geod(ellps="WGS84")
 _M_PER_DEG = 110_574.0  # least length of a degree of latitude on WGS 84
@@ -63,7 +65,7 @@ class SnapshotMarker:
         From the place it was looked for. [m]
     lane_start_deg : (float, float) or None
         Longitude and latitude of where the lane of an information tag begins. [deg]
-    heard_before : SequenceSpan or None
+    earlier_spans : SequenceSpan or None
         First and last transmission of a CERPM that the server accepted.
     """
 
@@ -83,7 +85,7 @@ class SnapshotMarker:
     kind: Mapping[str, Any]
     distance_m: float
     lane_start_deg: tuple[float, float] | None = None
-    heard_before: SequenceSpan | None = None
+    earlier_spans: SequenceSpan | None = None
 
     @property
     def plate_code(self) -> PlateCode:
@@ -100,12 +102,12 @@ class SnapshotMarker:
         """What its position is fit for."""
         return LocalizationGrade.EXACT if self.exact else LocalizationGrade.APPROXIMATE
 
-    def doubts(self, what: str) -> tuple[str, ...]:
+    def localization_warnings(self, what: str) -> tuple[str, ...]:
         """What makes its position unfit for localization; `what` is what it is called."""
         note = self.kind.get("transform_note")
         rmse_m = self.horizontal_rmse_m
         return tuple(
-            position_doubts(what, grade=self.grade, transform_note=note, horizontal_rmse_m=rmse_m, status=self.status)
+            position_warnings(what, grade=self.grade, transform_note=note, horizontal_rmse_m=rmse_m, status=self.status)
         )
 
 
@@ -127,8 +129,8 @@ class Snapshot:
         self._ends = np.cumsum(columns["code_bytes"], dtype=np.int64)
         self._lon_deg = columns["lon_step"] * layout.DEGREE_STEP
         self._lat_deg = columns["lat_step"] * layout.DEGREE_STEP
-        self._stands = columns["status"] != layout.STATUSES.index(layout.RETIRED)
-        self._family = np.array([layout.FAMILIES.index(kind["family"]) for kind in kinds] or [0])[columns["kind"]]
+        self._stands = columns["status"] != STATUSES.index(layout.RETIRED)
+        self._family = np.array([kind["family"] for kind in kinds] or [""])[columns["kind"]]
 
     def __len__(self) -> int:
         """Markers that may be on the road."""
@@ -141,7 +143,7 @@ class Snapshot:
 
     def summary(self) -> dict[str, Any]:
         """What it holds, as plain values: whose, where, from when to when, and how many of what."""
-        families = {name: self._family == number for number, name in enumerate(layout.FAMILIES)}
+        families = {name: self._family == name for name in sorted({kind["family"] for kind in self._kinds})}
         heard = self._columns["flags"] & layout.HEARD_FLAG != 0
         return {
             "version": self.version,
@@ -168,7 +170,7 @@ class Snapshot:
         off_deg = np.abs((self._lon_deg - lon_deg + 180.0) % 360.0 - 180.0)
         proposed = np.flatnonzero(
             self._stands
-            & (self._family == layout.FAMILIES.index(family))
+            & (self._family == family)
             & (np.abs(self._lat_deg - lat_deg) <= reach_deg)
             & (off_deg <= across_deg)
         )
@@ -188,7 +190,7 @@ class Snapshot:
         return next((m for m in found if m.code == code.digits and m.kind["n"] == code.n), None)
 
     def tags(self, lon_deg: float, lat_deg: float, reach_m: float) -> tuple[InformationTag, ...]:
-        """Designs for `TagBook` and `decode_trace`."""
+        """Designs for `TagCandidates` and `decode_trace`."""
         return tuple(dict.fromkeys(tag.tag for tag in self.registered_tags(lon_deg, lat_deg, reach_m)))
 
     def registered_tags(self, lon_deg: float, lat_deg: float, reach_m: float) -> tuple[RegisteredTag, ...]:
@@ -196,34 +198,34 @@ class Snapshot:
         found = (_registered_tag(marker) for marker in self.near("magnet", lon_deg, lat_deg, reach_m))
         return tuple(sorted((tag for tag in found if tag is not None), key=lambda tag: tag.marker_id))
 
-    def tag_book(self, lon_deg: float, lat_deg: float, reach_m: float) -> TagBook:
+    def tag_candidates(self, lon_deg: float, lat_deg: float, reach_m: float) -> TagCandidates:
         """What `decode_trace` looks for: the tags within a distance; without any, the codebooks' formats."""
         designs = (book.design for book in self.codebooks)
         formats = (TagFormat(design.magnets, design.length_m, design.segment_m) for design in designs)
-        return tag_book(self.registered_tags(lon_deg, lat_deg, reach_m), formats)
+        return tag_candidates(self.registered_tags(lon_deg, lat_deg, reach_m), formats)
 
     def registered_cerpms(self, lon_deg: float, lat_deg: float, reach_m: float) -> dict[int, RegisteredMarker]:
         """What `merge_markers` holds packets against, by number, within a distance."""
         return {int(marker.code): _registered(marker) for marker in self.near("cerpm", lon_deg, lat_deg, reach_m)}
 
     def known_cerpms(self, numbers: Iterable[int]) -> KnownCerpms:
-        """What `hold_against_known` takes, of the markers with these numbers wherever they are."""
+        """What `match_known_markers` takes, of the markers with these numbers wherever they are."""
         wanted = list(numbers)
         rows = [(number, self._cerpm_rows[number]) for number in wanted if number in self._cerpm_rows]
         markers = {number: self._marker(row, math.nan) for number, row in rows}
-        intervals = {number: marker.kind.get("least_interval_s") for number, marker in markers.items()}
+        intervals = {number: marker.kind.get("min_interval_s") for number, marker in markers.items()}
         return KnownCerpms(
             {number: _registered(marker) for number, marker in markers.items()},
-            {n: [marker.heard_before] for n, marker in markers.items() if marker.heard_before is not None},
+            {n: [marker.earlier_spans] for n, marker in markers.items() if marker.earlier_spans is not None},
             {number: interval for number, interval in intervals.items() if interval is not None},
-            {number: marker.doubts("marker") for number, marker in markers.items()},
+            {number: marker.localization_warnings("marker") for number, marker in markers.items()},
             frozenset(number for number, marker in markers.items() if marker.status == layout.RETIRED),
         )
 
     @cached_property
     def _cerpm_rows(self) -> dict[int, int]:
         """Rows of the CERPMs by their numbers."""
-        rows = np.flatnonzero(self._family == layout.FAMILIES.index("cerpm"))
+        rows = np.flatnonzero(self._family == "cerpm")
         ends = self._ends[rows]
         starts = ends - self._columns["code_bytes"][rows]
         places = zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True)
@@ -242,7 +244,7 @@ class Snapshot:
         return SnapshotMarker(
             marker_id=str(uuid.UUID(bytes=bytes(column["id"]))),
             family=kind["family"],
-            status=layout.STATUSES[int(column["status"])],
+            status=STATUSES[int(column["status"])],
             code=self._codes[end - int(column["code_bytes"]) : end].decode(),
             lon_deg=round(float(self._lon_deg[row]), 9),
             lat_deg=round(float(self._lat_deg[row]), 9),
@@ -256,7 +258,7 @@ class Snapshot:
             kind=kind,
             distance_m=distance_m,
             lane_start_deg=self._lane_start_deg(column),
-            heard_before=_heard_before(column),
+            earlier_spans=_heard_before(column),
         )
 
     def _lane_start_deg(self, column: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -356,7 +358,7 @@ def _registered_tag(marker: SnapshotMarker) -> RegisteredTag | None:
     return RegisteredTag(
         marker.marker_id, marker.status, tag, marker.lon_deg, marker.lat_deg, marker.height_m,
         marker.heading_deg or 0.0, lane_lon_deg, lane_lat_deg, marker.horizontal_rmse_m, marker.grade,
-        marker.doubts("tag"), None if meaning is None else Meaning(**meaning),
+        marker.localization_warnings("tag"), None if meaning is None else Meaning(**meaning),
     )  # fmt: skip
 
 

@@ -17,21 +17,21 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.overlay import VehiclePose, lane_in_frame, ned_from_enu
-from app.decoders.cerpm.packets import HeardPacket
 from app.demo.server import checked
 from app.demo.table import LaneResult
 from app.encoders.cerpm.payload import encode_message
-from app.encoders.cerpm.placement import place_markers
+from app.lanes.overlay import VehiclePose, lane_in_frame, ned_from_enu
 from app.markers.cerpm import CerpmMessage, LaneSide
+from app.planning.cerpm_placement import place_markers
 from app.sensors.camera import Camera
 from app.sensors.pose_track import PoseTrack
+from app.sensors.receiver import ReceivedPacket
 from app.simulation.radio.attacks import forge_packets, move_claim, number_entries, replay_packets
-from app.simulation.radio.drive import HeardDrive, drive_past
+from app.simulation.radio.drive import SimulatedDrive, drive_past
+from app.simulation.radio.driving import SatelliteReceiver
 from app.simulation.radio.lanes import TrueLane, lane_from_wgs84
 from app.simulation.radio.link import Radio
-from app.simulation.radio.markers import LaidMarkers, survey_places
-from app.simulation.radio.vehicle import Receiver
+from app.simulation.radio.markers import InstalledMarkers, install_markers
 from app.simulation.steering import check_steering
 from app.simulation.vehicle import PoseNoise
 
@@ -56,7 +56,7 @@ class LaneDrive:
     """A drive past the markers, and what is wrong with it."""
 
     name: str
-    receiver: Receiver
+    receiver: SatelliteReceiver
     attacked: bool = False
     moved: bool = False
 
@@ -74,7 +74,7 @@ class BuiltLane:
     """
 
     lane: TrueLane
-    laid: LaidMarkers
+    installed: InstalledMarkers
     markers: list[dict[str, Any]]
     keys: dict[int, bytes]
     table: str
@@ -83,10 +83,10 @@ class BuiltLane:
 def list_lane_drives() -> tuple[LaneDrive, ...]:
     """An ordinary one, one under attack, one past a marker that was moved, and one without RTK."""
     return (
-        LaneDrive("ordinary", Receiver.rtk()),
-        LaneDrive("forged, replayed", Receiver.rtk(), attacked=True),
-        LaneDrive("a marker moved", Receiver.rtk(), moved=True),
-        LaneDrive("2 m positions", Receiver.plain()),
+        LaneDrive("ordinary", SatelliteReceiver.rtk()),
+        LaneDrive("forged, replayed", SatelliteReceiver.rtk(), attacked=True),
+        LaneDrive("a marker moved", SatelliteReceiver.rtk(), moved=True),
+        LaneDrive("2 m positions", SatelliteReceiver.plain()),
     )
 
 
@@ -100,7 +100,7 @@ def load_lane() -> TrueLane:
 def build_lane(client: httpx.Client, rng: np.random.Generator) -> BuiltLane:
     """Place markers along the lane, survey them, register them, and fetch what they are programmed with."""
     lane = load_lane()
-    laid = survey_places(lane, place_markers(lane.left_m, lane.right_m), rng)
+    installed = install_markers(lane, place_markers(lane.left_m, lane.right_m), rng)
     markers = [
         checked(
             client.post(
@@ -108,35 +108,36 @@ def build_lane(client: httpx.Client, rng: np.random.Generator) -> BuiltLane:
                 json={
                     "family": "cerpm",
                     "position": {
-                        "lon_deg": float(laid.lon_deg[k]),
-                        "lat_deg": float(laid.lat_deg[k]),
+                        "lon_deg": float(installed.lon_deg[k]),
+                        "lat_deg": float(installed.lat_deg[k]),
                         "height_m": 0.0,
                         "realization": "ITRF2014",
                         "horizontal_rmse_m": SURVEY_RMSE_M,
                         "survey_method": "GNSS RTK",
                     },
-                    "number": int(laid.number[k]),
-                    "side": LaneSide(int(laid.side[k])).name.lower(),
+                    "number": int(installed.number[k]),
+                    "side": LaneSide(int(installed.side[k])).name.lower(),
                     "speed_limit": SPEED_LIMIT,
                     "radio": {"interval_s": INTERVAL_S},
                     "status": "active",
-                    "measure_m": round(float(laid.chainage_m[k]), 3),
+                    "measure_m": round(float(installed.chainage_m[k]), 3),
                 },
             )
         ).json()
-        for k in range(len(laid))
+        for k in range(len(installed))
     ]
     wanted = {"marker_ids": [marker["id"] for marker in markers]}
     table = checked(client.post("/v1/programs", json=wanted)).text
     secret = checked(client.post("/v1/programs", json={**wanted, "with_keys": True})).text
-    keys = {int(row["number"]): bytes.fromhex(row["key_hex"]) for row in csv.DictReader(io.StringIO(secret))}
-    return BuiltLane(lane, laid, markers, keys, table)
+    programs = csv.DictReader(io.StringIO(secret))
+    keys = {int(program["number"]): bytes.fromhex(program["key_hex"]) for program in programs}
+    return BuiltLane(lane, installed, markers, keys, table)
 
 
 def drive_lane_and_judge(
-    client: httpx.Client, built: BuiltLane, drive: LaneDrive, number: int, before: Sequence[HeardPacket],
+    client: httpx.Client, built: BuiltLane, drive: LaneDrive, number: int, before: Sequence[ReceivedPacket],
     rng: np.random.Generator,
-) -> tuple[LaneResult, dict[str, Any], bytes, dict[str, Any], list[HeardPacket]]:  # fmt: skip
+) -> tuple[LaneResult, dict[str, Any], bytes, dict[str, Any], list[ReceivedPacket]]:  # fmt: skip
     """Drive past what is built, upload what was heard, compare with the truth.
 
     Returns
@@ -148,25 +149,25 @@ def drive_lane_and_judge(
         ZIP of packets, poses and a camera frame, as uploaded.
     context : dict
         Uploaded with it.
-    packets : list of HeardPacket
+    packets : list of ReceivedPacket
         For others to replay.
     """
-    laid, moved = built.laid, None
+    installed, moved = built.installed, None
     if drive.moved:
-        row = len(laid) // 2
-        moved = int(laid.number[row])
-        laid = move_claim(built.lane, laid, row, rng, distance_m=MOVED_M)
+        row = len(installed) // 2
+        moved = int(installed.number[row])
+        installed = move_claim(built.lane, installed, row, rng, distance_m=MOVED_M)
     start_s = _START_S + number * _DRIVE_APART_S
-    first = np.full(len(laid), int(number * _DRIVE_APART_S / INTERVAL_S))
+    first = np.full(len(installed), int(number * _DRIVE_APART_S / INTERVAL_S))
     heard = drive_past(
-        built.lane, laid, rng, sign=lambda message: _sign(built, message), radio=Radio(interval_s=INTERVAL_S),
+        built.lane, installed, rng, sign=lambda message: _sign(built, message), radio=Radio(interval_s=INTERVAL_S),
         receiver=drive.receiver, start_s=start_s, first_sequence=first,
     )  # fmt: skip
     packets = list(heard.packets)
     if drive.attacked:
         span = (float(heard.drive.time_s[0]), float(heard.drive.time_s[-1]))
         packets += forge_packets(packets, FORGED, rng) + replay_packets(list(before), REPLAYED, rng, at_s=span)
-        packets = number_entries(sorted(packets, key=lambda packet: packet.heard_at_s))
+        packets = number_entries(sorted(packets, key=lambda packet: packet.received_at_s))
     recording, captured_at = _pack(built, heard, packets)
     context = {
         "camera": {**CAMERA, "width_px": _FRAME_PX[0], "height_px": _FRAME_PX[1]},
@@ -186,14 +187,14 @@ def _sign(built: BuiltLane, message: CerpmMessage) -> bytes:
 
 
 def judge_lane(
-    built: BuiltLane, drive: LaneDrive, moved: int | None, heard: HeardDrive, decode: dict[str, Any]
+    built: BuiltLane, drive: LaneDrive, moved: int | None, heard: SimulatedDrive, decode: dict[str, Any]
 ) -> LaneResult:
     """The server's answer against what was simulated."""
     verdicts, lane = decode["report"]["verdicts"], decode["lane"]
     true = {packet.payload for packet in heard.packets}
     result = LaneResult(
         drive.name,
-        markers=len(built.laid),
+        markers=len(built.installed),
         packets=decode["report"]["packets"],
         authentic=verdicts["authentic"],
         true_packets=len(true),
@@ -242,7 +243,7 @@ def path_errors_m(lane: TrueLane, path_m: Floats) -> tuple[Floats, float]:
 # --- what the vehicle uploads -------------------------------------------------------------------------------------
 
 
-def _pack(built: BuiltLane, heard: HeardDrive, packets: Sequence[HeardPacket]) -> tuple[bytes, str]:
+def _pack(built: BuiltLane, heard: SimulatedDrive, packets: Sequence[ReceivedPacket]) -> tuple[bytes, str]:
     at_s = float(heard.track.time_s[int(_FRAME_AT * len(heard.track.time_s))])
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
@@ -252,11 +253,11 @@ def _pack(built: BuiltLane, heard: HeardDrive, packets: Sequence[HeardPacket]) -
     return packed.getvalue(), datetime.fromtimestamp(at_s, UTC).isoformat()
 
 
-def write_packets(packets: Sequence[HeardPacket]) -> str:
+def write_packets(packets: Sequence[ReceivedPacket]) -> str:
     """A receiver's log: a JSON object a packet."""
     lines = [
         {
-            "time": datetime.fromtimestamp(packet.heard_at_s, UTC).isoformat(),
+            "time": datetime.fromtimestamp(packet.received_at_s, UTC).isoformat(),
             "payload_hex": packet.payload.hex() if packet.payload else "",
             "rssi_dbm": packet.rssi_dbm,
             "snr_db": packet.snr_db,
@@ -277,7 +278,7 @@ def write_poses(track: PoseTrack) -> str:
     return stream.getvalue()
 
 
-def draw_frame(lane: TrueLane, heard: HeardDrive, at_s: float) -> bytes:
+def draw_frame(lane: TrueLane, heard: SimulatedDrive, at_s: float) -> bytes:
     """A plain camera frame of the true lane: asphalt, sky and painted lines. JPEG."""
     width, height = _FRAME_PX
     camera = Camera.from_field_of_view(width, height, **CAMERA)

@@ -1,4 +1,4 @@
-"""What the demo's vehicle sees: plates on a real lane, driven over, rendered in front of real road photos."""
+"""Frames of the demo's drives over plates on a real lane, rendered in front of real road photos."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from app.demo.lane import LanePlace, list_lane_places
@@ -20,15 +19,14 @@ from app.simulation.conditions import draw_daylight
 from app.simulation.drive import Drive, drive_over_plate
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import PlateScene, face_truth
-from app.simulation.road import road_background
+from app.simulation.road import road_background, road_photos
 
 DATA = Path(__file__).parent / "data"
-PHOTOS = ("p1_solidWhiteCurve.jpg", "p1_whiteCarLaneSwitch.jpg", "vid_60.jpg")
 PAPER_DIGITS = "023792168411"
 CAMERA = Camera.from_field_of_view(1920, 1080, 70.0, height_m=1.57, depression_deg=23.0, forward_m=1.2)
 SPEED_KMH = 30.0
 FPS = 30.0
-LEAST_ROWS = 8.0  # a unit is one pixel high: from here on frames are counted
+MIN_ROWS = 8.0  # a unit is one pixel high: from here on frames are counted
 SURVEY_RMSE_M = 0.01
 SURVEY_HEADING_RMSE_DEG = 0.1
 COARSE_ERROR_M = (2.0, 5.0)
@@ -115,8 +113,8 @@ def drive_over(place: LanePlace, code: PlateCode, rng: np.random.Generator) -> I
     """
     conditions = draw_daylight(rng)
     sensor = replace(conditions.sensor, readout_s=0.0)
-    photo = cv2.imread(str(DATA / PHOTOS[int(rng.integers(len(PHOTOS)))]))
-    background = road_background(np.asarray(photo, np.uint8), CAMERA, rng)
+    photos = road_photos()
+    background = road_background(photos[int(rng.integers(len(photos)))], CAMERA, rng)
     drive = Drive(
         camera=CAMERA,
         face=plate_face(code, replace(GEOMETRY, n=code.n), conditions.look, conditions.wear, rng),
@@ -131,7 +129,7 @@ def drive_over(place: LanePlace, code: PlateCode, rng: np.random.Generator) -> I
     )
     for scene in drive_over_plate(drive, rng):
         rows = face_truth(scene, scene.faces[0]).height_px
-        if rows >= LEAST_ROWS:
+        if rows >= MIN_ROWS:
             frame = render_plate_scene(scene, background, rng)
             yield _with_truth(frame.jpeg, rows, scene, place, rng)
 

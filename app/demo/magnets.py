@@ -1,4 +1,4 @@
-"""The demo's magnets: a codebook, tags and lines laid out on a lane, and drives over them as the recorder's files."""
+"""The demo's magnets: a codebook, tags and lines on a lane, and drives over them as the recorder's files."""
 
 from __future__ import annotations
 
@@ -125,14 +125,14 @@ def list_drives() -> list[TraceDrive]:
 
 @dataclass(slots=True)
 class Built:
-    """What is registered and lies in the road."""
+    """Registered magnets on the lane."""
 
     lane: Lane
     tags: list[dict[str, Any]] = field(default_factory=list)
     lines: list[dict[str, Any]] = field(default_factory=list)
 
     def scene(self, drive: TraceDrive) -> tuple[Scene, Lane]:
-        """What is driven over: tags where they were laid out, lines by the holes of their sheets."""
+        """The scene of a drive: tags at their planned chainages, lines at the holes of their sheets."""
         back = drive.wrong_way
         lane = self.lane.reversed() if back else self.lane
         tags = []

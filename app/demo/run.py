@@ -1,4 +1,4 @@
-"""The demo from start to end: register, fetch artwork, drive, upload, compare."""
+"""The demo from start to end: register markers, fetch artwork, simulate drives, upload them, compare the results."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from typing import Any
 import httpx
 import numpy as np
 
-from app.decoders.cerpm.packets import HeardPacket
 from app.demo.cerpms import INTERVAL_S, build_lane, drive_lane_and_judge, list_lane_drives
-from app.demo.drive import FPS, LEAST_ROWS, SPEED_KMH, DemoFrame, DemoPlate, drive_over, list_plates, registered_code
+from app.demo.drive import FPS, MIN_ROWS, SPEED_KMH, DemoFrame, DemoPlate, drive_over, list_plates, registered_code
 from app.demo.magnets import BOOK, LENGTH_M, build, list_drives
 from app.demo.server import LocalServer, checked
 from app.demo.table import LaneResult, Pass, TraceResult, draw_lane_table, draw_table, draw_trace_table
 from app.demo.traces import drive_and_judge
 from app.errors import WaymarkError
 from app.geodesy import enu_from_wgs84
+from app.sensors.receiver import ReceivedPacket
 
 _SEED = 7
 _FORMATS = ("svg", "pdf", "dxf", "png")
 _SHOWN_ROWS = 110.0  # the annotated picture is the frame whose plate is about so many rows high
 Say = Callable[[str], None]
 _PLATE_NOTES = (
-    f"In view: the whole plate is in the picture, {LEAST_ROWS:g} rows high or more. Frames are simulated before",
+    f"In view: the whole plate is in the frame and at least {MIN_ROWS:g} rows high. Frames are simulated in front of",
     "real road photos; the paper drove on a road. Errors: medians over the frames with a fix, survey included.",
 )
 _MAGNET_NOTES = (
-    "Magnets: found with the right polarity and orientation, of those under the bar. Wrong way: tags told to be",
-    "passed against the legal direction. Ratio: measured over true distance ratio. Along, across: RMS of the position",
-    "at the tags, survey included. Dashed, solid: lane departures told, of the true ones. False: readings that are no",
-    "magnet. Fields are simulated. METRO drove on roads, over tags of three magnets: share of lying / upright magnets,",
-    "share of tags, ratio as mean ± standard deviation.",
+    "Magnets: decoded with the right polarity and orientation, of those under the bar. Wrong way: tags reported as",
+    "passed against the legal direction. Ratio: measured over true distance ratio. Along, across: RMS error of the",
+    "position at the tags, survey included. Dashed, solid: lane departures detected, of the actual ones. False:",
+    "readings where there is no magnet. Fields are simulated. METRO drove on roads, over tags of three magnets: share",
+    "of lying / upright magnets, share of tags, ratio as mean ± standard deviation.",
 )
 _LANE_NOTES = (
-    "Accepted: packets with a fresh tag of their marker. Path, own track: RMS from the lane's true centre line.",
-    "Steering: a simulated car that follows the path, its front axle against the true line, positions within 2 cm.",
+    "Accepted: authentic packets with a new sequence. Path, own track: RMS distance from the lane's true centre line.",
+    "Steering: RMS distance of the front axle of a simulated car that follows the path, from the true centre line.",
     "Radio, drives and attacks are simulated; the paper drove on roads.",
 )
 
 
 @dataclass(slots=True)
 class _Shown:
-    """The frame that becomes the annotated picture."""
+    """The frame whose annotated picture is written."""
 
     rows: float = 0.0
     decode_id: str = ""
@@ -67,7 +67,7 @@ def run_demo(out: Path, *, say: Say, keep_serving: bool = False) -> bool:
     Parameters
     ----------
     out : Path
-        Folder for artwork, frames and results; created if need be.
+        Folder for artwork, frames and results; created if it does not exist.
     say : callable
         Prints a line.
     keep_serving : bool
@@ -76,8 +76,8 @@ def run_demo(out: Path, *, say: Say, keep_serving: bool = False) -> bool:
     Returns
     -------
     bool
-        Every plate and every tag was read, matched and gave a position, the wrong way was told, nothing was read wrong,
-        nothing forged was accepted, and the lane's path is where the lane is.
+        Whether every plate and every tag was decoded, matched and gave a position, the wrong way was reported, no
+        reading was wrong, no forged packet was accepted, and the paths follow the lane.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def run_demo(out: Path, *, say: Say, keep_serving: bool = False) -> bool:
     """
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="waymark-demo-", ignore_cleanup_errors=True) as folder:
-        say("Starting a server with an empty registry (the very first start compiles the decoder) ...")
+        say("Starting a server with an empty registry (the first start compiles the decoders) ...")
         with LocalServer(Path(folder)) as server, server.client() as client:
             passes, written = _demonstrate(client, out, say)
             say("")
@@ -110,7 +110,7 @@ def run_demo(out: Path, *, say: Say, keep_serving: bool = False) -> bool:
                 say(line)
             say(f"{_verdict(passes, drives, lanes)} {time.monotonic() - began:.0f} s.")
             if keep_serving:
-                say(f"\nThe server stays at {server.url}/ until you press Ctrl-C. Key: {server.key}")
+                say(f"\nThe server keeps running at {server.url}/ until you press Ctrl-C. Key: {server.key}")
                 server.wait()
     return all(p.is_good for p in passes) and all(d.is_good for d in drives) and all(lane.is_good for lane in lanes)
 
@@ -124,15 +124,15 @@ def _demonstrate(client: httpx.Client, out: Path, say: Say) -> tuple[list[Pass],
     files = [_fetch_artwork(client, marker, out / "artwork") for marker in markers]
     bundle = checked(client.post("/v1/artwork", json={"marker_ids": [m["id"] for m in markers], "formats": _FORMATS}))
     (out / "artwork.zip").write_bytes(bundle.content)
-    say(f"Wrote the artwork; each plate was rendered and read back first: {bundle.headers['Waymark-Proof']}")
-    say(f"Driving over them at {SPEED_KMH:g} km/h, {FPS:g} frames a second; uploading each frame ...")
+    say(f"Wrote the artwork, after each plate was rendered and read back: {bundle.headers['Waymark-Proof']}")
+    say(f"Simulating drives over them at {SPEED_KMH:g} km/h and {FPS:g} frames a second; uploading each frame ...")
     shown, passes = _Shown(), []
     rows: list[dict[str, Any]] = []
     for number, (plate, marker) in enumerate(zip(plates, markers, strict=True), 1):
         drive_rng = np.random.default_rng([_SEED, number])
         passes.append(_drive(client, f"{number}", plate, marker, drive_rng, shown, rows))
     return passes, [
-        f"{sum(files)} files in {out / 'artwork'}/, and {out / 'artwork.zip'} with manifest and quality sheet",
+        f"artwork: {sum(files)} files in {out / 'artwork'}/, and {out / 'artwork.zip'} with manifest and quality sheet",
         *_write_results(client, out, shown, rows),
     ]
 
@@ -142,7 +142,7 @@ def _fetch_artwork(client: httpx.Client, marker: dict[str, Any], folder: Path) -
     for form in _FORMATS:
         answer = checked(client.get(f"/v1/markers/{marker['id']}/artwork.{form}"))
         if not answer.headers.get("Waymark-Proof", "").startswith("read-back "):
-            raise WaymarkError("an artwork came without its proof")
+            raise WaymarkError("the server delivered artwork without a proof")
         (folder / f"{marker['code']['digits']}.{form}").write_bytes(answer.content)
     return len(_FORMATS)
 
@@ -169,16 +169,16 @@ def _drive(
         result.decoded += bool(right)
         result.wrong += len(read) - len(right[:1])
         result.matched += any(reading["match"] and reading["match"]["marker_id"] == marker["id"] for reading in right)
-        row = {"plate": code.digits, "frame": number, "rows": round(frame.rows, 1), "decoded": bool(right)}
+        record = {"plate": code.digits, "frame": number, "rows": round(frame.rows, 1), "decoded": bool(right)}
         if fix := decode["fix"]:
             error_m = enu_from_wgs84(fix["lon_deg"], fix["lat_deg"], 0.0, (frame.lon_deg, frame.lat_deg, 0.0))[:2]
             result.position_errors_m.append(float(np.hypot(*error_m)))
             result.heading_errors_deg.append(abs((fix["heading_deg"] - frame.heading_deg + 180) % 360 - 180))
-            row["position_error_cm"] = round(100 * result.position_errors_m[-1], 2)
-            row["heading_error_deg"] = round(result.heading_errors_deg[-1], 3)
+            record["position_error_cm"] = round(100 * result.position_errors_m[-1], 2)
+            record["heading_error_deg"] = round(result.heading_errors_deg[-1], 3)
         if right:
             shown.offer(frame, decode["id"])
-        rows.append(row)
+        rows.append(record)
     return result
 
 
@@ -195,13 +195,13 @@ def _write_results(client: httpx.Client, out: Path, shown: _Shown, rows: list[di
         writer = csv.DictWriter(file, names)
         writer.writeheader()
         writer.writerows(rows)
-    written = [f"every frame's result in {out / 'frames.csv'}"]
+    written = [f"the results of all frames: {out / 'frames.csv'}"]
     if shown.decode_id:
         (out / "annotated.jpg").write_bytes(checked(client.get(f"/v1/decodes/{shown.decode_id}/annotated.jpg")).content)
         (out / "frame.jpg").write_bytes(shown.jpeg)
         (out / "frame.json").write_text(json.dumps(shown.context, indent=2) + "\n")
-        written.append(f"a frame as uploaded in {out / 'frame.jpg'}, its context in {out / 'frame.json'}")
-        written.append(f"the same frame with what was read in it: {out / 'annotated.jpg'}")
+        written.append(f"an uploaded frame: {out / 'frame.jpg'}, its context: {out / 'frame.json'}")
+        written.append(f"the same frame with the decoded plates: {out / 'annotated.jpg'}")
     return written
 
 
@@ -209,12 +209,12 @@ def _demonstrate_magnets(client: httpx.Client, out: Path, say: Say) -> tuple[lis
     """Register magnets, drive over them, and keep what was uploaded and drawn of the first drive."""
     (out / "layouts").mkdir(parents=True, exist_ok=True)
     built = build(client, out / "layouts", np.random.default_rng([_SEED, 100]))
-    say(f"Made a codebook of {len(BOOK['meanings'])} meanings; registered {len(built.tags)} tags and 2 lines on")
+    say(f"Created a codebook of {len(BOOK['meanings'])} meanings; registered {len(built.tags)} tags and 2 lines on")
     say(f"{LENGTH_M:.0f} m of lane, wrote their drilling sheets, surveyed the tags within 1 cm:")
     for marker in built.tags:
         at_m, code = marker["layout"]["chainage_m"], marker["code"]
         say(f"  {at_m:3.0f} m  {code['text']}  {code['meaning']['text']}")
-    say("Driving over them; uploading each drive as the files of METRO's recorder ...")
+    say("Simulating drives over them; uploading each drive as the files of METRO's recorder ...")
     results = []
     for number, drive in enumerate(list_drives()):
         result, decode, recording, context = drive_and_judge(
@@ -227,9 +227,9 @@ def _demonstrate_magnets(client: httpx.Client, out: Path, say: Say) -> tuple[lis
             (out / "drive.json").write_text(json.dumps(context, indent=2) + "\n")
             (out / "trace.svg").write_bytes(checked(client.get(decode["links"]["plot"])).content)
     return results, [
-        f"drilling sheets as pdf, csv and geojson in {out / 'layouts'}/",
-        f"the {results[0].name} drive as uploaded in {out / 'drive.zip'}, its context in {out / 'drive.json'}",
-        f"its field, and what was found in it: {out / 'trace.svg'}",
+        f"drilling sheets as pdf, csv and geojson: {out / 'layouts'}/",
+        f"the {results[0].name} drive as uploaded: {out / 'drive.zip'}, its context: {out / 'drive.json'}",
+        f"its magnetic field with the decoded magnets: {out / 'trace.svg'}",
     ]
 
 
@@ -239,18 +239,18 @@ def _demonstrate_cerpms(client: httpx.Client, out: Path, say: Say) -> tuple[list
     folder.mkdir(parents=True, exist_ok=True)
     built = build_lane(client, np.random.default_rng([_SEED, 200]))
     say(f"Registered {len(built.markers)} CERPMs on both sides of the lane in Karlsruhe, 40 ft apart, closer in")
-    say("bends, surveyed within 2 cm an axis; wrote what they are programmed with.")
+    say("bends, surveyed within 2 cm per axis; wrote their programs.")
     (folder / "programs.csv").write_text(built.table)
     dump = checked(client.get(f"/v1/markers/{built.markers[0]['id']}/payload.hex")).text
     (folder / "payload.txt").write_text(dump)
     plan = {"radio": {"interval_s": INTERVAL_S}, "design_speed_mps": 8.3, "recommend": True}
     check = checked(client.post("/v1/radio-checks", json=plan)).json()
     (folder / "radio-check.json").write_text(json.dumps(check, indent=2) + "\n")
-    say(f"Radio check: sent every {INTERVAL_S:g} s, {check['read_probability']:.1%} of the markers are read")
+    say(f"Radio check: at one transmission every {INTERVAL_S:g} s {check['read_probability']:.1%} of markers are read")
     say(f"{check['preview_m']:.0f} m ahead at 30 km/h. To reach 99 %: {check['recommendation']['sentence']}.")
-    say("Driving past them; uploading each drive as packets, poses and a camera frame ...")
+    say("Simulating drives past them; uploading each drive as packets, poses and a camera frame ...")
     results: list[LaneResult] = []
-    heard: list[HeardPacket] = []
+    heard: list[ReceivedPacket] = []
     for number, drive in enumerate(list_lane_drives()):
         rng = np.random.default_rng([_SEED, 200, number])
         result, decode, recording, context, heard = drive_lane_and_judge(client, built, drive, number, heard, rng)
@@ -262,17 +262,17 @@ def _demonstrate_cerpms(client: httpx.Client, out: Path, say: Say) -> tuple[list
             for name, link in (("lane.svg", "plot"), ("lane.geojson", "lane"), ("overlay.jpg", "overlay")):
                 (folder / name).write_bytes(checked(client.get(decode["links"][link])).content)
     return results, [
-        f"what the CERPMs are programmed with in {folder / 'programs.csv'}, one message explained in "
-        f"{folder / 'payload.txt'}, the radio check in {folder / 'radio-check.json'}",
-        f"the {results[0].name} drive past them in {folder / 'drive.zip'}, its context in {folder / 'drive.json'}",
-        f"its lane as {folder / 'lane.svg'} and {folder / 'lane.geojson'}, over the frame in {folder / 'overlay.jpg'}",
+        f"programs of the CERPMs: {folder / 'programs.csv'}, one message explained: {folder / 'payload.txt'}, "
+        f"the radio check: {folder / 'radio-check.json'}",
+        f"the {results[0].name} drive past them: {folder / 'drive.zip'}, its context: {folder / 'drive.json'}",
+        f"its lane: {folder / 'lane.svg'} and {folder / 'lane.geojson'}, over the frame: {folder / 'overlay.jpg'}",
     ]
 
 
 def _verdict(passes: list[Pass], drives: list[TraceResult], lanes: list[LaneResult]) -> str:
-    bad = [f"plate {p.name}" for p in passes if not p.is_good]
-    bad += [f"drive {drive.name}" for drive in drives if not drive.is_good]
-    bad += [f"drive {lane.name}" for lane in lanes if not lane.is_good]
-    if bad:
-        return f"FAILED: {', '.join(bad)}."
-    return "All plates and tags were read, matched and gave a position; the lane's path is where the lane is."
+    failed = [f"plate {p.name}" for p in passes if not p.is_good]
+    failed += [f"drive {drive.name}" for drive in drives if not drive.is_good]
+    failed += [f"drive {lane.name}" for lane in lanes if not lane.is_good]
+    if failed:
+        return f"FAILED: {', '.join(failed)}."
+    return "All plates and tags were decoded, matched and gave a position; the paths follow the lane."

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 FIX_WITHIN_M = 0.5
-"""A position at a tag that is farther off is wrong. [m]"""
+"""Largest error of a position at a tag that counts as right. [m]"""
 PAPER_IN_VIEW, PAPER_DECODED = 11, 4  # figure 10 at 30 km/h and 30 frames a second
 _METRO: tuple[tuple[str, ...], ...] = (
     ("METRO, figure 13a", "", "48", "0.97 / 1.00"),
@@ -24,7 +24,7 @@ _TRACE_HEAD = (
     "across [cm]", "dashed", "solid", "false",
 )  # fmt: skip
 PATH_WITHIN_M = 0.1
-"""A path that is farther off, RMS, is wrong. [m]"""
+"""Largest RMS error of a path that counts as right. [m]"""
 _LANE_HEAD = (
     "drive", "markers", "packets", "accepted", "refused", "left out", "path RMS [cm]", "worst [cm]", "coverage",
     "own track [cm]", "steering [cm]",
@@ -39,7 +39,7 @@ _HEAD = ("plate", "scheme", "digits", "in view", "decoded", "wrong", "matched", 
 
 @dataclass(slots=True)
 class Pass:
-    """What came of one drive over a plate.
+    """Result of one drive over a plate.
 
     Attributes
     ----------
@@ -59,27 +59,27 @@ class Pass:
 
     @property
     def is_good(self) -> bool:
-        """Nothing was read wrong, and the plate was read, matched and gave a fix at least as often as in the paper."""
+        """Whether no digits were wrong, and decodes, matches and fixes are as many as the paper's or more."""
         enough = min(self.decoded, self.matched, len(self.position_errors_m)) >= PAPER_DECODED
         return enough and self.wrong == 0
 
 
 @dataclass(slots=True)
 class TraceResult:
-    """What came of one drive.
+    """Result of one drive over magnets.
 
     Attributes
     ----------
     passed, found, false : int
-        Magnets under the bar, those of them read with the right polarity and orientation, readings that are no magnet.
+        Magnets under the bar, those decoded with the right polarity and orientation, readings without a magnet.
     tags, right, matched, wrong, flagged : int
-        Tags there are, read right, found in the registry as themselves, read as something else, told to be passed the
-        wrong way.
+        Tags on the road, decoded correctly, matched with their own marker, decoded as something else, reported as
+        passed the wrong way.
     deviations : list of float
         Measured over true distance ratio.
     along_m, across_m : list of float
         Errors of the vehicle's position at a tag. [m]
-    departures : dict of style to (told right, true, told wrong)
+    departures : dict of line style to (true positives, actual, false positives)
     """
 
     name: str
@@ -101,7 +101,7 @@ class TraceResult:
 
     @property
     def is_good(self) -> bool:
-        """All tags were read right, matched, placed and passed the way that they were told to be; nothing was wrong."""
+        """Whether all tags were decoded, matched and gave a position, and the reported direction was right."""
         near = sum(math.hypot(*off_m) < FIX_WITHIN_M for off_m in zip(self.along_m, self.across_m, strict=True))
         whole = self.right == self.matched == near == self.tags
         return whole and self.wrong == 0 and self.flagged == (self.tags if self.wrong_way else 0)
@@ -109,16 +109,16 @@ class TraceResult:
 
 @dataclass(slots=True)
 class LaneResult:
-    """What came of one drive past CERPMs.
+    """Result of one drive past CERPMs.
 
     Attributes
     ----------
     packets, authentic, true_packets : int
-        Uploaded, accepted, and those of them that the markers really sent in this drive.
+        Uploaded packets, accepted ones, and those that the markers themselves sent in this drive.
     left_out : list of int
-        Numbers of the markers that were named and left out.
+        Numbers of the markers that the path leaves out.
     moved : int or None
-        The one that claims a wrong place.
+        Number of the marker that sends a wrong position.
     path_rms_m, path_max_m : float
         Of the path from the lane's true centre line. [m]
     coverage : float
@@ -144,9 +144,9 @@ class LaneResult:
 
     @property
     def is_good(self) -> bool:
-        """Nothing forged was accepted, who lies is named and nobody else, and the path is where the lane is."""
-        named = [self.moved] if self.moved is not None else []
-        return self.authentic <= self.true_packets and self.left_out == named and self.path_rms_m < PATH_WITHIN_M
+        """Whether no forged packet was accepted, only the moved marker was left out, and the path follows the lane."""
+        expected = [self.moved] if self.moved is not None else []
+        return self.authentic <= self.true_packets and self.left_out == expected and self.path_rms_m < PATH_WITHIN_M
 
 
 def draw_table(passes: Sequence[Pass]) -> str:
@@ -200,8 +200,8 @@ def draw_lane_table(results: Sequence[LaneResult]) -> str:
 def _trace_row(r: TraceResult) -> tuple[str, ...]:
     ratio = f"{statistics.mean(r.deviations):.3f} ± {statistics.stdev(r.deviations):.3f}" if r.deviations[1:] else "-"
     departures = (
-        (f"{right} of {true}" if true else "-") + (f" + {bad} bad" if bad else "")
-        for right, true, bad in r.departures.values()
+        (f"{right} of {actual}" if actual else "-") + (f" + {false} false" if false else "")
+        for right, actual, false in r.departures.values()
     )
     return (
         r.name,
@@ -225,7 +225,7 @@ def _rms(errors_m: Sequence[float]) -> str:
 
 
 def _draw(head: Sequence[str], rows: Sequence[Sequence[str]], below: Sequence[Sequence[str]], *, left: int) -> str:
-    """Rows and those to compare them with; the first columns are texts, the others numbers."""
+    """Rows, and below a rule those to compare them with; the first columns are texts, the others numbers."""
     widths = [max(len(row[k]) for row in (head, *rows, *below)) for k in range(len(head))]
     rule = "  ".join("-" * width for width in widths)
     lines = [_line(head, widths, left), rule, *(_line(row, widths, left) for row in rows)]

@@ -88,7 +88,7 @@ def _upload(client: httpx.Client, recording: bytes, context: dict[str, Any]) -> 
 
 
 def _judge_magnets(result: TraceResult, drive: SimulatedDrive, readings: Sequence[dict[str, Any]]) -> None:
-    """Each magnet under the bar takes the nearest reading; what is left and of no magnet beside the bar is false."""
+    """Assign the nearest reading to each magnet under the bar; others are false, except at magnets beside the bar."""
     left = list(readings)
     beside = [magnet for magnet in drive.magnets if abs(magnet.lateral_cm) > _UNDER_CM]
     for magnet in drive.magnets:
@@ -112,9 +112,9 @@ def _judge_tags(
     result: TraceResult, built: Built, lane: Lane, drive: SimulatedDrive, readings: Sequence[dict[str, Any]]
 ) -> None:
     markers = built.tags[::-1] if result.wrong_way else built.tags
-    laid_m = [tag.chainage_m for tag in drive.tags]
+    chainages_m = [tag.chainage_m for tag in drive.tags]
     claimed: list[dict[str, Any]] = []
-    for number, (marker, placed, at) in enumerate(zip(markers, drive.tags, laid_m, strict=True)):
+    for number, (marker, placed, at) in enumerate(zip(markers, drive.tags, chainages_m, strict=True)):
         magnets = [magnet for magnet in drive.magnets if magnet.tag == number]
         near = [r for r in readings if abs(r["start_s"] - magnets[0].t_s) * magnets[0].speed_m_s < 1.0]
         if not near:
@@ -141,7 +141,7 @@ def _judge_tags(
 def _judge_departures(
     style: str, magnets: Sequence[TrueMagnet], crossings: Sequence[dict[str, Any]]
 ) -> tuple[int, int, int]:
-    """Departures told right, true ones, and told ones that are none."""
+    """True positives, actual departures, false positives."""
     under = [
         magnet
         for magnet in magnets
@@ -151,12 +151,12 @@ def _judge_departures(
     ]
     starts = under[:1] + [b for a, b in pairwise(under) if b.t_s - a.t_s > _EPISODE_S]
     ends = [a for a, b in pairwise(under) if b.t_s - a.t_s > _EPISODE_S] + under[-1:]
-    told = [c for c in crossings if c["style"] == style]
+    detected = [c for c in crossings if c["style"] == style]
     right = 0
     for start, end in zip(starts, ends, strict=True):
         side = "left" if start.lateral_cm >= 0 else "right"
-        hits = [c for c in told if c["side"] == side and start.t_s - _EPISODE_S < c["t_s"] < end.t_s + _EPISODE_S]
+        hits = [c for c in detected if c["side"] == side and start.t_s - _EPISODE_S < c["t_s"] < end.t_s + _EPISODE_S]
         right += bool(hits)
         if hits:
-            told.remove(hits[0])
-    return right, len(starts), len(told)
+            detected.remove(hits[0])
+    return right, len(starts), len(detected)

@@ -1,4 +1,4 @@
-"""Calibration board -> a drawing at true size, written by the writers of plate artwork."""
+"""Calibration board to a drawing at true size, written by the writers of plate artwork."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from app.sensors.calibration_board import MODULES, CalibrationBoard, marker_is_d
 A_SIZES_MM = ((210.0, 297.0), (297.0, 420.0), (420.0, 594.0), (594.0, 841.0), (841.0, 1189.0))
 MARGIN_MM = 10.0
 LEGEND_MM = 24.0
-"""Below the board: the scale bar and what is written beside it."""
+"""Height below the board for the scale bar and the legend. [mm]"""
 BAR_MM = 100.0
 _LINE_MM = 0.3
 

@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from app.errors import InvalidParameter
 from app.markers import snapshot as layout
+from app.markers.status import STATUSES
 
 _HEIGHT_LIMIT_MM = 2**31 - 1
 
@@ -103,7 +104,7 @@ def _columns(
         "vertical_rmse_mm": [_rmse(marker["vertical_rmse_m"], 1e-3) for marker in markers],
         "heading_rmse_step": [_rmse(marker["heading_rmse_deg"], layout.HEADING_RMSE_STEP_DEG) for marker in markers],
         "kind": kinds,
-        "status": [layout.STATUSES.index(marker["status"]) for marker in markers],
+        "status": [STATUSES.index(marker["status"]) for marker in markers],
         "flags": [_flags(marker) for marker in markers],
         "code_bytes": [len(code) for code in codes],
         "lane_lon_step": [round((marker.get("lane_lon_deg") or 0.0) / layout.DEGREE_STEP) for marker in markers],

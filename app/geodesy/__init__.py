@@ -9,10 +9,9 @@ from app.geodesy.place import (
     place_position,
     place_positions,
 )
-from app.geodesy.systems import WGS84, normalize_crs, reference_system
+from app.geodesy.systems import normalize_crs, reference_system
 
 __all__ = [
-    "WGS84",
     "LocalizationGrade",
     "PlacedPosition",
     "PlacedPositions",

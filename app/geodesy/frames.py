@@ -1,4 +1,4 @@
-"""Local frames, bearings, and longitudes and latitudes that can be."""
+"""Local frames, bearings, and checks of longitudes and latitudes."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def wgs84_from_enu(
 
 
 def enu_from_heading(heading_deg: float) -> npt.NDArray[np.float64]:
-    """Rotation from (right, forward, up) of something with this heading to (east, north, up), shape (3, 3)."""
+    """Rotation from (right, forward, up) of a body with this heading to (east, north, up), shape (3, 3)."""
     h = math.radians(heading_deg)
     return np.array([[math.cos(h), math.sin(h), 0], [-math.sin(h), math.cos(h), 0], [0, 0, 1.0]])
 
 
 def check_lon_lat(lon_deg: float, lat_deg: float, field: str = "position") -> None:
-    """Refuse a longitude or latitude that is out of range or not finite."""
+    """Raises InvalidParameter if a longitude or latitude is out of range or not finite."""
     for name, value, bound in (("lon_deg", lon_deg, 180.0), ("lat_deg", lat_deg, 90.0)):
         if not math.isfinite(value) or not -bound <= value <= bound:
             raise InvalidParameter(

@@ -1,4 +1,4 @@
-"""Transformations to ITRF2014 that state an accuracy, and the grids that they need."""
+"""Transformations to ITRF2014 with a stated accuracy, and their grids."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from app.geodesy.systems import best_effort, covers, named_system
 
 _ITRF2014_2D, _ITRF2014_3D = "EPSG:9000", "EPSG:7912"
 _TIMELY = ("t_epoch", "defmodel")
-_MAX_NAME = 300
+_MAX_NAME = 300  # characters; source: by hand
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +30,9 @@ class BoundedOperation:
     bound_m : float
         Its stated accuracy. [m]
     name : str
-        What PROJ calls it.
+        Its name in PROJ.
     needs_epoch : bool
-        It depends on time: PROJ fills in an epoch of its own where none is given.
+        Whether it depends on time: PROJ assumes an epoch if there is none.
     """
 
     transformer: Transformer
@@ -41,7 +41,7 @@ class BoundedOperation:
     needs_epoch: bool
 
     def covers(self, lon_deg: npt.NDArray[np.float64], lat_deg: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-        """Which places its stated accuracy holds for: those in its area of use."""
+        """Which places are in its area of use, where its stated accuracy holds."""
         return covers(self.transformer.area_of_use, lon_deg, lat_deg)
 
 
@@ -49,18 +49,18 @@ class BoundedOperation:
 def bounded_operations(name: str, three_d: bool) -> tuple[BoundedOperation, ...]:
     """Operations from a system's longitudes and latitudes to ITRF2014 that can be run here and state an accuracy.
 
-    The best comes first. From a projected system PROJ does not find those that need a system between: it knows none
-    from ETRS89 / UTM zone 32N, but four from ETRS89.
+    The most accurate comes first. From a projected system PROJ does not find operations with an intermediate system: it
+    finds none from ETRS89 / UTM zone 32N, but four from ETRS89.
     """
     target = _ITRF2014_3D if three_d else _ITRF2014_2D
     geographic = named_system(name).geodetic_crs
     assert geographic is not None
     source = geographic.to_3d() if three_d else geographic.to_2d()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # it warns of missing grids, which only narrow the choice
+        warnings.simplefilter("ignore", UserWarning)  # missing grids only reduce the choice
         try:
             group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
-        except IndexError:  # how pyproj says that PROJ knows no operation at all
+        except IndexError:  # pyproj raises it if PROJ knows no operation
             return ()
     stated = [
         BoundedOperation(
@@ -78,14 +78,14 @@ def bounded_operations(name: str, three_d: bool) -> tuple[BoundedOperation, ...]
 def list_operations(
     name: str, lon_deg: float, lat_deg: float, *, three_d: bool, epoch: float | None, accuracy_m: float
 ) -> list[BoundedOperation] | str:
-    """Operations that may bring a place to ITRF2014 as exact, the best first; or why there are none.
+    """Operations that transform a place to ITRF2014 with the required accuracy, best first; or why there are none.
 
     Parameters
     ----------
     name : str
         Of the system, as `normalize_crs` writes it.
     lon_deg, lat_deg : float
-        About where the place is. [deg]
+        Approximate position. [deg]
     three_d : bool
         With an ellipsoidal height.
     epoch : float or None
@@ -107,9 +107,9 @@ def list_operations(
 
 
 def use_grids(folder: Path | None) -> None:
-    """Let PROJ find an operator's grids in a folder, besides its own data; None takes that back.
+    """Add an operator's folder of grids to PROJ's own data; None removes it.
 
-    Call it before positions are placed. Nothing is ever fetched from a network.
+    Call it before positions are transformed. Nothing is downloaded.
     """
     network.set_network_enabled(False)  # type: ignore[attr-defined]
     own = _own_folders()

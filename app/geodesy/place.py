@@ -1,4 +1,4 @@
-"""Positions as they are given -> WGS 84 / ITRF, with what is known of the way there."""
+"""Positions in any reference system to WGS 84 / ITRF, with the transformation and its accuracy."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,9 @@ from app.geodesy.systems import (
 _GLOBAL_REALIZATION = re.compile(r"(WGS ?84|ITRF|IGS|IGb)", re.IGNORECASE)
 
 
+Grade = Literal["exact", "approximate, not for localization"]
+
+
 class LocalizationGrade(StrEnum):
     """Whether a position may be used to localize a vehicle."""
 
@@ -36,7 +40,7 @@ class LocalizationGrade(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlacedPosition:
-    """A position in WGS 84 / ITRF, with what is known of the way there.
+    """A position in WGS 84 / ITRF, with its transformation.
 
     Attributes
     ----------
@@ -45,14 +49,14 @@ class PlacedPosition:
     height_m : float or None
         Above the ellipsoid if it was, else above the vertical datum it came with. [m]
     crs : str
-        The CRS it was given in, in the form ``EPSG:code`` or ``OGC:CRS84``.
+        The original CRS, in the form ``EPSG:code`` or ``OGC:CRS84``.
     realization : str or None
         Frame of lon_deg, lat_deg: as stated, or the one it was transformed into.
     transform_accuracy_m : float or None
         Stated bound of the transformation; 0 without one, None if there is no bound. [m]
     grade : LocalizationGrade
     note : str or None
-        Why it is only approximate, or what was done.
+        Why it is only approximate, or which transformation was used.
     """
 
     lon_deg: float
@@ -77,14 +81,14 @@ def place_position(
     ellipsoidal_height: bool = True,
     accuracy_m: float = 0.1,
 ) -> PlacedPosition:
-    """Bring a position as it was given to WGS 84 / ITRF, and say how good that is.
+    """Transform a submitted position to WGS 84 / ITRF, with the accuracy of the transformation.
 
     Parameters
     ----------
     first, second : float
         Longitude and latitude [deg], or easting and northing [m] where `projected`.
     height_m : float, optional
-        Height as given. [m]
+        Height in the original system. [m]
     crs : str, optional
         EPSG code, URN or URI; WGS 84 without.
     projected : bool
@@ -107,10 +111,9 @@ def place_position(
 
     Notes
     -----
-    PROJ takes NAD83(2011) to EPSG:4326 by a null shift and fills in an epoch without a word. So other systems are
-    transformed to ITRF2014 by operations that state an accuracy and, where they depend on time, with a given epoch
-    only, and only within the area that the operation is made for. Whatever remains is placed as well as possible and
-    graded approximate.
+    PROJ transforms NAD83(2011) to EPSG:4326 by a null shift and assumes an epoch without a warning. So other systems
+    are transformed to ITRF2014 only by operations that state an accuracy, within their area of use and, if they depend
+    on time, with an epoch. All other positions are transformed without a bound and graded approximate.
     """
     name = normalize_crs(crs)
     system = named_system(name)
@@ -151,8 +154,8 @@ def place_position(
 class PlacedPositions:
     """Positions in WGS 84 / ITRF that came the same way; as `PlacedPosition`, with arrays of shape (N,).
 
-    `placed` is False where a position is not finite, out of range, far outside the area of use, or out of the reach of
-    the transformation: NaN stands there.
+    `placed` is False, and the position NaN, where a position is not finite, out of range, far outside the area of use,
+    or outside the transformation's domain.
     """
 
     lon_deg: npt.NDArray[np.float64]
@@ -177,14 +180,14 @@ def place_positions(
     ellipsoidal_height: bool = True,
     accuracy_m: float = 0.1,
 ) -> PlacedPositions:
-    """Bring many positions to WGS 84 / ITRF at once, each as `place_position` would.
+    """Transform many positions to WGS 84 / ITRF, each as `place_position` does.
 
     Parameters
     ----------
     first, second : ndarray, shape (N,)
         Longitude and latitude [deg], or easting and northing in the unit of the CRS.
     height_m : ndarray, shape (N,)
-        Height as given; NaN where there is none. [m]
+        Height in the original system; NaN where there is none. [m]
     crs, realization, epoch, ellipsoidal_height, accuracy_m
         As for `place_position`.
 
@@ -205,8 +208,8 @@ def place_positions(
         )
     has_height = bool(np.isfinite(heights[known]).all())
     middle = int(np.flatnonzero(known)[np.argsort(lon[known])[known.sum() // 2]])
-    given = (float(first[middle]), float(second[middle]), float(heights[middle]) if has_height else None)
-    moved = _to_itrf2014(name, (float(lon[middle]), float(lat[middle])), given, epoch, accuracy_m)
+    original = (float(first[middle]), float(second[middle]), float(heights[middle]) if has_height else None)
+    moved = _to_itrf2014(name, (float(lon[middle]), float(lat[middle])), original, epoch, accuracy_m)
     if isinstance(moved, str):
         grade, note = LocalizationGrade.APPROXIMATE, f"from {name}: {moved}"
         return PlacedPositions(lon, lat, height_m, known, name, None, None, grade, note)
@@ -234,12 +237,12 @@ def place_positions(
 def _to_itrf2014(
     name: str,
     place: tuple[float, float],
-    given: tuple[float, float, float | None],
+    original: tuple[float, float, float | None],
     epoch: float | None,
     accuracy_m: float,
 ) -> tuple[BoundedOperation, float, float, float] | str:
-    """The operation that reaches a place, about which it is, with what it makes of it; or why there is none."""
-    first, second, height_m = given
+    """The first operation that transforms a place, with its result; or why there is none."""
+    first, second, height_m = original
     operations = list_operations(name, *place, three_d=height_m is not None, epoch=epoch, accuracy_m=accuracy_m)
     if isinstance(operations, str):
         return operations

@@ -1,4 +1,4 @@
-"""Coordinate reference systems: by the names that people and standards write, and where they hold."""
+"""Coordinate reference systems: names in their usual forms, and areas of use."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _EPSG_FORMS = (
 _CRS84_FORMS = ("OGC:CRS84", "URN:OGC:DEF:CRS:OGC:1.3:CRS84", "URN:OGC:DEF:CRS:OGC::CRS84")
 _CRS_RULE = "an EPSG code or OGC:CRS84"
 _CRS_CURE = "write EPSG:4326, EPSG:6318, urn:ogc:def:crs:EPSG::2326, ...; without a CRS the position is WGS 84"
-_OUTSIDE_DEG = 1.0
+_OUTSIDE_DEG = 1.0  # [deg] margin about an area of use; source: by hand, 111 km
 
 
 def normalize_crs(crs: str | None) -> str:
-    """``EPSG:code`` or ``OGC:CRS84`` from the forms that people and standards write.
+    """``EPSG:code`` or ``OGC:CRS84`` from the usual forms of a name.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def is_global(system: CRS) -> bool:
 
 @lru_cache(maxsize=256)
 def best_effort(name: str) -> Transformer:
-    """To WGS 84 by whatever PROJ thinks best, with or without a bound."""
+    """To WGS 84 by the operation that PROJ prefers, with or without a stated accuracy."""
     return Transformer.from_crs(name, WGS84, always_xy=True)
 
 
@@ -103,7 +103,7 @@ def geographic_from(name: str) -> Transformer | None:
 
 
 def wgs84_without_bound(name: str, first: float, second: float) -> tuple[float, float]:
-    """Longitude and latitude of a place, as good as PROJ can without saying how good. [deg]"""
+    """Longitude and latitude of a place, without a stated accuracy. [deg]"""
     if named_system(name).is_geographic and is_global(named_system(name)):
         return first, second
     lon_deg, lat_deg = best_effort(name).transform(first, second)
@@ -124,7 +124,7 @@ def covers(
 
 
 def check_area(system: CRS, name: str, lon_deg: float, lat_deg: float) -> None:
-    """Refuse a place far outside the system's area of use.
+    """Check that a place is not far outside the system's area of use.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Live sources of uploads: they collect, keep and send on what a broker delivers."""
+"""Live sources of uploads: messages of a broker are collected, stored on disk and sent to the server."""

@@ -1,4 +1,4 @@
-"""Uplinks from an MQTT broker (ChirpStack, The Things Stack, a receiver's own) -> packet logs -> the server.
+"""Uplinks from an MQTT broker (ChirpStack, The Things Stack, a receiver's own), sent to the server as packet logs.
 
 Each message is written to the spool before it is acknowledged, and each batch is sent under a key of its own until the
 server has it: a broker, a server or a process that stops in between costs time, not packets.
@@ -26,14 +26,14 @@ from app.errors import InvalidParameter, NotAllowed, Unavailable
 from app.ingest.spool import Spool
 
 DEFAULT_TOPICS = ("application/+/device/+/event/up", "v3/+/devices/+/up")
-_MAX_TEXT_BYTES = 256 * 1024
+_MAX_TEXT_BYTES = 256 * 1024  # [byte] longest message that is stored; chosen by hand
 _RETRY_S = (1.0, 60.0)
 _LOG = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class MqttSource:
-    """Where uplinks come from.
+    """The broker that uplinks come from.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class MqttSource:
 
 @dataclass(frozen=True, slots=True)
 class Sink:
-    """Where packet logs go.
+    """The server that packet logs are sent to.
 
     Attributes
     ----------
@@ -104,13 +104,13 @@ class MqttIngest:
         self._messages: queue.SimpleQueue[mqtt.MQTTMessage | None] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self.listening = threading.Event()
-        """Set once the broker has taken the subscription."""
+        """Set when the broker has accepted the subscription."""
         self._fatal: Exception | None = None
         self._client = self._make_client()
         self._http = httpx.Client(base_url=sink.server, headers={"Authorization": f"Bearer {sink.key}"}, timeout=120)
 
     def run(self) -> None:
-        """Collect and send until `stop`; then send what is there.
+        """Collect and send until `stop`; then send what was collected.
 
         Raises
         ------
@@ -188,7 +188,7 @@ class MqttIngest:
                 return
 
     def _next_messages(self) -> list[mqtt.MQTTMessage]:
-        """What came, after a short wait for it."""
+        """Messages that arrived, after a short wait."""
         found: list[mqtt.MQTTMessage] = []
         try:
             message = self._messages.get(timeout=0.2)
@@ -209,7 +209,7 @@ class MqttIngest:
             self._client.ack(message.mid, message.qos)
 
     def _send_batches(self) -> bool:
-        """Whether the server took, or refused for good, every batch that waits."""
+        """Whether the server accepted, or refused finally, every waiting batch."""
         for batch in self._spool.list_batches():
             data = batch.read_bytes()
             try:

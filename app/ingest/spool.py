@@ -1,4 +1,4 @@
-"""Messages on disk until the server has them. Nothing that was acknowledged to a broker is lost."""
+"""Messages on disk until the server has accepted them. No message that was acknowledged to a broker is lost."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BATCH = "batch-*.jsonl"
 
 
 class Spool:
-    """A folder of messages as JSON lines: one file that grows, and batches that wait to be sent.
+    """A folder of messages as JSON lines: one file that is appended to, and batches that wait to be sent.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class Spool:
         self._refused.mkdir(parents=True, exist_ok=True)
         self._file = (folder / _COLLECTING).open("ab")
         self.messages = self._count()
-        """Messages in the file that grows."""
+        """Number of messages in the file that is appended to."""
 
     def add(self, messages: Iterable[dict[str, Any]]) -> None:
         """Append messages; they are on the disk when this returns."""
@@ -40,7 +40,7 @@ class Spool:
         self.messages += len(lines)
 
     def cut(self) -> Path | None:
-        """Make what was collected a batch; its name is the batch's key for ever."""
+        """Turn the collected messages into a batch; its name stays its idempotency key."""
         if not self.messages:
             return None
         self._file.close()
@@ -55,12 +55,12 @@ class Spool:
         return sorted(self._folder.glob(_BATCH), key=lambda path: path.stat().st_mtime_ns)
 
     def refuse(self, batch: Path, why: dict[str, Any]) -> None:
-        """Put a batch aside that the server will never take, with its problem document."""
+        """Set aside a batch that the server refused finally, with the problem document."""
         (self._refused / f"{batch.stem}.problem.json").write_bytes(orjson.dumps(why, option=orjson.OPT_INDENT_2))
         batch.rename(self._refused / batch.name)
 
     def close(self) -> None:
-        """Close the file that grows."""
+        """Close the file that is appended to."""
         self._file.close()
 
     def _count(self) -> int:

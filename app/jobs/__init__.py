@@ -1,1 +1,1 @@
-"""Decoding outside the server process: the same task locally and on a distributed engine."""
+"""Decoder processes, the functions that they call, and the queue of jobs."""

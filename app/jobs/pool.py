@@ -5,38 +5,30 @@ from __future__ import annotations
 import os
 import queue
 import threading
-from concurrent.futures import Future
-from typing import Any
+from typing import Any, TypeVar
 
-from app.decoders.calibration.results import CameraCalibration
 from app.errors import Unavailable
-from app.jobs.calibration_child import calibrate_photos
-from app.jobs.child import ONE_THREAD, ChildLimits, DecodePlates, annotate_frame, find_plates, load_frame, process_id
-from app.jobs.keeper import Keeper, Pending, Step
-from app.jobs.packet_child import draw_overlay, lay_lane, read_drive
-from app.jobs.survey_child import read_survey_file
-from app.jobs.trace_child import decode_recording
-from app.registry.exchange.table import SurveyTable
-from app.services.calibrations import CalibrationTask
-from app.services.frames import AnnotationTask, FrameResult, FrameTask, PlateSearch
-from app.services.imports import SurveyTask
-from app.services.packets import DriveFiles, DriveTask, LaneResult, LaneTask, OverlayTask
-from app.services.traces import TraceResult, TraceTask
+from app.jobs.decoder_process import ONE_THREAD, ProcessIdTask, ProcessLimits
+from app.jobs.frame_tasks import DecodePlates
+from app.jobs.supervisor import Pending, WorkerSupervisor
+from app.services.decoder_processes import Task
+
+ResultT = TypeVar("ResultT")
 
 
 class DecodePool:
-    """Processes that decode frames.
+    """Decoder processes; `submit` hands them tasks.
 
     Parameters
     ----------
     decode : callable
         Module-level `decode_plates`; it is imported by name in each child.
     workers : int
-    limits : ChildLimits
+    limits : ProcessLimits
     max_pixels : int
-        Most pixels that OpenCV in a child agrees to decode: a second line behind the header check.
+        Largest picture that OpenCV in a child decodes, in case the check of the header misses one. [px]
     max_waiting : int
-        Most frames that are waiting or being decoded; more are refused as busy.
+        Largest number of tasks that wait or are carried out; more are refused as busy.
     """
 
     def __init__(
@@ -44,24 +36,24 @@ class DecodePool:
         decode: DecodePlates,
         *,
         workers: int = 2,
-        limits: ChildLimits | None = None,
+        limits: ProcessLimits | None = None,
         max_pixels: int = 50_000_000,
         max_waiting: int = 32,
     ) -> None:
         self._decode = decode
         self._workers = workers
-        self._limits = limits or ChildLimits()
+        self._limits = limits or ProcessLimits()
         self._max_pixels = max_pixels
         self._places = threading.BoundedSemaphore(max_waiting)
         self._lock = threading.Lock()
         self._tasks: queue.SimpleQueue[Pending[Any] | None] = queue.SimpleQueue()
-        self._keepers: list[Keeper] = []
+        self._supervisors: list[WorkerSupervisor] = []
         self._closed = False
 
     def warm(self) -> None:
-        """Start the processes without waiting for them; without it the first frame starts them."""
+        """Start the processes without waiting for them; without it the first task starts them."""
         with self._lock:
-            self._start_keepers()
+            self._start_supervisors()
 
     def open(self) -> None:
         """Start the processes and wait until one is ready.
@@ -71,84 +63,51 @@ class DecodePool:
         Unavailable
             None could be started.
         """
-        self._start(((process_id, None),)).result()
+        self.submit(ProcessIdTask()).result()
 
     def close(self) -> None:
-        """Stop the processes, also in the middle of a frame."""
+        """Stop the processes, also in the middle of a task."""
         with self._lock:
             self._closed = True
-            keepers, self._keepers = self._keepers, []
-        for keeper in keepers:
-            keeper.close()
-        for _keeper in keepers:
+            supervisors, self._supervisors = self._supervisors, []
+        for supervisor in supervisors:
+            supervisor.close()
+        for _supervisor in supervisors:
             self._tasks.put(None)
-        for keeper in keepers:
-            keeper.join()
+        for supervisor in supervisors:
+            supervisor.join()
 
     def is_ready(self) -> bool:
-        """Whether frames can be handed over."""
+        """Whether tasks can be handed over."""
         with self._lock:
-            return not self._closed and (not self._keepers or any(keeper.is_up for keeper in self._keepers))
+            return not self._closed and (
+                not self._supervisors or any(supervisor.is_up for supervisor in self._supervisors)
+            )
 
-    def start(self, task: FrameTask, search: Future[PlateSearch], *, wait_s: float = 0.0) -> Pending[FrameResult]:
-        """Hand a frame over and return, at once or as soon as there is a place for it within `wait_s`.
-
-        The picture is loaded while the caller still finds out what to look for, and fills `search`.
-        """
-        return self._start(((load_frame, task), (find_plates, search)), wait_s)
-
-    def start_trace(self, task: TraceTask, *, wait_s: float = 0.0) -> Pending[TraceResult]:
-        """Hand a recording over and return, at once or as soon as there is a place for it within `wait_s`."""
-        return self._start(((decode_recording, task),), wait_s, self._limits.trace_timeout_s)
-
-    def start_drive(self, task: DriveTask, *, wait_s: float = 0.0) -> Pending[DriveFiles]:
-        """Hand the files of a drive over to be read, at once or as soon as there is a place within `wait_s`."""
-        return self._start(((read_drive, task),), wait_s, self._limits.trace_timeout_s)
-
-    def start_lane(self, task: LaneTask, *, wait_s: float = 0.0) -> Pending[LaneResult]:
-        """Hand verified markers over to lay a lane, at once or as soon as there is a place within `wait_s`."""
-        return self._start(((lay_lane, task),), wait_s, self._limits.trace_timeout_s)
-
-    def start_survey(self, task: SurveyTask, *, wait_s: float = 0.0) -> Pending[SurveyTable]:
-        """Hand a survey over to be read, at once or as soon as there is a place within `wait_s`."""
-        return self._start(((read_survey_file, task),), wait_s, self._limits.trace_timeout_s)
-
-    def start_calibration(self, task: CalibrationTask, *, wait_s: float = 0.0) -> Pending[CameraCalibration]:
-        """Hand photos of a board over, at once or as soon as there is a place within `wait_s`."""
-        return self._start(((calibrate_photos, task),), wait_s, self._limits.trace_timeout_s)
-
-    def draw_overlay(self, task: OverlayTask) -> bytes:
-        """Camera frame with a lane, encoded."""
-        drawn: bytes = self._start(((draw_overlay, task),)).result()
-        return drawn
-
-    def annotate(self, task: AnnotationTask) -> bytes:
-        """Picture with outlines, encoded."""
-        drawn: bytes = self._start(((annotate_frame, task),)).result()
-        return drawn
-
-    def _start(self, steps: tuple[Step, ...], wait_s: float = 0.0, timeout_s: float | None = None) -> Pending[Any]:
+    def submit(self, task: Task[ResultT], *, wait_s: float = 0.0) -> Pending[ResultT]:
+        """As `DecoderProcesses.submit`; `Unavailable` also where the pool was closed."""
         if not (self._places.acquire(timeout=wait_s) if wait_s else self._places.acquire(blocking=False)):
             raise Unavailable("every decoder process is busy", cure="try again in a few seconds")
-        pending: Pending[Any] = Pending(steps, self._interrupt, timeout_s or self._limits.timeout_s)
+        timeout_s = self._limits.trace_timeout_s if task.is_long else self._limits.timeout_s
+        pending: Pending[ResultT] = Pending(task.steps(), self._interrupt, timeout_s)
         pending.future.add_done_callback(lambda _future: self._places.release())
         with self._lock:
             if self._closed:
                 pending.future.cancel()
                 raise Unavailable("the server is stopping", cure="try again in a few seconds")
-            self._start_keepers()
+            self._start_supervisors()
             self._tasks.put(pending)
         return pending
 
     def _interrupt(self, pending: Pending[Any]) -> None:
-        for keeper in self._keepers:
-            keeper.interrupt(pending)
+        for supervisor in self._supervisors:
+            supervisor.interrupt(pending)
 
-    def _start_keepers(self) -> None:
-        if self._keepers or self._closed:
+    def _start_supervisors(self) -> None:
+        if self._supervisors or self._closed:
             return
         # children take these from the environment before they import numpy or OpenCV
         os.environ.update(ONE_THREAD, OPENCV_IO_MAX_IMAGE_PIXELS=str(self._max_pixels))
-        self._keepers = [Keeper(self._tasks, self._decode, self._limits) for _ in range(self._workers)]
-        for keeper in self._keepers:
-            keeper.start()
+        self._supervisors = [WorkerSupervisor(self._tasks, self._decode, self._limits) for _ in range(self._workers)]
+        for supervisor in self._supervisors:
+            supervisor.start()

@@ -1,4 +1,4 @@
-"""The CERPM message: what a chip-enabled raised pavement marker says of itself, and its 24 bytes.
+"""The message of a chip-enabled raised pavement marker (CERPM), and the layout of its 24 bytes.
 
 Source: CERPM paper (Kadav et al., Sensors 2024, 24, 2327), section 2.2: geospatial information, speed limit and number,
 sent by LoRa. Bytes, tag and sequence are Waymark's: the paper names authentication as future work.
@@ -27,20 +27,17 @@ from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 
 VERSION = 1
-MESSAGE_BYTES = 24
-"""All of a message: the most that SF10 at 125 kHz sends in 400 ms with the header. [bytes]"""
-TAG_BYTES = 4
+MESSAGE_BYTES = 24  # [bytes] source: the longest packet of SF10 at 125 kHz within the 400 ms of 47 CFR 15.247
+TAG_BYTES = 4  # [bytes] source: as long as LoRaWAN's integrity code (docs/decisions/0009-cerpms.md)
 BODY_BYTES = MESSAGE_BYTES - TAG_BYTES
-KEY_BYTES = 16
-MAX_NUMBER = 2**32 - 1
-MAX_SEQUENCE = 2**32 - 1
+KEY_BYTES = 16  # [bytes] source: AES-128
+MAX_NUMBER = 2**32 - 1  # source: four bytes
+MAX_SEQUENCE = 2**32 - 1  # source: four bytes
 MAX_SPEED_LIMIT = 255
-DEGREE_STEP = 1e-7
-"""Resolution of longitude and latitude; at most 1.1 cm on the ground. [deg]"""
-HEIGHT_STEP_M = 0.1
-HEIGHT_M = (-1000.0, 5553.4)
-"""Lowest and highest height that fits. [m]"""
-NO_HEIGHT = 65535
+DEGREE_STEP = 1e-7  # [deg] at most 1.1 cm on the ground; source: the largest step of 32 bits within a survey's 0.02 m
+HEIGHT_STEP_M = 0.1  # [m] source: docs/cerpm-message.md
+HEIGHT_M = (-1000.0, 5553.4)  # [m] lowest and highest; source: 65,534 steps of 0.1 m
+NO_HEIGHT = 65535  # source: the highest value of 16 bits
 
 
 class LaneSide(IntEnum):
@@ -59,7 +56,7 @@ class SpeedUnit(StrEnum):
 
     @property
     def km_h(self) -> float:
-        """One of it. [km/h]"""
+        """Length of the unit. [km/h]"""
         return 1.0 if self is SpeedUnit.KM_H else 1.609344
 
 
@@ -87,7 +84,7 @@ class SpeedLimit:
 
 @dataclass(frozen=True, slots=True)
 class CerpmMessage:
-    """What a marker says.
+    """Contents of a message.
 
     Attributes
     ----------
@@ -100,12 +97,12 @@ class CerpmMessage:
     side : LaneSide
     speed_limit : SpeedLimit or None
     sequence : int
-        Which transmission this is.
+        Number of the transmission.
 
     Raises
     ------
     InvalidParameter
-        A value does not fit its bytes.
+        A value does not fit its field.
     """
 
     number: int
@@ -118,15 +115,15 @@ class CerpmMessage:
 
     def __post_init__(self) -> None:
         check_lon_lat(self.lon_deg, self.lat_deg)
-        for name, value, least, most in (
+        for name, value, low, high in (
             ("number", self.number, 1, MAX_NUMBER),
             ("sequence", self.sequence, 0, MAX_SEQUENCE),
         ):
-            if not least <= value <= most or value != int(value):
+            if not low <= value <= high or value != int(value):
                 raise InvalidParameter(
                     f"{name} is {value}",
                     field=name,
-                    limit=f"a whole number from {least} to {most}",
+                    limit=f"a whole number from {low} to {high}",
                     cure="numbers and sequences are 32 bits; a marker at the end of its sequence needs a new number",
                 )
         if self.height_m is not None and not (

@@ -12,11 +12,9 @@ from cryptography.hazmat.primitives.kdf.kbkdf import KBKDFCMAC, CounterLocation,
 from app.errors import InvalidParameter
 from app.markers.cerpm import BODY_BYTES, KEY_BYTES, MAX_NUMBER, TAG_BYTES
 
-AGENCY_KEY_BYTES = (16, 32)
-"""An agency's key is for AES-128 or AES-256. [bytes]"""
-KEY_LABEL = b"waymark cerpm v1"
-"""What the derived keys are for; another version of the message takes another label."""
-_COUNTER_BYTES = 4
+AGENCY_KEY_BYTES = (16, 32)  # [bytes] source: AES-128 and AES-256
+KEY_LABEL = b"waymark cerpm v1"  # purpose of the derived keys; another message version needs another label
+_COUNTER_BYTES = 4  # [bytes] source: NIST SP 800-108r1, section 4.1, r = 32
 
 
 def derive_marker_key(agency_key: bytes, number: int) -> bytes:
@@ -32,7 +30,7 @@ def derive_marker_key(agency_key: bytes, number: int) -> bytes:
     Returns
     -------
     bytes
-        16 of them: what is programmed into the marker. Who opens a marker learns its key and no other.
+        16 of them, programmed into the marker. Whoever opens a marker learns only its own key.
 
     Raises
     ------

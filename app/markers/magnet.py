@@ -21,17 +21,26 @@ from itertools import pairwise
 from app.errors import CodeMismatch, InvalidParameter
 
 MAGNETS = (2, 7)
-"""Fewest and most magnets of an information tag: two reference nodes; figure 5a ends at seven."""
+"""Smallest and largest number of magnets of an information tag. Source: METRO section 4.2 (two reference nodes) and
+figure 5a, which ends at seven."""
 LENGTH_M = (0.5, 30.0)
+"""Shortest and longest tag. [m] Source: `MIN_GAP_M`, and by hand; METRO's figure 5 ends below."""
 SEGMENT_M = (0.02, 30.0)
-"""Segmentation distances; the paper tested down to 0.02 m, hardly more than a magnet's own length. [m]"""
+"""Smallest and largest segmentation distance. [m] Source: METRO tested down to 0.02 m, hardly more than a magnet's own
+length; a segment is no longer than the tag."""
 MIN_GAP_M = 0.5
-"""Nearest that neighbouring magnets may stand without their fields coupling; gives figure 17a exactly. [m]"""
+"""Smallest distance of neighbouring magnets whose fields do not couple. [m] Source: METRO figure 17a, whose capacities
+follow from it exactly."""
 MAX_LINE_SPACING_M = 6.0
-"""Farthest that the magnets of a line may stand apart (METRO section 6.3). [m]"""
+"""Largest distance between the magnets of a line. [m] Source: METRO section 6.3."""
+MOMENT_AM2 = 2.47
+"""Moment of METRO's magnet: an N52 cuboid of 15 x 15 x 9.5 mm (METRO section 6.2) with a remanence of 1.45 T. [A m2]
+Source: remanence times volume over mu0."""
+FIELD_UT_M3 = 0.1
+"""mu0 / (4 pi), the field of a dipole of 1 A m2 at 1 m across its axis. [uT m3 / (A m2)] Source: SI."""
 
 _TICKS_PER_M = 10_000
-"""Lengths are whole tenths of a millimetre: fine enough for inches, and exact to count with."""
+"""Lengths are whole tenths of a millimetre. Source: chosen by hand, exact to count with and fine enough for inches."""
 _SOURCE = "METRO paper, section 4.2"
 _INFORMATION = re.compile(
     r"(?P<polarities>[NS]{1,16})_(?P<length>\d{1,3}(\.\d{1,4})?)_(?P<segment>\d{1,3}(\.\d{1,4})?)"

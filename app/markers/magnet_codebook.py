@@ -12,7 +12,7 @@ from enum import StrEnum
 from typing import Any
 
 from app.errors import CodeMismatch, Conflict, InvalidParameter
-from app.markers.magnet import InformationTag, Polarity, parse_tag
+from app.markers.magnet import InformationTag, parse_tag
 from app.markers.magnet_design import TagDesign
 
 MAX_NAME = 80
@@ -20,7 +20,7 @@ CODEBOOK_FORMAT = "waymark-codebook/1"
 
 
 class MeaningKind(StrEnum):
-    """What a tag tells a vehicle."""
+    """Kinds of messages to a vehicle."""
 
     ARROW = "arrow"
     STOP_LINE_AHEAD = "stop-line-ahead"
@@ -136,7 +136,7 @@ class Codebook:
     design : TagDesign
         What all its tags share.
     entries : tuple of (InformationTag, Meaning)
-        In the order in which they were given.
+        In the order in which they were added.
 
     Raises
     ------
@@ -167,7 +167,7 @@ class Codebook:
 
     @property
     def tags(self) -> tuple[InformationTag, ...]:
-        """The codes, in the order in which they were given."""
+        """The codes, in the order in which they were added."""
         return tuple(tag for tag, _ in self.entries)
 
     def find_meaning(self, tag: InformationTag) -> Meaning | None:
@@ -177,10 +177,6 @@ class Codebook:
     def find_tag(self, meaning: Meaning) -> InformationTag | None:
         """The code of a meaning, or None if it has none."""
         return next((tag for tag, known in self.entries if known == meaning), None)
-
-    def list_tags(self, polarities: tuple[Polarity, ...]) -> tuple[InformationTag, ...]:
-        """The codes that share these polarities: what a reader who has seen them may choose among."""
-        return tuple(tag for tag in self.tags if tag.polarities == polarities)
 
     def to_document(self) -> dict[str, Any]:
         """As plain values, for JSON."""

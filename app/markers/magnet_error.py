@@ -1,4 +1,4 @@
-"""How well distance ratios are read, and which codes can be told apart.
+"""How well distance ratios are read, and which codes can be distinguished.
 
 The places of a tag's magnets are read with an error each; the odometer adds its own to every gap. A code is what
 remains when the scale is taken out: u = (place of each middle magnet) / (length of the tag). So an error of scale that
@@ -18,13 +18,13 @@ import numpy.typing as npt
 from scipy.special import ndtr, ndtri
 
 from app.errors import InvalidParameter
+from app.markers.magnet import FIELD_UT_M3, MOMENT_AM2
 from app.markers.magnet_design import TagDesign
 
 FloatArray = npt.NDArray[np.float64]
 MAX_PLACEMENTS = 4000
-"""Most placements that are looked at; of larger designs, so many at equal ranks."""
-_FIELD_UT_M3 = 0.1
-"""mu_0 / 4 pi in uT m3 / (A m2)."""
+"""Placements that are examined at most; of larger designs, so many at equal ranks. Source: chosen by hand for speed
+(docs/decisions/0007-magnets-in-the-registry.md has the times)."""
 
 
 def _check_fields(values: MagnetErrorModel | OdometerError, may_be_zero: tuple[str, ...]) -> None:
@@ -45,23 +45,23 @@ class MagnetErrorModel:
     Attributes
     ----------
     placement_m : float
-        Standard deviation of a magnet's place in the road; METRO section 8.2 saw less than 3 mm. [m]
+        Standard deviation of a magnet's place in the road. [m] Source: METRO section 8.2 saw less than 3 mm.
     noise_ut : float
-        Noise of a sample on the forward axis. [uT]
+        Noise of a sample on the forward axis. [uT] Source: MLX90393 as METRO sets it (section 6.1).
     moment_am2 : float
         Magnetic moment of a magnet. [A m2]
     sample_rate_hz : float
-        Of the magnetometers. [Hz]
+        Of the magnetometers. [Hz] Source: METRO section 6.1.
     channels : float
-        Sensor axes of like strength whose evidence the decoder adds up.
+        Sensor axes of like strength whose evidence the decoder adds up. Source: chosen by hand.
     timing_s : float
         Standard deviation of the time at which a magnet is placed, beyond noise: jitter of the samples, or their
-        interval / sqrt(12) for a decoder that works in whole samples. [s]
+        interval / sqrt(12) for a decoder that works in whole samples. [s] Source: chosen by hand.
     """
 
     placement_m: float = 0.0015
     noise_ut: float = 1.5
-    moment_am2: float = 2.47
+    moment_am2: float = MOMENT_AM2
     sample_rate_hz: float = 350.0
     channels: float = 4.0
     timing_s: float = 0.0001
@@ -77,7 +77,7 @@ class MagnetErrorModel:
         A pulse of amplitude A and width h, sampled N times, is placed to h (noise / A) / sqrt(N). The field straight
         above a lying magnet falls with the cube of the clearance h, the samples rise with h / speed.
         """
-        amplitude_ut = _FIELD_UT_M3 * self.moment_am2 / clearance_m**3
+        amplitude_ut = FIELD_UT_M3 * self.moment_am2 / clearance_m**3
         samples = self.channels * self.sample_rate_hz * clearance_m / speed_mps
         noise_m = clearance_m * (self.noise_ut / amplitude_ut) / math.sqrt(samples)
         return math.hypot(noise_m, self.placement_m, self.timing_s * speed_mps)
@@ -94,11 +94,12 @@ class OdometerError:
     Attributes
     ----------
     quantum_mps : float
-        Step of the speed signal. [m/s]
+        Step of the speed signal. [m/s] Source: chosen by hand.
     rate_hz : float
-        Speeds a second; METRO section 7.1: 10. [Hz]
+        Speeds per second. [Hz] Source: METRO section 7.1.
     drift : float
-        Standard deviation of the relative change of scale from one gap to the next (slip, braking, latency).
+        Standard deviation of the relative change of scale from one gap to the next (slip, braking, latency). Source:
+        chosen by hand.
     """
 
     quantum_mps: float = 0.01
@@ -116,7 +117,7 @@ class OdometerError:
 
 @dataclass(frozen=True, slots=True)
 class ReadingConditions:
-    """Under what a code must be read: the fastest and highest vehicle to be served, and what it measures with.
+    """Conditions under which a code must be read: the fastest and highest vehicle, its odometer and its decoder.
 
     Attributes
     ----------
@@ -225,8 +226,8 @@ def separation_for(confusion: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class ToldApart:
-    """How many codes of a design can be told apart when all are in use.
+class Distinguishable:
+    """How many codes of a design can be distinguished when all are in use.
 
     Attributes
     ----------
@@ -246,8 +247,8 @@ class ToldApart:
     worst_accuracy: float
 
 
-def told_apart(design: TagDesign, conditions: ReadingConditions, *, accuracy: float = 0.99) -> ToldApart:
-    """Share of a design's codes that a decoder tells apart, magnets and polarities being read.
+def distinguishable(design: TagDesign, conditions: ReadingConditions, *, accuracy: float = 0.99) -> Distinguishable:
+    """Share of a design's codes that a decoder distinguishes, magnets and polarities being read.
 
     Parameters
     ----------
@@ -255,7 +256,7 @@ def told_apart(design: TagDesign, conditions: ReadingConditions, *, accuracy: fl
     conditions : ReadingConditions
         Speed, clearance, odometer and decoder.
     accuracy : float
-        Least probability with which a code counts as told apart.
+        Smallest probability with which a code counts as distinguished.
 
     Raises
     ------
@@ -265,24 +266,24 @@ def told_apart(design: TagDesign, conditions: ReadingConditions, *, accuracy: fl
     Notes
     -----
     Exact for three magnets, whose codes have a neighbour on each side; with more a bound from below, the sum over all
-    neighbours on the grid. Designs of more than 4000 placements are judged by that many of them at equal ranks.
+    neighbours on the grid. Designs of more than 4000 placements are sampled at that many equal ranks.
     """
     if not 0 < accuracy < 1:
         raise InvalidParameter(f"accuracy is {accuracy:g}", field="accuracy", limit="between 0 and 1")
     if not design.placements:
-        return ToldApart(0.0, 0, 0, 0.0, 0.0)
+        return Distinguishable(0.0, 0, 0, 0.0, 0.0)
     right = 1.0 - np.minimum(_confusion(design, placements_of(design), conditions), 1.0)
     share = float(np.mean(right >= accuracy))
     codes = round(share * design.placements) * 2**design.magnets
-    return ToldApart(share, codes, design.coupled_capacity, float(right.mean()), float(right.min()))
+    return Distinguishable(share, codes, design.coupled_capacity, float(right.mean()), float(right.min()))
 
 
-def placements_of(design: TagDesign, most: int = MAX_PLACEMENTS) -> npt.NDArray[np.int64]:
-    """Gaps in segments, shape (K, M - 1): all placements in rising order, or `most` of them at equal ranks."""
-    if design.placements <= most:
+def placements_of(design: TagDesign, max_count: int = MAX_PLACEMENTS) -> npt.NDArray[np.int64]:
+    """Gaps in segments, shape (K, M - 1): all placements in rising order, or `max_count` of them at equal ranks."""
+    if design.placements <= max_count:
         rows = list(design.list_gap_steps())
     else:
-        rows = [design.gap_steps_at(k * (design.placements - 1) // (most - 1)) for k in range(most)]
+        rows = [design.gap_steps_at(k * (design.placements - 1) // (max_count - 1)) for k in range(max_count)]
     return np.array(rows, dtype=np.int64).reshape(-1, design.magnets - 1)
 
 

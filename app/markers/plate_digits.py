@@ -1,4 +1,4 @@
-"""Digits of many plates at once: what `PlateCode` makes one by one, for imports of a million."""
+"""Digits of many plates in one call, the same as `PlateCode` makes one by one: for imports of a million."""
 
 from __future__ import annotations
 

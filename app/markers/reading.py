@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from app.markers.plate import PlateCode, PlateGeometry
 
 
 class PlateOutcome(StrEnum):
-    """What became of a candidate plate. All but READ carry no digits.
+    """Outcome of a candidate plate. Only READ has digits.
 
     The first five after READ are the cases that the PolyU paper filters out (section II-D4).
     """
@@ -90,7 +91,7 @@ class PlateReading:
     corrected_cells : tuple of int
         Cells whose symbol came from error correction or from the codebook.
     from_codebook : bool
-        The codebook decided, the frame alone would have been refused.
+        The codebook decided; the frame alone would have been refused.
     geometry : PlateGeometry or None
     grade : PlateGrade or None
     pose : PlatePose or None
@@ -98,9 +99,10 @@ class PlateReading:
     height_px, width_px : float
         Extent of the corners in the image. [px]
     reason : str
-        Why it was refused, for people.
+        Why it was refused, as a sentence.
     """
 
+    family: ClassVar[str] = "plate"
     outcome: PlateOutcome
     corners_px: npt.NDArray[np.float64] | None = None
     corners_covariance_px2: npt.NDArray[np.float64] | None = None

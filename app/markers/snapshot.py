@@ -88,10 +88,8 @@ ELLIPSOIDAL_FLAG: Final = 2
 HEARD_FLAG: Final = 4
 """Transmissions of the CERPM were heard before."""
 
-FAMILIES: Final = ("plate", "magnet", "cerpm")
 RETIRED: Final = "retired"
 """Only CERPMs: what they say counts no more, whoever has their keys."""
-STATUSES: Final = ("planned", "built", "surveyed", "active", "suspect", RETIRED)
 
 
 class SnapshotRefused(UnreadableUpload):

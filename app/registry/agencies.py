@@ -5,19 +5,45 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
-from app.errors import NotFound
 from app.registry.audit import Author, record
 from app.registry.ids import new_id
+from app.registry.resources import Resource
+from app.registry.rows import fetch_all, find_one, select_rows
 from app.registry.tables import agencies, api_keys
 
-Row = sa.RowMapping
+
+class AgencyRow(NamedTuple):
+    """An agency."""
+
+    id: str
+    name: str
+
+
+class KeyRow(NamedTuple):
+    """A key as it is stored, without the hash of its text."""
+
+    id: str
+    agency_id: str
+    holder_id: str
+    label: str
+    prefix: str
+    scope: str
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+    last_used_at: datetime | None
+
+
 OPERATOR = Author("the server's operator")
 """Who makes keys from the command line and at the first start."""
-_KEY = sa.select(api_keys).where(api_keys.c.sha256 == sa.bindparam("sha256"))  # built once: every request asks
+KEYS = Resource("key", KeyRow, api_keys, cure="GET /v1/keys lists yours")
+_KEY = select_rows(KeyRow, api_keys).where(
+    api_keys.c.sha256 == sa.bindparam("sha256")
+)  # built once: every request asks
 _USED = (
     sa.update(api_keys)
     .where(
@@ -26,7 +52,6 @@ _USED = (
     )
     .values(last_used_at=sa.bindparam("at"))
 )
-_SHOWN = [column for column in api_keys.c if column.name not in ("agency_id", "sha256")]
 
 
 def key_sha256(key: str) -> str:
@@ -44,9 +69,9 @@ def find_first_agency(connection: sa.Connection) -> str | None:
     return connection.execute(sa.select(agencies.c.id).order_by(agencies.c.id).limit(1)).scalar_one_or_none()
 
 
-def list_agencies(connection: sa.Connection) -> list[Row]:
-    """Ids and names of all agencies, by name."""
-    return list(connection.execute(sa.select(agencies.c.id, agencies.c.name).order_by(agencies.c.name)).mappings())
+def list_agencies(connection: sa.Connection) -> list[AgencyRow]:
+    """All agencies, by name."""
+    return fetch_all(connection, select_rows(AgencyRow, agencies).order_by(agencies.c.name), AgencyRow)
 
 
 def add_agency(connection: sa.Connection, name: str, now: datetime) -> str:
@@ -69,7 +94,7 @@ def add_key(
     holder_id: str | None = None,
     author: Author = OPERATOR,
 ) -> str:
-    """Store a key, say so in the agency's audit log, and return its id.
+    """Store a key, record it in the agency's audit log, and return its id.
 
     A key that takes over from another has its holder.
     """
@@ -93,40 +118,17 @@ def add_key(
     return key_id
 
 
-def find_key(connection: sa.Connection, key: str) -> Row | None:
+def find_key(connection: sa.Connection, key: str) -> KeyRow | None:
     """The stored row of a key as it was sent."""
-    return connection.execute(_KEY, {"sha256": key_sha256(key)}).mappings().one_or_none()
+    return find_one(connection, _KEY, KeyRow, {"sha256": key_sha256(key)})
 
 
-def get_key(connection: sa.Connection, agency_id: str, key_id: str) -> Row:
-    """One key of an agency.
-
-    Raises
-    ------
-    NotFound
-        There is none with this id, or it belongs to another agency.
-    """
-    query = sa.select(*_SHOWN).where(api_keys.c.id == key_id, api_keys.c.agency_id == agency_id)
-    row = connection.execute(query).mappings().one_or_none()
-    if row is None:
-        raise NotFound(f"there is no key {key_id}", field="key_id", cure="GET /v1/keys lists yours")
-    return row
-
-
-def list_keys(connection: sa.Connection, agency_id: str, *, after: str | None, limit: int) -> list[Row]:
-    """Keys of an agency in the order they were made."""
-    query = sa.select(*_SHOWN).where(api_keys.c.agency_id == agency_id)
-    if after is not None:
-        query = query.where(api_keys.c.id > after)
-    return list(connection.execute(query.order_by(api_keys.c.id).limit(limit)).mappings())
-
-
-def find_successor(connection: sa.Connection, agency_id: str, key: Row) -> str | None:
+def find_successor(connection: sa.Connection, agency_id: str, key: KeyRow) -> str | None:
     """Id of a key that took over from this one and was not revoked."""
     query = sa.select(api_keys.c.id).where(
         api_keys.c.agency_id == agency_id,
-        api_keys.c.holder_id == key["holder_id"],
-        api_keys.c.id > key["id"],
+        api_keys.c.holder_id == key.holder_id,
+        api_keys.c.id > key.id,
         api_keys.c.revoked_at.is_(None),
     )
     return connection.execute(query.limit(1)).scalar_one_or_none()
@@ -150,7 +152,7 @@ def expire_key(connection: sa.Connection, key_id: str, at: datetime) -> None:
 
 
 def revoke_key(connection: sa.Connection, agency_id: str, key_id: str, now: datetime, *, author: Author) -> None:
-    """End a key now, and say so in the agency's audit log."""
+    """Revoke a key, and record it in the agency's audit log."""
     connection.execute(sa.update(api_keys).where(api_keys.c.id == key_id).values(revoked_at=now))
     record(connection, agency_id, author, "key.revoked", now=now, subject=key_id)
 

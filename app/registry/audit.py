@@ -14,17 +14,38 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from operator import ge
-from typing import Any
+from typing import Any, NamedTuple
 
 import orjson
 import sqlalchemy as sa
+from pydantic import JsonValue
 
 from app.registry.columns import Columns, JsonTexts
+from app.registry.rows import fetch_all, find_one, select_rows
 from app.registry.tables import audit_log, marker_versions
 
-Row = sa.RowMapping
 NO_ENTRY = "0" * 64
 """What the first entry of a chain names as the hash before it."""
+
+
+class EntryRow(NamedTuple):
+    """An entry as it is stored."""
+
+    agency_id: str
+    number: int
+    at: datetime
+    who: str
+    key_id: str | None
+    action: str
+    subject: str | None
+    detail: dict[str, JsonValue] | None
+    versions: int
+    digest: str
+    previous_hash: str
+    hash: str
+
+
+_ENTRIES = select_rows(EntryRow, audit_log)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +166,7 @@ def content_sha256(content: Any) -> str:
     return hashlib.sha256(orjson.dumps(content, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
 
-def entry_hash(entry: Mapping[str, Any] | Row) -> str:
+def entry_hash(entry: Mapping[str, Any] | sa.RowMapping) -> str:
     """Hash of an entry: SHA-256 of all its other columns as a JSON array, the hash before it among them."""
     values = [entry[column.name] for column in audit_log.c if column.name != "hash"]
     return content_sha256(values)
@@ -174,10 +195,10 @@ def recording(
     subject : str, optional
         Id or name of what it was done to.
     detail : mapping, optional
-        What else there is to say, as JSON; never a secret.
+        Further details as JSON; never a secret.
     """
     head = find_head(connection, agency_id)
-    number, previous = (head["number"] + 1, head["hash"]) if head is not None else (1, NO_ENTRY)
+    number, previous = (head.number + 1, head.hash) if head is not None else (1, NO_ENTRY)
     now = now.astimezone(UTC)
     entry = AuditEntry(agency_id, number, now, author.who)
     yield entry
@@ -217,13 +238,13 @@ def add_versions(connection: sa.Connection, versions: list[dict[str, Any]]) -> N
     connection.execute(sa.insert(marker_versions), versions)
 
 
-def find_head(connection: sa.Connection, agency_id: str) -> Row | None:
+def find_head(connection: sa.Connection, agency_id: str) -> EntryRow | None:
     """The newest entry of the agency's chain."""
-    query = sa.select(audit_log).where(audit_log.c.agency_id == agency_id).order_by(audit_log.c.number.desc()).limit(1)
-    return connection.execute(query).mappings().one_or_none()
+    query = _ENTRIES.where(audit_log.c.agency_id == agency_id).order_by(audit_log.c.number.desc()).limit(1)
+    return find_one(connection, query, EntryRow)
 
 
-def list_entries(connection: sa.Connection, agency_id: str, *, after: int = 0, limit: int = 100) -> list[Row]:
+def list_entries(connection: sa.Connection, agency_id: str, *, after: int = 0, limit: int = 100) -> list[EntryRow]:
     """Entries of the agency's chain, oldest first."""
-    query = sa.select(audit_log).where(audit_log.c.agency_id == agency_id, audit_log.c.number > after)
-    return list(connection.execute(query.order_by(audit_log.c.number).limit(limit)).mappings())
+    query = _ENTRIES.where(audit_log.c.agency_id == agency_id, audit_log.c.number > after)
+    return fetch_all(connection, query.order_by(audit_log.c.number).limit(limit), EntryRow)

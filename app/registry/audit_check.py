@@ -13,8 +13,8 @@ from typing import NamedTuple
 import orjson
 import sqlalchemy as sa
 
-from app.registry.audit import NO_ENTRY, Row, entry_hash, version_sha256
-from app.registry.markers import PUBLIC
+from app.registry.audit import NO_ENTRY, entry_hash, version_sha256
+from app.registry.marker_rows import PUBLIC
 from app.registry.tables import audit_log, marker_versions, markers
 
 _PAGE = 1000
@@ -81,7 +81,7 @@ def _check_log(
         elif entry["previous_hash"] != previous:
             yield Fault(where, "does not name the hash of the entry before it: one of the two was replaced or moved")
         if entry_hash(entry) != entry["hash"]:
-            yield Fault(where, "changed: its hash is not that of what it says")
+            yield Fault(where, "changed: its hash does not match its content")
         while group is not None and group.number < entry["number"]:
             yield _uncovered(group)
             group = next(covered, None)
@@ -134,7 +134,7 @@ def _covered(connection: sa.Connection, agency_id: str) -> Iterator[_Group]:
         yield group
 
 
-def _compare(entry: Row, found: _Group) -> Iterator[Fault]:
+def _compare(entry: sa.RowMapping, found: _Group) -> Iterator[Fault]:
     if found.count != entry["versions"]:
         what = f"wrote {entry['versions']} versions of markers, {found.count} are there"
         yield Fault(f"entry {entry['number']}", f"{what}: some were removed, added or moved")
@@ -169,19 +169,19 @@ def _check_versions(connection: sa.Connection, agency_id: str, report: ChainRepo
         number = row["version"]
         report.versions += 1
         if _sha256_of(row) != row["sha256"]:
-            yield Fault(where, "changed: its hash is not that of what it says")
+            yield Fault(where, "changed: its hash does not match its content")
         elif row[f"{_NOW}id"] is not None and (names := _differing(row)):
-            yield Fault(f"marker {marker_id}", f"is not what its {where.split(' of ')[0]} says: {', '.join(names)}")
+            yield Fault(f"marker {marker_id}", f"differs from its {where.split(' of ')[0]}: {', '.join(names)}")
 
 
-def _sha256_of(row: Row) -> str:
+def _sha256_of(row: sa.RowMapping) -> str:
     return version_sha256(
         row["agency_id"], row["marker_id"], row["version"], row["at"], row["who"], row["why"], row["kind"],
         row["marker"],
     )  # fmt: skip
 
 
-def _differing(row: Row) -> list[str]:
+def _differing(row: sa.RowMapping) -> list[str]:
     """Columns of the marker that its newest version has otherwise; a version knows the columns of its time."""
     known = {name: value for name, value in row["marker"].items() if _NOW + name in row}
     now = orjson.loads(orjson.dumps({name: row[_NOW + name] for name in known}))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
@@ -12,19 +12,31 @@ from app.registry.audit import AuditEntry
 from app.registry.bulk_load import large_load, load_columns
 from app.registry.columns import Columns, json_objects
 from app.registry.feature_text import feature_texts
-from app.registry.markers import PUBLIC, MarkerFilter, Row, conditions_of
+from app.registry.marker_rows import MARKERS, CodeRow, MarkerRow
+from app.registry.markers import MarkerFilter, conditions_of
+from app.registry.rows import fetch_all, row_maker, select_rows
 from app.registry.spatial import Box, box_around, within_box
 from app.registry.tables import marker_versions, markers
 from app.registry.tenancy import seeing_every_agency
 
 _CHUNK = 500
-_PLACE = (markers.c.lon_deg, markers.c.lat_deg, markers.c.height_m, markers.c.vertical_datum)
 
 
-def list_places_in(connection: sa.Connection, agency_id: str, box: Box, *, limit: int) -> list[Row]:
+class PlaceRow(NamedTuple):
+    """Where a marker is."""
+
+    lon_deg: float
+    lat_deg: float
+    height_m: float | None
+    vertical_datum: str | None
+
+
+def list_places_in(connection: sa.Connection, agency_id: str, box: Box, *, limit: int) -> list[PlaceRow]:
     """Places and heights of the agency's markers in a box that may be on the road."""
-    query = sa.select(*_PLACE).where(markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box))
-    return list(connection.execute(query.limit(limit)).mappings())
+    query = select_rows(PlaceRow, markers).where(
+        markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box)
+    )
+    return fetch_all(connection, query.limit(limit), PlaceRow)
 
 
 def is_any_near(connection: sa.Connection, agency_id: str, lon_deg: float, lat_deg: float, radius_m: float) -> bool:
@@ -35,32 +47,28 @@ def is_any_near(connection: sa.Connection, agency_id: str, lon_deg: float, lat_d
     return connection.execute(query.limit(1)).first() is not None
 
 
-def list_markers_in(connection: sa.Connection, agency_id: str, family: str, box: Box, *, limit: int) -> list[Row]:
+def list_markers_in(connection: sa.Connection, agency_id: str, family: str, box: Box, *, limit: int) -> list[MarkerRow]:
     """The agency's markers of a family in a box that may be on the road."""
-    query = sa.select(*PUBLIC).where(
+    query = MARKERS.where(
         markers.c.agency_id == agency_id,
         markers.c.family == family,
         markers.c.status != "retired",
         within_box(box),
     )
-    return list(connection.execute(query.limit(limit)).mappings())
+    return fetch_all(connection, query.limit(limit), MarkerRow)
 
 
-def list_by_digits(connection: sa.Connection, family: str, digits: Sequence[str]) -> Iterator[Row]:
-    """What any agency's markers with these digits are: id, agency_id, digits, n, scheme, place, status."""
-    columns = (
-        markers.c.id, markers.c.agency_id, markers.c.digits, markers.c.n, markers.c.scheme, markers.c.status,
-        markers.c.lon_deg, markers.c.lat_deg, markers.c.digits_match_position,
-    )  # fmt: skip
+def list_by_digits(connection: sa.Connection, family: str, digits: Sequence[str]) -> Iterator[CodeRow]:
+    """Any agency's markers with these digits."""
     known = sa.select(sa.literal(1)).where(markers.c.family == family).limit(1)
     with seeing_every_agency(connection):
         wanted = sorted(set(digits)) if digits and connection.execute(known).first() is not None else []
     for start in range(0, len(wanted), _CHUNK):
-        query = sa.select(*columns).where(
+        query = select_rows(CodeRow, markers).where(
             markers.c.digits.in_(wanted[start : start + _CHUNK]), markers.c.family == family
         )
         with seeing_every_agency(connection):
-            found = connection.execute(query).mappings().all()
+            found = fetch_all(connection, query, CodeRow)
         yield from found
 
 
@@ -69,7 +77,7 @@ def add_markers(
 ) -> None:
     """Store new markers of the entry's agency, each with the first version of its history.
 
-    The columns are those of `PUBLIC`, the rows in the order of their ids; `kind` tells a version's kind from the
+    The columns are those of `MarkerRow`, the rows in the order of their ids; `kind` tells a version's kind from the
     status.
     """
     kinds = [str(kind(status)) for status in columns.values("status")]
@@ -88,7 +96,7 @@ def many_markers(connection: sa.Connection, rows: int) -> AbstractContextManager
 def list_records(
     connection: sa.Connection,
     agency_id: str,
-    narrowed: MarkerFilter,
+    filtered: MarkerFilter,
     fields: Sequence[str],
     *,
     after: str | None,
@@ -97,17 +105,17 @@ def list_records(
     """Markers in the order of their ids as flat records of these fields: columns, `code`, and `side` of CERPMs."""
     own = {"code": markers.c.digits, "side": markers.c.spec["side"].as_string()}
     columns = [own[name].label(name) if name in own else markers.c[name] for name in fields]
-    query = sa.select(*columns).where(markers.c.agency_id == agency_id, *conditions_of(narrowed))
+    query = sa.select(*columns).where(markers.c.agency_id == agency_id, *conditions_of(filtered))
     if after is not None:
         query = query.where(markers.c.id > after)
     rows = connection.execute(query.order_by(markers.c.id).limit(limit)).all()
     return [dict(zip(fields, row, strict=True)) for row in rows]
 
 
-def has_heights(connection: sa.Connection, agency_id: str, narrowed: MarkerFilter) -> bool:
+def has_heights(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> bool:
     """Whether a marker of the filter has a height."""
     query = sa.select(markers.c.row).where(
-        markers.c.agency_id == agency_id, markers.c.height_m.is_not(None), *conditions_of(narrowed)
+        markers.c.agency_id == agency_id, markers.c.height_m.is_not(None), *conditions_of(filtered)
     )
     return connection.execute(query.limit(1)).first() is not None
 
@@ -119,33 +127,31 @@ _SNAPSHOT = (
 )  # fmt: skip
 
 
-def list_for_snapshot(connection: sa.Connection, agency_id: str, family: str, box: Box, *, limit: int) -> list[Row]:
-    """The agency's markers of a family in a box with what vehicles need of them: all but the retired ones.
+def list_for_snapshot(
+    connection: sa.Connection,
+    agency_id: str,
+    family: str,
+    box: Box,
+    *,
+    columns: Sequence[sa.ColumnElement[Any]] = (),
+    with_retired: bool = False,
+    limit: int,
+) -> list[MarkerRow]:
+    """The agency's markers of a family in a box with what vehicles need of them; None in the columns they do not need.
 
-    Retired CERPMs are among them: whoever has their keys can still send. Of magnets also lane_lon_deg, lane_lat_deg and
-    meaning; of CERPMs side, speed_limit, interval_s and jitter_share.
+    With further columns their `spec` has these alone, by their labels.
     """
-    spec = markers.c.spec
-    lane_start, radio = spec["lane"]["points_deg"][0], spec["radio"]
-    own: dict[str, tuple[sa.ColumnElement[Any], ...]] = {
-        "plate": (),
-        "magnet": (
-            lane_start[0].as_float().label("lane_lon_deg"),
-            lane_start[1].as_float().label("lane_lat_deg"),
-            spec["meaning"].label("meaning"),
-        ),
-        "cerpm": (
-            spec["side"].as_string().label("side"),
-            spec["speed_limit"].label("speed_limit"),
-            radio["interval_s"].as_float().label("interval_s"),
-            radio["jitter_share"].as_float().label("jitter_share"),
-        ),
-    }
-    query = sa.select(*(markers.c[name] for name in _SNAPSHOT), *own[family]).where(
+    wanted = _SNAPSHOT if columns else (*_SNAPSHOT, "spec")
+    shared = (markers.c[name] if name in wanted else sa.null() for name in MarkerRow._fields)
+    query = sa.select(*shared, *columns).where(
         markers.c.agency_id == agency_id,
         markers.c.family == family,
         within_box(box),
     )
-    if family != "cerpm":
+    if not with_retired:
         query = query.where(markers.c.status != "retired")
-    return list(connection.execute(query.limit(limit)).mappings())
+    make, count, labels = row_maker(MarkerRow), len(MarkerRow._fields), [column.name for column in columns]
+    found = connection.execute(query.limit(limit))
+    if not columns:
+        return list(map(make, found))
+    return [make(row[:count])._replace(spec=dict(zip(labels, row[count:], strict=True))) for row in found]

@@ -1,8 +1,8 @@
-"""Rows by the hundred thousand: past SQLAlchemy's compiler, by COPY on PostgreSQL, with the indexes filled afterwards.
+"""Bulk inserts: without SQLAlchemy's compiler, by COPY on PostgreSQL, and with indexes built after the rows.
 
-SQLite gets one prepared statement for hundreds of rows; what they have in common is bound once. A load that is large
-beside what a table holds drops indexes and the R*Tree's trigger for its transaction: keeping them up row by row costs
-more than making them anew.
+SQLite gets one prepared statement for hundreds of rows; values that all rows share are bound once. A load that is
+large compared with the table drops indexes and the R*Tree's trigger for its transaction: updating them row by row costs
+more than building them again.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from app.registry.rtree_pack import fill_rtree
 from app.registry.tenancy import seeing_every_agency
 
 LARGE = 50_000
-"""From as many rows on the indexes are made anew, if the table does not hold more than the rows that come."""
-_CACHE_KIB = 32 * 1024
-_AT_ONCE = 500
-_MOST_VALUES = 30_000
-"""SQLite takes 32 766 values a statement."""
+"""Number of rows from which on indexes are built afterwards, if the table does not hold more rows than are loaded.
+Chosen by hand."""
+_CACHE_KIB = 32 * 1024  # [KiB] SQLite's page cache during a large load; chosen by hand
+_ROWS_PER_STATEMENT = 500  # chosen by hand
+_MAX_VALUES = 30_000
+"""SQLite accepts 32 766 values in a statement (https://www.sqlite.org/limits.html, SQLITE_MAX_VARIABLE_NUMBER)."""
 _RTREE_TRIGGER = "markers_rtree_insert"
 
 
@@ -47,7 +48,7 @@ def load_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[Mapping
 
 
 def load_columns(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
-    """Insert rows given by column; JSON columns take values or `JsonTexts`, times are aware."""
+    """Insert rows that come by column; JSON columns take values or `JsonTexts`, times are aware."""
     if not columns.count:
         return
     same = {name: _stored(connection, table, name, [value])[0] for name, value in columns.same.items()}
@@ -65,7 +66,7 @@ def _stored(connection: sa.Connection, table: sa.Table, name: str, values: Seque
 
 
 def _load(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
-    """Insert values as the driver takes them; None in all rows is left to the table."""
+    """Insert values as the driver takes them; a column that is None in all rows gets the table's default."""
     same = {
         name: value
         for name, value in columns.same.items()
@@ -75,32 +76,32 @@ def _load(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
     if not own:
         name, value = same.popitem()
         own[name] = [value] * columns.count
-    said = Columns(columns.count, same, own)
+    columns_of_rows = Columns(columns.count, same, own)
     if connection.dialect.name == "postgresql":
-        _copy(connection, table, said)
+        _copy(connection, table, columns_of_rows)
     else:
-        _insert(connection, table, said)
+        _insert(connection, table, columns_of_rows)
 
 
 def _insert(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
     # keeps the schema's pages in memory: were one written now and again with the indexes at the end, SQLite would
     # compute the checksums of its whole log a second time (sqlite3WalFrames, iReCksum)
     connection.exec_driver_sql("SELECT count(*) FROM sqlite_schema").scalar_one()
-    at_once = min(_AT_ONCE, (_MOST_VALUES - len(columns.same)) // len(columns.own))
-    for start in range(0, columns.count, at_once):
-        part = [values[start : start + at_once] for values in columns.own.values()]
+    rows_per_statement = min(_ROWS_PER_STATEMENT, (_MAX_VALUES - len(columns.same)) // len(columns.own))
+    for start in range(0, columns.count, rows_per_statement):
+        part = [values[start : start + rows_per_statement] for values in columns.own.values()]
         statement = _insert_statement(table.name, tuple(columns.own), tuple(columns.same), len(part[0]))
         connection.exec_driver_sql(statement, (*chain.from_iterable(zip(*part, strict=True)), *columns.same.values()))
 
 
 @lru_cache(maxsize=16)
 def _insert_statement(table: str, own: tuple[str, ...], same: tuple[str, ...], rows: int) -> str:
-    """Rows of values of their own, then one of what they have in common."""
+    """An INSERT of rows with values of their own, followed once by the values that they share."""
     row = f"({_places(len(own))})"
     rest = f", {_places(len(same))}" if same else ""
     return (
-        f"WITH given AS (VALUES {', '.join([row] * rows)}) "
-        f"INSERT INTO {table} ({_listed((*own, *same))}) SELECT given.*{rest} FROM given"
+        f"WITH new_rows AS (VALUES {', '.join([row] * rows)}) "
+        f"INSERT INTO {table} ({_listed((*own, *same))}) SELECT new_rows.*{rest} FROM new_rows"
     )
 
 
@@ -110,53 +111,53 @@ def _places(count: int) -> str:
 
 @contextmanager
 def large_load(connection: sa.Connection, tables: Sequence[sa.Table], rows: int) -> Iterator[None]:
-    """Put off what indexes need until the block ends, where that is cheaper; in the transaction of the connection."""
+    """Build indexes when the block ends, if that is cheaper; in the transaction of the connection."""
     if rows < LARGE:
         yield
         return
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql(f"PRAGMA cache_size = -{_CACHE_KIB}")
-    put_off = _put_off_postgresql if connection.dialect.name == "postgresql" else _put_off_sqlite
+    postpone = _postpone_postgresql if connection.dialect.name == "postgresql" else _postpone_sqlite
     with seeing_every_agency(connection):  # the rows of others count too
-        again = [
+        rebuild = [
             step
             for table in tables
             if _count_up_to(connection, table, rows) <= rows
-            for step in put_off(connection, table)
+            for step in postpone(connection, table)
         ]
     try:
         yield
     finally:
         if connection.dialect.name == "sqlite":
             connection.exec_driver_sql("PRAGMA cache_size = -2000")
-    for step in again:
+    for step in rebuild:
         step()
 
 
-def _count_up_to(connection: sa.Connection, table: sa.Table, most: int) -> int:
-    query = sa.select(sa.literal(1)).select_from(table).limit(most + 1).subquery()
+def _count_up_to(connection: sa.Connection, table: sa.Table, limit: int) -> int:
+    query = sa.select(sa.literal(1)).select_from(table).limit(limit + 1).subquery()
     return int(connection.execute(sa.select(sa.func.count()).select_from(query)).scalar_one())
 
 
-def _put_off_sqlite(connection: sa.Connection, table: sa.Table) -> list[Callable[[], object]]:
-    """Drop the indexes by digits and the R*Tree's trigger; what makes them again.
+def _postpone_sqlite(connection: sa.Connection, table: sa.Table) -> list[Callable[[], object]]:
+    """Drop the indexes by digits and the R*Tree's trigger. Returns the steps that build them again.
 
-    The other indexes end in the rising id: keeping them up costs less than reading the table again.
+    The other indexes end in the rising id: updating them costs less than reading the table again.
     """
     query = "SELECT name, type, sql FROM sqlite_master WHERE tbl_name = ? AND sql IS NOT NULL AND type IN (?, ?)"
     found = connection.exec_driver_sql(query, (table.name, "index", "trigger")).all()
-    again: list[Callable[[], object]] = []
+    rebuild: list[Callable[[], object]] = []
     for name, kind, statement in found:
         if kind == "index" and "digits" in statement:
             connection.exec_driver_sql(f"DROP INDEX {name}")
         elif name == _RTREE_TRIGGER:
             connection.exec_driver_sql(f"DROP TRIGGER {name}")
             last = connection.exec_driver_sql(f"SELECT coalesce(max(row), 0) FROM {table.name}").scalar_one()
-            again.append(partial(_fill_rtree, connection, table.name, last))
+            rebuild.append(partial(_fill_rtree, connection, table.name, last))
         else:
             continue
-        again.append(partial(connection.exec_driver_sql, statement))
-    return again
+        rebuild.append(partial(connection.exec_driver_sql, statement))
+    return rebuild
 
 
 def _fill_rtree(connection: sa.Connection, table: str, last: int) -> None:
@@ -168,10 +169,10 @@ def _fill_rtree(connection: sa.Connection, table: str, last: int) -> None:
         fill_rtree(connection, table)
 
 
-def _put_off_postgresql(connection: sa.Connection, table: sa.Table) -> list[Callable[[], object]]:
-    """Drop the indexes and foreign keys of a table that is empty and ours; what makes them again.
+def _postpone_postgresql(connection: sa.Connection, table: sa.Table) -> list[Callable[[], object]]:
+    """Drop the indexes and foreign keys of an empty table that we own. Returns the steps that build them again.
 
-    Nobody waits for the lock: there is nothing to read in an empty table.
+    Nobody waits for the lock: an empty table has nothing to read.
     """
     owned = connection.exec_driver_sql(
         "SELECT pg_get_userbyid(relowner) = current_user FROM pg_class WHERE oid = to_regclass(%s)", (table.name,)
@@ -189,7 +190,7 @@ def _put_off_postgresql(connection: sa.Connection, table: sa.Table) -> list[Call
            WHERE conrelid = to_regclass(%s) AND contype = 'f'""",
         (table.name,),
     ).all()
-    # nobody sees the rows before they are committed, and then the policies bind the owner again
+    # no other session sees the rows before they are committed, and then the policies apply to the owner again
     connection.exec_driver_sql(f"ALTER TABLE {table.name} NO FORCE ROW LEVEL SECURITY")
     for name, _definition in keys:
         connection.exec_driver_sql(f"ALTER TABLE {table.name} DROP CONSTRAINT {name}")
@@ -212,7 +213,7 @@ def _copy(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
     try:
         with driver.cursor() as cursor, cursor.copy(statement) as copy:
             copy.write(_copy_text(columns))
-    except psycopg.Error as error:  # as SQLAlchemy names what goes wrong in its own statements
+    except psycopg.Error as error:  # the exception that SQLAlchemy raises for its own statements
         raise sa.exc.DBAPIError.instance(statement, None, error, psycopg.Error) from error
     if target != table.name:
         listed = _listed(names)
@@ -236,7 +237,7 @@ def _copy_value(value: Any) -> str:
 
 
 def _copied_into(connection: sa.Connection, table: sa.Table, names: Sequence[str]) -> str:
-    """The table itself, or one of this transaction where policies on rows bind us: COPY is refused there."""
+    """The table itself, or a temporary one if row level security applies to us: PostgreSQL then refuses COPY."""
     if not connection.exec_driver_sql("SELECT row_security_active(%s)", (table.name,)).scalar_one():
         return table.name
     target = f"{table.name}_copied"
@@ -256,5 +257,5 @@ def _json(value: Any) -> str | None:
 
 @lru_cache(maxsize=64)
 def _sqlite_time(value: datetime | None) -> str | None:
-    """As SQLAlchemy stores UTC times in SQLite."""
+    """A UTC time as SQLAlchemy stores it in SQLite."""
     return None if value is None else value.strftime("%Y-%m-%d %H:%M:%S.%f")

@@ -4,14 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
-from app.registry.markers import PUBLIC, Row
+from app.registry.marker_rows import MARKERS, MarkerRow
+from app.registry.rows import fetch_all, fetch_in, find_one, select_rows
 from app.registry.tables import agency_secrets, cerpm_spans, markers
 
 _CHUNK = 500
+
+
+class SpanRow(NamedTuple):
+    """Transmissions of a CERPM that one upload had; times are seconds since 1970-01-01 UTC, None without a clock."""
+
+    row: int
+    number: int
+    first_sequence: int
+    last_sequence: int
+    first_heard_s: float | None
+    last_heard_s: float | None
 
 
 def find_secret(connection: sa.Connection, agency_id: str) -> bytes | None:
@@ -25,12 +37,12 @@ def add_secret(connection: sa.Connection, agency_id: str, wrapped: bytes, now: d
     connection.execute(sa.insert(agency_secrets).values(agency_id=agency_id, wrapped=wrapped, created_at=now))
 
 
-def find_number(connection: sa.Connection, agency_id: str, number: int) -> Row | None:
+def find_number(connection: sa.Connection, agency_id: str, number: int) -> MarkerRow | None:
     """The agency's marker that carries, or once carried, this number."""
-    query = sa.select(*PUBLIC).where(
+    query = MARKERS.where(
         markers.c.agency_id == agency_id, markers.c.family == "cerpm", markers.c.digits == str(number)
     )
-    return connection.execute(query).mappings().one_or_none()
+    return find_one(connection, query, MarkerRow)
 
 
 def last_number(connection: sa.Connection, agency_id: str) -> int:
@@ -40,54 +52,53 @@ def last_number(connection: sa.Connection, agency_id: str) -> int:
     return int(connection.execute(query).scalar_one() or 0)
 
 
-def list_by_number(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, Row]:
+def list_by_number(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, MarkerRow]:
     """The agency's markers with these numbers, retired ones too."""
-    wanted = [str(number) for number in numbers]
-    query = sa.select(*PUBLIC).where(markers.c.agency_id == agency_id, markers.c.family == "cerpm")
-    found: dict[int, Row] = {}
-    for start in range(0, len(wanted), _CHUNK):
-        chunk = query.where(markers.c.digits.in_(wanted[start : start + _CHUNK]))
-        found.update({int(row["digits"]): row for row in connection.execute(chunk).mappings()})
-    return found
+    query = MARKERS.where(markers.c.agency_id == agency_id, markers.c.family == "cerpm")
+    found = fetch_in(connection, query, MarkerRow, markers.c.digits, map(str, numbers))
+    return {int(row.digits): row for row in found}
 
 
-def list_spans(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, list[Row]]:
+def list_spans(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, list[SpanRow]]:
     """What was heard of each of these markers before, in the order it was uploaded."""
-    wanted = list(numbers)
-    query = sa.select(cerpm_spans).where(cerpm_spans.c.agency_id == agency_id).order_by(cerpm_spans.c.row)
-    found: dict[int, list[Row]] = {}
-    for start in range(0, len(wanted), _CHUNK):
-        chunk = query.where(cerpm_spans.c.number.in_(wanted[start : start + _CHUNK]))
-        for row in connection.execute(chunk).mappings():
-            found.setdefault(row["number"], []).append(row)
+    query = select_rows(SpanRow, cerpm_spans).where(cerpm_spans.c.agency_id == agency_id).order_by(cerpm_spans.c.row)
+    found: dict[int, list[SpanRow]] = {}
+    for row in fetch_in(connection, query, SpanRow, cerpm_spans.c.number, numbers):
+        found.setdefault(row.number, []).append(row)
     return found
 
 
-def list_span_ends(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, Row]:
-    """First and last transmission of each of these markers that was ever heard, and when, by number.
+def newest_row(spans: Mapping[int, Sequence[SpanRow]]) -> int:
+    """Key of the span that was stored last; 0 without any."""
+    return max((span.row for of_marker in spans.values() for span in of_marker), default=0)
 
-    Rows have number, first_sequence, first_heard_s, last_sequence, last_heard_s; of markers that were heard.
+
+def list_span_ends(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, SpanRow]:
+    """From the first to the last transmission that was ever heard of each of these markers, by number.
+
+    Only of markers that were heard; `row` is that of the span that was stored last.
     """
     wanted, mine = list(numbers), cerpm_spans.c
     first, last = sa.func.min(mine.first_sequence), sa.func.max(mine.last_sequence)
-    found: dict[int, Row] = {}
+    found: dict[int, SpanRow] = {}
     for start in range(0, len(wanted), _CHUNK):
         chosen = (mine.agency_id == agency_id, mine.number.in_(wanted[start : start + _CHUNK]))
         ends = sa.select(mine.number, first.label("first"), last.label("last")).where(*chosen).group_by(mine.number)
         end = ends.subquery()
         query = (
             sa.select(
+                sa.func.max(mine.row),
                 mine.number,
-                end.c.first.label("first_sequence"),
-                end.c.last.label("last_sequence"),
-                _time_of(mine.first_sequence == end.c.first, mine.first_heard_s).label("first_heard_s"),
-                _time_of(mine.last_sequence == end.c.last, mine.last_heard_s).label("last_heard_s"),
+                end.c.first,
+                end.c.last,
+                _time_of(mine.first_sequence == end.c.first, mine.first_heard_s),
+                _time_of(mine.last_sequence == end.c.last, mine.last_heard_s),
             )
             .join(end, end.c.number == mine.number)
             .where(*chosen)
             .group_by(mine.number, end.c.first, end.c.last)
         )
-        found.update({row["number"]: row for row in connection.execute(query).mappings()})
+        found.update({row.number: row for row in fetch_all(connection, query, SpanRow)})
     return found
 
 
@@ -95,12 +106,6 @@ def _time_of(end: sa.ColumnElement[bool], heard_s: sa.ColumnElement[float]) -> s
     """When an end was heard first; null where one log that has it had no times."""
     untimed = sa.func.count(sa.case((sa.and_(end, heard_s.is_(None)), 1)))
     return sa.case((untimed > 0, None), else_=sa.func.min(sa.case((end, heard_s))))
-
-
-def last_span_row(connection: sa.Connection, agency_id: str) -> int:
-    """The row of the agency's newest span; a reader sees by it whether others were added since."""
-    query = sa.select(sa.func.max(cerpm_spans.c.row)).where(cerpm_spans.c.agency_id == agency_id)
-    return int(connection.execute(query).scalar_one() or 0)
 
 
 def add_spans(connection: sa.Connection, agency_id: str, decode_id: str, spans: Sequence[Mapping[str, Any]]) -> None:

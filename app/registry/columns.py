@@ -1,4 +1,4 @@
-"""Many rows by column: what all of them say is said once, and the JSON of a row is filled into one template."""
+"""Many rows by column: shared values are stored once, and the JSON of each row is made from one template."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Columns:
 
     @classmethod
     def of(cls, count: int, same: Mapping[str, Any], lists: Mapping[str, Sequence[Any]]) -> Columns:
-        """Columns of which some are given as lists, though their values may all be the same."""
+        """Columns from lists; a list whose values are all the same becomes one shared value."""
         alike = {name for name, values in lists.items() if not isinstance(values, JsonTexts) and _is_one_value(values)}
         return cls(
             count,
@@ -42,7 +42,7 @@ class Columns:
         )
 
     def but(self, **lists: Sequence[Any]) -> Columns:
-        """With other values in some columns."""
+        """A copy with other values in some columns."""
         return Columns.of(
             self.count,
             {name: value for name, value in self.same.items() if name not in lists},
@@ -109,6 +109,6 @@ def _text(value: Any) -> str:
 
 
 def _is_one_value(values: Sequence[Any]) -> bool:
-    """Whether there is but one value, of one type: 0 is not False."""
+    """Whether all values are equal and of one type: 0 is not False."""
     first = values[0] if values else None
     return bool(values) and list(values).count(first) == len(values) and len(set(map(type, values))) == 1

@@ -1,4 +1,4 @@
-"""Conditions on properties, as a filter expression says them, as SQL that both databases answer alike.
+"""Conditions on properties from filter expressions, as SQL with the same result on both databases.
 
 Values are bound parameters; which properties there are, and of which kind a value must be, whoever reads the expression
 has checked.
@@ -47,14 +47,14 @@ class Missing:
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """True or false, whatever the row."""
+    """True or false for every row."""
 
     value: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Not:
-    """The opposite, by SQL's logic: of what is unknown, unknown."""
+    """The negation, in SQL's three-valued logic: that of unknown is unknown."""
 
     condition: Condition
 
@@ -71,7 +71,7 @@ Condition = Compared | Missing | Constant | Not | Joined
 
 
 def condition_sql(condition: Condition, columns: dict[str, sa.ColumnElement[Any]]) -> sa.ColumnElement[bool]:
-    """The condition on these columns by their properties' names."""
+    """The condition as SQL on columns, by their properties' names."""
     match condition:
         case Constant(value):
             return sa.literal(1, sa.Integer) == sa.literal(int(value), sa.Integer)
@@ -131,7 +131,7 @@ def pinned_values(condition: Condition | None) -> dict[str, Value]:
 
 
 class _Bytewise(FunctionElement[str]):
-    """A text in the order of its code points, which is SQLite's; PostgreSQL's is that of the database's language."""
+    """A text in the order of code points, as SQLite sorts; PostgreSQL would sort by the database's language."""
 
     name = "waymark_bytewise"
     type = sa.String()
@@ -149,7 +149,7 @@ def _in_c(element: _Bytewise, compiler: SQLCompiler, **how: Any) -> str:
 
 
 class _Like(FunctionElement[bool]):
-    """A text like a pattern, upper case apart from lower: SQLite's LIKE takes them for the same, its GLOB does not."""
+    """LIKE that distinguishes upper and lower case: SQLite's LIKE does not, its GLOB does."""
 
     name = "waymark_like"
     type = sa.Boolean()
@@ -173,7 +173,7 @@ def _by_like(element: _Like, compiler: SQLCompiler, **how: Any) -> str:
 
 
 def _glob(like: str) -> str:
-    """A pattern of LIKE as one of GLOB."""
+    """A pattern of LIKE, converted to GLOB."""
 
     def part(match: re.Match[str]) -> str:
         text = match[0]
@@ -188,7 +188,7 @@ def _glob(like: str) -> str:
 def _pattern_parts(like: str) -> list[str | None]:
     """A pattern of LIKE by characters: None for any text, an empty one for any character."""
     return [
-        {"%": None, "_": ""}.get(part, part[-1])  # what is escaped is itself
+        {"%": None, "_": ""}.get(part, part[-1])  # an escaped character stands for itself
         for part in re.findall(r"\\.|.", like, flags=re.DOTALL)
     ]
 

@@ -81,11 +81,11 @@ class Database:
 
     @property
     def name(self) -> str:
-        """What to call the database in messages: its path, or its URL without the password."""
+        """Name of the database for messages: its path, or its URL without the password."""
         return str(self.path) if self.path is not None else self.url.set(query={}).render_as_string()
 
     def open(self) -> None:
-        """Take ownership of the file for this process, or see that the server can be used.
+        """Take ownership of the file for this process, or check that the server can be used.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class Database:
         self._lock_fd = _lock_file(self.path.with_name(self.path.name + ".lock"), self.path)
 
     def close(self) -> None:
-        """Close the connections and give the file up."""
+        """Close the connections and release the file."""
         self.engine.dispose()
         self._asking.dispose()
         if self._lock_fd is not None:
@@ -119,7 +119,7 @@ class Database:
             yield connection.execution_options(**isolation(self.url, write=False), **{LONG: long})
 
     def ask(self, question: Callable[[sa.Connection], Answer]) -> Answer:
-        """What a single reading statement answers; `read` is for more than one.
+        """The result of a single reading statement; `read` is for more than one.
 
         Parameters
         ----------
@@ -174,7 +174,7 @@ class Database:
                 command.upgrade(config, revision)
 
     def current_revision(self) -> str | None:
-        """The revision of the schema; None without one."""
+        """The revision of the schema; None if there is none."""
         with self.read() as connection:
             return MigrationContext.configure(connection).get_current_revision()
 
@@ -187,7 +187,7 @@ class Database:
             return False
 
     def list_warnings(self) -> list[str]:
-        """What an operator should know of a PostgreSQL server: the policies on rows do not bind, or cost too much."""
+        """Warnings for the operator of a PostgreSQL server: row level security does not apply, or searches are slow."""
         if self.path is not None:
             return []
         with self.engine.connect() as connection:
@@ -233,7 +233,7 @@ def alembic_config() -> Config:
 
 
 def head_revision() -> str | None:
-    """The newest revision that this code knows."""
+    """The newest revision of the migrations."""
     return ScriptDirectory.from_config(alembic_config()).get_current_head()
 
 

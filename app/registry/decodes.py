@@ -1,36 +1,98 @@
-"""Queries on decodes and the observations that they left."""
+"""Queries on decodes and the observations that they made.
+
+A decode that was answered while the caller waited is done. One that was queued has a job of the same id, whose row
+has its state, its progress and its error.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import NotFound
-from app.registry.tables import decodes, observations
+from app.registry.jobs import JobState
+from app.registry.rows import fetch_all, find_one
+from app.registry.tables import decodes, jobs, observations
 
-Row = sa.RowMapping
-UNFINISHED = ("queued", "running")
-IMPORT = "import"
-"""Kind of the jobs that are imports of surveys: they wait in the same queue, and nobody lists them as decodes."""
-_PUBLIC = [column for column in decodes.c if column.name not in ("agency_id", "holder_id")]
+
+class DecodeRow(NamedTuple):
+    """A decode with the state of its job.
+
+    Attributes
+    ----------
+    kind : str
+        Of the upload: frame, archive, trace or packets.
+    context : dict
+        What was declared of the upload.
+    upload_key, picture_key : str or None
+        Keys of the blobs of the upload and of the plot.
+    result : dict or None
+        None until the decode is done.
+    """
+
+    id: str
+    kind: str
+    context: dict[str, Any]
+    created_at: datetime
+    finished_at: datetime | None = None
+    upload_key: str | None = None
+    picture_key: str | None = None
+    result: dict[str, Any] | None = None
+    state: JobState = "queued"
+    progress: float = 0.0
+    attempts: int = 0
+    error: dict[str, str] | None = None
+
+
+class NewObservation(NamedTuple):
+    """What a decode observed of a marker.
+
+    Attributes
+    ----------
+    frame : int
+        Index of the frame in an archive; 0 for every other upload.
+    what : str
+        ``seen``, or what was wrong.
+    """
+
+    marker_id: str
+    frame: int
+    at: datetime
+    what: str
+    detail: dict[str, Any]
+
+
+_JOB_COLUMNS: dict[str, sa.ColumnElement[Any]] = {
+    "state": sa.func.coalesce(jobs.c.state, "done"),
+    "progress": sa.func.coalesce(jobs.c.progress, 1.0),
+    "attempts": sa.func.coalesce(jobs.c.attempts, 1),
+    "error": jobs.c.error,
+    "finished_at": sa.func.coalesce(jobs.c.finished_at, decodes.c.finished_at),
+}
+_COLUMNS = {
+    name: (_JOB_COLUMNS[name] if name in _JOB_COLUMNS else decodes.c[name]).label(name) for name in DecodeRow._fields
+}
+_WITH_JOB = decodes.outerjoin(jobs, jobs.c.id == decodes.c.id)
+_FULL = sa.select(*_COLUMNS.values()).select_from(_WITH_JOB)
+_WITHOUT_RESULT = sa.select(*{**_COLUMNS, "result": sa.null().label("result")}.values()).select_from(_WITH_JOB)
 _ADD_DECODE = sa.insert(decodes)  # built once: building a statement costs more than running it
 _ADD_OBSERVATIONS = {
     "sqlite": sqlite.insert(observations).on_conflict_do_nothing(),
     "postgresql": postgresql.insert(observations).on_conflict_do_nothing(),
 }
-_SHORT = [column for column in _PUBLIC if column.name != "result"]
 
 
-def add_decode(connection: sa.Connection, agency_id: str, holder_id: str, values: Mapping[str, Any]) -> None:
-    """Store a new decode, uploaded with somebody's key."""
+def add_decode(connection: sa.Connection, agency_id: str, holder_id: str | None, decode: DecodeRow) -> None:
+    """Store a new decode, uploaded with the key of a holder; the columns of its job are not stored here."""
+    values = {name: value for name, value in decode._asdict().items() if name in decodes.c}
     connection.execute(_ADD_DECODE, {**values, "agency_id": agency_id, "holder_id": holder_id})
 
 
-def get_decode(connection: sa.Connection, agency_id: str, decode_id: str, *, holder_id: str | None = None) -> Row:
+def get_decode(connection: sa.Connection, agency_id: str, decode_id: str, *, holder_id: str | None = None) -> DecodeRow:
     """One decode, of anybody in the agency or of one holder of a key.
 
     Raises
@@ -38,144 +100,44 @@ def get_decode(connection: sa.Connection, agency_id: str, decode_id: str, *, hol
     NotFound
         There is none with this id, or it belongs to another.
     """
-    query = sa.select(*_PUBLIC).where(
-        decodes.c.id == decode_id, decodes.c.agency_id == agency_id, decodes.c.kind != IMPORT
-    )
+    query = _FULL.where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
     if holder_id is not None:
         query = query.where(decodes.c.holder_id == holder_id)
-    row = connection.execute(query).mappings().one_or_none()
+    row = find_one(connection, query, DecodeRow)
     if row is None:
         raise NotFound(f"there is no decode {decode_id}", field="decode_id", cure="GET /v1/decodes lists yours")
     return row
 
 
-def get_import(connection: sa.Connection, agency_id: str, import_id: str) -> Row:
-    """One import of the agency that is or was a job.
-
-    Raises
-    ------
-    NotFound
-        There is none with this id, or it belongs to another.
-    """
-    query = sa.select(*_PUBLIC).where(
-        decodes.c.id == import_id, decodes.c.agency_id == agency_id, decodes.c.kind == IMPORT
-    )
-    row = connection.execute(query).mappings().one_or_none()
-    if row is None:
-        raise NotFound(f"there is no import {import_id}", field="import_id")
-    return row
-
-
 def list_decodes(
-    connection: sa.Connection,
-    agency_id: str,
-    *,
-    state: str | None,
-    before: str | None,
-    limit: int,
-    holder_id: str | None = None,
-) -> list[Row]:
+    connection: sa.Connection, agency_id: str,
+    *, state: str | None, before: str | None, limit: int, holder_id: str | None = None,
+) -> list[DecodeRow]:  # fmt: skip
     """Decodes without their results, newest first; of anybody in the agency or of one holder of a key."""
-    query = sa.select(*_SHORT).where(decodes.c.agency_id == agency_id, decodes.c.kind != IMPORT)
+    query = _WITHOUT_RESULT.where(decodes.c.agency_id == agency_id)
     if holder_id is not None:
         query = query.where(decodes.c.holder_id == holder_id)
-    if state is not None:
-        query = query.where(decodes.c.state == state)
+    if state == "done":
+        query = query.where(sa.or_(jobs.c.id.is_(None), jobs.c.state == state))
+    elif state is not None:  # of a decode with a job: an index of jobs finds the few that are not done
+        query = query.where(jobs.c.state == state, jobs.c.agency_id == agency_id, jobs.c.kind == "decode")
     if before is not None:
         query = query.where(decodes.c.id < before)
-    return list(connection.execute(query.order_by(decodes.c.id.desc()).limit(limit)).mappings())
+    return fetch_all(connection, query.order_by(decodes.c.id.desc()).limit(limit), DecodeRow)
 
 
-def list_imports(
-    connection: sa.Connection, agency_id: str, *, state: str | None, before: str | None, limit: int
-) -> list[Row]:
-    """Imports of the agency that are or were jobs, without their reports, newest first."""
-    query = sa.select(*_SHORT).where(decodes.c.agency_id == agency_id, decodes.c.kind == IMPORT)
-    if state is not None:
-        query = query.where(decodes.c.state == state)
-    if before is not None:
-        query = query.where(decodes.c.id < before)
-    return list(connection.execute(query.order_by(decodes.c.id.desc()).limit(limit)).mappings())
+def store_result(
+    connection: sa.Connection, agency_id: str, decode_id: str,
+    *, result: Mapping[str, Any], picture_key: str | None, now: datetime,
+) -> None:  # fmt: skip
+    """Store the result of a decode that was queued, in the transaction that finishes its job."""
+    own = sa.update(decodes).where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
+    connection.execute(own.values(result=result, picture_key=picture_key, finished_at=now))
 
 
-def list_unfinished(connection: sa.Connection) -> list[str]:
-    """Ids of the decodes of all agencies that are still to be done, oldest first."""
-    query = sa.select(decodes.c.id).where(decodes.c.state.in_(UNFINISHED)).order_by(decodes.c.id)
-    return list(connection.execute(query).scalars())
-
-
-def start_decode(connection: sa.Connection, decode_id: str) -> Row | None:
-    """Take a job that is queued, or that an earlier process left running; None if it is finished or gone."""
-    statement = (
-        sa.update(decodes)
-        .where(decodes.c.id == decode_id, decodes.c.state.in_(UNFINISHED))
-        .values(state="running", attempts=decodes.c.attempts + 1)
-    )
-    if connection.execute(statement).rowcount != 1:
-        return None
-    return connection.execute(sa.select(decodes).where(decodes.c.id == decode_id)).mappings().one()
-
-
-def record_progress(connection: sa.Connection, decode_id: str, progress: float) -> bool:
-    """Note how far a job is; returns whether it shall stop."""
-    connection.execute(
-        sa.update(decodes).where(decodes.c.id == decode_id, decodes.c.state == "running").values(progress=progress)
-    )
-    query = sa.select(decodes.c.cancel_requested).where(decodes.c.id == decode_id)
-    return bool(connection.execute(query).scalar_one_or_none() in (True, None))
-
-
-def request_cancel(connection: sa.Connection, agency_id: str, decode_id: str, now: datetime) -> None:
-    """Ask a job to stop; one that waits is cancelled at once, one that is finished stays as it is."""
-    own = (decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
-    connection.execute(
-        sa.update(decodes)
-        .where(*own, decodes.c.state == "queued")
-        .values(state="cancelled", cancel_requested=True, finished_at=now)
-    )
-    connection.execute(sa.update(decodes).where(*own, decodes.c.state == "running").values(cancel_requested=True))
-
-
-def begin_step(connection: sa.Connection, decode_id: str, progress: float) -> bool:
-    """Note how far a running job is, unless somebody asked it to stop; returns whether it goes on."""
-    statement = sa.update(decodes).where(
-        decodes.c.id == decode_id, decodes.c.state == "running", decodes.c.cancel_requested.is_(False)
-    )
-    return connection.execute(statement.values(progress=progress)).rowcount == 1
-
-
-def request_cancel_before(
-    connection: sa.Connection, agency_id: str, decode_id: str, now: datetime, *, progress: float
-) -> bool:
-    """Ask a job to stop that is not so far yet; one that waits is cancelled at once. Returns whether it will stop."""
-    own = (decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
-    waiting = sa.update(decodes).where(*own, decodes.c.state == "queued")
-    stopped = waiting.values(state="cancelled", cancel_requested=True, finished_at=now)
-    if connection.execute(stopped).rowcount == 1:
-        return True
-    running = sa.update(decodes).where(*own, decodes.c.state == "running", decodes.c.progress < progress)
-    return connection.execute(running.values(cancel_requested=True)).rowcount == 1
-
-
-def finish_decode(connection: sa.Connection, decode_id: str, values: Mapping[str, Any]) -> bool:
-    """Write a job's outcome, unless it has one already."""
-    statement = sa.update(decodes).where(decodes.c.id == decode_id, decodes.c.state.in_(UNFINISHED)).values(**values)
-    return connection.execute(statement).rowcount == 1
-
-
-def add_observations(connection: sa.Connection, agency_id: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Store what was seen of markers; a row that is there already stays."""
+def add_observations(connection: sa.Connection, agency_id: str, decode_id: str, rows: Sequence[NewObservation]) -> None:
+    """Store what a decode observed of markers; a row that is there already stays."""
     if not rows:
         return
-    statement = _ADD_OBSERVATIONS[connection.dialect.name]
-    connection.execute(statement, [{**row, "agency_id": agency_id} for row in rows])
-
-
-def list_observations(connection: sa.Connection, agency_id: str, decode_id: str) -> list[Row]:
-    """What a decode saw of the registry's markers."""
-    query = (
-        sa.select(observations)
-        .where(observations.c.decode_id == decode_id, observations.c.agency_id == agency_id)
-        .order_by(observations.c.frame, observations.c.marker_id)
-    )
-    return list(connection.execute(query).mappings())
+    same = {"agency_id": agency_id, "decode_id": decode_id}
+    connection.execute(_ADD_OBSERVATIONS[connection.dialect.name], [{**row._asdict(), **same} for row in rows])

@@ -1,4 +1,4 @@
-"""Engines of the two databases: connections, their settings, and which failures mean "try again later"."""
+"""Engines of the two databases: connections, their settings, and the failures after which a request can be repeated."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _SESSION = {
     "plan_cache_mode": "force_custom_plan",  # a plan for any box reads the whole agency for a small one
 }
 _PAGE_BYTES = 16_384
-"""Of a new SQLite file. Rows have 2 kB; and looking a page up takes time with the pages of a log, which has all of an
-import in it."""
+"""Page size of a new SQLite file. [byte] Rows have 2 kB, and finding a page takes longer the more pages the log holds,
+which contains the whole of an import. No figure was kept; `python -m benchmarks.imports` measures it."""
 _CANNOT_BE_REACHED = "the database cannot be reached"
 
 
@@ -48,7 +48,7 @@ def sqlite_engine(url: sa.URL) -> sa.Engine:
 
 
 def sqlite_asking_engine(url: sa.URL) -> sa.Engine:
-    """Engine of a SQLite file for single statements: each is a transaction by itself."""
+    """Engine of a SQLite file for single statements, each in its own transaction."""
     return _sqlite_engine(url, "query_only = ON", pool_reset_on_return=None)
 
 
@@ -74,7 +74,7 @@ def _sqlite_engine(url: sa.URL, *pragmas: str, **options: Any) -> sa.Engine:
 
 
 class _BinaryCursor(psycopg.Cursor[Any]):
-    """A cursor that numbers and times come through as they are, not as text."""
+    """A cursor that returns numbers and times in binary, not as text."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -82,7 +82,7 @@ class _BinaryCursor(psycopg.Cursor[Any]):
 
 
 def postgres_asking_engine(url: sa.URL) -> sa.Engine:
-    """Engine of a PostgreSQL database for single statements: nothing is sent but these.
+    """Engine of a PostgreSQL database for single statements, without BEGIN, ROLLBACK or a ping.
 
     A statement sees one snapshot by itself. Before it a ping, a BEGIN and after it a ROLLBACK cost more than it does.
     """
@@ -112,7 +112,7 @@ def _connect_args(url: sa.URL) -> dict[str, Any]:
 
 
 def postgres_engine(url: sa.URL) -> sa.Engine:
-    """Engine of a PostgreSQL database: reads see one snapshot and cannot write; writes come one after another."""
+    """Engine of a PostgreSQL database: a read sees one snapshot and cannot write; writes run one after another."""
     engine = sa.create_engine(
         url,
         connect_args=_connect_args(url),
@@ -148,7 +148,7 @@ def isolation(url: sa.URL, *, write: bool) -> dict[str, Any]:
 
 @contextmanager
 def busy_is_unavailable() -> Iterator[None]:
-    """Failures of a database that works again later, as `Unavailable`."""
+    """Raise temporary failures of the database as `Unavailable`."""
     try:
         yield
     except sa.exc.TimeoutError as error:

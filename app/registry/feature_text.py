@@ -1,59 +1,37 @@
 """A marker's GeoJSON feature, as the row keeps it beside its columns: pages are read a thousand times a second, and
 putting a hundred features together for each takes longer than all the rest (decision 0013).
 
-Whatever writes a marker writes this with it. A property that is added here needs a migration that writes all texts
-anew.
+Whatever writes a marker writes this with it. A property that is added to `FIELDS` needs a migration that writes all
+texts anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from functools import lru_cache
-from operator import itemgetter
+from operator import attrgetter
 from typing import Any
 
 import orjson
 
 from app.registry.columns import Columns, JsonTexts, json_objects, json_texts
+from app.registry.features import FIELDS
+from app.registry.marker_rows import MarkerRow
 
-PROPERTIES = {
-    "family": "family",
-    "status": "status",
-    "scheme": "scheme",
-    "code": "digits",
-    "heading_deg": "heading_deg",
-    "heading_rmse_deg": "heading_rmse_deg",
-    "side": "spec",
-    "road": "road",
-    "measure_m": "measure_m",
-    "offset_m": "offset_m",
-    "realization": "realization",
-    "epoch": "epoch",
-    "vertical_datum": "vertical_datum",
-    "horizontal_rmse_m": "horizontal_rmse_m",
-    "vertical_rmse_m": "vertical_rmse_m",
-    "survey_method": "survey_method",
-    "check_points": "check_points",
-    "surveyor": "surveyor",
-    "instrument": "instrument",
-    "transform_accuracy_m": "transform_accuracy_m",
-    "localization_grade": "localization_grade",
-    "version": "version",
-    "updated_at": "updated_at",
-}
+PROPERTIES = {field.name: field.column.key or "spec" for field in FIELDS}
 """Properties in their order, and the columns that they come from; of `spec` a CERPM's side."""
-_pick = itemgetter(*PROPERTIES.values())
+_pick = attrgetter(*PROPERTIES.values())
 
 
-def feature_text(marker: Mapping[str, Any]) -> str:
-    """The feature of a marker with all its columns: WGS 84 longitude and latitude, height if there is one; one line."""
-    lon_deg, lat_deg, height_m = marker["lon_deg"], marker["lat_deg"], marker["height_m"]
+def feature_text(marker: MarkerRow) -> str:
+    """The feature of a marker: WGS 84 longitude and latitude, height if there is one; one line."""
+    lon_deg, lat_deg, height_m = marker.lon_deg, marker.lat_deg, marker.height_m
     properties = dict(zip(PROPERTIES, _pick(marker), strict=True))
-    properties["side"] = _side(marker["spec"]) if marker["family"] == "cerpm" else None
+    properties["side"] = _side(marker.spec) if marker.family == "cerpm" else None
     feature = {
         "type": "Feature",
-        "id": marker["id"],
+        "id": marker.id,
         "geometry": {
             "type": "Point",
             "coordinates": (lon_deg, lat_deg) if height_m is None else (lon_deg, lat_deg, height_m),

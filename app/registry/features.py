@@ -39,7 +39,7 @@ FIELDS = (
     Field("code", "string", _C.digits, "Digits of a plate, text of a tag, number of a CERPM"),
     Field("heading_deg", "number", _C.heading_deg, "Direction of travel, clockwise from true north [deg]"),
     Field("heading_rmse_deg", "number", _C.heading_rmse_deg, "Accuracy of the heading [deg]"),
-    Field("side", "string", _side, "Side of the lane that a CERPM says it is on"),
+    Field("side", "string", _side, "Side of the lane that a CERPM is on"),
     Field("road", "string", _C.road, "Road's name or number"),
     Field("measure_m", "number", _C.measure_m, "Chainage along the road [m]"),
     Field("offset_m", "number", _C.offset_m, "Offset from the road's axis, left positive [m]"),
@@ -71,7 +71,7 @@ class FeatureFilter:
         Markers that are out of use, instead of all others.
     box : Box or None
     heights_m : tuple of float or None
-        Least and greatest height; markers without one are in. [m]
+        Lowest and highest height; markers without a height are included. [m]
     since, until : datetime or None
         Bounds of the last change, both inclusive.
     equal : tuple of (name, value)
@@ -119,24 +119,24 @@ class Extent:
 def list_features(
     connection: sa.Connection,
     agency_id: str,
-    narrowed: FeatureFilter,
+    filtered: FeatureFilter,
     *,
     after: str | None,
     limit: int,
     counted: bool = False,
 ) -> tuple[list[str], int | None]:
     """Features as `feature_text` writes them, in the order of their ids, and how many match if they are counted."""
-    values = _values(agency_id, narrowed)
+    values = _values(agency_id, filtered)
     if after is not None:
         values["after"] = after
-    statement = _page(_shape(narrowed, after is not None), counted)
+    statement = _page(_shape(filtered, after is not None), counted)
     text, matched = connection.execute(statement, {**values, "most": limit}).one()
     return text.split("\n") if text else [], matched
 
 
-def count_features(connection: sa.Connection, agency_id: str, narrowed: FeatureFilter) -> int:
+def count_features(connection: sa.Connection, agency_id: str, filtered: FeatureFilter) -> int:
     """How many markers a filter leaves."""
-    return int(connection.execute(_count(_shape(narrowed, False)), _values(agency_id, narrowed)).scalar_one())
+    return int(connection.execute(_count(_shape(filtered, False)), _values(agency_id, filtered)).scalar_one())
 
 
 def find_feature(connection: sa.Connection, agency_id: str, marker_id: str, *, retired: bool) -> str | None:
@@ -149,35 +149,37 @@ def find_extent(connection: sa.Connection, agency_id: str, *, retired: bool) -> 
     row = connection.execute(_extent(retired), {"agency": agency_id}).one()
     if not row.total:
         return None
-    same = row.epochs == row.total and row.least == row.greatest
-    return Extent(row.total, row.west, row.south, row.east, row.north, row.first, row.last, row.least if same else None)
+    same = row.epochs == row.total and row.min_epoch == row.max_epoch
+    return Extent(
+        row.total, row.west, row.south, row.east, row.north, row.first, row.last, row.min_epoch if same else None
+    )
 
 
-def _shape(narrowed: FeatureFilter, after: bool) -> _Shape:
-    parts = narrowed.box.parts if narrowed.box is not None else ()
+def _shape(filtered: FeatureFilter, after: bool) -> _Shape:
+    parts = filtered.box.parts if filtered.box is not None else ()
     return _Shape(
-        narrowed.retired,
+        filtered.retired,
         tuple((p.east_deg - p.west_deg) * (p.north_deg - p.south_deg) >= _WIDE_DEG2 for p in parts),
-        narrowed.heights_m is not None,
-        narrowed.since is not None,
-        narrowed.until is not None,
-        tuple(name for name, _ in narrowed.equal),
-        narrowed.where,
+        filtered.heights_m is not None,
+        filtered.since is not None,
+        filtered.until is not None,
+        tuple(name for name, _ in filtered.equal),
+        filtered.where,
         after,
     )
 
 
-def _values(agency_id: str, narrowed: FeatureFilter) -> dict[str, Any]:
+def _values(agency_id: str, filtered: FeatureFilter) -> dict[str, Any]:
     values: dict[str, Any] = {"agency": agency_id, "retired": "retired"}
-    for k, box in enumerate(narrowed.box.parts if narrowed.box is not None else ()):
+    for k, box in enumerate(filtered.box.parts if filtered.box is not None else ()):
         values |= {f"w{k}": box.west_deg, f"s{k}": box.south_deg, f"e{k}": box.east_deg, f"n{k}": box.north_deg}
-    if narrowed.heights_m is not None:
-        values["low"], values["high"] = narrowed.heights_m
-    if narrowed.since is not None:
-        values["since"] = narrowed.since
-    if narrowed.until is not None:
-        values["until"] = narrowed.until
-    for k, (_, value) in enumerate(narrowed.equal):
+    if filtered.heights_m is not None:
+        values["low"], values["high"] = filtered.heights_m
+    if filtered.since is not None:
+        values["since"] = filtered.since
+    if filtered.until is not None:
+        values["until"] = filtered.until
+    for k, (_, value) in enumerate(filtered.equal):
         values[f"v{k}"] = value
     return values
 
@@ -251,7 +253,7 @@ def _extent(retired: bool) -> sa.Select[Any]:
         "first": sa.func.min(_C.updated_at),
         "last": sa.func.max(_C.updated_at),
         "epochs": sa.func.count(_C.epoch),
-        "least": sa.func.min(_C.epoch),
-        "greatest": sa.func.max(_C.epoch),
+        "min_epoch": sa.func.min(_C.epoch),
+        "max_epoch": sa.func.max(_C.epoch),
     }
     return sa.select(*(figure.label(name) for name, figure in figures.items())).where(*owned(retired))

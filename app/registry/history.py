@@ -4,28 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import datetime
-from typing import Any
 
 import sqlalchemy as sa
 
 from app.errors import NotFound
-from app.registry.audit import Row
-from app.registry.markers import PUBLIC, MarkerFilter, conditions_of
+from app.registry.marker_rows import MARKERS, MarkerRow, VersionRow
+from app.registry.markers import MarkerFilter, conditions_of
+from app.registry.rows import fetch_all, row_of, select_rows
 from app.registry.spatial import covers, distance_m
 from app.registry.tables import marker_versions, markers
 
-MOST_REBUILT = 20_000
+MAX_REBUILT = 20_000
 """Markers that changed since are read one by one from their versions: a page looks at no more of them."""
 _CHUNK = 500
-_UNKNOWN = dict.fromkeys(column.name for column in PUBLIC)
 
 
-def marker_of(version: Row) -> dict[str, Any]:
-    """The marker as a version has it; columns that there were not yet are null."""
-    return {**_UNKNOWN, **version["marker"]}
+def list_versions(
+    connection: sa.Connection, agency_id: str, marker_id: str, *, after: int = 0, limit: int = 100
+) -> list[VersionRow]:
+    """The history of a marker, oldest first."""
+    v = marker_versions.c
+    query = select_rows(VersionRow, marker_versions).where(
+        v.marker_id == marker_id, v.agency_id == agency_id, v.version > after
+    )
+    rows = fetch_all(connection, query.order_by(v.version).limit(limit), VersionRow)
+    return [row._replace(marker=row_of(MarkerRow, row.marker)) for row in rows]
 
 
-def get_version(connection: sa.Connection, agency_id: str, marker_id: str, version: int) -> Row:
+def get_version(connection: sa.Connection, agency_id: str, marker_id: str, version: int) -> VersionRow:
     """One version of a marker.
 
     Raises
@@ -33,64 +39,59 @@ def get_version(connection: sa.Connection, agency_id: str, marker_id: str, versi
     NotFound
         There is none, or it belongs to another agency.
     """
-    v = marker_versions.c
-    query = sa.select(marker_versions).where(v.marker_id == marker_id, v.agency_id == agency_id, v.version == version)
-    row = connection.execute(query).mappings().one_or_none()
-    if row is None:
+    row = next(iter(list_versions(connection, agency_id, marker_id, after=version - 1, limit=1)), None)
+    if row is None or row.version != version:
         raise NotFound(f"there is no version {version} of a marker {marker_id}", field="version")
     return row
 
 
 def list_as_of(
-    connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, at: datetime, *, after: str | None, limit: int
-) -> tuple[list[dict[str, Any]], str | None]:
+    connection: sa.Connection, agency_id: str, filtered: MarkerFilter, at: datetime, *, after: str | None, limit: int
+) -> tuple[list[MarkerRow], str | None]:
     """Markers as they were at a time, in the order of their ids, and the id to continue after if there may be more.
 
     What did not change since is searched as it is; the others are rebuilt from their versions and then filtered. A page
     that meets too many of these is short.
     """
-    query = sa.select(*PUBLIC).where(
-        markers.c.agency_id == agency_id, *conditions_of(narrowed), markers.c.updated_at <= at
-    )
+    query = MARKERS.where(markers.c.agency_id == agency_id, *conditions_of(filtered), markers.c.updated_at <= at)
     if after is not None:
         query = query.where(markers.c.id > after)
-    rows = connection.execute(query.order_by(markers.c.id).limit(limit + 1)).mappings()
-    found = [{name: row[name] for name in _UNKNOWN} for row in rows]
-    upto = found[-1]["id"] if len(found) > limit else None
-    rebuilt, reached = _rebuilt(connection, agency_id, narrowed, at, after=after, upto=upto, limit=limit)
-    merged = sorted([*found, *rebuilt], key=lambda marker: str(marker["id"]))
+    found = fetch_all(connection, query.order_by(markers.c.id).limit(limit + 1), MarkerRow)
+    upto = found[-1].id if len(found) > limit else None
+    rebuilt, reached = _rebuilt(connection, agency_id, filtered, at, after=after, upto=upto, limit=limit)
+    merged = sorted([*found, *rebuilt], key=lambda marker: marker.id)
     if reached is not None:
-        merged = [marker for marker in merged if marker["id"] <= reached]
+        merged = [marker for marker in merged if marker.id <= reached]
     page = merged[:limit]
     if len(merged) > limit:
-        return page, page[-1]["id"]
+        return page, page[-1].id
     return page, reached
 
 
 def _rebuilt(
     connection: sa.Connection,
     agency_id: str,
-    narrowed: MarkerFilter,
+    filtered: MarkerFilter,
     at: datetime,
     *,
     after: str | None,
     upto: str | None,
     limit: int,
-) -> tuple[list[dict[str, Any]], str | None]:
+) -> tuple[list[MarkerRow], str | None]:
     """Markers that changed since and match, and the id that was reached if there are more to look at."""
-    found: list[dict[str, Any]] = []
+    found: list[MarkerRow] = []
     seen = 0
     last = after
     while True:
         ids = _changed_since(connection, agency_id, at, after=last, upto=upto)
         for marker in _states(connection, ids, at):
-            if _matches(marker, narrowed):
+            if _matches(marker, filtered):
                 found.append(marker)
         seen += len(ids)
         if len(ids) < _CHUNK:
             return found, None
         last = ids[-1]
-        if len(found) > limit or seen >= MOST_REBUILT:
+        if len(found) > limit or seen >= MAX_REBUILT:
             return found, last
 
 
@@ -107,33 +108,33 @@ def _changed_since(
     return list(connection.execute(query.order_by(markers.c.id).limit(_CHUNK)).scalars())
 
 
-def _states(connection: sa.Connection, marker_ids: list[str], at: datetime) -> Iterator[dict[str, Any]]:
+def _states(connection: sa.Connection, marker_ids: list[str], at: datetime) -> Iterator[MarkerRow]:
     """Each marker by its last version that is not younger."""
     if not marker_ids:
         return
     v, w = marker_versions, marker_versions.alias()
     newest = sa.select(sa.func.max(w.c.version)).where(w.c.marker_id == v.c.marker_id, w.c.at <= at).scalar_subquery()
-    query = sa.select(v).where(v.c.marker_id.in_(marker_ids), v.c.version == newest)
-    for row in connection.execute(query).mappings():
-        yield marker_of(row)
+    query = sa.select(v.c.marker).where(v.c.marker_id.in_(marker_ids), v.c.version == newest)
+    for marker in connection.execute(query).scalars():
+        yield row_of(MarkerRow, marker)
 
 
-def _matches(marker: dict[str, Any], narrowed: MarkerFilter) -> bool:
+def _matches(marker: MarkerRow, filtered: MarkerFilter) -> bool:
     """As the conditions of a query, on a marker that was rebuilt."""
-    lon_deg, lat_deg, measure_m = marker["lon_deg"], marker["lat_deg"], marker["measure_m"]
-    box, near = narrowed.box, narrowed.near
+    lon_deg, lat_deg, measure_m = marker.lon_deg, marker.lat_deg, marker.measure_m
+    box, near = filtered.box, filtered.near
     if box is not None and not any(
         part.west_deg <= lon_deg <= part.east_deg and part.south_deg <= lat_deg <= part.north_deg for part in box.parts
     ):
         return False
     if near is not None and distance_m(near[0], near[1], lon_deg, lat_deg) > near[2]:
         return False
-    if narrowed.area is not None and not covers(narrowed.area, lon_deg, lat_deg):
+    if filtered.area is not None and not covers(filtered.area, lon_deg, lat_deg):
         return False
     for name in ("digits", "status", "family", "road"):
-        wanted = getattr(narrowed, name)
-        if wanted is not None and marker[name] != wanted:
+        wanted = getattr(filtered, name)
+        if wanted is not None and getattr(marker, name) != wanted:
             return False
-    if narrowed.from_m is not None and (measure_m is None or measure_m < narrowed.from_m):
+    if filtered.from_m is not None and (measure_m is None or measure_m < filtered.from_m):
         return False
-    return narrowed.to_m is None or (measure_m is not None and measure_m <= narrowed.to_m)
+    return filtered.to_m is None or (measure_m is not None and measure_m <= filtered.to_m)

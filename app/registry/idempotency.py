@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.registry.rows import find_one, select_rows
 from app.registry.tables import idempotency_keys
 
 
-def find_answer(connection: sa.Connection, agency_id: str, key: str, now: datetime) -> sa.RowMapping | None:
+class ResponseRow(NamedTuple):
+    """An answer, and the hash of the request that it was given to."""
+
+    request_sha256: str
+    response: Any
+
+
+def find_response(connection: sa.Connection, agency_id: str, key: str, now: datetime) -> ResponseRow | None:
     """The answer that was given under this key, unless it has expired."""
-    query = sa.select(idempotency_keys).where(
+    query = select_rows(ResponseRow, idempotency_keys).where(
         idempotency_keys.c.agency_id == agency_id,
         idempotency_keys.c.key == key,
         idempotency_keys.c.expires_at > now,
     )
-    return connection.execute(query).mappings().one_or_none()
+    return find_one(connection, query, ResponseRow)
 
 
-def add_answer(
+def add_response(
     connection: sa.Connection,
     agency_id: str,
     key: str,

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.registry.rows import fetch_all, select_rows
 from app.registry.spatial import Box, within_box
 from app.registry.tables import magnets, markers
 from app.registry.tenancy import seeing_every_agency
 
-Row = sa.RowMapping
+
+class MagnetRow(NamedTuple):
+    """Where a magnet of a marker lies."""
+
+    row: int
+    marker_id: str
+    number: int
+    agency_id: str
+    lon_deg: float
+    lat_deg: float
+    phi_deg: int
 
 
 def replace_magnets(
@@ -24,14 +35,14 @@ def replace_magnets(
     connection.execute(sa.insert(magnets), [{"marker_id": marker_id, "agency_id": agency_id, **hole} for hole in holes])
 
 
-def list_magnets_in(connection: sa.Connection, box: Box, *, ignoring: str | None = None) -> list[Row]:
+def list_magnets_in(connection: sa.Connection, box: Box, *, ignoring: str | None = None) -> list[MagnetRow]:
     """Magnets of any agency inside a box that may be in the road, but for those of one marker."""
     query = (
-        sa.select(magnets)
+        select_rows(MagnetRow, magnets)
         .join(markers, markers.c.id == magnets.c.marker_id)
         .where(within_box(box, magnets), markers.c.status != "retired")
     )
     if ignoring is not None:
         query = query.where(magnets.c.marker_id != ignoring)
     with seeing_every_agency(connection):
-        return list(connection.execute(query).mappings())
+        return fetch_all(connection, query, MagnetRow)

@@ -1,4 +1,4 @@
-"""Queries on markers and their history. All but `find_code_near` see one agency only."""
+"""Queries on markers. All but `find_code_near` see one agency only."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import sqlalchemy as sa
 from app.errors import NotFound, StaleVersion
 from app.registry.audit import AuditEntry, add_versions
 from app.registry.feature_text import feature_text
+from app.registry.marker_rows import MARKERS, CodeRow, MarkerRow
+from app.registry.rows import fetch_all, fetch_in, find_one, row_of, select_rows
 from app.registry.spatial import (
     Area,
     Box,
@@ -22,17 +24,13 @@ from app.registry.spatial import (
     within_box,
     within_radius,
 )
-from app.registry.tables import marker_versions, markers
+from app.registry.tables import markers
 from app.registry.tenancy import seeing_every_agency
-
-Row = sa.RowMapping
-PUBLIC = [column for column in markers.c if column.name not in ("row", "agency_id", "feature")]
-_UNKNOWN = dict.fromkeys(column.name for column in PUBLIC)
 
 
 @dataclass(frozen=True, slots=True)
 class MarkerFilter:
-    """What a list of markers is narrowed to; None does not narrow."""
+    """What a list of markers is filtered to; None does not narrow."""
 
     box: Box | None = None
     near: tuple[float, float, float] | None = None
@@ -45,7 +43,7 @@ class MarkerFilter:
     to_m: float | None = None
 
 
-def get_marker(connection: sa.Connection, agency_id: str, marker_id: str) -> Row:
+def get_marker(connection: sa.Connection, agency_id: str, marker_id: str) -> MarkerRow:
     """One marker.
 
     Raises
@@ -53,14 +51,14 @@ def get_marker(connection: sa.Connection, agency_id: str, marker_id: str) -> Row
     NotFound
         There is none with this id, or it belongs to another agency.
     """
-    query = sa.select(*PUBLIC).where(markers.c.id == marker_id, markers.c.agency_id == agency_id)
-    row = connection.execute(query).mappings().one_or_none()
+    query = MARKERS.where(markers.c.id == marker_id, markers.c.agency_id == agency_id)
+    row = find_one(connection, query, MarkerRow)
     if row is None:
         raise NotFound(f"there is no marker {marker_id}", field="marker_id")
     return row
 
 
-def get_markers(connection: sa.Connection, agency_id: str, marker_ids: list[str]) -> list[Row]:
+def get_markers(connection: sa.Connection, agency_id: str, marker_ids: list[str]) -> list[MarkerRow]:
     """Several markers, in the order asked for.
 
     Raises
@@ -68,11 +66,8 @@ def get_markers(connection: sa.Connection, agency_id: str, marker_ids: list[str]
     NotFound
         One is missing, or belongs to another agency.
     """
-    query = sa.select(*PUBLIC).where(markers.c.agency_id == agency_id)
-    found: dict[str, Row] = {}
-    for start in range(0, len(marker_ids), 500):
-        chunk = query.where(markers.c.id.in_(marker_ids[start : start + 500]))
-        found.update({row["id"]: row for row in connection.execute(chunk).mappings()})
+    query = MARKERS.where(markers.c.agency_id == agency_id)
+    found = {row.id: row for row in fetch_in(connection, query, MarkerRow, markers.c.id, marker_ids)}
     missing = next((marker_id for marker_id in marker_ids if marker_id not in found), None)
     if missing is not None:
         raise NotFound(f"there is no marker {missing}", field="marker_ids")
@@ -80,63 +75,69 @@ def get_markers(connection: sa.Connection, agency_id: str, marker_ids: list[str]
 
 
 def list_markers(
-    connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, *, after: str | None, limit: int
-) -> list[Row]:
+    connection: sa.Connection, agency_id: str, filtered: MarkerFilter, *, after: str | None, limit: int
+) -> list[MarkerRow]:
     """Markers in the order of their ids, which is the order they were registered in."""
-    query = sa.select(*PUBLIC).where(markers.c.agency_id == agency_id, *conditions_of(narrowed))
+    query = MARKERS.where(markers.c.agency_id == agency_id, *conditions_of(filtered))
     if after is not None:
         query = query.where(markers.c.id > after)
-    return list(connection.execute(query.order_by(markers.c.id).limit(limit)).mappings())
+    return fetch_all(connection, query.order_by(markers.c.id).limit(limit), MarkerRow)
 
 
-def conditions_of(narrowed: MarkerFilter) -> list[sa.ColumnElement[bool]]:
+def conditions_of(filtered: MarkerFilter) -> list[sa.ColumnElement[bool]]:
     """What a filter asks of a row."""
     conditions = []
-    if narrowed.box is not None:
-        conditions.append(within_box(narrowed.box))
-    if narrowed.near is not None:
-        conditions.append(within_radius(*narrowed.near))
-    if narrowed.digits is not None:
-        conditions.append(markers.c.digits == narrowed.digits)
-    if narrowed.status is not None:
-        conditions.append(markers.c.status == narrowed.status)
-    if narrowed.family is not None:
-        conditions.append(markers.c.family == narrowed.family)
-    if narrowed.area is not None:
-        conditions.append(within_area(narrowed.area))
-    if narrowed.road is not None:
-        conditions.append(markers.c.road == narrowed.road)
-    if narrowed.from_m is not None:
-        conditions.append(markers.c.measure_m >= narrowed.from_m)
-    if narrowed.to_m is not None:
-        conditions.append(markers.c.measure_m <= narrowed.to_m)
+    if filtered.box is not None:
+        conditions.append(within_box(filtered.box))
+    if filtered.near is not None:
+        conditions.append(within_radius(*filtered.near))
+    if filtered.digits is not None:
+        conditions.append(markers.c.digits == filtered.digits)
+    if filtered.status is not None:
+        conditions.append(markers.c.status == filtered.status)
+    if filtered.family is not None:
+        conditions.append(markers.c.family == filtered.family)
+    if filtered.area is not None:
+        conditions.append(within_area(filtered.area))
+    if filtered.road is not None:
+        conditions.append(markers.c.road == filtered.road)
+    if filtered.from_m is not None:
+        conditions.append(markers.c.measure_m >= filtered.from_m)
+    if filtered.to_m is not None:
+        conditions.append(markers.c.measure_m <= filtered.to_m)
     return conditions
 
 
-def list_plates_near(
-    connection: sa.Connection, agency_id: str, lon_deg: float, lat_deg: float, radius_m: float, *, limit: int = 1000
-) -> list[Row]:
-    """The agency's plates within a radius that may be on the road: all but the retired ones, nearest first."""
+def list_near(
+    connection: sa.Connection,
+    agency_id: str,
+    families: tuple[str, ...],
+    lon_deg: float,
+    lat_deg: float,
+    radius_m: float,
+    *,
+    limit: int = 1000,
+) -> list[MarkerRow]:
+    """The agency's markers of some families within a radius, all but the retired ones, nearest first."""
     parts = box_around(lon_deg, lat_deg, radius_m).parts
     values = {"agency": agency_id, "lon": lon_deg, "lat": lat_deg, "radius": radius_m, "most": limit}
     for k, box in enumerate(parts):
         values |= {f"w{k}": box.west_deg, f"s{k}": box.south_deg, f"e{k}": box.east_deg, f"n{k}": box.north_deg}
-    return list(connection.execute(_plates_near(len(parts)), values).mappings())
+    return fetch_all(connection, _near(len(parts), families), MarkerRow, values)
 
 
 @lru_cache
-def _plates_near(parts: int) -> sa.Select[Any]:
-    """Statement of `list_plates_near`, built once: every frame runs it, and building it costs more."""
+def _near(parts: int, families: tuple[str, ...]) -> sa.Select[Any]:
+    """Statement of `list_near`, built once: every frame runs it, and building it costs more."""
     number = partial(sa.bindparam, type_=sa.Double)
     proposed = (
         proposed_by_index(markers, *(number(f"{side}{k}") for side in ("w", "s", "e", "n"))) for k in range(parts)
     )
     distance = distance_to(number("lon"), number("lat"))
     return (
-        sa.select(*PUBLIC)
-        .where(
+        MARKERS.where(
             markers.c.agency_id == sa.bindparam("agency"),
-            markers.c.family == "plate",
+            markers.c.family.in_(families),
             markers.c.status != "retired",
             sa.or_(*proposed),
             distance <= number("radius"),
@@ -155,12 +156,12 @@ def find_code_near(
     *,
     mismatched_radius_m: float,
     ignoring: str | None = None,
-) -> Row | None:
+) -> CodeRow | None:
     """A plate of any agency that carries these digits and may be on the road.
 
     It lies within `radius_m`, or within `mismatched_radius_m` if its digits are not those of its own position.
     """
-    query = sa.select(markers.c.id, markers.c.agency_id).where(
+    query = select_rows(CodeRow, markers).where(
         markers.c.digits == digits,
         markers.c.status != "retired",
         sa.or_(
@@ -171,23 +172,21 @@ def find_code_near(
     if ignoring is not None:
         query = query.where(markers.c.id != ignoring)
     with seeing_every_agency(connection):
-        return connection.execute(query.limit(1)).mappings().one_or_none()
+        return find_one(connection, query.limit(1), CodeRow)
 
 
-def find_id_code(connection: sa.Connection, digits: str, n: int) -> Row | None:
+def find_id_code(connection: sa.Connection, digits: str, n: int) -> CodeRow | None:
     """The plate of any agency that carries, or once carried, these digits of the id scheme."""
-    query = sa.select(markers.c.id, markers.c.agency_id).where(
-        markers.c.digits == digits, markers.c.n == n, markers.c.scheme == "id"
-    )
+    query = select_rows(CodeRow, markers).where(markers.c.digits == digits, markers.c.n == n, markers.c.scheme == "id")
     with seeing_every_agency(connection):
-        return connection.execute(query).mappings().one_or_none()
+        return find_one(connection, query, CodeRow)
 
 
 def add_marker(
     connection: sa.Connection, entry: AuditEntry, values: Mapping[str, Any], *, kind: str, why: str | None
-) -> Row:
+) -> MarkerRow:
     """Store a new marker of the entry's agency with the first version of its history."""
-    feature = feature_text({**_UNKNOWN, **values})
+    feature = feature_text(row_of(MarkerRow, values))
     connection.execute(sa.insert(markers).values(agency_id=entry.agency_id, feature=feature, **values))
     return _recorded(connection, entry, values["id"], kind=kind, why=why)
 
@@ -201,7 +200,7 @@ def update_marker(
     version: int,
     kind: str,
     why: str | None,
-) -> Row:
+) -> MarkerRow:
     """Change a marker that is still at the version the caller read, and add to its history.
 
     Raises
@@ -210,7 +209,7 @@ def update_marker(
         It was changed since.
     """
     changes = {**changes, "version": version + 1, "updated_at": entry.at}
-    feature = feature_text({**get_marker(connection, entry.agency_id, marker_id), **changes})
+    feature = feature_text(get_marker(connection, entry.agency_id, marker_id)._replace(**changes))
     statement = (
         sa.update(markers)
         .where(markers.c.id == marker_id, markers.c.agency_id == entry.agency_id, markers.c.version == version)
@@ -221,25 +220,7 @@ def update_marker(
     return _recorded(connection, entry, marker_id, kind=kind, why=why)
 
 
-def list_versions(
-    connection: sa.Connection, agency_id: str, marker_id: str, *, after: int = 0, limit: int = 100
-) -> list[Row]:
-    """The history of a marker, oldest first."""
-    query = (
-        sa.select(marker_versions)
-        .where(
-            marker_versions.c.marker_id == marker_id,
-            marker_versions.c.agency_id == agency_id,
-            marker_versions.c.version > after,
-        )
-        .order_by(marker_versions.c.version)
-        .limit(limit)
-    )
-    return list(connection.execute(query).mappings())
-
-
-def _recorded(connection: sa.Connection, entry: AuditEntry, marker_id: str, *, kind: str, why: str | None) -> Row:
+def _recorded(connection: sa.Connection, entry: AuditEntry, marker_id: str, *, kind: str, why: str | None) -> MarkerRow:
     row = get_marker(connection, entry.agency_id, marker_id)
-    marker = {str(name): value for name, value in row.items()}
-    add_versions(connection, [entry.version(marker_id, row["version"], marker, kind=kind, why=why)])
+    add_versions(connection, [entry.version(marker_id, row.version, row._asdict(), kind=kind, why=why)])
     return row

@@ -1,4 +1,5 @@
-"""Mapbox Vector Tiles 2.1 of points, for databases that cannot write them. Sections are those of the specification."""
+"""Mapbox Vector Tiles 2.1 of points, for databases that cannot write them. Section numbers are those of the
+specification."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def write_layer(name: str, columns: Mapping[str, Sequence[Value | None]], points
     Returns
     -------
     bytes
-        Empty without points (4.1: a layer holds a feature at least).
+        Empty without points (4.1: a layer has at least one feature).
     """
     if not len(points_px):
         return b""
@@ -49,14 +50,14 @@ def write_layer(name: str, columns: Mapping[str, Sequence[Value | None]], points
 
 
 def _distinct(column: Sequence[Value | None]) -> list[Value]:
-    """The values of a column, each once: a number is not a truth value, nor 1 the same as 1.0."""
+    """The distinct values of a column: True differs from 1, and 1 from 1.0."""
     if len({type(value) for value in column} - {NoneType}) > 1:
         raise ValueError("the values of a property are of one type")
     return [value for value in dict.fromkeys(column) if value is not None]
 
 
 def _tags(columns: Iterable[Sequence[Value | None]], distinct: Sequence[Sequence[Value]]) -> Numbers:
-    """Key and value of each property of each feature, shape (N, 2 x properties); -1 twice for what is left out."""
+    """Key and value of each property of each feature, shape (N, 2 x properties); -1 twice for a missing value."""
     tags, first = [], 0
     for k, (column, values) in enumerate(zip(columns, distinct, strict=True)):
         index: dict[Value | None, int] = dict(zip(values, range(first, first + len(values)), strict=True))
@@ -68,7 +69,7 @@ def _tags(columns: Iterable[Sequence[Value | None]], distinct: Sequence[Sequence
 
 
 def _features(tags: Numbers, points_px: Numbers) -> bytes:
-    """All features. One of a point is nothing but varints."""
+    """All features; a point's feature consists of varints only."""
     count = len(points_px)
     zigzag = (points_px << 1) ^ (points_px >> 63)  # 4.3.2
     tag_bytes = _lengths(tags).sum(axis=1)
@@ -85,7 +86,7 @@ def _features(tags: Numbers, points_px: Numbers) -> bytes:
 
 
 def _lengths(numbers: Numbers) -> Numbers:
-    """Bytes of each as a varint; 0 for a negative one, which is left out."""
+    """Length of each value as a varint; 0 for a negative value, which is left out. [byte]"""
     lengths = (numbers >= 0).astype(np.int64)
     for bits in range(7, 64, 7):
         more = numbers >= np.int64(1) << np.int64(bits)

@@ -1,4 +1,4 @@
-"""The markers nearest to a place, by geodesic distance, from the spatial index of either database.
+"""The markers nearest to a position, by geodesic distance, from the spatial index of either database.
 
 Both look for a radius that holds enough markers, and then take the nearest of all inside it. PostGIS has an order of
 nearness on its GiST index, though one of degrees: what comes first in it is enough where it holds a whole box round the
@@ -18,18 +18,20 @@ import numpy.typing as npt
 import sqlalchemy as sa
 
 from app.registry.features import in_box
-from app.registry.markers import PUBLIC, MarkerFilter, Row, conditions_of
+from app.registry.marker_rows import PUBLIC, MarkerRow
+from app.registry.markers import MarkerFilter, conditions_of
+from app.registry.rows import row_maker
 from app.registry.spatial import Box, FloatArray, box_around, distances_m
 from app.registry.tables import markers
 
-Found = list[tuple[Row, float]]
+Found = list[tuple[MarkerRow, float]]
 _Rows = npt.NDArray[np.int64]
 
 AT_ONCE = 30
 _FIRST_M = 250.0
 _FAR_M = 5_000.0
-_WORLD_M = 20_038_000.0  # no two places are farther apart
-_WIDE_DEG2 = 2_500.0  # from here on reading all is quicker than asking the index
+_WORLD_M = 20_038_000.0  # [m] a little more than half a meridian or equator: no two positions are farther apart
+_WIDE_DEG2 = 2_500.0  # [deg^2] for larger boxes reading all rows is faster than the index; chosen by hand
 _FEW = 2_000
 _MANY = 4_000
 _ALL = 2**31 - 1
@@ -37,46 +39,48 @@ _HALVINGS = 16
 _CHUNK = 500
 _C = markers.c
 _PLACES = (_C.row, _C.lon_deg, _C.lat_deg)
+_PLACE = [1 + MarkerRow._fields.index(name) for name in ("lon_deg", "lat_deg")]  # behind the integer key
+_make = row_maker(MarkerRow)
 
 
 def find_nearest_at_once(
     connection: sa.Connection,
     agency_id: str,
-    narrowed: MarkerFilter,
+    filtered: MarkerFilter,
     lon_deg: float,
     lat_deg: float,
     count: int,
     within_m: float | None = None,
 ) -> Found | None:
-    """As `list_nearest`, by one statement; None where that does not tell."""
-    most_m = _WORLD_M if within_m is None else within_m
+    """As `list_nearest`, by one statement; None if one statement cannot find them."""
+    max_m = _WORLD_M if within_m is None else within_m
     if count > AT_ONCE:
         return None
     limit = 10 + math.ceil(3 * count / max(math.cos(math.radians(lat_deg)), 0.1))
-    narrowed = replace(narrowed, near=None)
+    filtered = replace(filtered, near=None)
     if connection.dialect.name == "postgresql":
         values: dict[str, Any] = {"agency": agency_id, "most": limit, "lon": lon_deg, "lat": lat_deg}
-        rows = connection.execute(_in_order(narrowed, True), values).mappings().all()
+        rows = connection.execute(_in_order(filtered, True), values).all()
     else:
-        parts = box_around(lon_deg, lat_deg, min(_FIRST_M, most_m)).parts
+        parts = box_around(lon_deg, lat_deg, min(_FIRST_M, max_m)).parts
         values = {"agency": agency_id, "most": 3 * limit, **_sides(parts)}
-        rows = connection.execute(_inside(narrowed, _wide(parts), True), values).mappings().all()
+        rows = connection.execute(_inside(filtered, _wide(parts), True), values).all()
         if len(rows) == 3 * limit:
             return None
-    lon, lat = (np.array([row[name] for row in rows], dtype=np.float64) for name in ("lon_deg", "lat_deg"))
+    lon, lat = (np.array([row[k] for row in rows], dtype=np.float64) for k in _PLACE)
     distances = distances_m(lon_deg, lat_deg, lon, lat)
-    chosen = sorted((d, row["row"], k) for k, (d, row) in enumerate(zip(distances.tolist(), rows, strict=True)))
-    chosen = [item for item in chosen[:count] if item[0] <= most_m]
-    far_m = chosen[-1][0] if len(chosen) == count else most_m
+    chosen = sorted((d, row[0], k) for k, (d, row) in enumerate(zip(distances.tolist(), rows, strict=True)))
+    chosen = [item for item in chosen[:count] if item[0] <= max_m]
+    far_m = chosen[-1][0] if len(chosen) == count else max_m
     if connection.dialect.name == "postgresql":
         enough = len(rows) < limit or _holds_box(lon_deg, lat_deg, far_m, float(lon[-1]), float(lat[-1]))
     else:
-        enough = far_m <= min(_FIRST_M, most_m)
-    return [(rows[k], distance) for distance, _, k in chosen] if enough else None
+        enough = far_m <= min(_FIRST_M, max_m)
+    return [(_make(rows[k][1:]), distance) for distance, _, k in chosen] if enough else None
 
 
 def _holds_box(lon_deg: float, lat_deg: float, radius_m: float, last_lon_deg: float, last_lat_deg: float) -> bool:
-    """Whether all in a box round a circle is nearer, in degrees, than the last row in the order of degrees."""
+    """Whether the whole box around a circle is nearer, in degrees, than the last row in the order of degrees."""
     (box, *more) = box_around(lon_deg, lat_deg, radius_m).parts
     half_lon, half_lat = (box.east_deg - box.west_deg) / 2, (box.north_deg - box.south_deg) / 2
     far_deg = math.hypot(last_lon_deg - lon_deg, last_lat_deg - lat_deg)
@@ -86,25 +90,25 @@ def _holds_box(lon_deg: float, lat_deg: float, radius_m: float, last_lon_deg: fl
 def list_nearest(
     connection: sa.Connection,
     agency_id: str,
-    narrowed: MarkerFilter,
+    filtered: MarkerFilter,
     lon_deg: float,
     lat_deg: float,
     count: int,
     within_m: float | None = None,
 ) -> Found:
-    """The agency's nearest markers that a filter leaves, with their distances in metres, nearest first.
+    """The agency's nearest markers that pass a filter, with their distances in metres, nearest first.
 
     Parameters
     ----------
-    narrowed : MarkerFilter
+    filtered : MarkerFilter
         Its `near` is left out.
     within_m : float, optional
         No farther than this. [m]
     """
-    search = _Search(connection, agency_id, replace(narrowed, near=None), lon_deg, lat_deg)
-    most_m = _WORLD_M if within_m is None else within_m
+    search = _Search(connection, agency_id, replace(filtered, near=None), lon_deg, lat_deg)
+    max_m = _WORLD_M if within_m is None else within_m
     has_order = connection.dialect.name == "postgresql"
-    rows, distances = search.by_order(count, most_m) if has_order else search.by_radius(count, most_m)
+    rows, distances = search.by_order(count, max_m) if has_order else search.by_radius(count, max_m)
     chosen = sorted(zip(distances.tolist(), rows.tolist(), strict=True))[:count]
     by_row = search.rows_of([row for _, row in chosen])
     return [(by_row[row], distance) for distance, row in chosen]
@@ -112,44 +116,44 @@ def list_nearest(
 
 class _Search:
     def __init__(
-        self, connection: sa.Connection, agency_id: str, narrowed: MarkerFilter, lon_deg: float, lat_deg: float
+        self, connection: sa.Connection, agency_id: str, filtered: MarkerFilter, lon_deg: float, lat_deg: float
     ) -> None:
-        self._connection, self._agency_id, self._narrowed = connection, agency_id, narrowed
+        self._connection, self._agency_id, self._narrowed = connection, agency_id, filtered
         self._lon, self._lat = lon_deg, lat_deg
 
-    def by_order(self, count: int, most_m: float) -> tuple[_Rows, FloatArray]:
+    def by_order(self, count: int, max_m: float) -> tuple[_Rows, FloatArray]:
         """Rows and distances inside a radius that the order of the index bounds."""
         values = {"lon": self._lon, "lat": self._lat, "most": count}
         rows, distances = self._measured(_in_order(self._narrowed, False), values)
-        if len(rows) < count:  # that is all of them
-            return rows[distances <= most_m], distances[distances <= most_m]
-        return self._circle(min(float(distances.max()), most_m))
+        if len(rows) < count:  # these are all
+            return rows[distances <= max_m], distances[distances <= max_m]
+        return self._circle(min(float(distances.max()), max_m))
 
-    def by_radius(self, count: int, most_m: float) -> tuple[_Rows, FloatArray]:
-        """Rows and distances inside a radius that grew until it held enough."""
-        radius_m, below_m, halvings, counted = min(_FIRST_M, most_m), 0.0, 0, False
+    def by_radius(self, count: int, max_m: float) -> tuple[_Rows, FloatArray]:
+        """Rows and distances inside a radius that grows until it holds enough."""
+        radius_m, below_m, halvings, counted = min(_FIRST_M, max_m), 0.0, 0, False
         while True:
             limit = _MANY + 4 * count if halvings < _HALVINGS and radius_m > _FIRST_M else _ALL
             rows, distances = self._circle(radius_m, limit)
-            if len(rows) == limit:  # more than are worth reading: between the two radii
+            if len(rows) == limit:  # too many rows to read: continue between the two radii
                 radius_m, halvings = math.sqrt(max(below_m, 1.0) * radius_m), halvings + 1
                 continue
-            if len(rows) >= count or radius_m >= most_m:
+            if len(rows) >= count or radius_m >= max_m:
                 return rows, distances
             below_m = radius_m
             if radius_m > _FAR_M and not counted:
                 counted = True
                 rows, distances = self._measured(_anywhere(self._narrowed), {"most": _FEW + 1})
                 if len(rows) <= _FEW:
-                    return rows[distances <= most_m], distances[distances <= most_m]
-            radius_m = min(radius_m * (4.0 if halvings == 0 else 1.4), most_m)
+                    return rows[distances <= max_m], distances[distances <= max_m]
+            radius_m = min(radius_m * (4.0 if halvings == 0 else 1.4), max_m)
 
-    def rows_of(self, rows: list[int]) -> dict[int, Row]:
+    def rows_of(self, rows: list[int]) -> dict[int, MarkerRow]:
         """Markers by their integer keys."""
         found = {}
         for start in range(0, len(rows), _CHUNK):
             query = sa.select(_C.row, *PUBLIC).where(_C.row.in_(rows[start : start + _CHUNK]))
-            found.update({row["row"]: row for row in self._connection.execute(query).mappings()})
+            found.update({row[0]: _make(row[1:]) for row in self._connection.execute(query)})
         return found
 
     def _circle(self, radius_m: float, limit: int = _ALL) -> tuple[_Rows, FloatArray]:
@@ -183,25 +187,25 @@ def _sides(parts: tuple[Box, ...]) -> dict[str, float]:
 
 
 @lru_cache(maxsize=256)
-def _inside(narrowed: MarkerFilter, wide: tuple[bool, ...], whole: bool) -> sa.Select[Any]:
+def _inside(filtered: MarkerFilter, wide: tuple[bool, ...], whole: bool) -> sa.Select[Any]:
     """Markers in the boxes of `_sides`."""
-    return _owned(narrowed, whole).where(sa.or_(*(in_box(k, is_wide) for k, is_wide in enumerate(wide))))
+    return _owned(filtered, whole).where(sa.or_(*(in_box(k, is_wide) for k, is_wide in enumerate(wide))))
 
 
 @lru_cache(maxsize=256)
-def _in_order(narrowed: MarkerFilter, whole: bool) -> sa.Select[Any]:
+def _in_order(filtered: MarkerFilter, whole: bool) -> sa.Select[Any]:
     """Markers in the order of their distance in degrees (PostGIS)."""
     geom = sa.table("markers", sa.column("geom")).c.geom
     point = sa.func.ST_MakePoint(sa.bindparam("lon", type_=sa.Double), sa.bindparam("lat", type_=sa.Double))
-    return _owned(narrowed, whole).order_by(geom.op("<->")(sa.func.ST_SetSRID(point, sa.literal_column("4326"))))
+    return _owned(filtered, whole).order_by(geom.op("<->")(sa.func.ST_SetSRID(point, sa.literal_column("4326"))))
 
 
 @lru_cache(maxsize=256)
-def _anywhere(narrowed: MarkerFilter) -> sa.Select[Any]:
-    return _owned(narrowed, False)
+def _anywhere(filtered: MarkerFilter) -> sa.Select[Any]:
+    return _owned(filtered, False)
 
 
-def _owned(narrowed: MarkerFilter, whole: bool) -> sa.Select[Any]:
+def _owned(filtered: MarkerFilter, whole: bool) -> sa.Select[Any]:
     columns = (_C.row, *PUBLIC) if whole else _PLACES
     most = sa.bindparam("most", type_=sa.Integer)
-    return sa.select(*columns).where(_C.agency_id == sa.bindparam("agency"), *conditions_of(narrowed)).limit(most)
+    return sa.select(*columns).where(_C.agency_id == sa.bindparam("agency"), *conditions_of(filtered)).limit(most)

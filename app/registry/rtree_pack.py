@@ -1,9 +1,10 @@
-"""An R*Tree of SQLite filled in one go: points sorted into full nodes, not put in one after another.
+"""Fills an empty R*Tree of SQLite in one pass: points are sorted into full nodes instead of inserted one by one.
 
 SQLite keeps an R*Tree in three ordinary tables (https://www.sqlite.org/rtree.html, "Shadow Tables"). A node is a blob:
 its depth (of the root, else zero) and its number of cells as two big-endian 16-bit numbers, then cells of a 64-bit id
-(of a row, or of the node below) and the box as 32-bit floats: least and greatest of each axis, rounded outward.
+(of a row, or of the node below) and the box as 32-bit floats: minimum and maximum of each axis, rounded outward.
 Packing: Leutenegger, Lopez, Edgington, "STR: a simple and efficient algorithm for R-tree packing", ICDE 1997.
+What it gains is in docs/decisions/0017-packed-rtree.md.
 """
 
 from __future__ import annotations
@@ -17,35 +18,35 @@ import sqlalchemy as sa
 _CELL = np.dtype([("id", ">i8"), ("box", ">f4", (4,))])
 _HEADER = np.dtype([("depth", ">u2"), ("cells", ">u2")])
 _ROOT = 1
-_PART = 20_000
+_PART = 20_000  # rows read or written at a time; chosen by hand
 
 Ids = npt.NDArray[np.int64]
 Boxes = npt.NDArray[np.float32]
 
 
 def fill_rtree(connection: sa.Connection, table: str) -> None:
-    """Fill the empty R*Tree of a table with the places of all its rows."""
+    """Fill the empty R*Tree of a table with the positions of all its rows."""
     rtree = f"{table}_rtree"
-    ids, boxes = _places(connection, table)
+    ids, boxes = _read_boxes(connection, table)
     if not len(ids):
         return
     size = connection.exec_driver_sql(f"SELECT length(data) FROM {rtree}_node WHERE nodeno = 1").scalar_one()
     depth, next_node = 0, _ROOT + 1
-    most = (int(size) - _HEADER.itemsize) // _CELL.itemsize
-    while len(ids) > most:
-        order, starts = _packed(boxes, most)
+    max_cells = (int(size) - _HEADER.itemsize) // _CELL.itemsize
+    while len(ids) > max_cells:
+        order, starts = _packed(boxes, max_cells)
         ids, boxes = ids[order], boxes[order]
         nodes = np.arange(next_node, next_node + len(starts), dtype=np.int64)
         _store(connection, rtree, ids, boxes, nodes, starts, size=size, is_leaf=depth == 0)
-        least, greatest = (f.reduceat(boxes, starts) for f in (np.minimum, np.maximum))
-        boxes = np.stack([least[:, 0], greatest[:, 1], least[:, 2], greatest[:, 3]], axis=1)
+        low, high = (f.reduceat(boxes, starts) for f in (np.minimum, np.maximum))
+        boxes = np.stack([low[:, 0], high[:, 1], low[:, 2], high[:, 3]], axis=1)
         ids, depth, next_node = nodes, depth + 1, next_node + len(nodes)
     root = np.array([_ROOT], dtype=np.int64)
     _store(connection, rtree, ids, boxes, root, np.zeros(1, dtype=np.intp), size=size, is_leaf=depth == 0, depth=depth)
 
 
-def _places(connection: sa.Connection, table: str) -> tuple[Ids, Boxes]:
-    """Rows, shape (N,), and the boxes of their places, shape (N, 4)."""
+def _read_boxes(connection: sa.Connection, table: str) -> tuple[Ids, Boxes]:
+    """Rows, shape (N,), and the boxes of their positions, shape (N, 4)."""
     driver = connection.connection.driver_connection
     assert driver is not None
     cursor = driver.execute(f"SELECT row, lon_deg, lat_deg FROM {table}")
@@ -57,17 +58,17 @@ def _places(connection: sa.Connection, table: str) -> tuple[Ids, Boxes]:
     return np.concatenate(ids), np.concatenate(boxes)
 
 
-def _outward(places: npt.NDArray[np.float64]) -> Boxes:
+def _outward(positions: npt.NDArray[np.float64]) -> Boxes:
     """Boxes of points, shape (N, 4): each side the next 32-bit float that is not inside."""
-    near = places.astype(np.float32)
-    low = np.where(near > places, np.nextafter(near, np.float32(-np.inf)), near)
-    high = np.where(near < places, np.nextafter(near, np.float32(np.inf)), near)
+    near = positions.astype(np.float32)
+    low = np.where(near > positions, np.nextafter(near, np.float32(-np.inf)), near)
+    high = np.where(near < positions, np.nextafter(near, np.float32(np.inf)), near)
     return np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]], axis=1).astype(np.float32)
 
 
-def _packed(boxes: Boxes, most: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def _packed(boxes: Boxes, max_cells: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Order of the entries and the first of each node: slices of longitude, in each runs of latitude."""
-    nodes = math.ceil(len(boxes) / most)
+    nodes = math.ceil(len(boxes) / max_cells)
     slices = math.ceil(math.sqrt(nodes))
     by_lon = np.argsort(boxes[:, 0], kind="stable")
     number = np.empty(len(boxes), dtype=np.int32)
@@ -75,7 +76,7 @@ def _packed(boxes: Boxes, most: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[
     order = np.lexsort((boxes[:, 2], number))
     starts = []
     for first, last in zip(*_edges(number[order]), strict=True):
-        parts = math.ceil((last - first) / most)
+        parts = math.ceil((last - first) / max_cells)
         starts.append(first + np.arange(parts) * (last - first) // parts)
     return order, np.concatenate(starts)
 

@@ -14,7 +14,7 @@ from app.registry.tables import markers
 def list_places(
     connection: sa.Connection,
     agency_id: str,
-    narrowed: MarkerFilter,
+    filtered: MarkerFilter,
     circles: Iterable[tuple[float, float, float]],
     *,
     limit: int,
@@ -24,7 +24,7 @@ def list_places(
     No more than about `limit` are read.
     """
     places = sa.select(markers.c.id, markers.c.lon_deg, markers.c.lat_deg).where(
-        markers.c.agency_id == agency_id, *conditions_of(narrowed)
+        markers.c.agency_id == agency_id, *conditions_of(filtered)
     )
     found: dict[str, tuple[str, float, float]] = {}
     for circle in circles:

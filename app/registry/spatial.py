@@ -26,7 +26,7 @@ from app.registry.tables import markers
 
 FloatArray = npt.NDArray[np.float64]
 _CONTINENT_DEG2 = 2_500.0
-_M_PER_DEG = 110_574.0  # least length of a degree of latitude on WGS 84
+_M_PER_DEG = 110_574.0  # [m/deg] shortest degree of latitude on WGS 84, at the equator
 
 
 def _rtree(table: str) -> sa.TableClause:
@@ -59,7 +59,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """A polygon or several in longitude and latitude; its edges are straight there. It spans no antimeridian.
+    """One polygon or several, with straight edges in longitude and latitude; none spans the antimeridian.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Area:
 
 
 def box_around(lon_deg: float, lat_deg: float, radius_m: float) -> Box:
-    """Smallest handy box that holds a circle, over the poles and the antimeridian too."""
+    """A box around a circle, also over the poles and the antimeridian; up to 1 % larger than needed."""
     reach_deg = radius_m / _M_PER_DEG * 1.001
     south, north = lat_deg - reach_deg, lat_deg + reach_deg
     if south <= -90.0 or north >= 90.0:
@@ -93,7 +93,7 @@ def _wrapped(lon_deg: float) -> float:
 
 
 class _Proposed(FunctionElement[bool]):
-    """Rows that the spatial index of their table proposes for a box: row column, west, south, east, north."""
+    """Rows that the spatial index of their table finds for a box: row column, west, south, east, north."""
 
     name = "waymark_proposed"
     type = sa.Boolean()
@@ -111,7 +111,7 @@ def proposed_by_index(
     east_deg: sa.ColumnElement[float],
     north_deg: sa.ColumnElement[float],
 ) -> sa.ColumnElement[bool]:
-    """Rows of `markers` or `magnets` whose place may be inside a box that does not span the antimeridian."""
+    """Rows of `markers` or `magnets` whose position may be inside a box that does not span the antimeridian."""
     return _Proposed(table.c.row, west_deg, south_deg, east_deg, north_deg)
 
 
@@ -134,7 +134,7 @@ def _by_gist(element: _Proposed, compiler: SQLCompiler, **how: Any) -> str:
 
 
 def within_box(box: Box, table: sa.Table = markers) -> sa.ColumnElement[bool]:
-    """Rows of `markers` or `magnets` inside a box: the index proposes, the exact columns decide."""
+    """Rows of `markers` or `magnets` inside a box: the index finds candidates, the exact columns decide."""
     return sa.or_(*(_within_part(part, table) for part in box.parts))
 
 
@@ -152,7 +152,7 @@ def _within_part(box: Box, table: sa.Table) -> sa.ColumnElement[bool]:
 
 
 def within_area(area: Area) -> sa.ColumnElement[bool]:
-    """Markers inside an area or on its edge: both databases ask GEOS."""
+    """Markers inside an area or on its edge; both databases use GEOS."""
     return sa.and_(sa.or_(*(within_box(box) for box in area.boxes)), _Covered(sa.literal(area.wkb, sa.LargeBinary)))
 
 
@@ -181,7 +181,7 @@ def _by_postgis(element: _Covered, compiler: SQLCompiler, **how: Any) -> str:
 
 
 def covers(area: Area, lon_deg: float, lat_deg: float) -> bool:
-    """Whether a place is inside an area or on its edge."""
+    """Whether a position is inside an area or on its edge."""
     return _covers(area.wkb, lon_deg, lat_deg)
 
 
@@ -203,7 +203,7 @@ def within_radius(lon_deg: float, lat_deg: float, radius_m: float) -> sa.ColumnE
 
 
 def distance_to(lon_deg: sa.ColumnElement[float], lat_deg: sa.ColumnElement[float]) -> sa.ColumnElement[float]:
-    """Geodesic distance of a marker from a place, as SQL. [m]
+    """Geodesic distance of a marker from a position, as SQL. [m]
 
     SQLite calls `distance_m`, PostgreSQL a function of migration 0004; the two agree within 2e-8 m.
     """
@@ -211,7 +211,7 @@ def distance_to(lon_deg: sa.ColumnElement[float], lat_deg: sa.ColumnElement[floa
 
 
 def distances_m(lon_deg: float, lat_deg: float, lons_deg: FloatArray, lats_deg: FloatArray) -> FloatArray:
-    """Geodesic distances of places from one place, shape (N,). [m]"""
+    """Geodesic distances of positions from one position, shape (N,). [m]"""
     same = np.ones(len(lons_deg))
     return np.asarray(_ellipsoid().inv(lon_deg * same, lat_deg * same, lons_deg, lats_deg)[2], dtype=np.float64)
 

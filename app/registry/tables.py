@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
-
 import sqlalchemy as sa
-from sqlalchemy.engine import Dialect
+
+from app.markers.status import STATUSES
+from app.registry import column_types
+from app.registry.column_types import ID, UtcTime, agency_column, one_of
 
 _NAMES = {
     "ix": "ix_%(table_name)s_%(column_0_N_name)s",
@@ -15,37 +16,6 @@ _NAMES = {
     "pk": "pk_%(table_name)s",
 }
 metadata = sa.MetaData(naming_convention=_NAMES)
-
-ID = sa.String(36)
-STATUSES = ("planned", "built", "surveyed", "active", "suspect", "retired")
-VERSION_KINDS = ("as-planned", "as-built", "resurvey", "correction", "change")
-DECODE_STATES = ("queued", "running", "done", "failed", "cancelled")
-SCOPES = ("admin", "planner", "surveyor", "viewer", "vehicle")
-
-
-class UtcTime(sa.TypeDecorator[datetime]):
-    """Aware UTC times, also on databases that keep no zone."""
-
-    impl = sa.DateTime(timezone=True)
-    cache_ok = True
-
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Store UTC."""
-        if value is None:
-            return None
-        if value.tzinfo is None:
-            raise ValueError("times are aware")
-        return value.astimezone(UTC)
-
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Return aware UTC."""
-        if value is None:
-            return None
-        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
-
-
-def _one_of(column: str, values: tuple[str, ...]) -> sa.CheckConstraint:
-    return sa.CheckConstraint(f"{column} IN ({', '.join(repr(v) for v in values)})", name=column)
 
 
 agencies = sa.Table(
@@ -57,15 +27,11 @@ agencies = sa.Table(
 )
 
 
-def _agency() -> sa.Column[str]:
-    return sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), nullable=False)
-
-
 api_keys = sa.Table(
     "api_keys",
     metadata,
     sa.Column("id", ID, primary_key=True),
-    _agency(),
+    agency_column(),
     sa.Column("holder_id", ID, nullable=False),  # keys that replace one another have the id of the first
     sa.Column("label", sa.String(200), nullable=False),
     sa.Column("prefix", sa.String(16), nullable=False),
@@ -75,7 +41,7 @@ api_keys = sa.Table(
     sa.Column("expires_at", UtcTime),
     sa.Column("revoked_at", UtcTime),
     sa.Column("last_used_at", UtcTime),
-    _one_of("scope", SCOPES),
+    one_of("scope", column_types.SCOPES),
 )
 
 markers = sa.Table(
@@ -84,7 +50,7 @@ markers = sa.Table(
     # the integer key is what the spatial index refers to; clients only see the id
     sa.Column("row", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), primary_key=True, autoincrement=True),
     sa.Column("id", ID, nullable=False, unique=True),
-    _agency(),
+    agency_column(),
     sa.Column("family", sa.String(16), nullable=False),
     sa.Column("status", sa.String(16), nullable=False),
     sa.Column("scheme", sa.String(16)),
@@ -124,7 +90,7 @@ markers = sa.Table(
     sa.Column("updated_at", UtcTime, nullable=False),
     # the GeoJSON feature that GIS clients read, written with every change of the row: registry/feature_text.py
     sa.Column("feature", sa.Text, nullable=False, server_default=""),
-    _one_of("status", STATUSES),
+    one_of("status", STATUSES),
     sa.CheckConstraint("lon_deg BETWEEN -180 AND 180 AND lat_deg BETWEEN -90 AND 90", name="position"),
     sa.Index("ix_markers_agency_id_id", "agency_id", "id"),
     sa.Index("ix_markers_agency_id_status_id", "agency_id", "status", "id"),
@@ -168,7 +134,7 @@ marker_versions = sa.Table(
     metadata,
     sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), primary_key=True),
     sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
-    _agency(),
+    agency_column(),
     sa.Column("at", UtcTime, nullable=False),
     sa.Column("who", sa.String(200), nullable=False),
     sa.Column("why", sa.String(500)),
@@ -176,7 +142,7 @@ marker_versions = sa.Table(
     sa.Column("kind", sa.String(16), nullable=False),
     sa.Column("audit_number", sa.BigInteger, nullable=False),
     sa.Column("sha256", sa.String(64), nullable=False),
-    _one_of("kind", VERSION_KINDS),
+    one_of("kind", column_types.VERSION_KINDS),
 )
 
 # what changed an agency's part of the registry: a chain, each entry with the hash of the one before (audit.py)
@@ -204,7 +170,7 @@ magnets = sa.Table(
     sa.Column("row", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), primary_key=True, autoincrement=True),
     sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), nullable=False),
     sa.Column("number", sa.Integer, nullable=False),
-    _agency(),
+    agency_column(),
     sa.Column("lon_deg", sa.Double, nullable=False),
     sa.Column("lat_deg", sa.Double, nullable=False),
     sa.Column("polarity", sa.String(1), nullable=False),
@@ -217,7 +183,7 @@ codebooks = sa.Table(
     "codebooks",
     metadata,
     sa.Column("id", ID, primary_key=True),
-    _agency(),
+    agency_column(),
     sa.Column("name", sa.String(80), nullable=False),
     sa.Column("design", sa.JSON, nullable=False),
     sa.Column("rules", sa.JSON, nullable=False),
@@ -244,7 +210,7 @@ cerpm_spans = sa.Table(
     "cerpm_spans",
     metadata,
     sa.Column("row", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), primary_key=True, autoincrement=True),
-    _agency(),
+    agency_column(),
     sa.Column("number", sa.BigInteger, nullable=False),
     sa.Column("first_sequence", sa.BigInteger, nullable=False),
     sa.Column("last_sequence", sa.BigInteger, nullable=False),
@@ -255,27 +221,107 @@ cerpm_spans = sa.Table(
     sqlite_autoincrement=True,
 )
 
+# an upload that is decoded; one that is not decoded while its sender waits has a job of the same id
 decodes = sa.Table(
     "decodes",
     metadata,
     sa.Column("id", ID, primary_key=True),
-    _agency(),
-    sa.Column("state", sa.String(16), nullable=False),
-    sa.Column("kind", sa.String(32), nullable=False),
+    agency_column(),
+    sa.Column("kind", sa.String(32), nullable=False),  # of the upload
     sa.Column("holder_id", sa.String(200)),  # of the key that uploaded it
     sa.Column("context", sa.JSON, nullable=False),
     sa.Column("upload_key", sa.String(200)),
     sa.Column("picture_key", sa.String(200)),
     sa.Column("result", sa.JSON(none_as_null=True)),
-    sa.Column("error", sa.JSON(none_as_null=True)),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("finished_at", UtcTime),  # when the result was stored
+    sa.Index("ix_decodes_agency_id_id", "agency_id", "id"),
+)
+
+# work that outlives the request that asked for it; what is true of a job is true in its row, and nowhere else
+jobs = sa.Table(
+    "jobs",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("holder_id", sa.String(200)),  # of the key that asked for it
+    sa.Column("kind", sa.String(32), nullable=False),
+    sa.Column("state", sa.String(16), nullable=False),
     sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
     sa.Column("progress", sa.Double, nullable=False, server_default="0"),
     sa.Column("cancel_requested", sa.Boolean, nullable=False, server_default=sa.false()),
+    sa.Column("input", sa.JSON, nullable=False),
+    sa.Column("upload_key", sa.String(200)),
+    sa.Column("result", sa.JSON(none_as_null=True)),
+    sa.Column("error", sa.JSON(none_as_null=True)),
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("finished_at", UtcTime),
-    _one_of("state", DECODE_STATES),
-    sa.Index("ix_decodes_agency_id_id", "agency_id", "id"),
-    sa.Index("ix_decodes_state", "state"),
+    one_of("state", column_types.JOB_STATES),
+    sa.Index("ix_jobs_agency_id_kind_id", "agency_id", "kind", "id"),
+    sa.Index("ix_jobs_state", "state"),
+)
+
+alignments = sa.Table(
+    "alignments",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("name", sa.String(80), nullable=False),
+    sa.Column("source_key", sa.String(200), nullable=False),  # of the blob with the file as it came
+    sa.Column("source_sha256", sa.String(64), nullable=False),
+    sa.Column("declaration", sa.JSON, nullable=False),
+    sa.Column("summary", sa.JSON, nullable=False),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.UniqueConstraint("agency_id", "name"),
+    sa.Index("ix_alignments_agency_id_id", "agency_id", "id"),
+)
+
+plans = sa.Table(
+    "plans",
+    metadata,
+    sa.Column("id", ID, primary_key=True),
+    agency_column(),
+    sa.Column("alignment_id", ID, sa.ForeignKey("alignments.id"), nullable=False),
+    sa.Column("name", sa.String(80), nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
+    sa.Column("rules", sa.JSON, nullable=False),
+    sa.Column("document_key", sa.String(200), nullable=False),  # of the blob with the placed markers
+    sa.Column("summary", sa.JSON, nullable=False),
+    sa.Column("proof", sa.JSON(none_as_null=True)),
+    sa.Column("author", sa.String(200), nullable=False),
+    sa.Column("author_id", sa.String(200), nullable=False),  # holder of the key that made what is to be approved
+    sa.Column("approver", sa.String(200)),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    one_of("status", column_types.PLAN_STATUSES),
+    sa.UniqueConstraint("agency_id", "name"),
+    sa.Index("ix_plans_agency_id_id", "agency_id", "id"),
+    sa.Index("ix_plans_alignment_id", "alignment_id"),
+)
+
+plan_versions = sa.Table(
+    "plan_versions",
+    metadata,
+    sa.Column("plan_id", ID, sa.ForeignKey("plans.id"), primary_key=True),
+    sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
+    agency_column(),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("who", sa.String(200), nullable=False),
+    sa.Column("why", sa.String(500)),
+    sa.Column("plan", sa.JSON, nullable=False),
+)
+
+plan_markers = sa.Table(
+    "plan_markers",
+    metadata,
+    sa.Column("plan_id", ID, sa.ForeignKey("plans.id"), primary_key=True),
+    sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),  # of the first of its planned markers
+    agency_column(),
+    sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), nullable=False),
+    sa.Index("ix_plan_markers_marker_id", "marker_id"),
 )
 
 observations = sa.Table(
@@ -284,7 +330,7 @@ observations = sa.Table(
     sa.Column("decode_id", ID, sa.ForeignKey("decodes.id"), primary_key=True),
     sa.Column("marker_id", ID, sa.ForeignKey("markers.id"), primary_key=True),
     sa.Column("frame", sa.Integer, primary_key=True, autoincrement=False, server_default="0"),
-    _agency(),
+    agency_column(),
     sa.Column("at", UtcTime, nullable=False),
     sa.Column("what", sa.String(32), nullable=False),
     sa.Column("detail", sa.JSON(none_as_null=True)),
@@ -307,7 +353,7 @@ roads = sa.Table(
     "roads",
     metadata,
     sa.Column("id", ID, primary_key=True),
-    _agency(),
+    agency_column(),
     sa.Column("name", sa.String(200), nullable=False),
     sa.Column("parts", sa.JSON, nullable=False),  # of the axis: lines of longitude and latitude
     sa.Column("given", sa.JSON, nullable=False),  # frame of the geometry as it came
@@ -329,7 +375,7 @@ road_versions = sa.Table(
     metadata,
     sa.Column("road_id", ID, sa.ForeignKey("roads.id"), primary_key=True),
     sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
-    _agency(),
+    agency_column(),
     sa.Column("at", UtcTime, nullable=False),
     sa.Column("who", sa.String(200), nullable=False),
     sa.Column("why", sa.String(500)),
@@ -342,7 +388,7 @@ vehicles = sa.Table(
     "vehicles",
     metadata,
     sa.Column("id", ID, primary_key=True),
-    _agency(),
+    agency_column(),
     sa.Column("name", sa.String(80), nullable=False),
     sa.Column("status", sa.String(16), nullable=False),
     sa.Column("note", sa.String(500)),
@@ -355,7 +401,7 @@ vehicles = sa.Table(
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("updated_at", UtcTime, nullable=False),
     sa.UniqueConstraint("agency_id", "name"),
-    _one_of("status", VEHICLE_STATUSES),
+    one_of("status", VEHICLE_STATUSES),
     sa.Index("ix_vehicles_agency_id_id", "agency_id", "id"),
 )
 
@@ -364,7 +410,7 @@ vehicle_versions = sa.Table(
     metadata,
     sa.Column("vehicle_id", ID, sa.ForeignKey("vehicles.id"), primary_key=True),
     sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
-    _agency(),
+    agency_column(),
     sa.Column("at", UtcTime, nullable=False),
     sa.Column("who", sa.String(200), nullable=False),
     sa.Column("why", sa.String(500)),
@@ -386,7 +432,7 @@ vehicle_uploads = sa.Table(
     metadata,
     sa.Column("decode_id", ID, sa.ForeignKey("decodes.id"), primary_key=True),
     sa.Column("vehicle_id", ID, sa.ForeignKey("vehicles.id"), nullable=False),
-    _agency(),
+    agency_column(),
     sa.Column("version", sa.Integer, nullable=False),  # of the vehicle's profile
     sa.Column("driven_m", sa.Double),  # null until the decode is done
     sa.Index("ix_vehicle_uploads_vehicle_id_decode_id", "vehicle_id", "decode_id"),
@@ -396,7 +442,7 @@ calibrations = sa.Table(
     "calibrations",
     metadata,
     sa.Column("id", ID, primary_key=True),
-    _agency(),
+    agency_column(),
     sa.Column("who", sa.String(200), nullable=False),
     sa.Column("result", sa.JSON, nullable=False),
     sa.Column("created_at", UtcTime, nullable=False),

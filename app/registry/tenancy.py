@@ -1,8 +1,8 @@
-"""Whose rows a transaction may see: the second lock, row level security on PostgreSQL (migration 0009).
+"""The agency of a transaction, for row level security on PostgreSQL (migration 0009).
 
-The first lock is the `agency_id` in every query. Should one be forgotten, the policies still hide what belongs to
-others: a transaction says at its start for whom it is, and one that says nothing sees no rows. For whom is a matter of
-the context (`contextvars`), which threads of a request inherit: the middleware says it once a request is authenticated.
+Every query has a condition on `agency_id`. If one is forgotten, the policies still hide the rows of other agencies:
+each transaction states its agency when it starts, and a transaction without an agency sees no rows. A context variable
+stores the agency; the threads of a request inherit it, and the middleware sets it when a request is authenticated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _WHOSE: ContextVar[str] = ContextVar("waymark_agency", default="")
 
 
 def whose_rows() -> str:
-    """What transactions that start here say: an agency's id, `EVERY_AGENCY`, or nothing."""
+    """The agency of transactions that start here: its id, `EVERY_AGENCY`, or an empty text."""
     return _WHOSE.get()
 
 
@@ -35,14 +35,14 @@ def acting_for(agency_id: str) -> Iterator[None]:
 
 @contextmanager
 def across_agencies() -> Iterator[None]:
-    """Transactions that start in this block see all rows: the server's own work, or its operator's."""
+    """Transactions that start in this block see all rows: for the work of the server itself or of its operator."""
     with acting_for(EVERY_AGENCY):
         yield
 
 
 @contextmanager
 def seeing_every_agency(connection: sa.Connection) -> Iterator[None]:
-    """Statements of this block see all rows: whether a number or a place on the road is taken by anybody."""
+    """Statements in this block see all rows, to check whether any agency uses a number or a place on the road."""
     if connection.dialect.name != "postgresql":
         yield
         return
@@ -52,5 +52,5 @@ def seeing_every_agency(connection: sa.Connection) -> Iterator[None]:
 
 
 def set_whose(connection: sa.Connection, whose: str, *, local: bool = True) -> None:
-    """Say for whom a transaction is, or with `local` false a session."""
+    """Set the agency of a transaction, or of a session if `local` is false."""
     connection.exec_driver_sql(f"SELECT set_config('{SETTING}', %s, {'true' if local else 'false'})", (whose,))

@@ -33,14 +33,14 @@ class Tile:
     row: int
 
     def box(self) -> Box:
-        """What the tile shows, with a margin so that symbols at its edge are whole."""
+        """The area of the tile with a margin, in which symbols at its edge are drawn whole."""
         size, margin = 2**self.zoom, _BUFFER_PX / EXTENT
         west, east = (self.column - margin) / size * 360 - 180, (self.column + 1 + margin) / size * 360 - 180
         north, south = (_lat_deg((self.row + step) / size) for step in (-margin, 1 + margin))
         return Box(max(west, -180.0), south, min(east, 180.0), north)
 
     def from_lon_lat(self, lon_lat_deg: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-        """Places on the tile, shape (N, 2). [px]"""
+        """Positions on the tile, shape (N, 2). [px]"""
         lat = np.clip(lon_lat_deg[:, 1], -_SOUTHERNMOST_DEG, _SOUTHERNMOST_DEG)
         right = (lon_lat_deg[:, 0] + 180.0) / 360.0
         down = 0.5 - np.arcsinh(np.tan(np.radians(lat))) / (2 * np.pi)
@@ -53,7 +53,7 @@ def _lat_deg(down: float) -> float:
 
 
 def marker_tile(connection: sa.Connection, agency_id: str, tile: Tile, *, retired: bool, layer: str) -> bytes:
-    """The agency's markers on a tile, at most `MAX_FEATURES`; empty without any.
+    """The agency's markers on a tile, at most `MAX_FEATURES`; empty if there are none.
 
     Both databases write the same, but for the last digits of headings.
     """
@@ -81,14 +81,14 @@ def _selected(retired: bool, wide: bool, *columns: sa.ColumnElement[Any]) -> sa.
 
 @lru_cache(maxsize=4)
 def _columns(retired: bool, wide: bool) -> sa.Select[Any]:
-    """One row of JSON arrays, their numbers with 15 digits. A row for each marker takes longer than the search."""
+    """One row of JSON arrays, their numbers with 15 digits: a row for each marker would take longer than the search."""
     q = _selected(retired, wide, markers.c.lon_deg, markers.c.lat_deg, *_COLUMNS).subquery()
     return sa.select(*map(sa.func.json_group_array, q.c))
 
 
 @lru_cache(maxsize=4)
 def _tile(retired: bool, wide: bool) -> sa.Select[Any]:
-    """A tile by PostGIS. Its places are those of `Tile.from_lon_lat`; ST_Transform takes longer than all the rest."""
+    """A tile by PostGIS, with the projection of `Tile.from_lon_lat`: ST_Transform takes longer than the whole query."""
     number = partial(sa.bindparam, type_=sa.Double)
     lat_deg = sa.func.least(sa.func.greatest(markers.c.lat_deg, -_SOUTHERNMOST_DEG), _SOUTHERNMOST_DEG)
     right = (markers.c.lon_deg + 180.0) / 360.0

@@ -1,10 +1,10 @@
-"""The axis of a road: distances along it, offsets from it, and back to positions.
+"""The axis of a road: positions to chainages and offsets, and back.
 
 The axis is made of parts, each a line of geodesics on WGS 84. Offset lines are parallel to the axis: between two
 vertices the direction of an offset turns from one bisector to the next, as on a plotted offset line. So every place
-near the axis has one chainage and one offset, and the two lead back to it; a plain perpendicular leaves wedges outside
-of bends that nothing leads to. Farther than 25 m from a vertex the foot is the plain perpendicular. Kinks above 90
-degrees are corners: outside of them the corner itself is the foot.
+near the axis has one chainage and one offset, from which it can be computed again; with plain perpendiculars, places in
+wedges outside of bends would have none. Farther than 25 m from a vertex the foot is the plain perpendicular. Kinks
+above 90 degrees are corners: outside of them the corner itself is the foot.
 
 Pure: arrays in, arrays out. Chainages are true lengths on the ellipsoid from the start of the first part; they run on
 from the end of one part to the start of the next.
@@ -24,29 +24,30 @@ from pyproj import Geod
 from scipy.spatial import cKDTree
 
 from app.errors import InvalidParameter
+from app.geodesy.ellipsoid import ecef_from_wgs84
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
-MAX_VERTICES = 100_000
-MAX_EDGE_M = 20_000.0
-MAX_LENGTH_M = 5_000_000.0
-MAX_OFFSET_M = 10_000.0
+MAX_VERTICES = 100_000  # source: by hand, bounds the memory of an axis
+MAX_EDGE_M = 20_000.0  # [m] source: by hand; longer edges are swapped or missing vertices
+MAX_LENGTH_M = 5_000_000.0  # [m] source: by hand, bounds the memory of an axis
+MAX_OFFSET_M = 10_000.0  # [m] source: by hand, bounds the time of a search
 _GEOD = Geod(ellps="WGS84")
-_PIECE_M = 250.0  # edges are cut into pieces that a plane fits
-_BEND_M = 25.0  # beyond it from a vertex, offsets are square to the edge
-_SAME_PLACE_M = 1e-4
-_CORNER_RAD = np.radians(90.0)
-_ON_BISECTOR = 1e-9  # share of a piece by which two strips overlap, so that nothing falls between them
-_SAME_FOOT_M = 1e-4
-_PAIRS = 1_000_000
-_REFINEMENTS = 3
-_WORSE = 1.01  # a foot of a strip is at most this much farther than the nearest place on the axis
+_PIECE_M = 250.0  # [m] edges are cut into pieces on which a plane is accurate to 0.1 mm (`_plane`); source: by hand
+_BEND_M = 25.0  # [m] farther from a vertex, offsets are square to the edge; source: docs/roads.md
+_SAME_PLACE_M = 1e-4  # [m] shorter edges are dropped; source: a tenth of a millimetre, below every survey
+_CORNER_RAD = np.radians(90.0)  # [rad] sharper kinks are corners; source: docs/roads.md
+_ON_BISECTOR = 1e-9  # share of a piece by which two strips overlap, so that there is no gap; source: above rounding
+_SAME_FOOT_M = 1e-4  # [m] source: `_SAME_PLACE_M`
+_PAIRS = 1_000_000  # of places and pieces in memory at the same time; source: by hand, about 100 MB
+_REFINEMENTS = 3  # of a foot on a geodesic; source: to the nanometre (`_exact`)
+_MAX_DETOUR = 1.01  # of a strip's foot against the nearest place on the axis; source: by hand, no measurement kept
 
 
 @dataclass(frozen=True, slots=True)
 class Foot:
-    """Where a place lies along an axis.
+    """Foot of a place on an axis.
 
     Attributes
     ----------
@@ -57,10 +58,10 @@ class Foot:
     offset_m : float
         From the axis, left positive. [m]
     beyond_m : float
-        How far the place lies before the start (negative) or after the end of its part. [m]
+        Distance of the place before the start (negative) or after the end of its part. [m]
     exact : bool
-        Chainage and offset lead back to the place: not so beyond an end, outside of a corner, and inside of a bend
-        farther from it than its centre.
+        Whether the place can be computed from chainage and offset: not beyond an end, outside of a corner, or beyond
+        the centre of a bend.
     """
 
     part: int
@@ -147,7 +148,7 @@ class Axis:
         for places, pieces in self._pairs(lon, lat, max_offset_m):
             x, y, share = self._plane(places, pieces, lon, lat)
             length = self._length[pieces]
-            inside = (share >= -_ON_BISECTOR) & (share <= 1 + _ON_BISECTOR) & (np.abs(y) <= max_offset_m * _WORSE)
+            inside = (share >= -_ON_BISECTOR) & (share <= 1 + _ON_BISECTOR) & (np.abs(y) <= max_offset_m * _MAX_DETOUR)
             self._add_strips(feet, places[inside], pieces[inside], lon, lat)
             away = np.hypot(x - np.clip(x, 0.0, length), y)
             self._add_nearest(feet, places, pieces, away, lon, lat)
@@ -207,7 +208,7 @@ class Axis:
     def _pairs(self, lon: FloatArray, lat: FloatArray, max_offset_m: float) -> Iterator[tuple[IntArray, IntArray]]:
         """Places and pieces that may belong together, some places at a time; all pieces of a place come together."""
         radius = self._reach + 2 * max_offset_m + 1.0
-        places = _ecef(lon, lat)
+        places = ecef_from_wgs84(lon, lat)
         counts = np.asarray(self._tree.query_ball_point(places, radius, return_length=True), dtype=np.intp)
         start = 0
         while start < len(places):
@@ -222,7 +223,7 @@ class Axis:
         self, places: IntArray, pieces: IntArray, lon: FloatArray, lat: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Coordinates along and left of pieces, good to a tenth of a millimetre within a kilometre, and shares."""
-        away = _ecef(lon, lat)[places] - self._start_ecef[pieces]
+        away = ecef_from_wgs84(lon, lat)[places] - self._start_ecef[pieces]
         x = np.einsum("ij,ij->i", away, self._forward[pieces])
         y = np.einsum("ij,ij->i", away, self._left[pieces])
         return x, y, self._share(pieces, x, y)
@@ -271,11 +272,11 @@ class Axis:
         lon: FloatArray,
         lat: FloatArray,
     ) -> None:
-        """The nearest place on the axis where it is nearer than the strips say: ends, corners, tight bends."""
+        """The nearest place on the axis if it is nearer than the strips give: at ends, corners and tight bends."""
         order = np.lexsort((away, places))
         firsts = order[np.unique(places[order], return_index=True)[1]]
         best = np.array([min((abs(f.offset_m) for f in feet[p]), default=np.inf) for p in places[firsts]])
-        firsts = firsts[best > away[firsts] * _WORSE + 0.01]
+        firsts = firsts[best > away[firsts] * _MAX_DETOUR + 0.01]
         if not len(firsts):
             return
         places, pieces = places[firsts], pieces[firsts]
@@ -382,24 +383,10 @@ def _turns(starts: FloatArray, azimuth: FloatArray, length: FloatArray, points: 
     return np.where(np.abs(angle) <= _CORNER_RAD, np.tan(angle / 2), 0.0)
 
 
-def _ecef(lon_deg: FloatArray, lat_deg: FloatArray) -> FloatArray:
-    """Earth-centred coordinates on the ellipsoid, shape (N, 3). [m]"""
-    lon, lat = np.radians(lon_deg), np.radians(lat_deg)
-    normal = _GEOD.a / np.sqrt(1 - _GEOD.es * np.sin(lat) ** 2)
-    return np.stack(
-        [
-            normal * np.cos(lat) * np.cos(lon),
-            normal * np.cos(lat) * np.sin(lon),
-            normal * (1 - _GEOD.es) * np.sin(lat),
-        ],
-        axis=-1,
-    )
-
-
 def _frames(lon_deg: FloatArray, lat_deg: FloatArray, azimuth_deg: FloatArray) -> tuple[FloatArray, ...]:
     """Starts of pieces and their unit vectors forward and left, earth-centred, each of shape (N, 3)."""
     lon, lat, azimuth = np.radians(lon_deg), np.radians(lat_deg), np.radians(azimuth_deg)
     east = np.stack([-np.sin(lon), np.cos(lon), np.zeros_like(lon)], axis=-1)
     north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], axis=-1)
     sine, cosine = np.sin(azimuth)[:, None], np.cos(azimuth)[:, None]
-    return _ecef(lon_deg, lat_deg), sine * east + cosine * north, sine * north - cosine * east
+    return ecef_from_wgs84(lon_deg, lat_deg), sine * east + cosine * north, sine * north - cosine * east

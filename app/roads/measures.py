@@ -1,9 +1,9 @@
-"""Measures of a road: what its signs say, against the chainages of its axis.
+"""Measures of a road: the distances on its signs, as a function of the chainage of its axis.
 
-Measures rise along the axis, straight between calibration points and in true metres beyond them. At an equation of
-stationing they jump: `measure_m` is what the sign says coming from before, `ahead_m` what it says going on. Where the
-jump is forward, the measures between are on no road; where it is back, or where parts overlap, one measure is at
-several places. Sections, between jumps and ends of parts, are where measures are unique.
+Measures increase along the axis, linearly between calibration points and in true metres beyond them. At an equation of
+stationing they jump, from `measure_m` before it to `ahead_m` after it. After a jump forward, the measures between
+the two do not exist on the road. After a jump back, or where parts overlap, one measure exists at several places.
+Within a section, between jumps and ends of parts, measures are unique.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy.typing as npt
 from app.errors import InvalidParameter
 
 FloatArray = npt.NDArray[np.float64]
-SCALES = (0.5, 2.0)
-"""Least and greatest metres of measure to a metre of road."""
-_SAME_M = 1e-6
-_ON_END_M = 1e-6
+SCALES = (0.5, 2.0)  # lowest and highest metres of measure to a metre of road; source: by hand
+_SAME_M = 1e-6  # [m] source: a micrometre, above rounding
+_ON_END_M = 1e-6  # [m] source: `_SAME_M`
+_MIN_APART_M = 1e-3  # [m] between calibration points; source: a millimetre, below every survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +35,9 @@ class CalibrationPoint:
     chainage_m : float
         Along the axis. [m]
     measure_m : float
-        What is signed there. [m]
+        Measure signed there. [m]
     ahead_m : float or None
-        At an equation of stationing, what is signed going on. [m]
+        At an equation of stationing, the measure after it. [m]
     """
 
     part: int
@@ -62,7 +62,7 @@ class Measures:
     sections: tuple[Section, ...]
 
     def measure_at(self, part: int, chainage_m: float) -> float:
-        """Measure of a place on the axis; at an equation the one going on. [m]"""
+        """Measure of a place on the axis; at an equation of stationing the one after it. [m]"""
         found = self._section_at(part, chainage_m)
         return float(np.interp(chainage_m, found.chainages_m, found.measures_m))
 
@@ -71,7 +71,7 @@ class Measures:
         return self.sections.index(self._section_at(part, chainage_m))
 
     def places_of(self, measure_m: float) -> list[tuple[int, int, float]]:
-        """Section, part and chainage of each place with a measure; none where it is on no road."""
+        """Section, part and chainage of each place with a measure; none if it is not on the road."""
         places = []
         for number, section in enumerate(self.sections):
             if section.measures_m[0] - _ON_END_M <= measure_m <= section.measures_m[-1] + _ON_END_M:
@@ -93,7 +93,7 @@ def calibrate(part_ranges_m: Sequence[tuple[float, float]], points: Sequence[Cal
     part_ranges_m : sequence of (start_m, end_m)
         Chainages of each part's ends. [m]
     points : sequence of CalibrationPoint
-        In any order. A part without any goes on from the end of the one before it, the first from 0.
+        In any order. A part without any continues from the end of the part before it, the first from 0.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def _add_knot(knots: list[tuple[float, float]], chainage_m: float, measure_m: fl
 
 def _check_places(points: list[CalibrationPoint]) -> None:
     for one, other in pairwise(points):
-        if other.chainage_m - one.chainage_m < 1e-3:
+        if other.chainage_m - one.chainage_m < _MIN_APART_M:
             raise InvalidParameter(
                 f"two calibration points lie at one place, with {one.measure_m:g} m and {other.measure_m:g} m",
                 field="calibration",

@@ -13,7 +13,14 @@ from app.errors import InvalidParameter
 Floats = npt.NDArray[np.float64]
 
 MAX_SENSORS = 64
+"""Sensors of a bar at most. Source: chosen by hand; METRO's has 14 (section 6.1)."""
 MIN_WIDTH_M = 0.1
+"""Smallest distance between the outermost sensors. [m] Source: chosen by hand; METRO's is 1.76 m."""
+MAX_FIELD_UT = 50_000.0
+"""Largest field that a chip reads, per axis. [uT] Source: MLX90393, 5 to 50 mT (METRO section 6.1)."""
+MAX_DELAY_S = 0.01
+"""Largest time between a time stamp and the reading of an axis. [s] Source: chosen by hand, over three samples of
+METRO."""
 
 
 class SensorRole(StrEnum):
@@ -82,7 +89,7 @@ class MagnetometerBar:
                 "each sensor has a rotation matrix", field="bar.vehicle_from_sensor", limit="S rotations, 3 x 3"
             )
         delays = tuple(float(d) for d in self.axis_delay_s)
-        if len(delays) != 3 or not all(abs(d) <= 0.01 for d in delays):
+        if len(delays) != 3 or not all(abs(d) <= MAX_DELAY_S for d in delays):
             raise InvalidParameter("three delays", field="bar.axis_delay_s", limit="-0.01 to 0.01 s")
         object.__setattr__(self, "positions_m", positions)
         object.__setattr__(self, "roles", roles)

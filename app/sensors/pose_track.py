@@ -1,4 +1,4 @@
-"""Where a vehicle was while it listened."""
+"""Positions of a vehicle over time."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter
+from app.geodesy.ellipsoid import metres_per_radian
 
 Floats = npt.NDArray[np.float64]
 
-LEAST_STEP_M = 5.0
-"""Between two places that count as driven. [m]"""
-FASTEST_M_S = 70.0
-_MAJOR_M, _E2 = 6378137.0, 0.0066943799901413165  # WGS 84
+MIN_STEP_M = 5.0  # [m] shorter steps are the receiver's noise; source: by hand, docs/fleet.md
+MAX_STEP_M = 50.0  # [m] of inaccurate receivers; source: by hand
+STEP_SIGMAS = 8.0  # accuracies in a step that counts as driven; source: by hand, two positions at 5.7 sigma
+DEFAULT_STEP_M = 10.0  # [m] without a reported accuracy; source: by hand, 8 x 1.25 m
+MAX_SPEED_M_S = 70.0  # [m/s] a faster step is a gap in the track; source: by hand, 252 km/h
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +71,7 @@ class PoseTrack:
         Returns
         -------
         PoseTrack
-            The same where no heading is known; between known headings they are interpolated.
+            This track if no heading is known; between known headings the heading is interpolated.
         """
         known = np.isfinite(self.heading_deg)
         if not known.any():
@@ -88,32 +90,27 @@ class PoseTrack:
         )
 
     def driven_m(self) -> float:
-        """How far the vehicle drove.
+        """Distance that the vehicle drove.
 
         Returns
         -------
         float
             Sum of the straight lines between places that are at least 5 m and eight times the accuracy of the position
-            apart (10 m where it is not known, 50 m at most): a receiver that stands still wanders, and that is no way.
-            A line that would take more than 70 m/s is a gap in the track, and counts nothing. [m]
+            apart (10 m where it is not known, 50 m at most): the position of a parked receiver wanders.
+            A line that would take more than 70 m/s is a gap in the track and is not counted. [m]
         """
         if len(self.time_s) < 2:
             return 0.0
         lon, lat = np.radians(np.unwrap(self.lon_deg, period=360.0)), np.radians(self.lat_deg)
         east_per_rad, north_per_rad = metres_per_radian(lat)
-        step_m = np.clip(8 * np.nan_to_num(self.accuracy_m, nan=10.0 / 8), LEAST_STEP_M, 50.0)
+        accuracy_m = np.nan_to_num(self.accuracy_m, nan=DEFAULT_STEP_M / STEP_SIGMAS)
+        step_m = np.clip(STEP_SIGMAS * accuracy_m, MIN_STEP_M, MAX_STEP_M)
         total_m, at = 0.0, 0
         for k in range(1, len(lon)):
             leg_m = math.hypot((lon[k] - lon[at]) * east_per_rad[at], (lat[k] - lat[at]) * north_per_rad[at])
             if leg_m < step_m[k]:
                 continue
-            if leg_m <= FASTEST_M_S * (self.time_s[k] - self.time_s[at]):
+            if leg_m <= MAX_SPEED_M_S * (self.time_s[k] - self.time_s[at]):
                 total_m += leg_m
             at = k
         return total_m
-
-
-def metres_per_radian(lat_rad: Floats) -> tuple[Floats, Floats]:
-    """East and north of a radian of longitude and of latitude, on the WGS 84 ellipsoid. [m]"""
-    curve = 1 - _E2 * np.sin(lat_rad) ** 2
-    return np.cos(lat_rad) * _MAJOR_M / np.sqrt(curve), _MAJOR_M * (1 - _E2) / curve**1.5

@@ -1,4 +1,4 @@
-"""Scene -> frame: what a camera on a vehicle sees of plates on the road.
+"""Scene to frame: the image of plates on the road in a camera on a vehicle.
 
 Radiance is linear, 1 = the sensor's saturation. Only the surroundings of the squares on the road are integrated over
 pixel area and exposure; the rest of the frame is the photo behind them, given the same light, tone and noise.
@@ -20,9 +20,9 @@ from app.simulation.footprint import (
     directions,
     exposure_samples,
     list_windows,
+    motion_blur_px,
     pixel_rays,
     sample_count,
-    smear_px,
 )
 from app.simulation.plate_scene import FaceTruth, PlateScene, face_truth
 from app.simulation.raster import accumulate_face, expose_photo, shade_rays
@@ -222,8 +222,8 @@ def gather_faces(
     """
     radiance = np.zeros((*rays.shape[:2], 3), np.float32)
     cover = np.zeros(rays.shape[:2], np.float32)
-    smear = max(smear_px(scene, scene.faces[k], scene.exposure_s) for k in members)
-    samples = exposure_samples(sample_count(cover.size, smear), scene.exposure_s, lag_s)
+    blur_px = max(motion_blur_px(scene, scene.faces[k], scene.exposure_s) for k in members)
+    samples = exposure_samples(sample_count(cover.size, blur_px), scene.exposure_s, lag_s)
     row_time = scene.row_time_s(window.grid[0])
     motion, spin = np.array([scene.speed_m_s, 0.0, 0.0]), np.radians(scene.spin_deg_s)
     for k, light in zip(members, lights, strict=True):

@@ -1,4 +1,4 @@
-"""Conditions drawn at random: from a sunny afternoon to everything at once."""
+"""Conditions drawn at random, from a sunny afternoon to every degradation together."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def draw_daylight(rng: np.random.Generator) -> Conditions:
 
 
 def draw_stress(rng: np.random.Generator, *, night: bool = False) -> Conditions:
-    """Every degradation drawn at random, several at once.
+    """Every degradation drawn at random, several together.
 
     Parameters
     ----------
@@ -87,16 +87,17 @@ def draw_stress(rng: np.random.Generator, *, night: bool = False) -> Conditions:
     )
     stressed = replace(
         fair,
-        wear=_draw_wear(rng),
-        shadow=_draw_shadow(rng),
+        wear=draw_wear(rng),
+        shadow=draw_shadow(rng),
         air=_draw_air(rng),
         sensor=sensor,
         exposure_s=1 / float(np.exp(rng.uniform(np.log(250), np.log(2500)))),
     )
-    return _at_night(stressed, rng) if night else stressed
+    return at_night(stressed, rng) if night else stressed
 
 
-def _draw_wear(rng: np.random.Generator) -> PlateWear:
+def draw_wear(rng: np.random.Generator) -> PlateWear:
+    """Wear and stains of a plate after years on the road."""
     return PlateWear(
         contrast_loss=_uniform(rng, 0, 0.45),
         patchy_loss=_uniform(rng, 0, 0.75) if rng.random() < 0.7 else 0.0,
@@ -106,7 +107,8 @@ def _draw_wear(rng: np.random.Generator) -> PlateWear:
     )
 
 
-def _draw_shadow(rng: np.random.Generator) -> Shadow:
+def draw_shadow(rng: np.random.Generator) -> Shadow:
+    """Shadow edges and leaves, each on some of the plates."""
     return Shadow(
         edge_light=_uniform(rng, 0.2, 0.7) if rng.random() < 0.4 else 1.0,
         edge_angle_deg=_uniform(rng, 0, 360),
@@ -129,7 +131,8 @@ def _draw_air(rng: np.random.Generator) -> Air:
     )
 
 
-def _at_night(conditions: Conditions, rng: np.random.Generator) -> Conditions:
+def at_night(conditions: Conditions, rng: np.random.Generator) -> Conditions:
+    """The same with headlights and lit plates in place of daylight."""
     look = replace(conditions.look, led=_uniform(rng, 0.15, 0.7))
     sensor = replace(conditions.sensor, full_well_e=_uniform(rng, 150, 800), read_noise_e=_uniform(rng, 2, 6), gain=1.0)
     night = replace(conditions, look=look, sensor=sensor, shadow=Shadow(), air=Air())

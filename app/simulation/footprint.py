@@ -1,4 +1,4 @@
-"""Which part of the road, and when, each pixel looks at."""
+"""The part of the road that each pixel sees, and when."""
 
 from __future__ import annotations
 
@@ -65,7 +65,10 @@ def _window(scene: PlateScene, placed: PlacedFace, truth: FaceTruth) -> Window |
     if not truth.partly_in_view:
         return None
     margin = (
-        smear_px(scene, placed, scene.exposure_s) + 4 * scene.sensor.blur_px + abs(scene.sensor.colour_shift_px) + 6
+        motion_blur_px(scene, placed, scene.exposure_s)
+        + 4 * scene.sensor.blur_px
+        + abs(scene.sensor.colour_shift_px)
+        + 6
     )
     low, high = truth.corners_px.min(axis=0) - margin, truth.corners_px.max(axis=0) + margin
     left, top = max(int(low[0]) // 2 * 2, 0), max(int(low[1]) // 2 * 2, 0)
@@ -74,8 +77,8 @@ def _window(scene: PlateScene, placed: PlacedFace, truth: FaceTruth) -> Window |
     return Window(left, top, right, bottom) if right - left > 1 and bottom - top > 1 else None
 
 
-def smear_px(scene: PlateScene, placed: PlacedFace, exposure_s: float) -> float:
-    """Longest way that a corner goes in the image during an exposure. [px]"""
+def motion_blur_px(scene: PlateScene, placed: PlacedFace, exposure_s: float) -> float:
+    """Longest path of a corner in the image during an exposure. [px]"""
     if not scene.speed_m_s and not any(scene.spin_deg_s):
         return 0.0
     corners = placed.corners_ground_m
@@ -84,9 +87,9 @@ def smear_px(scene: PlateScene, placed: PlacedFace, exposure_s: float) -> float:
     return min(float(np.nanmax(way)), 400.0) if np.isfinite(way).any() else 0.0
 
 
-def sample_count(pixels: int, smear: float) -> int:
+def sample_count(pixels: int, blur_px: float) -> int:
     """Samples a pixel: at least four for each pixel of motion, more where a window is small, fewer where it is vast."""
-    wanted = max(3_000_000 / max(pixels, 1), 4 * smear + 12, 24)
+    wanted = max(3_000_000 / max(pixels, 1), 4 * blur_px + 12, 24)
     return int(max(min(wanted, 160, 16_000_000 / max(pixels, 1)), 16))
 
 

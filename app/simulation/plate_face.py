@@ -17,7 +17,7 @@ from app.markers.plate import PlateCode, PlateGeometry
 
 FloatArray = npt.NDArray[np.float32]
 Colour = tuple[float, float, float]
-_MOST_TEXELS = 800
+_MAX_TEXELS = 800
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class PlateLook:
 
 @dataclass(frozen=True, slots=True)
 class PlateWear:
-    """What time did to a plate. All shares are 0 (new) to 1.
+    """Wear of a plate. All shares are 0 (new) to 1.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def grid_face(cells: npt.ArrayLike, side_m: float, wear: PlateWear, rng: np.rand
     """
     colours = np.asarray(cells, np.float32)
     count = colours.shape[0]
-    size = max(round(min(side_m * 1000, _MOST_TEXELS) / count) * count, count)
+    size = max(round(min(side_m * 1000, _MAX_TEXELS) / count) * count, count)
     crisp = np.repeat(np.repeat(colours, size // count, axis=0), size // count, axis=1)
     emission = np.ascontiguousarray(crisp * (led / max(float(colours.max()), 1e-6))) if led > 0 else None
     return Face(side_m, _worn(crisp, wear, side_m * 1000, rng), emission)

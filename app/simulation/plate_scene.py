@@ -200,9 +200,9 @@ class PlateScene:
     body_deg : tuple of float
         Roll, pitch (nose down) and yaw (left) of the vehicle against road and travel at mid-exposure. [deg]
     road_reflectance : float
-        Of the road in the photo: with its brightness there, it says how much light falls on the plate.
+        Of the road in the photo: its brightness over this is the light that falls on the plate.
     night_light : float or None
-        Light on a white surface as a share of saturation, in place of what the photo says; the photo goes dark too.
+        Light on a white surface as a share of saturation, in place of the photo's; the photo is darkened too.
     """
 
     camera: Camera

@@ -172,7 +172,7 @@ def expose_photo(
     encode, sigma : float32 (L, C, 256)
         Encoded value and noise of a photo's value at L even steps of light from 0 to 1. [grey levels]
     noise : float32 (M,)
-        Standard normal numbers; ``offsets`` : int64 (H,) says where each row starts in them.
+        Standard normal numbers; ``offsets`` : int64 (H,), where each row starts in them.
     """
     rows, cols, channels = photo.shape
     top_level = encode.shape[0] - 1

@@ -1,6 +1,9 @@
-"""Road photos seen by another camera: the photo's road laid flat and looked at again."""
+"""Road photos as another camera would see them: the road is projected to the ground and rendered again."""
 
 from __future__ import annotations
+
+from functools import lru_cache
+from importlib.resources import files
 
 import cv2
 import numpy as np
@@ -12,6 +15,15 @@ Image = npt.NDArray[np.uint8]
 _PHOTO_HORIZON = 0.585  # of the photo's height: dash cameras of the photos used look almost level
 _PHOTO_FOCAL = 0.9  # of the photo's width
 _PHOTO_HEIGHT_M = 1.3
+_PHOTOS = ("p1_solidWhiteCurve.jpg", "p1_whiteCarLaneSwitch.jpg", "vid_60.jpg")
+
+
+@lru_cache(maxsize=1)
+def road_photos() -> tuple[Image, ...]:
+    """Real photos of a dash camera; sources in app/simulation/data/SOURCES.md."""
+    folder = files("app.simulation") / "data"
+    coded = [np.frombuffer((folder / name).read_bytes(), np.uint8) for name in _PHOTOS]
+    return tuple(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8) for data in coded)
 
 
 def road_background(photo: Image, camera: Camera, rng: np.random.Generator, *, grain: float = 0.04) -> Image:

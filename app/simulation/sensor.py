@@ -1,4 +1,4 @@
-"""Radiance -> grey levels: noise, colour mosaic, gains, tone, sharpening, JPEG.
+"""Radiance to grey levels: noise, colour mosaic, gains, tone, sharpening, JPEG.
 
 Radiance is linear, 1 = the sensor's saturation; channels are blue, green, red.
 """

@@ -1,4 +1,4 @@
-"""Would a car that follows a decoded path stay in its lane? A simulated drive along it."""
+"""A simulated drive along a decoded path: does a car that follows it stay in its lane?"""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.control import (
+from app.errors import InvalidParameter
+from app.lanes.control import (
     Controller,
     FollowedPath,
     SteeringSettings,
     follow_path,
     nearest_on_path,
     plan_speed,
-    predict_pose,
-    stanley_rad,
 )
-from app.errors import InvalidParameter
-from app.simulation.vehicle import STEP_S, PoseNoise, Vehicle, draw_pose_errors, move_vehicle, turn_wheels
+from app.simulation.steered_drive import (
+    ENDINGS,
+    OFF_PATH_M,
+    REACHED_END,
+    Course,
+    car_values,
+    drive_course,
+    law_values,
+    start_on_bend,
+)
+from app.simulation.vehicle import STEP_S, PoseNoise, Vehicle, draw_pose_errors
 
 Floats = npt.NDArray[np.float64]
 
-OFF_PATH_M = 3.0
-"""A drive ends where the front axle is farther from its path. [m]"""
-_SPARE_S, _SPARE_SHARE = 30.0, 1.5
-_NEAR_M, _MAX_SUM_RAD = 0.15, 0.05
-"""The integral learns from errors smaller than this, and steers by no more than this. [m, rad]"""
-_SPEED_PID = (1.5, 0.15, 0.05)
-_SPEED_AHEAD_S = 0.5
-"""The speed wanted is that of the path so long ahead: the engine and the brakes need about it. [s]"""
+_SPARE_S, _SPARE_SHARE = 30.0, 1.5  # [s, 1] time allowed beyond the planned one; source: by hand
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,13 +69,13 @@ class SteeringTrace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SteeringCheck:
-    """How a simulated drive along a path went.
+    """Errors of a simulated drive along a path.
 
     Attributes
     ----------
     controller : Controller
     rms_m, max_m : float
-        Cross-track error of the front axle's centre against the true line, over the way driven. [m]
+        Cross-track error of the front axle's centre against the true line, over the distance driven. [m]
     mse_east_m2, mse_north_m2, mse_m2 : float
         Mean squares of the error vector's two components, and their magnitude (see Notes). [m2]
     path_rms_m, rear_rms_m : float
@@ -84,10 +85,10 @@ class SteeringCheck:
     lateral_acceleration_m_s2 : float
         Largest. [m/s2]
     mean_speed_m_s, excess_speed_m_s : float
-        Mean speed, and the most by which the planned speed was exceeded: the limit or less. [m/s]
+        Mean speed, and the maximum by which the planned speed (the limit or less) was exceeded. [m/s]
     distance_m, duration_s : float
     completed : bool
-        The front axle came to the path's end.
+        Whether the front axle reached the path's end.
     ended : str
         Why the drive ended.
     trace : SteeringTrace
@@ -140,19 +141,20 @@ def check_steering(
     path_enu_m : array_like, shape (S, 2)
         The path decoded: east, north in the direction of travel. [m]
     speed_limit_km_h : float or array_like, shape (S,)
-        Driven at, but for bends, which are taken at 2 m/s2 sideways, with 1.5 m/s2 of braking before them. [km/h]
+        Driven at except in bends, which are driven at 2 m/s2 of lateral acceleration, with 1.5 m/s2 of braking before
+        them. [km/h]
     controller : Controller or str
     settings : SteeringSettings, optional
-        Gains and the vehicle's delays as the controller believes them, which need not be true.
+        Gains, and the vehicle's delays as assumed by the controller.
     vehicle : Vehicle, optional
     noise : PoseNoise, optional
-        Errors of the poses that the controller is given; none without.
+        Errors of the poses for the controller; none by default.
     truth_enu_m : array_like, shape (M, 2), optional
-        The true centre line; the path itself without. [m]
+        The true centre line; the path itself by default. [m]
     rng : numpy.random.Generator, optional
-        Draws the noise; needed with it.
+        Draws the noise; required with it.
     start_offset_m : float
-        The drive starts so far left of the path, as on a steady bend of its curvature. [m]
+        Offset of the start left of the path, as on a steady bend of its curvature. [m]
 
     Returns
     -------
@@ -185,98 +187,20 @@ def check_steering(
     longest_s = _SPARE_SHARE * path.step_m * float(np.sum(1 / speed)) + _SPARE_S
     steps = math.ceil(longest_s / STEP_S)
     errors = draw_pose_errors(noise, steps, rng or np.random.default_rng(0))
-    rows, end = _drive(
-        path.position_enu_m, path.heading_rad, speed, path.step_m, float(path.curvature_per_m[0]), start_offset_m,
-        errors, _law_values(law, settings), _vehicle_values(vehicle),
-    )  # fmt: skip
-    return _judge(law, rows, path, truth, vehicle, ("reached the end", "left the path", "took too long")[end])
+    course = Course(path.position_enu_m, path.heading_rad, speed, path.step_m)
+    start = start_on_bend(course, float(path.curvature_per_m[0]), start_offset_m, vehicle.wheelbase_m)
+    rows, ending = drive_course(course, start, errors, law_values(law, settings), car_values(vehicle))
+    return _evaluate(law, rows, path, truth, vehicle, ENDINGS[ending])
 
 
 def _known_controller(controller: Controller | str) -> Controller:
+    """Raises InvalidParameter if the controller is unknown."""
     try:
         return Controller(controller)
     except ValueError as error:
         raise InvalidParameter(
             f"{controller!r} is not a controller", field="controller", limit=", ".join(Controller)
         ) from error
-
-
-def _law_values(law: Controller, s: SteeringSettings) -> tuple[float, ...]:
-    predictive = law is Controller.PREDICTIVE
-    return (
-        s.gain_per_s,
-        s.lookahead_m if law is Controller.STANLEY_LOOKAHEAD else 0.0,
-        s.latency_s if predictive else 0.0,
-        s.lag_s if predictive else 0.0,
-        s.wheelbase_m,
-        s.integral_per_m_s if predictive else 0.0,
-        1.0 if predictive else 0.0,
-    )
-
-
-def _vehicle_values(v: Vehicle) -> tuple[float, ...]:
-    return (
-        v.wheelbase_m, math.radians(v.max_steer_deg), math.radians(v.max_steer_rate_deg_s), v.steer_lag_s,
-        float(round(v.latency_s / STEP_S)), math.radians(v.steer_offset_deg), v.max_acceleration_m_s2,
-        v.max_braking_m_s2, v.drive_lag_s,
-    )  # fmt: skip
-
-
-# --- the drive ----------------------------------------------------------------------------------------------------
-
-
-@nb.njit(cache=True)
-def _drive(points, headings, speeds, step_m, curvature, offset, errors, law, car):  # type: ignore[no-untyped-def]
-    """Rows of rear x, y, heading, speed, planned speed, wheel angle, station, path error; and how it ended (0 well)."""
-    gain, ahead, assumed_latency, assumed_lag, assumed_base, integral_gain, predictive = law
-    wheelbase, max_steer, max_rate, lag, latency, askew, push, brake, drive_lag = car
-    dt, delay, last = STEP_S, int(latency), points.shape[0] - 1
-    waiting, held = round(assumed_latency / dt), round(assumed_lag / dt)
-    rows = np.empty((errors.shape[0], 8))
-    # a steady turn: the front axle runs along the path, the wheels stand at sin(steer) = wheelbase x curvature
-    wheel = math.asin(min(max(wheelbase * curvature, -0.5), 0.5))
-    yaw, speed, pushed = headings[0] - wheel, speeds[0], 0.0
-    x = points[0, 0] - offset * math.sin(headings[0]) - wheelbase * math.cos(yaw)
-    y = points[0, 1] + offset * math.cos(headings[0]) - wheelbase * math.sin(yaw)
-    depth = max(delay, waiting) + 1
-    sent = np.full(depth, wheel - askew)  # newest last
-    near, far, seen, summed, speed_sum, before = 0, min(int(ahead / step_m), last - 1), 0, 0.0, 0.0, 0.0
-    for k in range(errors.shape[0]):
-        front_x, front_y = x + wheelbase * math.cos(yaw), y + wheelbase * math.sin(yaw)
-        near, share, left = nearest_on_path(points, front_x, front_y, near)
-        station = (near + share) * step_m
-        wanted = speeds[min(max(int((station + _SPEED_AHEAD_S * speed) / step_m), 0), last)]
-        planned = speeds[min(max(int(station / step_m), 0), last)]
-        rows[k] = (x, y, yaw, speed, planned, wheel, station, left)
-        if near == last - 1 and share >= 1.0:
-            return rows[: k + 1], 0
-        if not abs(left) <= OFF_PATH_M:
-            return rows[: k + 1], 1
-        # the controller sees a pose with errors
-        at_x, at_y, at_yaw, at_wheel = x + errors[k, 0], y + errors[k, 1], yaw + errors[k, 2], wheel - askew
-        if predictive > 0:
-            pending = sent[depth - waiting :]
-            at_x, at_y, at_yaw, at_wheel = predict_pose(
-                at_x, at_y, at_yaw, at_wheel, speed, assumed_base, assumed_lag, pending, held, dt
-            )
-        at_x, at_y = at_x + assumed_base * math.cos(at_yaw), at_y + assumed_base * math.sin(at_yaw)
-        steer, error, seen, far = stanley_rad(points, headings, at_x, at_y, at_yaw, speed, gain, ahead, seen, far)
-        if abs(error) < _NEAR_M:
-            summed = min(max(summed - integral_gain * error * dt, -_MAX_SUM_RAD), _MAX_SUM_RAD)
-        sent[:-1] = sent[1:]
-        sent[-1] = min(max(steer + summed, -max_steer), max_steer)
-        wheel = turn_wheels(wheel, sent[depth - 1 - delay] + askew, lag, max_rate, max_steer, dt)
-        # speed by PID, its sum held while the limits hold
-        behind = wanted - speed
-        asked = _SPEED_PID[0] * behind + _SPEED_PID[1] * speed_sum
-        asked += _SPEED_PID[2] * (behind - before) / dt if k else 0.0
-        before = behind
-        if -brake < asked < push:
-            speed_sum += behind * dt
-        pushed += dt / max(drive_lag, dt) * (min(max(asked, -brake), push) - pushed)
-        x, y, yaw = move_vehicle(x, y, yaw, speed, wheel, wheelbase, dt)
-        speed = max(speed + pushed * dt, 0.0)
-    return rows, 2
 
 
 @nb.njit(cache=True)
@@ -296,12 +220,13 @@ def _errors_along(points, track, first):  # type: ignore[no-untyped-def]
     return out
 
 
-# --- judgement ----------------------------------------------------------------------------------------------------
+# --- evaluation ----------------------------------------------------------------------------------------------------
 
 
-def _judge(
+def _evaluate(
     law: Controller, rows: Floats, path: FollowedPath, truth: FollowedPath, vehicle: Vehicle, ended: str
 ) -> SteeringCheck:
+    """Errors of the rows of a drive."""
     rear, yaw, speed, wheel = rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 5]
     time_s = np.arange(len(rows), dtype=float) * np.float64(STEP_S)
     heading_deg = np.asarray((90.0 - np.degrees(yaw)) % 360.0, float)
@@ -338,7 +263,7 @@ def _judge(
         excess_speed_m_s=max(float(np.max(speed - rows[:, 4])), 0.0),
         distance_m=float(weights.sum()),
         duration_s=len(rows) * STEP_S,
-        completed=ended == "reached the end",
+        completed=ended == ENDINGS[REACHED_END],
         ended=ended,
         trace=trace,
     )

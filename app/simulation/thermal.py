@@ -1,4 +1,4 @@
-"""Scene -> thermal frame: temperatures instead of light, a slow sensor, one channel."""
+"""Scene to thermal frame: temperatures instead of light, a slow sensor, one channel."""
 
 from __future__ import annotations
 

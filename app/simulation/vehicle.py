@@ -1,4 +1,4 @@
-"""A car as a kinematic bicycle with a steering that has limits, a lag and a delay, and what its receiver says of it."""
+"""A car as a kinematic bicycle whose steering has limits, a lag and a delay, and the errors of its poses."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.control import check_range
+from app.lanes.control import check_range
 
 Floats = npt.NDArray[np.float64]
 
-STEP_S = 0.01
-"""Time step of simulation and controller: 100 Hz. [s]"""
+STEP_S = 0.01  # [s] time step of simulation and controller; source: by hand, 100 Hz
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """Parameters of the car; the wheelbase is the Kia Niro's.
+    """Parameters of the car.
 
     Attributes
     ----------
@@ -28,26 +27,26 @@ class Vehicle:
     max_steer_deg, max_steer_rate_deg_s : float
         Of the front wheels. [deg, deg/s]
     steer_lag_s, latency_s : float
-        Time constant with which the wheels follow, and how long a command is on its way. [s]
+        Time constant of the wheels, and delay of a command. [s]
     steer_offset_deg : float
-        By which the wheels stand askew, left positive. [deg]
+        Misalignment of the wheels, left positive. [deg]
     max_acceleration_m_s2, max_braking_m_s2, drive_lag_s : float
         Limits of speed control and its time constant.
 
     Notes
     -----
-    Tyres don't slip: right for what comfort allows (2 m/s2 sideways), not for emergencies.
+    Tyres do not slip: valid for comfortable driving (2 m/s2 sideways), not for emergencies.
     """
 
-    wheelbase_m: float = 2.70
-    max_steer_deg: float = 32.0
-    max_steer_rate_deg_s: float = 30.0
-    steer_lag_s: float = 0.10
-    latency_s: float = 0.12
+    wheelbase_m: float = 2.70  # [m] source: Kia Niro, the paper's car
+    max_steer_deg: float = 32.0  # [deg] source: assumed, no measurement kept
+    max_steer_rate_deg_s: float = 30.0  # [deg/s] source: assumed, no measurement kept
+    steer_lag_s: float = 0.10  # [s] source: assumed, no measurement kept
+    latency_s: float = 0.12  # [s] source: assumed, no measurement kept
     steer_offset_deg: float = 0.0
-    max_acceleration_m_s2: float = 2.0
-    max_braking_m_s2: float = 3.0
-    drive_lag_s: float = 0.3
+    max_acceleration_m_s2: float = 2.0  # [m/s2] source: assumed, comfortable driving
+    max_braking_m_s2: float = 3.0  # [m/s2] source: assumed, comfortable driving
+    drive_lag_s: float = 0.3  # [s] source: assumed, no measurement kept
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -60,7 +59,7 @@ class Vehicle:
 
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
-    """Errors of the pose that a controller is given: RTK with two antennas.
+    """Errors of the poses for a controller: RTK with two antennas.
 
     Attributes
     ----------
@@ -73,13 +72,13 @@ class PoseNoise:
 
     Notes
     -----
-    By default 0.02 m in the plane, as the paper's receiver states: 0.014 m on each axis, most of it slow.
+    By default 0.02 m in the plane, as stated for the paper's receiver: 0.014 m on each axis, most of it slow.
     """
 
-    drift_m: float = 0.0135
-    drift_over_s: float = 20.0
-    jitter_m: float = 0.004
-    heading_deg: float = 0.1
+    drift_m: float = 0.0135  # [m] source: the paper's receiver, 0.02 m in the plane
+    drift_over_s: float = 20.0  # [s] source: assumed, no measurement kept
+    jitter_m: float = 0.004  # [m] source: assumed, no measurement kept
+    heading_deg: float = 0.1  # [deg] source: assumed, two antennas
 
     def __post_init__(self) -> None:
         for name, low, high in (

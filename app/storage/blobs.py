@@ -19,7 +19,7 @@ _URL = "file:///FOLDER or s3://BUCKET/PREFIX"
 
 
 def new_blob_key(kind: str) -> str:
-    """A fresh random key. Nothing of it comes from the client, and it says nothing about the content."""
+    """A new random key, which depends neither on the client nor on the content."""
     name = uuid.uuid4().hex
     return f"{kind}/{name[:2]}/{name}"
 

@@ -1,4 +1,4 @@
-"""The public keys of an OIDC issuer (RFC 7517), as they are at a URL or in a file."""
+"""The public keys of an OIDC issuer (RFC 7517), from a URL or a file."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import httpx
 from app.errors import Unavailable
 
 MAX_BYTES = 256 * 1024
-_TIMEOUT_S = 5.0
+"""Largest key set. [byte] Chosen by hand."""
+_TIMEOUT_S = 5.0  # [s] chosen by hand
 
 
 def read_jwks(source: str) -> bytes:
-    """The key set at an address or in a file, not looked into.
+    """The key set at a URL or in a file, not parsed.
 
     Raises
     ------

@@ -12,7 +12,7 @@ MASTER_KEY_BYTES = 32
 
 
 def load_master_key(path: Path) -> bytes:
-    """The key in a file that only its owner may read; made up where there is none.
+    """The key in a file that only its owner may read; created if there is none.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def load_master_key(path: Path) -> bytes:
 
 
 def load_secret(path: Path) -> bytes:
-    """What is in a file that only its owner may read; 32 random bytes where there is none."""
+    """Content of a file that only its owner may read; 32 random bytes are written if there is none."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:

@@ -11,7 +11,7 @@ from app.storage.master_key import MASTER_KEY_BYTES, load_secret
 
 
 def load_signing_key(path: Path) -> Ed25519PrivateKey:
-    """The key in a file of 32 bytes that only its owner may read; made up where there is none.
+    """The key in a file of 32 bytes that only its owner may read; created if there is none.
 
     Raises
     ------

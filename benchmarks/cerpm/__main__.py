@@ -9,7 +9,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterable, Sequence
 
-from benchmarks.cerpm.others import run_forged, run_radio, run_speed, run_tracking
+from benchmarks.cerpm.packets_and_steering import run_forged, run_radio, run_speed, run_tracking
 from benchmarks.cerpm.paths import Result, run_dirty, run_path, run_spoof
 
 RUNS: dict[str, Callable[[int, bool], Result]] = {

@@ -1,15 +1,18 @@
-"""Rows about paths: losses, a spoofed marker, everything dirty at once."""
+"""Rows about paths: lost markers, a spoofed marker, all faults at once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from app.decoders.cerpm.lane import Lane, fit_lane
 from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.verify import verify_packets
+from app.lanes.estimate import Lane, LaneMarkers, fit_lane
+from app.sensors.pose_track import PoseTrack
+from app.sensors.receiver import ReceivedPacket
 from app.simulation.radio.attacks import (
     corrupt_packets,
     forge_packets,
@@ -20,27 +23,27 @@ from app.simulation.radio.attacks import (
     shuffle_packets,
 )
 from app.simulation.radio.drive import drive_past
+from app.simulation.radio.driving import SatelliteReceiver
 from app.simulation.radio.lanes import TrueLane
-from app.simulation.radio.markers import LaidMarkers, lose_row, lose_share
-from app.simulation.radio.vehicle import Receiver
+from app.simulation.radio.markers import InstalledMarkers, lose_row, lose_share
 from benchmarks.cerpm import scenes
-from benchmarks.cerpm.judge import Tally, judge_path, judge_track
+from benchmarks.cerpm.path_errors import Tally, path_errors, track_errors
 
 Result = tuple[str, Sequence[str], list[Sequence[object]]]
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What is laid, what is missing, and what is asked of the path."""
+    """Which markers are installed, which are missing, and the goal for the path."""
 
     name: str
     goal: tuple[float, float | None, float | None]
     """RMS [m], maximum [m], coverage."""
     per_side: int | None = None
-    lose: Callable[[LaidMarkers, np.random.Generator], LaidMarkers] | None = None
+    lose: Callable[[InstalledMarkers, np.random.Generator], InstalledMarkers] | None = None
     with_track: bool = True
     longest_m: float = np.inf
-    """Lanes are cut to this. [m]"""
+    """Longer lanes are cut. [m]"""
 
 
 CONDITIONS = (
@@ -56,12 +59,12 @@ CONDITIONS = (
 CURVATURE_GOAL_1PM = 0.003
 
 
-def _gap(markers: LaidMarkers, rng: np.random.Generator) -> LaidMarkers:
+def _gap(markers: InstalledMarkers, rng: np.random.Generator) -> InstalledMarkers:
     return lose_row(markers, 5, rng).without_sides()
 
 
 def met(yes: bool) -> str:
-    """As the tables say it."""
+    """Yes or no, as the tables print it."""
     return "yes" if yes else "**no**"
 
 
@@ -78,7 +81,7 @@ def run_path(seed: int, short: bool) -> Result:
     for number, condition in enumerate(CONDITIONS):
         ours = {name: Tally() for name in names}
         paper, own = Tally(), Tally()
-        for name, lane, rng in _scenes(seed, short, 10 + number):
+        for name, lane, rng in list_scenes(seed, short, 10 + number):
             add_errors(condition, scenes.shortened(lane, condition.longest_m), rng, ours[name], paper, own)
         every = Tally()
         for tally in ours.values():
@@ -88,12 +91,12 @@ def run_path(seed: int, short: bool) -> Result:
             curvature = every
         rows.append(_path_row(condition, ours, every, paper, own))
     got = curvature.curvature_rms_1pm
-    told, right = (100 * share for share in all_rows.told_and_right)
+    confidence, right = (100 * share for share in all_rows.confidence_and_share_right)
     note = (
         "RMS distance from the true centre line to the path [m], by lane; maximum and coverage over all lanes. Met: "
-        "RMS on each route and on the made lanes together. Own track: the vehicle's positions taken as the path.\n\n"
+        "RMS on each route, and on the generated lanes together. Own track: the vehicle's positions used as path.\n\n"
         f"Curvature at 40 ft: {got:.4f} 1/m RMS, goal {CURVATURE_GOAL_1PM}, met: {met(got <= CURVATURE_GOAL_1PM)}. "
-        f"Over all rows the paths give {told:.1f} % for being within 0.25 m of the centre; {right:.1f} % is."
+        f"Over all rows the mean confidence (within 0.25 m of the centre) is {confidence:.1f} %; {right:.1f} % are."
     )
     head = (
         "markers", "Karlsruhe low", "Karlsruhe moderate", "TFHRC bend", "TFHRC low", "made", "all", "max [m]",
@@ -102,7 +105,8 @@ def run_path(seed: int, short: bool) -> Result:
     return note, head, rows
 
 
-def _scenes(seed: int, short: bool, item: int):  # type: ignore[no-untyped-def]
+def list_scenes(seed: int, short: bool, item: int):  # type: ignore[no-untyped-def]
+    """Name, lane and generator of each run of an item."""
     runs, made = runs_of(short)
     for run in range(runs):
         for k, (name, lane) in enumerate(scenes.list_lanes(seed, run, made)):
@@ -113,20 +117,20 @@ def add_errors(
     condition: Condition, lane: TrueLane, rng: np.random.Generator, ours: Tally, paper: Tally, own: Tally
 ) -> None:
     """Errors of the path, of the paper's way and of the vehicle's own track on one drive."""
-    laid = scenes.lay(lane, rng, condition.per_side)
+    installed = scenes.install(lane, rng, condition.per_side)
     if condition.lose is not None:
-        laid = condition.lose(laid, rng)
+        installed = condition.lose(installed, rng)
     track = scenes.track(lane, rng)
-    first, last = span_of(laid)
-    markers, hint = scenes.markers_for_lane(laid), track if condition.with_track else None
-    ours.add(judge_path(lane, fit_lane(markers, hint), first, last))
-    paper.add(judge_path(lane, fit_lane(markers, hint, method="paper"), first, last))
-    own.add(judge_track(lane, track, first, last))
+    first, last = span_of(installed)
+    markers, hint = scenes.markers_for_lane(installed), track if condition.with_track else None
+    ours.add(path_errors(lane, fit_lane(markers, hint), first, last))
+    paper.add(path_errors(lane, fit_lane(markers, hint, method="paper"), first, last))
+    own.add(track_errors(lane, track, first, last))
 
 
-def span_of(laid: LaidMarkers) -> tuple[float, float]:
+def span_of(installed: InstalledMarkers) -> tuple[float, float]:
     """Chainages of the first and the last marker. [m]"""
-    return float(laid.chainage_m.min()), float(laid.chainage_m.max())
+    return float(installed.chainage_m.min()), float(installed.chainage_m.max())
 
 
 def _path_row(condition: Condition, ours: dict[str, Tally], every: Tally, paper: Tally, own: Tally) -> Sequence[object]:
@@ -144,42 +148,67 @@ def _path_row(condition: Condition, ours: dict[str, Tally], every: Tally, paper:
 # --- a spoofed marker ---------------------------------------------------------------------------------------------
 
 
+class SpoofCase(NamedTuple):
+    """Markers of which one sends a position 30 m off, and the goal for the path's RMS error [m]."""
+
+    name: str
+    per_side: int | None
+    sides: bool
+    lost: float
+    goal: float | None
+
+
+SPOOF_CASES = (
+    SpoofCase("40 ft", None, True, 0.0, 0.045), SpoofCase("40 ft, no sides", None, False, 0.0, None),
+    SpoofCase("40 ft, 20 % lost", None, True, 0.2, None), SpoofCase("ten a side", 10, True, 0.0, None),
+)  # fmt: skip
+
+
+def spoofed_markers(
+    case: SpoofCase, lane: TrueLane, rng: np.random.Generator
+) -> tuple[InstalledMarkers, int, PoseTrack, tuple[float, float]]:
+    """Markers, the row of the spoofed one, a track, and the chainages of the first and the last true marker."""
+    installed = lose_share(scenes.install(lane, rng, case.per_side), case.lost, rng)
+    installed = installed if case.sides else installed.without_sides()
+    row = int(rng.integers(len(installed)))
+    spoofed = move_claim(lane, installed, row, rng)
+    track = scenes.track(lane, rng)
+    return spoofed, row, track, span_of(spoofed.chosen(np.arange(len(installed)) != row))
+
+
 def run_spoof(seed: int, short: bool) -> Result:
-    """A marker that claims a place 30 m off, with its right tag."""
+    """A marker that sends a position 30 m off, with its valid tag."""
     rows: list[Sequence[object]] = []
-    cases: tuple[tuple[str, int | None, bool, float, float | None], ...] = (
-        ("40 ft", None, True, 0.0, 0.045), ("40 ft, no sides", None, False, 0.0, None),
-        ("40 ft, 20 % lost", None, True, 0.2, None), ("ten a side", 10, True, 0.0, None),
-    )  # fmt: skip
-    for number, (name, per_side, sides, lost, goal) in enumerate(cases):
+    for number, case in enumerate(SPOOF_CASES):
         path, paper, named, runs, others, rejected = Tally(), Tally(), 0, 0, 0, 0
-        for _name, lane, rng in _scenes(seed, short, 30 + number):
-            laid = lose_share(scenes.lay(lane, rng, per_side), lost, rng)
-            laid = laid if sides else laid.without_sides()
-            row = int(rng.integers(len(laid)))
-            spoofed = move_claim(lane, laid, row, rng)
-            markers, track = scenes.markers_for_lane(spoofed), scenes.track(lane, rng)
-            first, last = span_of(spoofed.chosen(np.arange(len(laid)) != row))
+        for _name, lane, rng in list_scenes(seed, short, 30 + number):
+            spoofed, row, track, (first, last) = spoofed_markers(case, lane, rng)
+            markers = scenes.markers_for_lane(spoofed)
             lane_found = fit_lane(markers, track)
             out = {one.row for one in lane_found.left_out}
             named += row in out
             rejected += len(out - {row})
-            runs, others = runs + 1, others + len(laid) - 1
-            path.add(judge_path(lane, lane_found, first, last))
-            paper.add(judge_path(lane, fit_lane(markers, track, method="paper"), first, last))
+            runs, others = runs + 1, others + len(spoofed) - 1
+            path.add(path_errors(lane, lane_found, first, last))
+            paper.add(path_errors(lane, fit_lane(markers, track, method="paper"), first, last))
         share = rejected / others
+        goal = case.goal
         good = named == runs and share <= 0.01 and (goal is None or path.rms_m <= goal)
         rows.append(
             (
-                name, f"{named} of {runs}", f"{100 * share:.2f} %", f"{path.rms_m:.3f}", f"{path.worst_m:.2f}",
+                case.name, f"{named} of {runs}", f"{100 * share:.2f} %", f"{path.rms_m:.3f}", f"{path.worst_m:.2f}",
                 f"all, <= 1 %{f', {goal}' if goal else ''}", met(good), f"{paper.rms_m:.2f}",
             )
         )  # fmt: skip
     head = ("markers", "named", "others left out", "RMS [m]", "max [m]", "goal", "met", "paper's way")
-    return "One marker of each run claims a place 30 m off in any direction that is on no line of the lane.", head, rows
+    return (
+        "One marker of each run sends a position 30 m off, in any direction that is on no line of the lane.",
+        head,
+        rows,
+    )
 
 
-# --- everything dirty ---------------------------------------------------------------------------------------------
+# --- all faults at once ---------------------------------------------------------------------------------------------
 
 
 def run_dirty(seed: int, short: bool) -> Result:
@@ -191,14 +220,15 @@ def run_dirty(seed: int, short: bool) -> Result:
     )
     for number, (name, more, (rms, coverage)) in enumerate(cases):
         tally, own, broken = Tally(), Tally(), 0
-        for _name, lane, rng in _scenes(seed, short, 40 + number):
-            found, log_track, (first, last), raised = dirty_path(lane, rng, more)
-            broken += raised
+        for _name, lane, rng in list_scenes(seed, short, 40 + number):
+            log = dirty_log(lane, rng, more)
+            found, (first, last) = _path_or_none(log), log.span_m
+            broken += found is None
             if found is not None:
-                tally.add(judge_path(lane, found, first, last))
+                tally.add(path_errors(lane, found, first, last))
             else:
                 tally.add(Tally(places=int((last - first) / 0.25), runs=1))
-            own.add(judge_track(lane, log_track, first, last))
+            own.add(track_errors(lane, log.track, first, last))
         good = broken == 0 and tally.rms_m <= rms and tally.coverage >= coverage
         rows.append(
             (
@@ -214,25 +244,40 @@ def run_dirty(seed: int, short: bool) -> Result:
     return note, head, rows
 
 
-def dirty_path(lane: TrueLane, rng: np.random.Generator, more: bool):  # type: ignore[no-untyped-def]
-    """Path or None, track, span of the markers heard, and whether anything was raised."""
-    laid = scenes.lay(lane, rng).without_sides()
-    keys = scenes.keys_for(laid)
+class DirtyLog(NamedTuple):
+    """A packet log with faults, its keys and track, and the chainages of the first and the last marker received."""
+
+    packets: list[ReceivedPacket]
+    keys: dict[int, bytes]
+    track: PoseTrack
+    span_m: tuple[float, float]
+
+
+def dirty_log(lane: TrueLane, rng: np.random.Generator, more: bool) -> DirtyLog:
+    """Drive past markers, and add faults to the log; with `more`, dead, forged and spoofed markers too."""
+    installed = scenes.install(lane, rng).without_sides()
+    keys = scenes.keys_for(installed)
     if more:
-        laid = lose_share(laid, 0.2, rng)
-        laid = move_claim(lane, laid, int(rng.integers(1, len(laid) - 1)), rng)
-    heard = drive_past(lane, laid, rng, sign=scenes.sign, receiver=Receiver.plain())
-    log = corrupt_packets(heard.packets, 0.1, rng)
+        installed = lose_share(installed, 0.2, rng)
+        installed = move_claim(lane, installed, int(rng.integers(1, len(installed) - 1)), rng)
+    drive = drive_past(lane, installed, rng, sign=scenes.sign, receiver=SatelliteReceiver.plain())
+    log = corrupt_packets(drive.packets, 0.1, rng)
     if more:
-        log += forge_packets(heard.packets, len(log) // 20, rng)
+        log += forge_packets(drive.packets, len(log) // 20, rng)
     log = shuffle_packets(repeat_packets(log, 0.3, rng), rng)
     log = number_entries(shift_clock(log, float(rng.uniform(-10, 10))))
-    span = span_of(laid.chosen(np.unique(heard.sender)))
-    found: Lane | None = None
+    return DirtyLog(log, keys, drive.track, span_of(installed.chosen(np.unique(drive.sender))))
+
+
+def markers_of_log(log: DirtyLog) -> LaneMarkers:
+    """The markers of a log, verified and merged."""
+    return scenes.markers_from_merged(merge_markers(verify_packets(log.packets, log.keys).packets, {}, log.track))
+
+
+def _path_or_none(log: DirtyLog) -> Lane | None:
+    """The path of a log; None where an exception was raised."""
     try:
-        merged = merge_markers(verify_packets(log, keys).packets, {}, heard.track)
-        found = fit_lane(scenes.markers_from_merged(merged), heard.track)
-    except Exception as error:  # noqa: BLE001 - what is counted here
+        return fit_lane(markers_of_log(log), log.track)
+    except Exception as error:  # noqa: BLE001 - exceptions are counted
         print(f"raised: {error!r}")
-        return None, heard.track, span, 1
-    return found, heard.track, span, 0
+        return None

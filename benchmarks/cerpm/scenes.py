@@ -11,16 +11,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.lane import LaneMarkers
-from app.decoders.cerpm.merge_types import MergedMarkers
-from app.decoders.cerpm.packets import HeardPacket
+from app.decoders.cerpm.merged_markers import MergedMarkers
 from app.encoders.cerpm.payload import encode_message
+from app.lanes.estimate import LaneMarkers
 from app.markers.cerpm import CerpmMessage, SpeedLimit, SpeedUnit
 from app.markers.cerpm_keys import derive_marker_key
+from app.planning.cerpm_placement import place_markers
 from app.sensors.pose_track import PoseTrack
+from app.sensors.receiver import ReceivedPacket
+from app.simulation.radio.driving import Driver, SatelliteReceiver, drive_lane, observe_track
 from app.simulation.radio.lanes import TrueLane, lane_from_wgs84, make_lane
-from app.simulation.radio.markers import LaidMarkers, lay_markers
-from app.simulation.radio.vehicle import Driver, Receiver, drive_lane, observe_track
+from app.simulation.radio.markers import InstalledMarkers, install_markers
 
 Floats = npt.NDArray[np.float64]
 
@@ -55,21 +56,34 @@ def shortened(lane: TrueLane, longest_m: float) -> TrueLane:
     return TrueLane(lane.origin, **parts)
 
 
-def lay(lane: TrueLane, rng: np.random.Generator, per_side: int | None = None) -> LaidMarkers:
+def install(lane: TrueLane, rng: np.random.Generator, per_side: int | None = None) -> InstalledMarkers:
     """Markers every 40 ft, closer in bends; or so many a side."""
-    return lay_markers(lane, rng, markers_per_side=per_side, speed_limit=LIMIT, survey_sd_m=SURVEY_M)
+    return install_markers(
+        lane,
+        place_markers(lane.left_m, lane.right_m, markers_per_side=per_side),
+        rng,
+        speed_limit=LIMIT,
+        survey_sd_m=SURVEY_M,
+    )
 
 
-def track(lane: TrueLane, rng: np.random.Generator, receiver: Receiver | None = None) -> PoseTrack:
+def track(lane: TrueLane, rng: np.random.Generator, receiver: SatelliteReceiver | None = None) -> PoseTrack:
     """A drive as the vehicle's receiver has it."""
-    return observe_track(lane, drive_lane(lane, Driver(), rng), receiver or Receiver.rtk(), rng)
+    return observe_track(lane, drive_lane(lane, Driver(), rng), receiver or SatelliteReceiver.rtk(), rng)
 
 
-def markers_for_lane(laid: LaidMarkers) -> LaneMarkers:
-    """Markers as if each was heard and verified."""
-    limit = laid.speed_limit.km_h if laid.speed_limit else np.nan
-    n = len(laid)
-    return LaneMarkers(laid.number, laid.lon_deg, laid.lat_deg, laid.told_side, np.full(n, SURVEY_M), np.full(n, limit))
+def markers_for_lane(installed: InstalledMarkers) -> LaneMarkers:
+    """Markers as if all were received and verified."""
+    limit = installed.speed_limit.km_h if installed.speed_limit else np.nan
+    n = len(installed)
+    return LaneMarkers(
+        installed.number,
+        installed.lon_deg,
+        installed.lat_deg,
+        installed.broadcast_side,
+        np.full(n, SURVEY_M),
+        np.full(n, limit),
+    )
 
 
 def markers_from_merged(merged: MergedMarkers) -> LaneMarkers:
@@ -90,12 +104,12 @@ def sign(message: CerpmMessage) -> bytes:
     return encode_message(message, key_of(message.number))
 
 
-def keys_for(laid: LaidMarkers) -> dict[int, bytes]:
+def keys_for(installed: InstalledMarkers) -> dict[int, bytes]:
     """Keys of the registered markers."""
-    return {int(n): key_of(int(n)) for n in laid.number}
+    return {int(n): key_of(int(n)) for n in installed.number}
 
 
-def payload_of(packets: Iterable[HeardPacket]) -> set[bytes]:
+def payload_of(packets: Iterable[ReceivedPacket]) -> set[bytes]:
     """Payloads of a log."""
     return {p.payload for p in packets if p.payload is not None}
 
@@ -111,4 +125,4 @@ def long_lane(rng: np.random.Generator, length_m: float, rate_hz: float = 10.0) 
     n = len(both)
     markers = LaneMarkers(np.arange(1, n + 1), lon, lat, side, np.full(n, SURVEY_M), np.full(n, LIMIT.km_h))
     drive = drive_lane(lane, Driver(speed_m_s=25.0), rng)
-    return markers, observe_track(lane, drive, Receiver.rtk(rate_hz), rng)
+    return markers, observe_track(lane, drive, SatelliteReceiver.rtk(rate_hz), rng)

@@ -49,10 +49,12 @@ def _print_faults(judge: Judge, seed: int, count: int) -> bool:
         print(f"| {kind} | {verdicts.total()} | {' | '.join(str(verdicts[v]) for v in VERDICTS)} |")
     print(f"| **all** | {count} | {' | '.join(str(total[v]) for v in VERDICTS)} |")
     print(f"| moves a marker over 10 m | {far.total()} | {' | '.join(str(far[v]) for v in VERDICTS)} |")
-    told = 1 - total["missed"] / count
+    detected = 1 - total["missed"] / count
     named = (total["refused"] + total["warned"]) / count
-    print(f"\nWarned or refused: {told:.1%} (goal {GOAL:.0%}); named by a check of its own: {named:.1%}.\n")
-    return told >= GOAL and not far["missed"]
+    print(
+        f"\nDetected (warned or refused): {detected:.1%} (goal {GOAL:.0%}); identified by its own check: {named:.1%}.\n"
+    )
+    return detected >= GOAL and not far["missed"]
 
 
 def _print_clean(judge: Judge, seed: int, count: int) -> bool:

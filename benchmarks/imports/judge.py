@@ -14,36 +14,20 @@ from typing import Any
 import numpy as np
 
 from app.errors import WaymarkError
+from app.families.rules import MarkerRules
+from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.read import read_survey
+from app.jobs.tasks import SameProcess
 from app.registry.database import Database
-from app.registry.exchange.declaration import ImportDeclaration
-from app.registry.exchange.place import local_m, place_survey
-from app.registry.exchange.read import read_survey
-from app.registry.exchange.table import SurveyTable
-from app.services.access import Access, Caller, Scope
-from app.services.imports import GivenImport, Imports, SurveyTask
-from app.services.marker_rules import MarkerRules
+from app.services.access.access import Access, Caller, Scope
+from app.services.surveys.imports import ImportInput, Imports
+from app.surveys.georeference import east_north_m, georeference_survey
 from benchmarks.imports.faults import Planted
 from benchmarks.imports.surveys import Survey
 
 STANDING = ("place_unchecked", "place_by_area_only")
 """Warnings that a sound survey gets too where there is nothing to check it against."""
 VERDICTS = ("refused", "warned", "standing caution only", "missed")
-
-
-@dataclass(frozen=True)
-class _Read:
-    table: SurveyTable
-
-    def result(self) -> SurveyTable:
-        return self.table
-
-
-class InProcess:
-    """Reads surveys where it stands."""
-
-    def start_survey(self, task: SurveyTask, *, wait_s: float = 0.0) -> _Read:
-        """Read a survey."""
-        return _Read(read_survey(task.data, task.declaration))
 
 
 @dataclass(frozen=True)
@@ -60,7 +44,7 @@ class Judge:
 
     def __init__(self, database: Database) -> None:
         self._access = Access(database, now)
-        self._imports = Imports(database, now, InProcess(), MarkerRules())
+        self._imports = Imports(database, now, SameProcess(), MarkerRules())
         self._count = 0
 
     def caller(self, survey: Survey) -> Caller:
@@ -72,7 +56,7 @@ class Judge:
             declaration = ImportDeclaration(
                 crs="EPSG:4326", family="cerpm", vertical_datum="ellipsoid", columns={"code": "number"}, status="active"
             )
-            given = GivenImport("\n".join(lines).encode(), declaration, mode="good")
+            given = ImportInput("\n".join(lines).encode(), declaration, mode="good")
             report, _ = self._imports.run(caller, given)
             assert report["stored"] == len(survey.registered), report["faults"][:3]
         return caller
@@ -80,14 +64,14 @@ class Judge:
     def codes(self, caller: Caller, data: bytes, declaration: dict[str, Any]) -> tuple[bool, Counter[str]]:
         """Whether something is refused, and the faults by code."""
         try:
-            given = GivenImport(data, ImportDeclaration(**declaration), dry_run=True)
+            given = ImportInput(data, ImportDeclaration(**declaration), dry_run=True)
             report, _ = self._imports.run(caller, given)
         except WaymarkError as error:
             return True, Counter([error.field or "file"])
         refused = any(fault["severity"] == "refused" for fault in report["faults"])
         return refused, Counter(report["counts"])
 
-    def store(self, caller: Caller, given: GivenImport) -> tuple[dict[str, Any], bool]:
+    def store(self, caller: Caller, given: ImportInput) -> tuple[dict[str, Any], bool]:
         """Import a file."""
         return self._imports.run(caller, given)
 
@@ -110,7 +94,7 @@ def moved_m(planted: Planted) -> float:
     """How far the fault moves a marker at most, across or up; NaN where rows are no longer the same. [m]"""
     try:
         declaration = ImportDeclaration(**planted.declaration)
-        placed = place_survey(read_survey(planted.data, declaration), declaration, 0.1)
+        placed = georeference_survey(read_survey(planted.data, declaration), declaration, 0.1)
     except WaymarkError:
         return float("nan")
     survey = planted.survey
@@ -118,8 +102,8 @@ def moved_m(planted: Planted) -> float:
     codes = placed.table.texts["code"]
     true = np.array([place_of.get(code or "", -1) for code in codes])
     origin = (float(survey.lon_deg[0]), float(survey.lat_deg[0]))
-    here = local_m(placed.placed.lon_deg, placed.placed.lat_deg, origin)
-    there = local_m(survey.lon_deg[true], survey.lat_deg[true], origin)
+    here = east_north_m(placed.placed.lon_deg, placed.placed.lat_deg, origin)
+    there = east_north_m(survey.lon_deg[true], survey.lat_deg[true], origin)
     across = np.hypot(here[0] - there[0], here[1] - there[1])
     up = np.abs(placed.height_m - survey.height_m[true])
     moved = np.fmax(across, up)[(true >= 0) & np.isfinite(across)]

@@ -42,7 +42,7 @@ def print_speed(rows: int) -> bool:
     """The table; whether imports and the GeoPackage keep the goals, which are for a million rows."""
     with TemporaryDirectory(prefix="waymark-bench-imports-") as name:
         survey = Path(name) / "survey.csv"
-        _write_survey(survey, rows)
+        write_survey(survey, rows)
         print(f"### imports-speed\n\n{rows} rows, {survey.stat().st_size / 1e6:.0f} MB of CSV.\n")
         print("| step | s | rows/s | CPU s | peak memory [MiB] |\n|---|---|---|---|---|", flush=True)
         figures = []
@@ -66,7 +66,8 @@ def _figures(survey: Path, folder: Path) -> Iterator[Figure]:
     yield from _peers(survey, folder)
 
 
-def _write_survey(path: Path, rows: int) -> None:
+def write_survey(path: Path, rows: int) -> None:
+    """A survey of a grid of markers, in CSV."""
     side = math.isqrt(rows) + 1
     with path.open("w") as file:
         file.write("number,lon,lat,height\n")
@@ -144,14 +145,15 @@ def _measured(what: str, command: list[str]) -> Figure | None:
 
 def main() -> None:
     """One step in this process; its figures as JSON."""
+    from app.families.rules import MarkerRules
+    from app.formats.surveys.declaration import ImportDeclaration
+    from app.jobs.tasks import SameProcess
     from app.registry.database import Database
-    from app.registry.exchange.declaration import ImportDeclaration
     from app.registry.markers import MarkerFilter
-    from app.services.access import Access, Scope
-    from app.services.exports import Exports
-    from app.services.imports import GivenImport, Imports
-    from app.services.marker_rules import MarkerRules
-    from benchmarks.imports.judge import InProcess, now
+    from app.services.access.access import Access, Scope
+    from app.services.surveys.exports import Exports
+    from app.services.surveys.imports import ImportInput, Imports
+    from benchmarks.imports.judge import now
 
     step, url, survey, out = sys.argv[1:]
     database = Database(url)
@@ -164,8 +166,8 @@ def main() -> None:
         declaration = ImportDeclaration(
             crs="EPSG:4326", vertical_datum="ellipsoid", family="cerpm", columns={"code": "number"}
         )
-        given = GivenImport(Path(survey).read_bytes(), declaration)
-        report, _ = Imports(database, now, InProcess(), MarkerRules()).run(caller, given)
+        given = ImportInput(Path(survey).read_bytes(), declaration)
+        report, _ = Imports(database, now, SameProcess(), MarkerRules()).run(caller, given)
         if report["stored"] != report["rows"]:
             raise SystemExit(f"{report['stored']} of {report['rows']} rows were stored")
     else:

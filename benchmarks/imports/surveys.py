@@ -11,7 +11,7 @@ import numpy.typing as npt
 import orjson
 from pyproj import Transformer
 
-from app.registry.exchange.place import local_m
+from app.surveys.georeference import east_north_m
 
 ROUTES = Path(__file__).parents[1] / "cerpm" / "routes"
 LANES = ("karlsruhe_low_1", "karlsruhe_moderate_1", "tfhrc_bend_1", "tfhrc_low_1")
@@ -125,7 +125,7 @@ def _boundary(lane: str, side: str) -> Floats:
 
 def _stations(line: Floats, spacing_m: float, rng: np.random.Generator) -> Floats:
     """Points every `spacing_m` along a line, with a gap or two where a junction is."""
-    east, north = local_m(line[:, 0], line[:, 1], (float(line[0, 0]), float(line[0, 1])))
+    east, north = east_north_m(line[:, 0], line[:, 1], (float(line[0, 0]), float(line[0, 1])))
     chainage = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(east), np.diff(north)))])
     stations = np.arange(rng.uniform(0, spacing_m), chainage[-1], spacing_m)
     if len(stations) > 12 and rng.integers(2):
@@ -136,5 +136,5 @@ def _stations(line: Floats, spacing_m: float, rng: np.random.Generator) -> Float
 
 def _heights(points: Floats, key: str) -> Floats:
     """Ellipsoidal heights of a road that falls by 2 %."""
-    east, north = local_m(points[:, 0], points[:, 1], (float(points[0, 0]), float(points[0, 1])))
+    east, north = east_north_m(points[:, 0], points[:, 1], (float(points[0, 0]), float(points[0, 1])))
     return np.asarray(_GROUND_M[key] + _GEOID_M[key] + 0.02 * east + 0.8 * np.sin(north / 90.0))

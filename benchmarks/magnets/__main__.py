@@ -1,6 +1,6 @@
 """``python -m benchmarks.magnets [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: recall, lateral, tags, ratio, wheel, false, speed, all. The clearance is not told to the decoder.
+Items: recall, lateral, tags, ratio, wheel, false, speed, all. The decoder does not know the clearance.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from app.decoders.magnet.book import TagBook, TagFormat
 from app.decoders.magnet.decoder import MagnetDecoder, decode_trace
+from app.decoders.magnet.identify import TagCandidates, TagFormat
 from app.decoders.magnet.metro import MetroSettings, decode_trace_metro
 from app.decoders.magnet.readings import Finding
 from app.markers.magnet import Orientation
@@ -23,7 +23,7 @@ from app.sensors.magnetometer_bar import MagnetTrace
 from app.simulation.magnetic.drive import SimulatedDrive
 from app.simulation.magnetic.vehicle import Course, Vehicle
 from benchmarks.magnets import scenes
-from benchmarks.magnets.judge import TagTally, Tally, judge_magnets, judge_tags
+from benchmarks.magnets.score import TagTally, Tally, score_magnets, score_tags
 
 ITEMS = ("recall", "lateral", "tags", "ratio", "wheel", "false", "speed")
 REFERENCE = Path(__file__).parents[1] / "reference"
@@ -84,10 +84,10 @@ def run_recall(seed: int, short: bool) -> Result:
             rng = np.random.default_rng([seed, clearance_cm, mph])
             drive = scenes.magnets_drive(rng, clearance_m=clearance_cm / 100, speed_mph=mph, count=60 if short else 200)
             findings, peer = decode_trace(drive.trace, BAR), _metro(drive)
-            all_.add(judge_magnets(drive, findings))
+            all_.add(score_magnets(drive, findings))
             for o in Orientation:
-                ours[o].add(judge_magnets(drive, findings, o))
-                metro[o].add(judge_magnets(drive, peer, o))
+                ours[o].add(score_magnets(drive, findings, o))
+                metro[o].add(score_magnets(drive, peer, o))
         recall = min(ours[o].recall for o in Orientation)
         rows.append(
             (
@@ -99,7 +99,7 @@ def run_recall(seed: int, short: bool) -> Result:
             )
         )  # fmt: skip
     head = ("clearance", "magnets", "recall 0°", "recall 90°", "wrong", "precision", "goal", "met", "metro", "paper")
-    return f"Speeds of {', '.join(map(str, speeds))} mph together. metro and paper: 0° / 90°.", head, rows
+    return f"Drives at {', '.join(map(str, speeds))} mph. metro and paper: recall of magnets at 0° / 90°.", head, rows
 
 
 def run_lateral(seed: int, short: bool) -> Result:
@@ -110,7 +110,7 @@ def run_lateral(seed: int, short: bool) -> Result:
         for mph in (20, 30, 45, 60):
             rng = np.random.default_rng([seed, 7, clearance_cm, mph])
             drive = scenes.magnets_drive(rng, clearance_m=clearance_cm / 100, speed_mph=mph, count=60 if short else 200)
-            tally.add(judge_magnets(drive, decode_trace(drive.trace, BAR)))
+            tally.add(score_magnets(drive, decode_trace(drive.trace, BAR)))
         rms = float(np.sqrt(np.mean(np.square(tally.lateral_cm))))
         rows.append((f"{clearance_cm} cm", len(tally.lateral_cm), f"{rms:.2f}", goal, _met(rms <= goal)))
     return "Root mean square, 20 to 60 mph.", ("clearance", "magnets", "RMS [cm]", "goal", "met"), rows
@@ -133,17 +133,17 @@ def run_tags(seed: int, short: bool) -> Result:
             for c in clearances:
                 rng = np.random.default_rng([seed, 11, c, int(mph), len(rows)])
                 drive = scenes.tags_drive(rng, form, count=n, clearance_m=c / 100, speed_mph=mph)
-                ours.add(judge_tags(drive, decode_trace(drive.trace, BAR, book=TagBook(formats=[form]))))
+                ours.add(score_tags(drive, decode_trace(drive.trace, BAR, candidates=TagCandidates(formats=[form]))))
                 settings = MetroSettings(amplitude_ut=5.0, tag_magnets=form.magnets)
-                peer.add(judge_tags(drive, decode_trace_metro(drive.trace, BAR, settings), segment_m=form.segment_m))
+                peer.add(score_tags(drive, decode_trace_metro(drive.trace, BAR, settings), segment_m=form.segment_m))
         rows.append(_tag_row(name, ours, goal, peer, paper))
     rng = np.random.default_rng([seed, 12])
     drive = scenes.long_drive(rng, minutes=4 if short else 30)
-    ours = judge_tags(drive, decode_trace(drive.trace, BAR, book=TagBook(formats=[TagFormat(3, 4.0, 0.1)])))
-    peer = judge_tags(drive, _metro(drive), segment_m=0.1)
+    ours = score_tags(drive, decode_trace(drive.trace, BAR, candidates=TagCandidates(formats=[TagFormat(3, 4.0, 0.1)])))
+    peer = score_tags(drive, _metro(drive), segment_m=0.1)
     rows.append(_tag_row(f"drive of {drive.trace.t_s[-1] / 60:.0f} min, Seg_d 0.1 m", ours, 0.98, peer, "-"))
     return (
-        "The format is known, the code is not.",
+        "The decoder knows the format of the tags, but not their codes.",
         ("tags", "n", "right", "wrong", "goal", "met", "metro", "paper"),
         rows,
     )
@@ -175,8 +175,10 @@ def run_ratio(seed: int, short: bool) -> Result:
     rows: list[Sequence[object]] = []
     for k, (name, shape, how, goal, paper) in enumerate(cases):
         drive = scenes.tags_drive(np.random.default_rng([seed, 21, k]), shape, count=n, **how)  # type: ignore[arg-type]
-        d = np.array(judge_tags(drive, decode_trace(drive.trace, BAR, book=TagBook(formats=[shape]))).deviations)
-        p = np.array(judge_tags(drive, _metro(drive), segment_m=1.0).deviations or [np.nan])
+        d = np.array(
+            score_tags(drive, decode_trace(drive.trace, BAR, candidates=TagCandidates(formats=[shape]))).deviations
+        )
+        p = np.array(score_tags(drive, _metro(drive), segment_m=1.0).deviations or [np.nan])
         met = abs(d.mean() - 1) <= 0.003 and d.std() <= goal
         rows.append(
             (
@@ -201,10 +203,10 @@ def run_wheel(seed: int, short: bool) -> Result:
         ours, with_amn, without = Tally(), Tally(), Tally()
         for k in range(1 if short else 3):
             drive = scenes.wheel_drive(np.random.default_rng([seed, 31, k]), passes=10 if short else 30, wheel=moment)
-            ours.add(judge_magnets(drive, decode_trace(drive.trace, BAR)))
-            with_amn.add(judge_magnets(drive, _metro(drive), Orientation.UP))
+            ours.add(score_magnets(drive, decode_trace(drive.trace, BAR)))
+            with_amn.add(score_magnets(drive, _metro(drive), Orientation.UP))
             off = MetroSettings(amplitude_ut=5.0, cancel_wheels=False)
-            without.add(judge_magnets(drive, decode_trace_metro(drive.trace, BAR, off), Orientation.UP))
+            without.add(score_magnets(drive, decode_trace_metro(drive.trace, BAR, off), Orientation.UP))
         accuracy = [t.found / max(t.true + t.extra + t.wrong, 1) for t in (ours, with_amn, without)]
         rows.append(
             (
@@ -215,7 +217,8 @@ def run_wheel(seed: int, short: bool) -> Result:
         )  # fmt: skip
     head = ("wheels", "magnets", "accuracy", "precision", "recall", "goal", "met", "metro", "without AMN", "paper")
     return (
-        "Upright magnets before the left wheel, 30 mph. Accuracy: right over true, wrong and false together.",
+        "Upright magnets in front of the left wheel, 30 mph. Accuracy: correct readings over the sum of actual, wrong "
+        "and false ones.",
         head,
         rows,
     )
@@ -237,11 +240,12 @@ def run_false(seed: int, short: bool) -> Result:
                 clearance_m=clearance,
             )
             km += drive.length_m / 1000
-            found += judge_magnets(drive, decode_trace(drive.trace, BAR)).extra
-            metro += judge_magnets(drive, _metro(drive)).extra
+            found += score_magnets(drive, decode_trace(drive.trace, BAR)).extra
+            metro += score_magnets(drive, _metro(drive)).extra
         rate = found / km
         rows.append((name, f"{km:.1f}", found, f"{rate:.2f}", goal, _met(rate <= goal), f"{metro / km:.0f}", "0"))
-    return "Readings where there is no magnet.", ("road", "km", "false", "a km", "goal", "met", "metro", "paper"), rows
+    head = ("road", "km", "false", "per km", "goal", "met", "metro", "paper")
+    return "Readings where there is no magnet (false positives).", head, rows
 
 
 def run_speed(seed: int, short: bool) -> Result:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from app.decoders.magnet.book import TagFormat
+from app.decoders.magnet.identify import TagFormat
 from app.markers.magnet import InformationTag, Orientation, Polarity
 from app.simulation.magnetic.clutter import Clutter, ferrous_clutter, town_clutter
 from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
@@ -83,7 +83,7 @@ def wheel_drive(rng: np.random.Generator, *, passes: int, wheel: float = 1.0) ->
 
 
 def noise_drive(rng: np.random.Generator, *, length_m: float, town: bool, clearance_m: float = 0.16) -> SimulatedDrive:
-    """A road without information tags; ten magnets of a line at its beginning tell the clearance."""
+    """A road without information tags; the clearance is estimated from ten magnets of a line at its beginning."""
     clutter = town_clutter(LEAD_M + 60, length_m, rng) if town else ferrous_clutter(LEAD_M + 60, length_m, 20, rng)
     lines = line_magnets(LEAD_M, LEAD_M + 60, 6, 0.2, Polarity.N)
     course = Course(speed_m_s=(25 if town else 30) * MPH, weave_m=0.15)

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 
 from benchmarks.plates import tables
-from benchmarks.plates.judge import Record, judge_job
-from benchmarks.plates.sets import LEAST_ROWS, RENDERED_ROWS, SETS, Job, read_trials
+from benchmarks.plates.evaluate import Record, evaluate_job
+from benchmarks.plates.sets import MIN_ROWS, RENDERED_ROWS, SETS, Job, read_trials
 from benchmarks.plates.speed import measure_speed
 
 ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy")
@@ -65,7 +65,7 @@ def run_jobs(jobs: list[Job], processes: int) -> list[Record]:
     if not jobs:
         return []
     with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return [record for records in pool.map(judge_job, jobs) for record in records]
+        return [record for records in pool.map(evaluate_job, jobs) for record in records]
 
 
 def main() -> None:
@@ -84,15 +84,15 @@ def main() -> None:
     start = time.monotonic()
     timings = measure_speed(args.seed, 12 if args.short else 100) if "speed" in items else []
     records = run_jobs(list_jobs(items, seeds, short=args.short, only=args.sets), args.processes)
-    print(f"Seeds {', '.join(map(str, seeds))}; {len(records)} frames judged; {time.monotonic() - start:.0f} s.")
+    print(f"Seeds {', '.join(map(str, seeds))}; {len(records)} frames evaluated; {time.monotonic() - start:.0f} s.")
     if args.short:
         print(f"Short mode: {SHORT_SHARE:.0%} of the trials' frames, drawn at random; their counts are scaled up.")
     _print("trials", items, tables.trials_table, records, _TRIALS_NOTE)
     _print("height", items, tables.height_table, records, "Decode rate by the height of the plate's image.")
-    _print("false", items, tables.wrong_table, records, "Wrong digits returned as valid.")
+    _print("false", items, tables.wrong_table, records, "Wrong digits that were returned as valid.")
     _print("peers", items, tables.peers_table, records, _PEERS_NOTE)
     if timings:
-        print(f"\n### speed\n\n{len(timings) // 2} contenders in turns on each frame.\n\n{tables.speed_table(timings)}")
+        print(f"\n### speed\n\n{len(timings) // 2} decoders take turns on each frame.\n\n{tables.speed_table(timings)}")
     _print("accuracy", items, tables.accuracy_table, records, "Over the frames decoded in the trials.")
     if wrong := tables.frame_list(r for r in records if r.wrong or r.wrong_known):
         print(f"\nWrong digits:\n{wrong}")
@@ -102,8 +102,9 @@ def main() -> None:
 
 
 _TRIALS_NOTE = (
-    f"Frames a drive, mean over the seeds; in view: all corners inside, {LEAST_ROWS:g} rows and more. Frames below "
-    f"{RENDERED_ROWS:g} rows are counted as not decoded without a look. The goal must be met by every seed ('least')."
+    f"Frames per drive, mean over the seeds. In view: all corners are inside the frame, and the plate is at least "
+    f"{MIN_ROWS:g} rows high. Frames in which it has fewer than {RENDERED_ROWS:g} rows count as not decoded and are "
+    "not processed. Every seed must meet the goal ('minimum')."
 )
 _PEERS_NOTE = "The same scenes with a tag of the plate's footprint, default parameters, one thread."
 

@@ -37,7 +37,7 @@ from app.simulation.thermal import render_thermal_scene
 Image = npt.NDArray[np.uint8]
 HERE = Path(__file__).parent.parent
 GEOMETRY = PlateGeometry()
-LEAST_ROWS = 4.0  # below this half a row a unit is left: such frames don't count as having the plate in view
+MIN_ROWS = 4.0  # below this half a row a unit is left: such frames don't count as having the plate in view
 RENDERED_ROWS = 8.0  # below this frames are counted as not decoded without a look
 SETS = ("trial", "stress", "night", "thermal", "hidden", "free")
 
@@ -91,7 +91,7 @@ class Job:
 
 @dataclass(slots=True, eq=False)
 class Shot:
-    """A frame to judge.
+    """A frame to evaluate.
 
     Attributes
     ----------
@@ -227,7 +227,7 @@ def _trial(job: Job) -> Iterator[Shot | Unseen]:
     label = f"{trial.figure}/{trial.trial}"
     for scene in drive_over_plate(drive, rng):
         height = face_truth(scene, scene.faces[0]).height_px
-        if height < LEAST_ROWS or rng.random() >= job.share:
+        if height < MIN_ROWS or rng.random() >= job.share:
             continue
         if height < RENDERED_ROWS:
             yield Unseen(label, height)

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.images import load_image
 from app.decoders.plate import decode_plates
+from app.formats.images import load_image
 from benchmarks.plates.peers import FAMILIES, TagFamily, detector, tag_face
 from benchmarks.plates.sets import Job, Shot, replace_face, shoot
 
@@ -34,7 +34,7 @@ def measure_speed(seed: int, frames: int) -> list[Timing]:
     """Median and mean time a frame of the decoder and the peers.
 
     Frames with a plate come from the trials at all distances, and the peers see their tag in the plate's place; frames
-    without one are the plate-free set. Every call is timed by itself, the contenders in turns on each frame.
+    without one are the plate-free set. Every call is timed by itself, the decoders take turns on each frame.
     """
     cv2.setNumThreads(1)
     plates = [s for s in _trial_shots(seed, frames) if isinstance(s, Shot)]

@@ -1,4 +1,4 @@
-"""Records -> Markdown tables, each row beside the paper's figure, a peer's or a goal."""
+"""Records to Markdown tables, each row beside the paper's figure, a peer's or a goal."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.plates.judge import Record
+from benchmarks.plates.evaluate import Record
 from benchmarks.plates.peers import FAMILIES
 from benchmarks.plates.sets import read_trials
 from benchmarks.plates.speed import Timing
@@ -33,7 +33,7 @@ def trials_table(records: Sequence[Record]) -> str:
             continue
         decoded = [_scaled(r for r in mine if r.seed == s and r.decoded) for s in seeds]
         known = [_scaled(r for r in mine if r.seed == s and r.decoded_known) for s in seeds]
-        met = _met(min(decoded) >= trial.goal) if mine[0].share == 1 else "-"  # a sample says too little
+        met = _met(min(decoded) >= trial.goal) if mine[0].share == 1 else "-"  # a sample is too small
         rows.append(
             (
                 f"{trial.figure}/{trial.trial}: {trial.speed_kmh:g} km/h, {trial.fps:g} fps, {trial.depression_deg:g}°"
@@ -56,7 +56,7 @@ def trials_table(records: Sequence[Record]) -> str:
         "figure/trial",
         "in view",
         "decoded",
-        "least",
+        "minimum",
         "wrong",
         "with codebook",
         "wrong",

@@ -16,17 +16,19 @@ import numpy.typing as npt
 import sqlalchemy as sa
 from scipy.spatial import cKDTree
 
+from app.families.cerpm.registration import NewCerpm
+from app.families.inputs import PositionIn
+from app.families.plate.registration import NewPlate
 from app.markers.plate import PlateCode
 from app.registry.bulk_load import large_load, load_rows
 from app.registry.database import Database
 from app.registry.feature_text import feature_text
 from app.registry.ids import new_id
+from app.registry.marker_rows import MarkerRow
+from app.registry.rows import row_of
 from app.registry.tables import markers
-from app.services.access import Access, Caller, Scope
-from app.services.cerpm_markers import NewCerpm
-from app.services.markers import Markers
-from app.services.plate_markers import NewPlate
-from app.services.positions import GivenPosition
+from app.services.access.access import Access, Caller, Scope
+from app.services.markers.markers import Markers
 
 Array = npt.NDArray[np.float64]
 
@@ -101,7 +103,7 @@ def fill(database: Database, network: Network) -> str:
 def _register_templates(database: Database, caller: Caller) -> dict[str, dict[str, Any]]:
     """What the product stores of a plate and of a CERPM; the two stay in the registry, far from the roads."""
     use_cases = Markers(database, lambda: datetime.now(UTC))
-    place = GivenPosition(lon_deg=-30.0, lat_deg=-30.0, **_SURVEY)
+    place = PositionIn(lon_deg=-30.0, lat_deg=-30.0, **_SURVEY)
     common: dict[str, Any] = {"status": "surveyed", "heading_deg": 90.0, "heading_rmse_deg": 0.5, "road": "A0"}
     common |= {"measure_m": 0.0, "offset_m": 1.75}
     use_cases.register(caller, NewPlate(place, **common))
@@ -137,4 +139,4 @@ def _row(
         "measure_m": k % PER_ROAD * SPACING_M,
         "original": {**template["original"], "lon_deg": lon_deg, "lat_deg": lat_deg},
     }
-    return {**marker, "feature": feature_text(marker)}
+    return {**marker, "feature": feature_text(row_of(MarkerRow, marker))}

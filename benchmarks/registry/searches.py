@@ -17,11 +17,11 @@ from app.registry.database import Database
 from app.registry.features import FeatureFilter
 from app.registry.markers import MarkerFilter
 from app.registry.spatial import Box
-from app.services.access import Access, Caller
-from app.services.decode_context import CoarsePosition
-from app.services.features import Features
-from app.services.matching import find_nearby_plates, match_reading
-from app.services.searches import Searches
+from app.services.access.access import Access, Caller
+from app.services.decodes.context import CoarsePosition
+from app.services.decodes.matching import find_nearby_markers, match_reading
+from app.services.markers.features import Features
+from app.services.markers.searches import Searches
 from benchmarks.registry.fill import CERPM_EVERY, PER_ROAD, SPACING_M, Network
 from benchmarks.registry.serving import BOX_FEATURES, PAGE, Registry
 
@@ -38,7 +38,7 @@ Medians = dict[tuple[str, str], float]  # by search and database [ms]
 def measure_searches(registry: Registry) -> tuple[bool, Medians]:
     """Print the searches at one size; whether each has its median below the goal on both databases, and the medians."""
     rows = len(registry.network.lon_deg)
-    print(f"### registry-searches\n\n{rows:,} markers; {TIMES} places at random, one search after the other.\n")
+    print(f"### registry-searches\n\n{rows:,} markers; {TIMES} random positions, one search after the other.\n")
     print(f"| search | database | median [ms] | 99 % [ms] | below {GOAL_MS:g} ms |\n|---|---|---|---|---|")
     met, medians = True, {}
     for kind in registry.urls:
@@ -63,7 +63,7 @@ def measure_growth(
                 found[rows] = {
                     (name, kind): p50 for kind in registry.urls for name, (p50, _) in _measured(registry, kind).items()
                 }
-    print("### registry-growth\n\nMedian at the service [ms] by the number of markers.\n")
+    print("### registry-growth\n\nMedian in the service layer [ms] by the number of markers.\n")
     print(f"| search | database | {' | '.join(f'{rows:,}' for rows in sizes)} |\n|---|---|{'---|' * len(sizes)}")
     for name, kind in found[sizes[-1]]:
         print(f"| {name} | {kind} | {' | '.join(f'{found[rows][name, kind]:.2f}' for rows in sizes)} |")
@@ -125,7 +125,7 @@ def _searches(database: Database, caller: Caller, network: Network) -> dict[str,
         reading = PlateReading(PlateOutcome.READ, code=PlateCode.from_position(lon, lat), confidence=1.0)
         position = CoarsePosition(lon + 5e-5, lat - 5e-5, COARSE_M)
         with database.read() as connection:
-            nearby = find_nearby_plates(connection, caller.agency_id, position)
+            nearby = find_nearby_markers(connection, caller.agency_id, position)
             return _found(match_reading(connection, caller.agency_id, reading, position, nearby))
 
     return {

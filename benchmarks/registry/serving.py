@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from app.registry.tiles import TILE_FIELDS
-from app.services.features import FIELDS
+from app.services.markers.features import FIELDS
 from benchmarks.registry.fill import Network
 from benchmarks.registry.load import ask, fetch
 from benchmarks.registry.servers import cpu_s, tipg, waymark

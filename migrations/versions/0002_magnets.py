@@ -1,4 +1,4 @@
-"""Magnets: codebooks, what a family keeps of its markers, where single magnets lie."""
+"""Magnets: codebooks, properties of a marker that only its family has, and positions of single magnets."""
 
 from __future__ import annotations
 

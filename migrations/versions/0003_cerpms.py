@@ -1,4 +1,4 @@
-"""CERPMs: numbers that are unique in an agency, secrets of agencies, transmissions that were heard."""
+"""CERPMs: numbers that are unique in an agency, secret keys of agencies, and received transmissions."""
 
 from __future__ import annotations
 

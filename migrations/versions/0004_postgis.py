@@ -1,6 +1,7 @@
-"""PostGIS: points of markers and magnets with a GiST index, and the distance that both databases compute alike.
+"""PostGIS: points of markers and magnets with a GiST index, and a distance function that is the same on both databases.
 
-SQLite has its R*Tree since 0001 and 0002. The points are generated from the exact columns, so nothing else writes them.
+SQLite has its R*Trees from 0001 and 0002. The points are generated columns, computed from longitude
+and latitude.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def downgrade() -> None:
 
 
 def _change_scopes(new_names: dict[str, str]) -> None:
-    """Give every key its scope's other name; the check on them is gone afterwards."""
+    """Rename the scopes of all keys, and drop the check constraint on them."""
     with op.batch_alter_table("api_keys") as table:
         table.drop_constraint(op.f("ck_api_keys_scope"), type_="check")
     cases = " ".join(f"WHEN '{old}' THEN '{new}'" for old, new in new_names.items())

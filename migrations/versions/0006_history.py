@@ -1,6 +1,6 @@
 """Kinds of versions, the audit log and the survey's provenance.
 
-Versions that are there already get a kind by what changed, their hash, and one entry of their agency's log.
+Existing versions get a kind that follows from what changed, their hash, and one entry in the log of their agency.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def _utc(at: datetime) -> datetime:
 
 
 def _sha256(row: Any, kind: str) -> str:
-    """As app/registry/audit.py does."""
+    """The hash that app/registry/audit.py computes."""
     values = (row.agency_id, row.marker_id, row.version, _utc(row.at), row.who, row.why, kind, row.marker)
     return hashlib.sha256(orjson.dumps(values, option=orjson.OPT_SORT_KEYS)).hexdigest()
 

@@ -1,7 +1,7 @@
-"""Row level security on PostgreSQL: a transaction sees the rows of the agency that it is for (registry/tenancy.py).
+"""Row level security on PostgreSQL: a transaction sees the rows of its agency (registry/tenancy.py).
 
-Forced, so that the tables' owner is bound too; superusers never are. A table that a later migration adds gets its
-policy there: a test compares.
+The policies are forced and therefore apply to the owner of the tables too, but never to superusers. A later migration
+that adds a table also adds its policy; a test checks this.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def downgrade() -> None:
 
 
 def _owned_tables() -> list[tuple[str, str]]:
-    """Tables of rows that belong to agencies, with the column that says to which."""
+    """Tables of rows that belong to agencies, with the column that contains the agency."""
     query = sa.text(
         "SELECT c.table_name FROM information_schema.columns c JOIN information_schema.tables t"
         " USING (table_schema, table_name)"

@@ -1,6 +1,6 @@
-"""The GeoJSON feature of each marker as text beside its columns, for those who read pages of them.
+"""The GeoJSON feature of each marker as text beside its columns, from which pages are assembled.
 
-What writes the texts here stays as it is: later migrations write them anew.
+The function that writes the texts here does not change; later migrations write the texts again.
 """
 
 from __future__ import annotations

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from app.decoders.magnet.book import TagFormat
+from app.decoders.magnet.identify import TagFormat
 from app.decoders.snapshot import Snapshot, open_snapshot
 from app.encoders.snapshot import write_snapshot
 from app.errors import InvalidParameter
 from app.markers import snapshot as layout
 from app.markers.magnet import parse_tag
-from app.markers.magnet_codebook import Codebook, Meaning
+from app.markers.magnet_codebook import Codebook, Meaning, MeaningKind
 from app.markers.magnet_design import TagDesign
 from app.markers.plate import PlateCode, PlateScheme
 
@@ -200,7 +200,7 @@ def test_a_snapshot_of_version_1_is_read() -> None:
     assert (tag.tag.text, tag.bearing_deg, tag.meaning) == ("SNS_4_0.1_10-30", 90.0, None)
     known = snapshot.known_cerpms([7, 8])
     assert known.registered[7].speed_limit_km_h == pytest.approx(80.4672)
-    assert (known.heard_before, known.least_interval_s) == ({}, {})
+    assert (known.earlier_spans, known.min_interval_s) == ({}, {})
     forged = VERSION_1[:8] + layout.VERSION.to_bytes(2, "little") + VERSION_1[10:]
     with pytest.raises(layout.SnapshotRefused):
         _open(forged)
@@ -217,20 +217,20 @@ def test_tags_carry_their_lane_and_meaning_and_books_their_formats() -> None:
     )  # fmt: skip
     line = _tag("N_90", 8.4, 49.0, kind={"scheme": "line-tag", "meaning": None})
     design = TagDesign(magnets=3, length_m=4.0, segment_m=0.1)
-    book = Codebook("streets", design, ((parse_tag("SNS_4_0.1_10-30"), Meaning("bend-right", 125.0)),))  # type: ignore[arg-type]
+    book = Codebook("streets", design, ((parse_tag("SNS_4_0.1_10-30"), Meaning(MeaningKind.BEND_RIGHT, 125.0)),))
     snapshot = _open(_write([placed, line], codebooks=[book.to_document()]))
     assert snapshot.codebooks == (book,)
     (tag,) = snapshot.registered_tags(8.4, 49.0, 10.0)
     assert (tag.lane_lon_deg, tag.lane_lat_deg) == (8.398765432, 48.998765432)
-    assert tag.meaning == Meaning("bend-right", 125.0)  # type: ignore[arg-type]
-    assert not snapshot.tag_book(8.4, 49.0, 10.0).formats
-    assert snapshot.tag_book(8.5, 49.0, 10.0).formats == (TagFormat(3, 4.0, 0.1),)
+    assert tag.meaning == Meaning(MeaningKind.BEND_RIGHT, 125.0)
+    assert not snapshot.tag_candidates(8.4, 49.0, 10.0).formats
+    assert snapshot.tag_candidates(8.5, 49.0, 10.0).formats == (TagFormat(3, 4.0, 0.1),)
 
 
 def test_cerpms_carry_what_was_heard_of_them() -> None:
     heard = {"first_sequence": 3, "last_sequence": 2**32 - 1, "first_heard_s": 1.7e9 + 0.1234, "last_heard_s": None}
     limit = {"value": 30, "unit": "km/h"}
-    kind = {"side": "right", "speed_limit": limit, "least_interval_s": 0.8, "transform_note": "a datum's bound"}
+    kind = {"side": "right", "speed_limit": limit, "min_interval_s": 0.8, "transform_note": "a datum's bound"}
     markers = [
         _cerpm(4_000_000_000, 8.4, 49.0, kind=kind, localization_grade="approximate", **heard),
         _cerpm(5, 8.41, 49.0), _cerpm(6, 8.41, 49.0, status="retired"),
@@ -240,12 +240,12 @@ def test_cerpms_carry_what_was_heard_of_them() -> None:
     assert [marker.code for marker in snapshot.near("cerpm", 8.41, 49.0, 10.0)] == ["5"]
     known = snapshot.known_cerpms([4_000_000_000, 5, 6, 7])
     assert sorted(known.registered) == [5, 6, 4_000_000_000]
-    (span,) = known.heard_before[4_000_000_000]
+    (span,) = known.earlier_spans[4_000_000_000]
     assert (span.first_sequence, span.last_sequence, span.first_heard_s) == (3, 2**32 - 1, 1.7e9 + 0.123)
     assert math.isnan(span.last_heard_s)
-    assert list(known.heard_before) == [4_000_000_000]
-    assert known.least_interval_s == {4_000_000_000: 0.8}
-    assert known.doubts == {
+    assert list(known.earlier_spans) == [4_000_000_000]
+    assert known.min_interval_s == {4_000_000_000: 0.8}
+    assert known.localization_warnings == {
         4_000_000_000: ("a datum's bound",), 5: (), 6: ("the marker is retired, its position is not surveyed",)
     }  # fmt: skip
     assert known.retired == {6}

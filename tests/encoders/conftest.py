@@ -1,9 +1,7 @@
-"""Fixtures of the encoders' tests: programs that are not ours, and orders to draw."""
+"""Fixtures of the encoders' tests: orders to draw."""
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable
 
 import pytest
@@ -12,22 +10,6 @@ from app.encoders.plate import PlateOrder
 from app.markers.plate import PlateCode, PlateGeometry
 
 RECORD_URL = "https://waymark.example/v1/markers/3f0c8a52-6a0c-7d1e-9f52-0123456789ab"
-
-
-@pytest.fixture(scope="session")
-def require_tool() -> Callable[..., str]:
-    """Path of a program; without it the test is skipped, on CI it fails."""
-
-    def find(*names: str) -> str:
-        for name in names:
-            if path := shutil.which(name):
-                return path
-        reason = f"none of {', '.join(names)} is installed"
-        if os.environ.get("CI"):
-            pytest.fail(reason)
-        pytest.skip(reason)
-
-    return find
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from app.encoders.calibration_board import encode_board
 from app.encoders.plate import ArtworkFormat, write_artwork
 from app.errors import InvalidParameter
 from app.sensors.calibration_board import CalibrationBoard
+from tests.http import WITHIN_S
 
 BOARDS = (CalibrationBoard(), CalibrationBoard(12, 9, 40.0, 30.0), CalibrationBoard(5, 4, 15.0, 9.0))
 Grey = npt.NDArray[np.uint8]
@@ -71,7 +72,9 @@ def test_a_pdf_is_the_board_in_millimetres(board: CalibrationBoard, tmp_path: Pa
         assert len(document.pages) == 1
     assert box[2:] == pytest.approx([drawing.width_mm, drawing.height_mm], abs=0.01)
     (tmp_path / "board.pdf").write_bytes(content)
-    subprocess.run([program, "-r", "150", "-gray", tmp_path / "board.pdf", tmp_path / "page"], check=True, timeout=120)
+    subprocess.run(
+        [program, "-r", "150", "-gray", tmp_path / "board.pdf", tmp_path / "page"], check=True, timeout=WITHIN_S
+    )
     [page] = tmp_path.glob("page*.pgm")
     grey = cv2.imread(str(page), cv2.IMREAD_GRAYSCALE)
     assert grey is not None

@@ -9,9 +9,8 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +25,13 @@ from app.encoders.cerpm.payload import encode_message
 from app.errors import InvalidParameter, NotAllowed, Unavailable
 from app.ingest.mqtt import MqttIngest, MqttSource, Sink
 from app.main import create_app
-from app.services.access import Scope
+from app.services.access.access import Scope
 from app.settings import Settings
 from app.simulation.radio.drive import drive_past
 from app.simulation.radio.link import Radio
-from tests.api_decodes.test_packets import chirpstack_uplink
+from tests.api.decodes.test_packets import chirpstack_uplink
 from tests.conftest import ADMIN_KEY, LiveServer
+from tests.http import WITHIN_S, wait_until
 from tests.jobs import standin
 
 BROKER = ("127.0.0.1", 1883)
@@ -60,9 +60,9 @@ def road(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LiveServer,
 
 def uplinks(built: BuiltLane, seed: int) -> list[dict[str, Any]]:
     """What a network server publishes of a drive."""
-    start = np.full(len(built.laid), seed * 1000)
+    start = np.full(len(built.installed), seed * 1000)
     heard = drive_past(
-        built.lane, built.laid, np.random.default_rng(seed), radio=Radio(interval_s=2.0), first_sequence=start,
+        built.lane, built.installed, np.random.default_rng(seed), radio=Radio(interval_s=2.0), first_sequence=start,
         start_s=1.78e9 + seed * 10_000.0, sign=lambda m: encode_message(m, built.keys[m.number]),
     )  # fmt: skip
     return [chirpstack_uplink(packet) for packet in heard.packets]
@@ -74,16 +74,9 @@ def publish(topic: str, messages: list[dict[str, Any] | str]) -> None:
     client.loop_start()
     sent = [client.publish(topic, m if isinstance(m, str) else json.dumps(m), qos=1) for m in messages]
     for info in sent:
-        info.wait_for_publish(10)
+        info.wait_for_publish(WITHIN_S)
     client.disconnect()
     client.loop_stop()
-
-
-def wait_for(condition: Callable[[], bool], what: str, within_s: float = 60.0) -> None:
-    deadline = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain for {what}"
-        time.sleep(0.05)
 
 
 class Running:
@@ -103,12 +96,12 @@ class Running:
 
     def __enter__(self) -> Running:
         self._thread.start()
-        assert self.ingest.listening.wait(20)
+        assert self.ingest.listening.wait(WITHIN_S)
         return self
 
     def __exit__(self, *_: object) -> None:
         self.ingest.stop()
-        self._thread.join(60)
+        self._thread.join(WITHIN_S)
         assert not self._thread.is_alive()
 
     @property
@@ -126,7 +119,7 @@ def test_uplinks_become_decodes_and_nothing_else_does(
     messages = uplinks(built, 51)
     with Running(source, Sink(server.url, key, {"packets": {}}, batch_s=1.0), tmp_path) as running:
         publish(topic, [*messages, "no JSON", "[1, 2]"])
-        wait_for(lambda: running.authentic >= len(messages), "the packets")
+        wait_until(lambda: running.authentic >= len(messages), "the packets")
     assert running.error is None
     assert running.authentic == len(messages)
     assert list(tmp_path.glob("batch-*")) == []
@@ -148,12 +141,12 @@ def test_a_server_that_is_away_costs_time_not_packets(
     half = len(messages) // 2
     with Running(source, Sink(nowhere, key, {"packets": {}}, batch_s=0.3), tmp_path) as away:
         publish(topic, messages[:half])
-        wait_for(lambda: sum(b.read_bytes().count(b"\n") for b in tmp_path.glob("batch-*")) >= half, "the spool")
+        wait_until(lambda: sum(b.read_bytes().count(b"\n") for b in tmp_path.glob("batch-*")) >= half, "the spool")
     assert away.error is None
     assert away.decodes == []
     publish(topic, messages[half:])  # nobody listens now: the broker keeps them
     with Running(source, Sink(server.url, key, {"packets": {}}, batch_s=0.3), tmp_path) as back:
-        wait_for(lambda: back.authentic >= len(messages), "the packets")
+        wait_until(lambda: back.authentic >= len(messages), "the packets")
     assert back.authentic == len(messages)
     assert list(tmp_path.glob("batch-*")) == []
 
@@ -166,7 +159,7 @@ def test_a_batch_that_is_refused_for_good_is_put_aside(
     source = MqttSource(broker, (topic,), client_id=f"test-{uuid.uuid4().hex}")
     with Running(source, Sink(server.url, key, {"packets": {}}, batch_s=0.3), tmp_path) as running:
         publish(topic, [{"this is": "no uplink"}])
-        wait_for(lambda: any((tmp_path / "refused").glob("*.problem.json")), "the refusal")
+        wait_until(lambda: any((tmp_path / "refused").glob("*.problem.json")), "the refusal")
     problem = json.loads(next((tmp_path / "refused").glob("*.problem.json")).read_bytes())
     assert problem["status"] in (415, 422)
     assert running.error is None
@@ -181,7 +174,7 @@ def test_who_is_not_let_in_is_told(
     source = MqttSource(broker, (topic,), client_id=f"test-{uuid.uuid4().hex}")
     with Running(source, Sink(server.url, "no such key", {"packets": {}}, batch_s=0.2), tmp_path) as running:
         publish(topic, [{"payload": "00"}])
-        wait_for(lambda: running.error is not None, "the refusal")
+        wait_until(lambda: running.error is not None, "the refusal")
     assert isinstance(running.error, NotAllowed)
     assert list(tmp_path.glob("batch-*"))  # it waits for a better key
     with pytest.raises(Unavailable, match="does not answer"):
@@ -209,9 +202,9 @@ def test_the_command_sends_what_it_has_when_it_is_stopped(
         assert line
     publish(topic, messages)
     spool = tmp_path / "spool" / "collecting.jsonl"
-    wait_for(lambda: spool.exists() and spool.read_bytes().count(b"\n") == len(messages), "the spool")
+    wait_until(lambda: spool.exists() and spool.read_bytes().count(b"\n") == len(messages), "the spool")
     process.send_signal(signal.SIGTERM)
-    _out, told = process.communicate(timeout=60)
+    _out, told = process.communicate(timeout=WITHIN_S)
     assert process.returncode == 0, told.decode()
     assert len(client.get("/v1/decodes").json()["items"]) == before + 1
     assert not spool.read_bytes()

@@ -8,43 +8,66 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
 
+import psutil
 import pytest
 
 from app.errors import InvalidParameter, Unavailable, UnreadableUpload
-from app.jobs import keeper
-from app.jobs.child import ChildLimits
-from app.jobs.keeper import Pending
+from app.families.plate.frames import PlateSearch
+from app.jobs import supervisor
+from app.jobs.decoder_process import ProcessLimits
 from app.jobs.pool import DecodePool
+from app.jobs.supervisor import Pending, WorkerSupervisor
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
-from app.services.frames import AnnotationTask, FrameResult, FrameTask, Outline, PlateSearch
+from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameResult, FrameSearch, FrameTask, Outline
+from tests.formats.pictures import huge_png, jpeg, lying_png, png
+from tests.http import wait_until
 from tests.jobs import standin
-from tests.uploads.pictures import huge_png, jpeg, lying_png, png
 
 CODE = PlateCode.from_position(8.5, 49.0)
 
 
 @pytest.fixture(scope="module")
 def pool() -> Iterator[DecodePool]:
-    made = DecodePool(standin.decode, workers=2, limits=ChildLimits(timeout_s=2.0))
+    made = DecodePool(standin.decode, workers=2)
     made.open()
     yield made
     made.close()
 
 
-def known(search: PlateSearch) -> Future[PlateSearch]:
-    future: Future[PlateSearch] = Future()
-    future.set_result(search)
+def known(search: PlateSearch) -> Future[FrameSearch]:
+    future: Future[FrameSearch] = Future()
+    future.set_result(FrameSearch({"plate": search}))
     return future
 
 
 def start(pool: DecodePool, what: int) -> Pending[FrameResult]:
-    return pool.start(FrameTask(png(standin.frame_that(what))), known(PlateSearch(codebook=(CODE,))))
+    return submit(pool, png(standin.frame_that(what)), known(PlateSearch(codebook=(CODE,))))
+
+
+def submit(pool: DecodePool, data: bytes, search: Future[FrameSearch]) -> Pending[FrameResult]:
+    return pool.submit(FrameTask(FramePicture(data), search))
 
 
 def child_of(pool: DecodePool) -> int:
     return int(start(pool, standin.OBEY).result().readings[0].reason.split()[0])
+
+
+def is_gone(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def wait_for_held(folder: Path) -> int:
+    """Id of the only process that holds a frame (`standin.hold`)."""
+    [path] = wait_until(lambda: list(folder.glob("*.pid")), "a process to hold a frame")
+    path.unlink()
+    return int(path.stem)
 
 
 def test_a_frame_goes_there_and_back(pool: DecodePool) -> None:
@@ -79,49 +102,68 @@ def test_a_killed_process_loses_only_its_own_frame(pool: DecodePool) -> None:
 
 
 def test_killing_idle_processes_costs_no_frame(pool: DecodePool) -> None:
-    for _round in range(2):
-        os.kill(child_of(pool), signal.SIGKILL)
-        assert start(pool, standin.OBEY).result().readings[0].digits == CODE.digits
-        time.sleep(0.5)
-        assert start(pool, standin.OBEY).result().readings[0].digits == CODE.digits
-
-
-def test_a_process_killed_from_outside_is_tried_again(pool: DecodePool) -> None:
-    """An out-of-memory killer takes a child in the middle of somebody's good frame."""
-    slow = DecodePool(slow_decode, workers=1, limits=ChildLimits(timeout_s=30))
-    slow.open()
-    try:
-        victim = int(start(slow, standin.OBEY).result().readings[0].reason)
-        pending = start(slow, standin.OBEY)
-        time.sleep(0.2)
+    for wait_for_the_end in (False, True):
+        victim = child_of(pool)
         os.kill(victim, signal.SIGKILL)
-        assert int(pending.result().readings[0].reason) != victim
+        if wait_for_the_end:
+            wait_until(lambda: is_gone(victim), "the process to end")  # noqa: B023 - asked in this round only
+        assert start(pool, standin.OBEY).result().readings[0].digits == CODE.digits
+
+
+def test_a_process_killed_from_outside_is_tried_again(tmp_path: Path) -> None:
+    """An out-of-memory killer takes a child in the middle of somebody's good frame."""
+    made = DecodePool(partial(standin.hold, tmp_path), workers=1, limits=ProcessLimits(timeout_s=600))
+    made.open()
+    try:
+        pending = start(made, standin.OBEY)
+        victim = wait_for_held(tmp_path)
+        os.kill(victim, signal.SIGKILL)
+        (tmp_path / "go").touch()
+        assert int(pending.result().readings[0].reason.split()[0]) != victim
     finally:
-        slow.close()
+        made.close()
 
 
-def slow_decode(pixels: object, **_options: object) -> list[object]:
-    time.sleep(0.6)
-    return standin.decode(pixels)  # type: ignore[return-value]
+def test_the_process_that_the_others_are_forks_of_is_replaced_too() -> None:
+    made = DecodePool(standin.decode, workers=1)
+    made.open()
+    try:
+        victim = child_of(made)
+        os.kill(psutil.Process(victim).ppid(), signal.SIGKILL)
+        assert child_of(made)
+        wait_until(lambda: is_gone(victim), "the process without a parent to end")
+        assert child_of(made) != victim
+    finally:
+        made.close()
 
 
-def test_a_frame_that_takes_too_long_is_stopped(pool: DecodePool) -> None:
-    began = time.monotonic()
-    with pytest.raises(UnreadableUpload, match="too long") as caught:
-        start(pool, standin.SLEEP).result()
-    assert 1.9 < time.monotonic() - began < 8
-    assert caught.value.limit == "2 s a file"
-    assert child_of(pool)
+def test_a_frame_that_takes_too_long_is_stopped() -> None:
+    made = DecodePool(standin.decode, workers=1, limits=ProcessLimits(timeout_s=2.0))
+    made.open()
+    try:
+        began = time.monotonic()
+        with pytest.raises(UnreadableUpload, match="too long") as caught:
+            start(made, standin.SLEEP).result()
+        assert time.monotonic() - began > 1.9
+        assert caught.value.limit == "2 s a file"
+        assert child_of(made)
+    finally:
+        made.close()
 
 
-def test_a_running_frame_can_be_cancelled(pool: DecodePool) -> None:
-    pending = start(pool, standin.SLEEP)
-    threading.Timer(0.3, pending.cancel).start()
-    began = time.monotonic()
-    with pytest.raises(Unavailable):
-        pending.result()
-    assert time.monotonic() - began < 8  # what runs into its time ends as UnreadableUpload, above
-    assert child_of(pool)
+def test_a_running_frame_can_be_cancelled(tmp_path: Path) -> None:
+    made = DecodePool(partial(standin.hold, tmp_path), workers=1, limits=ProcessLimits(timeout_s=600))
+    made.open()
+    try:
+        pending = start(made, standin.OBEY)
+        victim = wait_for_held(tmp_path)
+        threading.Thread(target=pending.cancel).start()
+        with pytest.raises(Unavailable):  # one that exceeds its time ends as UnreadableUpload, above
+            pending.result()
+        (tmp_path / "go").touch()
+        assert child_of(made) != victim
+    finally:
+        made.close()
 
 
 def test_memory_has_a_limit(pool: DecodePool) -> None:
@@ -134,17 +176,18 @@ def test_memory_has_a_limit(pool: DecodePool) -> None:
 @pytest.mark.parametrize("data", [lying_png(), huge_png(), b"", b"no picture", jpeg()[:-400]])
 def test_bad_pictures_are_refused_in_the_child_too(pool: DecodePool, data: bytes) -> None:
     with pytest.raises(UnreadableUpload) as caught:
-        pool.start(FrameTask(data), known(PlateSearch())).result()
+        submit(pool, data, known(PlateSearch())).result()
     assert caught.value.field == "file"
 
 
-def test_more_frames_than_places_are_refused_as_busy() -> None:
-    small = DecodePool(slow_decode, workers=1, max_waiting=2)
+def test_more_frames_than_places_are_refused_as_busy(tmp_path: Path) -> None:
+    small = DecodePool(partial(standin.hold, tmp_path), workers=1, max_waiting=2)
     small.open()
     try:
         waiting = [start(small, standin.OBEY) for _ in range(2)]
         with pytest.raises(Unavailable, match="busy"):
             start(small, standin.OBEY)
+        (tmp_path / "go").touch()
         for pending in waiting:
             pending.result()
         start(small, standin.OBEY).result()
@@ -166,18 +209,18 @@ def broken_decode(*_args: object, **_options: object) -> list[object]:
 
 
 def test_the_picture_is_loaded_before_the_search_is_known(pool: DecodePool) -> None:
-    search: Future[PlateSearch] = Future()
-    pending = pool.start(FrameTask(png(standin.frame_that(standin.OBEY))), search)
-    time.sleep(0.2)
+    search: Future[FrameSearch] = Future()
+    pending = submit(pool, png(standin.frame_that(standin.OBEY)), search)
+    wait_until(pending.future.running, "a process to take the picture")
     assert not pending.future.done()
-    search.set_result(PlateSearch(codebook=(CODE,)))
+    search.set_result(FrameSearch({"plate": PlateSearch(codebook=(CODE,))}))
     assert pending.result().readings[0].digits == CODE.digits
 
 
 @pytest.mark.parametrize("data", [png(standin.frame_that(standin.OBEY)), b"no picture"])
 def test_a_frame_cancelled_before_its_search_is_known_leaves_nothing_behind(pool: DecodePool, data: bytes) -> None:
-    before = [pool.start(FrameTask(data), Future()) for _ in range(4)]
-    time.sleep(0.2)
+    before = [submit(pool, data, Future()) for _ in range(4)]
+    wait_until(lambda: sum(pending.future.running() for pending in before) == 2, "both processes to take a picture")
     for pending in before:
         pending.cancel()
     for pending in before:
@@ -187,36 +230,43 @@ def test_a_frame_cancelled_before_its_search_is_known_leaves_nothing_behind(pool
 
 
 def test_a_killed_idle_process_is_replaced_before_a_frame_asks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeper, "_CHECK_S", 3.0)
+    may_replace = threading.Event()
+    start_early = WorkerSupervisor._start_early
+
+    def start_when_allowed(self: WorkerSupervisor) -> None:
+        if may_replace.is_set():
+            start_early(self)
+
+    monkeypatch.setattr(WorkerSupervisor, "_start_early", start_when_allowed)
+    monkeypatch.setattr(supervisor, "_CHECK_S", 0.05)
     made = DecodePool(standin.decode, workers=1)
     assert made.is_ready()
     made.open()
     try:
         victim = child_of(made)
         os.kill(victim, signal.SIGKILL)
-        os.waitid(os.P_PID, victim, os.WEXITED | os.WNOWAIT)
-        assert not made.is_ready()
-        deadline = time.monotonic() + 20
-        while not made.is_ready():
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        wait_until(lambda: not made.is_ready(), "the end of the process to be noticed")
+        may_replace.set()
+        wait_until(made.is_ready, "the process to be replaced")
         assert child_of(made) != victim
     finally:
         made.close()
     assert not made.is_ready()
 
 
-def test_a_cancelled_frame_that_waits_never_runs() -> None:
-    made = DecodePool(slow_decode, workers=1, max_waiting=2)
+def test_a_cancelled_frame_that_waits_never_runs(tmp_path: Path) -> None:
+    made = DecodePool(partial(standin.hold, tmp_path), workers=1, max_waiting=2)
     made.open()
     try:
         running, waiting = start(made, standin.OBEY), start(made, standin.DIE)
+        pid = wait_for_held(tmp_path)
         waiting.cancel()
         start(made, standin.OBEY).cancel()  # its place is free again
         with pytest.raises(Unavailable):
             waiting.result()
-        pid = int(running.result().readings[0].reason)
-        assert int(start(made, standin.OBEY).result().readings[0].reason) == pid
+        (tmp_path / "go").touch()
+        assert running.result().readings[0].digits == CODE.digits
+        assert child_of(made) == pid
     finally:
         made.close()
 
@@ -233,15 +283,14 @@ def test_a_closed_pool_leaves_no_process_and_takes_no_frame() -> None:
 
 
 def test_closing_the_pool_ends_the_waiting_for_its_frames() -> None:
-    made = DecodePool(standin.decode, workers=1, limits=ChildLimits(timeout_s=60))
+    made = DecodePool(standin.decode, workers=1, limits=ProcessLimits(timeout_s=600))
     made.open()
     running, queued = start(made, standin.SLEEP), start(made, standin.OBEY)
-    threading.Timer(0.3, made.close).start()
-    began = time.monotonic()
+    wait_until(running.future.running, "the frame to run")
+    threading.Thread(target=made.close).start()
     for pending in (running, queued):
         with pytest.raises(Unavailable):
             pending.result()
-    assert time.monotonic() - began < 10
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
@@ -252,7 +301,7 @@ def test_annotation(pool: DecodePool, suffix: str) -> None:
     frame = np.full((240, 320, 3), 128, np.uint8)
     outline = Outline(((100, 100), (200, 100), (200, 180), (100, 180)), "read", "023792168411 99 %")
     far = Outline(((-1e9, 0), (10, 0), (10, 1e9), (0, 10)), "unsure", "?")
-    drawn = pool.annotate(AnnotationTask(jpeg(frame), (outline, far), suffix))
+    drawn = pool.submit(AnnotationTask(jpeg(frame), (outline, far), suffix)).result()
     assert drawn.startswith({"png": b"\x89PNG", "jpg": b"\xff\xd8"}[suffix])
     pixels = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
     assert pixels.shape == (240, 320, 3)

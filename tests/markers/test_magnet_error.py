@@ -15,11 +15,11 @@ from app.markers.magnet_error import (
     OdometerError,
     ReadingConditions,
     covariance_of,
+    distinguishable,
     placements_of,
     ratio_std,
     separation,
     separation_for,
-    told_apart,
 )
 
 MPS_30_MPH = 13.41
@@ -37,7 +37,7 @@ def metro(speed_mps: float = MPS_30_MPH, clearance_m: float = 0.16) -> ReadingCo
 def test_the_papers_pipeline_tells_segments_apart_as_in_its_field_test(
     segment_m: float, low: float, high: float
 ) -> None:
-    assert low <= told_apart(TagDesign(3, 4.0, segment_m), metro()).mean_accuracy <= high
+    assert low <= distinguishable(TagDesign(3, 4.0, segment_m), metro()).mean_accuracy <= high
 
 
 def test_the_papers_pipeline_has_the_spread_of_its_field_test() -> None:
@@ -89,12 +89,12 @@ def decoded_share(design: TagDesign, at: ReadingConditions) -> np.ndarray:
     return np.array(shares)
 
 
-def test_the_share_told_apart_is_what_drawing_gives() -> None:
+def test_the_distinguishable_share_is_what_drawing_gives() -> None:
     design, at = TagDesign(3, 4.0, 0.05), metro()
     shares = decoded_share(design, at)
-    assert told_apart(design, at).mean_accuracy == pytest.approx(shares.mean(), abs=0.01)
+    assert distinguishable(design, at).mean_accuracy == pytest.approx(shares.mean(), abs=0.01)
     hard = ReadingConditions(MPS_30_MPH, 0.16, model=MagnetErrorModel(channels=1.0, timing_s=0.00063))
-    verdict = told_apart(design, hard, accuracy=0.975)
+    verdict = distinguishable(design, hard, accuracy=0.975)
     assert verdict.mean_accuracy == pytest.approx(decoded_share(design, hard).mean(), abs=0.01)
     assert 0 < verdict.share < 1
     assert verdict.codes == round(verdict.share * 61) * 8
@@ -102,7 +102,7 @@ def test_the_share_told_apart_is_what_drawing_gives() -> None:
 
 def test_with_more_magnets_the_share_is_a_bound_from_below() -> None:
     design, at = TagDesign(4, 3.0, 0.1), ReadingConditions(20.0, 0.30)
-    verdict = told_apart(design, at)
+    verdict = distinguishable(design, at)
     drawn = decoded_share(design, at)
     assert verdict.mean_accuracy <= drawn.mean() + 0.005
     assert verdict.mean_accuracy > drawn.mean() - 0.05
@@ -110,7 +110,7 @@ def test_with_more_magnets_the_share_is_a_bound_from_below() -> None:
 
 def test_every_difficulty_costs_codes() -> None:
     design = TagDesign(3, 4.0, 0.05)
-    easy = told_apart(design, ReadingConditions(10.0, 0.16))
+    easy = distinguishable(design, ReadingConditions(10.0, 0.16))
     assert (easy.share, easy.codes) == (1.0, 488)
     for hard in (
         ReadingConditions(10.0, 0.40),
@@ -119,23 +119,23 @@ def test_every_difficulty_costs_codes() -> None:
         ReadingConditions(10.0, 0.16, OdometerError(quantum_mps=0.6)),
         ReadingConditions(10.0, 0.16, model=MagnetErrorModel(placement_m=0.02)),
     ):
-        assert told_apart(design, hard).mean_accuracy < easy.mean_accuracy
-        assert told_apart(design, hard).codes < 488
+        assert distinguishable(design, hard).mean_accuracy < easy.mean_accuracy
+        assert distinguishable(design, hard).codes < 488
 
 
 def test_designs_without_ratio_and_designs_without_room() -> None:
-    two = told_apart(TagDesign(2, 4.0, 1.0), metro())
+    two = distinguishable(TagDesign(2, 4.0, 1.0), metro())
     assert (two.share, two.codes, two.worst_accuracy) == (1.0, 4, 1.0)
-    assert told_apart(TagDesign(7, 2.0, 0.5), metro()).capacity == 0
+    assert distinguishable(TagDesign(7, 2.0, 0.5), metro()).capacity == 0
 
 
-def test_a_design_too_large_to_list_is_judged_by_a_sample() -> None:
+def test_a_design_too_large_to_list_is_sampled() -> None:
     design = TagDesign(5, 6.0, 0.05)
     assert design.placements > 4000
     steps = placements_of(design)
     assert len({tuple(row) for row in steps}) == len(steps) == 4000
     assert [list(steps[0]), list(steps[-1])] == [[10, 10, 10, 90], [90, 10, 10, 10]]
-    assert 0 < told_apart(design, ReadingConditions(20.0, 0.30)).mean_accuracy < 1
+    assert 0 < distinguishable(design, ReadingConditions(20.0, 0.30)).mean_accuracy < 1
 
 
 @pytest.mark.parametrize("design", [TagDesign(2, 1.0, 0.5), TagDesign(4, 3.0, 0.2), TagDesign(7, 4.0, 0.5)])
@@ -165,7 +165,7 @@ def test_separation_is_a_probability_of_confusion() -> None:
         (lambda: OdometerError(drift=-0.1), "drift"),
         (lambda: MagnetErrorModel(moment_am2=math.inf), "moment_am2"),
         (lambda: MagnetErrorModel(noise_ut=math.nan), "noise_ut"),
-        (lambda: told_apart(TagDesign(3, 4.0, 1.0), metro(), accuracy=1.0), "accuracy"),
+        (lambda: distinguishable(TagDesign(3, 4.0, 1.0), metro(), accuracy=1.0), "accuracy"),
         (lambda: separation_for(0.5), "confusion"),
         (lambda: separation_for(math.nan), "confusion"),
     ],

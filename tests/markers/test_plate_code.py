@@ -21,10 +21,10 @@ from app.markers.plate import (
     is_codeword,
     plate_capacity,
     position_decimals,
-    resolve_position,
-    symbols_from_units,
+    unit_index,
     units_from_symbols,
 )
+from app.markers.plate_position import resolve_position
 
 # --- layout -----------------------------------------------------------------------------------------------------------
 
@@ -43,6 +43,11 @@ PAPER_UNITS = """
 
 def grid(text: str) -> np.ndarray:
     return np.array([[c == "#" for c in line.replace(" ", "")] for line in text.split("\n") if line.strip()], np.uint8)
+
+
+def symbols_from_units(units: np.ndarray) -> tuple[int, ...]:
+    bits = units.reshape(-1)[unit_index(units.shape[0])]
+    return tuple(int(v) for v in bits @ np.array([8, 4, 2, 1]))
 
 
 def test_the_papers_matrix_is_read_row_by_row() -> None:

@@ -10,14 +10,14 @@ import pytest
 import sqlalchemy as sa
 
 from app.errors import InvalidParameter, NotFound
+from app.families.inputs import PositionIn
+from app.families.plate.registration import NewPlate
 from app.registry import agencies
 from app.registry.audit import Author, find_head, list_entries, record, recording
 from app.registry.database import Database
-from app.services.access import Caller, Scope
-from app.services.audit import AuditLog, parse_head
-from app.services.markers import MarkerChange, Markers
-from app.services.plate_markers import NewPlate
-from app.services.positions import GivenPosition
+from app.services.access.access import Caller, Scope
+from app.services.access.audit import AuditLog, parse_head
+from app.services.markers.markers import MarkerChange, Markers
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 120, tzinfo=UTC)
 
@@ -44,7 +44,7 @@ class Registry:
         with self.database.read() as connection:
             head = find_head(connection, self.agency_ids[0])
         assert head is not None
-        return head["number"], head["hash"]
+        return head.number, head.hash
 
 
 @pytest.fixture
@@ -58,10 +58,10 @@ def registry(database: Database) -> Registry:
         caller = Caller(agency_id, f"key of {name}", f"planner of {name}", Scope.PLANNER)
         ids = []
         for j in range(2):
-            plate = NewPlate(GivenPosition(lon_deg=7.5 + k + j / 10, lat_deg=1.0, height_m=3.0), reason="Straße 大道")
+            plate = NewPlate(PositionIn(lon_deg=7.5 + k + j / 10, lat_deg=1.0, height_m=3.0), reason="Straße 大道")
             ids.append(str(markers.register(caller, plate)[0]["id"]))
         markers.change(caller, ids[0], MarkerChange({"status": "built"}), 1)
-        place = GivenPosition(lon_deg=7.50001 + k, lat_deg=1.0, horizontal_rmse_m=0.01)
+        place = PositionIn(lon_deg=7.50001 + k, lat_deg=1.0, horizontal_rmse_m=0.01)
         markers.change(caller, ids[0], MarkerChange({"status": "surveyed"}, place), 2)
         registry.agency_ids.append(agency_id)
         registry.marker_ids.append(sorted(ids))
@@ -80,8 +80,8 @@ def test_a_history_that_nobody_touched_has_no_fault(registry: Registry) -> None:
     assert registry.faults(expected=registry.head()) == []
     with registry.database.read() as connection:
         first, *_, last = list_entries(connection, registry.agency_ids[0])
-    assert first["previous_hash"] == "0" * 64
-    assert (last["who"], last["action"], last["detail"]) == ("an admin", "key.created", {"a": "ü", "b": 1})
+    assert first.previous_hash == "0" * 64
+    assert (last.who, last.action, last.detail) == ("an admin", "key.created", {"a": "ü", "b": 1})
 
 
 TAMPERED: dict[str, tuple[str, str]] = {
@@ -124,7 +124,7 @@ TAMPERED: dict[str, tuple[str, str]] = {
     ),
     "the marker itself": (
         "UPDATE markers SET lat_deg = 1.5 WHERE id = :marker",
-        "marker {marker}: is not what its version 3 says: lat_deg",
+        "marker {marker}: differs from its version 3: lat_deg",
     ),
     "an entry's author": (
         "UPDATE audit_log SET who = 'me' WHERE agency_id = :agency AND number = 2",
@@ -194,7 +194,7 @@ def test_entries_that_changed_places_are_found(registry: Registry) -> None:
     key = f"agency_id = '{registry.agency_ids[0]}' AND number"
     _swap(registry, "audit_log", key, columns, "2", "3")
     found = registry.faults()
-    assert {"entry 2: changed: its hash is not that of what it says"} <= set(found)
+    assert {"entry 2: changed: its hash does not match its content"} <= set(found)
     assert any(fault.startswith("entry 2: does not name the hash of the entry before it") for fault in found)
 
 
@@ -203,8 +203,8 @@ def test_versions_that_changed_places_are_found(registry: Registry) -> None:
     key = f"marker_id = '{marker_id}' AND version"
     _swap(registry, "marker_versions", key, "at, who, why, kind, audit_number, sha256", "1", "2")
     found = registry.faults()
-    assert f"version 1 of marker {marker_id}: changed: its hash is not that of what it says" in found
-    assert f"version 2 of marker {marker_id}: changed: its hash is not that of what it says" in found
+    assert f"version 1 of marker {marker_id}: changed: its hash does not match its content" in found
+    assert f"version 2 of marker {marker_id}: changed: its hash does not match its content" in found
 
 
 def test_what_moved_to_another_agency_is_found(registry: Registry) -> None:
@@ -213,11 +213,11 @@ def test_what_moved_to_another_agency_is_found(registry: Registry) -> None:
     registry.run("UPDATE marker_versions SET agency_id = :two WHERE marker_id = :marker", two=two, marker=marker_id)
     assert any("wrote 1 versions of markers, 0 are there" in fault for fault in registry.faults())
     assert f"version 1 of marker {marker_id}: missing, and it is the newest" in registry.faults()
-    assert f"version 1 of marker {marker_id}: changed: its hash is not that of what it says" in registry.faults("two")
+    assert f"version 1 of marker {marker_id}: changed: its hash does not match its content" in registry.faults("two")
     registry.run("UPDATE marker_versions SET agency_id = :one WHERE marker_id = :marker", one=one, marker=marker_id)
     assert registry.faults() == registry.faults("two") == []
     registry.run("UPDATE audit_log SET agency_id = :two WHERE agency_id = :one AND number = 5", one=one, two=two)
-    assert "entry 5: changed: its hash is not that of what it says" in registry.faults("two")
+    assert "entry 5: changed: its hash does not match its content" in registry.faults("two")
 
 
 def test_logs_that_two_agencies_swapped_are_found(registry: Registry) -> None:
@@ -227,8 +227,8 @@ def test_logs_that_two_agencies_swapped_are_found(registry: Registry) -> None:
     for source, target in ((one, spare), (two, one), (spare, two)):
         for table in ("audit_log", "marker_versions"):
             registry.run(f"UPDATE {table} SET agency_id = :t WHERE agency_id = :s", s=source, t=target)
-    assert "entry 1: changed: its hash is not that of what it says" in registry.faults("one")
-    assert "entry 1: changed: its hash is not that of what it says" in registry.faults("two")
+    assert "entry 1: changed: its hash does not match its content" in registry.faults("one")
+    assert "entry 1: changed: its hash does not match its content" in registry.faults("two")
 
 
 def test_an_end_that_was_cut_off_needs_a_head_that_was_kept(registry: Registry) -> None:

@@ -121,7 +121,7 @@ def test_a_large_load_leaves_every_index_and_finds_what_it_stored(database: Data
         for lon_deg in (8.0, 20.0):
             near = MarkerFilter(box=box_around(lon_deg, 49.123456789, 50.0))
             found = list_markers(connection, agency, near, after=None, limit=100)
-            assert sorted(int(row["digits"]) % 100 for row in found) == list(range(7))
+            assert sorted(int(row.digits) % 100 for row in found) == list(range(7))
 
 
 @pytest.mark.usefixtures("few_are_many")

@@ -12,7 +12,8 @@ from app.registry.audit import AuditEntry, version_sha256
 from app.registry.columns import Columns, JsonTexts, json_objects
 from app.registry.feature_text import feature_text, feature_texts
 from app.registry.ids import new_ids
-from app.registry.markers import PUBLIC
+from app.registry.marker_rows import MarkerRow
+from app.registry.rows import row_of
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)
 AWKWARD = ("", "plain", "a, b", '"%s" 100 %', "back\\slash\n", "Straße 日本", "null", "\x7f\u2028")
@@ -57,13 +58,13 @@ def test_members_may_have_an_order_of_their_own() -> None:
 def test_features_by_column_are_those_by_row(count: int) -> None:
     rows = [
         {
-            **dict.fromkeys(column.name for column in PUBLIC), "id": str(k), "family": ("cerpm", "plate")[k % 5 % 2],
+            **dict.fromkeys(MarkerRow._fields), "id": str(k), "family": ("cerpm", "plate")[k % 5 % 2],
             "spec": None if k % 3 == 1 else {"side": ("left", "right")[k % 2]}, "lon_deg": 8.0 + k / 7,
             "lat_deg": -1e-7, "height_m": None if k % 3 else 0.1, "road": AWKWARD[k], "updated_at": NOW, "version": 1,
         }
         for k in range(count)
     ]  # fmt: skip
-    assert feature_texts(_columns(rows)) == [feature_text(row) for row in rows]
+    assert feature_texts(_columns(rows)) == [feature_text(row_of(MarkerRow, row)) for row in rows]
 
 
 def test_what_is_json_already_goes_in_as_it_is() -> None:

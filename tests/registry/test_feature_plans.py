@@ -19,8 +19,8 @@ BOX = Box(7.0, 0.5, 7.1, 0.6)
 ACROSS = Box(179.9, 0.5, -179.9, 0.6)
 
 
-def _page(c: sa.Connection, own: str, narrowed: FeatureFilter, *, counted: bool = False) -> object:
-    return list_features(c, own, narrowed, after="id", limit=10, counted=counted)
+def _page(c: sa.Connection, own: str, filtered: FeatureFilter, *, counted: bool = False) -> object:
+    return list_features(c, own, filtered, after="id", limit=10, counted=counted)
 
 
 ASKED: dict[str, Callable[[sa.Connection, str], object]] = {

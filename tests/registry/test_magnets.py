@@ -10,19 +10,19 @@ import sqlalchemy as sa
 
 from app.encoders.magnet import CodebookRules
 from app.errors import StaleVersion
+from app.families.inputs import PositionIn
+from app.families.magnet.layouts import LaneInput, PlacedTag
+from app.families.magnet.registration import NewMagnets, TagInput
+from app.families.plate.registration import NewPlate
 from app.markers.magnet_design import TagDesign
 from app.registry import agencies, codebooks
 from app.registry.database import Database
 from app.registry.magnets import list_magnets_in
 from app.registry.markers import MarkerFilter, list_markers
 from app.registry.spatial import Box, box_around
-from app.services.access import Caller, Scope
-from app.services.codebooks import Codebooks
-from app.services.magnet_layouts import GivenLane, PlacedTag
-from app.services.magnet_markers import GivenTag, NewMagnets
-from app.services.markers import MarkerChange, Markers
-from app.services.plate_markers import NewPlate
-from app.services.positions import GivenPosition
+from app.services.access.access import Caller, Scope
+from app.services.markers.codebooks import Codebooks
+from app.services.markers.markers import MarkerChange, Markers
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 
@@ -35,14 +35,14 @@ def caller(database: Database) -> Caller:
 
 def _register(database: Database, caller: Caller, lon_deg: float = 7.0) -> dict[str, Any]:
     end_deg = (lon_deg + 0.001 + 180.0) % 360.0 - 180.0
-    lane = GivenLane(((lon_deg, 1.0), (end_deg, 1.0)), False, "geometry.coordinates")
-    new = NewMagnets(lane, GivenTag(PlacedTag(10.0), "SNS_4_0.1_10-30"))
+    lane = LaneInput(((lon_deg, 1.0), (end_deg, 1.0)), False, "geometry.coordinates", PositionIn())
+    new = NewMagnets(lane, TagInput(PlacedTag(10.0), "SNS_4_0.1_10-30"))
     return Markers(database, lambda: NOW).register(caller, new)[0]
 
 
-def _numbers(database: Database, box: Box, **narrowed: Any) -> list[int]:
+def _numbers(database: Database, box: Box, **filtered: Any) -> list[int]:
     with database.read() as connection:
-        return sorted(row["number"] for row in list_magnets_in(connection, box, **narrowed))
+        return sorted(row.number for row in list_magnets_in(connection, box, **filtered))
 
 
 def test_every_magnet_is_found_where_it_lies(database: Database, caller: Caller) -> None:
@@ -60,8 +60,8 @@ def test_magnets_over_the_antimeridian(database: Database, caller: Caller) -> No
     marker = _register(database, caller, lon_deg=179.99989)
     assert _signs(marker) == [1, 1, -1]
     assert _numbers(database, Box(179.9, 0.9, -179.9, 1.1)) == [1, 2, 3]
-    lane = GivenLane(((179.99989, 1.0), (-179.99911, 1.0)), False, "geometry.coordinates")
-    beside = NewMagnets(lane, GivenTag(PlacedTag(10.0, offset_m=1.0), "SNS_4_0.1_10-30"))
+    lane = LaneInput(((179.99989, 1.0), (-179.99911, 1.0)), False, "geometry.coordinates", PositionIn())
+    beside = NewMagnets(lane, TagInput(PlacedTag(10.0, offset_m=1.0), "SNS_4_0.1_10-30"))
     checks = Markers(database, lambda: NOW).register(caller, beside)[0]["checks"]
     assert next(c for c in checks if c["name"] == "neighbour-tag")["figure"] == pytest.approx(1.0, abs=1e-3)
 
@@ -71,7 +71,7 @@ def _signs(marker: dict[str, Any]) -> list[int]:
 
 
 def test_migration_0002_down_and_up_keeps_plates(database: Database, caller: Caller) -> None:
-    plate = NewPlate(GivenPosition(lon_deg=7.0, lat_deg=1.0))
+    plate = NewPlate(PositionIn(lon_deg=7.0, lat_deg=1.0))
     plate_id = Markers(database, lambda: NOW).register(caller, plate)[0]["id"]
     _register(database, caller)
     Codebooks(database, lambda: NOW).make(caller, "b", TagDesign(3, 4.0, 0.1), CodebookRules(), [("arrow", "left")])
@@ -87,7 +87,7 @@ def test_migration_0002_down_and_up_keeps_plates(database: Database, caller: Cal
     database.migrate()
     with database.read() as connection:
         (row,) = list_markers(connection, caller.agency_id, MarkerFilter(), after=None, limit=10)
-    assert (row["id"], row["spec"]) == (plate_id, None)
+    assert (row.id, row.spec) == (plate_id, None)
     _register(database, caller)
 
 
@@ -95,8 +95,10 @@ def test_a_codebook_is_replaced_at_its_version_only(database: Database, caller: 
     made, _ = Codebooks(database, lambda: NOW).make(caller, "b", TagDesign(3, 4.0, 0.1), CodebookRules())
     with database.write() as connection:
         change = {"version": 1, "now": NOW}
-        assert codebooks.replace_entries(connection, caller.agency_id, made["id"], [], **change)["version"] == 2
+        assert (
+            codebooks.CODEBOOKS.update(connection, caller.agency_id, made["id"], {"entries": []}, **change).version == 2
+        )
         with pytest.raises(StaleVersion):
-            codebooks.replace_entries(connection, caller.agency_id, made["id"], [], **change)
+            codebooks.CODEBOOKS.update(connection, caller.agency_id, made["id"], {"entries": []}, **change)
         with pytest.raises(StaleVersion):
-            codebooks.replace_entries(connection, "another agency", made["id"], [], version=2, now=NOW)
+            codebooks.CODEBOOKS.update(connection, "another agency", made["id"], {"entries": []}, version=2, now=NOW)

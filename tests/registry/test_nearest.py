@@ -20,7 +20,7 @@ from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, list_markers
 from app.registry.nearest import find_nearest_at_once, list_nearest
 from app.registry.tables import markers
-from app.services.search_areas import area_of
+from app.services.markers.search_areas import area_of
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
 GEOD = Geod(ellps="WGS84")
@@ -100,14 +100,14 @@ def _check(store: Store, place: tuple[float, float], count: int, family: str | N
         found = list_nearest(connection, *asked)
         at_once = find_nearest_at_once(connection, *asked)
     if at_once is not None:
-        assert [(row["id"], distance) for row, distance in at_once] == [(row["id"], d) for row, d in found]
+        assert [(row.id, distance) for row, distance in at_once] == [(row.id, d) for row, d in found]
     distances = [distance for _, distance in found]
     expected = _expected(store, place, count, family, np.inf if within_m is None else within_m)
     assert distances == pytest.approx(expected, abs=1e-6)
-    assert len({row["id"] for row, _ in found}) == len(found)
-    assert all(row["digits"].startswith(agency_id) for row, _ in found)
+    assert len({row.id for row, _ in found}) == len(found)
+    assert all(row.digits.startswith(agency_id) for row, _ in found)
     for row, distance in found:
-        assert GEOD.inv(*place, row["lon_deg"], row["lat_deg"])[2] == pytest.approx(distance, abs=1e-6)
+        assert GEOD.inv(*place, row.lon_deg, row.lat_deg)[2] == pytest.approx(distance, abs=1e-6)
 
 
 lon_deg = st.floats(-180, 180) | st.sampled_from([lon for lon, _ in PLACES])
@@ -168,4 +168,4 @@ def test_polygons_hold_what_is_inside_or_on_the_edge(store: Store, rings: list[l
         rows = list_markers(connection, agency_id, MarkerFilter(area=area), after=None, limit=10_000)
     inside = shapely.intersects_xy(shapely.from_wkb(area.wkb), spots[:, 0], spots[:, 1])
     assert inside.sum() > 20
-    assert sorted((row["lon_deg"], row["lat_deg"]) for row in rows) == sorted(map(tuple, spots[inside].tolist()))
+    assert sorted((row.lon_deg, row.lat_deg) for row in rows) == sorted(map(tuple, spots[inside].tolist()))

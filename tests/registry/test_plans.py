@@ -12,10 +12,10 @@ import sqlalchemy as sa
 from app.registry import agencies
 from app.registry.database import Database
 from app.registry.magnets import list_magnets_in
-from app.registry.markers import MarkerFilter, find_code_near, list_markers, list_plates_near
+from app.registry.markers import MarkerFilter, find_code_near, list_markers, list_near
 from app.registry.nearest import find_nearest_at_once
 from app.registry.spatial import Box, box_around
-from app.services.search_areas import area_of
+from app.services.markers.search_areas import area_of
 from tests.databases import query_plan
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
@@ -56,7 +56,7 @@ def store(
 
 
 @pytest.mark.parametrize(
-    ("narrowed", "index", "columns"),
+    ("filtered", "index", "columns"),
     [
         (MarkerFilter(), "ix_markers_agency_id_id", "agency_id=?"),
         (MarkerFilter(box=Box(-180, -90, 180, 90)), "ix_markers_agency_id_id", "agency_id=?"),
@@ -67,14 +67,14 @@ def store(
     ],
     ids=["all", "world", "status", "family", "digits", "road"],
 )
-def test_lists_use_their_index(store: tuple[Database, str], narrowed: MarkerFilter, index: str, columns: str) -> None:
+def test_lists_use_their_index(store: tuple[Database, str], filtered: MarkerFilter, index: str, columns: str) -> None:
     database, agency_id = store
-    plan = query_plan(database, lambda c: list_markers(c, agency_id, narrowed, after=None, limit=10))
+    plan = query_plan(database, lambda c: list_markers(c, agency_id, filtered, after=None, limit=10))
     if database.path is None:
         # in the order of ids an agency of many has its markers sooner from the index of all ids
         scans = (f"Scan using {index} on markers", f"Bitmap Index Scan on {index}")
         assert any(scan in plan for scan in scans) or (columns == "agency_id=?" and "uq_markers_id" in plan)
-        assert "Sort" not in plan or narrowed.digits or narrowed.road
+        assert "Sort" not in plan or filtered.digits or filtered.road
     else:
         assert f"USING INDEX {index} ({columns})" in plan
 
@@ -83,8 +83,8 @@ TRIANGLE = area_of([[[[7.0, 0.5], [7.1, 0.5], [7.0, 0.6], [7.0, 0.5]]]])
 SEARCHES: dict[str, Callable[[sa.Connection, str], object]] = {
     "box": lambda c, own: list_markers(c, own, MarkerFilter(box=Box(7, 0.5, 7.1, 0.6)), after=None, limit=10),
     "circle": lambda c, own: list_markers(c, own, MarkerFilter(near=(7.0, 0.5, 500.0)), after=None, limit=10),
-    "plates near": lambda c, own: list_plates_near(c, own, 7.0, 0.5, 50.0),
-    "over the antimeridian": lambda c, own: list_plates_near(c, own, 180.0, 0.5, 50.0),
+    "plates near": lambda c, own: list_near(c, own, ("plate",), 7.0, 0.5, 50.0),
+    "over the antimeridian": lambda c, own: list_near(c, own, ("plate",), 180.0, 0.5, 50.0),
     "polygon": lambda c, own: list_markers(c, own, MarkerFilter(area=TRIANGLE), after=None, limit=10),
     "a few near by": lambda c, own: find_nearest_at_once(c, own, MarkerFilter(), 7.0, 0.5, 10),
     "magnets": lambda c, own: list_magnets_in(c, box_around(7.0, 0.5, 2.0)),

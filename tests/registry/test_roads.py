@@ -9,14 +9,14 @@ import pytest
 import sqlalchemy as sa
 from pyproj import Geod
 
+from app.families.cerpm.registration import NewCerpm
+from app.families.inputs import PositionIn
 from app.registry.database import Database
 from app.registry.tables import audit_log, marker_versions, markers
-from app.services.access import Access, Caller, Scope
-from app.services.cerpm_markers import NewCerpm
-from app.services.markers import Markers
-from app.services.positions import GivenPosition
-from app.services.road_given import GivenCalibration, GivenLines
-from app.services.roads import NewRoad, RoadChange, Roads
+from app.services.access.access import Access, Caller, Scope
+from app.services.markers.markers import Markers
+from app.services.roads.input import CalibrationInput, LinesInput
+from app.services.roads.roads import NewRoad, RoadChange, Roads
 
 GEOD = Geod(ellps="WGS84")
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
@@ -32,7 +32,7 @@ def caller(database: Database) -> Caller:
 
 def _fill(database: Database, caller: Caller) -> np.ndarray:
     """One registered marker, and copies of its row along the road; their distances from its start. [m]"""
-    place = GivenPosition(lon_deg=-30.0, lat_deg=-30.0)
+    place = PositionIn(lon_deg=-30.0, lat_deg=-30.0)
     Markers(database, lambda: NOW).register(caller, NewCerpm(place, road="A 5"))
     along = np.linspace(1.0, 9_999.0, COUNT)
     same = np.ones(COUNT)
@@ -59,13 +59,13 @@ def _measures(database: Database) -> list[tuple[float, float, int]]:
 def test_thousands_of_markers_are_measured_and_the_log_covers_each(database: Database, caller: Caller) -> None:
     along = _fill(database, caller)
     roads = Roads(database, lambda: NOW)
-    road, _ = roads.register(caller, NewRoad("A 5", GivenLines((LINE,))))
+    road, _ = roads.register(caller, NewRoad("A 5", LinesInput((LINE,))))
     assert (road["markers"]["measured"], road["markers"]["left"]) == (COUNT, 1)
     found = _measures(database)
     assert np.allclose([measure for measure, _, _ in found], along, atol=1e-6)
     assert np.abs([offset for _, offset, _ in found]).max() < 1e-6
     assert {version for _, _, version in found} == {2}
-    calibration = (GivenCalibration(1_000.0, vertex=0), GivenCalibration(10_900.0, vertex=1))
+    calibration = (CalibrationInput(1_000.0, vertex=0), CalibrationInput(10_900.0, vertex=1))
     changed = roads.change(caller, road["id"], RoadChange(calibration=calibration), 1)
     assert changed["markers"]["measured"] == COUNT
     assert np.allclose([measure for measure, _, _ in _measures(database)], 1_000 + along * 0.99, atol=1e-6)
@@ -83,7 +83,7 @@ def test_thousands_of_markers_are_measured_and_the_log_covers_each(database: Dat
 
 def test_down_and_up_again_keeps_markers_and_their_measures(database: Database, caller: Caller) -> None:
     _fill(database, caller)
-    Roads(database, lambda: NOW).register(caller, NewRoad("A 5", GivenLines((LINE,))))
+    Roads(database, lambda: NOW).register(caller, NewRoad("A 5", LinesInput((LINE,))))
     before = _measures(database)
     database.migrate("0006")
     with database.read() as connection:
@@ -93,5 +93,5 @@ def test_down_and_up_again_keeps_markers_and_their_measures(database: Database, 
     database.migrate()
     assert database.is_ready()
     assert _measures(database) == before
-    road, _ = Roads(database, lambda: NOW).register(caller, NewRoad("A 5", GivenLines((LINE,))))
+    road, _ = Roads(database, lambda: NOW).register(caller, NewRoad("A 5", LinesInput((LINE,))))
     assert (road["version"], road["markers"]["unchanged"]) == (1, COUNT)

@@ -12,16 +12,19 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 
-from app.registry import agencies, codebooks
+from app.registry import agencies
 from app.registry.bulk_load import large_load, load_rows
 from app.registry.database import Database
 from app.registry.ids import new_id
+from app.registry.resources import Resource
+from app.registry.rows import select_rows
 from app.registry.tables import codebooks as codebook_table
 from app.registry.tables import idempotency_keys, metadata
 from app.registry.tenancy import across_agencies, acting_for, seeing_every_agency
 from app.settings import Settings
-from tests.api.test_codebooks import DESIGN
+from tests.api.markers.test_codebooks import DESIGN
 from tests.conftest import LiveServer
+from tests.http import WITHIN_S
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 ALL = sa.select(codebook_table.c.name).order_by(codebook_table.c.name)  # somebody forgot the WHERE
@@ -107,7 +110,7 @@ def test_threads_do_not_mix(database: Database, owners: tuple[str, str]) -> None
     together = threading.Barrier(8)
 
     def look(number: int) -> bool:
-        together.wait(10)
+        together.wait(WITHIN_S)
         with acting_for(owners[number % 2]):
             return all(_seen(database) == [f"of {number % 2 + 1}"] for _ in range(25))
 
@@ -153,13 +156,13 @@ def test_a_request_sees_its_agencys_rows_even_if_the_query_forgets(
     serve: Callable[[Settings], LiveServer],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def forgetful(connection: sa.Connection, _agency_id: str, **_: Any) -> list[sa.RowMapping]:
-        return list(connection.execute(sa.select(codebook_table)).mappings())
+    def forgetful(resource: Resource[Any], _agency_id: str, _equal: dict[str, Any]) -> sa.Select[Any]:
+        return select_rows(resource.row, resource.table)
 
     server = serve(Settings(data_dir=tmp_path, database_url=new_database_url(tmp_path), warm_decoders=False))
     with server.agency("one") as one, server.agency("two") as two:
         for client, name in ((one, "first"), (two, "second")):
             assert client.post("/v1/codebooks", json={"name": name, "design": DESIGN}).status_code == 201
-        monkeypatch.setattr(codebooks, "list_codebooks", forgetful)
+        monkeypatch.setattr(Resource, "_select", forgetful)
         for client, name in ((one, "first"), (two, "second")) * 3:
             assert [book["name"] for book in client.get("/v1/codebooks").json()["items"]] == [name]

@@ -73,11 +73,11 @@ def store(
     database.close()
 
 
-def _found(store: tuple[Database, str, np.ndarray], narrowed: MarkerFilter) -> set[tuple[float, float]]:
+def _found(store: tuple[Database, str, np.ndarray], filtered: MarkerFilter) -> set[tuple[float, float]]:
     database, agency_id, _ = store
     with database.read() as connection:
-        rows = list_markers(connection, agency_id, narrowed, after=None, limit=10_000)
-    return {(row["lon_deg"], row["lat_deg"]) for row in rows}
+        rows = list_markers(connection, agency_id, filtered, after=None, limit=10_000)
+    return {(row.lon_deg, row.lat_deg) for row in rows}
 
 
 @pytest.mark.parametrize("centre", CENTRES)

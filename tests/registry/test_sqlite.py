@@ -10,10 +10,12 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
+from app.families.inputs import PositionIn
+from app.families.plate.registration import NewPlate
 from app.registry import agencies
 from app.registry.database import Database
-from app.services.access import Access, Caller, Scope
-from app.services.markers import GivenPosition, Markers, NewPlate
+from app.services.access.access import Access, Caller, Scope
+from app.services.markers.markers import Markers
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 
@@ -71,7 +73,7 @@ def test_a_second_process_is_told_who_owns_the_file(database: Database) -> None:
 def test_the_spatial_index_follows_the_table(database: Database) -> None:
     with database.write() as connection:
         caller = Caller(agencies.add_agency(connection, "one", NOW), "key", "tester", Scope.PLANNER)
-    plate = NewPlate(GivenPosition(lon_deg=7.5, lat_deg=1.0))
+    plate = NewPlate(PositionIn(lon_deg=7.5, lat_deg=1.0))
     marker = Markers(database, lambda: NOW).register(caller, plate)[0]
 
     def boxes() -> list[tuple[float, ...]]:

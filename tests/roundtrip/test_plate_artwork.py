@@ -32,6 +32,7 @@ from app.encoders.plate.drawing import Boxes, Layer
 from app.errors import ProofFailed
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading
+from tests.http import WITHIN_S
 
 URL = "https://waymark.example/v1/markers/3f0c8a52-6a0c-7d1e-9f52-0123456789ab"
 CAMERA_PX_PER_MM = 1.0  # a plate some 1.5 m in front of a 1080p camera
@@ -97,7 +98,7 @@ def test_files_are_read_by_the_decoder_through_other_renderers(kind: str, tmp_pa
             pytest.skip("pdftoppm is not installed")
         (tmp_path / "plate.pdf").write_bytes(write_pdf(drawing))
         command = [pdftoppm, "-r", "150", "-singlefile", "-png", "plate.pdf", "page"]
-        subprocess.run(command, cwd=tmp_path, check=True, timeout=60)
+        subprocess.run(command, cwd=tmp_path, check=True, timeout=WITHIN_S)
         picture = (tmp_path / "page.png").read_bytes()
     sheet = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
     size = (round(drawing.width_mm * CAMERA_PX_PER_MM), round(drawing.height_mm * CAMERA_PX_PER_MM))

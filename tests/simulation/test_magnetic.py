@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
 from app.markers.magnet import InformationTag, Orientation, Polarity
 from app.sensors.magnetometer_bar import MagnetometerBar
-from app.simulation.magnetic.dipoles import cuboid_field_ut, dipole_field_ut
+from app.simulation.magnetic.dipoles import dipole_field_ut
 from app.simulation.magnetic.drive import Scene, simulate_drive
 from app.simulation.magnetic.readout import CanBus, Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, Spread
@@ -26,6 +28,17 @@ def test_a_magnet_gives_32_ut_at_25_cm() -> None:
     near, far = dipole_field_ut(np.array([[0, 0, 0.25], [0, 0, 0.5]]), np.zeros(3), up)[:, 2]
     assert near == pytest.approx(31.6, abs=0.1)
     assert near / far == pytest.approx(8)
+
+
+def cuboid_field_ut(points_m: np.ndarray, size_m: tuple[float, float, float], remanence_t: float) -> np.ndarray:
+    """Field of a cuboid magnetised along its z axis: two charged faces (Furlani 2001, section 4.2)."""
+    field = np.zeros((len(points_m), 3))
+    for i, j, k in itertools.product((-1, 1), repeat=3):
+        x, y, z = (points_m - np.array([i, j, k]) * np.array(size_m) / 2).T
+        r = np.sqrt(x * x + y * y + z * z)
+        sign = i * j * k
+        field += np.stack([-sign * np.log(r + y), -sign * np.log(r + x), sign * np.arctan2(x * y, z * r)], axis=1)
+    return field * remanence_t * 1e6 / (4 * np.pi)
 
 
 def test_the_dipole_agrees_with_the_cuboid() -> None:

@@ -7,9 +7,17 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.markers.cerpm import LaneSide
+from app.planning.cerpm_placement import place_markers
+from app.simulation.radio.driving import (
+    Driver,
+    SatelliteReceiver,
+    drive_lane,
+    matern_noise,
+    observe_track,
+    ornstein_noise,
+)
 from app.simulation.radio.lanes import TrueLane, lane_between, make_lane
-from app.simulation.radio.markers import lay_markers, lose_row, lose_share
-from app.simulation.radio.vehicle import Driver, Receiver, drive_lane, matern_noise, observe_track, ornstein_noise
+from app.simulation.radio.markers import install_markers, lose_row, lose_share
 
 
 @pytest.fixture(scope="module")
@@ -58,31 +66,33 @@ def test_positions_go_to_degrees_and_back(lane: TrueLane) -> None:
 
 
 def test_surveys_are_off_by_what_they_say(lane: TrueLane) -> None:
-    laid = lay_markers(lane, np.random.default_rng(1002), spacing_m=2.0, survey_sd_m=0.05)
-    off = lane.enu_from_wgs84(laid.lon_deg, laid.lat_deg) - laid.point_m
+    installed = install_markers(
+        lane, place_markers(lane.left_m, lane.right_m, spacing_m=2.0), np.random.default_rng(1002), survey_sd_m=0.05
+    )
+    off = lane.enu_from_wgs84(installed.lon_deg, installed.lat_deg) - installed.point_m
     assert off.std() == pytest.approx(0.05, rel=0.08)
-    line = np.where((laid.side == LaneSide.LEFT)[:, None, None], lane.left_m[None, ::1], lane.right_m[None, ::1])
-    assert np.linalg.norm(line - laid.point_m[:, None], axis=2).min(axis=1).max() < 0.17  # laid on the lines
-    assert (np.abs(laid.lon_deg * 1e7 - np.round(laid.lon_deg * 1e7)) < 1e-4).all()
-    assert sorted(laid.number) == list(range(1, len(laid) + 1))
-    assert (np.diff(laid.number) != 1).mean() > 0.9
+    line = np.where((installed.side == LaneSide.LEFT)[:, None, None], lane.left_m[None, ::1], lane.right_m[None, ::1])
+    assert np.linalg.norm(line - installed.point_m[:, None], axis=2).min(axis=1).max() < 0.17  # installed on the lines
+    assert (np.abs(installed.lon_deg * 1e7 - np.round(installed.lon_deg * 1e7)) < 1e-4).all()
+    assert sorted(installed.number) == list(range(1, len(installed) + 1))
+    assert (np.diff(installed.number) != 1).mean() > 0.9
 
 
 def test_lost_shares_and_rows_are_exact(lane: TrueLane) -> None:
     rng = np.random.default_rng(1003)
-    laid = lay_markers(lane, rng)
-    assert len(lose_share(laid, 0.4, rng)) == len(laid) - round(0.4 * len(laid))
+    installed = install_markers(lane, place_markers(lane.left_m, lane.right_m), rng)
+    assert len(lose_share(installed, 0.4, rng)) == len(installed) - round(0.4 * len(installed))
     for side in (LaneSide.LEFT, LaneSide.RIGHT):
-        gapped = lose_row(laid, 5, rng, side)
-        gone = np.setdiff1d(laid.number, gapped.number)
-        rows = np.flatnonzero(np.isin(laid.number[laid.side == side], gone))
+        gapped = lose_row(installed, 5, rng, side)
+        gone = np.setdiff1d(installed.number, gapped.number)
+        rows = np.flatnonzero(np.isin(installed.number[installed.side == side], gone))
         assert list(np.diff(rows)) == [1, 1, 1, 1]
         assert rows[0] > 0
-        assert rows[-1] < (laid.side == side).sum() - 1
+        assert rows[-1] < (installed.side == side).sum() - 1
     with pytest.raises(InvalidParameter):
-        lose_row(laid, len(laid), rng)
+        lose_row(installed, len(installed), rng)
     with pytest.raises(InvalidParameter):
-        lose_share(laid, 1.5, rng)
+        lose_share(installed, 1.5, rng)
 
 
 def test_a_driver_alone_scores_what_drivers_score() -> None:
@@ -108,9 +118,9 @@ def test_a_driver_slows_down_for_bends(lane: TrueLane) -> None:
 
 
 @pytest.mark.parametrize(
-    ("receiver", "sd_m", "heading_deg"), [(Receiver.rtk(), 0.0197, 0.3), (Receiver.plain(), 2.0, 1.5)]
+    ("receiver", "sd_m", "heading_deg"), [(SatelliteReceiver.rtk(), 0.0197, 0.3), (SatelliteReceiver.plain(), 2.0, 1.5)]
 )
-def test_tracks_are_off_by_what_their_receiver_is(receiver: Receiver, sd_m: float, heading_deg: float) -> None:
+def test_tracks_are_off_by_what_their_receiver_is(receiver: SatelliteReceiver, sd_m: float, heading_deg: float) -> None:
     lane = make_lane(np.random.default_rng(1005), length_m=300)
     off, turned, rates = [], [], []
     for k in range(60):
@@ -139,7 +149,7 @@ def test_noises_have_their_deviation_and_memory() -> None:
 
 def test_the_same_seed_is_the_same_drive(lane: TrueLane) -> None:
     tracks = [
-        observe_track(lane, drive_lane(lane, Driver(), rng), Receiver.rtk(), rng)
+        observe_track(lane, drive_lane(lane, Driver(), rng), SatelliteReceiver.rtk(), rng)
         for rng in (np.random.default_rng(7), np.random.default_rng(7))
     ]
     assert (tracks[0].lon_deg == tracks[1].lon_deg).all()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.errors import InvalidParameter
-from app.simulation.radio.link import Radio, draw_shadows_db, hear_transmissions, mean_rssi_dbm, send_beacons
+from app.simulation.radio.link import Radio, draw_shadows_db, mean_rssi_dbm, receive_transmissions, send_beacons
 
 LOUD_DBM = -80.0
 
@@ -31,7 +31,7 @@ def test_losses_are_alohas_where_nothing_captures(
     for k in range(12):
         rng = np.random.default_rng(1500 + k)
         sent = send_beacons(count, radio, 0.0, spans * interval_s, rng)
-        heard = hear_transmissions(sent.start_s, np.full(len(sent.start_s), LOUD_DBM), radio, rng)
+        heard = receive_transmissions(sent.start_s, np.full(len(sent.start_s), LOUD_DBM), radio, rng)
         rates.append(heard.mean())
     load = 2 * radio.airtime_s / interval_s
     assert np.mean(rates) == pytest.approx((1 - load) ** (count - 1), abs=0.03)
@@ -45,7 +45,7 @@ def test_capture_and_the_preambles_spare_symbols_lose_less() -> None:
     strength = rng.normal(-90, 8, len(sent.start_s))
 
     def rate(radio: Radio) -> float:
-        return float(hear_transmissions(sent.start_s, strength, radio, np.random.default_rng(1)).mean())
+        return float(receive_transmissions(sent.start_s, strength, radio, np.random.default_rng(1)).mean())
 
     hard = rate(Radio(7, 500_000, 2.0, lock_symbols=12.25, capture_db=math.inf))
     spare = rate(Radio(7, 500_000, 2.0, capture_db=math.inf))
@@ -56,7 +56,7 @@ def test_capture_and_the_preambles_spare_symbols_lose_less() -> None:
 
 
 def _heard(starts: list[float], strengths: list[float], radio: Radio | None = None) -> list[bool]:
-    heard = hear_transmissions(
+    heard = receive_transmissions(
         np.array(starts), np.array(strengths), radio or Radio(10, 125_000, 5.0), np.random.default_rng(0)
     )
     return [bool(h) for h in heard]
@@ -86,7 +86,7 @@ def test_the_receiver_is_deaf_below_its_sensitivity() -> None:
     rng = np.random.default_rng(1700)
     start = np.arange(2000) * 1.0
     for over_db, low, high in ((-2, 0, 0.02), (0, 0.45, 0.55), (2, 0.98, 1)):
-        heard = hear_transmissions(start, np.full(2000, radio.sensitivity_dbm + over_db), radio, rng)
+        heard = receive_transmissions(start, np.full(2000, radio.sensitivity_dbm + over_db), radio, rng)
         assert low <= heard.mean() <= high
 
 

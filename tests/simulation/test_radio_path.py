@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.decoders.cerpm.lane import fit_lane
+from app.lanes.estimate import fit_lane
 from app.simulation.radio.lanes import TrueLane
 from benchmarks.cerpm import scenes
-from benchmarks.cerpm.judge import judge_path, judge_track
-from benchmarks.cerpm.others import run_forged
-from benchmarks.cerpm.paths import CONDITIONS, Tally, add_errors, dirty_path
+from benchmarks.cerpm.packets_and_steering import run_forged
+from benchmarks.cerpm.path_errors import path_errors, track_errors
+from benchmarks.cerpm.paths import CONDITIONS, Tally, add_errors, dirty_log, markers_of_log
 
 
 @pytest.fixture(scope="module")
@@ -20,20 +20,20 @@ def lane() -> TrueLane:
     return scenes.route("tfhrc_low_1")
 
 
-def test_the_judge_measures_a_path_that_is_off_by_a_known_way(lane: TrueLane) -> None:
-    laid = scenes.lay(lane, np.random.default_rng(2000))
-    found = fit_lane(scenes.markers_for_lane(laid), scenes.track(lane, np.random.default_rng(2001)))
+def test_errors_of_a_path_at_a_known_distance(lane: TrueLane) -> None:
+    installed = scenes.install(lane, np.random.default_rng(2000))
+    found = fit_lane(scenes.markers_for_lane(installed), scenes.track(lane, np.random.default_rng(2001)))
     true = lane.points_m(np.linspace(0, lane.length_m, len(found.lon_deg)), 0.5)
     lon, lat = lane.wgs84_from_enu(true)
-    tally = judge_path(lane, replace(found, lon_deg=lon, lat_deg=lat), 0.0, lane.length_m)
+    tally = path_errors(lane, replace(found, lon_deg=lon, lat_deg=lat), 0.0, lane.length_m)
     assert tally.rms_m == pytest.approx(0.5, abs=0.01)
     assert tally.coverage == 1.0
     third = len(lon) // 3
-    tally = judge_path(lane, replace(found, **{k: getattr(found, k)[:third] for k in _ROWS}), 0.0, lane.length_m)
+    tally = path_errors(lane, replace(found, **{k: getattr(found, k)[:third] for k in _ROWS}), 0.0, lane.length_m)
     assert tally.coverage == pytest.approx(1 / 3, abs=0.05)
-    unsure = judge_path(lane, replace(found, confidence=np.full(len(lon), 0.4)), 0.0, lane.length_m)
+    unsure = path_errors(lane, replace(found, confidence=np.full(len(lon), 0.4)), 0.0, lane.length_m)
     assert unsure.coverage == 0.0
-    refused = judge_path(lane, replace(found, refusal="no"), 0.0, lane.length_m)
+    refused = path_errors(lane, replace(found, refusal="no"), 0.0, lane.length_m)
     assert (refused.coverage, refused.refused) == (0.0, 1)
 
 
@@ -52,11 +52,10 @@ def test_paths_beat_the_drivers_own_track(lane: TrueLane) -> None:
 
 
 def test_a_dirty_log_gives_a_path(lane: TrueLane) -> None:
-    found, track, (first, last), raised = dirty_path(lane, np.random.default_rng(2003), True)
-    assert not raised
-    assert found is not None
-    tally = judge_path(lane, found, first, last)
-    assert tally.rms_m < 0.25 < judge_track(lane, track, first, last).rms_m
+    log = dirty_log(lane, np.random.default_rng(2003), True)
+    found = fit_lane(markers_of_log(log), log.track)
+    tally = path_errors(lane, found, *log.span_m)
+    assert tally.rms_m < 0.25 < track_errors(lane, log.track, *log.span_m).rms_m
     assert tally.coverage > 0.97
 
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from app.decoders.cerpm.control import Controller, SteeringSettings
 from app.errors import InvalidParameter
+from app.lanes.control import Controller, SteeringSettings
 from app.simulation.steering import check_steering
 from app.simulation.vehicle import PoseNoise, Vehicle, draw_pose_errors
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any, NoReturn
 
-from app.api.strict_json import parse_json
+from app.api.http.strict_json import parse_json
 from app.errors import MalformedRequest
 from app.registry.conditions import COMPARISONS, Compared, Condition, Constant, Joined, Missing, Not, Value
 

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated
 
-from starlette.requests import Request
+from fastapi import Depends
 from starlette.responses import Response
 
+from app.api.http.dependencies import Caller
+from app.api.ogc.dependencies import BaseUrl, CollectionOf, FeaturesService, Offers
 from app.api.ogc.openapi import api_document
-from app.api.ogc.query import known_parameters
-from app.api.ogc.responses import GEOJSON, JSON, OPENAPI, SCHEMA, answer, base_url, caller_of, link, negotiate
+from app.api.ogc.responses import GEOJSON, JSON, OPENAPI, SCHEMA, answer, link
+from app.api.ogc.shapes import CollectionDocument, Collections, Conformance, ExtentDocument, LandingPage
 from app.api.ogc.tiles import TILES_REL
 from app.registry.features import Extent
-from app.services.feature_crs import STORAGE_CRS, FeatureCrs
-from app.services.features import COLLECTIONS, Collection, Features, get_collection
+from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
+from app.services.markers.features import COLLECTIONS, Collection
 
-_OFFERED = ("f",)
 _SCHEMES_REL = "http://www.opengis.net/def/rel/ogc/1.0/tiling-schemes"
 _FEATURES = "http://www.opengis.net/spec/ogcapi-features"
 _FILTER = "http://www.opengis.net/spec/ogcapi-features-3/1.0/conf"
@@ -43,11 +44,13 @@ CONFORMANCE = (
 )
 
 
-def landing_page(request: Request) -> Response:
+OffersJson = Annotated[None, Depends(Offers(JSON))]
+OffersSchema = Annotated[None, Depends(Offers(SCHEMA, JSON))]
+OffersOpenApi = Annotated[None, Depends(Offers(OPENAPI, JSON))]
+
+
+def landing_page(_offers: OffersJson, base: BaseUrl) -> Response:
     """Where everything is."""
-    found = known_parameters(request, _OFFERED)
-    negotiate(request, found, JSON)
-    base = base_url(request)
     links = [
         link(f"{base}/", "self", JSON, "This document"),
         link(f"{base}/api", "service-desc", OPENAPI, "The API"),
@@ -55,84 +58,80 @@ def landing_page(request: Request) -> Response:
         link(f"{base}/collections", "data", JSON, "Collections"),
         link(f"{base}/tileMatrixSets", _SCHEMES_REL, JSON, "Tile matrix sets"),
     ]
-    return answer({"title": "Waymark", "description": "The registry of machine-readable roads", "links": links})
+    description = "The registry of machine-readable roads"
+    return answer(LandingPage(title="Waymark", description=description, links=links))
 
 
-def conformance(request: Request) -> Response:
-    """What the clients may expect."""
-    negotiate(request, known_parameters(request, _OFFERED), JSON)
-    return answer({"conformsTo": CONFORMANCE})
+def get_conformance(_offers: OffersJson) -> Response:
+    """The conformance classes."""
+    return answer(Conformance(conformsTo=list(CONFORMANCE)))
 
 
-def api(request: Request) -> Response:
+def get_api(_offers: OffersOpenApi, base: BaseUrl) -> Response:
     """The API as OpenAPI 3.0, written for the clients that read it."""
-    negotiate(request, known_parameters(request, _OFFERED), OPENAPI, JSON)
-    return answer(api_document(base_url(request)), OPENAPI)
+    return answer(api_document(base), OPENAPI)
 
 
-def collections(request: Request) -> Response:
+def list_collections(_offers: OffersJson, base: BaseUrl, caller: Caller, features: FeaturesService) -> Response:
     """All collections."""
-    negotiate(request, known_parameters(request, _OFFERED), JSON)
-    base = base_url(request)
-    found = [_described(request, collection, base) for collection in COLLECTIONS.values()]
-    links = [link(f"{base}/collections", "self", JSON), link(f"{base}/", "root", JSON)]
-    return answer({"links": links, "crs": list(FeatureCrs), "collections": found})
+    document: Collections = {
+        "links": [link(f"{base}/collections", "self", JSON), link(f"{base}/", "root", JSON)],
+        "crs": list(FeatureCrs),
+        "collections": [_described(found, features.extent(caller, found), base) for found in COLLECTIONS.values()],
+    }
+    return answer(document)
 
 
-def collection(request: Request) -> Response:
+def get_collection(
+    collection: CollectionOf, _offers: OffersJson, base: BaseUrl, caller: Caller, features: FeaturesService
+) -> Response:
     """One collection."""
-    found = get_collection(request.path_params["collection"])
-    negotiate(request, known_parameters(request, _OFFERED), JSON)
-    return answer(_described(request, found, base_url(request)))
+    return answer(_described(collection, features.extent(caller, collection), base))
 
 
-def schema(request: Request) -> Response:
+def get_schema(collection: CollectionOf, _offers: OffersSchema, base: BaseUrl) -> Response:
     """The JSON Schema of a collection's features: without it clients guess types from the first page."""
-    found = get_collection(request.path_params["collection"])
-    negotiate(request, known_parameters(request, _OFFERED), SCHEMA, JSON)
-    base = base_url(request)
-    properties = {field.name: schema_type(field.kind) | {"title": field.text} for field in found.fields}
     document = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"{base}/collections/{found.id}/schema",
-        "title": found.title,
+        "$id": f"{base}/collections/{collection.id}/schema",
+        "title": collection.title,
         "type": "object",
         "required": ["type", "geometry", "properties"],
         "properties": {
             "type": {"type": "string", "enum": ["Feature"]},
             "id": {"type": "string"},
-            "geometry": {"$ref": f"https://geojson.org/schema/{found.geometry}.json"},
-            "properties": {"type": "object", "properties": properties},
+            "geometry": {"$ref": f"https://geojson.org/schema/{collection.geometry}.json"},
+            "properties": {"type": "object", "properties": _field_schemas(collection)},
         },
     }
     return answer(document, SCHEMA)
 
 
-def queryables(request: Request) -> Response:
+def get_queryables(collection: CollectionOf, _offers: OffersSchema, base: BaseUrl) -> Response:
     """The JSON Schema of what filters can ask of a collection's features."""
-    found = get_collection(request.path_params["collection"])
-    negotiate(request, known_parameters(request, _OFFERED), SCHEMA, JSON)
     document = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"{base_url(request)}/collections/{found.id}/queryables",
-        "title": found.title,
+        "$id": f"{base}/collections/{collection.id}/queryables",
+        "title": collection.title,
         "type": "object",
-        "properties": {field.name: schema_type(field.kind) | {"title": field.text} for field in found.fields},
+        "properties": _field_schemas(collection),
         "additionalProperties": False,
     }
     return answer(document, SCHEMA)
 
 
-def schema_type(kind: str) -> dict[str, Any]:
+def _field_schemas(collection: Collection) -> dict[str, dict[str, str]]:
+    return {field.name: schema_type(field.kind) | {"title": field.text} for field in collection.fields}
+
+
+def schema_type(kind: str) -> dict[str, str]:
     """JSON Schema of a kind of property."""
     return {"type": "string", "format": "date-time"} if kind == "date-time" else {"type": kind}
 
 
-def _described(request: Request, found: Collection, base: str) -> dict[str, Any]:
-    features: Features = request.app.state.features
-    extent = features.extent(caller_of(request), found)
+def _described(found: Collection, extent: Extent | None, base: str) -> CollectionDocument:
     url = f"{base}/collections/{found.id}"
-    described: dict[str, Any] = {
+    described: CollectionDocument = {
         "id": found.id,
         "title": found.title,
         "description": found.text,
@@ -155,7 +154,7 @@ def _described(request: Request, found: Collection, base: str) -> dict[str, Any]
     return described
 
 
-def _extent_document(extent: Extent) -> dict[str, Any]:
+def _extent_document(extent: Extent) -> ExtentDocument:
     return {
         "spatial": {
             "bbox": [[extent.west_deg, extent.south_deg, extent.east_deg, extent.north_deg]],

@@ -5,24 +5,35 @@ No If-Match is asked for here, because these clients send none. Deleting a marke
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ValidationError
-from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
+from fastapi import Depends, Header, Request
 from starlette.responses import Response
 
-from app.api.markers import NewMarkerIn, patch_marker, post_marker
-from app.api.ogc.items import feature_id
-from app.api.ogc.query import known_parameters
-from app.api.ogc.responses import GEOJSON, JSON, base_url, caller_of
-from app.api.permissions import PERMISSIONS
-from app.api.schemas_patch import MarkerPatch
-from app.api.strict_json import parse_json
+from app.api.http.dependencies import Caller, Markers
+from app.api.http.forms import media_type_of, validated
+from app.api.http.permissions import PERMISSIONS
+from app.api.http.strict_json import parse_json
+from app.api.markers.markers import NewMarkerIn, patch_marker, post_marker
+from app.api.markers.schemas_patch import MarkerPatch
+from app.api.ogc.dependencies import (
+    BaseUrl,
+    CollectionOf,
+    EditableCollection,
+    FeatureId,
+    FeaturesService,
+    refuse_parameters,
+)
+from app.api.ogc.responses import GEOJSON, JSON
 from app.errors import InvalidParameter, UnsupportedUpload
-from app.services.feature_crs import STORAGE_CRS, FeatureCrs
-from app.services.features import Features, get_collection
+from app.families import FAMILIES, FAMILY_NAMES, get_family
+from app.families.family import Family
+from app.services.access.access import Caller as CallerValue
+from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
+from app.services.markers.features import Collection
+from app.services.markers.features import Features as FeaturesUseCases
+from app.services.markers.markers import Markers as MarkersUseCases
 
 _PLAIN = ("status", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m", "side")
 _CLEARED = ("heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")  # by a PUT without them
@@ -32,90 +43,121 @@ _SURVEYED = (
 )
 _FIXED = ("family", "scheme", "code")
 _READ_ONLY = ("transform_accuracy_m", "localization_grade", "version", "updated_at")
-_BODY_TYPES = (GEOJSON, JSON, "application/merge-patch+json")
+BODY_TYPES = (GEOJSON, JSON, "application/merge-patch+json")
 
 
-async def item_options(request: Request) -> Response:
-    """What may be done with this."""
-    collection = get_collection(request.path_params["collection"])
+@dataclass(frozen=True, slots=True)
+class _Edit:
+    """A request that edits: the caller, the use cases on features and markers, and the CRS of the body."""
+
+    collection: Collection
+    caller: CallerValue
+    features: FeaturesUseCases
+    markers: MarkersUseCases
+    crs: FeatureCrs
+
+
+async def get_edit(
+    collection: EditableCollection,
+    caller: Caller,
+    features: FeaturesService,
+    markers: Markers,
+    _parameters: Annotated[None, Depends(refuse_parameters)],
+    content_crs: Annotated[
+        str, Header(alias="Content-Crs", description="CRS of the body's geometry.")
+    ] = f"<{STORAGE_CRS}>",
+) -> _Edit:
+    """What a request that edits has besides its feature."""
+    sent = content_crs.strip().strip("<>")
+    if sent not in list(FeatureCrs):
+        raise InvalidParameter("this CRS is not offered", field="Content-Crs", limit=", ".join(FeatureCrs))
+    return _Edit(collection, caller, features, markers, FeatureCrs(sent))
+
+
+async def get_body(request: Request) -> dict[str, Any]:
+    """The feature in the body.
+
+    Raises
+    ------
+    UnsupportedUpload
+        The body is not GeoJSON.
+    MalformedRequest, InvalidParameter
+        It is not a feature.
+    """
+    kind = media_type_of(request)
+    if kind not in BODY_TYPES:
+        raise UnsupportedUpload("the body is not GeoJSON", field="Content-Type", limit=", ".join(BODY_TYPES))
+    body = parse_json(await request.body())
+    if not isinstance(body, dict) or body.get("type", "Feature") != "Feature":
+        raise InvalidParameter(
+            "the body is not a feature", field="type", limit="Feature", cure="send a GeoJSON Feature"
+        )
+    return body
+
+
+Edit = Annotated[_Edit, Depends(get_edit)]
+Body = Annotated[dict[str, Any], Depends(get_body)]
+
+
+async def list_collection_methods(request: Request, collection: CollectionOf, caller: Caller) -> Response:
+    """The methods that the caller may use on a collection's features, as the header Allow."""
+    return _allowed(request, collection, caller, "POST")
+
+
+async def list_feature_methods(request: Request, collection: CollectionOf, caller: Caller, feature: str) -> Response:
+    """The methods that the caller may use on a feature, as the header Allow."""
+    return _allowed(request, collection, caller, "PUT", "PATCH", "DELETE")
+
+
+def _allowed(request: Request, collection: Collection, caller: CallerValue, *edits: str) -> Response:
     allowed = ["GET", "HEAD", "OPTIONS"]
     if collection.editable:
-        scope, path = caller_of(request).scope, request.scope["route"].path
-        edits = ("PUT", "PATCH", "DELETE") if "feature" in request.path_params else ("POST",)
-        allowed += [method for method in edits if scope in PERMISSIONS[f"{method} {path}"]]
+        path = request.scope["route"].path
+        allowed += [method for method in edits if caller.scope in PERMISSIONS[f"{method} {path}"]]
     return Response(headers={"Allow": ", ".join(allowed)})
 
 
-async def post_item(request: Request) -> Response:
-    """Register a plate or a CERPM."""
-    body = await _body(request)
-    return await run_in_threadpool(_create, request, body)
+def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
+    """Register a marker of a family whose markers are points."""
+    given = {name: value for name, value in _properties(feature).items() if value is not None}
+    body = {name: given[name] for name in _PLAIN if name in given}
+    body["position"] = _place(feature.get("geometry"), edit.crs) | {n: given[n] for n in _SURVEYED if n in given}
+    family = _family(given.get("family", FAMILY_NAMES[0]))
+    body |= {"family": family.name, **family.feature_members(given)}
+    made = post_marker(validated(NewMarkerIn, body, "body"), edit.caller, edit.markers, None)
+    marker_id = made.headers["Location"].rsplit("/", 1)[1]
+    where = f"{base}/collections/{edit.collection.id}/items/{marker_id}"
+    return Response(status_code=201, headers={"Location": where})
 
 
-async def patch_item(request: Request) -> Response:
-    """Change properties or the place of a marker."""
-    body = await _body(request)
-    return await run_in_threadpool(_change, request, body)
-
-
-async def put_item(request: Request) -> Response:
+def put_feature(feature: Body, edit: Edit, feature_id: FeatureId) -> Response:
     """Replace a marker: what is left out is cleared, but for what a marker always has."""
-    body = await _body(request)
-    return await run_in_threadpool(_replace, request, body)
+    stored = edit.features.get(edit.caller, edit.collection, feature_id)
+    given = {**dict.fromkeys((*_CLEARED, *_SURVEYED)), **_properties(feature)}
+    place = _place(feature.get("geometry"), edit.crs)
+    before, properties = stored["geometry"]["coordinates"], stored["properties"]
+    if tuple(place.values()) == tuple(before) and all(given[name] == properties[name] for name in _SURVEYED):
+        for name in _SURVEYED:  # the position is as it was, and stays as it was sent
+            del given[name]
+        return _change({"properties": given}, edit, feature_id)
+    return _change({"properties": given, "geometry": feature["geometry"]}, edit, feature_id)
 
 
-def delete_item(request: Request) -> Response:
+def patch_feature(feature: Body, edit: Edit, feature_id: FeatureId) -> Response:
+    """Change properties or the position of a marker."""
+    return _change(feature, edit, feature_id)
+
+
+def delete_feature(edit: Edit, feature_id: FeatureId) -> Response:
     """Retire a marker."""
-    marker_id, _ = _stored(request)
-    known_parameters(request, ())
+    edit.features.get(edit.caller, edit.collection, feature_id)
     patch = MarkerPatch(status="retired", reason="deleted through OGC API Features")
-    patch_marker(marker_id, patch, caller_of(request), request.app.state.markers, None)
+    patch_marker(feature_id, patch, edit.caller, edit.markers, None)
     return Response(status_code=204)
 
 
-def _create(request: Request, feature: dict[str, Any]) -> Response:
-    collection = _editable(request)
-    known_parameters(request, ())
-    given = {name: value for name, value in _properties(feature).items() if value is not None}
-    body = {name: given[name] for name in _PLAIN if name in given}
-    body["position"] = _place(feature.get("geometry"), request) | {n: given[n] for n in _SURVEYED if n in given}
-    body["family"] = given.get("family", "plate")
-    if body["family"] == "magnet":
-        raise InvalidParameter(
-            "magnets need a lane, which a point has not",
-            field="properties.family",
-            limit="plate, cerpm",
-            cure="register magnets at /v1/markers",
-        )
-    if body["family"] == "cerpm" and "code" in given:
-        digits = str(given["code"])
-        body["number"] = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 20 else digits
-    elif body["family"] == "plate":
-        code = {"scheme": given.get("scheme"), "digits": given.get("code")}
-        body["code"] = {name: value for name, value in code.items() if value is not None}
-    made = post_marker(_validated(NewMarkerIn, body), caller_of(request), request.app.state.markers, None)
-    marker_id = made.headers["Location"].rsplit("/", 1)[1]
-    return Response(
-        status_code=201, headers={"Location": f"{base_url(request)}/collections/{collection}/items/{marker_id}"}
-    )
-
-
-def _replace(request: Request, feature: dict[str, Any]) -> Response:
-    _, stored = _stored(request)
-    known_parameters(request, ())
-    given = {**dict.fromkeys((*_CLEARED, *_SURVEYED)), **_properties(feature)}
-    place = _place(feature.get("geometry"), request)
-    before, properties = stored["geometry"]["coordinates"], stored["properties"]
-    if tuple(place.values()) == tuple(before) and all(given[name] == properties[name] for name in _SURVEYED):
-        for name in _SURVEYED:  # the position is as it was, and stays as it was given
-            del given[name]
-        return _change(request, {"properties": given})
-    return _change(request, {"properties": given, "geometry": feature["geometry"]})
-
-
-def _change(request: Request, feature: dict[str, Any]) -> Response:
-    marker_id, stored = _stored(request)
-    known_parameters(request, ())
+def _change(feature: dict[str, Any], edit: _Edit, feature_id: str) -> Response:
+    stored = edit.features.get(edit.caller, edit.collection, feature_id)
     given = _properties(feature)
     for name in _FIXED:
         if name in given and given[name] != stored["properties"][name]:
@@ -126,44 +168,31 @@ def _change(request: Request, feature: dict[str, Any]) -> Response:
                 cure="delete the marker and register another",
             )
     body = {name: given[name] for name in _PLAIN if name in given}
-    if stored["properties"]["family"] != "cerpm" and body.get("side") is None:
-        body.pop("side", None)
+    for name in _members_of_others(stored["properties"]["family"]):
+        if body.get(name) is None:  # a client sends every property that it was sent
+            body.pop(name, None)
     surveyed = {name: given[name] for name in _SURVEYED if name in given}
     if feature.get("geometry") is not None:
-        body["position"] = _place(feature["geometry"], request) | surveyed
+        body["position"] = _place(feature["geometry"], edit.crs) | surveyed
     elif surveyed:
-        marker = request.app.state.markers.get(caller_of(request), marker_id)
+        marker = edit.markers.get(edit.caller, feature_id)
         body["position"] = {**marker["position"]["original"], **surveyed}
     if body:
-        patch_marker(marker_id, _validated(MarkerPatch, body), caller_of(request), request.app.state.markers, None)
+        patch_marker(feature_id, validated(MarkerPatch, body, "body"), edit.caller, edit.markers, None)
     return Response(status_code=204)
 
 
-def _editable(request: Request) -> str:
-    collection = get_collection(request.path_params["collection"])
-    if not collection.editable:
-        raise InvalidParameter("this collection is read only", field="collectionId", limit="markers can be edited")
-    return collection.id
-
-
-def _stored(request: Request) -> tuple[str, dict[str, Any]]:
-    _editable(request)
-    collection = get_collection(request.path_params["collection"])
-    features: Features = request.app.state.features
-    marker_id = feature_id(request, collection)
-    return marker_id, features.get(caller_of(request), collection, marker_id)
-
-
-async def _body(request: Request) -> dict[str, Any]:
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind not in _BODY_TYPES:
-        raise UnsupportedUpload("the body is not GeoJSON", field="Content-Type", limit=", ".join(_BODY_TYPES))
-    body = parse_json(await request.body())
-    if not isinstance(body, dict) or body.get("type", "Feature") != "Feature":
+def _family(name: Any) -> Family[Any, Any]:
+    if name not in FAMILY_NAMES:
         raise InvalidParameter(
-            "the body is not a feature", field="type", limit="Feature", cure="send a GeoJSON Feature"
+            f"there is no family {str(name)[:40]!r}", field="properties.family", limit=", ".join(FAMILY_NAMES)
         )
-    return body
+    return get_family(name)
+
+
+def _members_of_others(family: str) -> set[str]:
+    """Members of a change that only other families have."""
+    return {name for other in FAMILIES if other.name != family and other.change for name in other.change.model_fields}
 
 
 def _properties(feature: dict[str, Any]) -> dict[str, Any]:
@@ -183,7 +212,7 @@ def _properties(feature: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _place(geometry: Any, request: Request) -> dict[str, Any]:
+def _place(geometry: Any, crs: FeatureCrs) -> dict[str, Any]:
     spot = geometry.get("coordinates") if isinstance(geometry, dict) and geometry.get("type") == "Point" else None
     if (
         not isinstance(spot, list)
@@ -191,16 +220,6 @@ def _place(geometry: Any, request: Request) -> dict[str, Any]:
         or not all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e9 for v in spot)
     ):
         raise InvalidParameter("the geometry is not a point", field="geometry", limit="Point with two or three numbers")
-    sent = request.headers.get("content-crs", f"<{STORAGE_CRS}>").strip().strip("<>")
-    if sent not in list(FeatureCrs):
-        raise InvalidParameter("this CRS is not offered", field="Content-Crs", limit=", ".join(FeatureCrs))
-    lon_deg, lat_deg = FeatureCrs(sent).to_lon_lat(float(spot[0]), float(spot[1]))
+    lon_deg, lat_deg = crs.to_lon_lat(float(spot[0]), float(spot[1]))
     place: dict[str, Any] = {"lon_deg": lon_deg, "lat_deg": lat_deg}
     return place if len(spot) == 2 else {**place, "height_m": float(spot[2])}
-
-
-def _validated(schema: type[BaseModel], body: dict[str, Any]) -> Any:
-    try:
-        return schema.model_validate(body)
-    except ValidationError as error:
-        raise RequestValidationError([{**item, "loc": ("body", *item["loc"])} for item in error.errors()]) from error

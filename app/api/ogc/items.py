@@ -2,94 +2,66 @@
 
 from __future__ import annotations
 
-import re
 from datetime import UTC, datetime
-from typing import Any
+from typing import cast
 
-from starlette.requests import Request
 from starlette.responses import Response
 
-from app.api.ogc.query import (
-    ITEM_PARAMETERS,
-    crs_parameter,
-    items_query,
-    known_parameters,
-    query_pairs,
-)
-from app.api.ogc.responses import GEOJSON, JSON, answer, base_url, caller_of, link, negotiate, with_query
-from app.services.features import LINES, Collection, Features, get_collection, no_feature
-
-_NAMES = ("json", "geojson")
-_MARKER_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", re.ASCII)
+from app.api.http.dependencies import Caller
+from app.api.ogc.dependencies import BaseUrl, CollectionOf, FeatureId, FeaturesService, ItemCrs, ItemsQueryOf
+from app.api.ogc.query import ItemsQuery
+from app.api.ogc.responses import GEOJSON, JSON, answer, link, with_query
+from app.api.ogc.shapes import Feature, FeaturePage, Link
+from app.services.markers.features import LINES
 
 
-def list_items(request: Request) -> Response:
+def list_items(
+    collection: CollectionOf, query: ItemsQueryOf, base: BaseUrl, caller: Caller, features: FeaturesService
+) -> Response:
     """A page of features, or how many there are."""
-    collection = get_collection(request.path_params["collection"])
-    asked = items_query(request, collection)
-    negotiate(request, dict(query_pairs(request)), GEOJSON, JSON, names=_NAMES)
-    features: Features = request.app.state.features
-    caller = caller_of(request)
-    if collection is LINES and asked.hits:
-        return answer(_hits(features.count_lines(caller, asked.narrowed)), GEOJSON)
-    if collection is LINES:
-        page = features.lines(
-            caller, asked.narrowed, after=asked.after, limit=asked.limit, crs=asked.crs, counted=asked.counted
-        )
-    elif asked.hits:
-        return answer(_hits(features.count(caller, asked.narrowed)), GEOJSON)
-    else:
-        page = features.page(
-            caller, asked.narrowed, after=asked.after, limit=asked.limit, crs=asked.crs, counted=asked.counted
-        )
-    document: dict[str, Any] = {
+    if query.hits:
+        count = features.count_lines if collection is LINES else features.count
+        return answer(_hits(count(caller, query.filtered)), GEOJSON)
+    read = features.lines if collection is LINES else features.page
+    page = read(caller, query.filtered, after=query.after, limit=query.limit, crs=query.crs, counted=query.counted)
+    document: FeaturePage = {
         "type": "FeatureCollection",
         "timeStamp": datetime.now(UTC),
         "numberReturned": page.returned,
+        "links": _links(query, f"{base}/collections/{collection.id}", page.after),
+        "features": cast("list[Feature]", page.features),  # JSON already, as it is stored
     }
     if page.matched is not None:
         document["numberMatched"] = page.matched
-    document["links"] = _links(request, collection, page.after)
-    document["features"] = page.features
-    return answer(document, GEOJSON, crs=asked.crs)
+    return answer(document, GEOJSON, crs=query.crs)
 
 
-def get_item(request: Request) -> Response:
+def get_item(
+    collection: CollectionOf,
+    crs: ItemCrs,
+    feature_id: FeatureId,
+    base: BaseUrl,
+    caller: Caller,
+    features: FeaturesService,
+) -> Response:
     """One feature."""
-    collection = get_collection(request.path_params["collection"])
-    found = known_parameters(request, ITEM_PARAMETERS)
-    crs = crs_parameter(found, "crs")
-    negotiate(request, found, GEOJSON, JSON, names=_NAMES)
-    features: Features = request.app.state.features
-    caller, wanted = caller_of(request), feature_id(request, collection)
     if collection is LINES:
-        feature = features.get_line(caller, wanted, crs)
+        feature = features.get_line(caller, feature_id, crs)
     else:
-        feature = features.get(caller, collection, wanted, crs)
-    url = f"{base_url(request)}/collections/{collection.id}"
-    feature["links"] = [
-        link(f"{url}/items/{feature['id']}", "self", GEOJSON),
-        link(url, "collection", JSON),
-    ]
+        feature = features.get(caller, collection, feature_id, crs)
+    url = f"{base}/collections/{collection.id}"
+    document: Feature = {
+        "type": "Feature",
+        "id": feature["id"],
+        "geometry": feature["geometry"],
+        "properties": feature["properties"],
+        "links": [link(f"{url}/items/{feature['id']}", "self", GEOJSON), link(url, "collection", JSON)],
+    }
     version = feature["properties"].get("version")
-    return answer(feature, GEOJSON, crs=crs, headers={"ETag": f'"{version}"'} if version is not None else None)
+    return answer(document, GEOJSON, crs=crs, headers={"ETag": f'"{version}"'} if version is not None else None)
 
 
-def feature_id(request: Request, collection: Collection) -> str:
-    """The id in the path, if it can be one.
-
-    Raises
-    ------
-    NotFound
-        It cannot.
-    """
-    given = str(request.path_params["feature"])
-    if not _MARKER_ID.fullmatch(given):
-        raise no_feature(collection)
-    return given
-
-
-def _hits(matched: int) -> dict[str, Any]:
+def _hits(matched: int) -> FeaturePage:
     return {
         "type": "FeatureCollection",
         "timeStamp": datetime.now(UTC),
@@ -100,11 +72,9 @@ def _hits(matched: int) -> dict[str, Any]:
     }
 
 
-def _links(request: Request, collection: Collection, after: str | None) -> list[dict[str, str]]:
-    base = f"{base_url(request)}/collections/{collection.id}"
-    pairs = query_pairs(request)
-    links = [link(with_query(f"{base}/items", pairs), "self", GEOJSON), link(base, "collection", JSON)]
+def _links(query: ItemsQuery, url: str, after: str | None) -> list[Link]:
+    links = [link(with_query(f"{url}/items", query.pairs), "self", GEOJSON), link(url, "collection", JSON)]
     if after is not None:
-        onward = [*((name, value) for name, value in pairs if name != "after"), ("after", after)]
-        links.append(link(with_query(f"{base}/items", onward), "next", GEOJSON))
+        onward = [*((name, value) for name, value in query.pairs if name != "after"), ("after", after)]
+        links.append(link(with_query(f"{url}/items", onward), "next", GEOJSON))
     return links

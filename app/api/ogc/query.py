@@ -13,15 +13,14 @@ from urllib.parse import parse_qsl
 from starlette.requests import Request
 
 from app.api.ogc.cql2 import LANGUAGES, Reader
+from app.api.ogc.parameters import DEFAULT_LIMIT, MAX_LIMIT, list_parameters
 from app.errors import MalformedRequest
 from app.registry.conditions import Condition
 from app.registry.features import FIELDS_BY_NAME, FeatureFilter
 from app.registry.spatial import Box
-from app.services.feature_crs import STORAGE_CRS, FeatureCrs
-from app.services.features import Collection
+from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
+from app.services.markers.features import Collection
 
-DEFAULT_LIMIT = 1000
-MAX_LIMIT = 10_000
 _MAX_QUERY_BYTES = 8192
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?", re.ASCII)
 _TIME = re.compile(
@@ -37,12 +36,14 @@ _ID = re.compile(r"[\x21-\x7e]{1,300}", re.ASCII)
 class ItemsQuery:
     """What a request for items asks for."""
 
-    narrowed: FeatureFilter
+    pairs: list[tuple[str, str]]
+    filtered: FeatureFilter
     limit: int
     after: str | None
     crs: FeatureCrs
     hits: bool
     counted: bool
+    format: str | None
 
 
 def refuse(name: str, message: str, limit: str) -> NoReturn:
@@ -80,7 +81,10 @@ def known_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
     MalformedRequest
         They are not.
     """
-    pairs = query_pairs(request)
+    return _named(query_pairs(request), known)
+
+
+def _named(pairs: list[tuple[str, str]], known: Sequence[str]) -> dict[str, str]:
     found = dict(pairs)
     if len(found) != len(pairs):
         refuse("query", "a parameter is sent twice", "each parameter once")
@@ -88,16 +92,6 @@ def known_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
         if name not in known:
             refuse(name[:80], "there is no such parameter here", ", ".join(known))
     return found
-
-
-ITEM_PARAMETERS = ("f", "crs")
-_EXPRESSION_PARAMETERS = ("filter", "filter-lang", "filter-crs")
-LIST_PARAMETERS = ("f", "crs", "bbox", "bbox-crs", "datetime", "limit", "after", "resultType", "count")
-
-
-def list_parameters(collection: Collection) -> tuple[str, ...]:
-    """Names of the parameters that a request for items of a collection may have."""
-    return (*LIST_PARAMETERS, *_EXPRESSION_PARAMETERS, *collection.filters)
 
 
 def items_query(request: Request, collection: Collection) -> ItemsQuery:
@@ -108,7 +102,8 @@ def items_query(request: Request, collection: Collection) -> ItemsQuery:
     MalformedRequest
         One is unknown or cannot be.
     """
-    found = known_parameters(request, list_parameters(collection))
+    pairs = query_pairs(request)
+    found = _named(pairs, list_parameters(collection))
     box, heights_m = _bbox(found)
     since, until = _datetime(found["datetime"]) if "datetime" in found else (None, None)
     kind = found.get("resultType", "results")
@@ -117,7 +112,7 @@ def items_query(request: Request, collection: Collection) -> ItemsQuery:
     after = found.get("after")
     if after is not None and not _ID.fullmatch(after):
         refuse("after", "after is the id of a feature", "take it from a next link")
-    narrowed = FeatureFilter(
+    filtered = FeatureFilter(
         retired=collection.retired,
         box=box,
         heights_m=heights_m,
@@ -127,7 +122,14 @@ def items_query(request: Request, collection: Collection) -> ItemsQuery:
         where=_where(found, collection),
     )
     return ItemsQuery(
-        narrowed, _limit(found), after, crs_parameter(found, "crs"), kind == "hits", _flag(found, "count")
+        pairs=pairs,
+        filtered=filtered,
+        limit=_limit(found),
+        after=after,
+        crs=crs_parameter(found, "crs"),
+        hits=kind == "hits",
+        counted=_flag(found, "count"),
+        format=found.get("f"),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 from urllib.parse import urlencode
 
 import orjson
@@ -12,9 +11,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from app.api.ogc.query import refuse
-from app.errors import NotAuthenticated
-from app.services.access import Caller
-from app.services.feature_crs import FeatureCrs
+from app.api.ogc.shapes import Link
+from app.services.markers.feature_crs import FeatureCrs
 
 JSON = "application/json"
 GEOJSON = "application/geo+json"
@@ -24,14 +22,6 @@ MVT = "application/vnd.mapbox-vector-tile"
 _OPTIONS = orjson.OPT_NAIVE_UTC | orjson.OPT_UTC_Z
 _HOST = re.compile(r"[A-Za-z0-9.\-]+(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]+\](:[0-9]{1,5})?", re.ASCII)
 _PREFIX = re.compile(r"(/[A-Za-z0-9._~\-]+)*/?", re.ASCII)
-
-
-def caller_of(request: Request) -> Caller:
-    """The caller that the middleware authenticated."""
-    caller = request.scope.get("state", {}).get("caller")
-    if not isinstance(caller, Caller):
-        raise NotAuthenticated("this resource needs a key", field="Authorization")
-    return caller
 
 
 def base_url(request: Request) -> str:
@@ -55,10 +45,12 @@ def _first(header: str | None) -> str:
     return (header or "").partition(",")[0].strip()
 
 
-def link(href: str, rel: str, kind: str, title: str | None = None) -> dict[str, str]:
+def link(href: str, rel: str, kind: str, title: str | None = None) -> Link:
     """A link."""
-    made = {"href": href, "rel": rel, "type": kind}
-    return made if title is None else {**made, "title": title}
+    made: Link = {"href": href, "rel": rel, "type": kind}
+    if title is not None:
+        made["title"] = title
+    return made
 
 
 def with_query(url: str, pairs: list[tuple[str, str]]) -> str:
@@ -66,7 +58,7 @@ def with_query(url: str, pairs: list[tuple[str, str]]) -> str:
     return f"{url}?{urlencode(pairs)}" if pairs else url
 
 
-def negotiate(request: Request, found: dict[str, str], *kinds: str, names: tuple[str, ...] = ("json",)) -> None:
+def negotiate(request: Request, form: str | None, *kinds: str, names: tuple[str, ...] = ("json",)) -> None:
     """Refuse a client that wants none of these media types.
 
     Raises
@@ -76,8 +68,8 @@ def negotiate(request: Request, found: dict[str, str], *kinds: str, names: tuple
     HTTPException
         406: the Accept header names others only.
     """
-    if "f" in found:
-        if found["f"] not in names:
+    if form is not None:
+        if form not in names:
             refuse("f", "this format is not offered", ", ".join(names))
         return
     accepted = request.headers.get("accept")
@@ -89,7 +81,7 @@ def negotiate(request: Request, found: dict[str, str], *kinds: str, names: tuple
 
 
 def answer(
-    content: Any,
+    content: object,
     kind: str = JSON,
     *,
     status: int = 200,

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
+from typing import Annotated
 
-from starlette.requests import Request
+from fastapi import Depends, Path
 from starlette.responses import Response
 
-from app.api.ogc.query import known_parameters
-from app.api.ogc.responses import JSON, MVT, answer, base_url, caller_of, link, negotiate
+from app.api.http.dependencies import Caller
+from app.api.ogc.dependencies import BaseUrl, CollectionOf, FeaturesService, Offers
+from app.api.ogc.responses import JSON, MVT, answer, link
+from app.api.ogc.shapes import TileMatrix, TileMatrixSet, TileMatrixSets, TileSet, TileSets
 from app.errors import NotFound
 from app.registry.tiles import MAX_ZOOM, Tile
-from app.services.feature_crs import FeatureCrs
-from app.services.features import Collection, Features, get_collection
+from app.services.markers.feature_crs import FeatureCrs
+from app.services.markers.features import Collection
 
 MATRIX_SET = "WebMercatorQuad"
 MATRIX_SET_URI = f"http://www.opengis.net/def/tilematrixset/OGC/1.0/{MATRIX_SET}"
@@ -22,51 +24,95 @@ TILES_REL = "http://www.opengis.net/def/rel/ogc/1.0/tilesets-vector"
 _SCHEME_REL = "http://www.opengis.net/def/rel/ogc/1.0/tiling-scheme"
 _WORLD_M = math.pi * 6_378_137.0
 _WHOLE = re.compile(r"0|[1-9][0-9]{0,8}", re.ASCII)
+TileNumber = Annotated[str, Path(description="A whole number, from 0.")]
 
 
-def list_tilesets(request: Request) -> Response:
+async def get_tiled_collection(collection: CollectionOf) -> Collection:
+    """The collection that the path names, if there are tiles of it.
+
+    Raises
+    ------
+    NotFound
+        There are none.
+    """
+    if not collection.has_tiles:
+        raise NotFound("there are no tiles of this collection", field="collectionId", cure="ask for its items")
+    return collection
+
+
+async def check_matrix_set(matrix_set: Annotated[str, Path(description=f"{MATRIX_SET} is the only one.")]) -> None:
+    """Refuse other tile matrix sets.
+
+    Raises
+    ------
+    NotFound
+        The path names another one.
+    """
+    if matrix_set != MATRIX_SET:
+        raise NotFound("there is no such tile matrix set", field="tileMatrixSetId", limit=MATRIX_SET)
+
+
+async def get_tile_place(zoom: TileNumber, row: TileNumber, column: TileNumber) -> Tile:
+    """The tile that the path names.
+
+    Raises
+    ------
+    NotFound
+        It is beyond the tile matrix set.
+    """
+    if all(_WHOLE.fullmatch(text) for text in (zoom, column, row)):
+        tile = Tile(int(zoom), int(column), int(row))
+        if tile.zoom <= MAX_ZOOM and max(tile.column, tile.row) < 2**tile.zoom:
+            return tile
+    raise NotFound(
+        "there is no such tile", field="tileMatrix", limit=f"level 0 to {MAX_ZOOM}; row, column below 2^level"
+    )
+
+
+Tiled = Annotated[Collection, Depends(get_tiled_collection)]
+MatrixSet = Annotated[None, Depends(check_matrix_set)]
+TilePlace = Annotated[Tile, Depends(get_tile_place)]
+OffersJson = Annotated[None, Depends(Offers(JSON))]
+OffersTiles = Annotated[
+    None, Depends(Offers(MVT, "application/x-protobuf", "application/octet-stream", names=("mvt", "pbf")))
+]
+
+
+def list_tilesets(collection: Tiled, _offers: OffersJson, base: BaseUrl) -> Response:
     """The tile sets of a collection: one."""
-    collection = _tiled(request)
-    negotiate(request, known_parameters(request, ("f",)), JSON)
-    return answer({"tilesets": [_tileset(request, collection)]})
+    return answer(TileSets(tilesets=[_tileset(base, collection)]))
 
 
-def get_tileset(request: Request) -> Response:
+def get_tileset(collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl) -> Response:
     """A tile set of a collection."""
-    collection = _tiled(request)
-    _check_matrix_set(request)
-    negotiate(request, known_parameters(request, ("f",)), JSON)
-    return answer(_tileset(request, collection))
+    return answer(_tileset(base, collection))
 
 
-def get_tile(request: Request) -> Response:
+def get_tile(
+    collection: Tiled,
+    _matrix_set: MatrixSet,
+    tile: TilePlace,
+    _offers: OffersTiles,
+    caller: Caller,
+    features: FeaturesService,
+) -> Response:
     """A tile; 204 without features."""
-    collection = _tiled(request)
-    _check_matrix_set(request)
-    tile = _tile(request)
-    found = known_parameters(request, ("f",))
-    negotiate(request, found, MVT, "application/x-protobuf", "application/octet-stream", names=("mvt", "pbf"))
-    features: Features = request.app.state.features
-    content = features.tile(caller_of(request), collection, tile)
+    content = features.tile(caller, collection, tile)
     headers = {"Cache-Control": "private, no-cache"}
     if not content:
         return Response(status_code=204, headers=headers)
     return Response(content, headers=headers, media_type=MVT)
 
 
-def list_matrix_sets(request: Request) -> Response:
+def list_matrix_sets(_offers: OffersJson, base: BaseUrl) -> Response:
     """The tile matrix sets: one."""
-    negotiate(request, known_parameters(request, ("f",)), JSON)
-    url = f"{base_url(request)}/tileMatrixSets/{MATRIX_SET}"
-    links = [link(url, "self", JSON)]
-    return answer({"tileMatrixSets": [{"id": MATRIX_SET, "uri": MATRIX_SET_URI, "links": links}]})
+    links = [link(f"{base}/tileMatrixSets/{MATRIX_SET}", "self", JSON)]
+    return answer(TileMatrixSets(tileMatrixSets=[{"id": MATRIX_SET, "uri": MATRIX_SET_URI, "links": links}]))
 
 
-def get_matrix_set(request: Request) -> Response:
+def get_matrix_set(_matrix_set: MatrixSet, _offers: OffersJson) -> Response:
     """The tile matrix set, by its figures."""
-    _check_matrix_set(request)
-    negotiate(request, known_parameters(request, ("f",)), JSON)
-    matrices = [
+    matrices: list[TileMatrix] = [
         {
             "id": str(zoom),
             "scaleDenominator": 2 * _WORLD_M / 256 / 0.00028 / 2**zoom,
@@ -79,44 +125,20 @@ def get_matrix_set(request: Request) -> Response:
         }
         for zoom in range(MAX_ZOOM + 1)
     ]
-    return answer(
-        {
-            "id": MATRIX_SET,
-            "uri": MATRIX_SET_URI,
-            "crs": FeatureCrs.WEB_MERCATOR,
-            "orderedAxes": ["X", "Y"],
-            "tileMatrices": matrices,
-        }
-    )
+    document: TileMatrixSet = {
+        "id": MATRIX_SET,
+        "uri": MATRIX_SET_URI,
+        "crs": FeatureCrs.WEB_MERCATOR,
+        "orderedAxes": ["X", "Y"],
+        "tileMatrices": matrices,
+    }
+    return answer(document)
 
 
-def _tiled(request: Request) -> Collection:
-    collection = get_collection(request.path_params["collection"])
-    if not collection.has_tiles:
-        raise NotFound("there are no tiles of this collection", field="collectionId", cure="ask for its items")
-    return collection
-
-
-def _check_matrix_set(request: Request) -> None:
-    if request.path_params["matrix_set"] != MATRIX_SET:
-        raise NotFound("there is no such tile matrix set", field="tileMatrixSetId", limit=MATRIX_SET)
-
-
-def _tile(request: Request) -> Tile:
-    texts = [str(request.path_params[name]) for name in ("zoom", "column", "row")]
-    if all(_WHOLE.fullmatch(text) for text in texts):
-        zoom, column, row = (int(text) for text in texts)
-        if zoom <= MAX_ZOOM and max(column, row) < 2**zoom:
-            return Tile(zoom, column, row)
-    raise NotFound(
-        "there is no such tile", field="tileMatrix", limit=f"level 0 to {MAX_ZOOM}; row, column below 2^level"
-    )
-
-
-def _tileset(request: Request, collection: Collection) -> dict[str, Any]:
-    base = base_url(request)
+def _tileset(base: str, collection: Collection) -> TileSet:
     url = f"{base}/collections/{collection.id}/tiles/{MATRIX_SET}"
     template = link(f"{url}/{{tileMatrix}}/{{tileRow}}/{{tileCol}}", "item", MVT)
+    template["templated"] = True
     return {
         "title": collection.title,
         "dataType": "vector",
@@ -125,6 +147,6 @@ def _tileset(request: Request, collection: Collection) -> dict[str, Any]:
         "links": [
             link(url, "self", JSON),
             link(f"{base}/tileMatrixSets/{MATRIX_SET}", _SCHEME_REL, JSON),
-            {**template, "templated": True},
+            template,
         ],
     }

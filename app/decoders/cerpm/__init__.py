@@ -1,1 +1,1 @@
-"""Packets of CERPMs -> verified markers, the lane between them, and a check of steering along it."""
+"""Received packets of CERPMs to verified markers."""

@@ -1,4 +1,4 @@
-"""Verified packets -> one place a marker, held against the registry, the other markers and the vehicle's track."""
+"""Verified packets to one position a marker, compared with the registry, the other markers and the vehicle's track."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.merge_types import (
+from app.decoders.cerpm.merged_markers import (
     USED_ANYWAY,
     Disagreement,
     Finding,
@@ -18,24 +18,25 @@ from app.decoders.cerpm.merge_types import (
     MergeRules,
     RegisteredMarker,
 )
-from app.decoders.cerpm.packets import PlainClaim
-from app.decoders.cerpm.track_places import distances_m, offsets_m, vehicle_places
+from app.decoders.cerpm.vehicle_positions import distances_m, offsets_m, vehicle_positions
 from app.decoders.cerpm.verify import Verdict, VerifiedPacket
 from app.markers.cerpm import CerpmMessage, LaneSide
 from app.sensors.pose_track import PoseTrack
+from app.sensors.receiver import PlainClaim
 
 Floats = npt.NDArray[np.float64]
 
-SURVEY_SIGMA_M = 0.02
-"""Of a marker's survey where it is not known (CERPM paper, section 2.2). [m]"""
-_LEAST_SHARED = 3
-"""Markers that a common shift must show in."""
-_SHIFT_SCATTER_M, _SHARE_SHIFTED, _LARGEST_SHIFT_M = 0.2, 0.8, 1000.0
+SURVEY_SIGMA_M = 0.02  # [m] of a survey of unknown accuracy; source: CERPM paper, section 2.2
+_MIN_SHIFTED = 3  # markers with a common shift; source: by hand, a median of three ignores one outlier
+_MAX_SHIFT_SCATTER_M = 0.2  # [m] about a common shift; source: by hand, well above surveys of 0.02 m
+_MIN_SHIFTED_SHARE = 0.8  # of the registered markers; source: by hand, no measurement kept
+_MAX_SHIFT_M = 1000.0  # [m] source: by hand; old national datums are shifted by some hundred metres against WGS 84
+_SWAPPED_REACHES = 5.0  # reaches from its place, at which swapped coordinates are looked for; source: by hand
 
 
 @dataclass(slots=True)
 class _Candidate:
-    """What was heard of one number."""
+    """What was received of one marker number."""
 
     number: int
     newest: CerpmMessage | PlainClaim
@@ -50,14 +51,14 @@ def merge_markers(
     track: PoseTrack | None = None,
     rules: MergeRules | None = None,
 ) -> MergedMarkers:
-    """One place for each marker; what disagrees is named and, but for `USED_ANYWAY`, left out.
+    """One position for each marker; disagreements are reported and, except for `USED_ANYWAY`, left out.
 
     Parameters
     ----------
     verified : iterable of VerifiedPacket
         Of `verify_packets`.
     registered : mapping of int to RegisteredMarker or None
-        By number.
+        Registered markers by number.
     track : PoseTrack, optional
         The vehicle's own positions.
     rules : MergeRules, optional
@@ -73,15 +74,16 @@ def merge_markers(
     findings = _two_places(packets, candidates, rules)
     findings += _swapped(candidates, track, rules)
     warnings: list[str] = []
-    findings += _out_of_reach(_unnamed(candidates, findings), track, rules, warnings)
-    rest = _unnamed(candidates, findings)
+    findings += _out_of_reach(_without_findings(candidates, findings), track, rules, warnings)
+    rest = _without_findings(candidates, findings)
     shift_m = _common_shift(rest, rules)
-    findings += _against_registry(rest, rules) if shift_m is None else _shifted(rest, shift_m)
+    findings += _compare_with_registry(rest, rules) if shift_m is None else _shifted(rest, shift_m)
     left_out = {f.number: f.reason for f in reversed(findings) if f.kind not in USED_ANYWAY}
     return _rows([c for c in candidates if c.number not in left_out], left_out, findings, shift_m, warnings)
 
 
-def _unnamed(candidates: Sequence[_Candidate], findings: Sequence[Finding]) -> list[_Candidate]:
+def _without_findings(candidates: Sequence[_Candidate], findings: Sequence[Finding]) -> list[_Candidate]:
+    """Candidates that no finding leaves out."""
     named = {finding.number for finding in findings if finding.kind not in USED_ANYWAY}
     return [candidate for candidate in candidates if candidate.number not in named]
 
@@ -89,6 +91,7 @@ def _unnamed(candidates: Sequence[_Candidate], findings: Sequence[Finding]) -> l
 def _candidates(
     packets: Sequence[VerifiedPacket], registered: Mapping[int, RegisteredMarker | None], rules: MergeRules
 ) -> list[_Candidate]:
+    """Numbers with an authentic packet or, where the rules allow, packets in clear; each with its newest message."""
     accepted: dict[int, list[VerifiedPacket]] = defaultdict(list)
     clear: dict[int, list[VerifiedPacket]] = defaultdict(list)
     for packet in packets:
@@ -105,7 +108,7 @@ def _candidates(
             )
         else:
             group = clear[number]
-            newest = max(group, key=lambda p: _time_key(p.packet.heard_at_s)).packet.claim
+            newest = max(group, key=lambda p: _time_key(p.packet.received_at_s)).packet.claim
         if newest is not None:
             found.append(_Candidate(number, newest, group, (newest.lon_deg, newest.lat_deg), registered.get(number)))
     return found
@@ -115,9 +118,10 @@ def _time_key(time_s: float) -> float:
     return time_s if math.isfinite(time_s) else -math.inf
 
 
-def _claimed(packet: VerifiedPacket) -> tuple[float, float]:
-    said = packet.message or packet.packet.claim
-    return (said.lon_deg, said.lat_deg) if said is not None else (math.nan, math.nan)
+def _sent_position(packet: VerifiedPacket) -> tuple[float, float]:
+    """Longitude and latitude in a packet; NaN without. [deg]"""
+    content = packet.message or packet.packet.claim
+    return (content.lon_deg, content.lat_deg) if content is not None else (math.nan, math.nan)
 
 
 # --- one number in two places -------------------------------------------------------------------------------------
@@ -126,16 +130,16 @@ def _claimed(packet: VerifiedPacket) -> tuple[float, float]:
 def _two_places(
     packets: Sequence[VerifiedPacket], candidates: Sequence[_Candidate], rules: MergeRules
 ) -> list[Finding]:
-    """Numbers whose packets carry valid tags and tell of different places."""
+    """Numbers whose packets have valid tags and different positions."""
     rejected: dict[int, list[VerifiedPacket]] = defaultdict(list)
     for packet in packets:
-        # what an earlier drive heard already is a replay for sure: it says nothing of a second marker
+        # a packet that an earlier drive received is certainly a replay, so it does not show a second marker
         if packet.verdict is Verdict.OUT_OF_ORDER and packet.number is not None:
             rejected[packet.number].append(packet)
     findings = []
     for candidate in candidates:
         more = rejected.get(candidate.number, [])
-        if all(_claimed(packet) == candidate.place for packet in (*candidate.accepted, *more)):
+        if all(_sent_position(packet) == candidate.place for packet in (*candidate.accepted, *more)):
             continue
         ordered = sorted(candidate.accepted, key=_order_key)
         away_m = _away_m(candidate.place, ordered)
@@ -144,37 +148,38 @@ def _two_places(
         if changes > 1 or (candidate.known is None and (also_m > rules.apart_m).any()):
             far_m = max(float(away_m.max()), float(also_m.max(initial=0.0)))
             reason = (
-                f"packets with valid tags claim two places {far_m:.1f} m apart: two markers have this number, or an "
+                f"packets with valid tags have positions {far_m:.1f} m apart: two markers have this number, or an "
                 "old message of a moved marker is being sent again"
             )
             findings.append(Finding(candidate.number, Disagreement.TWO_PLACES, reason, far_m))
         elif changes == 1:
             far_m = float(away_m.max())
-            reason = f"its place changed by {far_m:.1f} m during the log: programmed again; the newest is used"
+            reason = f"its position changed by {far_m:.1f} m during the log: programmed again; the newest is used"
             findings.append(Finding(candidate.number, Disagreement.REPROGRAMMED, reason, far_m))
     return findings
 
 
 def _away_m(place: tuple[float, float], packets: Sequence[VerifiedPacket]) -> Floats:
-    claims = np.array([_claimed(packet) for packet in packets], float).reshape(-1, 2)
-    return distances_m(np.broadcast_to(place, claims.shape), claims)
+    """Distances of sent positions from a place. [m]"""
+    sent = np.array([_sent_position(packet) for packet in packets], float).reshape(-1, 2)
+    return distances_m(np.broadcast_to(place, sent.shape), sent)
 
 
 def _order_key(packet: VerifiedPacket) -> tuple[float, float]:
     sequence = packet.message.sequence if packet.message else -1
-    return (float(sequence), _time_key(packet.packet.heard_at_s))
+    return (float(sequence), _time_key(packet.packet.received_at_s))
 
 
-# --- places that cannot be ----------------------------------------------------------------------------------------
+# --- impossible positions -----------------------------------------------------------------------------------------
 
 
 def _swapped(candidates: Sequence[_Candidate], track: PoseTrack | None, rules: MergeRules) -> list[Finding]:
-    """Claims that would fit with longitude and latitude exchanged, and do not as they are."""
+    """Positions that are possible only with longitude and latitude exchanged."""
     if not candidates:
         return []
-    near = _where_they_should_be(candidates, track)
+    near = _expected_places(candidates, track)
     claims = np.array([c.place for c in candidates], float)
-    fits = (np.abs(claims[:, 0]) <= 90) & (distances_m(near, claims) > 5 * rules.reach_m)
+    fits = (np.abs(claims[:, 0]) <= 90) & (distances_m(near, claims) > _SWAPPED_REACHES * rules.reach_m)
     fits &= distances_m(near, claims[:, ::-1]) <= rules.reach_m
     findings = []
     for i in np.flatnonzero(fits).tolist():
@@ -184,14 +189,14 @@ def _swapped(candidates: Sequence[_Candidate], track: PoseTrack | None, rules: M
     return findings
 
 
-def _where_they_should_be(candidates: Sequence[_Candidate], track: PoseTrack | None) -> Floats:
-    """Near each marker: its registered place, or the vehicle's when it was heard, or the middle of all others."""
+def _expected_places(candidates: Sequence[_Candidate], track: PoseTrack | None) -> Floats:
+    """A place near each marker: registered, or the vehicle's at its first packet, or the median of all markers."""
     near = np.array([(c.known.lon_deg, c.known.lat_deg) if c.known else (math.nan, math.nan) for c in candidates])
     unknown = np.isnan(near[:, 0])
     if track is not None:
-        near[unknown] = vehicle_places(track, [c.accepted[0].packet.heard_at_s for c in candidates])[unknown]
+        near[unknown] = vehicle_positions(track, [c.accepted[0].packet.received_at_s for c in candidates])[unknown]
         unknown = np.isnan(near[:, 0])
-    if len(candidates) >= _LEAST_SHARED:
+    if len(candidates) >= _MIN_SHIFTED:
         claims = np.array([c.place for c in candidates], float)
         near[unknown] = np.median(claims, axis=0)
     return near
@@ -200,26 +205,26 @@ def _where_they_should_be(candidates: Sequence[_Candidate], track: PoseTrack | N
 def _out_of_reach(
     candidates: Sequence[_Candidate], track: PoseTrack | None, rules: MergeRules, warnings: list[str]
 ) -> list[Finding]:
-    """Markers whose every packet was heard further away than radio reaches."""
+    """Markers whose packets were all received from further away than radio reaches."""
     if track is None or not candidates:
         return []
     counts = [len(c.accepted) for c in candidates]
-    vehicle = vehicle_places(track, [p.packet.heard_at_s for c in candidates for p in c.accepted])
+    vehicle = vehicle_positions(track, [p.packet.received_at_s for c in candidates for p in c.accepted])
     away_m = distances_m(vehicle, np.repeat(np.array([_used_place(c) for c in candidates], float), counts, axis=0))
     nearest_m = np.full(len(candidates), np.inf)
     np.fmin.at(nearest_m, np.repeat(np.arange(len(candidates)), counts), away_m)
-    heard = int(np.isfinite(nearest_m).sum())
+    located = int(np.isfinite(nearest_m).sum())
     findings = []
     for i in np.flatnonzero(np.isfinite(nearest_m) & (nearest_m > rules.reach_m)).tolist():
         reason = (
-            f"heard {nearest_m[i] / 1000:.1f} km from its place, further than radio reaches: recorded there and sent "
-            "again here, or carried away"
+            f"received {nearest_m[i] / 1000:.1f} km from its place, further than radio reaches: recorded there and "
+            "sent again here, or carried away"
         )
         findings.append(Finding(candidates[i].number, Disagreement.OUT_OF_REACH, reason, float(nearest_m[i])))
-    if 2 * len(findings) > max(heard, 2):
+    if 2 * len(findings) > max(located, 2):
         warnings.append(
-            f"{len(findings)} of {heard} markers were heard further away than radio reaches: the track is of another "
-            "drive, or the clocks do not fit"
+            f"{len(findings)} of {located} markers were received from further away than radio reaches: the track is of "
+            "another drive, or the clocks do not fit"
         )
     return findings
 
@@ -229,32 +234,32 @@ def _used_place(candidate: _Candidate) -> tuple[float, float]:
     return candidate.place if known is None else (known.lon_deg, known.lat_deg)
 
 
-# --- against the registry -----------------------------------------------------------------------------------------
+# --- comparison with the registry ---------------------------------------------------------------------------------
 
 
 def _common_shift(candidates: Sequence[_Candidate], rules: MergeRules) -> tuple[float, float] | None:
-    """Shift of the claims that the registered markers share, if it is more than their surveys explain."""
+    """Common shift of sent against registered positions, if there is one that surveys do not explain."""
     pairs = [(_used_place(c), c.place) for c in candidates if c.known is not None]
-    if len(pairs) < _LEAST_SHARED:
+    if len(pairs) < _MIN_SHIFTED:
         return None
-    off_m = offsets_m([known for known, _claim in pairs], [claim for _known, claim in pairs])
+    off_m = offsets_m([known for known, _sent in pairs], [sent for _known, sent in pairs])
     shift_m = np.median(off_m, axis=0)
     size_m = float(np.hypot(*shift_m))
     scatter_m = np.hypot(*(off_m - shift_m).T)
-    if not rules.apart_m < size_m <= _LARGEST_SHIFT_M or np.mean(scatter_m <= _SHIFT_SCATTER_M) < _SHARE_SHIFTED:
+    if not rules.apart_m < size_m <= _MAX_SHIFT_M or np.mean(scatter_m <= _MAX_SHIFT_SCATTER_M) < _MIN_SHIFTED_SHARE:
         return None
     return float(shift_m[0]), float(shift_m[1])
 
 
 def _shifted(candidates: Sequence[_Candidate], shift_m: tuple[float, float]) -> list[Finding]:
     reason = (
-        f"the markers claim places {shift_m[0]:+.2f} m east and {shift_m[1]:+.2f} m north of their registered ones, "
-        "all alike: positions of another datum"
+        f"the markers send positions {shift_m[0]:+.2f} m east and {shift_m[1]:+.2f} m north of their registered ones, "
+        "all alike: their datum is another one"
     )
     return [Finding(c.number, Disagreement.DATUM_SHIFT, reason, math.hypot(*shift_m)) for c in candidates]
 
 
-def _against_registry(candidates: Sequence[_Candidate], rules: MergeRules) -> list[Finding]:
+def _compare_with_registry(candidates: Sequence[_Candidate], rules: MergeRules) -> list[Finding]:
     known = [(c, c.known) for c in candidates if c.known is not None]
     if not known:
         return []
@@ -263,16 +268,16 @@ def _against_registry(candidates: Sequence[_Candidate], rules: MergeRules) -> li
     findings = []
     for (candidate, marker), apart_m in zip(known, away_m, strict=True):
         limit_m = max(rules.apart_m, rules.sigmas * _sigma_m(marker))
-        said = candidate.newest.side
+        sent_side = candidate.newest.side
         if not apart_m <= limit_m:
             reason = (
-                f"claims a place {apart_m:.2f} m from its registered one (limit {limit_m:.2f} m): moved, or programmed "
-                "wrongly"
+                f"sends a position {apart_m:.2f} m from its registered one (limit {limit_m:.2f} m): moved, or "
+                "programmed wrongly"
             )
             findings.append(Finding(candidate.number, Disagreement.MOVED, reason, float(apart_m)))
-        elif LaneSide.UNKNOWN not in (marker.side, said) and marker.side != said:
+        elif LaneSide.UNKNOWN not in (marker.side, sent_side) and marker.side != sent_side:
             reason = (
-                f"says that it stands {said.name.lower()}, registered {marker.side.name.lower()}; the registry is used"
+                f"sends the side {sent_side.name.lower()}, registered {marker.side.name.lower()}; the registry is used"
             )
             findings.append(Finding(candidate.number, Disagreement.OTHER_SIDE, reason))
     return findings

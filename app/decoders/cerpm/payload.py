@@ -1,4 +1,4 @@
-"""The 24 bytes of a CERPM -> its message, and whether its marker signed it."""
+"""The 24 bytes of a CERPM to its message, and the check of its tag."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from app.markers.cerpm import (
 )
 from app.markers.cerpm_keys import message_tag
 
-_BODY = struct.Struct(">BIiiHBI")
-_LON_STEPS, _LAT_STEPS = 1_800_000_000, 900_000_000
+_BODY = struct.Struct(">BIiiHBI")  # source: the table of `app.markers.cerpm`
+_LON_STEPS, _LAT_STEPS = 1_800_000_000, 900_000_000  # source: 180 and 90 degrees in 1e-7 (docs/cerpm-message.md)
 _FIELD = "payload"
-_CURE_DAMAGED = "nothing can be done with this one packet; if all of a marker are so, program it again"
+_CURE_DAMAGED = "ignore this packet; if all packets of a marker are like this, program it again"
 
 
 class UndecodablePayload(InvalidParameter):
@@ -31,12 +31,12 @@ class UndecodablePayload(InvalidParameter):
 
 
 def decode_message(payload: bytes) -> tuple[CerpmMessage, bytes]:
-    """What a payload says, and its tag. Nothing is known yet of who sent it.
+    """Message and tag of a payload. The tag is not checked yet.
 
     Parameters
     ----------
     payload : bytes
-        24 of them, as `app.markers.cerpm` lays them out.
+        24 of them, in the layout of `app.markers.cerpm`.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def decode_message(payload: bytes) -> tuple[CerpmMessage, bytes]:
     UndecodablePayload
         Another length or an unknown version.
     InvalidParameter
-        A value that no marker sends: the reserved bit, a side, the number 0, or a position off the globe.
+        An invalid value: the reserved bit, a side, the number 0, or a position off the globe.
     """
     _check_form(payload)
     head, number, lon_steps, lat_steps, height_steps, speed, sequence = _BODY.unpack_from(payload)

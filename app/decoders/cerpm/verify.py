@@ -1,4 +1,4 @@
-"""Heard packets -> which of them their marker sent, fresh and once."""
+"""Received packets to a verdict on each: whether its marker sent it, just then and not before."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,34 +15,35 @@ import numpy.typing as npt
 from app.decoders.cerpm.freshness import (
     FASTEST_INTERVAL_S,
     FreshnessRules,
-    HeardOrder,
-    LearntIntervals,
+    LearnedIntervals,
+    SequenceOrder,
     SequenceSpan,
     order_of_spans,
     within_spans,
 )
-from app.decoders.cerpm.packets import HeardPacket
 from app.decoders.cerpm.payload import UndecodablePayload, decode_message, has_valid_tag
 from app.errors import InvalidParameter
 from app.markers.cerpm import CerpmMessage
+from app.sensors.receiver import ReceivedPacket
 
 Floats = npt.NDArray[np.float64]
 Keys = Callable[[int], bytes | None] | Mapping[int, bytes]
 
-_CLAIM_BYTES = 16
-"""Of a payload before its sequence: they change only when a marker is programmed again."""
-_DAMAGED_BITS = 12
-_DAMAGED_TAG_BITS = 8
-_WRONG_KEY_PACKETS = 3
+_FIXED_BYTES = (
+    16  # [bytes] of a payload before its sequence; source: docs/cerpm-message.md; change when reprogrammed only
+)
+_MAX_DAMAGED_BITS = 12  # of the fixed bytes; source: by hand; of 128 random bits so few differ once in 1e22
+_MAX_DAMAGED_TAG_BITS = 8  # of the tag's 32; source: by hand; of random tags one in 285 is as close
+_MIN_WRONG_KEY_PACKETS = 3  # source: by hand, no measurement kept
 _CLEAR = "sent in clear, without a tag: anyone can have sent it"
 _NO_KEY = "no marker of this number is registered, so there is no key to check it with"
 _FORGED = "the tag is not the marker's: forged, or damaged on the way"
 _WRONG_KEY = "every packet of this number has a tag of another key: programmed with a wrong key, or forged throughout"
-_DAMAGED = "the tag does not fit, and the packet is an authentic one but for a few bits: damaged on the way"
+_DAMAGED = "the tag does not fit, and the packet differs from an authentic one in a few bits: damaged on the way"
 
 
 class Verdict(StrEnum):
-    """What a packet is worth. Only an authentic one says where a marker is."""
+    """Class of a packet. Only authentic packets contribute a marker's position."""
 
     AUTHENTIC = "authentic"
     UNAUTHENTICATED = "unauthenticated"
@@ -57,21 +59,21 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class VerifiedPacket:
-    """A packet and what it is worth.
+    """A packet and its verdict.
 
     Attributes
     ----------
-    packet : HeardPacket
+    packet : ReceivedPacket
     verdict : Verdict
     number : int or None
-        That it gives for its marker; only authentic, replayed, out-of-order and duplicate ones carry that marker's tag.
+        Of its marker, as sent; only authentic, replayed, out-of-order and duplicate packets have that marker's tag.
     message : CerpmMessage or None
-        Of a payload that can be decoded, whoever sent it; of a packet in clear see `packet.claim`.
+        Of a payload that can be decoded, whoever sent it; for a packet in clear see `packet.claim`.
     reason : str
-        Why it is not accepted; of an authentic one, what is not sure about it.
+        Why it is not accepted; of an authentic packet, what could not be checked.
     """
 
-    packet: HeardPacket
+    packet: ReceivedPacket
     verdict: Verdict
     number: int | None = None
     message: CerpmMessage | None = None
@@ -79,17 +81,17 @@ class VerifiedPacket:
 
     @property
     def entry(self) -> int:
-        """Where in the log it is."""
+        """Row, line or event of the log."""
         return self.packet.entry
 
     @property
     def accepted(self) -> bool:
-        """Whether it may say where a marker is."""
+        """Whether it contributes its marker's position."""
         return self.verdict is Verdict.AUTHENTIC
 
     @property
     def signed(self) -> bool:
-        """Whether it carries the marker's tag, fresh or not."""
+        """Whether it has the marker's valid tag, fresh or not."""
         return self.verdict in _SIGNED
 
 
@@ -105,7 +107,7 @@ class Verification:
     packets : list of VerifiedPacket
         In the order they came.
     spans : dict of int to tuple of SequenceSpan
-        Accepted sequences of each marker, to be kept and given as `heard_before` next time.
+        Accepted sequences of each marker, to be stored and passed as `earlier_spans` next time.
     warnings : list of str
     """
 
@@ -114,7 +116,7 @@ class Verification:
     warnings: list[str]
 
     def counts(self) -> dict[Verdict, int]:
-        """Packets of each verdict."""
+        """Number of packets of each verdict."""
         found = dict.fromkeys(Verdict, 0)
         for packet in self.packets:
             found[packet.verdict] += 1
@@ -122,21 +124,21 @@ class Verification:
 
 
 def verify_packets(
-    packets: Sequence[HeardPacket],
+    packets: Sequence[ReceivedPacket],
     keys: Keys,
-    heard_before: Mapping[int, Sequence[SequenceSpan]] | None = None,
+    earlier_spans: Mapping[int, Sequence[SequenceSpan]] | None = None,
     rules: FreshnessRules | None = None,
 ) -> Verification:
-    """Tell authentic, fresh packets from all others.
+    """Verify the tags and the freshness of packets.
 
     Parameters
     ----------
-    packets : sequence of HeardPacket
+    packets : sequence of ReceivedPacket
         Of one log, in any order.
     keys : callable or mapping
         The key of the marker of a number; None, or no entry, where there is no such marker.
-    heard_before : mapping of int to sequence of SequenceSpan, optional
-        What earlier logs gave, by number; logs may come late.
+    earlier_spans : mapping of int to sequence of SequenceSpan, optional
+        Spans of earlier logs, by number; logs may be uploaded in any order.
     rules : FreshnessRules, optional
 
     Returns
@@ -150,9 +152,9 @@ def verify_packets(
 
     Notes
     -----
-    A packet without a time is only accepted above every sequence known, and its freshness stays unknown. A recorded
-    packet that nobody heard before, sent again where no newer one of its marker is heard, is fresh by all that its
-    bytes can tell; where the vehicle was when it heard it must tell (see `merge_markers`).
+    A packet without a time is only accepted above every known sequence, and its freshness stays unknown. A recorded
+    packet that was never received before, sent again where no newer packet of its marker is received, cannot be
+    distinguished from a fresh one by its bytes; only the vehicle's position can show it (see `merge_markers`).
     """
     rules = rules or FreshnessRules()
     checked = _check_tags(packets, keys)
@@ -161,12 +163,12 @@ def verify_packets(
     for index, packet in enumerate(checked):
         if packet.accepted and packet.number is not None:
             by_number[packet.number].append(index)
-    intervals = LearntIntervals({n: _sequences_and_times([checked[i] for i in at]) for n, at in by_number.items()})
+    intervals = LearnedIntervals({n: _sequences_and_times([checked[i] for i in at]) for n, at in by_number.items()})
     spans: dict[int, tuple[SequenceSpan, ...]] = {}
     for number, indices in by_number.items():
-        known = tuple((heard_before or {}).get(number, ()))
-        least_s = intervals.least_s(number) if rules.least_interval_s is None else rules.least_interval_s
-        for index, verdict, reason in _judge_marker([checked[i] for i in indices], known, rules, least_s):
+        known = tuple((earlier_spans or {}).get(number, ()))
+        min_s = intervals.min_s(number) if rules.min_interval_s is None else rules.min_interval_s
+        for index, verdict, reason in _check_freshness([checked[i] for i in indices], known, rules, min_s):
             at = indices[index]
             checked[at] = replace(checked[at], verdict=verdict, reason=reason)
         accepted = [checked[i] for i in indices if checked[i].accepted]
@@ -178,7 +180,8 @@ def verify_packets(
 # --- tags ---------------------------------------------------------------------------------------------------------
 
 
-def _check_tags(packets: Iterable[HeardPacket], keys: Keys) -> list[VerifiedPacket]:
+def _check_tags(packets: Iterable[ReceivedPacket], keys: Keys) -> list[VerifiedPacket]:
+    """Verdicts by tags alone; equal payloads are checked once."""
     find_key = keys.get if isinstance(keys, Mapping) else keys
     known_keys: dict[int, bytes | None] = {}
     seen: dict[bytes, tuple[Verdict, int | None, CerpmMessage | None, str]] = {}
@@ -194,9 +197,9 @@ def _check_tags(packets: Iterable[HeardPacket], keys: Keys) -> list[VerifiedPack
     return checked
 
 
-def _in_clear(packet: HeardPacket) -> VerifiedPacket:
+def _in_clear(packet: ReceivedPacket) -> VerifiedPacket:
     if packet.claim is None:
-        return VerifiedPacket(packet, Verdict.UNDECODABLE, reason="there is neither a payload nor a claim in it")
+        return VerifiedPacket(packet, Verdict.UNDECODABLE, reason="it has neither a payload nor a position in clear")
     return VerifiedPacket(packet, Verdict.UNAUTHENTICATED, packet.claim.number, reason=_CLEAR)
 
 
@@ -221,156 +224,167 @@ def _check_tag(
 
 
 def _name_failures(checked: list[VerifiedPacket]) -> None:
-    """Tell damage and wrong keys from forgeries, for people: none of them is accepted."""
-    claims: dict[int, int] = {}
-    tags: dict[bytes, int] = {}
-    failed: dict[tuple[int, bytes], set[int]] = defaultdict(set)
+    """Distinguish damage and wrong keys from forgeries, for people: none of them is accepted."""
+    contents: dict[int, int] = {}  # fixed bytes by number, of authentic packets
+    tags: dict[bytes, int] = {}  # tags by body, of authentic packets
+    failed: dict[tuple[int, bytes], set[int]] = defaultdict(set)  # sequences with an invalid tag
     for packet in checked:
         payload = packet.packet.payload
         if payload is None or packet.number is None or packet.message is None:
             continue
         if packet.accepted:
-            claims.setdefault(packet.number, int.from_bytes(payload[:_CLAIM_BYTES]))
+            contents.setdefault(packet.number, int.from_bytes(payload[:_FIXED_BYTES]))
             tags[payload[:-4]] = int.from_bytes(payload[-4:])
         elif packet.verdict is Verdict.FORGED:
-            failed[packet.number, payload[:_CLAIM_BYTES]].add(packet.message.sequence)
+            failed[packet.number, payload[:_FIXED_BYTES]].add(packet.message.sequence)
     for index, packet in enumerate(checked):
         payload = packet.packet.payload
         if packet.verdict is not Verdict.FORGED or payload is None or packet.number is None:
             continue
-        if packet.number not in claims:
-            if len(failed[packet.number, payload[:_CLAIM_BYTES]]) >= _WRONG_KEY_PACKETS:
+        if packet.number not in contents:
+            if len(failed[packet.number, payload[:_FIXED_BYTES]]) >= _MIN_WRONG_KEY_PACKETS:
                 checked[index] = replace(packet, verdict=Verdict.WRONG_KEY, reason=_WRONG_KEY)
-        elif _is_damaged(payload, claims[packet.number], tags):
+        elif _is_damaged(payload, contents[packet.number], tags):
             checked[index] = replace(packet, verdict=Verdict.CORRUPT, reason=_DAMAGED)
 
 
-def _is_damaged(payload: bytes, claim: int, tags: Mapping[bytes, int]) -> bool:
-    bits = (int.from_bytes(payload[:_CLAIM_BYTES]) ^ claim).bit_count()
+def _is_damaged(payload: bytes, content: int, tags: Mapping[bytes, int]) -> bool:
+    """Whether a payload differs from an authentic one in a few bits of its fixed bytes or its tag."""
+    bits = (int.from_bytes(payload[:_FIXED_BYTES]) ^ content).bit_count()
     if bits:
-        return bits <= _DAMAGED_BITS
+        return bits <= _MAX_DAMAGED_BITS
     tag = tags.get(payload[:-4])
-    return tag is not None and (int.from_bytes(payload[-4:]) ^ tag).bit_count() <= _DAMAGED_TAG_BITS
+    return tag is not None and (int.from_bytes(payload[-4:]) ^ tag).bit_count() <= _MAX_DAMAGED_TAG_BITS
 
 
 # --- freshness ----------------------------------------------------------------------------------------------------
 
-_Judged = tuple[int, Verdict, str]
+
+class _Finding(NamedTuple):
+    """Verdict on one of a marker's packets, by its row."""
+
+    row: int
+    verdict: Verdict
+    reason: str
 
 
-def _judge_marker(
-    packets: Sequence[VerifiedPacket], known: Sequence[SequenceSpan], rules: FreshnessRules, least_interval_s: float
-) -> list[_Judged]:
-    """Verdicts on packets of one marker that carry its tag; those that are accepted are left out unless unsure."""
-    sequences, heard_s = _sequences_and_times(packets)
-    judged: list[_Judged] = []
-    timed = np.isfinite(heard_s)
-    if rules.received_at_s is not None:
-        future = timed & (heard_s > rules.received_at_s + rules.clock_tolerance_s)
+def _check_freshness(
+    packets: Sequence[VerifiedPacket], known: Sequence[SequenceSpan], rules: FreshnessRules, min_interval_s: float
+) -> list[_Finding]:
+    """Verdicts on packets of one marker with its valid tag; fresh packets have none unless their time is unknown."""
+    sequences, received_s = _sequences_and_times(packets)
+    findings: list[_Finding] = []
+    timed = np.isfinite(received_s)
+    if rules.uploaded_at_s is not None:
+        future = timed & (received_s > rules.uploaded_at_s + rules.clock_tolerance_s)
         for i in np.flatnonzero(future):
-            ahead_s = heard_s[i] - rules.received_at_s
-            judged.append((int(i), Verdict.OUT_OF_ORDER, f"heard {ahead_s:.0f} s after the log was uploaded"))
+            ahead_s = received_s[i] - rules.uploaded_at_s
+            findings.append(
+                _Finding(int(i), Verdict.OUT_OF_ORDER, f"received {ahead_s:.0f} s after the log was uploaded")
+            )
         timed &= ~future
-    leaders, echoes = _split_echoes(packets, sequences, heard_s, np.flatnonzero(timed), rules)
-    judged += echoes
-    judged += _judge_timed(sequences[leaders], heard_s[leaders], leaders, known, rules, least_interval_s)
+    leaders, echoes = _split_echoes(packets, sequences, received_s, np.flatnonzero(timed), rules)
+    findings += echoes
+    findings += _check_timed(sequences[leaders], received_s[leaders], leaders, known, rules, min_interval_s)
     highest = max([span.last_sequence for span in known] + [int(sequences[i]) for i in leaders], default=-1)
-    return judged + _judge_untimed(sequences, np.flatnonzero(np.isnan(heard_s)), highest)
+    return findings + _check_untimed(sequences, np.flatnonzero(np.isnan(received_s)), highest)
 
 
 def _sequences_and_times(packets: Sequence[VerifiedPacket]) -> tuple[Floats, Floats]:
     sequences = [packet.message.sequence if packet.message else 0 for packet in packets]
-    return np.array(sequences, float), np.array([packet.packet.heard_at_s for packet in packets], float)
+    return np.array(sequences, float), np.array([packet.packet.received_at_s for packet in packets], float)
 
 
 def _split_echoes(
     packets: Sequence[VerifiedPacket],
     sequences: Floats,
-    heard_s: Floats,
+    received_s: Floats,
     among: npt.NDArray[np.intp],
     rules: FreshnessRules,
-) -> tuple[npt.NDArray[np.intp], list[_Judged]]:
-    """The first hearing of each sequence, and verdicts on the others."""
-    order = among[np.lexsort((among, heard_s[among], sequences[among]))]
+) -> tuple[npt.NDArray[np.intp], list[_Finding]]:
+    """The first reception of each sequence, and verdicts on the others."""
+    order = among[np.lexsort((among, received_s[among], sequences[among]))]
     new = np.diff(sequences[order], prepend=-1) > 0
     leaders = order[new]
-    judged: list[_Judged] = []
+    findings: list[_Finding] = []
     for i, leader in zip(order[~new], leaders[np.cumsum(new) - 1][~new], strict=True):
         packet, first = packets[i].packet, packets[leader].packet
-        after_s = heard_s[i] - heard_s[leader]
+        after_s = received_s[i] - received_s[leader]
         if packet.payload != first.payload:
             reason = f"another message of the same sequence is entry {first.entry}: two markers have this number"
-            judged.append((int(i), Verdict.OUT_OF_ORDER, reason))
+            findings.append(_Finding(int(i), Verdict.OUT_OF_ORDER, reason))
         elif after_s <= rules.echo_s or (packet.event is not None and packet.event == first.event):
-            judged.append((int(i), Verdict.DUPLICATE, f"heard already as entry {first.entry}"))
+            findings.append(_Finding(int(i), Verdict.DUPLICATE, f"received already as entry {first.entry}"))
         else:
-            reason = f"heard already {after_s:.0f} s before, as entry {first.entry}"
-            judged.append((int(i), Verdict.REPLAYED, reason))
-    return leaders, judged
+            reason = f"received already {after_s:.0f} s before, as entry {first.entry}"
+            findings.append(_Finding(int(i), Verdict.REPLAYED, reason))
+    return leaders, findings
 
 
-def _judge_timed(
+def _check_timed(
     sequences: Floats,
-    heard_s: Floats,
+    received_s: Floats,
     indices: npt.NDArray[np.intp],
     known: Sequence[SequenceSpan],
     rules: FreshnessRules,
-    least_interval_s: float,
-) -> list[_Judged]:
+    min_interval_s: float,
+) -> list[_Finding]:
+    """Verdicts on late and early packets, by the order of their sequences."""
     # a marker may have been programmed to another interval between drives
-    before = order_of_spans(known, rules.least_interval_s or FASTEST_INTERVAL_S)
+    before = order_of_spans(known, rules.min_interval_s or FASTEST_INTERVAL_S)
     within = within_spans(known, sequences)
-    late_s, early_s = before.late_s(sequences, heard_s), before.early_s(sequences, heard_s)
-    late_here_s = HeardOrder(sequences, heard_s, least_interval_s).late_s(sequences, heard_s)
+    late_s, early_s = before.late_s(sequences, received_s), before.early_s(sequences, received_s)
+    late_here_s = SequenceOrder(sequences, received_s, min_interval_s).late_s(sequences, received_s)
     tolerance_s = rules.clock_tolerance_s + rules.log_tolerance_s
-    judged: list[_Judged] = []
+    findings: list[_Finding] = []
     for k in np.flatnonzero((late_s > tolerance_s) | (early_s > tolerance_s) | (late_here_s > rules.log_tolerance_s)):
         index, sequence = int(indices[k]), int(sequences[k])
         if late_s[k] > tolerance_s:
             verdict = Verdict.REPLAYED if within[k] else Verdict.OUT_OF_ORDER
             ago = f"{late_s[k]:.0f} s too late" if math.isfinite(late_s[k]) else "too late, or in a log without times"
-            reason = f"sequence {sequence} was sent before another that an earlier drive heard: heard again {ago}"
+            reason = f"sequence {sequence} was sent before another that an earlier drive received: received again {ago}"
         elif early_s[k] > tolerance_s:
             verdict = Verdict.OUT_OF_ORDER
-            reason = f"sequence {sequence} is heard {early_s[k]:.0f} s before a lower one of another drive"
+            reason = f"sequence {sequence} is received {early_s[k]:.0f} s before a lower one of another drive"
         else:
             verdict = Verdict.OUT_OF_ORDER
-            reason = f"sequence {sequence} is heard {late_here_s[k]:.0f} s too late for a higher one of this log"
-        judged.append((index, verdict, reason))
-    return judged
+            reason = f"sequence {sequence} is received {late_here_s[k]:.0f} s too late for a higher one of this log"
+        findings.append(_Finding(index, verdict, reason))
+    return findings
 
 
-def _judge_untimed(sequences: Floats, indices: npt.NDArray[np.intp], highest: int) -> list[_Judged]:
-    judged: list[_Judged] = []
+def _check_untimed(sequences: Floats, indices: npt.NDArray[np.intp], highest: int) -> list[_Finding]:
+    """Verdicts on packets without times, which are accepted above the highest known sequence."""
+    findings: list[_Finding] = []
     seen: set[int] = set()
     for i in indices:
         sequence = int(sequences[i])
         if sequence in seen:
-            judged.append(
-                (int(i), Verdict.DUPLICATE, "this sequence is in the log already; without times no more is known")
-            )
+            reason = "this sequence is in the log already; without times no more is known"
+            findings.append(_Finding(int(i), Verdict.DUPLICATE, reason))
         elif sequence <= highest:
             reason = f"without a time it must be above sequence {highest}, which is known already; it is {sequence}"
-            judged.append((int(i), Verdict.OUT_OF_ORDER, reason))
+            findings.append(_Finding(int(i), Verdict.OUT_OF_ORDER, reason))
         else:
-            judged.append((int(i), Verdict.AUTHENTIC, "freshness unknown: the log has no time for it"))
+            findings.append(_Finding(int(i), Verdict.AUTHENTIC, "freshness unknown: the log has no time for it"))
         seen.add(sequence)
-    return judged
+    return findings
 
 
 def _spans_of(accepted: Sequence[VerifiedPacket]) -> tuple[SequenceSpan, ...]:
+    """One span of the packets with times, and one of those without."""
     spans = []
     for timed in (True, False):
-        group = [p for p in accepted if math.isfinite(p.packet.heard_at_s) is timed and p.message is not None]
+        group = [p for p in accepted if math.isfinite(p.packet.received_at_s) is timed and p.message is not None]
         if group:
             sequences = [p.message.sequence for p in group if p.message is not None]
-            times = [p.packet.heard_at_s for p in group] if timed else [math.nan]
+            times = [p.packet.received_at_s for p in group] if timed else [math.nan]
             spans.append(SequenceSpan(min(sequences), max(sequences), min(times), max(times)))
     return tuple(spans)
 
 
 def _warnings(checked: Iterable[VerifiedPacket]) -> list[str]:
-    untimed = sum(1 for p in checked if p.accepted and not math.isfinite(p.packet.heard_at_s))
+    untimed = sum(1 for p in checked if p.accepted and not math.isfinite(p.packet.received_at_s))
     if not untimed:
         return []
     return [f"freshness unknown: {untimed} packets have no time; they are accepted by the order of sequences alone"]

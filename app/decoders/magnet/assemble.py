@@ -1,50 +1,44 @@
-"""Magnets in their order -> line crossings and information tags."""
+"""Magnets in the order of the road, grouped to line crossings and information tags."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.book import Match, TagBook
-from app.decoders.magnet.readings import LineCrossing, MagnetReading, Side, TagReading
+from app.decoders.magnet.identify import Identification, TagCandidates
+from app.decoders.magnet.readings import LineCrossing, MagnetReading, PlacedMagnet, Side, TagReading
 from app.markers.magnet import MAX_LINE_SPACING_M, LineStyle, LineTag, Orientation, Polarity
 
 Floats = npt.NDArray[np.float64]
 
-LONGEST_GAP_M = 6.5
-"""Magnets of one tag stand at most so far apart, unless a book of tags says otherwise."""
-_SPEED_ERROR = 0.002
-"""Share by which the speed may drift between two gaps of a tag."""
-_SAME_LANE_CM = 70.0
+MAX_GAP_M = 6.5
+"""Largest distance between two magnets of a tag where the candidates have none. [m] Source: chosen by hand, more than
+the 6 m of METRO section 6.3."""
+_GAP_FACTOR, _GAP_SPARE_M = 1.05, 0.3  # a row ends after so many largest gaps, and metres more; source: by hand
+_MIN_LENGTH_SHARE, _MIN_LENGTH_SPARE_M = 0.95, 0.1  # shortest row that no longer tag can still be; source: by hand
+_SPEED_STD = 0.002  # share by which the speed may drift between two gaps of a tag; source: by hand, 0.2 %
+_LINE_REACH = 1.5  # distance of two magnets of one line over the largest allowed one; source: by hand, one missed
+_SAME_LINE_CM = 70.0  # [cm] lateral distance up to which magnets are of one line; source: by hand, a weaving vehicle
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlacedMagnet:
-    """A magnet's reading and where it lies on the plane."""
-
-    reading: MagnetReading
-    place_m: Floats
-
-
-class Assembler:
+class TagAssembler:
     """Groups magnets as they come.
 
     Parameters
     ----------
-    book : TagBook
+    candidates : TagCandidates
         Tags that may be on the road; an empty one groups by gaps alone.
     """
 
-    def __init__(self, book: TagBook) -> None:
-        self._book = book
+    def __init__(self, candidates: TagCandidates) -> None:
+        self._candidates = candidates
         self._row: list[PlacedMagnet] = []
         self._lines: list[MagnetReading] = []
-        self._longest_m = book.longest_gap_m or LONGEST_GAP_M
+        self._longest_m = candidates.longest_gap_m or MAX_GAP_M
 
     def add(self, magnet: PlacedMagnet) -> list[LineCrossing | TagReading]:
         """Findings that a further magnet completes."""
@@ -56,15 +50,15 @@ class Assembler:
 
     def pass_by(self, odometer_m: float) -> list[LineCrossing | TagReading]:
         """Findings that are complete because nothing came for a while."""
-        if self._row and odometer_m - self._row[-1].reading.odometer_m > self._longest_m * 1.05 + 0.3:
+        if self._row and odometer_m - self._row[-1].reading.odometer_m > _GAP_FACTOR * self._longest_m + _GAP_SPARE_M:
             return self.finish()
         return []
 
     def finish(self) -> list[LineCrossing | TagReading]:
-        """What the magnets so far are."""
+        """Findings of the magnets so far, which no further one joins."""
         found: list[LineCrossing | TagReading] = []
         while self._row:
-            match = self._book.best_match(self._row) if self._book else None
+            match = self._candidates.identify(self._row) if self._candidates else None
             if match is None:
                 if len(self._row) > 1 and not found:
                     found.append(make_reading(self._row, None))
@@ -75,26 +69,27 @@ class Assembler:
         return found
 
     def _complete(self) -> list[LineCrossing | TagReading]:
-        """A tag that is whole, where no longer one could still come of it."""
-        if not self._book or len(self._row) < 2:
+        """A whole tag at the end of the row that cannot be the beginning of a longer one."""
+        if not self._candidates or len(self._row) < 2:
             return []
-        match = self._book.best_match(self._row)
+        match = self._candidates.identify(self._row)
         if match is None or match.missing or match.members[-1] != len(self._row) - 1:
             return []
         length = math.dist(self._row[match.members[0]].place_m, self._row[-1].place_m)
-        if length < self._book.longest_m * 0.95 - 0.1:
+        if length < _MIN_LENGTH_SHARE * self._candidates.longest_m - _MIN_LENGTH_SPARE_M:
             return []
         reading = make_reading(self._row, match)
         self._row = []
         return [reading]
 
     def _cross(self, magnet: MagnetReading) -> list[LineCrossing | TagReading]:
-        reach = 1.5 * MAX_LINE_SPACING_M
+        """A line crossing, at the first magnet of a line."""
+        reach = _LINE_REACH * MAX_LINE_SPACING_M
         self._lines = [m for m in self._lines if magnet.odometer_m - m.odometer_m < reach]
         known = [
             m
             for m in self._lines
-            if m.polarity is magnet.polarity and abs(m.lateral_cm - magnet.lateral_cm) < _SAME_LANE_CM
+            if m.polarity is magnet.polarity and abs(m.lateral_cm - magnet.lateral_cm) < _SAME_LINE_CM
         ]
         self._lines = [m for m in self._lines if m not in known] + [magnet]
         if known:
@@ -104,13 +99,13 @@ class Assembler:
         return [LineCrossing(magnet.t_s, magnet.odometer_m, style, side, magnet.lateral_cm, magnet.confidence)]
 
 
-def make_reading(row: Sequence[PlacedMagnet], match: Match | None) -> TagReading:
-    """The reading of a row of magnets, as the tag that was matched or as it is."""
+def make_reading(row: Sequence[PlacedMagnet], match: Identification | None) -> TagReading:
+    """The reading of a row of magnets, as the tag that was identified or without one."""
     members = [row[i] for i in match.members] if match else list(row)
     readings = tuple(m.reading for m in members)
     gaps = tuple(math.dist(a.place_m, b.place_m) for a, b in pairwise(members))
     std = tuple(
-        math.hypot(a.along_std_m, b.along_std_m, _SPEED_ERROR * gap)
+        math.hypot(a.along_std_m, b.along_std_m, _SPEED_STD * gap)
         for (a, b), gap in zip(pairwise(readings), gaps, strict=True)
     )
     ratios = tuple(g / gaps[0] for g in gaps[1:]) if gaps and gaps[0] > 0 else ()

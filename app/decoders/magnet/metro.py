@@ -16,7 +16,10 @@ from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 Floats = npt.NDArray[np.float64]
 
 VERSION = "metro-1"
-_SPIKE_UT = 100.0
+_SPIKE_UT = 100.0  # [uT] a sample so far off the median of three is a fault; source: by hand
+_WHEEL_REACH_M = 0.2  # [m] across, from a reference sensor to those in front of its wheel; source: by hand
+_MERGE_M = 0.125 * 10 / 3.6  # [m] detections nearer than this are one magnet, 0.125 s at 10 km/h; source: by hand
+_CONFIDENCE = 0.5  # of every reading: the paper gives none
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +29,7 @@ class MetroSettings:
     Attributes
     ----------
     amplitude_ut : float
-        Least step of an extremum. The published code has 16 uT, more than a phi = 0 magnet gives at 30 cm. [uT]
+        Smallest step of an extremum. [uT] Source: METRO's published code; a phi = 0 magnet gives less at 30 cm.
     cancel_wheels : bool
         Adaptive magnetic field neutralization (section 5.3) on the array sensors nearest to a reference.
     tag_magnets : int
@@ -78,9 +81,11 @@ def decode_trace_metro(
                 # straight above a forward magnet the field points backward
                 polarity = Polarity.N if peak == (orientation is Orientation.UP) else Polarity.S
                 i = int(at[k])
-                reading = MagnetReading(float(trace.t_s[i]), float(odometer[i]), lateral_cm, polarity, orientation, 0.5)
+                reading = MagnetReading(
+                    float(trace.t_s[i]), float(odometer[i]), lateral_cm, polarity, orientation, _CONFIDENCE
+                )
                 found.append((float(amplitude[k]), reading))
-    magnets = steps.merge_detections(found, 0.125 * 10 / 3.6)
+    magnets = steps.merge_detections(found, _MERGE_M)
     return [*magnets, *_lines(magnets), *_tags(magnets, trace.t_s, speed, heading, settings)]
 
 
@@ -103,7 +108,7 @@ def _cancel(field: Floats, bar: MagnetometerBar, rate_hz: float) -> Floats:
     for reference in bar.references:
         aligned = field[:, reference]  # traces come in the vehicle's axes already
         away = np.abs(bar.positions_m[bar.array, 1] - bar.positions_m[reference, 1])
-        for sensor in bar.array[away < 0.2]:
+        for sensor in bar.array[away < _WHEEL_REACH_M]:
             for axis in range(3):
                 scaled = steps.scale_reference(aligned[:, axis], field[:, sensor, axis], quiet)
                 out[:, sensor, axis] = steps.cancel_wheel_noise(field[:, sensor, axis], scaled)
@@ -156,6 +161,6 @@ def _tag(row: list[MagnetReading], t_s: Floats, speed: Floats, heading: Floats |
         wrong_way=False,
         missing=0,
         extra=0,
-        confidence=0.5,
+        confidence=_CONFIDENCE,
         magnets=tuple(row),
     )

@@ -13,10 +13,17 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 MPH = 0.44704
+"""A mile per hour. [m/s] Source: international mile of 1609.344 m."""
 SMOOTHING = ((20 * MPH, 15), (40 * MPH, 9), (np.inf, 5))
-"""Below a speed [m/s], samples of the Gaussian window (section 5.2.1, step 1)."""
+"""Samples of the Gaussian window below a speed [m/s]. Source: METRO section 5.2.1, step 1."""
 SG_WINDOW, SG_ORDER = 5, 2
+"""Samples and polynomial order of the Savitzky-Golay filter. Source: METRO section 5.2.1, step 2."""
 LMS_TAPS, LMS_RATE, LMS_WINDOW = 4, 1e-6, 50
+"""Taps, rate [1/uT2] and samples of a window of the adaptive filter. Source: chosen by hand; METRO section 5.3 has
+none."""
+THRESHOLD_CROSSINGS, THRESHOLD_FACTOR = 50, 1.5
+"""Crossings of the noise that set the slope threshold, and its factor. Source: chosen by hand; METRO section 5.2.1,
+step 3, has none."""
 
 
 def gaussian_window(samples: int) -> Floats:
@@ -53,7 +60,7 @@ def find_zero_crossings(derivative: Floats) -> tuple[Indices, Floats]:
     return at, derivative[at + 1] - derivative[at]
 
 
-def slope_threshold(slopes: Floats, *, first: int = 50, factor: float = 1.5) -> float:
+def slope_threshold(slopes: Floats, *, first: int = THRESHOLD_CROSSINGS, factor: float = THRESHOLD_FACTOR) -> float:
     """Step 3: what noise alone does not exceed, from the first crossings, before any magnet."""
     return float(factor * np.max(np.abs(slopes[:first]), initial=0.0))
 
@@ -62,12 +69,6 @@ def amplitude_steps(x: Floats, crossings: Indices, rate_hz: float) -> Floats:
     """Step 3: how far x (T,) is at each crossing from what is usual there, its mean over a second."""
     usual = ndimage.uniform_filter1d(x, max(int(rate_hz), 3), mode="nearest")
     return np.asarray(np.abs(x - usual)[crossings])
-
-
-def align_reference(reference: Floats, vehicle_from_sensor: Floats) -> Floats:
-    """AMN step 1: a reference sensor's samples (T, 3) turned into the axes of the bar."""
-    turned: Floats = reference @ vehicle_from_sensor.T
-    return turned
 
 
 def scale_reference(reference: Floats, front: Floats, quiet: int) -> Floats:
@@ -79,8 +80,10 @@ def scale_reference(reference: Floats, front: Floats, quiet: int) -> Floats:
 
 
 @nb.njit(cache=True, nogil=True)
-def cancel_wheel_noise(front, reference, taps=LMS_TAPS, rate=LMS_RATE, window=LMS_WINDOW):  # type: ignore[no-untyped-def]
-    """AMN step 2: front (T,) less what an LMS filter of it can tell of the reference (T,).
+def cancel_wheel_noise(
+    front: Floats, reference: Floats, taps: int = LMS_TAPS, rate: float = LMS_RATE, window: int = LMS_WINDOW
+) -> Floats:
+    """AMN step 2: front (T,) less what an LMS filter of it predicts of the reference (T,).
 
     The desired signal is the reference, the input the front sensor (section 5.3, figure 8); weights are renewed over
     windows of samples. Offsets are removed by the mean of the window before.
@@ -92,13 +95,13 @@ def cancel_wheel_noise(front, reference, taps=LMS_TAPS, rate=LMS_RATE, window=LM
         low = max(start - window, 0)
         mean_f, mean_r = front[low:stop].mean(), reference[low:stop].mean()
         for i in range(max(start, taps - 1), stop):
-            told = 0.0
+            predicted = 0.0
             for k in range(taps):
-                told += weights[k] * (front[i - k] - mean_f)
-            error = (reference[i] - mean_r) - told
+                predicted += weights[k] * (front[i - k] - mean_f)
+            error = (reference[i] - mean_r) - predicted
             for k in range(taps):
                 weights[k] += 2 * rate * error * (front[i - k] - mean_f)
-            out[i] = front[i] - told
+            out[i] = front[i] - predicted
     return out
 
 

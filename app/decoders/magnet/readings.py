@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+import numpy.typing as npt
+
 from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
 
 
@@ -72,6 +75,14 @@ class MagnetReading:
         return int(self.orientation)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedMagnet:
+    """A magnet's reading and its position on the plane of the vehicle's path, shape (2,). [m]"""
+
+    reading: MagnetReading
+    place_m: npt.NDArray[np.float64]
+
+
 @dataclass(frozen=True, slots=True)
 class LineCrossing:
     """The bar came over a line: a lane departure unless it was meant.
@@ -119,13 +130,13 @@ class TagReading:
     lateral_cm : float
         Mean place on the bar, left positive. [cm]
     tag : InformationTag or None
-        The design that it is, where designs or a format are known.
+        The tag that it is, where registered tags or a format are known.
     wrong_way : bool
-        It is that design met from behind: the vehicle drives against the legal direction.
+        It is that tag met from behind: the vehicle drives against the legal direction.
     missing, extra : int
-        Magnets of the design that were not seen, and seen magnets that are not of it.
+        Magnets of the tag that were not seen, and seen magnets that are not of it.
     confidence : float
-        Probability that it is that tag (without designs: that all polarities are right).
+        Probability that it is that tag (without candidates: that all polarities are right).
     magnets : tuple of MagnetReading
     """
 

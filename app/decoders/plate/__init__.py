@@ -1,4 +1,4 @@
-"""Camera frame -> readings of coded plates."""
+"""Camera frame to readings of coded plates."""
 
 from app.decoders.plate.reader import DECODER_VERSION, decode_plates
 

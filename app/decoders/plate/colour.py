@@ -1,8 +1,8 @@
-"""Where a frame is red and where it is green, at half resolution and coarser.
+"""Signals of red and green in a frame, at half resolution and coarser.
 
-The first signal is how far red stands above green and blue, or green above red and blue: neutral surfaces, sky and
-lamps give nothing, a cast gives less than the share of the brightness that is taken off. The second, for where that
-finds no plate, is the ratio of red to green against the neighbourhood's.
+The difference signal is how far red exceeds green and blue, or green exceeds red and blue: neutral surfaces, sky and
+lamps give nothing, a colour cast less than the share of the brightness that the threshold has. The ratio signal, for
+frames where that finds no plate, is the ratio of red to green relative to the neighbourhood.
 """
 
 from __future__ import annotations
@@ -11,18 +11,27 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-BLOCK = 16  # side of a block of the background grid, in pixels of the signal
-# a red marker beside brown soil needs a high threshold to stand alone, a small one far away a low one to be seen at all
-VIVID_LEVELS = ((6, 2), (10, 5), (20, 11))
-FAINT_LEVELS = ((6, 0), (14, 0))
-FAINTEST_LEVELS = ((3, 0), (7, 0))
+from app.decoders.compiled import ieee_kernel, kernel
+
+BLOCK = 16
+"""[pixels of the signal] side of a block, for which one threshold holds. Source: chosen by hand."""
+DIFFERENCE_LEVELS = ((6, 2), (10, 5), (20, 11))
+"""[grey levels, 1/32 of the brightness] thresholds of the difference signal. Source: chosen by hand: a red marker
+beside brown soil needs a high one to stand alone, a small one far away a low one to be seen at all."""
+RATIO_LEVELS = ((6, 0), (14, 0))
+"""[1/128 of a natural logarithm, none] thresholds of the ratio signal. Source: chosen by hand."""
+COARSE_RATIO_LEVELS = ((3, 0), (7, 0))
+"""The same at a quarter of the resolution, where noise is half. Source: half of `RATIO_LEVELS`."""
 NOISE_FACTOR = 3.5
+"""[1] threshold over the mean difference of neighbours around a block, which foliage and grass have everywhere. Source:
+chosen by hand."""
 
 Array = npt.NDArray[Any]
+Grey = npt.NDArray[np.uint8]
+Signal = npt.NDArray[np.int16]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +53,13 @@ class MarkerSignal:
     opponent : ndarray of int16, shape (H // scale, W // scale)
         Strength of the colour.
     planes : Planes
-        What it was made of. [grey levels]
+        The scaled frame. [grey levels]
     peak : ndarray of int16, shape (H // scale, blocks)
         Strongest signal in every run of `BLOCK` pixels of a row.
     threshold : ndarray of int16, shape (blocks, blocks)
-        What stands above the roughness around a block.
+        Signal that exceeds the roughness around a block.
     levels : tuple of (int, int)
-        Thresholds to look at: strength, and share of the brightness in 32nds.
+        Thresholds at which blobs are cut out: strength, and share of the brightness in 32nds.
     scale : int
         Pixels of the frame that make one of the signal, along a side.
     """
@@ -73,15 +82,15 @@ def _planes(image: Array) -> Planes:
     return Planes(blue, green, red, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 
 
-def vivid_signal(planes: Planes) -> MarkerSignal:
-    """How far red stands above green and blue, or green above red and blue: strong colours, whatever is around."""
+def difference_signal(planes: Planes) -> MarkerSignal:
+    """How far red exceeds green and blue, or green exceeds red and blue: saturated colours."""
     red_above = cv2.subtract(planes.red, cv2.max(planes.green, planes.blue))
     green_above = cv2.subtract(planes.green, cv2.max(planes.red, planes.blue))
-    return _signal(cv2.subtract(red_above, green_above, dtype=cv2.CV_16S), planes, VIVID_LEVELS)
+    return _signal(cv2.subtract(red_above, green_above, dtype=cv2.CV_16S), planes, DIFFERENCE_LEVELS)
 
 
-def faint_signal(planes: Planes) -> MarkerSignal:
-    """The ratio of red to green against the neighbourhood's: weak colours in haze, glare or a colour cast.
+def ratio_signal(planes: Planes) -> MarkerSignal:
+    """The ratio of red to green relative to the neighbourhood: weak colours in haze, glare or a colour cast.
 
     About 128 times the ratio's logarithm, less in the dark.
     """
@@ -92,11 +101,11 @@ def faint_signal(planes: Planes) -> MarkerSignal:
     _block_means(opponent, means)  # cv2.resize by area takes ten times as long where the sides are no multiples
     level = cv2.medianBlur(means, 5)
     opponent = cv2.subtract(opponent, cv2.resize(level, (width, height), interpolation=cv2.INTER_LINEAR))
-    return _signal(opponent, planes, FAINT_LEVELS)
+    return _signal(opponent, planes, RATIO_LEVELS)
 
 
-def faintest_signal(planes: Planes) -> MarkerSignal:
-    """The same at half the planes' resolution, where noise is less: large plates in thick haze."""
+def coarse_ratio_signal(planes: Planes) -> MarkerSignal:
+    """The ratio signal at half the planes' resolution, where noise is less: large plates in thick haze."""
     height, width = planes.red.shape
     half = (width // 2, height // 2)
     coarse = Planes(
@@ -105,7 +114,7 @@ def faintest_signal(planes: Planes) -> MarkerSignal:
             for plane in (planes.blue, planes.green, planes.red, planes.luma)
         )
     )
-    return replace(faint_signal(coarse), levels=FAINTEST_LEVELS, scale=4)
+    return replace(ratio_signal(coarse), levels=COARSE_RATIO_LEVELS, scale=4)
 
 
 def _signal(opponent: Array, planes: Planes, levels: tuple[tuple[int, int], ...]) -> MarkerSignal:
@@ -116,93 +125,18 @@ def _signal(opponent: Array, planes: Planes, levels: tuple[tuple[int, int], ...]
     return MarkerSignal(opponent, planes, peak, _thresholds(rough), levels)
 
 
-_SPOTS = np.array([(x, y) for x in (-0.03, 0.0, 0.03) for y in (-0.03, 0.0, 0.03)])
-
-
-@dataclass(frozen=True, slots=True)
-class MarkerColours:
-    """How red the triangle of a fitted plate is, and how green its squares are.
-
-    Attributes
-    ----------
-    margins : ndarray, shape (4,)
-        How far the signal of the triangle and the squares stands out of the units', in their spreads.
-    tints : ndarray, shape (4,)
-        Red of the triangle, green of the squares above their other colours, as shares of the median square's; grey
-        being what the units are. A black square in the dark has none, whatever the ratio of its few grey levels says.
-    cast : ndarray, shape (2,)
-        Blue and red of the units as shares of their green.
-    """
-
-    margins: Array
-    tints: Array
-    cast: Array
-
-
-def marker_colours(signal: MarkerSignal, plate_from_image: Array, centroids: Array, units: Array) -> MarkerColours:
-    """Colours of a fitted plate's markers.
-
-    Parameters
-    ----------
-    signal : MarkerSignal
-    plate_from_image : ndarray, shape (3, 3)
-        Full-resolution pixels to plate coordinates.
-    centroids : ndarray, shape (4, 2)
-        Of the markers, in plate coordinates.
-    units : ndarray, shape (U, 2)
-        Centres of the units, in plate coordinates.
-    """
-    points = np.concatenate([(centroids[:, None] + _SPOTS[None]).reshape(-1, 2), units])
-    planes = signal.planes
-    seen = np.empty((4, len(points)))
-    _look_up(np.linalg.inv(plate_from_image), points, signal.scale, signal.opponent,
-             planes.blue, planes.green, planes.red, seen)  # fmt: skip
-    strength, blue, green, red = seen
-    spots = 4 * len(_SPOTS)
-    cast = np.array([plane[spots:].sum() for plane in (blue, green, red)])
-    cast = np.maximum(cast, 1.0) / max(cast[1], 1.0)
-    sign = np.array([1, -1, -1, -1])
-    inside = strength[:spots].reshape(4, -1).mean(axis=1)
-    between = strength[spots:]
-    # as grey units would look in the same light
-    blue, green, red = (
-        plane[:spots].reshape(4, -1).mean(axis=1) / c for plane, c in zip((blue, green, red), cast, strict=True)
-    )
-    tints = np.where(sign > 0, red - np.maximum(green, blue), green - np.maximum(red, blue))
-    return MarkerColours(sign * (inside - between.mean()) / (between.std() + 1.0),
-                         tints / max(float(np.median(tints[1:])), 1.0), cast[[0, 2]])  # fmt: skip
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _look_up(image_from_plate, points, scale, opponent, blue, green, red, seen):  # type: ignore[no-untyped-def]
-    """Signal and colours at points of the plate."""
-    height, width = opponent.shape
-    m = image_from_plate
-    for k in range(points.shape[0]):
-        u = points[k, 0]
-        v = points[k, 1]
-        w = m[2, 0] * u + m[2, 1] * v + m[2, 2]
-        x = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) / w - (scale - 1) / 2) / scale
-        y = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) / w - (scale - 1) / 2) / scale
-        column = int(np.rint(min(max(x, 0.0), width - 1.0)))
-        row = int(np.rint(min(max(y, 0.0), height - 1.0)))
-        seen[0, k] = opponent[row, column]
-        seen[1, k] = blue[row, column]
-        seen[2, k] = green[row, column]
-        seen[3, k] = red[row, column]
-
-
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _ratio(green, red, opponent):  # type: ignore[no-untyped-def]
+@kernel
+def _ratio(green: Grey, red: Grey, opponent: Signal) -> None:
+    """Set 256 (r - g) / (r + g + 24), the ratio's logarithm times 128 where both are bright; shape (pixels,) each."""
     for k in range(opponent.shape[0]):
         r = np.float32(red[k])
         g = np.float32(green[k])
         opponent[k] = np.int16(np.int32(np.float32(256.0) * (r - g) / (r + g + np.float32(24.0))))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _block_means(signal, means):  # type: ignore[no-untyped-def]
-    """Means of about equal blocks of a signal."""
+@ieee_kernel
+def _block_means(signal: Signal, means: Signal) -> None:
+    """Set the means of about equal blocks of a signal; sums of rows, so that the blocks of a row share memory."""
     height, width = signal.shape
     rows, columns = means.shape
     total = np.empty(columns, np.int32)
@@ -221,8 +155,9 @@ def _block_means(signal, means):  # type: ignore[no-untyped-def]
             means[r, c] = np.int16(np.rint(total[c] / area))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _block_statistics(opponent, peak, rough):  # type: ignore[no-untyped-def]
+@ieee_kernel
+def _block_statistics(opponent: Signal, peak: Signal, rough: npt.NDArray[np.int32]) -> None:
+    """Set the strongest signal of each run of `BLOCK` pixels in a row, and add up neighbours' differences by block."""
     height, width = opponent.shape
     whole = width // BLOCK
     for y in range(height):
@@ -240,8 +175,8 @@ def _block_statistics(opponent, peak, rough):  # type: ignore[no-untyped-def]
             peak[y, whole] = max(peak[y, whole], abs(opponent[y, x]))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _thresholds(rough):  # type: ignore[no-untyped-def]
+@ieee_kernel
+def _thresholds(rough: npt.NDArray[np.int32]) -> Signal:
     """Threshold per block against the roughness around, which foliage and grass have everywhere."""
     rows, cols = rough.shape
     threshold = np.empty((rows, cols), np.int16)

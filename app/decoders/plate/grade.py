@@ -4,22 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.decoders.plate.decode import DecodedSymbols
+from app.decoders.plate.decode_symbols import DecodedSymbols
 from app.decoders.plate.fit import PlateFit
-from app.decoders.plate.weighing import UnitEvidence
+from app.decoders.plate.unit_likelihoods import UnitEvidence
 from app.markers.plate import PlateScheme, plate_capacity
 from app.markers.reading import PlateGrade
 
-# least value for grades 1, 2, 3, 4 (ISO/IEC 15415, section 7.8)
 _CONTRAST = (0.20, 0.40, 0.55, 0.70)
+"""[light units] span of the levels for grades 1, 2, 3, 4. Source: symbol contrast of ISO/IEC 15415, section 7.8."""
 _MODULATION = (0.20, 0.30, 0.40, 0.50)
+"""[1] margin of the weakest cell for grades 1 to 4. Source: modulation of ISO/IEC 15415, section 7.8."""
 _UNUSED = (0.25, 0.37, 0.50, 0.62)
-_MARKERS = (2.0, 3.0, 4.5, 6.0)  # colour margins, in spreads
-_AXES = (0.15, 0.25, 0.40, 0.60)  # shorter over longer side of a unit in the image
-_GRID = (0.60, 0.75, 0.85, 0.93)  # share of the pixels' variance that the ideal grid explains
+"""[1] unused error correction for grades 1 to 4. Source: ISO/IEC 15415, section 7.8."""
+_MARKERS = (2.0, 3.0, 4.5, 6.0)
+"""[standard deviations] colour margin of the weakest marker for grades 1 to 4. Source: chosen by hand."""
+_AXES = (0.15, 0.25, 0.40, 0.60)
+"""[1] shorter over longer side of a unit in the image for grades 1 to 4. Source: chosen by hand."""
+_GRID = (0.60, 0.75, 0.85, 0.93)
+"""[1] share of the pixels' variance that the grid explains for grades 1 to 4. Source: chosen by hand."""
+MODULATION_FULL = 20.0
+"""[root of cost] margin of the weakest cell on a sharp, clean plate, which counts as 1. Source: chosen by hand."""
 
 
-def _step(value: float, limits: tuple[float, float, float, float]) -> float:
+def _grade(value: float, limits: tuple[float, float, float, float]) -> float:
+    """Grade from 0 to 4: the number of limits that are reached."""
     return float(np.searchsorted(limits, value, side="right"))
 
 
@@ -47,10 +55,7 @@ def grade_plate(fit: PlateFit, evidence: UnitEvidence, decoded: DecodedSymbols, 
     elif decoded.corrected:
         unused = 0.0
     parts = (
-        _step(contrast, _CONTRAST), _step(modulation, _MODULATION), _step(weakest_marker, _MARKERS),
-        _step(axial, _AXES), _step(fit.explained, _GRID), _step(unused, _UNUSED),
+        _grade(contrast, _CONTRAST), _grade(modulation, _MODULATION), _grade(weakest_marker, _MARKERS),
+        _grade(axial, _AXES), _grade(fit.explained, _GRID), _grade(unused, _UNUSED),
     )  # fmt: skip
     return PlateGrade(min(parts), *parts)
-
-
-MODULATION_FULL = 20.0  # square root of the weakest cell's cost margin on a plate without any doubt

@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
+import numpy.typing as npt
+
+from app.decoders.compiled import kernel, routine
+
+Array = npt.NDArray[np.float64]
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def factorize(matrix):  # type: ignore[no-untyped-def]
+@routine
+def factorize(matrix: Array) -> Array:
     """Cholesky factor of the symmetric matrix with this lower triangle; empty if it is not positive."""
     n = matrix.shape[0]
     factor = np.zeros((n, n))
@@ -30,8 +34,8 @@ def factorize(matrix):  # type: ignore[no-untyped-def]
     return factor
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def substitute(factor, rhs):  # type: ignore[no-untyped-def]
+@routine
+def substitute(factor: Array, rhs: Array) -> Array:
     """Forward half of the solution, shape (n,): its squares are what the unknowns up to each one take off a sum."""
     n = factor.shape[0]
     half = rhs.copy()
@@ -43,12 +47,12 @@ def substitute(factor, rhs):  # type: ignore[no-untyped-def]
     return half
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def solve_factorized(factor, half, least_last):  # type: ignore[no-untyped-def]
-    """Solution of the system whose factor this is, shape (n,); the last unknown is held at `least_last` or above."""
+@routine
+def solve_factorized(factor: Array, half: Array, min_last: float) -> Array:
+    """Solution of the system whose factor this is, shape (n,); the last unknown is held at `min_last` or above."""
     n = factor.shape[0]
     solution = half.copy()
-    solution[n - 1] = max(solution[n - 1], least_last * factor[n - 1, n - 1])
+    solution[n - 1] = max(solution[n - 1], min_last * factor[n - 1, n - 1])
     for i in range(n - 1, -1, -1):
         solution[i] /= factor[i, i]
         value = solution[i]
@@ -57,8 +61,8 @@ def solve_factorized(factor, half, least_last):  # type: ignore[no-untyped-def]
     return solution
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def invert(matrix):  # type: ignore[no-untyped-def]
+@kernel
+def invert(matrix: Array) -> Array:
     """Inverse of a symmetric positive definite matrix; empty if it is not positive."""
     factor = factorize(matrix)
     n = factor.shape[0]

@@ -1,7 +1,7 @@
-"""Corners and camera -> pose of the plate -> position and heading of the vehicle.
+"""Corners and camera to the pose of the plate, and that to position and heading of the vehicle.
 
-IPPE gives the pose of a square in closed form (Collins and Bartoli, IJCV 109, 2014); a few Gauss-Newton steps weigh the
-corners by their covariance and the mount's height and level by what springs leave of them.
+IPPE gives the pose of a square in closed form (Collins and Bartoli, IJCV 109, 2014); a few Gauss-Newton steps then
+weight the corners by their covariance, and the mount's height and level by how far springs move them.
 """
 
 from __future__ import annotations
@@ -21,9 +21,18 @@ from app.sensors.camera import Camera
 
 Array = npt.NDArray[Any]
 
-LEVEL_SPREAD_RAD = math.radians(0.4)  # of a vehicle's roll and pitch against the road
-HEIGHT_SPREAD_M = 0.02  # of a camera's height: springs, load
-CORNER_FLOOR_PX = 0.05  # of a corner: what the fit's covariance leaves out
+LEVEL_SPREAD_RAD = math.radians(0.4)
+"""[rad] standard deviation of a vehicle's roll and pitch relative to the road. Source: chosen by hand; the simulated
+vehicles have 0.15 degrees (`simulation.drive.Drive.sway_deg`)."""
+HEIGHT_SPREAD_M = 0.02
+"""[m] standard deviation of a camera's height: springs, load. Source: chosen by hand."""
+MIN_DEPTH_M = 0.05
+"""[m] depth of a plate in front of the camera. Source: chosen by hand."""
+MAX_STEPS, REST = 6, 1e-7
+"""[steps; rad, m] of Gauss-Newton at most, and the step below which it ends. Source: chosen by hand."""
+CORNER_FLOOR_PX = 0.05
+"""[px] standard deviation that is added to a corner's, for what the fit's covariance leaves out. Source: chosen by
+hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +106,9 @@ def _refine(
 ) -> tuple[float, Array, Array] | None:
     """Gauss-Newton on corners and mount: cost, pose (rotation vector left of the first, translation), information."""
     cost, information = math.inf, np.eye(6)
-    for _ in range(6):
+    for _ in range(MAX_STEPS):
         rotation = cv2.Rodrigues(pose[:3])[0]
-        if pose[5] <= 0.05:
+        if pose[5] <= MIN_DEPTH_M:
             return None
         in_camera = object_m @ rotation.T
         projected, jacobian = cv2.projectPoints(in_camera, np.zeros(3), pose[3:], camera.matrix, distortion)
@@ -110,13 +119,13 @@ def _refine(
         step = np.linalg.solve(information, by_pose.T @ weight @ residual - by_mount.T @ mount_weight @ mount)
         cost = float(residual @ weight @ residual + mount @ mount_weight @ mount)
         pose = np.concatenate([cv2.Rodrigues(cv2.Rodrigues(step[:3])[0] @ rotation)[0].ravel(), pose[3:] + step[3:]])
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < REST:
             break
     return (cost, pose, information) if math.isfinite(cost) else None
 
 
 def _mount_residual(rotation: Array, translation: Array, camera: Camera) -> tuple[Array, Array, Array]:
-    """How far the plate is from lying on the road as the mount sees it: two tilts [rad] and a height [m].
+    """Departure of the plate from the road's plane as the mount sees it: two tilts [rad] and a height [m].
 
     The derivative is by a small rotation about the camera's axes and the translation.
     """
@@ -155,7 +164,7 @@ def fix_vehicle(
     vertical_rmse_m: float,
     heading_rmse_deg: float,
 ) -> VehicleFix:
-    """Where the vehicle is, from a plate whose survey is known.
+    """Position and heading of the vehicle from a plate whose survey is known.
 
     Parameters
     ----------

@@ -1,4 +1,7 @@
-"""Frame -> readings: detect, fit, weigh, decode, judge; vivid colours first, faint ones where those give nothing."""
+"""Frame to readings: detect, fit, unit likelihoods, decode, accept.
+
+Red and green are searched by their difference first, by their ratio where that gives no digits.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +13,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.colour import (
-    MarkerColours,
-    MarkerSignal,
-    faint_signal,
-    faintest_signal,
-    half_planes,
-    marker_colours,
-    vivid_signal,
-)
-from app.decoders.plate.decode import MOST_DAMAGE, DecodedSymbols, decode_symbols
-from app.decoders.plate.fit import PlateFit, fit_plate, marker_centroids, project, unit_centres
+from app.decoders.plate.colour import MarkerSignal, coarse_ratio_signal, difference_signal, half_planes, ratio_signal
+from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
+from app.decoders.plate.detect_quads import MARKER_RATIO, MarkerQuad, detect_marker_quads
+from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, fit_warm_plates
+from app.decoders.plate.fit import PlateFit, fit_plate
 from app.decoders.plate.grade import grade_plate
+from app.decoders.plate.homography import project
+from app.decoders.plate.layout import marker_centroids, unit_centres
+from app.decoders.plate.marker_colours import MarkerColours, marker_colours
 from app.decoders.plate.pose import locate_plate
-from app.decoders.plate.quads import MARKER_RATIO, MarkerQuad, detect_marker_quads
-from app.decoders.plate.thermal import ORIENTATION_EVIDENCE, fit_warm_plates
-from app.decoders.plate.weighing import weigh_units
+from app.decoders.plate.unit_likelihoods import unit_log_likelihoods
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading
@@ -33,31 +31,65 @@ from app.sensors.camera import Camera
 
 DECODER_VERSION = "plate/1"
 DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
-SURE = 0.9995  # least probability at which digits are given out
-MOST_FITS = 5  # candidates that are fitted in one pass
-LEAST_EXPLAINED = 0.6  # share of the pixels' variance, below which nothing is a plate
-LEAST_EXPLAINED_ALONE = 0.83  # the same for digits that no registry confirms
-LEAST_EXPLAINED_SMALL, SMALL_UNIT_PX = 0.9, 2.5  # the same where a grid that lies wrong explains nearly as much
-LEAST_ROWS_ALONE = 1.5  # of the image over a unit, for digits that neither a check of 16 bits nor a registry confirms
-CLEAN_EXPLAINED = 0.93  # from which a word may be corrected without a registry
-STRONG_RANK = 3.5  # of a candidate that deserves a second geometry when the first explains nothing
-LEAST_MARGIN = 1.0  # colour margin of a marker that is there
-LEAST_MARGIN_ALONE = 2.2  # the same without a registry
-LEAST_TINT_ALONE = 0.35  # red or green of a marker against the median square, the same
-CAST_ALONE = (0.65, 1.5)  # blue and red of the units against their green, beyond which they are no greys, the same
-# after the coarse stage of a fit: margin and tint of the second weakest marker, cast of the units
+MIN_CONFIDENCE = 0.9995
+"""[probability] from which digits are returned. Source: no wrong digits (decision record 0005, rule 4)."""
+MAX_FITS = 5
+"""[candidates] that are fitted for one signal. Source: chosen by hand, for speed."""
+MIN_EXPLAINED = 0.6
+"""[1] share of the pixels' variance below which a candidate is no plate. Source: chosen by hand."""
+MIN_EXPLAINED_ALONE = 0.83
+"""[1] the same for digits that no registry confirms. Source: chosen by hand; effect: `python -m
+benchmarks.plates.thresholds`."""
+MIN_EXPLAINED_SMALL, SMALL_UNIT_PX = 0.9, 2.5
+"""[1, px] the same on units below this size, where a misplaced grid explains nearly as much. Source: chosen by hand;
+effect: `python -m benchmarks.plates.thresholds`."""
+MIN_ROWS_ALONE = 1.5
+"""[px] height of a unit in the image for digits that neither a check of 16 bits nor a registry confirms. Source: one
+wrong frame of 5,192 in the trials of `python -m benchmarks.plates trials`, seeds 71 and 72."""
+CLEAN_EXPLAINED = 0.93
+"""[1] share of variance from which a word may be corrected without a registry. Source: chosen by hand; effect: `python
+-m benchmarks.plates.thresholds`."""
+STRONG_RANK = 3.5
+"""[log odds] rank of a candidate that gets a second geometry when the first explains nothing. Source: chosen by
+hand."""
+MIN_MARGIN = 1.0
+"""[standard deviations] colour margin of a marker that is there. Source: chosen by hand."""
+MIN_MARGIN_ALONE = 2.2
+"""[standard deviations] the same without a registry. Source: chosen by hand; effect: `python -m
+benchmarks.plates.thresholds`."""
+MIN_TINT_ALONE = 0.35
+"""[median square] red or green of a marker, without a registry. Source: chosen by hand; effect: `python -m
+benchmarks.plates.thresholds`."""
+CAST_ALONE = (0.65, 1.5)
+"""[green] blue and red of the units beyond which they are not grey, without a registry. Source: chosen by hand; effect:
+`python -m benchmarks.plates.thresholds`."""
 COARSE_MARGIN, COARSE_TINT, COARSE_CAST = 1.5, 0.4, (0.74, 1.35)
-COARSE_WEAKEST = (1.0, 0.3)  # margin and tint of the weakest, unless a marker is missing on what is plainly a plate:
-PLAIN_EXPLAINED, PLAIN_MARGIN = 0.93, 8.0  # so much is explained, or the second weakest stands out so far
-LEAST_SIDE_PX = 24
-SAME_MARKER = 0.03  # distance of two candidates' markers, as a share of the plate, up to which one fit serves both
+"""Margin and tint of the second weakest marker and cast of the units for which a coarse fit is refined, units as above.
+Source: chosen by hand, for speed."""
+COARSE_WEAKEST = (1.0, 0.3)
+"""Margin and tint of the weakest marker, the same. Source: chosen by hand, for speed."""
+CLEAR_EXPLAINED, CLEAR_MARGIN = 0.93, 8.0
+"""Share of variance, or margin of the second weakest marker, with which the weakest may be missing. Source: chosen by
+hand."""
+MAX_CENTROID_SHIFT = (0.15, 1.5)
+"""[plate, px] distance of the fitted markers from the detected ones, the sum of both. Source: chosen by hand."""
+SIZE_MISFIT_RANGE, CLOSE_SIZE_MISFIT, WORN_RATIO = (-0.4, 0.55), 0.4, 0.95
+"""[log, log, 1] measured over expected `MARKER_RATIO` of a geometry that is tried, of one that is tried first, and the
+usual ratio. Source: chosen by hand; wear and blur change the size of markers."""
+SURE_CELL = 0.9
+"""[probability] of each cell above which a refusal is `unsure`, below it `cells-undecodable`. Source: chosen by
+hand."""
+MIN_SIDE_PX = 24
+"""[px] least side of a frame. Source: chosen by hand; no plate that can be read fits in less."""
+SAME_MARKER = 0.03
+"""[plate] distance of two candidates' markers up to which one fit serves both. Source: chosen by hand."""
 Frame = npt.NDArray[Any]
 Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """What is the same for all candidates of a frame, and the candidates fitted so far, good and bad."""
+    """What all candidates of a frame share, and the candidates fitted so far, good and bad."""
 
     image: Frame
     camera: Camera | None
@@ -67,13 +99,13 @@ class _Task:
 
     def fit_candidate(self, signal: MarkerSignal, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
         """Fit of a candidate; that of about the same markers in an earlier pass serves again."""
-        plain = True
+        has_colours = True
 
         def promising(plate_from_image: Array, explained: float) -> bool:
-            nonlocal plain
+            nonlocal has_colours
             colours = marker_colours(signal, plate_from_image, marker_centroids(geometry), unit_centres(geometry))
-            plain = _may_be_plate(colours, explained)
-            return plain
+            has_colours = _is_promising(colours, explained)
+            return has_colours
 
         reach_px = SAME_MARKER * np.ptp(quad.centroids_px, axis=0) + 0.5
         for known, centroids_px, earlier in self.fits:
@@ -81,7 +113,7 @@ class _Task:
             if known == geometry and (apart_px < reach_px).all():
                 return earlier
         fit = fit_plate(self.image, quad.centroids_px, geometry, promising=promising)
-        if plain:  # else another signal's colours may say more
+        if has_colours:  # else another signal may show them
             self.fits.append((geometry, quad.centroids_px, fit))
         if fit is not None and fit.explained > CLEAN_EXPLAINED:
             fitted_px = project(np.linalg.inv(fit.plate_from_image), marker_centroids(geometry))
@@ -106,7 +138,7 @@ def decode_plates(
     camera : Camera, optional
         Gives every reading a pose.
     codebook : sequence of PlateCode
-        Codes of the plates registered near by; they decide where the frame alone is in doubt.
+        Codes of the plates registered near by; they decide where the frame alone is uncertain.
     thermal : bool
         Dark units are warm, that is bright, and there are no colours.
     geometries : sequence of PlateGeometry
@@ -115,8 +147,8 @@ def decode_plates(
     Returns
     -------
     list of PlateReading
-        Read plates first; candidates that look like plates but were refused follow with their outcome. Nothing there
-        is an empty list.
+        Read plates first; candidates that look like plates but were refused follow with their outcome. Empty where
+        there is none.
 
     Raises
     ------
@@ -126,18 +158,18 @@ def decode_plates(
     _check(image, camera, thermal, geometries)
     task = _Task(image, camera, codebook, geometries)
     readings = _decode_thermal(task) if thermal else _decode_colour(task)
-    return list(_without_shadows(readings))
+    return list(_suppress_overlapping(readings))
 
 
 def _decode_colour(task: _Task) -> list[PlateReading]:
     image = task.image
     planes = half_planes(image)
     readings: list[PlateReading] = []
-    for signal_of in (vivid_signal, faint_signal, faintest_signal):
+    for signal_of in (difference_signal, ratio_signal, coarse_ratio_signal):
         signal = signal_of(planes)
-        for quad in detect_marker_quads(signal)[:MOST_FITS]:
+        for quad in detect_marker_quads(signal)[:MAX_FITS]:
             if not any(_covers(reading, quad) for reading in readings):
-                readings += _read(task, signal, quad)
+                readings += _read_candidate(task, signal, quad)
         if any(reading.code for reading in readings):
             break
     return readings
@@ -148,22 +180,22 @@ def _decode_thermal(task: _Task) -> list[PlateReading]:
     for geometry in task.geometries:
         for fits, evidence in fit_warm_plates(task.image, geometry):
             centre = fits[0].corners_px.mean(axis=0)
-            if fits[0].explained >= LEAST_EXPLAINED and not any(_inside(centre, r) for r in readings):
-                readings.append(_judge_orientations(task, fits, geometry, evidence))
+            if fits[0].explained >= MIN_EXPLAINED and not any(_inside(centre, r) for r in readings):
+                readings.append(_read_orientations(task, fits, geometry, evidence))
         if any(reading.code for reading in readings):
             break
     return readings
 
 
-def _judge_orientations(task: _Task, fits: list[PlateFit], geometry: PlateGeometry, evidence: float) -> PlateReading:
-    """Reading of the likeliest orientation; of another one only when the codebook confirms it."""
-    unsure = PlateOutcome.RED_MARKER_MISSING, "nothing tells the triangle from the squares"
+def _read_orientations(task: _Task, fits: list[PlateFit], geometry: PlateGeometry, evidence: float) -> PlateReading:
+    """Reading of the likeliest orientation; of another one only where the codebook confirms it."""
+    unsure = PlateOutcome.RED_MARKER_MISSING, "the triangle cannot be distinguished from the squares"
     first: PlateReading | None = None
     for fit in fits:
         missing = _out_of_view(task.image.shape, fit)
         if missing is None and (first is not None or evidence < ORIENTATION_EVIDENCE):
             missing = unsure
-        reading = _judge(task, fit, geometry, missing)
+        reading = _read_fit(task, fit, geometry, missing)
         if reading.code is not None:
             return reading
         first = first or reading
@@ -175,10 +207,10 @@ def _judge_orientations(task: _Task, fits: list[PlateFit], geometry: PlateGeomet
 
 def _check(image: Frame, camera: Camera | None, thermal: bool, geometries: Sequence[PlateGeometry]) -> None:
     if image.dtype != np.uint8 or image.ndim != (2 if thermal else 3) or (image.ndim == 3 and image.shape[2] != 3):
-        wanted = "(H, W) grey levels" if thermal else "(H, W, 3) blue, green, red"
-        raise InvalidParameter(f"a frame is uint8 {wanted}, not {image.dtype} {image.shape}", field="image")
-    if min(image.shape[:2]) < LEAST_SIDE_PX:
-        raise InvalidParameter("the frame is too small", field="image", limit=f"at least {LEAST_SIDE_PX} px a side")
+        expected = "(H, W) grey levels" if thermal else "(H, W, 3) blue, green, red"
+        raise InvalidParameter(f"a frame is uint8 {expected}, not {image.dtype} {image.shape}", field="image")
+    if min(image.shape[:2]) < MIN_SIDE_PX:
+        raise InvalidParameter("the frame is too small", field="image", limit=f"at least {MIN_SIDE_PX} px a side")
     if camera is not None and (camera.height_px, camera.width_px) != image.shape[:2]:
         raise InvalidParameter(
             f"the camera gives {camera.width_px} x {camera.height_px} px, the frame has "
@@ -201,8 +233,8 @@ def _inside(point_px: Array, reading: PlateReading) -> bool:
     return bool(((point_px > low) & (point_px < high)).all())
 
 
-def _without_shadows(readings: list[PlateReading]) -> Iterator[PlateReading]:
-    """Of candidates in one place only the read one, or the surest of those that were refused."""
+def _suppress_overlapping(readings: list[PlateReading]) -> Iterator[PlateReading]:
+    """Of candidates in one place only the read one, or the most probable of those that were refused."""
     kept: list[PlateReading] = []
     for reading in sorted(readings, key=lambda r: (r.code is None, -r.confidence)):
         centre = None if reading.corners_px is None else reading.corners_px.mean(axis=0)
@@ -213,25 +245,26 @@ def _without_shadows(readings: list[PlateReading]) -> Iterator[PlateReading]:
 
 def _likely_geometries(quad: MarkerQuad, geometries: Sequence[PlateGeometry]) -> list[PlateGeometry]:
     """Geometries whose markers may be as large as the candidate's, close ones first; wear makes markers smaller."""
-    misfit = {g: math.log(quad.size_ratio / (0.95 * MARKER_RATIO[g.n])) for g in geometries}
-    possible = [g for g in geometries if -0.4 < misfit[g] < 0.55] or [min(geometries, key=lambda g: abs(misfit[g]))]
-    return sorted(possible, key=lambda g: abs(misfit[g]) > 0.4)
+    misfit = {g: math.log(quad.size_ratio / (WORN_RATIO * MARKER_RATIO[g.n])) for g in geometries}
+    possible = [g for g in geometries if SIZE_MISFIT_RANGE[0] < misfit[g] < SIZE_MISFIT_RANGE[1]]
+    possible = possible or [min(geometries, key=lambda g: abs(misfit[g]))]
+    return sorted(possible, key=lambda g: abs(misfit[g]) > CLOSE_SIZE_MISFIT)
 
 
-def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateReading]:
+def _read_candidate(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateReading]:
     """The candidate's best reading under the geometries that fit it; empty when it is no plate."""
     best: PlateReading | None = None
     for geometry in _likely_geometries(quad, task.geometries):
         fit = task.fit_candidate(signal, quad, geometry)
-        if fit is None or fit.explained < LEAST_EXPLAINED:
+        if fit is None or fit.explained < MIN_EXPLAINED:
             if quad.rank < STRONG_RANK:
                 break
             continue
         colours = marker_colours(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
-        if np.sort(colours.margins)[1] < LEAST_MARGIN:
+        if np.sort(colours.margins)[1] < MIN_MARGIN:
             continue
-        missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins) or _odd_colours(colours)
-        reading = _judge(task, fit, geometry, missing, weakest_marker=float(colours.margins.min()))
+        missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins) or _wrong_colours(colours)
+        reading = _read_fit(task, fit, geometry, missing, weakest_marker=float(colours.margins.min()))
         if reading.code is not None:
             return [reading]
         if best is None or reading.confidence > best.confidence:
@@ -241,12 +274,12 @@ def _read(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateRead
     return [best] if best else []
 
 
-def _may_be_plate(colours: MarkerColours, explained: float) -> bool:
-    """Whether a coarse fit is worth a fine one: most of what is not a plate has no colours where a plate has them."""
+def _is_promising(colours: MarkerColours, explained: float) -> bool:
+    """Whether a coarse fit is refined: most of what is no plate lacks colours where a plate has them."""
     margins, tints = np.sort(colours.margins), np.sort(colours.tints)
     weakest = margins[0] >= COARSE_WEAKEST[0] and tints[0] >= COARSE_WEAKEST[1]
     return bool(
-        (weakest or explained >= PLAIN_EXPLAINED or margins[1] >= PLAIN_MARGIN)
+        (weakest or explained >= CLEAR_EXPLAINED or margins[1] >= CLEAR_MARGIN)
         and margins[1] >= COARSE_MARGIN
         and tints[1] >= COARSE_TINT
         and COARSE_CAST[0] < colours.cast.min()
@@ -254,7 +287,7 @@ def _may_be_plate(colours: MarkerColours, explained: float) -> bool:
     )
 
 
-def _judge(
+def _read_fit(
     task: _Task,
     fit: PlateFit,
     geometry: PlateGeometry,
@@ -271,15 +304,15 @@ def _judge(
         width_px=float(extent[0]),
         height_px=float(extent[1]),
     )
-    evidence = weigh_units(fit)
+    evidence = unit_log_likelihoods(fit)
     if evidence is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
         return replace(reading, outcome=outcome, reason=reason)
     thermal = task.image.ndim == 2
     decoded = decode_symbols(
-        evidence, geometry.n, task.codebook, SURE,
-        clean=fit.explained > CLEAN_EXPLAINED and not thermal,  # no colours vouch for the way it lies
-        most_damage=math.inf if thermal else MOST_DAMAGE,  # no stain hides a heater
+        evidence, geometry.n, task.codebook, MIN_CONFIDENCE,
+        clean=fit.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
+        max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
     )  # fmt: skip
     reading = replace(
         reading,
@@ -291,11 +324,11 @@ def _judge(
     if decoded.code is None:
         outcome, reason = missing or _undecoded(decoded)
         return replace(reading, outcome=outcome, reason=reason)
-    least = LEAST_EXPLAINED_SMALL if fit.unit_px < SMALL_UNIT_PX else LEAST_EXPLAINED_ALONE
-    weak = missing is not None or fit.explained < least
-    small = decoded.code.scheme is not PlateScheme.ID and float(extent.min()) < LEAST_ROWS_ALONE * geometry.n
+    min_explained = MIN_EXPLAINED_SMALL if fit.unit_px < SMALL_UNIT_PX else MIN_EXPLAINED_ALONE
+    weak = missing is not None or fit.explained < min_explained
+    small = decoded.code.scheme is not PlateScheme.ID and float(extent.min()) < MIN_ROWS_ALONE * geometry.n
     if small and not weak and not decoded.confirmed:
-        reason = f"a plate of less than {LEAST_ROWS_ALONE * geometry.n:g} rows, and nothing checks these digits"
+        reason = f"a plate of less than {MIN_ROWS_ALONE * geometry.n:g} rows, and these digits have no check"
         return replace(reading, outcome=PlateOutcome.UNSURE, reason=reason)
     if weak and not decoded.confirmed:
         outcome, reason = missing or (PlateOutcome.UNSURE, "the plate's pattern explains too little of the image")
@@ -311,37 +344,37 @@ def _judge(
 
 
 def _undecoded(decoded: DecodedSymbols) -> tuple[PlateOutcome, str]:
-    sure_cells = bool(decoded.cell_confidence) and min(decoded.cell_confidence) > 0.9
+    sure_cells = bool(decoded.cell_confidence) and min(decoded.cell_confidence) > SURE_CELL
     return (PlateOutcome.UNSURE if sure_cells else PlateOutcome.CELLS_UNDECODABLE), decoded.reason
 
 
 def _missing_parts(
     shape: tuple[int, ...], quad: MarkerQuad, fit: PlateFit, geometry: PlateGeometry, margins: Array
 ) -> tuple[PlateOutcome, str] | None:
-    """Which of the cases that the paper filters out this is, if any (PolyU, section II-D4)."""
+    """The case that the paper filters out, if it is one (PolyU, section II-D4), and the reason."""
     outside = _out_of_view(shape, fit)
     if outside is not None:
         return outside
-    if margins[0] < LEAST_MARGIN:
-        return PlateOutcome.RED_MARKER_MISSING, "no red triangle where it should be"
-    if margins[1:].min() < LEAST_MARGIN:
-        return PlateOutcome.GREEN_MARKER_MISSING, "a green square is not where it should be"
+    if margins[0] < MIN_MARGIN:
+        return PlateOutcome.RED_MARKER_MISSING, "there is no red triangle in its place"
+    if margins[1:].min() < MIN_MARGIN:
+        return PlateOutcome.GREEN_MARKER_MISSING, "a green square is missing from its place"
     fitted_px = project(np.linalg.inv(fit.plate_from_image), marker_centroids(geometry))
     moved = np.abs(fitted_px - quad.centroids_px).max(axis=0)
-    if (moved > 0.15 * np.ptp(fit.corners_px, axis=0) + 1.5).any():
+    if (moved > MAX_CENTROID_SHIFT[0] * np.ptp(fit.corners_px, axis=0) + MAX_CENTROID_SHIFT[1]).any():
         return PlateOutcome.VERTICES_BEYOND_MARKERS, "the grid's corners are not where the markers are"
     return None
 
 
-def _odd_colours(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
-    """A marker or units whose colours are not believed without a registry: a look-alike or a worn plate."""
-    pale = (colours.margins < LEAST_MARGIN_ALONE) | (colours.tints < LEAST_TINT_ALONE)
+def _wrong_colours(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
+    """A marker or units whose colours need a registry to confirm them: a look-alike or a worn plate."""
+    pale = (colours.margins < MIN_MARGIN_ALONE) | (colours.tints < MIN_TINT_ALONE)
     if pale[0]:
-        return PlateOutcome.RED_MARKER_MISSING, "what stands for the red triangle is hardly red"
+        return PlateOutcome.RED_MARKER_MISSING, "the red triangle is hardly red"
     if pale.any():
-        return PlateOutcome.GREEN_MARKER_MISSING, "what stands for a green square is hardly green"
+        return PlateOutcome.GREEN_MARKER_MISSING, "a green square is hardly green"
     if colours.cast.min() < CAST_ALONE[0] or colours.cast.max() > CAST_ALONE[1]:
-        return PlateOutcome.CELLS_UNDECODABLE, "what stands for the units is coloured"
+        return PlateOutcome.CELLS_UNDECODABLE, "the units are coloured"
     return None
 
 

@@ -1,4 +1,4 @@
-"""The 24 bytes of a message, explained one field after the other."""
+"""Explanation of the 24 bytes of a message, field by field."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from app.markers.cerpm_keys import message_tag
 
 @dataclass(frozen=True, slots=True)
 class ExplainedBytes:
-    """Some bytes of a message and what they say.
+    """Some bytes of a message and their meaning.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class ExplainedBytes:
 
 
 def explain_payload(payload: bytes, key: bytes | None = None) -> tuple[ExplainedBytes, ...]:
-    """What each byte of a message is for.
+    """Meaning of each byte of a message.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def explain_payload(payload: bytes, key: bytes | None = None) -> tuple[Explained
     Returns
     -------
     tuple of ExplainedBytes
-        In order, without a hole. Values that no marker sends are named as such, and nothing is refused for them.
+        In order, without gaps. Invalid values are described as such and not refused.
 
     Raises
     ------

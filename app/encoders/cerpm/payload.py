@@ -1,4 +1,4 @@
-"""CERPM message -> the 24 bytes that its marker sends."""
+"""CERPM message to the 24 bytes that its marker sends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BODY = struct.Struct(">BIiiHBI")
 
 
 def encode_message(message: CerpmMessage, key: bytes) -> bytes:
-    """What a marker sends.
+    """Payload of a message.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def encode_message(message: CerpmMessage, key: bytes) -> bytes:
     Returns
     -------
     bytes
-        24 of them, as `app.markers.cerpm` lays them out.
+        24 of them, in the layout of `app.markers.cerpm`.
 
     Raises
     ------
@@ -43,12 +43,12 @@ def encode_message(message: CerpmMessage, key: bytes) -> bytes:
 
 
 def encode_body(message: CerpmMessage) -> bytes:
-    """Bytes 0 to 19 of a message: all but the tag.
+    """Bytes 0 to 19 of a message: all except the tag.
 
     Notes
     -----
-    Degrees and height are rounded to their steps as the decimal numbers that people read, ties to even. +180 and -180
-    degrees of longitude stay as they are given: both are the antimeridian, and both fit.
+    Degrees and height are rounded to their steps in decimal arithmetic, ties to even. +180 and -180 degrees of
+    longitude are not normalized: both are the antimeridian, and both fit.
     """
     limit = message.speed_limit
     is_mph = limit is not None and limit.unit is SpeedUnit.MPH

@@ -1,4 +1,4 @@
-"""What one CERPM is programmed with, and a table of it for many."""
+"""Programs of CERPMs, and a table for programming many."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from app.encoders.cerpm.payload import encode_body
-from app.encoders.cerpm.settings import RadioSettings
 from app.errors import InvalidParameter
 from app.markers.cerpm import KEY_BYTES, CerpmMessage, LaneSide, SpeedUnit
+from app.radio.settings import RadioSettings
 
-SEQUENCE_AT = 16
-"""First of the four bytes of a body that the marker counts up. [bytes]"""
-MAX_PROGRAMS = 100_000
+SEQUENCE_AT = 16  # [bytes] first of the four bytes of the sequence; source: docs/cerpm-message.md
+MAX_PROGRAMS = 100_000  # source: by hand, bounds the size of a table
 COLUMNS = (
     "number", "lon_deg", "lat_deg", "height_m", "side", "speed_limit", "speed_unit", "body_hex", "sequence_start",
     "interval_s", "jitter_share", "frequency_hz", "channels", "hopping", "spreading_factor", "bandwidth_hz",
@@ -25,14 +24,14 @@ KEY_COLUMN = "key_hex"
 
 @dataclass(frozen=True, slots=True)
 class MarkerProgram:
-    """What one marker is programmed with.
+    """Program of one marker.
 
     Parameters
     ----------
     message : CerpmMessage
-        Its first: with the sequence that it starts at, above all that it ever sent.
+        The first one: its sequence is above all that the marker ever sent.
     key : bytes
-        The marker's own, 16 bytes; kept out of representations.
+        The marker's own, 16 bytes; not shown by `repr`.
     radio : RadioSettings
 
     Raises
@@ -54,22 +53,17 @@ class MarkerProgram:
         """Bytes 0 to 19 of the first message; the marker counts bytes 16 to 19 up and adds the tag itself."""
         return encode_body(self.message)
 
-    @property
-    def last_sequence_years(self) -> float:
-        """How long the sequence lasts at this interval. [year]"""
-        return (2**32 - self.message.sequence) * self.radio.interval_s / (365.25 * 86_400)
-
 
 def write_programs_csv(programs: Sequence[MarkerProgram], *, with_keys: bool = False) -> str:
-    """A table for programming many markers: a header, then one row a marker.
+    """Table for programming many markers: a header, then one row a marker.
 
     Parameters
     ----------
     programs : sequence of MarkerProgram
         Of one agency: numbers differ. At most 100,000.
     with_keys : bool
-        Add the column ``key_hex``. Who has such a table can speak for its markers: hand it to the programming station
-        and to nobody else.
+        Add the column ``key_hex``. Whoever has such a table can send for its markers: give it only to the
+        programming station.
 
     Returns
     -------

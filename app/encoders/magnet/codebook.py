@@ -1,4 +1,4 @@
-"""Giving codes to meanings, so far apart that a decoder does not take one for another."""
+"""Assignment of codes to meanings, far enough apart that a decoder does not take one for another."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class CodebookRules:
     conditions : ReadingConditions
         The worst under which the codes must be read.
     confusion : float
-        Most probability with which a code may be taken for another one, the polarities being read right.
+        Largest probability with which a code may be taken for another one, the polarities being read right.
     wrong_way_safe : bool
-        No code is the reverse of another one, nor its own, nor too near to it: so every reading tells the direction.
+        No code is the reverse of another one, nor its own, nor too near to it: every reading shows the direction.
     survive_missing : bool
-        A code is told even when any one of its magnets is missed; from four magnets on.
+        A code is read even when any one of its magnets is missed; from four magnets on.
     """
 
     conditions: ReadingConditions = field(default_factory=ReadingConditions)
@@ -56,7 +56,7 @@ class CodebookRules:
 
 
 def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookRules) -> Codebook:
-    """Give codes to further meanings; codes given before stay as they are.
+    """Assign codes to further meanings; codes assigned before stay as they are.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookR
     -------
     Codebook
         With the meanings added in their order. The same book, meanings and rules always give the same codes. Of
-        designs with more than 4000 placements, that many at equal ranks are given out.
+        designs with more than 4000 placements, that many at equal ranks are assigned.
 
     Raises
     ------
@@ -92,24 +92,24 @@ def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookR
     for tag in book.tags:
         space.take(tag)
     free = space.list_free()
-    given: list[tuple[InformationTag, Meaning]] = []
+    assigned: list[tuple[InformationTag, Meaning]] = []
     for meaning in meanings:
         chosen = next(free, None)
         if chosen is None:
-            raise _full(book, len(meanings), len(given), rules)
+            raise _full(book, len(meanings), len(assigned), rules)
         space.take(chosen)
-        given.append((chosen, meaning))
-    return Codebook(book.name, book.design, (*book.entries, *given))
+        assigned.append((chosen, meaning))
+    return Codebook(book.name, book.design, (*book.entries, *assigned))
 
 
-def codebook_capacity(design: TagDesign, rules: CodebookRules, *, most: int = 100_000) -> int:
-    """Codes that an empty book of a design takes under these rules, counted up to `most`."""
+def codebook_capacity(design: TagDesign, rules: CodebookRules, *, max_count: int = 100_000) -> int:
+    """Codes that an empty book of a design takes under these rules, counted up to `max_count`."""
     space = _CodeSpace(design, rules)
     count = 0
     for tag in space.list_free():
         space.take(tag)
         count += 1
-        if count == most:
+        if count == max_count:
             break
     return count
 

@@ -1,13 +1,13 @@
-"""The drilling sheet: a layout with what was checked and what it costs, for the writers."""
+"""The drilling sheet: a layout with its checks and its costs, for the writers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
 
-from app.encoders.magnet.checks import Check, Site, check_layout
-from app.encoders.magnet.costs import Bill, bill_of_materials
+from app.encoders.magnet.bill import Bill
 from app.encoders.magnet.layout import MagnetLayout
+from app.markers.checks import Check
 
 
 class SheetFormat(StrEnum):
@@ -35,8 +35,3 @@ class DrillingSheet:
     def passed(self) -> bool:
         """Whether every check passed."""
         return all(check.passed for check in self.checks)
-
-
-def drilling_sheet(layout: MagnetLayout, site: Site | None = None) -> DrillingSheet:
-    """Check a layout and count its materials."""
-    return DrillingSheet(layout, check_layout(layout, site or Site()), bill_of_materials(layout))

@@ -1,29 +1,21 @@
-"""Drilling sheet -> PDF: the plan to scale with every pole drawn, the table of holes, the checks and the bill.
+"""Drilling sheets to PDF: the plan to scale with every pole drawn, the table of holes, the checks and the bill.
 
 A4 on its side. Magnets are drawn larger than they are; the thin cross line through each is the place of its hole.
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
-from importlib import resources
 from itertools import pairwise
 from typing import Any
-
-from reportlab.lib.colors import HexColor
-from reportlab.pdfbase import pdfmetrics
-from reportlab.pdfbase.ttfonts import TTFont
-from reportlab.pdfgen.canvas import Canvas
 
 from app.encoders.magnet.layout import Hole
 from app.encoders.magnet.sheet import DrillingSheet
 from app.encoders.magnet.sheet_csv import fixed
+from app.encoders.pdf import POINTS_PER_MM, Canvas, EmbeddedFont, PdfFile
 from app.markers.magnet import InformationTag, Orientation, Polarity
 
 PAGE_MM = (297.0, 210.0)
-POINTS_PER_MM = 72.0 / 25.4
 PLAN_MM = 250.0
 SCALES = (5, 10, 20, 25, 50, 100, 125)
 LINE_SCALE = 200
@@ -32,8 +24,9 @@ HOLE_LINE_MM = 0.11
 
 _LEFT_MM, _RIGHT_MM, _BOTTOM_MM = 15.0, 282.0, 16.0
 _PLAN_LEFT_MM = 23.5
-_REGULAR, _BOLD = "WaymarkVera", "WaymarkVera-Bold"
-_BLACK, _GREY, _RED, _BLUE, _PALE = (HexColor(c) for c in ("#111111", "#777777", "#c8102e", "#1f4e9e", "#f0f0f0"))
+_REGULAR, _BOLD = "Regular", "Bold"
+_BLACK, _GREY, _RED, _BLUE, _PALE, _WHITE = "#111111", "#777777", "#c8102e", "#1f4e9e", "#f0f0f0", "#ffffff"
+_THIN_MM = 0.2
 _NOTES = (
     "Positions are WGS 84; distances are level, at the road's height. Bearings are clockwise from true north.",
     "Before gluing, hold a compass to each magnet: the pole marked N pushes the needle's north end away. "
@@ -64,8 +57,12 @@ def write_sheet_pdf(sheet: DrillingSheet) -> bytes:
     bytes
         PDF with embedded fonts. The same sheet always gives the same bytes.
     """
-    pages = _draw(sheet, pages=0)[1]
-    return _draw(sheet, pages)[0]
+    paper = _Paper(sheet)
+    _draw_plan(paper, sheet)
+    _draw_holes(paper, sheet)
+    _draw_checks(paper, sheet)
+    _draw_bill(paper, sheet)
+    return paper.to_bytes()
 
 
 def plan_scale(sheet: DrillingSheet) -> int:
@@ -75,86 +72,62 @@ def plan_scale(sheet: DrillingSheet) -> int:
     return next(scale for scale in SCALES if sheet.layout.length_m * 1000 / scale <= PLAN_MM)
 
 
-def _draw(sheet: DrillingSheet, pages: int) -> tuple[bytes, int]:
-    stream = io.BytesIO()
-    paper = _Paper(stream, sheet, pages)
-    _draw_plan(paper, sheet)
-    _draw_holes(paper, sheet)
-    _draw_checks(paper, sheet)
-    _draw_bill(paper, sheet)
-    paper.close()
-    return stream.getvalue(), paper.page
-
-
 class _Paper:
-    """Pages in millimetres from the lower left corner, with a cursor `y_mm` that runs down."""
+    """Pages in millimetres from the lower left corner, with a cursor `y_mm` that moves down."""
 
-    def __init__(self, stream: io.BytesIO, sheet: DrillingSheet, pages: int) -> None:
-        _register_fonts()
-        size = (PAGE_MM[0] * POINTS_PER_MM, PAGE_MM[1] * POINTS_PER_MM)
-        self.canvas = Canvas(stream, pagesize=size, invariant=1, initialFontName=_REGULAR)
-        self.canvas.setTitle(f"Drilling sheet {sheet.layout.name}")
-        self.canvas.setCreator("Waymark")
-        self.canvas.setAuthor("Waymark")
-        self.canvas.setProducer("Waymark")
-        self.page, self._pages, self._sheet = 0, pages, sheet
+    def __init__(self, sheet: DrillingSheet) -> None:
+        self._sheet = sheet
+        self._fonts = {_REGULAR: EmbeddedFont(), _BOLD: EmbeddedFont(bold=True)}
+        self._pages: list[Canvas] = []
         self._begin()
 
-    def close(self) -> None:
-        self.canvas.showPage()
-        self.canvas.save()
+    @property
+    def canvas(self) -> Canvas:
+        """The page that is drawn."""
+        return self._pages[-1]
+
+    def to_bytes(self) -> bytes:
+        """The file; every page gets its number and the number of pages."""
+        for number, page in enumerate(self._pages, start=1):
+            footer = f"Waymark drilling sheet, page {number} of {len(self._pages)}"
+            page.text(_RIGHT_MM, 7, footer, font=_REGULAR, points=6.5, colour=_GREY, anchor="end")
+        file = PdfFile(f"Drilling sheet {self._sheet.layout.name}")
+        fonts = " ".join(f"/{name} {font.add_to(file)} 0 R" for name, font in self._fonts.items())
+        resources = file.add(f"<< /Font << {fonts} >> >>".encode())
+        for page in self._pages:
+            file.add_page({"MediaBox": (0.0, 0.0, *PAGE_MM)}, resources, page.content())
+        return file.to_bytes()
 
     def need(self, height_mm: float) -> bool:
         """Turn the page unless so much room is left; whether it was turned."""
         if self.y_mm - height_mm >= _BOTTOM_MM:
             return False
-        self.canvas.showPage()
         self._begin()
         return True
 
     def text(
         self, x: float, y: float, text: str, points: float = 7.5, *, bold: bool = False, anchor: str = "start",
-        colour: Any = _BLACK, width: float | None = None,
+        colour: str = _BLACK, width: float | None = None,
     ) -> None:  # fmt: skip
         """A line of text, made smaller where it is wider than `width`."""
-        name = _BOLD if bold else _REGULAR
-        drawn = _drawable(text)
+        font = _BOLD if bold else _REGULAR
         if width is not None:
-            points = min(
-                points, points * width * POINTS_PER_MM / max(pdfmetrics.stringWidth(drawn, name, points), 1e-9)
-            )
-        self.canvas.setFont(name, points)
-        self.canvas.setFillColor(colour)
-        draw = {
-            "start": self.canvas.drawString,
-            "middle": self.canvas.drawCentredString,
-            "end": self.canvas.drawRightString,
-        }
-        draw[anchor](x * POINTS_PER_MM, y * POINTS_PER_MM, drawn)
+            points = min(points, points * width / max(self._fonts[font].width_mm(text, points), 1e-9))
+        self.canvas.text(x, y, text, font=font, points=points, colour=colour, anchor=anchor)
 
-    def lines(self, points: Iterable[tuple[float, float]], width: float = 0.2, colour: Any = _BLACK) -> None:
+    def lines(
+        self, points: Iterable[tuple[float, float]], width: float = _THIN_MM, colour: str = _BLACK,
+        dash: Sequence[int] = (),
+    ) -> None:  # fmt: skip
         """An open line through points."""
-        self.canvas.setStrokeColor(colour)
-        self.canvas.setLineWidth(width * POINTS_PER_MM)
-        path = self.canvas.beginPath()
-        for i, (x, y) in enumerate(points):
-            (path.lineTo if i else path.moveTo)(x * POINTS_PER_MM, y * POINTS_PER_MM)
-        self.canvas.drawPath(path)
-
-    def box(self, x: float, y: float, width: float, height: float, fill: Any, stroke: bool = False) -> None:
-        """A filled rectangle."""
-        self.canvas.setFillColor(fill)
-        self.canvas.setStrokeColor(_BLACK)
-        self.canvas.setLineWidth(0.2 * POINTS_PER_MM)
-        corner = (x * POINTS_PER_MM, y * POINTS_PER_MM, width * POINTS_PER_MM, height * POINTS_PER_MM)
-        self.canvas.rect(*corner, fill=1, stroke=int(stroke))
+        self.canvas.lines(points, width_mm=width, colour=colour, dash=dash)
 
     def heading(self, title: str) -> None:
         self.text(_LEFT_MM, self.y_mm, title, 9, bold=True)
         self.y_mm -= 5.5
 
     def _begin(self) -> None:
-        self.page += 1
+        self._pages.append(Canvas(self._fonts))
         layout, passed = self._sheet.layout, self._sheet.passed
         self.text(_LEFT_MM, 196, layout.name, 14, bold=True, width=150)
         verdict = "all checks passed" if passed else "NOT all checks passed"
@@ -169,8 +142,6 @@ class _Paper:
         self.lines([(_LEFT_MM, 187.5), (_RIGHT_MM, 187.5)])
         for i, note in enumerate(_NOTES):
             self.text(_LEFT_MM, 10.5 - 3.5 * i, note, 6.5, colour=_GREY)
-        pages = f" of {self._pages}" if self._pages else ""
-        self.text(_RIGHT_MM, 7, f"Waymark drilling sheet, page {self.page}{pages}", 6.5, anchor="end", colour=_GREY)
         self.y_mm = 181.0
 
 
@@ -237,9 +208,7 @@ def _draw_lane(paper: _Paper, sheet: DrillingSheet, start_m: float, per_m: float
         if abs(left_m) * per_m > 14.0:  # it would cross what else is drawn
             return 0.0
         points.append((_PLAN_LEFT_MM + float(away @ along) * per_m, axis_mm + left_m * per_m))
-    paper.canvas.setDash(4, 3)
-    paper.lines(points, 0.3, _GREY)
-    paper.canvas.setDash()
+    paper.lines(points, 0.3, _GREY, dash=(4, 3))
     return float(axis_mm - min(y for _, y in points))
 
 
@@ -247,15 +216,14 @@ def _draw_magnet(paper: _Paper, hole: Hole, x: float, y: float, size: float) -> 
     """A magnet with its poles: red and N where the north pole is."""
     if hole.orientation is Orientation.UP:
         up = hole.polarity
-        paper.canvas.setFillColor(_RED if up is Polarity.N else _BLUE)
-        paper.canvas.setStrokeColor(_BLACK)
-        paper.canvas.setLineWidth(0.2 * POINTS_PER_MM)
-        paper.canvas.circle(x * POINTS_PER_MM, y * POINTS_PER_MM, size / 2 * 0.7 * POINTS_PER_MM, fill=1, stroke=1)
+        fill = _RED if up is Polarity.N else _BLUE
+        paper.canvas.circle(x, y, size / 2 * 0.7, fill=fill, outline=_BLACK, width_mm=_THIN_MM)
         _pole_letter(paper, up, x, y, size)
     else:
         forward = hole.polarity
         for pole, left in ((forward.flipped, x - size / 2), (forward, x)):
-            paper.box(left, y - size / 4, size / 2, size / 2, _RED if pole is Polarity.N else _BLUE)
+            fill = _RED if pole is Polarity.N else _BLUE
+            paper.canvas.box(left, y - size / 4, size / 2, size / 2, fill=fill)
             _pole_letter(paper, pole, left + size / 4, y, size * 0.75)
     for end in (7.0, -7.0):
         paper.lines([(x, y + end), (x, y + end * 0.035 * size)], HOLE_LINE_MM)
@@ -264,9 +232,8 @@ def _draw_magnet(paper: _Paper, hole: Hole, x: float, y: float, size: float) -> 
 
 def _pole_letter(paper: _Paper, pole: Polarity, x: float, y: float, size: float) -> None:
     points = size * 0.35 * POINTS_PER_MM
-    paper.text(
-        x, y - 0.37 * points / POINTS_PER_MM, pole.value, points, bold=True, anchor="middle", colour=HexColor("#ffffff")
-    )
+    middle = y - 0.37 * points / POINTS_PER_MM
+    paper.text(x, middle, pole.value, points, bold=True, anchor="middle", colour=_WHITE)
 
 
 def _draw_travel(paper: _Paper, y: float) -> None:
@@ -295,7 +262,7 @@ def _draw_holes(paper: _Paper, sheet: DrillingSheet) -> None:
         if paper.need(5.0):
             _hole_titles(paper)
         if hole.number % 2:
-            paper.box(_LEFT_MM, paper.y_mm - 1.3, _RIGHT_MM - _LEFT_MM, 4.6, _PALE)
+            paper.canvas.box(_LEFT_MM, paper.y_mm - 1.3, _RIGHT_MM - _LEFT_MM, 4.6, fill=_PALE)
         for _, right, cell in _HOLE_COLUMNS:
             paper.text(right, paper.y_mm, cell(hole, float(gap_m)), 7.5, anchor="end")
         paper.y_mm -= 4.6
@@ -345,20 +312,3 @@ def _draw_bill(paper: _Paper, sheet: DrillingSheet) -> None:
 
 def _bearing(degrees: float | None) -> str:
     return "-" if degrees is None else fixed(round(degrees, 2) % 360.0, 2)
-
-
-# --- fonts ----------------------------------------------------------------------------------------------------------
-
-
-@lru_cache(maxsize=1)
-def _register_fonts() -> None:
-    """Bitstream Vera, which reportlab carries: its licence allows embedding."""
-    for name, file in ((_REGULAR, "Vera.ttf"), (_BOLD, "VeraBd.ttf")):
-        content = (resources.files("reportlab") / "fonts" / file).read_bytes()
-        pdfmetrics.registerFont(TTFont(name, io.BytesIO(content)))
-
-
-def _drawable(text: str) -> str:
-    """Text in which characters that the font lacks are question marks."""
-    known = pdfmetrics.getFont(_REGULAR).face.charToGlyph
-    return "".join(c if ord(c) in known else "?" for c in text)

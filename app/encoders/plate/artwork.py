@@ -1,4 +1,4 @@
-"""Orders -> drawings: one plate on its sheet, or many nested on sheets of a given size."""
+"""Orders to drawings: one plate on its sheet, or many nested on sheets of a chosen size."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def tile_mm(geometry: PlateGeometry) -> tuple[float, float]:
 
 
 def encode_plate(order: PlateOrder, options: ArtworkOptions = PLAIN) -> Drawing:
-    """Draw one plate at true size, with everything that the margin tells the workshop.
+    """Draw one plate at true size, with the information for the workshop in its margin.
 
     Parameters
     ----------
@@ -73,15 +73,15 @@ def encode_sheets(
         The sheet is too small for one plate with its margins, or there are no plates.
     """
     if not orders:
-        raise InvalidParameter("there is no plate to nest", field="plates", limit="1 or more")
+        raise InvalidParameter("there are no plates to nest", field="plates", limit="1 or more")
     tiles = [tile_mm(order.geometry) for order in orders]
     tile_width, tile_height = max(w for w, _ in tiles), max(h for _, h in tiles)
-    for name, value, least in (("width_mm", width_mm, tile_width), ("height_mm", height_mm, tile_height)):
-        if not least <= value <= MAX_SHEET_MM:
+    for name, value, minimum in (("width_mm", width_mm, tile_width), ("height_mm", height_mm, tile_height)):
+        if not minimum <= value <= MAX_SHEET_MM:
             raise InvalidParameter(
-                f"{name} of the sheet is {value:g} mm, the largest plate needs {least:g} mm with its margins",
+                f"{name} of the sheet is {value:g} mm, the largest plate needs {minimum:g} mm with its margins",
                 field=f"sheet.{name}",
-                limit=f"{least:g} to {MAX_SHEET_MM:g} mm",
+                limit=f"{minimum:g} to {MAX_SHEET_MM:g} mm",
                 cure="choose a larger sheet, or smaller plates",
             )
     columns, rows = int(width_mm // tile_width), int(height_mm // tile_height)

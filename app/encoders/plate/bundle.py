@@ -1,4 +1,4 @@
-"""A selection of plates -> one ZIP: artwork, manifest and quality sheet."""
+"""A selection of plates to one ZIP: artwork, manifest and quality sheet."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _LONGEST_STEM = 60
 
 @dataclass(frozen=True, slots=True)
 class BundleOptions:
-    """What a bundle holds.
+    """Contents of a bundle.
 
     Parameters
     ----------
@@ -70,14 +70,14 @@ def write_bundle(
     options : BundleOptions, optional
         PDF and SVG by default.
     read : callable, optional
-        Reader for the self-proof; without it nothing is proved, and the manifest says so.
+        Reader that reads each drawing back; without it nothing is proved, which the manifest states.
     progress : callable, optional
-        Told the number of plates done after each.
+        Called with the number of finished plates after each one.
 
     Returns
     -------
     dict
-        The manifest, as it lies in the ZIP.
+        The manifest, as it is in the ZIP.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def write_bundle(
             cure="split the selection",
         )
     if not options.formats:
-        raise InvalidParameter("no format was asked for", field="formats", limit="at least one of svg, pdf, dxf, png")
+        raise InvalidParameter("no format was requested", field="formats", limit="at least one of svg, pdf, dxf, png")
     names = safe_names([f"{order.plate_id}-r{order.revision}" for order in orders])
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
         packer = _Packer(archive)

@@ -1,4 +1,4 @@
-"""Colours of a plate as data: what the fabricator buys, what the inspector measures, what the files show.
+"""Colours of a plate as data: what the fabricator buys, the inspector measures and the files show.
 
 Sources: ASTM D4956 (retroreflective sheeting) and its daytime chromaticity limits as printed in 23 CFR 655, subpart F,
 appendix, table 1; ASTM D6628 (colour of retroreflective pavement marking); RAL Classic "traffic" colours.
@@ -33,7 +33,7 @@ class ColourSpec:
     marking : str
         ASTM D6628 colour, or why there is none.
     chromaticity_xy : tuple of (x, y)
-        Corners of the permitted daytime region, CIE 1931, illuminant D65, 45/0; empty where none is laid down.
+        Corners of the permitted daytime region, CIE 1931, illuminant D65, 45/0; empty where none is specified.
     """
 
     layer: Layer

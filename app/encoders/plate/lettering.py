@@ -1,6 +1,5 @@
-"""Text as outlines, so that no file needs a font where it is opened.
+"""Text as outlines: no file needs a font where it is opened.
 
-Bitstream Vera, which reportlab carries (its licence allows embedding), is read once from the installed package.
 Glyph coordinates are font units, y up; a run of text is a path per character, cached both per character and per text.
 """
 
@@ -8,15 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import resources
 from typing import Any
 
 import numpy as np
 from fontTools.pens.basePen import BasePen
 from fontTools.pens.transformPen import TransformPen
-from fontTools.ttLib import TTFont
 
 from app.encoders.plate.drawing import FloatArray, Text
+from app.encoders.typeface import load_typeface
 
 _SHRINK = 1 / 8  # 256 units to the em: 0.02 mm on a 2.4 mm capital, and files a third smaller
 CAPITAL_UNITS = 1493.0 * _SHRINK
@@ -74,17 +72,10 @@ class _OutlinePen(BasePen):  # type: ignore[misc]
         self._at = (round(self.contours[-1][0][0]), round(self.contours[-1][0][1]))
 
 
-@lru_cache(maxsize=1)
-def _font() -> tuple[Any, dict[int, str]]:
-    with resources.as_file(resources.files("reportlab") / "fonts" / "Vera.ttf") as path:
-        font = TTFont(str(path), lazy=False)
-    return font.getGlyphSet(), font.getBestCmap()
-
-
 @lru_cache(maxsize=1024)
 def _glyph(character: str) -> _Glyph:
-    glyphs, names = _font()
-    name = names.get(ord(character), ".notdef")
+    face = load_typeface()
+    glyphs, name = face.glyphs, face.glyph_name(character, ".notdef")
     pen = _OutlinePen(glyphs)
     glyphs[name].draw(TransformPen(pen, (_SHRINK, 0, 0, _SHRINK, 0, 0)))
     contours = tuple(np.array(contour) for contour in pen.contours)

@@ -1,6 +1,6 @@
-"""What the sheet says round a plate: who it is, how large, which way up, where it lies, and a QR to its record.
+"""The margin around a plate on its sheet: its id, size, orientation and position, and a QR code to its record.
 
-Frame: millimetres from the plate's centre, y up, so that a margin and its face move together.
+Frame: millimetres from the plate's centre, y up, a margin and its face move together.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SIDE_TOLERANCE_MM = 0.5
 UNIT_TOLERANCE_MM = 0.3
 
 _CROP_FROM_MM, _CROP_TO_MM = 7.0, 15.0
-_HAIRLINE_MM = 0.2
+HAIRLINE_MM = 0.2
 _LABEL_WIDTH_MM = 20.0
 _ROW_MM = 5.2
 _TEXT_MM = 2.4
@@ -36,10 +36,10 @@ def fixed_margin(geometry: PlateGeometry) -> tuple[Part, ...]:
     """What the margin of every plate of a geometry shows."""
     half = geometry.side_mm / 2
     return (
-        Stroke(Layer.CUT, box_points(-half, -half, half, half), _HAIRLINE_MM, closed=True),
-        *_crop_marks(half),
+        Stroke(Layer.CUT, box_points(-half, -half, half, half), HAIRLINE_MM, closed=True),
+        *crop_marks(half),
         *_travel_arrow(half),
-        *_dimension(half, f"{geometry.side_mm:g} mm ± {SIDE_TOLERANCE_MM:g} outer edge, border gap included"),
+        *dimension(half, f"{geometry.side_mm:g} mm ± {SIDE_TOLERANCE_MM:g} outer edge, border gap included"),
         *_scale_bar(-half, -half - 66.0),
         *_arrow(Layer.ENGRAVE, half - QR_SIDE_MM - 7.0, -half - 27.0 - QR_SIDE_MM / 2 - 6.0, 5.0, 12.0),
         Text(Layer.NOTE, "Engrave on the back", half, -half - 62.2, 1.8, "end"),
@@ -47,7 +47,7 @@ def fixed_margin(geometry: PlateGeometry) -> tuple[Part, ...]:
 
 
 def plate_margin(order: PlateOrder) -> tuple[Part, ...]:
-    """What the margin says of one plate."""
+    """The margin's parts that depend on the plate."""
     half = order.geometry.side_mm / 2
     room = order.geometry.side_mm / 2 - 22.0
     id_mm = fitted_height_mm(order.plate_id, 5.0, room)
@@ -92,11 +92,12 @@ def _back_mark(order: PlateOrder, right: float, top: float) -> list[Part]:
     id_mm = fitted_height_mm(order.plate_id, 2.4, QR_SIDE_MM + 10.0)
     parts: list[Part] = [Text(Layer.ENGRAVE, order.plate_id, right, top - QR_SIDE_MM - 5.6, id_mm, "end")]
     if order.record_url:
-        parts.append(_qr(order.record_url, right - QR_SIDE_MM, top))
+        parts.append(qr_code(order.record_url, right - QR_SIDE_MM, top))
     return parts
 
 
-def _qr(url: str, left: float, top: float) -> Modules:
+def qr_code(url: str, left: float, top: float) -> Modules:
+    """QR code of an address, by the place of its upper left corner."""
     modules = qr_modules(url).astype(np.int8)
     edges = np.diff(np.pad(modules, ((0, 0), (1, 1))), axis=1)
     row, start = np.nonzero(edges == 1)
@@ -105,7 +106,8 @@ def _qr(url: str, left: float, top: float) -> Modules:
     return Modules(Layer.ENGRAVE, runs, QR_SIDE_MM / len(modules), left, top)
 
 
-def _crop_marks(half: float) -> list[Part]:
+def crop_marks(half: float) -> list[Part]:
+    """Marks at the corners of a square of this half side."""
     marks: list[Part] = []
     for sx in (-1, 1):
         for sy in (-1, 1):
@@ -113,7 +115,7 @@ def _crop_marks(half: float) -> list[Part]:
                 [(sx * half, sy * (half + _CROP_FROM_MM)), (sx * half, sy * (half + _CROP_TO_MM))],
                 [(sx * (half + _CROP_FROM_MM), sy * half), (sx * (half + _CROP_TO_MM), sy * half)],
             ):
-                marks.append(Stroke(Layer.CROP, np.array(ends, dtype=np.float64), _HAIRLINE_MM))
+                marks.append(Stroke(Layer.CROP, np.array(ends, dtype=np.float64), HAIRLINE_MM))
     return marks
 
 
@@ -136,7 +138,7 @@ def _travel_arrow(half: float) -> list[Part]:
     return [*_arrow(Layer.NOTE, 0.0, bottom, 8.0, 14.0), Text(Layer.NOTE, "travel", 0.0, bottom - 4.0, 2.0, "middle")]
 
 
-def _dimension(half: float, label: str) -> list[Part]:
+def dimension(half: float, label: str) -> list[Part]:
     """Dimension line under the plate, broken by its label, with arrowheads that touch the plate's edges."""
     y, height = -half - 20.0, 2.4
     clear = text_width_mm(label, height) / 2 + 3.0
@@ -144,9 +146,9 @@ def _dimension(half: float, label: str) -> list[Part]:
     for side in (-1.0, 1.0):
         tip = side * half
         parts += [
-            Stroke(Layer.NOTE, np.array([(tip - side * 3.0, y), (side * clear, y)]), _HAIRLINE_MM),
+            Stroke(Layer.NOTE, np.array([(tip - side * 3.0, y), (side * clear, y)]), HAIRLINE_MM),
             Shape(Layer.NOTE, np.array([(tip, y), (tip - side * 3.0, y + 0.8), (tip - side * 3.0, y - 0.8)])),
-            Stroke(Layer.NOTE, np.array([(tip, y + 2.5), (tip, y - 2.5)]), _HAIRLINE_MM),
+            Stroke(Layer.NOTE, np.array([(tip, y + 2.5), (tip, y - 2.5)]), HAIRLINE_MM),
         ]
     return parts
 
@@ -159,7 +161,7 @@ def _scale_bar(left: float, bottom: float) -> list[Part]:
     labels = [Text(Layer.NOTE, f"{x}", left + x, bottom + 4.0, 1.8, "middle") for x in (50, 100)]
     return [
         Boxes(Layer.NOTE, boxes),
-        Stroke(Layer.NOTE, frame, _HAIRLINE_MM, closed=True),
+        Stroke(Layer.NOTE, frame, HAIRLINE_MM, closed=True),
         Text(Layer.NOTE, "0", left, bottom + 4.0, 1.8, "middle"),
         *labels,
         Text(Layer.NOTE, "mm", left + SCALE_BAR_MM + 3.0, bottom + 0.4, 1.8),

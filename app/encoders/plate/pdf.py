@@ -1,18 +1,14 @@
-"""Drawing -> PDF at true size, every layer in a spot ink of its own.
-
-Written by hand: a drawing needs a dozen kinds of PDF object (ISO 32000-1), and reportlab takes ten times as long for
-them, names a font that is not embedded on every page, and packs streams as text.
-"""
+"""Drawings to PDF at true size, every layer in a spot ink of its own."""
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
 
+from app.encoders.pdf import POINTS_PER_MM, Box, PdfFile
 from app.encoders.plate.colours import INKS
 from app.encoders.plate.drawing import (
     FACE_LAYERS,
@@ -29,12 +25,9 @@ from app.encoders.plate.drawing import (
 )
 from app.encoders.plate.lettering import origin_mm, pdf_run, run_units, scale_mm
 
-POINTS_PER_MM = 72.0 / 25.4
 _INK_NAMES = {Layer.BLEED: str(Layer.BASE), Layer.CROP: "All"}
 """Bleed is printed with the base's ink; crop marks are in the registration colour, that is on every separation."""
-_CATALOG, _PAGES, _INFO, _RESOURCES, _FIRST_FREE = 1, 2, 3, 4, 5
-_COMPRESSION = 6
-_REPEATED = 3
+_MIN_REPEATS = 3  # a text that occurs as often is written once, as a form; chosen by hand
 
 
 def write_pdf(drawings: Drawing | Sequence[Drawing], *, compress: bool = True) -> bytes:
@@ -60,58 +53,30 @@ def write_pdf(drawings: Drawing | Sequence[Drawing], *, compress: bool = True) -
         if any(part.layer in UNDER_LAYERS for part in drawing.parts):
             pages.append((drawing, (*UNDER_LAYERS, *SHEET_LAYERS)))
     forms = _repeated_texts(pages)
-    first_page = _FIRST_FREE + len(forms)
-    kids = " ".join(f"{first_page + 2 * i} 0 R" for i in range(len(pages)))
-    objects = [
-        f"<< /Type /Catalog /Pages {_PAGES} 0 R >>".encode(),
-        f"<< /Type /Pages /Count {len(pages)} /Kids [{kids}] >>".encode(),
-        f"<< /Title {_text_string(sheets[0].title)} /Creator (Waymark) /Producer (Waymark) /Trapped /False >>".encode(),
-        _resources(len(forms)),
-        *(_form(text, compress) for text in forms),
-    ]
-    for i, (drawing, layers) in enumerate(pages):
-        objects.append(_page(drawing, contents=first_page + 2 * i + 1))
-        objects.append(_stream(_content(drawing, layers, forms), compress))
-    return _file(objects)
+    file = PdfFile(sheets[0].title, compress=compress)
+    resources = file.add(_resources(file.next_number + 1, len(forms)))
+    for text in forms:
+        _add_form(file, text)
+    for drawing, layers in pages:
+        file.add_page(_page_boxes(drawing), resources, _content(drawing, layers, forms))
+    return file.to_bytes()
 
 
 def _repeated_texts(pages: Sequence[tuple[Drawing, tuple[Layer, ...]]]) -> dict[str, str]:
     """Names of the forms in which texts that occur often are written once."""
     counts = Counter(part.text for drawing, _ in pages for part in drawing.parts if isinstance(part, Text))
-    often = [text for text, count in counts.items() if count >= _REPEATED]
+    often = [text for text, count in counts.items() if count >= _MIN_REPEATS]
     return {text: f"T{i}" for i, text in enumerate(often)}
 
 
-def _form(text: str, compress: bool) -> bytes:
+def _add_form(file: PdfFile, text: str) -> None:
     """A text as a form, painted with the colour in force where it is used (8.10)."""
     box = f"/BBox [-100 -100 {run_units(text) + 100} 350]"
-    return _stream(pdf_run(text).encode("ascii"), compress, f"/Type /XObject /Subtype /Form {box} ")
-
-
-def _file(objects: list[bytes]) -> bytes:
-    """Number the objects from 1, and close with the cross-reference table and the trailer (ISO 32000-1, 7.5)."""
-    chunks = [b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n"]
-    position, offsets = len(chunks[0]), []
-    for number, body in enumerate(objects, start=1):
-        chunk = b"%d 0 obj\n%b\nendobj\n" % (number, body)
-        offsets.append(position)
-        position += len(chunk)
-        chunks.append(chunk)
-    size = len(objects) + 1
-    chunks.append(b"xref\n0 %d\n0000000000 65535 f \n" % size)
-    chunks += [b"%010d 00000 n \n" % offset for offset in offsets]
-    trailer = b"trailer\n<< /Size %d /Root %d 0 R /Info %d 0 R >>\nstartxref\n%d\n%%%%EOF\n"
-    chunks.append(trailer % (size, _CATALOG, _INFO, position))
-    return b"".join(chunks)
-
-
-def _text_string(text: str) -> str:
-    """A text string of the document's properties, in UTF-16 with its mark (7.9.2.2)."""
-    return f"<feff{text.encode('utf-16-be').hex()}>"
+    file.add_stream(pdf_run(text).encode("ascii"), f"/Type /XObject /Subtype /Form {box} ")
 
 
 @lru_cache(maxsize=64)
-def _resources(forms: int) -> bytes:
+def _resources(first_form: int, forms: int) -> bytes:
     """A separation colour space for each ink (8.6.6.4), a state in which strokes overprint (11.7.4), the forms."""
     spaces = []
     for layer, ink in INKS.items():
@@ -119,34 +84,21 @@ def _resources(forms: int) -> bytes:
         tint = f"<< /FunctionType 2 /Domain [0 1] /C0 [0 0 0 0] /C1 [{full}] /N 1 >>"
         spaces.append(f"/{layer} [/Separation /{_INK_NAMES.get(layer, layer)} /DeviceCMYK {tint}]")
     states = "/OVER << /Type /ExtGState /OP true /OPM 1 >>"
-    texts = " ".join(f"/T{i} {_FIRST_FREE + i} 0 R" for i in range(forms))
+    texts = " ".join(f"/T{i} {first_form + i} 0 R" for i in range(forms))
     return f"<< /ColorSpace << {' '.join(spaces)} >> /ExtGState << {states} >> /XObject << {texts} >> >>".encode()
 
 
-def _page(drawing: Drawing, contents: int) -> bytes:
-    left, bottom, right, top = 0.0, 0.0, drawing.width_mm, drawing.height_mm
-    bleed = 0.0
-    if len(drawing.trim_mm) == 1:
-        left, bottom, right, top = drawing.trim_mm[0]
-        bleed = drawing.bleed_mm
-    boxes = {
-        "MediaBox": (0.0, 0.0, drawing.width_mm, drawing.height_mm),
+def _page_boxes(drawing: Drawing) -> dict[str, Box]:
+    """MediaBox, BleedBox and TrimBox. [mm]"""
+    sheet = (0.0, 0.0, drawing.width_mm, drawing.height_mm)
+    is_one_plate = len(drawing.trim_mm) == 1
+    left, bottom, right, top = drawing.trim_mm[0] if is_one_plate else sheet
+    bleed = drawing.bleed_mm if is_one_plate else 0.0
+    return {
+        "MediaBox": sheet,
         "BleedBox": (left - bleed, bottom - bleed, right + bleed, top + bleed),
         "TrimBox": (left, bottom, right, top),
     }
-    rows = " ".join(
-        f"/{name} [{' '.join(f'{v * POINTS_PER_MM:.4f}' for v in values)}]" for name, values in boxes.items()
-    )
-    return (
-        f"<< /Type /Page /Parent {_PAGES} 0 R {rows} /Resources {_RESOURCES} 0 R /Contents {contents} 0 R >>".encode()
-    )
-
-
-def _stream(content: bytes, compress: bool, entries: str = "") -> bytes:
-    packing = "/Filter /FlateDecode " if compress else ""
-    if compress:
-        content = zlib.compress(content, _COMPRESSION)
-    return f"<< {entries}{packing}/Length {len(content)} >>\nstream\n".encode() + content + b"\nendstream"
 
 
 def _content(drawing: Drawing, layers: Sequence[Layer], forms: Mapping[str, str]) -> bytes:

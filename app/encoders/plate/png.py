@@ -44,7 +44,7 @@ def write_png(drawing: Drawing, *, dpi: float = 150.0) -> bytes:
             f"the resolution is {dpi:g} dpi", field="dpi", limit=f"{low:g} to {high:g} dpi", cure="150 is usual"
         )
     per_metre = round(dpi / _MM_PER_INCH * 1000)
-    px_per_mm = per_metre / 1000  # what pHYs can say, so that the file measures true
+    px_per_mm = per_metre / 1000  # as pHYs stores it, so the file has true size
     width, height = round(drawing.width_mm * px_per_mm), round(drawing.height_mm * px_per_mm)
     if width * height > MAX_PIXELS:
         raise InvalidParameter(

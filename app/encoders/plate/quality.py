@@ -154,7 +154,7 @@ def _colour_parts(plates: int) -> list[Part]:
 
 def _chromaticity(spec: ColourSpec) -> str:
     if not spec.chromaticity_xy:
-        return "no chromaticity laid down; matt"
+        return "no chromaticity specified; matt"
     return "x, y within " + "  ".join(f"({x:.3f}, {y:.3f})" for x, y in spec.chromaticity_xy)
 
 

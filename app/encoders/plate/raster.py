@@ -1,4 +1,4 @@
-"""Drawing -> pixels, for the PNG writer and for the proof."""
+"""Drawing to pixels, for the PNG writer and for the proof."""
 
 from __future__ import annotations
 

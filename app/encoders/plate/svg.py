@@ -1,4 +1,4 @@
-"""Drawing -> SVG in millimetres: width and height in mm, a viewBox in mm, a named group for each layer."""
+"""Drawing to SVG in millimetres: width and height in mm, a viewBox in mm, a named group for each layer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Iron that is no magnet of ours: cars beside the road, manhole covers, joints, rebar, plates and scrap.
+"""Iron that is not a marker: cars beside the road, manhole covers, joints, rebar, plates and scrap.
 
 Each is a cluster of dipoles in lane coordinates (along, left, up), induced by the earth's field and, as steel is,
 permanently magnetised several times as much. Moments are chosen so that the fields agree with what is published for

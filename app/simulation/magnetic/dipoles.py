@@ -8,12 +8,9 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from app.markers.magnet import FIELD_UT_M3
 
-MOMENT_AM2 = 2.47
-"""METRO's N52 cuboid, 15 x 15 x 9.5 mm, remanence 1.45 T. [A m2]"""
-K_UT = 0.1
-"""mu0 / (4 pi) in uT m3 / (A m2)."""
+Floats = npt.NDArray[np.float64]
 
 
 def dipole_field_ut(points_m: Floats, dipole_m: Floats, moment_am2: Floats) -> Floats:
@@ -33,43 +30,8 @@ def dipole_field_ut(points_m: Floats, dipole_m: Floats, moment_am2: Floats) -> F
     """
     r = np.asarray(points_m, float) - dipole_m
     square = np.sum(r * r, axis=1)[:, None]
-    field: Floats = K_UT * (3 * r * (r @ moment_am2)[:, None] / square - moment_am2) / square**1.5
+    field: Floats = FIELD_UT_M3 * (3 * r * (r @ moment_am2)[:, None] / square - moment_am2) / square**1.5
     return field
-
-
-def cuboid_field_ut(points_m: Floats, size_m: tuple[float, float, float], remanence_t: float) -> Floats:
-    """Field of a cuboid at the origin, magnetised along its z axis: two charged faces.
-
-    Parameters
-    ----------
-    points_m : ndarray, shape (N, 3)
-        Outside the cuboid. [m]
-    size_m : tuple of float
-        Edges along x, y, z. [m]
-    remanence_t : float
-        Br. [T]
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Flux density. [uT]
-
-    Notes
-    -----
-    The closed form of a uniformly charged rectangle, e.g. Furlani, Permanent Magnet and Electromechanical Devices
-    (2001), section 4.2.
-    """
-    field = np.zeros((len(points_m), 3))
-    for i in (-1, 1):
-        for j in (-1, 1):
-            for k in (-1, 1):
-                x, y, z = (points_m - np.array([i, j, k]) * np.array(size_m) / 2).T
-                r = np.sqrt(x * x + y * y + z * z)
-                sign = i * j * k
-                field[:, 0] -= sign * np.log(r + y)
-                field[:, 1] -= sign * np.log(r + x)
-                field[:, 2] += sign * np.arctan2(x * y, z * r)
-    return field * remanence_t * 1e6 / (4 * math.pi)
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
@@ -96,7 +58,7 @@ def add_static_field(out, points, axes, chainage, dipoles, at, reach):  # type: 
                 if square > limit:
                     continue
                 along = 3 * (x * dipoles[d, 3] + y * dipoles[d, 4] + z * dipoles[d, 5]) / square
-                f = 0.1 / (square * math.sqrt(square))
+                f = FIELD_UT_M3 / (square * math.sqrt(square))
                 out[i, j] += f * (
                     (along * x - dipoles[d, 3]) * axes[i, j, 0]
                     + (along * y - dipoles[d, 4]) * axes[i, j, 1]

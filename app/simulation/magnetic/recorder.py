@@ -7,13 +7,13 @@ import io
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.traces.wire import write_stream
 from app.errors import InvalidParameter
+from app.formats.traces.wire import write_stream
 from app.sensors.magnetometer_bar import MagnetTrace
 
 Floats = npt.NDArray[np.float64]
 
-_VEHICLE_FROM_RECORDED = np.array((1.0, -1.0, -1.0), np.float32)
+_VEHICLE_FROM_RECORDED = np.array((1.0, -1.0, -1.0), np.float32)  # FRD, as METRO's recorder writes
 
 
 def write_recorder_files(
@@ -36,7 +36,7 @@ def write_recorder_files(
     """
     return {
         f"RawData_{run}.csv": _raw_data(trace),
-        f"RawSpeed_{run}.csv": _series(trace.t_s, "Speed", 3.6 * _held(trace)),
+        f"RawSpeed_{run}.csv": _series(trace.t_s, "Speed", 3.6 * _latest_speed(trace)),
         f"RawSWA_{run}.csv": _series(
             trace.t_s, "SWA", np.zeros(len(trace.t_s)) if steering_wheel_deg is None else steering_wheel_deg
         ),
@@ -64,12 +64,12 @@ def _raw_data(trace: MagnetTrace) -> bytes:
     return out.getvalue().encode()
 
 
-def _held(trace: MagnetTrace) -> Floats:
+def _latest_speed(trace: MagnetTrace) -> Floats:
     """The last speed sent before each sample, the first one before any. [m/s]"""
     if not trace.speed_t_s.size:
         raise InvalidParameter("the trace has no speed", field="trace.speed_m_s", limit="one value or more")
-    held: Floats = trace.speed_m_s[np.maximum(np.searchsorted(trace.speed_t_s, trace.t_s, side="right") - 1, 0)]
-    return held
+    latest: Floats = trace.speed_m_s[np.maximum(np.searchsorted(trace.speed_t_s, trace.t_s, side="right") - 1, 0)]
+    return latest
 
 
 def _series(t_s: Floats, name: str, values: Floats) -> bytes:

@@ -1,4 +1,4 @@
-"""What goes wrong with markers and logs, and who makes it go wrong."""
+"""Faults of markers and logs, and attacks."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.decoders.cerpm.packets import HeardPacket
 from app.errors import InvalidParameter
 from app.markers.cerpm import BODY_BYTES, MESSAGE_BYTES, TAG_BYTES
+from app.sensors.receiver import ReceivedPacket
 from app.simulation.radio.lanes import TrueLane
-from app.simulation.radio.markers import LaidMarkers
+from app.simulation.radio.markers import InstalledMarkers
 
-_ON_THE_LINE_M = 1.0
-_TRIES = 1000
+_ON_THE_LINE_M = 1.0  # [m] from a boundary, where a wrong position is not detectable; source: by hand
+_TRIES = 1000  # source: by hand, bounds the search
 
 
 def move_claim(
-    lane: TrueLane, markers: LaidMarkers, row: int, rng: np.random.Generator, *, distance_m: float = 30.0
-) -> LaidMarkers:
-    """A marker that claims a place some way off: moved, or programmed for another; its tags stay right.
+    lane: TrueLane, markers: InstalledMarkers, row: int, rng: np.random.Generator, *, distance_m: float = 30.0
+) -> InstalledMarkers:
+    """A marker that sends a wrong position, moved or programmed wrongly; its tags stay valid.
 
     Parameters
     ----------
     lane : TrueLane
-    markers : LaidMarkers
+    markers : InstalledMarkers
     row : int
-        Which one.
+        Index of the marker.
     rng : numpy.random.Generator
         Draws the direction; one that leaves it on a boundary of the lane, or straight beyond an end of one, is drawn
-        again: there it is on its neighbours' line.
+        again: there it is on the line of its neighbours.
     distance_m : float
         [m]
 
@@ -60,7 +60,7 @@ def move_claim(
     )
 
 
-def corrupt_packets(packets: Sequence[HeardPacket], share: float, rng: np.random.Generator) -> list[HeardPacket]:
+def corrupt_packets(packets: Sequence[ReceivedPacket], share: float, rng: np.random.Generator) -> list[ReceivedPacket]:
     """A log in which a share of the payloads has flipped bits, a lost end, or bytes too many."""
     out = list(packets)
     for k in np.flatnonzero(rng.random(len(out)) < share):
@@ -82,50 +82,52 @@ def corrupt_packets(packets: Sequence[HeardPacket], share: float, rng: np.random
 
 
 def repeat_packets(
-    packets: Sequence[HeardPacket], share: float, rng: np.random.Generator, *, within_s: float = 0.5
-) -> list[HeardPacket]:
-    """A log in which a share of the packets is there twice, as two gateways or a repeated delivery give it."""
-    out: list[HeardPacket] = []
+    packets: Sequence[ReceivedPacket], share: float, rng: np.random.Generator, *, within_s: float = 0.5
+) -> list[ReceivedPacket]:
+    """A log with a share of the packets twice, as from two gateways or repeated delivery."""
+    out: list[ReceivedPacket] = []
     for packet, again, late in zip(
         packets, rng.random(len(packets)) < share, rng.uniform(0, within_s, len(packets)), strict=True
     ):
         out.append(packet)
         if again:
-            out.append(replace(packet, heard_at_s=packet.heard_at_s + float(late), rssi_dbm=packet.rssi_dbm - 3))
+            out.append(replace(packet, received_at_s=packet.received_at_s + float(late), rssi_dbm=packet.rssi_dbm - 3))
     return out
 
 
-def shuffle_packets(packets: Sequence[HeardPacket], rng: np.random.Generator, *, reach: int = 8) -> list[HeardPacket]:
-    """A log whose lines are up to so many places out of order; times stay with their packets."""
+def shuffle_packets(
+    packets: Sequence[ReceivedPacket], rng: np.random.Generator, *, reach: int = 8
+) -> list[ReceivedPacket]:
+    """A log whose rows are out of order by up to `reach` rows; times stay with their packets."""
     order = np.argsort(np.arange(len(packets)) + rng.uniform(0, reach, len(packets)), kind="stable")
     return [packets[int(k)] for k in order]
 
 
-def shift_clock(packets: Sequence[HeardPacket], offset_s: float) -> list[HeardPacket]:
+def shift_clock(packets: Sequence[ReceivedPacket], offset_s: float) -> list[ReceivedPacket]:
     """A log whose receiver's clock is off against the vehicle's track."""
-    return [replace(packet, heard_at_s=packet.heard_at_s + offset_s) for packet in packets]
+    return [replace(packet, received_at_s=packet.received_at_s + offset_s) for packet in packets]
 
 
-def number_entries(packets: Sequence[HeardPacket]) -> list[HeardPacket]:
-    """A log whose entries are numbered in the order they stand."""
+def number_entries(packets: Sequence[ReceivedPacket]) -> list[ReceivedPacket]:
+    """A log whose entries are numbered in order."""
     return [replace(packet, entry=entry) for entry, packet in enumerate(packets)]
 
 
 def forge_packets(
-    packets: Sequence[HeardPacket], count: int, rng: np.random.Generator, *, later_s: float = 0.0
-) -> list[HeardPacket]:
-    """Packets of somebody who heard these and has no key.
+    packets: Sequence[ReceivedPacket], count: int, rng: np.random.Generator, *, later_s: float = 0.0
+) -> list[ReceivedPacket]:
+    """Packets forged from received ones, without a key.
 
     Parameters
     ----------
-    packets : sequence of HeardPacket
+    packets : sequence of ReceivedPacket
         With payloads; each forgery starts from one of them.
     count : int
     rng : numpy.random.Generator
         Draws which, and how: another tag by chance; the tag of the packet kept and its place, its sequence or another
         bit of its body changed; the tag of another packet; a tag of zeros; the number of another marker.
     later_s : float
-        When they are heard, at least, after the packet that each started from. [s]
+        Minimum delay after the packet that each starts from. [s]
 
     Raises
     ------
@@ -135,10 +137,10 @@ def forge_packets(
     real = [(p, p.payload) for p in packets if p.payload is not None and len(p.payload) == MESSAGE_BYTES]
     if len(real) < 2:
         raise InvalidParameter("fewer than two packets to forge from", field="packets", limit="two or more")
-    out: list[HeardPacket] = []
+    out: list[ReceivedPacket] = []
     while len(out) < count:
-        (base, told), (_other, foreign) = (real[int(k)] for k in rng.choice(len(real), 2, replace=False))
-        body, tag = bytearray(told[:BODY_BYTES]), told[BODY_BYTES:]
+        (base, genuine), (_other, foreign) = (real[int(k)] for k in rng.choice(len(real), 2, replace=False))
+        body, tag = bytearray(genuine[:BODY_BYTES]), genuine[BODY_BYTES:]
         kind = int(rng.integers(6))
         if kind == 0:
             body[5:13] = rng.bytes(8) if rng.random() < 0.5 else _nudged(bytes(body[5:13]), rng)
@@ -155,21 +157,21 @@ def forge_packets(
         if kind == 5 or rng.random() < 0.3:
             tag = bytes(TAG_BYTES) if rng.random() < 0.2 else rng.bytes(TAG_BYTES)
         payload = bytes(body) + tag
-        if payload in (told, foreign):
+        if payload in (genuine, foreign):
             continue  # nothing was changed
         late = later_s + float(rng.uniform(0, 5))
-        out.append(replace(base, heard_at_s=base.heard_at_s + late, payload=payload))
+        out.append(replace(base, received_at_s=base.received_at_s + late, payload=payload))
     return out
 
 
 def replay_packets(
-    packets: Sequence[HeardPacket], count: int, rng: np.random.Generator, *, at_s: tuple[float, float]
-) -> list[HeardPacket]:
+    packets: Sequence[ReceivedPacket], count: int, rng: np.random.Generator, *, at_s: tuple[float, float]
+) -> list[ReceivedPacket]:
     """Packets recorded on the road and sent again, bit by bit, between two times. [s]"""
     if not packets:
         raise InvalidParameter("no packets to replay", field="packets", limit="one or more")
     return [
-        replace(packets[int(k)], heard_at_s=float(t), rssi_dbm=float(round(rng.uniform(-115, -70))))
+        replace(packets[int(k)], received_at_s=float(t), rssi_dbm=float(round(rng.uniform(-115, -70))))
         for k, t in zip(rng.integers(0, len(packets), count), rng.uniform(*at_s, count), strict=True)
     ]
 

@@ -1,4 +1,4 @@
-"""A drive past markers: what the vehicle's receiver hears of them, and where the vehicle was."""
+"""A drive past markers: packets received by the vehicle, and its track."""
 
 from __future__ import annotations
 
@@ -8,51 +8,51 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.packets import HeardPacket, PlainClaim
 from app.markers.cerpm import CerpmMessage, LaneSide
 from app.sensors.pose_track import PoseTrack
+from app.sensors.receiver import PlainClaim, ReceivedPacket
+from app.simulation.radio.driving import Drive, Driver, SatelliteReceiver, drive_lane, observe_track
 from app.simulation.radio.lanes import TrueLane
 from app.simulation.radio.link import (
     Radio,
     Transmissions,
     draw_shadows_db,
-    hear_transmissions,
     mean_rssi_dbm,
+    receive_transmissions,
     send_beacons,
 )
-from app.simulation.radio.markers import LaidMarkers
-from app.simulation.radio.vehicle import Drive, Driver, Receiver, drive_lane, observe_track
+from app.simulation.radio.markers import InstalledMarkers
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Sign = Callable[[CerpmMessage], bytes]
 
-ANTENNA_M = 1.5
-"""Of the vehicle above the road. [m]"""
-_SNR_LIMITS_DB = (-20.0, 12.0)
+ANTENNA_M = 1.5  # [m] height of the antenna above the road; source: assumed, the roof of a car
+_SNR_LIMITS_DB = (-20.0, 12.0)  # [dB] source: range that LoRa receivers report
+_SNR_SD_DB = 0.5  # [dB] of a reported SNR; source: assumed, no measurement kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeardDrive:
-    """A packet log, the vehicle's track, and what is true of them.
+class SimulatedDrive:
+    """A packet log and the vehicle's track, with the truth about both.
 
     Attributes
     ----------
-    packets : tuple of HeardPacket
-        In the order heard.
+    packets : tuple of ReceivedPacket
+        In the order received.
     track : PoseTrack
         On the same clock.
     drive : Drive
-        Where the vehicle really was.
+        True positions of the vehicle.
     sent : Transmissions
         All of them.
     distance_m, strength_dbm : ndarray, shape (K,)
-        Of each transmission from the vehicle, and at its receiver. [m, dBm]
+        Distance of each transmission from the vehicle, and strength at its receiver. [m, dBm]
     sender : ndarray of int, shape (len(packets),)
-        Which of the laid markers sent each packet.
+        Index of the installed marker that sent each packet.
     """
 
-    packets: tuple[HeardPacket, ...]
+    packets: tuple[ReceivedPacket, ...]
     track: PoseTrack
     drive: Drive
     sent: Transmissions
@@ -63,22 +63,22 @@ class HeardDrive:
 
 def drive_past(
     lane: TrueLane,
-    markers: LaidMarkers,
+    markers: InstalledMarkers,
     rng: np.random.Generator,
     *,
     sign: Sign | None,
     radio: Radio | None = None,
     driver: Driver | None = None,
-    receiver: Receiver | None = None,
+    receiver: SatelliteReceiver | None = None,
     start_s: float = 1.78e9,
     first_sequence: npt.ArrayLike | None = None,
-) -> HeardDrive:
-    """Drive a lane and listen.
+) -> SimulatedDrive:
+    """Drive a lane and receive packets.
 
     Parameters
     ----------
     lane : TrueLane
-    markers : LaidMarkers
+    markers : InstalledMarkers
         Those that send.
     rng : numpy.random.Generator
         Draws the drive, the receiver's errors and the radio.
@@ -86,8 +86,8 @@ def drive_past(
         Message to the bytes that its marker sends; None for the paper's packets in clear.
     radio : Radio, optional
     driver : Driver, optional
-    receiver : Receiver, optional
-        RTK unless given.
+    receiver : SatelliteReceiver, optional
+        RTK by default.
     start_s : float
         Seconds since 1970-01-01 UTC. [s]
     first_sequence : array_like of int, shape (N,), optional
@@ -95,7 +95,7 @@ def drive_past(
     """
     radio = radio or Radio()
     drive = drive_lane(lane, driver or Driver(), rng, start_s=start_s)
-    track = observe_track(lane, drive, receiver or Receiver.rtk(), rng)
+    track = observe_track(lane, drive, receiver or SatelliteReceiver.rtk(), rng)
     sent = send_beacons(
         len(markers), radio, float(drive.time_s[0]), float(drive.time_s[-1]), rng, first_sequence=first_sequence
     )
@@ -104,43 +104,43 @@ def drive_past(
     travelled = np.interp(sent.start_s, drive.time_s, drive.chainage_m)
     strength = mean_rssi_dbm(distance) + draw_shadows_db(sent.sender, travelled, radio, rng)
     strength = strength + rng.normal(0, radio.fading_sd_db, len(strength))
-    heard = np.flatnonzero(hear_transmissions(sent.start_s, strength, radio, rng))
-    snr = np.clip(strength[heard] - radio.noise_dbm + rng.normal(0, 0.5, len(heard)), *_SNR_LIMITS_DB)
+    received = np.flatnonzero(receive_transmissions(sent.start_s, strength, radio, rng))
+    snr = np.clip(strength[received] - radio.noise_dbm + rng.normal(0, _SNR_SD_DB, len(received)), *_SNR_LIMITS_DB)
     packets = tuple(
-        _heard(entry, markers, sent, int(k), radio, sign, float(strength[k]), float(snr[entry]))
-        for entry, k in enumerate(heard)
+        _packet(entry, markers, sent, int(k), radio, sign, float(strength[k]), float(snr[entry]))
+        for entry, k in enumerate(received)
     )
-    return HeardDrive(packets, track, drive, sent, distance, strength, sent.sender[heard])
+    return SimulatedDrive(packets, track, drive, sent, distance, strength, sent.sender[received])
 
 
-def _heard(
+def _packet(
     entry: int,
-    markers: LaidMarkers,
+    markers: InstalledMarkers,
     sent: Transmissions,
     k: int,
     radio: Radio,
     sign: Sign | None,
     strength_dbm: float,
     snr_db: float,
-) -> HeardPacket:
+) -> ReceivedPacket:
     """A packet as the receiver logs it when it is over: RSSI in whole dB, SNR in quarters."""
     message = marker_message(markers, int(sent.sender[k]), int(sent.sequence[k]))
     at_s, rssi, snr = float(sent.start_s[k]) + radio.airtime_s, float(round(strength_dbm)), round(4 * snr_db) / 4
     if sign is not None:
-        return HeardPacket(entry, at_s, payload=sign(message), rssi_dbm=rssi, snr_db=snr)
+        return ReceivedPacket(entry, at_s, payload=sign(message), rssi_dbm=rssi, snr_db=snr)
     claim = PlainClaim(
         message.number, message.lon_deg, message.lat_deg, message.height_m, message.side, message.speed_limit
     )
-    return HeardPacket(entry, at_s, claim=claim, rssi_dbm=rssi, snr_db=snr)
+    return ReceivedPacket(entry, at_s, claim=claim, rssi_dbm=rssi, snr_db=snr)
 
 
-def marker_message(markers: LaidMarkers, row: int, sequence: int) -> CerpmMessage:
-    """What a laid marker says in a transmission."""
+def marker_message(markers: InstalledMarkers, row: int, sequence: int) -> CerpmMessage:
+    """Message of an installed marker in a transmission."""
     return CerpmMessage(
         number=int(markers.number[row]),
         lon_deg=float(markers.lon_deg[row]),
         lat_deg=float(markers.lat_deg[row]),
-        side=LaneSide(int(markers.told_side[row])),
+        side=LaneSide(int(markers.broadcast_side[row])),
         speed_limit=markers.speed_limit,
         sequence=sequence,
     )

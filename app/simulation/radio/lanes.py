@@ -1,4 +1,4 @@
-"""Lanes whose centre line is known: between given boundaries, or made of clothoids."""
+"""Lanes with a known centre line: between two boundaries, or made of clothoids."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ import numpy.typing as npt
 import pymap3d
 from scipy.ndimage import gaussian_filter1d
 
-from app.encoders.cerpm.cross_sections import cut_lane, direction_rad
 from app.errors import InvalidParameter
+from app.lanes.cross_sections import cut_lane, direction_rad
 
 Floats = npt.NDArray[np.float64]
 Origin = tuple[float, float, float]
 
-STEP_M = 0.25
-_MAX_CURVATURE_1PM = 0.04
-_CAR_SMOOTHING_M = 3.0
+STEP_M = 0.25  # [m] between stations; source: by hand, an eighth of the smoothing of 2.2 m
+_MAX_CURVATURE_1PM = 0.04  # [1/m] source: by hand, a radius of 25 m
+_CAR_SMOOTHING_M = 3.0  # [m] source: by hand, about a wheelbase
+_MAX_TURN_RAD = 2.2  # [rad] of the direction against the first one, so that lanes do not cross themselves; by hand
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueLane:
-    """A lane as it is.
+    """The truth about a lane.
 
     Attributes
     ----------
@@ -58,7 +59,7 @@ class TrueLane:
     def points_m(self, chainage_m: npt.ArrayLike, left_m: npt.ArrayLike = 0.0) -> Floats:
         """East and north beside the centre line as a car follows it, shape (K, 2). [m]
 
-        A car does not follow kinks: the line is smoothed over 3 m. Beyond its ends the lane goes on straight.
+        A car does not follow kinks: the line is smoothed over 3 m. The lane is straight beyond its ends.
         """
         at, aside = np.broadcast_arrays(np.asarray(chainage_m, float), np.asarray(left_m, float))
         line, yaw = self._driven()
@@ -68,10 +69,6 @@ class TrueLane:
         on = np.stack([np.interp(inside, self.chainage_m, line[:, k]) for k in range(2)], -1)
         beside = aside[..., None] * np.stack([-ahead[..., 1], ahead[..., 0]], -1)
         return np.asarray(on + (at - inside)[..., None] * ahead + beside)
-
-    def yaws_rad(self, chainage_m: npt.ArrayLike) -> Floats:
-        """Direction of the line that a car follows, shape (K,). [rad]"""
-        return np.asarray(np.interp(np.asarray(chainage_m, float), self.chainage_m, self._driven()[1]))
 
     def _driven(self) -> tuple[Floats, Floats]:
         """The centre line without kinks: integrated from its smoothed direction, drift taken out; and its direction."""
@@ -107,19 +104,19 @@ def lane_between(left_m: npt.ArrayLike, right_m: npt.ArrayLike, origin: Origin) 
     Raises
     ------
     InvalidParameter
-        They are no lane: see `cut_lane`.
+        They are not the boundaries of a lane: see `cut_lane`.
     """
     cut = cut_lane(left_m, right_m, step_m=STEP_M)
     return TrueLane(origin, cut.chainage_m, cut.centre_m, cut.left_m, cut.right_m, cut.yaw_rad, cut.curvature_1pm)
 
 
 def lane_from_wgs84(left_deg: npt.ArrayLike, right_deg: npt.ArrayLike, *, height_m: float = 0.0) -> TrueLane:
-    """The lane between two boundaries given as longitude and latitude, each shape (N, 2); the origin is on the left.
+    """The lane between two boundaries in longitude and latitude, each shape (N, 2); the origin is on the left one.
 
     Raises
     ------
     InvalidParameter
-        They are no lane: see `cut_lane`.
+        They are not the boundaries of a lane: see `cut_lane`.
     """
     left, right = np.asarray(left_deg, float), np.asarray(right_deg, float)
     for name, line in (("left_deg", left), ("right_deg", right)):
@@ -154,7 +151,7 @@ def make_lane(
     max_curvature_1pm : float
         Sharpest bend; half of the bends are below a third of it. [1/m]
     width_m : tuple of float
-        Least and greatest width. [m]
+        Minimum and maximum width. [m]
 
     Raises
     ------
@@ -191,7 +188,7 @@ def _bends(rng: np.random.Generator, length_m: float, sharpest_1pm: float) -> Fl
         clothoid = max(float(rng.uniform(10, 40)), 600 * size)
         arc = min(float(rng.uniform(10, 120)), max(1.8 / max(size, 1e-9) - clothoid, 5.0))
         sign = 1.0 if rng.random() < 0.5 else -1.0
-        if abs(heading + sign * size * (arc + clothoid)) > 2.2:  # the lane never crosses itself
+        if abs(heading + sign * size * (arc + clothoid)) > _MAX_TURN_RAD:
             sign = -math.copysign(1.0, heading)
         heading += sign * size * (arc + clothoid)
         for more, value in ((0.0, 0.0), (clothoid, sign * size), (arc, sign * size), (clothoid, 0.0)):

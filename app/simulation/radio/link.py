@@ -1,4 +1,4 @@
-"""The radio between markers and a vehicle: path loss, sensitivity, collisions, a receiver that hears one at a time."""
+"""The radio between markers and a vehicle: path loss, sensitivity, collisions, a receiver for one packet at a time."""
 
 from __future__ import annotations
 
@@ -8,24 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from app.encoders.cerpm.airtime import check_modulation, symbol_time_s, time_on_air_s
-from app.encoders.cerpm.link import LinkModel, sensitivity_dbm
 from app.errors import InvalidParameter
 from app.markers.cerpm import MESSAGE_BYTES
+from app.radio.airtime import check_modulation, symbol_time_s, time_on_air_s
+from app.radio.link import LinkModel, sensitivity_dbm
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
-_NOISE_FIGURE_DB = 6.0
-_SOFT_DB = 0.35
-"""Scale of the logistic step from hearing nothing to hearing all about the sensitivity. [dB]"""
-_PREAMBLE_TAIL_SYMBOLS = 4.25
+_NOISE_FIGURE_DB = 6.0  # [dB] source: assumed for the SX1276, no measurement kept
+_SOFT_DB = 0.35  # [dB] scale of the logistic step from no reception to full reception; source: assumed
+_PREAMBLE_TAIL_SYMBOLS = 4.25  # source: SX1276 data sheet, 4.1.1.7
 
 
 @dataclass(frozen=True, slots=True)
 class Radio:
-    """How markers send and what the air and the receiver do to it.
+    """Transmission, propagation and reception of markers' packets.
 
     Attributes
     ----------
@@ -34,7 +33,7 @@ class Radio:
     bandwidth_hz : int
         125, 250 or 500 kHz. [Hz]
     interval_s, jitter : float
-        Between transmissions of a marker, and the share of it by which each is early or late at most, below half. [s]
+        Between transmissions of a marker, and the maximum share of it by which each is early or late, below half. [s]
     payload_bytes : int
         [bytes]
     preamble_symbols : int
@@ -42,24 +41,24 @@ class Radio:
     lock_symbols : float
         Of the preamble's end that the receiver needs undisturbed to lock (Bor et al. 2016: five).
     capture_db : float
-        By how much a packet must be above all others together to be read; infinite: never. [dB]
+        By how much a packet must be above the sum of all others to be read; infinite: never read. [dB]
     shadow_sd_db, shadow_length_m : float
-        Of what stands in the way, and how far the vehicle drives until that is forgotten (Gudmundson). [dB, m]
+        Of shadowing, and its correlation length along the vehicle's way (Gudmundson 1991). [dB, m]
     fading_sd_db : float
-        From packet to packet. [dB]
+        Of fading from packet to packet. [dB]
     """
 
     spreading_factor: int = 7
     bandwidth_hz: int = 500_000
-    interval_s: float = 2.0
-    jitter: float = 0.1
+    interval_s: float = 2.0  # [s] source: by hand, no measurement kept
+    jitter: float = 0.1  # source: by hand, no measurement kept
     payload_bytes: int = MESSAGE_BYTES
     preamble_symbols: int = 8
-    lock_symbols: float = 5.0
-    capture_db: float = 6.0
-    shadow_sd_db: float = 4.0
-    shadow_length_m: float = 25.0
-    fading_sd_db: float = 2.0
+    lock_symbols: float = 5.0  # source: Bor et al. 2016, section 4
+    capture_db: float = 6.0  # [dB] source: Bor et al. 2016, section 4
+    shadow_sd_db: float = 4.0  # [dB] source: assumed, no measurement kept
+    shadow_length_m: float = 25.0  # [m] source: assumed, no measurement kept
+    fading_sd_db: float = 2.0  # [dB] source: assumed, no measurement kept
 
     def __post_init__(self) -> None:
         check_modulation(self.spreading_factor, self.bandwidth_hz)
@@ -72,7 +71,7 @@ class Radio:
 
     @property
     def airtime_s(self) -> float:
-        """Of one packet. [s]"""
+        """Time on air of one packet. [s]"""
         return time_on_air_s(
             self.payload_bytes, self.spreading_factor, self.bandwidth_hz, preamble_symbols=self.preamble_symbols
         )
@@ -89,7 +88,7 @@ class Radio:
 
     @property
     def sensitivity_dbm(self) -> float:
-        """Half of the packets at this strength are heard. [dBm]"""
+        """Strength at which half of the packets are received. [dBm]"""
         return sensitivity_dbm(self.spreading_factor, self.bandwidth_hz)
 
     @property
@@ -100,12 +99,12 @@ class Radio:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transmissions:
-    """What markers sent, by time.
+    """Transmissions of markers, by time.
 
     Attributes
     ----------
     sender : ndarray of int, shape (K,)
-        Which of the markers.
+        Index of the marker.
     sequence : ndarray of int, shape (K,)
         Of its message.
     start_s : ndarray, shape (K,)
@@ -131,7 +130,7 @@ def send_beacons(
     *,
     first_sequence: npt.ArrayLike | None = None,
 ) -> Transmissions:
-    """What markers send from one time to another, none of them knowing of the others.
+    """Transmissions of independent markers from one time to another.
 
     Parameters
     ----------
@@ -141,9 +140,9 @@ def send_beacons(
     start_s, end_s : float
         [s]
     rng : numpy.random.Generator
-        Draws phases, jitter and sequences to begin with.
+        Draws phases, jitter and first sequences.
     first_sequence : array_like of int, shape (count,), optional
-        Drawn below 1,000,000 if not given.
+        Drawn below 1,000,000 by default.
 
     Notes
     -----
@@ -169,7 +168,7 @@ def draw_shadows_db(sender: Ints, travelled_m: Floats, radio: Radio, rng: np.ran
     sender : ndarray of int, shape (K,)
         By time.
     travelled_m : ndarray, shape (K,)
-        How far the vehicle had come. [m]
+        Distance driven by the vehicle. [m]
     radio : Radio
     rng : numpy.random.Generator
     """
@@ -186,7 +185,7 @@ def draw_shadows_db(sender: Ints, travelled_m: Floats, radio: Radio, rng: np.ran
     return shadows * radio.shadow_sd_db
 
 
-def hear_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, rng: np.random.Generator) -> Bools:
+def receive_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, rng: np.random.Generator) -> Bools:
     """Which transmissions one receiver reads.
 
     Parameters
@@ -198,7 +197,7 @@ def hear_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, rng:
     radio : Radio
         All send with the same settings.
     rng : numpy.random.Generator
-        Draws what is heard about the sensitivity.
+        Draws receptions near the sensitivity.
 
     Returns
     -------
@@ -208,8 +207,8 @@ def hear_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, rng:
     -----
     Bor et al. 2016, "Do LoRa low-power wide-area networks scale?", section 4: packets of one spreading factor collide
     where they overlap, but for the beginning of the preamble, unless one is `capture_db` above the others. The
-    receiver locks on to a preamble if it is idle and then hears nothing else until that packet is over: one that begins
-    meanwhile is lost, however strong, and strong enough it takes the first with it.
+    receiver locks on to a preamble if it is idle and then receives nothing else until that packet is over: another
+    packet that begins meanwhile is lost, and if it is strong enough, the first one too.
     """
     airtime, spare = radio.airtime_s, radio.spare_s
     odds = 1 / (1 + np.exp(-np.clip((strength_dbm - radio.sensitivity_dbm) / _SOFT_DB, -60, 60)))
@@ -218,22 +217,22 @@ def hear_transmissions(start_s: Floats, strength_dbm: Floats, radio: Radio, rng:
     first = np.searchsorted(start_s, start_s - airtime + spare, side="right")
     locked = np.searchsorted(start_s, start_s + spare + radio.lock_symbols * radio.symbol_s, side="left")
     last = np.searchsorted(start_s, start_s + airtime, side="left")
-    heard = np.zeros(len(start_s), bool)
+    received = np.zeros(len(start_s), bool)
     free_at = -math.inf
     for k in np.flatnonzero(audible):
         if start_s[k] + spare < free_at:
             continue  # another packet is being read
         others = np.r_[first[k] : k, k + 1 : locked[k]]
-        if not _stands_out(power[k], power[others].sum(), radio.capture_db):
+        if not _is_captured(power[k], power[others].sum(), radio.capture_db):
             continue  # no lock on a disturbed preamble
         free_at = start_s[k] + airtime
         others = np.r_[first[k] : k, k + 1 : last[k]]
         worst = _strongest_moment(start_s[others], power[others], start_s[k] + spare, airtime)
-        heard[k] = _stands_out(power[k], worst, radio.capture_db)
-    return heard
+        received[k] = _is_captured(power[k], worst, radio.capture_db)
+    return received
 
 
-def _stands_out(power_mw: float, others_mw: float, capture_db: float) -> bool:
+def _is_captured(power_mw: float, others_mw: float, capture_db: float) -> bool:
     return others_mw <= 0 or power_mw >= 10 ** (capture_db / 10) * others_mw
 
 

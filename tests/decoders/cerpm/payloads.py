@@ -7,7 +7,7 @@ import struct
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.cmac import CMAC
 
-from app.decoders.cerpm.packets import HeardPacket
+from app.sensors.receiver import ReceivedPacket
 
 LON_DEG, LAT_DEG = -85.6123456, 42.2834567
 START_S = 1_790_000_000.0
@@ -40,7 +40,9 @@ def signed(content: bytes, key: bytes | None = None) -> bytes:
     return content + cmac.finalize()[:4]
 
 
-def heard(sequence: int, at_s: float, number: int = 7, *, entry: int = 0, payload: bytes | None = None) -> HeardPacket:
+def heard(
+    sequence: int, at_s: float, number: int = 7, *, entry: int = 0, payload: bytes | None = None
+) -> ReceivedPacket:
     """An honest packet, unless it is given another payload."""
     content = payload or signed(body(number, LON_DEG + number * 1e-4, sequence=sequence))
-    return HeardPacket(entry, START_S + at_s, content, rssi_dbm=-110.0)
+    return ReceivedPacket(entry, START_S + at_s, content, rssi_dbm=-110.0)

@@ -10,13 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from app.decoders.cerpm.packets import HeardPacket
-from app.decoders.cerpm.path_loss import PAPER_EXPONENT, fit_path_loss
 from app.decoders.cerpm.signal import SignalHealth, SignalReport, SignalRules, profile_signals
 from app.decoders.cerpm.verify import Verdict, VerifiedPacket
 from app.errors import InvalidParameter
 from app.markers.cerpm import CerpmMessage
+from app.radio.link import EXPONENT
+from app.radio.path_loss import fit_path_loss
 from app.sensors.pose_track import PoseTrack
+from app.sensors.receiver import ReceivedPacket
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, START_S
 
 M_EAST = 1 / (111_320 * math.cos(math.radians(LAT_DEG)))
@@ -45,13 +46,13 @@ def drive(
             keep = math.exp(-30 / 25)
             shadow = keep * shadow + math.sqrt(1 - keep**2) * rng.normal()
             distance_m = math.hypot(15 * t - east_m, 2.7)
-            rssi = -108 - 10 * PAPER_EXPONENT * math.log10(distance_m / 50) + 4 * shadow + rng.normal(0, 2)
+            rssi = -108 - 10 * EXPONENT * math.log10(distance_m / 50) + 4 * shadow + rng.normal(0, 2)
             rssi += (offset_db or {}).get(number, 0.0)
             audible = rng.random() < 1 / (1 + math.exp(-(rssi - SENSITIVITY_DBM)))
             if not audible or rng.random() < (lost or {}).get(number, 0.2):
                 continue
             message = CerpmMessage(number, *places[number], sequence=1000 + sequence)
-            heard = HeardPacket(len(packets), START_S + float(t), b"", rssi_dbm=float(round(rssi)))
+            heard = ReceivedPacket(len(packets), START_S + float(t), b"", rssi_dbm=float(round(rssi)))
             packets.append(VerifiedPacket(heard, Verdict.AUTHENTIC, number, message))
     return packets, places, track
 
@@ -64,13 +65,13 @@ def health(report: SignalReport) -> dict[int, SignalHealth]:
 def sample(rng: np.random.Generator, count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Distances up to 500 m, and strengths of what is heard of packets there."""
     distance = rng.uniform(5, 500, count)
-    rssi = np.round(-108 - 10 * PAPER_EXPONENT * np.log10(distance / 50) + rng.normal(0, 4.5, count))
+    rssi = np.round(-108 - 10 * EXPONENT * np.log10(distance / 50) + rng.normal(0, 4.5, count))
     heard = rng.random(count) < 1 / (1 + np.exp(-(rssi - SENSITIVITY_DBM)))
     return distance[heard], rssi[heard]
 
 
 def test_the_papers_line() -> None:
-    assert pytest.approx(2.04, abs=0.005) == PAPER_EXPONENT
+    assert pytest.approx(2.04, abs=0.005) == EXPONENT
 
 
 def test_weak_packets_that_are_never_heard_do_not_flatten_the_line() -> None:
@@ -79,14 +80,14 @@ def test_weak_packets_that_are_never_heard_do_not_flatten_the_line() -> None:
     line = fit_path_loss(distance, rssi, rng.integers(0, 30, len(rssi)))
     assert line is not None
     slope = -np.polyfit(10 * np.log10(distance / 50), rssi, 1)[0]
-    assert slope < PAPER_EXPONENT - 0.3  # least squares
-    assert line.exponent.value == pytest.approx(PAPER_EXPONENT, abs=0.2)
-    assert line.exponent.low < PAPER_EXPONENT < line.exponent.high
+    assert slope < EXPONENT - 0.3  # least squares
+    assert line.exponent.value == pytest.approx(EXPONENT, abs=0.2)
+    assert line.exponent.low < EXPONENT < line.exponent.high
     assert line.level_dbm.low < -108 < line.level_dbm.high
     assert line.level_dbm.high - line.level_dbm.low < 3
     assert line.spread_db == pytest.approx(4.5, abs=0.6)
     assert line.sensitivity_dbm == pytest.approx(SENSITIVITY_DBM, abs=1.5)
-    assert line.at_1m_dbm == pytest.approx(-108 + 10 * PAPER_EXPONENT * math.log10(50), abs=4)
+    assert line.at_1m_dbm == pytest.approx(-108 + 10 * EXPONENT * math.log10(50), abs=4)
 
 
 def test_strays_do_not_move_the_line() -> None:
@@ -95,7 +96,7 @@ def test_strays_do_not_move_the_line() -> None:
     rssi[::60] = -60
     line = fit_path_loss(distance, rssi, rng.integers(0, 30, len(rssi)), SENSITIVITY_DBM)
     assert line is not None
-    assert line.exponent.value == pytest.approx(PAPER_EXPONENT, abs=0.3)
+    assert line.exponent.value == pytest.approx(EXPONENT, abs=0.3)
     assert line.level_dbm.value == pytest.approx(-108, abs=1.2)
 
 
@@ -107,7 +108,7 @@ def test_intervals_hold_what_they_promise() -> None:
         assert line is not None
         held += [
             line.level_dbm.low <= -108 <= line.level_dbm.high,
-            line.exponent.low <= PAPER_EXPONENT <= line.exponent.high,
+            line.exponent.low <= EXPONENT <= line.exponent.high,
         ]
     assert (held >= 35).all()  # 38 of 40 are promised
 
@@ -124,7 +125,7 @@ def test_distances_that_are_all_alike_tell_no_exponent() -> None:
     line = fit_path_loss(rng.uniform(95, 105, 60), rng.normal(-114, 3, 60), np.arange(60) // 6)
     assert line is not None
     assert not line.fitted_exponent
-    assert line.exponent.value == PAPER_EXPONENT
+    assert line.exponent.value == EXPONENT
     assert line.level_dbm.value == pytest.approx(-108, abs=2)
     assert fit_path_loss(np.full(19, 50.0), np.full(19, -108.0), np.zeros(19)) is None
 
@@ -133,13 +134,13 @@ def test_profiles_tell_distances_and_deliveries() -> None:
     packets, places, track = drive(1006)
     report = profile_signals(packets, places, track)
     profile = report.profiles[10]
-    assert profile.against == "fleet"
-    assert len(profile.distance_m) == profile.heard
+    assert profile.compared_with == "fleet"
+    assert len(profile.distance_m) == profile.received
     assert profile.nearest_m < 40
     assert 150 < profile.farthest_m < 700
     assert profile.delivery is not None
-    assert profile.expected > profile.heard
-    assert profile.delivery.low < profile.heard / profile.expected < profile.delivery.high
+    assert profile.expected > profile.received
+    assert profile.delivery.low < profile.received / profile.expected < profile.delivery.high
     levels = [profile.level_db for profile in report.profiles.values() if profile.level_db]
     assert len(levels) == 20
     assert sum(level.low < 0 < level.high for level in levels) >= 18
@@ -183,7 +184,7 @@ def test_without_a_track_only_deliveries_are_known() -> None:
 def test_one_marker_is_held_against_the_paper() -> None:
     packets, places, track = drive(1012, markers=1, offset_db={1: 1.0})
     profile = profile_signals(packets, places, track).profiles[1]
-    assert profile.against == "paper"
+    assert profile.compared_with == "paper"
     assert profile.health in (SignalHealth.HEALTHY, SignalHealth.NOT_ENOUGH_DATA)
 
 
@@ -198,7 +199,7 @@ def test_two_passes_an_hour_apart_are_not_one_of_losses() -> None:
     packets, places, _track = drive(1014)
     shift = [
         VerifiedPacket(
-            HeardPacket(p.entry, p.packet.heard_at_s + 3600, b"", rssi_dbm=p.packet.rssi_dbm),
+            ReceivedPacket(p.entry, p.packet.received_at_s + 3600, b"", rssi_dbm=p.packet.rssi_dbm),
             Verdict.AUTHENTIC, p.number,
             CerpmMessage(p.number or 1, LON_DEG, LAT_DEG, sequence=p.message.sequence + 1800),
         )
@@ -210,7 +211,9 @@ def test_two_passes_an_hour_apart_are_not_one_of_losses() -> None:
 
 def test_packets_without_a_strength_or_that_are_not_accepted() -> None:
     packets, places, track = drive(1015)
-    silent = [VerifiedPacket(HeardPacket(0, p.packet.heard_at_s, b""), p.verdict, p.number, p.message) for p in packets]
+    silent = [
+        VerifiedPacket(ReceivedPacket(0, p.packet.received_at_s, b""), p.verdict, p.number, p.message) for p in packets
+    ]
     report = profile_signals(silent, places, track)
     assert report.path_loss is None
     assert report.profiles[2].farthest_m > 0

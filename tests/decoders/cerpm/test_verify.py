@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 
 from app.decoders.cerpm.freshness import FreshnessRules, SequenceSpan
-from app.decoders.cerpm.packets import HeardPacket, PlainClaim
 from app.decoders.cerpm.verify import Verdict, Verification, verify_packets
 from app.errors import InvalidParameter
+from app.sensors.receiver import PlainClaim, ReceivedPacket
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, START_S, body, heard, key_of, signed
 
 KEYS = {number: key_of(number) for number in range(1, 41)}
 DAY_S = 86_400.0
 
 
-def verdicts(packets: list[HeardPacket], **given: object) -> list[Verdict]:
+def verdicts(packets: list[ReceivedPacket], **given: object) -> list[Verdict]:
     """Of each packet."""
     return [p.verdict for p in verify_packets(packets, KEYS, **given).packets]  # type: ignore[arg-type]
 
 
 def drive(
     start_s: float, first: int, *, count: int = 20, number: int = 7, interval_s: float = 1.0
-) -> list[HeardPacket]:
+) -> list[ReceivedPacket]:
     """An honest drive past one marker."""
     return [heard(first + i, start_s + i * interval_s, number, entry=i) for i in range(count)]
 
@@ -42,12 +42,12 @@ def test_an_honest_drive_is_accepted_and_its_span_kept() -> None:
 def test_what_is_not_signed_is_named() -> None:
     good = signed(body(3, sequence=5))
     cases = {
-        Verdict.UNAUTHENTICATED: HeardPacket(0, START_S, claim=PlainClaim(3, LON_DEG, LAT_DEG)),
-        Verdict.UNKNOWN_MARKER: HeardPacket(1, START_S, signed(body(4000))),
-        Verdict.FORGED: HeardPacket(2, START_S, body(4) + b"\0\0\0\1"),
-        Verdict.CORRUPT: HeardPacket(3, START_S, good[:7] + bytes([good[7] ^ 0x21]) + good[8:]),
-        Verdict.AUTHENTIC: HeardPacket(4, START_S, good),
-        Verdict.UNDECODABLE: HeardPacket(5, START_S, good[:23]),
+        Verdict.UNAUTHENTICATED: ReceivedPacket(0, START_S, claim=PlainClaim(3, LON_DEG, LAT_DEG)),
+        Verdict.UNKNOWN_MARKER: ReceivedPacket(1, START_S, signed(body(4000))),
+        Verdict.FORGED: ReceivedPacket(2, START_S, body(4) + b"\0\0\0\1"),
+        Verdict.CORRUPT: ReceivedPacket(3, START_S, good[:7] + bytes([good[7] ^ 0x21]) + good[8:]),
+        Verdict.AUTHENTIC: ReceivedPacket(4, START_S, good),
+        Verdict.UNDECODABLE: ReceivedPacket(5, START_S, good[:23]),
     }
     found = verify_packets(list(cases.values()), KEYS)
     assert [p.verdict for p in found.packets] == list(cases)
@@ -59,19 +59,19 @@ def test_impossible_values_and_a_turned_tag_are_damage() -> None:
     good = signed(body(3, sequence=5))
     turned = good[:-1] + bytes([good[-1] ^ 4])
     nowhere = signed(body(3, lon_deg=200.0, sequence=6))
-    packets = [HeardPacket(i, START_S + i, p) for i, p in enumerate((good, turned, nowhere))]
+    packets = [ReceivedPacket(i, START_S + i, p) for i, p in enumerate((good, turned, nowhere))]
     assert verdicts(packets) == [Verdict.AUTHENTIC, Verdict.CORRUPT, Verdict.CORRUPT]
 
 
 def test_a_marker_with_another_key_is_named_as_that() -> None:
-    packets = [HeardPacket(i, START_S + i, signed(body(5, sequence=i), key_of(99))) for i in range(4)]
+    packets = [ReceivedPacket(i, START_S + i, signed(body(5, sequence=i), key_of(99))) for i in range(4)]
     assert verdicts(packets) == [Verdict.WRONG_KEY] * 4
     assert verdicts(packets[:2]) == [Verdict.FORGED] * 2
 
 
 def test_disorder_and_echoes_cost_nothing() -> None:
     packets = drive(0, 100)
-    echoes = [replace(p, heard_at_s=p.heard_at_s + 1.5, entry=50 + p.entry) for p in packets[::4]]
+    echoes = [replace(p, received_at_s=p.received_at_s + 1.5, entry=50 + p.entry) for p in packets[::4]]
     mixed = packets + echoes
     np.random.default_rng(3).shuffle(mixed)  # type: ignore[arg-type]
     found = verify_packets(mixed, KEYS)
@@ -82,7 +82,7 @@ def test_disorder_and_echoes_cost_nothing() -> None:
 
 def test_the_same_sequence_again_is_a_replay_unless_it_is_the_same_uplink() -> None:
     first = replace(heard(100, 0), event="uplink-1")
-    again = replace(first, heard_at_s=first.heard_at_s + 40)
+    again = replace(first, received_at_s=first.received_at_s + 40)
     other = replace(again, event="uplink-2")
     assert verdicts([first, again]) == [Verdict.AUTHENTIC, Verdict.DUPLICATE]
     assert verdicts([first, other]) == [Verdict.AUTHENTIC, Verdict.REPLAYED]
@@ -99,12 +99,14 @@ def test_a_recorded_one_played_before_the_first_honest_one_came_too_late() -> No
     recorded = heard(100, 995, entry=0)  # 900 transmissions before the honest ones take longer than 5 s
     honest = drive(1000, 1000)
     assert verdicts([recorded, *honest])[0] is Verdict.OUT_OF_ORDER
-    sharper = FreshnessRules(least_interval_s=0.5)
+    sharper = FreshnessRules(min_interval_s=0.5)
     assert verdicts([heard(980, 995), *honest], rules=sharper)[0] is Verdict.OUT_OF_ORDER
     assert verdicts([heard(998, 998), *honest], rules=sharper) == [Verdict.AUTHENTIC] * 21
 
 
-def fleet(start_s: float, first: int, numbers: range, *, interval_s: float = 2.0, count: int = 6) -> list[HeardPacket]:
+def fleet(
+    start_s: float, first: int, numbers: range, *, interval_s: float = 2.0, count: int = 6
+) -> list[ReceivedPacket]:
     """An honest drive past several markers, whose transmissions are up to 10 % early or late."""
     rng = np.random.default_rng(first)
     return [
@@ -114,7 +116,7 @@ def fleet(start_s: float, first: int, numbers: range, *, interval_s: float = 2.0
     ]
 
 
-def test_the_interval_that_a_log_shows_tells_what_was_kept_back() -> None:
+def test_the_interval_in_a_log_shows_what_was_recorded_and_sent_again() -> None:
     honest = fleet(100, 1000, range(1, 9))
     # sent 100 times before the first honest one, so 200 s before, and heard 60 s before it
     late = [heard(900, 40, number) for number in (1, 5)]
@@ -142,13 +144,13 @@ def test_markers_of_other_intervals_are_no_replays() -> None:
 def test_a_replay_on_another_day_is_known_from_the_spans() -> None:
     first = verify_packets(drive(0, 100), KEYS)
     spans = {number: list(kept) for number, kept in first.spans.items()}
-    replays = [replace(p, heard_at_s=p.heard_at_s + DAY_S) for p in drive(0, 100)]
+    replays = [replace(p, received_at_s=p.received_at_s + DAY_S) for p in drive(0, 100)]
     lost = heard(110, DAY_S)
     earlier = heard(99, DAY_S)
     fresh = drive(DAY_S, 80_000)
-    assert verdicts(replays, heard_before=spans) == [Verdict.REPLAYED] * 20
-    assert verdicts([lost, earlier], heard_before=spans) == [Verdict.REPLAYED, Verdict.OUT_OF_ORDER]
-    assert verdicts(fresh, heard_before=spans) == [Verdict.AUTHENTIC] * 20
+    assert verdicts(replays, earlier_spans=spans) == [Verdict.REPLAYED] * 20
+    assert verdicts([lost, earlier], earlier_spans=spans) == [Verdict.REPLAYED, Verdict.OUT_OF_ORDER]
+    assert verdicts(fresh, earlier_spans=spans) == [Verdict.AUTHENTIC] * 20
 
 
 def test_a_late_log_fits_between_those_that_came_before_it() -> None:
@@ -158,26 +160,26 @@ def test_a_late_log_fits_between_those_that_came_before_it() -> None:
             SequenceSpan(5000, 5020, START_S + DAY_S, START_S + DAY_S + 20),
         ]
     }
-    assert verdicts(drive(3600, 2000), heard_before=spans) == [Verdict.AUTHENTIC] * 20
-    assert verdicts(drive(-3600, 50, count=1), heard_before=spans) == [Verdict.AUTHENTIC]
-    assert verdicts(drive(2 * DAY_S, 4000), heard_before=spans) == [Verdict.OUT_OF_ORDER] * 20
-    assert verdicts(drive(-3600, 4000), heard_before=spans) == [Verdict.OUT_OF_ORDER] * 20
+    assert verdicts(drive(3600, 2000), earlier_spans=spans) == [Verdict.AUTHENTIC] * 20
+    assert verdicts(drive(-3600, 50, count=1), earlier_spans=spans) == [Verdict.AUTHENTIC]
+    assert verdicts(drive(2 * DAY_S, 4000), earlier_spans=spans) == [Verdict.OUT_OF_ORDER] * 20
+    assert verdicts(drive(-3600, 4000), earlier_spans=spans) == [Verdict.OUT_OF_ORDER] * 20
 
 
 @pytest.mark.parametrize("offset_s", [-30.0, 30.0])
 def test_clocks_may_differ_between_drives(offset_s: float) -> None:
-    spans = verify_packets([replace(p, heard_at_s=p.heard_at_s - offset_s) for p in drive(0, 100)], KEYS).spans
-    beside = [replace(p, heard_at_s=p.heard_at_s + offset_s) for p in drive(0.2, 100, interval_s=0.99)]
-    assert verdicts(beside, heard_before=spans) == [Verdict.AUTHENTIC] * 20
+    spans = verify_packets([replace(p, received_at_s=p.received_at_s - offset_s) for p in drive(0, 100)], KEYS).spans
+    beside = [replace(p, received_at_s=p.received_at_s + offset_s) for p in drive(0.2, 100, interval_s=0.99)]
+    assert verdicts(beside, earlier_spans=spans) == [Verdict.AUTHENTIC] * 20
 
 
 def test_the_same_log_again_is_read_again() -> None:
     spans = verify_packets(drive(0, 100), KEYS).spans
-    assert verdicts(drive(0, 100), heard_before=spans) == [Verdict.AUTHENTIC] * 20
+    assert verdicts(drive(0, 100), earlier_spans=spans) == [Verdict.AUTHENTIC] * 20
 
 
 def test_without_times_only_what_is_above_all_known_is_accepted() -> None:
-    packets = [replace(p, heard_at_s=math.nan) for p in drive(0, 100)]
+    packets = [replace(p, received_at_s=math.nan) for p in drive(0, 100)]
     found = verify_packets([*packets, packets[0]], KEYS, {7: [SequenceSpan(1, 104, START_S, START_S)]})
     assert [p.verdict for p in found.packets] == [Verdict.OUT_OF_ORDER] * 5 + [Verdict.AUTHENTIC] * 15 + [
         Verdict.DUPLICATE
@@ -187,11 +189,11 @@ def test_without_times_only_what_is_above_all_known_is_accepted() -> None:
     (span,) = found.spans[7]
     assert (span.first_sequence, span.last_sequence) == (105, 119)
     assert math.isnan(span.last_heard_s)
-    assert verdicts(drive(DAY_S, 110), heard_before=found.spans) == [Verdict.REPLAYED] * 10 + [Verdict.AUTHENTIC] * 10
+    assert verdicts(drive(DAY_S, 110), earlier_spans=found.spans) == [Verdict.REPLAYED] * 10 + [Verdict.AUTHENTIC] * 10
 
 
 def test_nothing_is_heard_after_its_upload() -> None:
-    rules = FreshnessRules(received_at_s=START_S + 10)
+    rules = FreshnessRules(uploaded_at_s=START_S + 10)
     assert verdicts([heard(1, 0), heard(2, 3600)], rules=rules) == [Verdict.AUTHENTIC, Verdict.OUT_OF_ORDER]
 
 
@@ -206,7 +208,7 @@ def test_ten_thousand_forged_and_replayed_packets_are_all_refused_and_no_honest_
     rng = np.random.default_rng(1007)
     spans: dict[int, list[SequenceSpan]] = {}
     refused = honest = 0
-    recorded: list[HeardPacket] = []
+    recorded: list[ReceivedPacket] = []
     for day in range(5):
         clock_s = day * 3600 + rng.uniform(-30, 30)
         log = [
@@ -229,15 +231,15 @@ def test_ten_thousand_forged_and_replayed_packets_are_all_refused_and_no_honest_
     assert honest == 0
 
 
-def _forgery(rng: np.random.Generator, clock_s: float) -> HeardPacket:
+def _forgery(rng: np.random.Generator, clock_s: float) -> ReceivedPacket:
     content = body(int(rng.integers(1, 41)), LON_DEG + 3e-4, sequence=int(rng.integers(0, 2**32)))
-    return HeardPacket(0, START_S + clock_s + rng.uniform(0, 30), content + rng.bytes(4))
+    return ReceivedPacket(0, START_S + clock_s + rng.uniform(0, 30), content + rng.bytes(4))
 
 
-def _replay(rng: np.random.Generator, recorded: list[HeardPacket], clock_s: float, old: bool) -> HeardPacket:
+def _replay(rng: np.random.Generator, recorded: list[ReceivedPacket], clock_s: float, old: bool) -> ReceivedPacket:
     packet = recorded[int(rng.integers(len(recorded)))]
-    at_s = START_S + clock_s + rng.uniform(0, 30) if old else packet.heard_at_s + rng.uniform(0.1, 100)
-    return replace(packet, heard_at_s=at_s)
+    at_s = START_S + clock_s + rng.uniform(0, 30) if old else packet.received_at_s + rng.uniform(0.1, 100)
+    return replace(packet, received_at_s=at_s)
 
 
 def test_a_long_log_takes_seconds() -> None:
@@ -248,7 +250,7 @@ def test_a_long_log_takes_seconds() -> None:
     assert found.counts()[Verdict.AUTHENTIC] == 20_000
 
 
-@pytest.mark.parametrize("name", ["clock_tolerance_s", "echo_s", "least_interval_s", "received_at_s"])
+@pytest.mark.parametrize("name", ["clock_tolerance_s", "echo_s", "min_interval_s", "uploaded_at_s"])
 def test_rules_are_checked(name: str) -> None:
     for value in (-1.0, math.nan, math.inf):
         with pytest.raises(InvalidParameter, match=name):

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from app.decoders.cerpm.merge import merge_markers
-from app.decoders.cerpm.merge_types import Disagreement, MergedMarkers, MergeRules, RegisteredMarker
-from app.decoders.cerpm.packets import HeardPacket, PlainClaim
-from app.decoders.cerpm.track_places import distances_m, offsets_m, vehicle_places
+from app.decoders.cerpm.merged_markers import Disagreement, MergedMarkers, MergeRules, RegisteredMarker
+from app.decoders.cerpm.vehicle_positions import distances_m, offsets_m, vehicle_positions
 from app.decoders.cerpm.verify import VerifiedPacket, verify_packets
 from app.errors import InvalidParameter
 from app.markers.cerpm import LaneSide
 from app.sensors.pose_track import PoseTrack
+from app.sensors.receiver import PlainClaim, ReceivedPacket
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, START_S, body, key_of, signed
 
 M_EAST, M_NORTH = 1 / (111_320 * math.cos(math.radians(LAT_DEG))), 1 / 111_080
@@ -36,15 +36,15 @@ def say(
     north_m: float = 0.0,
     swap: bool = False,
     head: int = 0x14,
-) -> HeardPacket:
-    """A signed packet that claims a place so far off."""
+) -> ReceivedPacket:
+    """A signed packet with a position this far off."""
     lon, lat = place(number)
     lon, lat = lon + east_m * M_EAST, lat + north_m * M_NORTH
     content = body(number, *((lat, lon) if swap else (lon, lat)), sequence=sequence, head=head)
-    return HeardPacket(sequence, START_S + at_s, signed(content))
+    return ReceivedPacket(sequence, START_S + at_s, signed(content))
 
 
-def heard(*packets: HeardPacket) -> list[VerifiedPacket]:
+def heard(*packets: ReceivedPacket) -> list[VerifiedPacket]:
     """With verdicts."""
     return verify_packets(packets, key_of).packets
 
@@ -69,8 +69,8 @@ def kinds(merged: MergedMarkers) -> dict[int, Disagreement]:
     return {finding.number: finding.kind for finding in merged.findings}
 
 
-def drive(count: int = 6, **off: float) -> list[HeardPacket]:
-    """Each marker is heard twice."""
+def drive(count: int = 6, **off: float) -> list[ReceivedPacket]:
+    """Each marker is received twice."""
     return [say(n, 100 + k, n + 0.1 * k, **off) for n in range(1, count + 1) for k in range(2)]  # type: ignore[arg-type]
 
 
@@ -90,8 +90,8 @@ def test_rows_are_of_the_registry_or_the_newest_message() -> None:
 
 
 def test_nobody_without_a_tag_moves_a_marker() -> None:
-    forged = HeardPacket(9, START_S + 3, body(1, LON_DEG, LAT_DEG + 1, sequence=200) + b"abcd")
-    clear = HeardPacket(10, START_S + 3, claim=PlainClaim(1, LON_DEG, LAT_DEG + 1))
+    forged = ReceivedPacket(9, START_S + 3, body(1, LON_DEG, LAT_DEG + 1, sequence=200) + b"abcd")
+    clear = ReceivedPacket(10, START_S + 3, claim=PlainClaim(1, LON_DEG, LAT_DEG + 1))
     replayed = replace(say(1, 90, 4, east_m=30.0), entry=11)
     merged = merge_markers(heard(*drive(3), forged, clear, replayed), registry(1, 2, 3), track())
     assert merged.lat_deg.tolist() == [place(n)[1] for n in (1, 2, 3)]
@@ -99,7 +99,7 @@ def test_nobody_without_a_tag_moves_a_marker() -> None:
 
 
 def test_claims_in_clear_are_used_where_that_is_asked_for() -> None:
-    clear = [HeardPacket(n, START_S + n, claim=PlainClaim(n, *place(n))) for n in (1, 2)]
+    clear = [ReceivedPacket(n, START_S + n, claim=PlainClaim(n, *place(n))) for n in (1, 2)]
     assert not len(merge_markers(heard(*clear), {}).number)
     merged = merge_markers(heard(*clear, say(2, 1, 2, east_m=0.2)), {}, None, MergeRules(accept_clear=True))
     assert merged.number.tolist() == [1, 2]
@@ -129,7 +129,7 @@ def test_two_markers_of_one_number_are_named() -> None:
         assert merged.number.tolist() == [1, 2]
     behind = [say(3, 10 + k, 5 + k, east_m=20.0) for k in range(3)]
     assert kinds(merge_markers(heard(*drive(2), *honest, *behind), {}, track())) == {3: Disagreement.TWO_PLACES}
-    # the registry tells which of both is right, so an old message sent again does not put a marker out of use
+    # the registry shows which of both is right, so an old message sent again does not put a marker out of use
     assert kinds(merge_markers(heard(*drive(2), *honest, *behind), registry(3), track())) == {}
 
 
@@ -209,7 +209,7 @@ def test_places_of_the_vehicle_between_poses() -> None:
     around = PoseTrack(
         np.array([0.0, 1, 2, 20]), np.array([179.9999, -179.9999, -179.9998, 0]), np.zeros(4), nothing, nothing
     )
-    places = vehicle_places(around, [-1, 0, 0.5, 1.5, 2, 10, 20, 21, np.nan])
+    places = vehicle_positions(around, [-1, 0, 0.5, 1.5, 2, 10, 20, 21, np.nan])
     np.testing.assert_allclose(
         places[:, 0], [np.nan, 179.9999, -180, -179.99985, -179.9998, np.nan, 0, np.nan, np.nan], atol=1e-9
     )

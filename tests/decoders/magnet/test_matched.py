@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from app.decoders.magnet.book import TagBook, TagFormat
 from app.decoders.magnet.decoder import MagnetDecoder, decode_trace
+from app.decoders.magnet.identify import TagCandidates, TagFormat
 from app.decoders.magnet.readings import Finding, LineCrossing, MagnetReading, NoiseFinding, NoiseKind, Side, TagReading
 from app.errors import InvalidParameter
 from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
@@ -74,10 +74,10 @@ def test_town_iron_is_named_not_read() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_any_chunking_gives_the_same(seed: int) -> None:
     drive = tags_drive(14, [InformationTag.from_gaps("SNS", 1.0, (1, 3))] * 3, 25.0)
-    book = TagBook(formats=[TagFormat()])
-    whole = decode_trace(drive.trace, BAR, book=book)
+    candidates = TagCandidates(formats=[TagFormat()])
+    whole = decode_trace(drive.trace, BAR, candidates=candidates)
     rng = np.random.default_rng(seed)
-    decoder = MagnetDecoder(BAR, book=book)
+    decoder = MagnetDecoder(BAR, candidates=candidates)
     pieces: list[Finding] = []
     t = -1.0
     while t < drive.trace.t_s[-1]:
@@ -111,11 +111,11 @@ TAGS = [
 ]
 
 
-@pytest.mark.parametrize("known", ["formats", "designs"])
+@pytest.mark.parametrize("known", ["formats", "tags"])
 def test_reads_tags(known: str) -> None:
     drive = tags_drive(15, TAGS, 15.0)
-    book = TagBook(formats=[TagFormat()]) if known == "formats" else TagBook(TAGS)
-    tags = [f for f in decode_trace(drive.trace, BAR, book=book) if isinstance(f, TagReading)]
+    candidates = TagCandidates(formats=[TagFormat()]) if known == "formats" else TagCandidates(TAGS)
+    tags = [f for f in decode_trace(drive.trace, BAR, candidates=candidates) if isinstance(f, TagReading)]
     assert [t.tag for t in tags] == TAGS
     assert not any(t.wrong_way or t.missing or t.extra for t in tags)
     for reading in tags:
@@ -127,7 +127,7 @@ def test_reads_tags(known: str) -> None:
 @pytest.mark.parametrize("magnet", [0, 1, 2])
 def test_a_missing_magnet_costs_only_its_own_tag(magnet: int) -> None:
     drive = tags_drive(16, TAGS, 9.0, drop=(1, magnet))
-    tags = [f for f in decode_trace(drive.trace, BAR, book=TagBook(TAGS)) if isinstance(f, TagReading)]
+    tags = [f for f in decode_trace(drive.trace, BAR, candidates=TagCandidates(TAGS)) if isinstance(f, TagReading)]
     whole = [t.tag for t in tags if not t.missing]
     assert [t for t in whole if t is not None] == [TAGS[0], TAGS[2], TAGS[3]]
 
@@ -135,7 +135,7 @@ def test_a_missing_magnet_costs_only_its_own_tag(magnet: int) -> None:
 def test_an_extra_magnet_costs_nothing() -> None:
     more = [RoadMagnet(30 + 9 + 2.0, 0.0, Polarity.N, Orientation.FORWARD)]
     drive = tags_drive(17, TAGS, 9.0, extra=more)
-    tags = [f for f in decode_trace(drive.trace, BAR, book=TagBook(TAGS)) if isinstance(f, TagReading)]
+    tags = [f for f in decode_trace(drive.trace, BAR, candidates=TagCandidates(TAGS)) if isinstance(f, TagReading)]
     assert [t.tag for t in tags] == TAGS
     assert [t.extra for t in tags] == [0, 1, 0, 0]
 
@@ -143,7 +143,7 @@ def test_an_extra_magnet_costs_nothing() -> None:
 def test_the_wrong_way_is_recognised() -> None:
     tags = [InformationTag.from_gaps("NNN", 1.0, (1, 3)), InformationTag.from_gaps("NSN", 1.0, (3, 1))]
     drive = tags_drive(18, tags, 15.0, wrong_way=True)
-    readings = [f for f in decode_trace(drive.trace, BAR, book=TagBook(tags)) if isinstance(f, TagReading)]
+    readings = [f for f in decode_trace(drive.trace, BAR, candidates=TagCandidates(tags)) if isinstance(f, TagReading)]
     assert [r.tag for r in readings] == tags
     assert all(r.wrong_way for r in readings)
 
@@ -174,7 +174,7 @@ def test_other_bars_and_rates() -> None:
     assert right_and_other(drive, decode_trace(drive.trace, bar)) == (12, 0)
 
 
-def test_missing_samples_and_a_gap_are_survived_and_told() -> None:
+def test_missing_samples_and_a_gap_are_survived_and_reported() -> None:
     drive = magnets_drive(21, 0.16, 30)
     t, field = drive.trace.t_s, drive.trace.field_ut.copy()
     field[:, 4] = np.nan  # a dead sensor

@@ -45,11 +45,6 @@ def test_thresholds() -> None:
     assert steps.amplitude_steps(x, np.array([100, 500]), 350)[1] == pytest.approx(20, abs=0.1)
 
 
-def test_alignment_turns_the_reference() -> None:
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    np.testing.assert_allclose(steps.align_reference(np.array([[1.0, 2, 3]]), turn), [[-2, 1, 3]])
-
-
 def test_scaling_takes_offset_and_spread() -> None:
     rng = np.random.default_rng(1)
     front, reference = 5 + 2 * rng.standard_normal(400), 100 + 30 * rng.standard_normal(400)

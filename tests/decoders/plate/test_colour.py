@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.decoders.plate.colour import MarkerColours, half_planes, marker_colours, vivid_signal
-from app.decoders.plate.fit import marker_centroids, unit_centres
-from app.decoders.plate.reader import CAST_ALONE, LEAST_TINT_ALONE
+from app.decoders.plate.colour import difference_signal, half_planes
+from app.decoders.plate.layout import marker_centroids, unit_centres
+from app.decoders.plate.marker_colours import MarkerColours, marker_colours
+from app.decoders.plate.reader import CAST_ALONE, MIN_TINT_ALONE
 from app.markers.plate import PlateGeometry
 
 GEOMETRY = PlateGeometry()
@@ -21,14 +22,14 @@ def colours_of(triangle: Colour, squares: Colour, units: Colour) -> MarkerColour
     image[:80, :80] = triangle
     image[:80, -80:] = image[-80:, :80] = image[-80:, -80:] = squares
     plate_from_image = np.diag([1 / SIDE_PX, 1 / SIDE_PX, 1.0])
-    signal = vivid_signal(half_planes(image))
+    signal = difference_signal(half_planes(image))
     return marker_colours(signal, plate_from_image, marker_centroids(GEOMETRY), unit_centres(GEOMETRY))
 
 
 def test_a_black_triangle_with_a_purple_tint_is_not_red() -> None:
     """Lateral chromatic aberration tints what is black: much redder than green, but no redder than blue."""
     colours = colours_of((40, 30, 46), (49, 73, 49), (100, 106, 116))
-    assert colours.tints[0] < LEAST_TINT_ALONE
+    assert colours.tints[0] < MIN_TINT_ALONE
     np.testing.assert_allclose(colours.tints[1:], 1.0)
 
 
@@ -39,7 +40,7 @@ def test_a_red_triangle_is_red_under_a_cast(cast: tuple[float, float, float]) ->
         for colour in ((40, 45, 120), (70, 140, 60), (150, 150, 150))
     )
     colours = colours_of(triangle, squares, units)
-    assert colours.tints.min() > LEAST_TINT_ALONE
+    assert colours.tints.min() > MIN_TINT_ALONE
     assert CAST_ALONE[0] < colours.cast.min()
     assert colours.cast.max() < CAST_ALONE[1]
     np.testing.assert_allclose(colours.cast, (cast[0], cast[2]), rtol=0.02)

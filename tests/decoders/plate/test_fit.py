@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.decoders.plate.fit import fit_plate, marker_centroids, project
+from app.decoders.plate.fit import fit_plate
+from app.decoders.plate.homography import project
+from app.decoders.plate.layout import marker_centroids
 from app.markers.plate import PlateGeometry
 from app.simulation.plate_scene import PlacedFace
 from tests.decoders.plate.scenes import face_of, shoot, shoot_plate

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from app.decoders.images import load_image
 from app.decoders.plate import decode_plates
 from app.errors import InvalidParameter
+from app.formats.images import load_image
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlateReading
 from app.sensors.camera import Camera

@@ -108,7 +108,7 @@ def test_a_face_without_dark_units_is_undecodable() -> None:
 
 @pytest.mark.parametrize("seed", [20, 53, 95])
 def test_a_stain_that_turns_a_light_unit_dark_is_no_digit(seed: int) -> None:
-    """Each of these shows a wrong digit, every cell clear: what tells is that stains end beside units, too."""
+    """Each of these shows a wrong digit, every cell clear: only the residuals beside the units show the stains."""
     wear = PlateWear(contrast_loss=0.2, patchy_loss=0.4, dirt_blobs=3, dirt_mm=16.0)
     readings = read_face(face_of(wear=wear, seed=seed), turn_deg=20.0)
     assert digits_in(readings) == []
@@ -116,7 +116,7 @@ def test_a_stain_that_turns_a_light_unit_dark_is_no_digit(seed: int) -> None:
     assert "stained" in readings[0].reason
 
 
-def test_the_registry_vouches_for_digits_beside_a_stain() -> None:
+def test_the_registry_confirms_digits_beside_a_stain() -> None:
     wear = PlateWear(contrast_loss=0.2, patchy_loss=0.4, dirt_blobs=3, dirt_mm=16.0)
     face = face_of(wear=wear, seed=5)
     assert digits_in(read_face(face, turn_deg=20.0)) == []

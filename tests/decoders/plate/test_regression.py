@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.plates.judge import Record, judge_job
+from benchmarks.plates.evaluate import Record, evaluate_job
 from benchmarks.plates.sets import Job, read_trials
 
 TRIALS = (2, 5, 9, 14, 16, 20, 22, 24, 25)  # of the paper's 26, in figures 10, 12 and 13
-LEAST_ROWS = 16.0
-LEAST_READ_SHARE = 0.88  # 0.95 were read when this was written
+MIN_ROWS = 16.0
+MIN_READ_SHARE = 0.88  # 0.95 were read when this was written
 
 
 @pytest.fixture(scope="module")
 def trial_records() -> list[Record]:
     assert len(read_trials()) == 26
-    return [record for k in TRIALS for record in judge_job(Job("trial", k, seed=11, frames=0, share=0.12))]
+    return [record for k in TRIALS for record in evaluate_job(Job("trial", k, seed=11, frames=0, share=0.12))]
 
 
 def test_trial_frames_stay_read(trial_records: list[Record]) -> None:
-    large = [record for record in trial_records if record.height_px >= LEAST_ROWS]
+    large = [record for record in trial_records if record.height_px >= MIN_ROWS]
     assert len(large) >= 40
     missed = [(record.label, record.number, record.height_px) for record in large if not record.decoded]
-    assert len(missed) <= (1 - LEAST_READ_SHARE) * len(large), missed
+    assert len(missed) <= (1 - MIN_READ_SHARE) * len(large), missed
     assert sum(record.decoded_known for record in large) >= sum(record.decoded for record in large)
 
 
@@ -33,6 +33,6 @@ def test_no_trial_frame_is_read_wrong(trial_records: list[Record]) -> None:
 
 @pytest.mark.parametrize(("name", "frames"), [("free", 20), ("hidden", 8)])
 def test_frames_without_a_whole_plate_are_never_read_wrong(name: str, frames: int) -> None:
-    records = judge_job(Job(name, 0, seed=11, frames=frames))
+    records = evaluate_job(Job(name, 0, seed=11, frames=frames))
     assert len(records) == frames
     assert [(r.number, r.wrong, r.wrong_known) for r in records if r.wrong or r.wrong_known] == []

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.decoders.plate import decode_plates
-from app.decoders.plate.thermal import _quad_around
+from app.decoders.plate.detect_thermal import _quad_around
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
 from benchmarks.plates.sets import Job, Shot, find_shot

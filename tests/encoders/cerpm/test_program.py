@@ -7,19 +7,11 @@ import io
 
 import pytest
 
-from app.encoders.cerpm import (
-    MarkerProgram,
-    RadioSettings,
-    Region,
-    encode_message,
-    explain_payload,
-    time_on_air_s,
-    wrap_uplink,
-    write_programs_csv,
-)
+from app.encoders.cerpm import MarkerProgram, encode_message, explain_payload, write_programs_csv
 from app.errors import InvalidParameter
 from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit
 from app.markers.cerpm_keys import derive_marker_key, message_tag
+from app.radio.settings import RadioSettings
 
 AGENCY_KEY = bytes(range(32))
 
@@ -73,54 +65,6 @@ def test_a_short_key_programs_nothing() -> None:
     with pytest.raises(InvalidParameter) as caught:
         MarkerProgram(make_program().message, b"short", RadioSettings())
     assert caught.value.field == "key"
-
-
-def test_a_sequence_lasts_longer_than_a_marker() -> None:
-    assert make_program().last_sequence_years == pytest.approx(204.15, abs=0.01)
-
-
-# --- LoRaWAN ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("region", "data_rate", "spreading_factor", "bandwidth_hz"),
-    [
-        (Region.US915, 1, 9, 125_000),
-        (Region.US915, 3, 7, 125_000),
-        (Region.US915, 4, 8, 500_000),
-        (Region.EU868, 0, 12, 125_000),
-        (Region.EU868, 6, 7, 250_000),
-    ],
-)
-def test_lorawan_adds_13_bytes(region: Region, data_rate: int, spreading_factor: int, bandwidth_hz: int) -> None:
-    program = make_program()
-    payload = encode_message(program.message, program.key)
-    uplink = wrap_uplink(payload, region, data_rate)
-    assert (uplink.payload, uplink.frame_bytes, uplink.f_port) == (payload, 37, 24)
-    assert uplink.time_on_air_s == time_on_air_s(37, spreading_factor, bandwidth_hz)
-
-
-@pytest.mark.parametrize(
-    ("region", "data_rate", "mac_bytes", "field"),
-    [
-        (Region.US915, 0, 0, "data_rate"),
-        (Region.US915, 5, 0, "data_rate"),
-        (Region.EU868, 7, 0, "data_rate"),
-        (Region.US915, -1, 0, "data_rate"),
-        (Region.US915, 1, 16, "mac_command_bytes"),
-    ],
-)
-def test_data_rates_without_room_are_refused(region: Region, data_rate: int, mac_bytes: int, field: str) -> None:
-    with pytest.raises(InvalidParameter) as caught:
-        wrap_uplink(bytes(24), region, data_rate, mac_command_bytes=mac_bytes)
-    assert caught.value.field == field
-
-
-def test_the_refusal_of_dr0_names_those_that_fit() -> None:
-    with pytest.raises(InvalidParameter, match="room for 11") as caught:
-        wrap_uplink(bytes(24), Region.US915, 0)
-    assert caught.value.limit is not None
-    assert "DR1, DR2, DR3, DR4" in caught.value.limit
 
 
 # --- explanation --------------------------------------------------------------------------------------------------

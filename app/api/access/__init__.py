@@ -1,0 +1,1 @@
+"""Routes on keys and the audit log."""

@@ -1,0 +1,1 @@
+"""Routes on uploads and their decodes."""

@@ -1,0 +1,168 @@
+"""/v1/decodes: upload frames and traces, read what was found in them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Path, Query, Request, Response
+
+from app.api.decodes.schemas import CONTEXT_EXAMPLE, ContextIn
+from app.api.decodes.uploads import RAW_TYPES, Upload
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
+from app.api.http.forms import form_body
+from app.api.http.problems import problem_responses
+from app.api.http.responses import (
+    BINARY,
+    NOT_MODIFIED,
+    IfNoneMatch,
+    created_response,
+    document_response,
+    file_response,
+    json_response,
+    page_response,
+)
+from app.registry.jobs import JobState
+from app.services.decodes.decodes import Decodes as DecodesService
+from app.services.decodes.documents import DecodeDocument, DecodePage
+from app.services.decodes.outputs import DecodeOutputs
+
+router = APIRouter(prefix="/v1/decodes", tags=["decodes"])
+
+DecodeId = Annotated[Identifier, Path(description="Id of the decode.")]
+_MEDIA_TYPES = {"png": "image/png", "jpg": "image/jpeg"}
+
+_JSON_BODY = {"type": "object", "description": "An uplink as a network server posts it."}
+_BODY = form_body(
+    {
+        "file": {**BINARY, "description": "JPEG, PNG, or a ZIP of them; a trace."},
+        "vehicle": {"type": "string", "description": "Name or id of the vehicle."},
+    },
+    "context",
+    ContextIn,
+    {"file": "frame.jpg", "context": CONTEXT_EXAMPLE},
+    **{kind: {"schema": _JSON_BODY if kind == "application/json" else BINARY} for kind in RAW_TYPES},
+)
+Decodes = Annotated[DecodesService, use_cases("decodes")]
+Outputs = Annotated[DecodeOutputs, use_cases("decode_outputs")]
+
+
+@router.post(
+    "",
+    status_code=201,
+    openapi_extra=_BODY,
+    responses={
+        201: {"model": DecodeDocument, "description": "Decoded"},
+        202: {"model": DecodeDocument, "description": "Queued; Location leads to its progress"},
+        **problem_responses(404, 409, 415),
+    },
+)
+def post_decode(caller: Caller, upload: Upload, decodes: Decodes) -> Response:
+    """Decode a frame, a magnetometer trace or a packet log (answered at once), a ZIP of frames or a long log (queued).
+
+    A trace is announced by `trace` in its context; its file is METRO's stream, the recorder's or plain CSV, Parquet, or
+    a ZIP of the files of one recording, CAN logs with them.
+
+    A packet log of CERPMs is announced by `packets`; it is CSV, JSON lines, raw payloads or uplinks of ChirpStack or
+    The Things Stack, or a ZIP of these with the vehicle's poses and a camera frame.
+
+    The context comes as the form's part `context`, or beside a bare file in the header `Waymark-Context`, as JSON. With
+    an Idempotency-Key a repeated request gets the first answer again. No plate is a result: an empty list.
+    """
+    document, replayed = decodes.decode_upload(caller, upload.data, upload.context, upload.idempotency)
+    if document["state"] == "done":
+        return created_response(document, replayed, path="/v1/decodes")
+    response = created_response(document, replayed, path="/v1/decodes", status=202)
+    response.headers["Retry-After"] = "1"
+    return response
+
+
+@router.get("", responses=document_response(DecodePage))
+def list_decodes(
+    request: Request,
+    caller: Caller,
+    decodes: Decodes,
+    state: JobState | None = None,
+    limit: PageSize = 100,
+    before: LastId = None,
+) -> Response:
+    """Decodes without their results, newest first."""
+    page, last = decodes.page(caller, state=state, before=before, limit=limit)
+    return page_response(request, {"items": page}, before=last)
+
+
+@router.get("/{decode_id}", responses=document_response(DecodeDocument, 404))
+def get_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
+    """One decode with its result, or its progress."""
+    document = decodes.get(caller, decode_id)
+    waiting = document["state"] in ("queued", "running")
+    return json_response(document, headers={"Retry-After": "1"} if waiting else None)
+
+
+@router.post("/{decode_id}/cancel", responses=document_response(DecodeDocument, 404))
+def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Response:
+    """Ask a queued or running decode to stop; a finished one stays as it is."""
+    return json_response(decodes.cancel(caller, decode_id))
+
+
+@router.get(
+    "/{decode_id}/plot.svg", responses={**file_response(["image/svg+xml"]), **NOT_MODIFIED, **problem_responses(404)}
+)
+def get_plot(decode_id: DecodeId, caller: Caller, outputs: Outputs, if_none_match: IfNoneMatch = None) -> Response:
+    """What was found: magnets, tags and line crossings in a trace, or the lane and the radio of a packet log."""
+    headers = {"ETag": f'"{decode_id}-plot"', "Cache-Control": "private, max-age=86400"}
+    plot = outputs.plot(caller, decode_id)
+    if if_none_match == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    return Response(plot, headers=headers, media_type="image/svg+xml")
+
+
+@router.get(
+    "/{decode_id}/lane.geojson", responses={**file_response(["application/geo+json"]), **problem_responses(404)}
+)
+def get_lane(decode_id: DecodeId, caller: Caller, outputs: Outputs) -> Response:
+    """Path, boundaries and markers that a packet log gave, as GeoJSON."""
+    answer = json_response(outputs.lane(caller, decode_id))
+    answer.headers["Content-Type"] = "application/geo+json"
+    return answer
+
+
+@router.get(
+    "/{decode_id}/overlay.{suffix}",
+    responses={**file_response(_MEDIA_TYPES.values()), **NOT_MODIFIED, **problem_responses(404)},
+)
+def get_overlay(
+    decode_id: DecodeId,
+    suffix: Literal["png", "jpg"],
+    caller: Caller,
+    decodes: Decodes,
+    outputs: Outputs,
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """The camera frame of a packet log with the lane drawn over it, drawn when it is asked for."""
+    headers = {"ETag": f'"{decode_id}-overlay-{suffix}"', "Cache-Control": "private, max-age=86400"}
+    if if_none_match == headers["ETag"]:
+        decodes.get(caller, decode_id)
+        return Response(status_code=304, headers=headers)
+    return Response(outputs.overlay(caller, decode_id, suffix), headers=headers, media_type=_MEDIA_TYPES[suffix])
+
+
+@router.get(
+    "/{decode_id}/annotated.{suffix}",
+    responses={**file_response(_MEDIA_TYPES.values()), **NOT_MODIFIED, **problem_responses(404)},
+)
+def get_annotated(
+    decode_id: DecodeId,
+    suffix: Literal["png", "jpg"],
+    caller: Caller,
+    decodes: Decodes,
+    outputs: Outputs,
+    frame: Annotated[int, Query(ge=0, le=100_000, description="Number of the frame in an archive.")] = 0,
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """The frame with outlines, digits and confidence of its readings, drawn when it is asked for."""
+    headers = {"ETag": f'"{decode_id}-{frame}-{suffix}"', "Cache-Control": "private, max-age=86400"}
+    if if_none_match == headers["ETag"]:
+        decodes.get(caller, decode_id)
+        return Response(status_code=304, headers=headers)
+    picture = outputs.annotated(caller, decode_id, suffix, frame)
+    return Response(picture, headers=headers, media_type=_MEDIA_TYPES[suffix])

@@ -1,0 +1,1 @@
+"""Routes on vehicles, calibrations and snapshots."""

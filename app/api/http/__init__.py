@@ -1,0 +1,1 @@
+"""What every route shares: dependencies, middleware, permissions, problem documents, limits."""

@@ -1,0 +1,96 @@
+"""Forms with files: their media type, text parts, declarations and Idempotency-Keys, and their OpenAPI description."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, TypeVar
+
+from fastapi import Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
+from starlette.datastructures import FormData, UploadFile
+
+from app.api.http.components import reference
+from app.api.http.dependencies import checked_idempotency_key
+from app.api.http.strict_json import parse_json
+from app.services.idempotency import IdempotencyKey
+
+FORM = "multipart/form-data"
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+def media_type_of(request: Request) -> str:
+    """The media type of a request's body, without parameters."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+async def read_text(form: FormData, name: str) -> bytes:
+    """A part that is text, sent as a file or not; empty if there is none."""
+    part = form.get(name, "")
+    return await part.read() if isinstance(part, UploadFile) else part.encode()
+
+
+def validated(model: type[ModelT], value: Any, *where: str) -> ModelT:
+    """A value as a model.
+
+    Raises
+    ------
+    RequestValidationError
+        It is not valid; the locations begin with `where`, because the problem table expects them inside a request.
+    """
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        raise RequestValidationError([{**fault, "loc": (*where, *fault["loc"])} for fault in error.errors()]) from error
+
+
+def read_declaration(model: type[ModelT], text: bytes, *where: str) -> ModelT:
+    """A model from the JSON text of the part that `where` ends with; an empty text declares nothing.
+
+    Raises
+    ------
+    MalformedRequest
+        It is not JSON.
+    RequestValidationError
+        It is not valid.
+    """
+    return validated(model, parse_json(text, where[-1]) if text.strip() else {}, *where)
+
+
+def idempotency_of(request: Request, header: str | None, text: bytes, *files: bytes) -> IdempotencyKey | None:
+    """The key with the hash of what was uploaded: a form's boundaries differ at each try."""
+    key = checked_idempotency_key(header)
+    if key is None:
+        return None
+    lengths = " ".join(str(len(part)) for part in (text, *files[:-1]))
+    digest = hashlib.sha256(f"{request.url.path} {lengths}\n".encode())
+    for part in (text, *files):
+        digest.update(part)
+    return IdempotencyKey(key, digest.hexdigest())
+
+
+def form_body(
+    parts: dict[str, Any], declared_in: str, declaration: type[BaseModel], example: Any, **others: Any
+) -> dict[str, Any]:
+    """OpenAPI description of a body that is a form: its first part is required, and one part is a declaration in JSON.
+
+    Parameters
+    ----------
+    parts : dict
+        Schemas of the other parts.
+    declared_in : str
+        Name of the part that is declared as JSON.
+    declaration : type
+        Model of that part.
+    example : dict
+        A form.
+    **others
+        Further media types of the body.
+    """
+    first = next(iter(parts))
+    form = {
+        "schema": {"type": "object", "required": [first], "properties": {**parts, declared_in: reference(declaration)}},
+        "encoding": {declared_in: {"contentType": "application/json"}},
+        "example": example,
+    }
+    return {"requestBody": {"required": True, "content": {FORM: form, **others}}}

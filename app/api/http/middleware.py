@@ -1,0 +1,241 @@
+"""Pure ASGI middleware: request ids and logs, metrics, authentication and limits, all before the body is read."""
+
+from __future__ import annotations
+
+import re
+import time
+import uuid
+from collections.abc import Callable, Mapping
+
+import anyio
+import structlog
+from anyio import to_thread
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from app.api.http.permissions import Permissions
+from app.api.http.problems import BodyRefused, problem_from, unexpected
+from app.api.http.rate_limits import RateLimit, address_of
+from app.errors import MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
+from app.registry.tenancy import acting_for
+from app.services.access.access import Caller
+
+PROTECTED = ("/v1", "/ogc")
+_METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
+_AUTH_THREADS = 4
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_LOG = structlog.get_logger("waymark.access")
+
+
+def is_protected(path: str) -> bool:
+    """Whether a path needs a key."""
+    return any(path == prefix or path.startswith(prefix + "/") for prefix in PROTECTED)
+
+
+class Observed:
+    """Gives each request an id, a log line and metrics, and turns a bug into a problem document."""
+
+    def __init__(self, app: ASGIApp, registry: CollectorRegistry) -> None:
+        self._app = app
+        labels = ("method", "route", "status")
+        self._count = Counter("waymark_http_requests", "Requests answered", labels, registry=registry)
+        self._seconds = Histogram("waymark_http_request_seconds", "Time to answer", labels[:2], registry=registry)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        asked = Headers(scope=scope).get("x-request-id", "")
+        request_id = asked if _REQUEST_ID.fullmatch(asked) else uuid.uuid4().hex
+        scope.setdefault("state", {})["request_id"] = request_id
+        structlog.contextvars.clear_contextvars()
+        structlog.contextvars.bind_contextvars(request_id=request_id)
+        started = time.perf_counter()
+        status = 0
+
+        async def send_with_id(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                headers["X-Request-ID"] = request_id
+                headers.raw.extend(scope["state"].get("rate_limit", ()))
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_with_id)
+        except Exception as error:
+            if status:
+                raise
+            await unexpected(error, scope)(scope, receive, send_with_id)
+        finally:
+            self._record(scope, status, time.perf_counter() - started)
+
+    def _record(self, scope: Scope, status: int, seconds: float) -> None:
+        route = getattr(scope.get("route"), "path", None) or "unmatched"
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        self._count.labels(method, route, str(status)).inc()
+        self._seconds.labels(method, route).observe(seconds)
+        _LOG.info(
+            "request",
+            method=scope["method"],
+            path=scope["path"],
+            route=route,
+            status=status,
+            ms=round(seconds * 1000, 2),
+            agency=scope["state"].get("agency_id"),
+        )
+
+
+class Guarded:
+    """Checks the key and the declared length before the body is read, and the length while it is.
+
+    Parameters
+    ----------
+    app : ASGIApp
+    authenticate : callable
+        The caller behind a key; runs in a thread.
+    recall : callable
+        The caller behind a key if that is known without asking anybody.
+    was_valid : callable
+        Whether a key was valid when it was last asked about.
+    requests, failures : RateLimit or None
+        Of requests by key, and of wrong keys by address; None: as many as they like.
+    body_limits : mapping
+        Most bytes of a body by path prefix; the empty prefix is the default. [byte]
+    permissions : Permissions
+        Who may make which request.
+    body_timeout_s : float
+        Longest wait for the next part of a body. [s]
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        authenticate: Callable[[str], Caller],
+        recall: Callable[[str], Caller | None],
+        was_valid: Callable[[str], bool],
+        requests: RateLimit | None,
+        failures: RateLimit | None,
+        body_limits: Mapping[str, int],
+        permissions: Permissions,
+        body_timeout_s: float,
+    ) -> None:
+        self._app = app
+        self._authenticate = authenticate
+        self._recall = recall
+        self._was_valid = was_valid
+        self._requests = requests
+        self._failures = failures
+        self._body_limits = body_limits
+        self._permissions = permissions
+        self._body_timeout_s = body_timeout_s
+        self._threads = anyio.CapacityLimiter(_AUTH_THREADS)  # its own, or slow requests would keep new ones waiting
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        try:
+            if is_protected(scope["path"]):
+                await self._admit(scope, headers)
+            limit = _by_prefix(self._body_limits, scope["path"])
+            _check_declared_length(headers, limit)
+        except WaymarkError as error:
+            response = problem_from(error, scope)
+            response.headers["Connection"] = "close"
+            await response(scope, receive, send)
+            return
+        with acting_for(scope.get("state", {}).get("agency_id", "")):
+            await self._app(scope, _limited(receive, limit, self._body_timeout_s), send)
+
+    async def _admit(self, scope: Scope, headers: Headers) -> None:
+        key = _key_in(headers)
+        caller = self._recall(key)
+        if caller is None:
+            caller = await self._authenticated(scope, key)
+        state = scope.setdefault("state", {})
+        state["agency_id"] = caller.agency_id
+        if self._requests is not None:
+            left = self._requests.take(caller.key_id)
+            state["rate_limit"] = ((b"ratelimit-policy", self._requests.policy), (b"ratelimit", left))
+        allowed = self._permissions.find(scope["method"], scope["path"])
+        if allowed is None:
+            return  # nothing there: 404 or 405. Should there be a route after all, it finds no caller and refuses
+        caller.require(allowed)
+        state["caller"] = caller
+
+    async def _authenticated(self, scope: Scope, key: str) -> Caller:
+        if self._failures is None:
+            return await to_thread.run_sync(self._authenticate, key, limiter=self._threads)
+        client = scope.get("client")
+        address = address_of(client[0]) if client else "unknown"
+        if not self._was_valid(key):  # those who share an address with a guesser go on with what they have
+            self._failures.check(address)
+        try:
+            return await to_thread.run_sync(self._authenticate, key, limiter=self._threads)
+        except NotAuthenticated:
+            self._failures.take(address)
+            raise
+
+
+def _by_prefix(table: Mapping[str, int], path: str) -> int:
+    return table[max((prefix for prefix in table if path.startswith(prefix)), key=len)]
+
+
+def _key_in(headers: Headers) -> str:
+    scheme, _, key = headers.get("authorization", "").partition(" ")
+    found = key.strip() if scheme.lower() == "bearer" else headers.get("x-api-key", "").strip()
+    if not found:
+        raise NotAuthenticated(
+            "this resource requires a key",
+            field="Authorization",
+            limit="Authorization: Bearer KEY or X-API-Key: KEY",
+            cure="send the admin key that the server printed at its first start, or a key that was created with it",
+        )
+    return found
+
+
+def _check_declared_length(headers: Headers, limit: int) -> None:
+    declared = headers.get("content-length")
+    if declared is None:
+        return
+    if not (declared.isascii() and declared.isdigit()):
+        raise MalformedRequest("Content-Length is not a number", field="Content-Length", limit="digits")
+    if len(declared) > 19 or int(declared) > limit:
+        raise _too_large(limit)
+
+
+def _too_large(limit: int) -> UploadTooLarge:
+    return UploadTooLarge(
+        f"the body is larger than {limit} bytes", field="body", limit=f"{limit} bytes", cure="split the request"
+    )
+
+
+def _limited(receive: Receive, limit: int, timeout_s: float) -> Receive:
+    """A `receive` that stops a body that is too large or too slow."""
+    seen, complete = 0, False
+
+    async def receive_within_limit() -> Message:
+        nonlocal seen, complete
+        if complete:
+            return await receive()
+        try:
+            with anyio.fail_after(timeout_s):
+                message = await receive()
+        except TimeoutError as error:
+            raise HTTPException(408, f"no part of the body arrived for {timeout_s:g} s") from error
+        if message["type"] == "http.request":
+            seen += len(message.get("body", b""))
+            complete = not message.get("more_body", False)
+            if seen > limit:
+                raise BodyRefused(_too_large(limit))
+        return message
+
+    return receive_within_limit

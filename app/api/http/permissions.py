@@ -1,0 +1,182 @@
+"""Who may call what: one table of every route. The middleware asks it before a body is read; a test compares it with
+the application's routes.
+
+A route that is missing here is refused to everybody. docs/access.md says what each scope is for.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from re import Pattern
+
+from starlette.routing import compile_path
+
+from app.services.access.access import Scope
+
+Allowed = frozenset[Scope]
+
+PUBLIC: Allowed = frozenset()
+"""Scopes of routes that need no key."""
+EVERYBODY: Allowed = frozenset(Scope)
+"""Any scope. Vehicles see only their own rows through such a route."""
+READERS: Allowed = EVERYBODY - {Scope.VEHICLE}
+UPLOADERS: Allowed = EVERYBODY - {Scope.VIEWER}
+SURVEYORS: Allowed = READERS - {Scope.VIEWER}
+PLANNERS: Allowed = frozenset({Scope.PLANNER, Scope.ADMIN})
+ADMINS: Allowed = frozenset({Scope.ADMIN})
+
+_OGC_ITEMS = "/ogc/collections/{collection}/items"
+_OGC_TILES = "/ogc/collections/{collection}/tiles"
+
+PERMISSIONS: dict[str, Allowed] = {
+    # --- the page, the documentation, the operator's
+    "GET /": PUBLIC,
+    "GET /static": PUBLIC,
+    "GET /docs": PUBLIC,
+    "GET /docs/oauth2-redirect": PUBLIC,
+    "GET /redoc": PUBLIC,
+    "GET /openapi.json": PUBLIC,
+    "GET /healthz": PUBLIC,
+    "GET /readyz": PUBLIC,
+    "GET /metrics": PUBLIC,
+    # --- markers and what is made from them
+    "GET /v1/markers": READERS,
+    "POST /v1/markers": PLANNERS,
+    "POST /v1/markers/search": READERS,
+    "POST /v1/markers/bulk": SURVEYORS,  # registering as POST /v1/markers
+    "GET /v1/markers/{marker_id}": READERS,
+    "PATCH /v1/markers/{marker_id}": SURVEYORS,
+    "GET /v1/markers/{marker_id}/accuracy": READERS,
+    "GET /v1/markers/{marker_id}/versions": READERS,
+    "GET /v1/markers/{marker_id}/versions/{version}": READERS,
+    "GET /v1/markers/{marker_id}/observations": READERS,
+    "GET /v1/markers/{marker_id}/observations/summary": READERS,
+    "GET /v1/markers/{marker_id}/artwork.{form}": READERS,
+    "GET /v1/markers/{marker_id}/layout.{form}": READERS,
+    "GET /v1/markers/{marker_id}/payload.{form}": PLANNERS,  # who has a payload can speak for the marker
+    "POST /v1/artwork": READERS,
+    "POST /v1/programs": PLANNERS,  # with the markers' keys: admins, see app/services/markers/cerpm_programs.py
+    "POST /v1/radio-checks": READERS,
+    "GET /v1/imports": SURVEYORS,
+    "POST /v1/imports": SURVEYORS,
+    "GET /v1/imports/{import_id}": SURVEYORS,
+    "POST /v1/imports/{import_id}/cancel": SURVEYORS,
+    "GET /v1/exports/{kind}": READERS,
+    "GET /v1/snapshots": EVERYBODY,  # vehicles without a connection decode with it
+    "GET /v1/snapshots/public-key": EVERYBODY,
+    "GET /v1/audit": ADMINS,
+    # --- plans
+    "GET /v1/alignments": READERS,
+    "POST /v1/alignments": PLANNERS,
+    "GET /v1/alignments/{alignment_id}": READERS,
+    "GET /v1/alignments/{alignment_id}/source": READERS,
+    "GET /v1/plans": READERS,
+    "POST /v1/plans": PLANNERS,
+    "GET /v1/plans/{plan_id}": READERS,
+    "PATCH /v1/plans/{plan_id}": PLANNERS,
+    "GET /v1/plans/{plan_id}/versions": READERS,
+    "GET /v1/plans/{plan_id}/files/{name}": READERS,
+    "POST /v1/plans/{plan_id}/approve": PLANNERS,
+    "POST /v1/plans/{plan_id}/commit": PLANNERS,
+    "GET /v1/plans/{plan_id}/as-built": READERS,
+    # --- roads
+    "GET /v1/roads": READERS,
+    "POST /v1/roads": PLANNERS,
+    "GET /v1/roads/{road_id}": READERS,
+    "PATCH /v1/roads/{road_id}": PLANNERS,
+    "GET /v1/roads/{road_id}/versions": READERS,
+    "GET /v1/roads/{road_id}/locate": READERS,
+    "POST /v1/roads/{road_id}/locate": READERS,
+    "GET /v1/roads/{road_id}/position": READERS,
+    "POST /v1/roads/{road_id}/position": READERS,
+    "GET /v1/roads/{road_id}/markers": READERS,
+    # --- codebooks
+    "GET /v1/codebooks": READERS,
+    "POST /v1/codebooks": PLANNERS,
+    "GET /v1/codebooks/{codebook_id}": READERS,
+    "GET /v1/codebooks/{codebook_id}/entries": READERS,
+    "POST /v1/codebooks/{codebook_id}/entries": PLANNERS,
+    "GET /v1/codebooks/{codebook_id}/entries/{code}": READERS,
+    # --- decodes
+    "GET /v1/decodes": EVERYBODY,
+    "POST /v1/decodes": UPLOADERS,
+    "GET /v1/decodes/{decode_id}": EVERYBODY,
+    "POST /v1/decodes/{decode_id}/cancel": UPLOADERS,
+    "GET /v1/decodes/{decode_id}/plot.svg": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/lane.geojson": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/overlay.{suffix}": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/annotated.{suffix}": EVERYBODY,
+    # --- fleet
+    "GET /v1/vehicles": READERS,
+    "POST /v1/vehicles": PLANNERS,
+    "GET /v1/vehicles/{vehicle_id}": READERS,
+    "PATCH /v1/vehicles/{vehicle_id}": PLANNERS,
+    "DELETE /v1/vehicles/{vehicle_id}": PLANNERS,
+    "GET /v1/vehicles/{vehicle_id}/versions": READERS,
+    "PUT /v1/vehicles/{vehicle_id}/calibration": PLANNERS,
+    "GET /v1/calibration-boards/board.{form}": READERS,
+    "GET /v1/calibrations": READERS,
+    "POST /v1/calibrations": SURVEYORS,
+    "GET /v1/calibrations/{calibration_id}": READERS,
+    "PUT /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
+    "DELETE /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
+    # --- keys
+    "GET /v1/keys": ADMINS,
+    "POST /v1/keys": ADMINS,
+    "GET /v1/keys/{key_id}": ADMINS,
+    "POST /v1/keys/{key_id}/rotate": ADMINS,
+    "DELETE /v1/keys/{key_id}": ADMINS,
+    # --- OGC API
+    "GET /ogc": READERS,
+    "GET /ogc/": READERS,
+    "GET /ogc/conformance": READERS,
+    "GET /ogc/api": READERS,
+    "GET /ogc/collections": READERS,
+    "GET /ogc/collections/{collection}": READERS,
+    "GET /ogc/collections/{collection}/schema": READERS,
+    "GET /ogc/collections/{collection}/queryables": READERS,
+    f"GET {_OGC_ITEMS}": READERS,
+    f"POST {_OGC_ITEMS}": PLANNERS,
+    f"OPTIONS {_OGC_ITEMS}": READERS,
+    f"GET {_OGC_ITEMS}/{{feature}}": READERS,
+    f"PUT {_OGC_ITEMS}/{{feature}}": SURVEYORS,
+    f"PATCH {_OGC_ITEMS}/{{feature}}": SURVEYORS,
+    f"DELETE {_OGC_ITEMS}/{{feature}}": PLANNERS,
+    f"OPTIONS {_OGC_ITEMS}/{{feature}}": READERS,
+    "GET /ogc/tileMatrixSets": READERS,
+    "GET /ogc/tileMatrixSets/{matrix_set}": READERS,
+    f"GET {_OGC_TILES}": READERS,
+    f"GET {_OGC_TILES}/{{matrix_set}}": READERS,
+    f"GET {_OGC_TILES}/{{matrix_set}}/{{zoom}}/{{row}}/{{column}}": READERS,
+}
+
+
+class Permissions:
+    """The table, prepared for a look-up at each request.
+
+    Parameters
+    ----------
+    table : mapping of str to set of Scope
+        By method and path template, e.g. ``GET /v1/markers/{marker_id}``. A parameter fills no more than one segment.
+    """
+
+    def __init__(self, table: Mapping[str, Allowed] = PERMISSIONS) -> None:
+        self._plain: dict[tuple[str, str], Allowed] = {}
+        self._templates: dict[tuple[str, int], list[tuple[Pattern[str], Allowed]]] = defaultdict(list)
+        # where two templates fit a path, that with fewer parameters is meant: /markers/summary, not /markers/{id}
+        for route, allowed in sorted(table.items(), key=lambda item: item[0].count("{")):
+            method, _, path = route.partition(" ")
+            if "{" in path:
+                self._templates[method, path.count("/")].append((compile_path(path)[0], allowed))
+            else:
+                self._plain[method, path] = allowed
+
+    def find(self, method: str, path: str) -> Allowed | None:
+        """Scopes that may use a route; None if the table does not contain it. HEAD is treated as GET."""
+        method = "GET" if method == "HEAD" else method
+        allowed = self._plain.get((method, path))
+        if allowed is None:
+            candidates = self._templates.get((method, path.count("/")), ())
+            allowed = next((found for pattern, found in candidates if pattern.match(path)), None)
+        return allowed

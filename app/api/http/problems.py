@@ -1,0 +1,279 @@
+"""Every error that a client can cause, as an RFC 9457 problem document from one table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any, NamedTuple, NotRequired
+
+import orjson
+import structlog
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import ConfigDict, with_config
+from starlette.exceptions import HTTPException
+
+from app import errors
+from app.api.http.components import reference
+from app.encoders.magnet import CodebookFull
+from app.services.error_documents import ErrorCause, error_cause
+
+Described = dict[int | str, dict[str, Any]]
+"""What FastAPI's argument `responses` takes: status to description."""
+MEDIA_TYPE = "application/problem+json"
+_LOG = structlog.get_logger(__name__)
+
+
+class ProblemKind(NamedTuple):
+    """Status, identifier and title of one class of errors."""
+
+    status: int
+    slug: str
+    title: str
+
+    @property
+    def type(self) -> str:
+        """Identifier of the kind."""
+        return f"urn:waymark:problem:{self.slug}"
+
+
+PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
+    errors.MalformedRequest: ProblemKind(400, "malformed-request", "The request cannot be read"),
+    errors.NotAuthenticated: ProblemKind(401, "not-authenticated", "A valid key is required"),
+    errors.NotAllowed: ProblemKind(403, "not-allowed", "The key's scope does not allow this request"),
+    errors.NotFound: ProblemKind(404, "not-found", "The resource does not exist"),
+    errors.Conflict: ProblemKind(409, "conflict", "The request conflicts with stored data"),
+    CodebookFull: ProblemKind(409, "codebook-full", "The codebook has no further code with the required separation"),
+    errors.CodeTaken: ProblemKind(409, "code-taken", "The code is already in use"),
+    errors.IdempotencyConflict: ProblemKind(
+        409, "idempotency-conflict", "The Idempotency-Key was used for another request"
+    ),
+    errors.StaleVersion: ProblemKind(412, "stale-version", "The resource was changed in the meantime"),
+    errors.UploadTooLarge: ProblemKind(413, "too-large", "The request is too large"),
+    errors.UnsupportedUpload: ProblemKind(415, "unsupported-upload", "No decoder supports this file"),
+    errors.InvalidParameter: ProblemKind(422, "invalid-parameter", "A value is not allowed"),
+    errors.CodeMismatch: ProblemKind(422, "code-mismatch", "The digits do not match the position or scheme"),
+    errors.ReferenceSystemError: ProblemKind(422, "reference-system", "The reference system cannot be used"),
+    errors.CalibrationRefused: ProblemKind(
+        422, "calibration-refused", "The camera cannot be calibrated from these photos"
+    ),
+    errors.UnreadableUpload: ProblemKind(422, "unreadable-upload", "The upload cannot be read"),
+    errors.VersionRequired: ProblemKind(428, "version-required", "The change must state the version it is based on"),
+    errors.TooManyRequests: ProblemKind(429, "too-many-requests", "Too many requests in a short time"),
+    errors.ProofFailed: ProblemKind(500, "proof-failed", "The artwork could not be read back"),
+    errors.Unavailable: ProblemKind(503, "unavailable", "The service is temporarily unavailable"),
+}
+UNION_TAG = "one-of:"
+"""Prefix of the path elements that pydantic adds for the members of a union; they are not part of the body."""
+VALIDATION = ProblemKind(422, "invalid-parameter", "A value is not allowed")
+
+
+class BodyRefused(HTTPException):
+    """A domain error found while the body is read; FastAPI would turn any other exception there into a bare 400."""
+
+    def __init__(self, error: errors.WaymarkError) -> None:
+        super().__init__(400, error.message)
+        self.error = error
+
+
+class FieldError(NamedTuple):
+    """One invalid input."""
+
+    field: str | None
+    detail: str
+    limit: str | None = None
+    cure: str | None = None
+
+
+class FieldErrorDocument(ErrorCause):
+    """One input at fault."""
+
+    detail: str
+
+
+@with_config(
+    ConfigDict(
+        json_schema_extra={
+            "example": {
+                "type": "urn:waymark:problem:invalid-parameter",
+                "title": "A value is not allowed",
+                "status": 422,
+                "detail": "lat_deg is 91.0, outside -90 to 90 degrees",
+                "instance": "/v1/markers",
+                "field": "position.lat_deg",
+                "limit": "-90 to 90 deg",
+                "cure": "positions are longitude, latitude in degrees; check for swapped axes or another CRS",
+            }
+        }
+    )
+)
+class Problem(ErrorCause):
+    """RFC 9457 problem document; `field`, `limit` and `cure` are those of the first error."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str
+    request_id: NotRequired[str]
+    errors: NotRequired[list[FieldErrorDocument]]
+
+
+def problem_responses(*statuses: int, refused: type[Problem] | None = None) -> Described:
+    """OpenAPI description of the problems that a route can return, besides those of every /v1 route.
+
+    Parameters
+    ----------
+    statuses : int
+    refused : type, optional
+        The problem document with a report that the route may return with status 422.
+    """
+    documented: Described = {}
+    for status in sorted({400, 401, 403, 408, 413, 422, 429, 500, 503, *statuses}):
+        kinds = [kind for kind in PROBLEMS.values() if kind.status == status]
+        titles = "; ".join(f"`{kind.slug}`: {kind.title}" for kind in kinds) or HTTPStatus(status).phrase
+        documented[status] = {
+            "description": titles,
+            "content": {MEDIA_TYPE: {"schema": reference(Problem, "serialization")}},
+        }
+    if refused is not None:
+        either = {"anyOf": [reference(document, "serialization") for document in (Problem, refused)]}
+        documented[422]["content"] = {MEDIA_TYPE: {"schema": either}}
+    return documented
+
+
+def kind_of(error: errors.WaymarkError) -> ProblemKind | None:
+    """The table's entry for an error: that of its class, else of the nearest base class."""
+    return next((PROBLEMS[base] for base in type(error).__mro__ if base in PROBLEMS), None)
+
+
+def problem(
+    kind: ProblemKind,
+    detail: str,
+    scope: Any,
+    faults: list[FieldError] | None = None,
+    headers: dict[str, str] | None = None,
+) -> Response:
+    """A problem document as a response."""
+    body = _document(kind, detail, scope)
+    if faults:
+        errors: list[FieldErrorDocument] = [{"detail": fault.detail, **_cause(fault)} for fault in faults]
+        body = {**body, **_cause(faults[0]), "errors": errors}
+    content = orjson.dumps(body, default=str)
+    return Response(content, kind.status, _challenge(kind.status, headers), media_type=MEDIA_TYPE)
+
+
+def report_problem(slug: str, title: str, fault: FieldError, scope: Any, report: object) -> Response:
+    """The response to a request that was refused with a report of everything that is wrong with it."""
+    body = _document(ProblemKind(422, slug, title), fault.detail, scope)
+    return Response(orjson.dumps({**body, **_cause(fault), "report": report}), 422, media_type=MEDIA_TYPE)
+
+
+def _document(kind: ProblemKind, detail: str, scope: Any) -> Problem:
+    document: Problem = {
+        "type": kind.type,
+        "title": kind.title,
+        "status": kind.status,
+        "detail": detail,
+        "instance": scope.get("path", ""),
+    }
+    if (request_id := scope.get("state", {}).get("request_id")) is not None:
+        document["request_id"] = request_id
+    return document
+
+
+def _cause(fault: FieldError) -> ErrorCause:
+    return error_cause(fault.field, fault.limit, fault.cure)
+
+
+def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
+    """The response to a domain error; an error that is in no table is a bug of Waymark."""
+    kind = kind_of(error)
+    if kind is None:
+        return unexpected(error, scope)
+    if kind.status >= 500:
+        _LOG.error("request failed", error=type(error).__name__, detail=error.message)
+    faults = [FieldError(field=e.field, detail=e.message, limit=e.limit, cure=e.cure) for e in (error, *error.parts)]
+    wait = {"Retry-After": str(error.retry_after_s)} if isinstance(error, errors.TooManyRequests) else None
+    return problem(kind, error.message, scope, faults, wait)
+
+
+def unexpected(error: Exception, scope: Any) -> Response:
+    """The response to a bug: the details are in the log, the client gets only the request's id."""
+    _LOG.error("unexpected error", exc_info=error, path=scope.get("path"))
+    kind = ProblemKind(500, "internal-error", "The server failed")
+    return problem(kind, "an unexpected error; its details are in the server's log under this request_id", scope)
+
+
+def install_problem_handlers(app: FastAPI) -> None:
+    """Turn every error of an app into a problem document."""
+
+    async def on_domain_error(request: Request, error: Exception) -> Response:
+        assert isinstance(error, errors.WaymarkError)
+        return problem_from(error, request.scope)
+
+    async def on_validation_error(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        faults = [validation_fault(item) for item in error.errors()]
+        return problem(VALIDATION, faults[0].detail, request.scope, faults)
+
+    async def on_http_error(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        if isinstance(error, BodyRefused):
+            response = problem_from(error.error, request.scope)
+            response.headers["Connection"] = "close"  # what is left of the body is not worth reading
+            return response
+        phrase = HTTPStatus(error.status_code).phrase
+        kind = ProblemKind(error.status_code, phrase.lower().replace(" ", "-"), phrase)
+        return problem(kind, _http_detail(request, error), request.scope, headers=dict(error.headers or {}))
+
+    app.add_exception_handler(errors.WaymarkError, on_domain_error)
+    app.add_exception_handler(RequestValidationError, on_validation_error)
+    app.add_exception_handler(HTTPException, on_http_error)
+
+
+def _http_detail(request: Request, error: HTTPException) -> str:
+    if error.status_code == 404:
+        return f"there is no resource at {request.url.path}"
+    if error.status_code == 405:
+        return f"{request.method} is not allowed at {request.url.path}"
+    return str(error.detail)
+
+
+_CONSTRAINTS = {
+    "ge": "at least {}",
+    "gt": "more than {}",
+    "le": "at most {}",
+    "lt": "less than {}",
+    "min_length": "at least {} long",
+    "max_length": "at most {} long",
+    "pattern": "pattern {}",
+    "expected": "one of {}",
+}
+
+
+def validation_fault(item: Mapping[str, Any]) -> FieldError:
+    """The invalid input that an error of pydantic names."""
+    location = [str(part) for part in item["loc"] if not str(part).startswith(UNION_TAG)]
+    path = ".".join(location[1:] if len(location) > 1 else location)
+    context = item.get("ctx") or {}
+    limits = [text.format(context[name]) for name, text in _CONSTRAINTS.items() if name in context]
+    cause = context.get("error")
+    if isinstance(cause, errors.WaymarkError):
+        return FieldError(field=cause.field or path, detail=cause.message, limit=cause.limit, cure=cause.cure)
+    cures = {"missing": f"send {path}", "extra_forbidden": f"leave {path} out"}
+    return FieldError(
+        field=path,
+        detail=f"{path}: {item['msg']}",
+        limit=", ".join(limits) or item["msg"],
+        cure=cures.get(item["type"], f"correct {path}; /docs describes what it may be"),
+    )
+
+
+def _challenge(status: int, headers: dict[str, str] | None) -> dict[str, str]:
+    extra = dict(headers or {})
+    if status == 401:
+        extra["WWW-Authenticate"] = 'Bearer realm="waymark"'
+    if status == 503:
+        extra["Retry-After"] = "5"
+    return extra

@@ -1,0 +1,104 @@
+"""What many routes return, and its OpenAPI description: documents, pages, files, 304 Not Modified."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any
+
+import orjson
+from fastapi import Header, Request, Response
+
+from app.api.http.problems import Described, problem_responses
+
+BINARY: dict[str, str] = {"type": "string", "format": "binary"}
+GEOJSON: dict[str, Any] = {
+    "type": "object",
+    "description": "A GeoJSON FeatureCollection (RFC 7946).",
+    "required": ["type", "features"],
+    "properties": {
+        "type": {"type": "string", "enum": ["FeatureCollection"]},
+        "features": {"type": "array", "items": {"type": "object", "additionalProperties": True}},
+    },
+    "additionalProperties": True,
+}
+_SCHEMAS = {"application/geo+json": GEOJSON, "application/json": {"type": "object", "additionalProperties": True}}
+NOT_MODIFIED: Described = {304: {"description": "The representation that If-None-Match names is still current"}}
+
+IfNoneMatch = Annotated[
+    str | None, Header(alias="If-None-Match", description="ETag of the representation that the client has.")
+]
+IfMatch = Annotated[
+    str | None,
+    Header(
+        alias="If-Match",
+        description='ETag of the version that the change is based on, e.g. `"3"`, or `*` for any version.',
+    ),
+]
+IdempotencyKeyHeader = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        description="1 to 200 printable characters, such as a UUID. A repeated request gets the first response again.",
+    ),
+]
+Prefer = Annotated[
+    str | None,
+    Header(
+        alias="Prefer",
+        description="`respond-async` runs the request as a job: the response is 202 Accepted (RFC 7240).",
+    ),
+]
+
+
+def file_response(media_types: Iterable[str], description: str = "The file", status: int = 200) -> Described:
+    """A response that is a file of one of some media types: binary, or GeoJSON."""
+    content = {media_type: {"schema": _SCHEMAS.get(media_type, BINARY)} for media_type in media_types}
+    return {status: {"description": description, "content": content}}
+
+
+def text_response(media_type: str, description: str = "The text", status: int = 200) -> Described:
+    """A response that is a text."""
+    return {status: {"description": description, "content": {media_type: {"schema": {"type": "string"}}}}}
+
+
+def document_response(model: Any, *problems: int, status: int = 200, description: str | None = None) -> Described:
+    """A response that is a document, with the problems that the route can return besides those of every /v1 route."""
+    described = {"model": model} if description is None else {"model": model, "description": description}
+    return {status: described, **problem_responses(*problems)}
+
+
+def json_response(content: object, status: int = 200, headers: dict[str, str] | None = None) -> Response:
+    """A JSON response, serialised by orjson."""
+    return Response(orjson.dumps(content), status, headers, media_type="application/json")
+
+
+def page_response(request: Request, page: object, **cursor: str | int | None) -> Response:
+    """A page; if there is a next one, a Link header names it: this URL with the cursor as a parameter."""
+    onward = {name: value for name, value in cursor.items() if value}
+    url = request.url.include_query_params(**onward)
+    return json_response(page, headers={"Link": f'<{url}>; rel="next"'} if onward else None)
+
+
+def versioned_response(document: Mapping[str, object], if_none_match: str | None = None) -> Response:
+    """A document with its version as ETag; 304 where the client has this version."""
+    headers = {"ETag": etag_of(document)}
+    if if_none_match == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    return json_response(document, headers=headers)
+
+
+def created_response(
+    document: Mapping[str, object], replayed: bool, *, path: str | None = None, status: int = 201
+) -> Response:
+    """A new document with its Location below `path`, its version as ETag, and whether the response is repeated."""
+    headers = {"Idempotency-Replayed": "true"} if replayed else {}
+    if path is not None:
+        headers["Location"] = f"{path}/{document['id']}"
+    if "version" in document:
+        headers["ETag"] = etag_of(document)
+    return json_response(document, status, headers)
+
+
+def etag_of(document: Mapping[str, object]) -> str:
+    """The ETag of a document with versions."""
+    return f'"{document["version"]}"'

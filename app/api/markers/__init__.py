@@ -1,0 +1,1 @@
+"""Routes on markers, codebooks, artwork and searches."""

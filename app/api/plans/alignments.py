@@ -1,0 +1,123 @@
+"""/v1/alignments: roads that plans are made for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Path, Request, Response
+from starlette.datastructures import UploadFile
+
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
+from app.api.http.forms import FORM, form_body, idempotency_of, media_type_of, read_declaration, read_text
+from app.api.http.problems import problem_responses
+from app.api.http.responses import (
+    BINARY,
+    NOT_MODIFIED,
+    IdempotencyKeyHeader,
+    IfNoneMatch,
+    created_response,
+    document_response,
+    file_response,
+    page_response,
+    versioned_response,
+)
+from app.api.plans.schemas import AlignmentIn
+from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.services.idempotency import IdempotencyKey
+from app.services.plans.alignments import Alignments
+from app.services.plans.documents import AlignmentDocument, AlignmentPage
+
+router = APIRouter(prefix="/v1/alignments", tags=["plans"])
+
+MAX_DECLARATION_BYTES = 64 * 1024
+_CURE = "send multipart/form-data with the parts file and declaration"
+_BODY = form_body(
+    {"file": {**BINARY, "description": "GeoJSON, GeoPackage, zipped Shapefile, LandXML, DXF, lanelet2 or OpenDRIVE."}},
+    "declaration",
+    AlignmentIn,
+    {"file": "road.geojson", "declaration": {"name": "L 560, km 12 to 14"}},
+)
+
+AlignmentId = Annotated[Identifier, Path(description="Id of the alignment.")]
+Service = Annotated[Alignments, use_cases("alignments")]
+
+
+@dataclass(frozen=True, slots=True)
+class _Upload:
+    data: bytes
+    file_name: str
+    declared: AlignmentIn
+    idempotency: IdempotencyKey | None
+
+
+async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = None) -> _Upload:
+    """Read the file and its declaration from the form.
+
+    Raises
+    ------
+    UnsupportedUpload, UnreadableUpload, MalformedRequest
+        The request is no form, has no file, or other parts than a file and a declaration.
+    """
+    if media_type_of(request) != FORM:
+        raise UnsupportedUpload("a road comes as a form", field="Content-Type", limit=FORM, cure=_CURE)
+    async with request.form(max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
+        names = [name for name, _value in form.multi_items()]
+        if set(names) - {"file", "declaration"} or len(set(names)) != len(names):
+            raise MalformedRequest(
+                "the form has an unexpected part, or has one twice",
+                field="body",
+                limit="one file, one declaration",
+                cure=_CURE,
+            )
+        file = form.get("file")
+        if not isinstance(file, UploadFile):
+            raise UnreadableUpload("there is no file in the form", field="file", limit="a part file", cure=_CURE)
+        data, file_name = await file.read(), (file.filename or "")[:200]
+        text = await read_text(form, "declaration")
+    if len(text) > MAX_DECLARATION_BYTES:
+        raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
+    declared = read_declaration(AlignmentIn, text, "body", "declaration")
+    return _Upload(data, file_name, declared, idempotency_of(request, idempotency_key, text, data))
+
+
+@router.post(
+    "",
+    status_code=201,
+    openapi_extra=_BODY,
+    responses=document_response(AlignmentDocument, 409, 415, status=201, description="Stored"),
+)
+def post_alignment(upload: Annotated[_Upload, Depends(get_upload)], caller: Caller, alignments: Service) -> Response:
+    """Store a road: its lanes with width, direction, curvature, grade and design speed."""
+    declared = upload.declared
+    document, replayed = alignments.add(
+        caller, declared.name, upload.data, upload.file_name, declared.declaration(), upload.idempotency
+    )
+    return created_response(document, replayed, path="/v1/alignments")
+
+
+@router.get("", responses=document_response(AlignmentPage))
+def list_alignments(
+    request: Request, caller: Caller, alignments: Service, limit: PageSize = 100, after: LastId = None
+) -> Response:
+    """Alignments in the order they were made."""
+    page, last = alignments.page(caller, after=after, limit=limit)
+    return page_response(request, page, after=last)
+
+
+@router.get("/{alignment_id}", responses={**NOT_MODIFIED, **document_response(AlignmentDocument, 404)})
+def get_alignment(
+    alignment_id: AlignmentId, caller: Caller, alignments: Service, if_none_match: IfNoneMatch = None
+) -> Response:
+    """One alignment, with its version as ETag."""
+    return versioned_response(alignments.get(caller, alignment_id), if_none_match)
+
+
+@router.get(
+    "/{alignment_id}/source",
+    responses={**file_response(["application/octet-stream"], "The file as it came"), **problem_responses(404)},
+)
+def get_source(alignment_id: AlignmentId, caller: Caller, alignments: Service) -> Response:
+    """The file as it came."""
+    data, _name = alignments.source(caller, alignment_id)
+    return Response(data, media_type="application/octet-stream")

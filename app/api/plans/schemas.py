@@ -1,0 +1,84 @@
+"""Bodies of requests on alignments and plans."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from app.families.inputs import Identifier, Number, Text
+from app.planning.alignment_declaration import AlignmentDeclaration
+from app.services.plans.plans import PlanChange
+
+Name = Annotated[Text, Field(min_length=1, max_length=80)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class AlignmentIn(_Body):
+    """What is declared of a file with a road; what the file states may be left out."""
+
+    name: Name
+    crs: Annotated[Text | None, Field(max_length=64, examples=["EPSG:25832"])] = None
+    realization: Annotated[Text | None, Field(max_length=64, examples=["ITRF2014"])] = None
+    epoch: Annotated[Number | None, Field(ge=1900, le=2100, description="Decimal year.")] = None
+    vertical_datum: Annotated[Text | None, Field(max_length=64, examples=["ellipsoid"])] = None
+    unit: Literal["m", "ft-us", "ft-intl"] | None = None
+    height_unit: Literal["m", "ft-us", "ft-intl"] | None = None
+    ignore_heights: bool = False
+    origin: Annotated[
+        tuple[Number, Number] | None,
+        Field(description="Longitude and latitude of the origin of local coordinates. Such a road is not surveyed."),
+    ] = None
+    bearing_deg: Annotated[
+        Number, Field(ge=-360, le=360, description="Direction of the local y axis; only with `origin`.")
+    ] = 0.0
+
+    def declaration(self) -> AlignmentDeclaration:
+        """The declaration of the file."""
+        values = self.model_dump(exclude={"name"})
+        return AlignmentDeclaration(**values)
+
+
+class PlanIn(_Body):
+    """A plan to make: the rules are a document as docs/plans.md describes it."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "L 560, plates every 100 m",
+                    "alignment_id": "019cb624-0000-7000-8000-0000000000aa",
+                    "rules": {"version": 1, "plates": {"spacing_m": 100}},
+                }
+            ]
+        },
+    )
+
+    name: Name
+    alignment_id: Identifier
+    rules: dict[str, Any]
+
+
+class PlanPatch(_Body):
+    """What to change of a plan; new rules place and check it again."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [{"rules": {"version": 1, "plates": {"spacing_m": 50}}, "reason": "closer in the bends"}]
+        },
+    )
+
+    name: Name | None = None
+    rules: dict[str, Any] | None = None
+    reason: Annotated[Text | None, Field(max_length=500)] = None
+
+    def change(self) -> PlanChange:
+        """What the request names."""
+        named = self.model_fields_set - {"reason"}
+        values = {name: value for name, value in self.model_dump(include=named).items() if value is not None}
+        return PlanChange(values, self.reason)

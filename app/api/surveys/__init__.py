@@ -1,0 +1,1 @@
+"""Routes on imports and exports of markers."""

@@ -1,0 +1,45 @@
+"""/v1/exports: markers as files."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Response
+from fastapi.responses import StreamingResponse
+
+from app.api.http.dependencies import Caller, use_cases
+from app.api.http.problems import problem_responses
+from app.api.http.responses import file_response
+from app.api.markers.filters import Filtered
+from app.services.surveys.exports import STREAMED, WHOLE
+from app.services.surveys.exports import Exports as ExportsService
+
+router = APIRouter(prefix="/v1/exports", tags=["exports"])
+
+_SUFFIXES = {"shapefile": "shp.zip", "landxml": "xml"}
+Exports = Annotated[ExportsService, use_cases("exports")]
+
+
+@router.get(
+    "/{kind}",
+    responses={
+        **file_response(media.partition(";")[0] for media in (STREAMED | WHOLE).values()),
+        **problem_responses(),
+    },
+)
+def get_export(
+    kind: Literal["csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"],
+    caller: Caller,
+    exports: Exports,
+    filtered: Filtered,
+) -> Response:
+    """The markers of a filter, or all: CSV and GeoJSON as a stream, the others as one file.
+
+    The filters are those of GET /v1/markers.
+
+    Positions are longitude and latitude in WGS 84 / ITRF; LandXML and DXF are in the UTM zone they lie in.
+    """
+    headers = {"Content-Disposition": f'attachment; filename="markers.{_SUFFIXES.get(kind, kind)}"'}
+    if kind in STREAMED:
+        return StreamingResponse(exports.stream(caller, kind, filtered), headers=headers, media_type=STREAMED[kind])
+    return StreamingResponse(exports.whole(caller, kind, filtered), headers=headers, media_type=WHOLE[kind])

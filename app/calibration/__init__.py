@@ -1,0 +1,1 @@
+"""Photos of a calibration board to a camera's intrinsics and distortion with their standard deviations."""

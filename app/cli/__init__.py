@@ -1,0 +1,46 @@
+"""`waymark`: the command line, a thin layer over the use cases, the encoders and the decoders.
+
+Each module holds the commands of one use case; this one lists them.
+"""
+
+from __future__ import annotations
+
+import typer
+
+from app.cli import audit, ingest, plans, plates, proof, rules, server, snapshots, surveys, traces
+from app.errors import WaymarkError
+
+cli = typer.Typer(name="waymark", no_args_is_help=True, add_completion=False, pretty_exceptions_show_locals=False)
+cli.command()(server.serve)
+cli.command()(server.demo)
+cli.command()(server.migrate)
+cli.command()(server.key)
+cli.command("import")(surveys.import_survey)
+cli.command("export")(surveys.export_markers)
+cli.add_typer(snapshots.cli, name="snapshot")
+cli.add_typer(audit.cli, name="audit")
+cli.command()(plates.encode)
+cli.command()(plates.board)
+cli.command()(plates.decode)
+cli.command()(traces.decode_trace)
+cli.add_typer(ingest.cli, name="ingest")
+cli.command()(plans.plan)
+cli.command()(proof.proof)
+cli.add_typer(rules.cli, name="rules")
+
+
+@cli.callback()
+def waymark() -> None:
+    """The registry of machine-readable roads."""
+
+
+def main() -> None:
+    """Run the command line; an expected error is printed as one line, without a traceback."""
+    try:
+        cli()
+    except WaymarkError as error:
+        typer.echo(f"waymark: {error.message}", err=True)
+        for name in ("limit", "cure"):
+            if value := getattr(error, name):
+                typer.echo(f"  {name}: {value}", err=True)
+        raise SystemExit(1) from None

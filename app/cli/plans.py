@@ -1,0 +1,193 @@
+"""The command that plans a road without a server: from a file with lanes to a folder with all outputs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.cli.errors import bad_input
+from app.errors import InvalidParameter
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from app.planning.outputs.files import OutputOptions
+    from app.planning.plan import Plan
+
+RoadArgument = Annotated[
+    Path, typer.Argument(exists=True, dir_okay=False, help="GeoJSON, GeoPackage, Shapefile, LandXML, DXF, ...")
+]
+RulesOption = Annotated[Path, typer.Option(exists=True, dir_okay=False, help="Rules as YAML or JSON.")]
+OutOption = Annotated[Path, typer.Option(help="Folder for the files; created if it does not exist.")]
+OriginOption = Annotated[
+    str | None, typer.Option(help="LON,LAT of the origin of local coordinates; markers are then not surveyed. [deg]")
+]
+_PLAN_FILE = "plan.json"
+
+
+def plan(
+    road: RoadArgument,
+    rules: RulesOption,
+    out: OutOption,
+    origin: OriginOption = None,
+    bearing: Annotated[float, typer.Option(help="Direction of the local y axis, with --origin. [deg]")] = 0.0,
+    crs: Annotated[str | None, typer.Option(help="CRS of the road's coordinates, e.g. EPSG:25832.")] = None,
+    realization: Annotated[str | None, typer.Option(help="Frame of the coordinates, e.g. ITRF2014.")] = None,
+    epoch: Annotated[float | None, typer.Option(help="Coordinate epoch. [decimal year]")] = None,
+    vertical_datum: Annotated[str | None, typer.Option(help="ellipsoid, or the datum, e.g. EPSG:5703.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of the road's coordinates: m, ft-us or ft-intl.")] = None,
+    ignore_heights: Annotated[bool, typer.Option("--ignore-heights", help="Leave heights out.")] = False,
+    name: Annotated[str | None, typer.Option(help="Name of the plan. Default: that of the road's file.")] = None,
+    stakeout_crs: Annotated[
+        str | None, typer.Option(help="Projected CRS of the stakeout. Default: the road's.")
+    ] = None,
+    stakeout_unit: Annotated[str | None, typer.Option(help="Unit of the stakeout: m, ft-us or ft-intl.")] = None,
+    scale: Annotated[int | None, typer.Option(help="Scale of the drawings: 250, 500, 1000, 2000 or 5000.")] = None,
+    owner: Annotated[str, typer.Option(help="Legal owner, for the title block.")] = "",
+    number: Annotated[str, typer.Option(help="Identification number, for the title block.")] = "",
+    date: Annotated[str, typer.Option(help="Date of issue, for the title block.")] = "",
+    creator: Annotated[str, typer.Option(help="Creator, for the title block.")] = "",
+    approver: Annotated[str, typer.Option(help="Approval person, for the title block.")] = "",
+) -> None:
+    """Place markers on a road by rules, check them, and write bill, drawings, stakeout and schedule.
+
+    The exit status is 2 if the road or the rules are refused; then nothing is written.
+    """
+    from rich.console import Console
+
+    from app.planning.alignment_declaration import AlignmentDeclaration
+    from app.planning.outputs.drawing_sheet import TitleBlock
+    from app.planning.outputs.files import OutputOptions
+    from app.planning.outputs.strip_map import DrawingOptions
+
+    console = Console(stderr=True)
+    with bad_input():
+        _check_folder(out)
+        declaration = AlignmentDeclaration(
+            crs, realization, epoch, vertical_datum, unit, None, ignore_heights, _origin(origin), bearing
+        )
+        made = _make(console, road, rules, declaration, name or road.stem)
+        block = TitleBlock(owner, number, date, creator, approver)
+        _write(console, made, out, OutputOptions(stakeout_crs, stakeout_unit, DrawingOptions(block, scale)))
+    _print(made, out)
+
+
+def _origin(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        lon, lat = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InvalidParameter(
+            f"--origin is {text[:60]!r}", field="origin", limit="LON,LAT in degrees", cure="write e.g. 8.42,49.01"
+        ) from None
+    return lon, lat
+
+
+def _check_folder(out: Path) -> None:
+    """A folder that is new, empty, or has a plan already, whose files are replaced."""
+    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / _PLAN_FILE).exists())):
+        raise InvalidParameter(
+            f"{out} has files that are no plan",
+            field="out",
+            limit="a new or empty folder, or one with a plan",
+            cure="choose another folder",
+        )
+
+
+def _make(console: Console, road: Path, rules_file: Path, declaration: object, name: str) -> Plan:
+    """Read, place and check, each with its line of progress."""
+    from app.formats.alignments.read import read_alignment
+    from app.planning.alignment_declaration import AlignmentDeclaration
+    from app.planning.build_alignment import build_alignment
+    from app.planning.placement import place_plan
+    from app.planning.plan_checks import check_plan
+    from app.planning.read_rules import read_rules
+
+    assert isinstance(declaration, AlignmentDeclaration)
+    with console.status("Reading the rules") as status:
+        rules = read_rules(rules_file.read_bytes())
+        status.update("Reading the road")
+        file = read_alignment(road.read_bytes(), road.name)
+        status.update("Placing the road")
+        alignment = build_alignment(file, rules.road, declaration, name=road.stem)
+        status.update("Placing the markers")
+        placed = place_plan(alignment, rules, name=name)
+        if not placed.markers:
+            raise InvalidParameter(
+                "the rules place no marker on this road",
+                field="rules",
+                limit="at least one marker",
+                cure="; ".join(left.reason for left in placed.left_out[:3]) or "check lanes, spacing and line styles",
+            )
+        status.update(f"Checking {len(placed.markers)} markers")
+        return check_plan(placed)
+
+
+def _write(console: Console, made: Plan, out: Path, options: OutputOptions) -> None:
+    """All files, or none: they are moved into the folder when the last one is complete."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from app.planning.outputs.files import plan_files
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder:
+        files = list(plan_files(made, options))
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        with Progress(*columns, console=console, transient=True) as progress:
+            task = progress.add_task("Writing", total=len(files))
+            for file in files:
+                progress.update(task, description=f"Writing {file.name}")
+                path = Path(folder) / file.name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(file.write())
+                progress.advance(task)
+        for file in files:
+            target = out / file.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(Path(folder) / file.name, target)
+
+
+def _print(made: Plan, out: Path) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from app.markers.checks import Verdict
+    from app.planning.outputs.bill import plan_bill
+    from app.planning.outputs.report import counts_sentence, finding_figures, finding_place, verdict_counts
+
+    console = Console()
+    road = made.alignment
+    console.print(f"[bold]{escape(made.name)}[/]: {len(road.lanes)} lanes, {road.lane_length_m / 1000:.3f} km of lane")
+    console.print(f"  {counts_sentence(made)}")
+    console.print(f"  cost: {escape(plan_bill(made).sentence)}")
+    if not road.surveyed:
+        console.print("  [yellow]PLANNED - positions not surveyed[/]: the road was placed by an origin")
+    for warning in road.warnings[:5]:
+        console.print(f"  [yellow]warning[/]: {escape(warning)}")
+    colours = {Verdict.OK: "green", Verdict.WARN: "yellow", Verdict.FAIL: "red"}
+    table = Table("check", "verdict", "figure", "limit", "where")
+    for finding in made.findings:
+        colour = colours[finding.verdict]
+        figure, limit = finding_figures(finding)
+        verdict = f"[{colour}]{finding.verdict.value}[/]"
+        table.add_row(escape(finding.name), verdict, figure, limit, escape(finding_place(made, finding)))
+    if made.findings:
+        console.print(table)
+        for finding in made.findings:
+            if finding.verdict is not Verdict.OK:
+                colour = colours[finding.verdict]
+                console.print(
+                    f"  [{colour}]{finding.verdict.value}[/] {escape(finding.name)}: {escape(finding.sentence)}"
+                )
+        found = verdict_counts(made)
+        console.print("  checks: " + ", ".join(f"{count} {verdict.value}" for verdict, count in found.items()))
+    removed = sum(left.moved_m is None for left in made.left_out)
+    if made.left_out:
+        console.print(f"  {removed} places left out, {len(made.left_out) - removed} markers moved; see report.md")
+    console.print(f"  files: {escape(str(out))}")

@@ -1,0 +1,97 @@
+"""Commands for plates and pictures that need no server: artwork, calibration boards, decoding."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from app.cli.database import read_settings
+from app.errors import InvalidParameter
+
+if TYPE_CHECKING:
+    from app.encoders.plate import ArtworkFormat
+
+OutOption = Annotated[Path, typer.Option(help="Folder for the files; created if it does not exist.")]
+FormatOption = Annotated[list[str] | None, typer.Option("--format", help="svg, pdf, dxf or png; may be repeated.")]
+
+
+def encode(
+    out: OutOption = Path("."),
+    lon_deg: Annotated[float | None, typer.Option(help="Longitude of a position plate. [deg]")] = None,
+    lat_deg: Annotated[float | None, typer.Option(help="Latitude of a position plate. [deg]")] = None,
+    check_digits: Annotated[int, typer.Option(min=0, max=2, help="Check digits of a position plate.")] = 0,
+    registry_number: Annotated[int | None, typer.Option(help="Registry number of an id plate.")] = None,
+    n: Annotated[int, typer.Option(help="Units along a side: 8, 10 or 12.")] = 8,
+    unit_mm: Annotated[float, typer.Option(help="Side of a unit. [mm]")] = 35.0,
+    gap_mm: Annotated[float, typer.Option(help="Gap between units. [mm]")] = 5.0,
+    thickness_mm: Annotated[float, typer.Option(help="Thickness of the base plate. [mm]")] = 20.0,
+    form: FormatOption = None,
+) -> None:
+    """Write the artwork of one plate at true size, after the decoder has read it back."""
+    from app.decoders.plate import decode_plates
+    from app.markers.plate import PlateGeometry
+    from app.services.markers.plate_files import encode_plate_files, plate_code_for
+
+    formats = _formats(form or ("svg", "pdf"))
+    position = (lon_deg, lat_deg) if lon_deg is not None and lat_deg is not None else None
+    files = encode_plate_files(
+        plate_code_for(position, registry_number, n=n, check_digits=check_digits),
+        PlateGeometry(n, unit_mm, gap_mm, thickness_mm),
+        formats,
+        position=position,
+        read=lambda image, geometry: decode_plates(image, geometries=(geometry,)),
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        (out / name).write_bytes(content)
+        typer.echo(out / name)
+
+
+def board(
+    out: OutOption = Path("."),
+    columns: Annotated[int, typer.Option(help="Columns of squares.")] = 7,
+    rows: Annotated[int, typer.Option(help="Rows of squares.")] = 10,
+    square_mm: Annotated[float, typer.Option(help="Side of a square. [mm]")] = 25.0,
+    marker_mm: Annotated[float, typer.Option(help="Side of a marker. [mm]")] = 18.0,
+    form: FormatOption = None,
+) -> None:
+    """Write a board for calibrating cameras, at true size; print it at 100 %."""
+    from app.encoders.calibration_board import encode_board
+    from app.encoders.plate import write_artwork
+    from app.sensors.calibration_board import CalibrationBoard
+
+    formats = _formats(form or ("pdf",))
+    drawing = encode_board(CalibrationBoard(columns, rows, square_mm, marker_mm))
+    out.mkdir(parents=True, exist_ok=True)
+    for name in formats:
+        path = out / f"waymark-board-{columns}x{rows}-{square_mm:g}mm.{name}"
+        path.write_bytes(write_artwork(drawing, name).content)
+        typer.echo(path)
+
+
+def decode(
+    pictures: Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="JPEG or PNG files.")],
+    thermal: Annotated[bool, typer.Option(help="The pictures come from a thermal camera.")] = False,
+) -> None:
+    """Decode the plates in pictures, and print one JSON object for each picture."""
+    import orjson
+
+    from app.decoders.plate import decode_plates
+    from app.formats.images import ImageLimits
+    from app.services.markers.plate_files import decode_picture
+
+    limits = ImageLimits(pixels=read_settings().max_image_pixels)
+    for picture in pictures:
+        found = decode_picture(picture.name, picture.read_bytes(), decode=decode_plates, limits=limits, thermal=thermal)
+        typer.echo(orjson.dumps(found, option=orjson.OPT_SERIALIZE_NUMPY))
+
+
+def _formats(names: list[str] | tuple[str, ...]) -> list[ArtworkFormat]:
+    from app.encoders.plate import ArtworkFormat
+
+    unknown = sorted(set(names) - set(ArtworkFormat))
+    if unknown:
+        raise InvalidParameter(f"there is no format {unknown[0]}", limit=", ".join(ArtworkFormat))
+    return [ArtworkFormat(name) for name in names]

@@ -1,0 +1,75 @@
+"""Commands that run the server, prepare its database and create keys."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from app.cli.database import owned_database, read_settings
+
+HostOption = Annotated[str | None, typer.Option(help="Address to listen on. Default: WAYMARK_HOST, or 127.0.0.1.")]
+PortOption = Annotated[int | None, typer.Option(help="Port to listen on. Default: WAYMARK_PORT, or 8000.")]
+
+
+def serve(host: HostOption = None, port: PortOption = None) -> None:
+    """Start the server. On an empty database it prints the first admin key."""
+    import uvicorn
+
+    from app.logs import configure_logs
+    from app.main import create_app
+
+    settings = read_settings(host=host, port=port)
+    configure_logs(settings.log_format, settings.log_level)
+    with owned_database(settings):
+        pass  # a database that another process owns is reported in one line here, not in a traceback of the server
+    uvicorn.run(
+        create_app(settings),
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=30,
+    )
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the results; created if it does not exist.")] = Path("demo-out"),
+    serve: Annotated[bool, typer.Option("--serve", help="Leave the server running afterwards.")] = False,
+) -> None:
+    """Register plates, magnets and CERPMs, decode simulated drives past them, and print a table for each family."""
+    from app.demo import run_demo
+
+    if not run_demo(out, say=lambda line: typer.echo(line), keep_serving=serve):
+        raise typer.Exit(1)
+
+
+def migrate(
+    revision: Annotated[str, typer.Argument(help="Revision to migrate to, newer or older.")] = "head",
+) -> None:
+    """Migrate the database's schema to a revision. `waymark serve` migrates to the newest one by itself."""
+    with owned_database(read_settings()) as database:
+        database.migrate(revision)
+    typer.echo(f"{database.name} is at revision {revision}")
+
+
+def key(
+    agency: Annotated[str, typer.Argument(help="Name of the agency; it is created if it does not exist.")],
+    scope: Annotated[str, typer.Option(help="admin, planner, surveyor, viewer or vehicle.")] = "planner",
+    label: Annotated[str, typer.Option(help="Who or what the key is for; shown in histories.")] = "key",
+    days: Annotated[
+        int | None, typer.Option(min=1, max=3653, help="Days until the key expires. Default: never.")
+    ] = None,
+) -> None:
+    """Create a key for an agency and print it once. A server on an SQLite file must not be running."""
+    from datetime import timedelta
+
+    from app.main import utc_now
+    from app.services.access.access import Access, parse_scope
+
+    with owned_database(read_settings()) as database:
+        database.migrate()
+        expires_at = utc_now() + timedelta(days=days) if days else None
+        typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label, expires_at))

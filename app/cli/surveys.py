@@ -1,0 +1,83 @@
+"""Commands that import surveys and export markers, for files of any size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import ValidationError
+
+from app.cli.database import operator, owned_database, read_settings
+from app.errors import InvalidParameter
+
+
+def import_survey(
+    survey: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="CSV, GeoJSON, GeoPackage, ...")],
+    agency: Annotated[str, typer.Option(help="Name of the agency that owns the markers.")],
+    declared: Annotated[str, typer.Option("--declaration", help="Declaration as JSON; see docs/imports.md.")] = "{}",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Report only; nothing is stored.")] = False,
+    map_file: Annotated[Path | None, typer.Option("--map", help="SVG file for the residuals of a comparison.")] = None,
+) -> None:
+    """Import a survey and print the report. The exit status is 1 if the survey is refused.
+
+    A server on an SQLite file must not be running.
+    """
+    import orjson
+
+    from app.api.surveys.schemas import DeclarationIn
+    from app.jobs.tasks import SameProcess
+    from app.main import marker_rules, utc_now
+    from app.services.surveys.declarations import import_input
+    from app.services.surveys.imports import Imports
+
+    try:
+        declaration = DeclarationIn.model_validate_json(declared)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InvalidParameter(f"--declaration {place}: {first['msg']}", cure="see docs/imports.md") from error
+    declaration = declaration.model_copy(update={"dry_run": dry_run or declaration.dry_run})
+    given = import_input(declaration.declared(), survey.read_bytes())
+    settings = read_settings()
+    with owned_database(settings) as database:
+        database.migrate()
+        with operator(database, agency) as caller:
+            report, _ = Imports(database, utc_now, SameProcess(), marker_rules(settings)).run(caller, given)
+    shown: dict[str, object] = {**report}
+    if map_file is not None and report["comparison"] is not None:
+        map_file.write_text(report["comparison"]["map_svg"] or "")
+        shown["comparison"] = {name: value for name, value in report["comparison"].items() if name != "map_svg"}
+    typer.echo(orjson.dumps(shown, option=orjson.OPT_INDENT_2))
+    if report["outcome"] == "refused":
+        raise typer.Exit(1)
+
+
+def export_markers(
+    out: Annotated[Path, typer.Argument(dir_okay=False, help="File to write; it must not exist.")],
+    agency: Annotated[str, typer.Option(help="Name of the agency that owns the markers.")],
+    kind: Annotated[str, typer.Option("--format", help="csv, geojson, gpkg, shapefile, kml, landxml or dxf.")] = "gpkg",
+    bbox: Annotated[str | None, typer.Option(help="Only markers in west,south,east,north. [deg]")] = None,
+    status: Annotated[str | None, typer.Option(help="Only markers with this status.")] = None,
+    family: Annotated[str | None, typer.Option(help="Only markers of this family: plate, magnet or cerpm.")] = None,
+) -> None:
+    """Write an agency's markers to a file. A server on an SQLite file must not be running."""
+    from tempfile import TemporaryDirectory
+
+    from app.api.markers.filters import parse_box
+    from app.registry.markers import MarkerFilter
+    from app.services.surveys.exports import KINDS, Exports
+
+    if kind not in KINDS:
+        raise InvalidParameter(f"there is no format {kind[:40]!r}", limit=", ".join(KINDS))
+    if out.exists():
+        raise InvalidParameter(f"{out} already exists", cure="remove it, or choose another name")
+    filtered = MarkerFilter(box=parse_box(bbox) if bbox else None, status=status, family=family)
+    with (
+        owned_database(read_settings()) as database,
+        TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder,
+    ):
+        database.migrate()
+        with operator(database, agency) as caller:
+            Exports(database).write_file(caller, kind, filtered, Path(folder)).rename(out)
+    typer.echo(out)

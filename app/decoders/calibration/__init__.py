@@ -1,1 +1,0 @@
-"""Photos of a calibration board -> the camera's intrinsics and distortion, and how sure they are."""

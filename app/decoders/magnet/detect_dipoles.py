@@ -1,0 +1,353 @@
+"""Detection of the dipoles of a region: matching pursuit with joint fits.
+
+The strongest candidate of the matched filters is fitted together with the dipoles near it, its field is taken out of
+the bins, the bins are scored again, and so on until nothing exceeds the threshold (orthogonal matching pursuit: Pati,
+Rezaiifar and Krishnaprasad, 1993). Clusters whose kinds are unclear are then explained by magnets of one kind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.magnet.dipole_fit import FORWARD, UPRIGHT, MagnetPrior
+from app.decoders.magnet.dipole_model import PARAMETERS, add_dipole_field
+from app.decoders.magnet.ferrous import is_ferrous
+from app.decoders.magnet.fit_window import SURE_MARGIN, Dipole, FitWindow, Region, SensorArray
+from app.decoders.magnet.matched_filter import BIN_M, HALF_BINS, THRESHOLD, BinScores, FilterBank, score_bins
+from app.decoders.magnet.preprocess import Blocks
+
+Floats = npt.NDArray[np.float64]
+Floats32 = npt.NDArray[np.float32]
+
+STOP_SHARE = 0.015
+"""Share of the strongest candidate's statistic below which the pursuit ends: what a model that errs by some percent
+leaves of a strong magnet. Source: chosen by hand, no measurement kept."""
+MAX_MAGNETS = 12
+"""Dipoles of a region at most. Source: chosen by hand; a region of 8 m holds two tags of METRO's seven magnets at
+most."""
+PENALTY, CLOSE_PENALTY = 30.0, 30.0
+"""Cost of each further magnet when numbers of magnets are compared, and of two that stand too close.
+[chi-squared] Source: chosen by hand, near the detection threshold."""
+CLOSE_M = 0.42
+"""Distance along the road below which two magnets stand too close. [m] Source: `MIN_GAP_M` of 0.5 m, METRO figure 17a,
+less the error of two places."""
+CLUSTER_M, CLUSTER_MARGIN_M = 1.2, 0.6
+"""Largest distance in a cluster, whose fields overlap, and the road beyond it that is scored again. [m] Source: by
+hand."""
+MAX_POLISHED = 6
+"""Dipoles that are fitted together at most in the end. Source: chosen by hand for speed: a fit grows with the
+square."""
+FERROUS_COUNT = 4
+"""Number of dipoles after which, and after twice of which, a region is examined for iron. Source: chosen by hand."""
+MAX_FAILED = 3
+"""Fits that do not confirm what the filters saw, after which a region counts as iron. Source: chosen by hand."""
+MAX_JOINT_FITS, ROW_WIDTH_M = 12, 0.3
+"""Joint fits that a region may take if its dipoles do not stand in a row so narrow. [1, m] Source: bounds the delay of
+a streamed trace, `python -m benchmarks.magnets speed`."""
+TOGETHER_M, MAX_TOGETHER = 1.1, 3
+"""Dipoles that are fitted together with a new one: their distance, and their number with it. [m, 1] Source: by hand."""
+SAME_M = 0.3
+"""Dipoles nearer than this are one. [m] Source: chosen by hand, well below `MIN_GAP_M`."""
+CONFIRMED_SHARE = 0.5
+"""Share of the threshold that a fit must explain to confirm its candidate. Source: chosen by hand."""
+KNOWN_BINS, REFUSED_BINS = 2, 3
+"""Bins on each side that are not tried again after a candidate was a known dipole, or its fit was refused. Source: by
+hand."""
+START_BINS = 8
+"""Bins on each side in which the other kind's best start is looked for: 40 cm. Source: chosen by hand; an upright
+magnet's forward field peaks half a height from it."""
+TRACKED_STD_M = 0.08
+"""A clearance known better than this is the start of fits. [m] Source: chosen by hand, between `CLEARANCE_STD_M` and
+the estimated one."""
+FIELD_M = 2.0
+"""Reach of a dipole's field in the bins. [m] Source: chosen by hand, the filters reach 1.2 m."""
+CHANGE_M, CHANGE_HEIGHTS = 0.9, 3.0
+"""Reach of what a dipole changes in the filters' results: metres, and heights more. Source: chosen by hand for
+speed."""
+TAG_WIDTH_M = 0.15
+"""Width of a row of magnets that can be a tag. [m] Source: chosen by hand, a vehicle that heads 2 degrees off over 4
+m."""
+
+
+@dataclass(slots=True, eq=False)
+class DipoleDetector:
+    """Detects the dipoles of regions.
+
+    Attributes
+    ----------
+    bank : FilterBank
+    array : SensorArray
+    """
+
+    bank: FilterBank
+    array: SensorArray
+
+    def detect(self, blocks: Blocks, region: Region, prior: MagnetPrior) -> list[Dipole]:
+        """Dipoles of a region.
+
+        Lines and tags keep apart, so clusters of mixed or unclear kinds are also explained by one kind alone.
+        """
+        pursuit = _Pursuit(self.bank, self.array, region, prior, FitWindow(self.array, blocks, region, prior))
+        found, ferrous = pursuit.run((FORWARD, UPRIGHT), [])
+        if ferrous:
+            return found
+        for cluster in _clusters(found):
+            if pursuit.is_slow(found):
+                return found
+            if _is_unclear(cluster) and 2 * sum(d.unlike_magnet for d in cluster) <= len(cluster):
+                found = self._fit_one_kind(pursuit, found, cluster)
+        return pursuit.polish(found)
+
+    def _fit_one_kind(self, pursuit: _Pursuit, found: list[Dipole], cluster: list[Dipole]) -> list[Dipole]:
+        """Explain a cluster by magnets of one kind, if that is as likely."""
+        others = [d for d in found if all(d is not c for c in cluster)]
+        places = [float(d.params[0]) for d in cluster]
+        span = min(places), max(places)
+        part = pursuit.between(span[0] - CLUSTER_MARGIN_M, span[1] + CLUSTER_MARGIN_M)
+        costs = [(pursuit.window.cost(found, *span) + _penalty(found), found)]
+        for kind in (FORWARD, UPRIGHT):
+            if any(d.kind != kind for d in cluster):
+                whole = others + part.run((kind,), others)[0]
+                costs.append((pursuit.window.cost(whole, *span) + _penalty(whole), whole))
+        costs.sort(key=lambda c: c[0])
+        best = costs[0][1]
+        own = [d for d in best if all(d is not o for o in others)]
+        if len(costs) == 1 or len({d.kind for d in own}) > 1:
+            return best
+        margin = costs[1][0] - costs[0][0]  # of the kind that they share
+        return others + [replace(d, margin=max(d.margin, margin)) for d in own]
+
+
+@dataclass(slots=True, eq=False)
+class _Residual:
+    """What the dipoles found so far leave of a region: bins and their scores."""
+
+    x: Floats32
+    scores: BinScores
+
+    def best(self, columns: list[int]) -> tuple[int, float]:
+        """Bin with the largest statistic of some kinds, and the statistic."""
+        k = int(np.argmax(self.scores.statistic[:, columns].max(axis=1)))
+        return k, float(self.scores.statistic[k, columns].max())
+
+    def discard(self, k: int, bins: int) -> None:
+        """Try no more candidates so near to bin k."""
+        self.scores.statistic[max(k - bins, 0) : k + bins + 1] = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Candidate:
+    """Where a magnet may be: the bin, the start of a fit as each kind (the likelier first), and who is fitted again."""
+
+    bin: int
+    starts: dict[int, Floats]
+    group: list[int]
+
+    @property
+    def start(self) -> Floats:
+        """Start as the likelier kind."""
+        return next(iter(self.starts.values()))
+
+
+@dataclass(slots=True, eq=False)
+class _Pursuit:
+    """The matching pursuit over one region, or over a part of it."""
+
+    bank: FilterBank
+    array: SensorArray
+    region: Region
+    prior: MagnetPrior
+    window: FitWindow
+    _failed: int = field(default=0, init=False)
+
+    def between(self, start_m: float, end_m: float) -> _Pursuit:
+        """The same over the part between two distances."""
+        first = self.region.start + HALF_BINS
+        count = len(self.region.scores.statistic)
+        a = min(max(int(start_m / BIN_M) - first, 0), count - 1)
+        b = min(max(int(end_m / BIN_M) - first, a), count - 1)
+        part = replace(
+            self.region,
+            x=self.region.x[a : b + 1 + 2 * HALF_BINS],
+            start=self.region.start + a,
+            scores=self.region.scores.part(a, b + 1),
+        )
+        return replace(self, region=part)
+
+    def run(self, kinds: tuple[int, ...], known: list[Dipole]) -> tuple[list[Dipole], bool]:
+        """Dipoles of some kinds that explain what known ones leave of the region, the strongest first.
+
+        Returns
+        -------
+        list of Dipole, bool
+            And whether the region is iron, of which further poles would only take time.
+        """
+        scores = self.region.scores
+        left = _Residual(self.region.x.copy(), BinScores(scores.statistic.copy(), scores.cell.copy()))
+        if known:
+            self._subtract(left, known, [])
+        columns = [0 if kind == FORWARD else 1 for kind in kinds]
+        found: list[Dipole] = []
+        strongest = 0.0
+        self._failed = 0
+        while len(found) < MAX_MAGNETS:
+            k, best = left.best(columns)
+            strongest = max(strongest, best)
+            if best < max(THRESHOLD, STOP_SHARE * strongest):
+                break
+            candidate = self._candidate(k, kinds, columns, left, found)
+            if any(_apart_m(d.params, candidate.start) < SAME_M for d in found):
+                left.discard(k, KNOWN_BINS)  # what the model of that dipole missed
+                continue
+            before, failed = [found[i] for i in candidate.group], self._failed
+            fitted = self._fit(candidate, found, known, left)
+            if fitted is not None:
+                found = self._with_fitted(found, candidate.group, fitted)
+                found, ferrous = self._examine(found)
+                if ferrous:
+                    return found, True
+                self._subtract(left, fitted, before)
+            elif self._failed > failed and self._is_hopeless(found):
+                return found, True
+        return found, False
+
+    def _candidate(
+        self, k: int, kinds: tuple[int, ...], columns: list[int], left: _Residual, found: list[Dipole]
+    ) -> _Candidate:
+        """The candidate at bin k."""
+        order = sorted(zip(kinds, columns, strict=True), key=lambda c: -float(left.scores.statistic[k, c[1]]))
+        starts = {kind: self._start(k, column, left.scores) for kind, column in order}
+        s = starts[order[0][0]][0]
+        near = sorted(range(len(found)), key=lambda i: abs(found[i].params[0] - s))[: MAX_TOGETHER - 1]
+        return _Candidate(k, starts, [i for i in near if abs(found[i].params[0] - s) < TOGETHER_M])
+
+    def _start(self, k: int, column: int, scores: BinScores) -> Floats:
+        """Where a magnet of a kind fits best near bin k."""
+        statistic = scores.statistic
+        low, at = max(k - START_BINS, 0), k
+        if statistic[k, column] < statistic[k].max():
+            at = low + int(np.argmax(statistic[low : k + START_BINS + 1, column]))
+        start = np.zeros(PARAMETERS)
+        start[0] = (self.region.start + HALF_BINS + at + 0.5) * BIN_M
+        start[1] = self.bank.lateral_m[scores.cell[at, column]]
+        tracked = self.prior.clearance_std_m < TRACKED_STD_M
+        start[2] = self.prior.clearance_m if tracked else self.bank.height_m[scores.cell[at, column]]
+        return start
+
+    def _fit(
+        self, candidate: _Candidate, found: list[Dipole], known: list[Dipole], left: _Residual
+    ) -> list[Dipole] | None:
+        """The candidate's group and its dipole, fitted together; None if that does not confirm the candidate."""
+        group = [found[i] for i in candidate.group]
+        others = [d for i, d in enumerate(found) if i not in candidate.group] + known
+        fitted = self.window.fit_either_kind(group, candidate.starts, others)
+        if fitted is None:
+            left.discard(candidate.bin, 0)
+            return None
+        added = fitted[-1]
+        same = any(_apart_m(d.params, added.params) < SAME_M for d in fitted[:-1])
+        if added.explained < CONFIRMED_SHARE * THRESHOLD or same:
+            left.discard(candidate.bin, REFUSED_BINS)
+            self._failed += 1
+            return None
+        return fitted
+
+    def _is_hopeless(self, found: list[Dipole]) -> bool:
+        """Whether the region is iron because too many fits were refused, or they take too long."""
+        return (self._failed >= MAX_FAILED and self._failed > len(found)) or self.is_slow(found)
+
+    def _with_fitted(self, found: list[Dipole], group: list[int], fitted: list[Dipole]) -> list[Dipole]:
+        """The dipoles with a group fitted again, each with its margin, and the new one."""
+        out = list(found)
+        for i, dipole in zip(group, fitted, strict=False):
+            out[i] = replace(dipole, margin=found[i].margin)
+        return [*out, fitted[-1]]
+
+    def _examine(self, found: list[Dipole]) -> tuple[list[Dipole], bool]:
+        """Whether the dipoles so far are poles of iron; they may be polished to find out."""
+        if is_ferrous(found, self.array.half_width_m) or self.is_slow(found):
+            return found, True
+        if len(found) in (FERROUS_COUNT, 2 * FERROUS_COUNT) and _mostly_unlike(found):
+            found = self.polish(found)
+            return found, _mostly_unlike(found) and not _is_row(found)
+        return found, False
+
+    def is_slow(self, found: list[Dipole]) -> bool:
+        """Whether the fits took so long that only a row of magnets is worth more."""
+        width = np.ptp([d.params[1] for d in found]) if found else 0.0
+        return bool(self.window.joint_fits > MAX_JOINT_FITS and width > ROW_WIDTH_M)
+
+    def polish(self, found: list[Dipole]) -> list[Dipole]:
+        """Fit the dipoles of each cluster together: those found first were fitted without the others."""
+        for cluster in (c for c in _clusters(found) if len(c) > 1):
+            for k in range(0, len(cluster), MAX_POLISHED):
+                part = cluster[k : k + MAX_POLISHED]
+                others = [d for d in found if all(d is not p for p in part)]
+                fitted = self.window.fit([d.params for d in part], [d.kind for d in part], others)
+                if fitted:
+                    found = others + [replace(f, margin=d.margin) for f, d in zip(fitted, part, strict=True)]
+        return found
+
+    def _subtract(self, left: _Residual, add: list[Dipole], undo: list[Dipole]) -> None:
+        """Take the fields of dipoles out of the bins, put earlier fits of them back, and score the bins again."""
+        x, share = left.x, self.region.common_share
+        middles: Floats = (self.region.start + np.arange(len(x), dtype=float) + 0.5) * BIN_M
+        rows = x.reshape(len(x), -1, 3)
+        for sign, dipoles in ((-1.0, add), (1.0, undo)):
+            for dipole in dipoles:
+                s = dipole.params[0]
+                low, high = np.searchsorted(middles, (s - FIELD_M, s + FIELD_M))
+                add_dipole_field(dipole.params, middles[low:high], self.array.positions_m, sign, share, rows[low:high])
+        changed = [d.params for d in (*add, *undo)]
+        first = self.region.start + HALF_BINS
+        start_m = min(p[0] - CHANGE_M - CHANGE_HEIGHTS * p[2] for p in changed)
+        end_m = max(p[0] + CHANGE_M + CHANGE_HEIGHTS * p[2] for p in changed)
+        a = max(int(start_m / BIN_M) - first, 0)
+        b = min(int(end_m / BIN_M) - first + 1, len(left.scores.statistic))
+        if a < b:
+            score_bins(x, HALF_BINS + a, self.bank, self.region.variance, left.scores.part(a, b))
+
+
+def _clusters(dipoles: list[Dipole]) -> list[list[Dipole]]:
+    """Groups of dipoles with less than `CLUSTER_M` from each to the next."""
+    groups: list[list[Dipole]] = []
+    for dipole in sorted(dipoles, key=lambda d: float(d.params[0])):
+        if groups and dipole.params[0] - groups[-1][-1].params[0] < CLUSTER_M:
+            groups[-1].append(dipole)
+        else:
+            groups.append([dipole])
+    return groups
+
+
+def _is_unclear(cluster: list[Dipole]) -> bool:
+    """Whether the kinds of a cluster's dipoles may be others, as their fields overlap."""
+    places = [float(d.params[0]) for d in cluster]
+    kinds = {d.kind for d in cluster}
+    return len(cluster) > 1 and bool(
+        len(kinds) > 1 or min(np.diff(places)) < CLOSE_M or min(d.margin for d in cluster) < SURE_MARGIN
+    )
+
+
+def _mostly_unlike(dipoles: list[Dipole]) -> bool:
+    """Whether most of the dipoles are unlike magnets."""
+    return 2 * sum(d.unlike_magnet for d in dipoles) > len(dipoles)
+
+
+def _is_row(dipoles: list[Dipole]) -> bool:
+    """Whether dipoles stand like the magnets of a tag, apart and one behind the other."""
+    places = np.array([d.params[:2] for d in dipoles])
+    gap_m = np.diff(np.sort(places[:, 0])).min(initial=np.inf)
+    return bool(np.ptp(places[:, 1]) < TAG_WIDTH_M and gap_m > CLOSE_M)
+
+
+def _penalty(dipoles: list[Dipole]) -> float:
+    """Cost of the number of dipoles, and of those that stand too close."""
+    places = np.sort([float(d.params[0]) for d in dipoles])
+    return PENALTY * len(dipoles) + CLOSE_PENALTY * int(np.sum(np.diff(places) < CLOSE_M))
+
+
+def _apart_m(a: Floats, b: Floats) -> float:
+    return float(np.hypot(a[0] - b[0], a[1] - b[1]))

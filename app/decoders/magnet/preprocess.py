@@ -1,0 +1,348 @@
+"""From samples to blocks along the road: faulty samples replaced, time turned into distance.
+
+A sample is faulty if it is outside the chip's range, repeats the sample before, or is a spike: off by itself while the
+samples before and after it, and its neighbours on the bar, agree. It is replaced by interpolation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.magnet.kernels import exact_entry, exact_step
+from app.decoders.magnet.readings import NoiseFinding, NoiseKind
+from app.errors import InvalidParameter
+from app.sensors.magnetometer_bar import MAX_FIELD_UT, MagnetometerBar, MagnetTrace, SensorRole
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+BLOCK_M = 0.02
+"""Samples nearer to each other than this are averaged. [m] Source: chosen by hand, less than half a bin
+(`app.decoders.magnet.matched_filter.BIN_M`)."""
+MIN_GAP_S = 0.1
+"""A longer interval between samples is reported as a gap. [s] Source: chosen by hand, 35 samples of METRO's 350 Hz."""
+MAX_GAP_M = 10.0
+"""Most distance that is counted over a gap. [m] Source: chosen by hand."""
+MAX_INTERPOLATION_S = 1.0
+"""A speed is interpolated between values at most so far apart, else the last one is kept. [s] Source: chosen by hand,
+ten values of METRO's CAN bus (section 7.1: 10 Hz)."""
+MIN_SPIKE_UT = 25.0
+"""Smallest deviation of a spike from the samples around it. [uT] Source: chosen by hand, no measurement kept."""
+SPIKE_RATIO = 4.0
+"""A spike deviates so many times as much as its neighbours on the bar. Source: chosen by hand, no measurement kept."""
+MIN_NEIGHBOUR_UT = 4.0
+"""Deviation that is assumed of neighbours that deviate less. [uT] Source: chosen by hand, 2 to 3 times a chip's
+noise."""
+SPIKE_MISMATCH, SPIKE_NOISE_UT = 0.15, 3.0
+"""A single outlier bends the sample before it by minus half of its own deviation. The difference may be this share, or
+this much. [1, uT] Source: the second difference; levels chosen by hand, no measurement kept."""
+SURE_SPIKE_UT, SURE_MISMATCH, SURE_NOISE_UT = 60.0, 0.05, 6.0
+"""The same for spikes that are accepted whatever their neighbours do. [uT, 1, uT] Source: chosen by hand; a magnet at
+30 m/s must remain (`tests/decoders/magnet/test_preprocess.py`)."""
+NEIGHBOUR_REACH_M = 0.25
+"""Farthest neighbour on the bar. [m] Source: METRO's spacing of 16 cm (section 5.1), with room for other bars."""
+AHEAD = 2
+"""Samples that are looked at ahead: the next one may be faulty. Source: chosen by hand."""
+FORGET_BLOCKS = 400
+"""Blocks after which old ones are dropped: speed only."""
+
+
+class Blocks:
+    """Averages of neighbouring samples, those not yet forgotten.
+
+    Odometer s (N,) [m], time t (N,) [s], speed v (N,) [m/s], field x (N, S, 3) [uT], share of good samples w (N, S).
+    """
+
+    def __init__(self, sensors: int) -> None:
+        self.s = np.empty(0)
+        self.t = np.empty(0)
+        self.v = np.empty(0)
+        self.x = np.empty((0, sensors, 3))
+        self.w = np.empty((0, sensors))
+
+    def append(self, s: Floats, t: Floats, v: Floats, x: Floats, w: Floats) -> None:
+        """Add blocks at the end."""
+        self.s, self.t, self.v = (np.concatenate(p) for p in ((self.s, s), (self.t, t), (self.v, v)))
+        self.x, self.w = np.concatenate((self.x, x)), np.concatenate((self.w, w))
+
+    def forget(self, before_m: float) -> None:
+        """Drop what lies before a distance, in large pieces."""
+        n = int(np.searchsorted(self.s, before_m))
+        if n > FORGET_BLOCKS:
+            self.s, self.t, self.v, self.x, self.w = (a[n:].copy() for a in (self.s, self.t, self.v, self.x, self.w))
+
+
+class Preprocessor:
+    """Replaces faulty samples, integrates the speed and averages samples to blocks; the same for any chunking."""
+
+    def __init__(self, bar: MagnetometerBar) -> None:
+        self._bar = bar
+        n = bar.sensor_count
+        self._t = np.empty(0)
+        self._x = np.empty((0, n, 3))
+        self._speed_t = np.empty(0)
+        self._speed = np.empty(0)
+        self._last: tuple[float, float, float] | None = None  # time, speed and odometer of the newest sample used
+        self._repair = _Repair(
+            np.full((n, 3), np.nan), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), _neighbours(bar)
+        )
+        self._open = _OpenBlock(np.zeros((n, 3)), np.zeros(n), np.zeros(5))
+        self.findings: list[NoiseFinding] = []
+        self.headings = np.empty((0, 2))
+
+    def feed(self, chunk: MagnetTrace) -> None:
+        """Take a piece of the trace."""
+        if chunk.field_ut.shape[1] != self._bar.sensor_count:
+            raise InvalidParameter(
+                f"the trace has {chunk.field_ut.shape[1]} sensors, the bar {self._bar.sensor_count}",
+                field="trace.field_ut",
+                limit=f"{self._bar.sensor_count} sensors",
+                cure="declare the bar that recorded it",
+            )
+        before = self._t[-1] if self._t.size else (self._last[0] if self._last else -np.inf)
+        if chunk.t_s.size and chunk.t_s[0] <= before:
+            raise InvalidParameter(
+                f"the piece starts at {chunk.t_s[0]:.6f} s, the one before ended at {before:.6f} s",
+                field="trace.t_s",
+                limit="rising",
+                cure="feed the pieces in their order",
+            )
+        self._t = np.concatenate((self._t, chunk.t_s))
+        self._x = np.concatenate((self._x, chunk.field_ut.astype(float)))
+        self._speed_t = np.concatenate((self._speed_t, chunk.speed_t_s))
+        self._speed = np.concatenate((self._speed, np.abs(chunk.speed_m_s)))
+        if chunk.heading_t_s is not None and chunk.heading_deg is not None:
+            self.headings = np.concatenate((self.headings, np.stack([chunk.heading_t_s, chunk.heading_deg], 1)))
+
+    def take(self, blocks: Blocks, *, final: bool = False) -> None:
+        """Move what is complete into the blocks; all of it if final."""
+        ready = self._ready(final)
+        if ready < 1:
+            if final:
+                self._close(blocks)
+            return
+        t, raw = self._t[:ready], self._x[: ready + AHEAD]
+        if lacking := ready + AHEAD - len(raw):  # the very last samples have no sample after them
+            raw = np.concatenate((raw, np.repeat(raw[-1:], lacking, axis=0)))
+        s, v = self._odometer(t)
+        out = _OpenBlock(np.empty((ready, *raw.shape[1:])), np.empty((ready, raw.shape[1])), np.empty((ready, 5)))
+        n = _repair_and_average(raw, np.stack([s, t, v], axis=1), self._repair, self._open, out)
+        blocks.append(out.drive[:n, 2], out.drive[:n, 3], out.drive[:n, 4], out.field[:n], out.good[:n])
+        self._t, self._x = self._t[ready:], self._x[ready:]
+        keep = max(int(np.searchsorted(self._speed_t, t[ready - 1])) - 2, 0)
+        self._speed_t, self._speed = self._speed_t[keep:], self._speed[keep:]
+        if final:
+            self._close(blocks)
+
+    def _ready(self, final: bool) -> int:
+        """Samples that can be used: their speed is known, and so are the samples after them."""
+        if final:
+            return self._t.size
+        if not self._t.size or not self._speed_t.size:
+            return 0
+        until = self._speed_t[-1]
+        if self._t[-1] > until + MAX_INTERPOLATION_S:
+            return self._t.size - AHEAD
+        return min(int(np.searchsorted(self._t, until, side="right")), self._t.size - AHEAD)
+
+    def _odometer(self, t: Floats) -> tuple[Floats, Floats]:
+        """Distance and speed at times."""
+        if not self._speed_t.size:
+            raise InvalidParameter(
+                "the trace has no speed", field="trace.speed_m_s", limit="one value or more", cure="upload the CAN log"
+            )
+        v = np.interp(t, self._speed_t, self._speed)
+        before = np.clip(np.searchsorted(self._speed_t, t, side="right") - 1, 0, self._speed_t.size - 1)
+        after = np.minimum(before + 1, self._speed_t.size - 1)
+        far = self._speed_t[after] - self._speed_t[before] > MAX_INTERPOLATION_S
+        v = np.where(far, self._speed[before], v)
+        if self._last is None:
+            self._last = (float(t[0]), float(v[0]), 0.0)
+        time = np.concatenate(([self._last[0]], t))
+        speed = np.concatenate(([self._last[1]], v))
+        step = np.diff(time) * (speed[1:] + speed[:-1]) / 2
+        for i in np.flatnonzero(np.diff(time) > MIN_GAP_S):
+            step[i] = min(step[i], MAX_GAP_M)
+            self.findings.append(
+                NoiseFinding(
+                    float(time[i]), self._last[2], 0.0, NoiseKind.GAP,
+                    f"no samples for {time[i + 1] - time[i]:.3f} s from {time[i]:.3f} s",
+                )
+            )  # fmt: skip
+        s = np.cumsum(np.concatenate(([self._last[2]], step)))[1:]
+        self._last = (float(t[-1]), float(v[-1]), float(s[-1]))
+        return s, v
+
+    def _close(self, blocks: Blocks) -> None:
+        """Move the open block into the blocks."""
+        count = self._open.drive[0]
+        if count:
+            s, t, v = self._open.drive[2:] / count
+            x, w = self._open.field / count, self._open.good / count
+            blocks.append(np.array([s]), np.array([t]), np.array([v]), x[None], w[None])
+            self._open.drive[0] = 0
+
+
+def _neighbours(bar: MagnetometerBar) -> npt.NDArray[np.int64]:
+    """Two nearest array sensors of each within 0.25 m, -1 for none, shape (S, 2)."""
+    out = np.full((bar.sensor_count, 2), -1, np.int64)
+    for i in bar.array:
+        away = np.linalg.norm(bar.positions_m - bar.positions_m[i], axis=1)
+        near = [
+            j for j in np.argsort(away) if j != i and away[j] < NEIGHBOUR_REACH_M and bar.roles[j] is SensorRole.ARRAY
+        ]
+        out[i, : len(near[:2])] = near[:2]
+    return out
+
+
+# --- kernels; S sensors ---------------------------------------------------------------------------------------------
+
+
+class _Repair(NamedTuple):
+    """What the check of a sample needs of those before it; fields are relative to `offset`. [uT]"""
+
+    offset: Floats  # (S, 3) first plausible sample, NaN until there is one
+    raw: Floats  # (S, 3) the sample before, as read
+    last: Floats  # (S, 3) the sample before, repaired
+    earlier: Floats  # (S, 3) the one before that, repaired
+    neighbours: Integers  # (S, 2) nearest array sensors, -1 for none
+
+
+class _Check(NamedTuple):
+    """A sample compared with its prediction from the samples around it."""
+
+    predicted: Floats  # (S, 3) on the line through the last repaired and the next usable sample [uT]
+    deviation: Floats  # (S,) distance from it, 0 where the sample or the next one is unusable [uT]
+    usable: Flags  # (S,) in range and no repeat
+    next_usable: Flags  # (S,)
+
+
+class _OpenBlock(NamedTuple):
+    """Sums over the samples of the block that is being filled; as an output, blocks that are complete."""
+
+    field: Floats  # (S, 3) [uT]
+    good: Floats  # (S,) number of good samples
+    drive: Floats  # (5,) samples, s of the first, sums of s [m], t [s], v [m/s]
+
+
+@exact_step
+def _in_range(x: Floats) -> bool:
+    """Whether a sample (3,) is within the chip's range; NaN is not."""
+    return bool(abs(x[0]) < MAX_FIELD_UT and abs(x[1]) < MAX_FIELD_UT and abs(x[2]) < MAX_FIELD_UT)
+
+
+@exact_step
+def _is_same(a: Floats, b: Floats) -> bool:
+    return bool(a[0] == b[0] and a[1] == b[1] and a[2] == b[2])
+
+
+@exact_step
+def _next_sample(raw: Floats, i: int, j: int, usable: bool, repair: _Repair) -> int:
+    """Samples to the one that the prediction uses: 2 if the next one is out of range, a repeat or a spike."""
+    if not _in_range(raw[i + 1, j]) or _is_same(raw[i + 1, j], raw[i, j]):
+        return 2
+    if usable or not _in_range(raw[i + 2, j]):
+        return 1
+    one = two = 0.0  # beside a faulty sample a spike may follow: the flatter continuation is the likelier
+    for a in range(3):
+        before = repair.offset[j, a] + repair.last[j, a]
+        one += (raw[i + 1, j, a] - before) ** 2
+        two += (raw[i + 2, j, a] - before) ** 2
+    return 2 if one > two / 4 else 1
+
+
+@exact_step
+def _check_sample(raw: Floats, i: int, repair: _Repair, check: _Check) -> None:
+    """Compare sample i of every sensor with its prediction."""
+    for j in range(raw.shape[1]):
+        usable = _in_range(raw[i, j])
+        if usable and math.isnan(repair.offset[j, 0]):
+            for a in range(3):
+                repair.offset[j, a] = raw[i, j, a]
+                repair.last[j, a] = repair.earlier[j, a] = 0.0
+        elif usable and _is_same(raw[i, j], repair.raw[j]):
+            usable = False
+        ahead = _next_sample(raw, i, j, usable, repair)
+        square = 0.0
+        for a in range(3):
+            repair.raw[j, a] = raw[i, j, a]
+            after = raw[i + ahead, j, a] - repair.offset[j, a]
+            check.predicted[j, a] = (ahead * repair.last[j, a] + after) / (ahead + 1)
+            square += (raw[i, j, a] - repair.offset[j, a] - check.predicted[j, a]) ** 2
+        check.usable[j] = usable
+        check.next_usable[j] = _in_range(raw[i + ahead, j])
+        check.deviation[j] = math.sqrt(square) if usable and check.next_usable[j] else 0.0
+
+
+@exact_step
+def _is_spike(j: int, repair: _Repair, check: _Check) -> bool:
+    """Whether a sample is off by itself: in time by its second difference, across the bar by its neighbours."""
+    deviation = check.deviation[j]
+    if deviation <= MIN_SPIKE_UT or repair.neighbours[j, 0] < 0:
+        return False
+    mismatch = 0.0
+    for a in range(3):
+        mismatch += (repair.last[j, a] - (repair.earlier[j, a] + check.predicted[j, a]) / 2) ** 2
+    around = MIN_NEIGHBOUR_UT
+    for q in range(2):
+        if repair.neighbours[j, q] >= 0:
+            around = max(around, check.deviation[repair.neighbours[j, q]])
+    if deviation > SURE_SPIKE_UT and mismatch < (SURE_MISMATCH * deviation + SURE_NOISE_UT) ** 2:
+        return True
+    alone = mismatch < (SPIKE_MISMATCH * deviation) ** 2 + SPIKE_NOISE_UT**2
+    return bool(alone and deviation > SPIKE_RATIO * around)
+
+
+@exact_step
+def _add_sample(sample: Floats, drive: Floats, repair: _Repair, check: _Check, block: _OpenBlock) -> None:
+    """Repair a sample (S, 3) taken at drive (3,) and add it to the open block."""
+    if block.drive[0] == 0:
+        block.field[:] = 0.0
+        block.good[:] = 0.0
+        block.drive[:] = 0.0
+        block.drive[1] = drive[0]
+    block.drive[0] += 1
+    for q in range(3):
+        block.drive[2 + q] += drive[q]
+    for j in range(sample.shape[0]):
+        good = check.usable[j] and not _is_spike(j, repair, check)
+        for a in range(3):
+            repair.earlier[j, a] = repair.last[j, a]
+            if good:
+                repair.last[j, a] = sample[j, a] - repair.offset[j, a]
+            elif check.next_usable[j] and not math.isnan(repair.offset[j, 0]):
+                repair.last[j, a] = check.predicted[j, a]
+            block.field[j, a] += repair.last[j, a]
+        block.good[j] += good
+
+
+@exact_step
+def _close_block(block: _OpenBlock, out: _OpenBlock, at: int) -> None:
+    """Write the means of the open block to the place `at` of the output, and empty it."""
+    count = block.drive[0]
+    for j in range(block.good.size):
+        out.good[at, j] = block.good[j] / count
+        for a in range(3):
+            out.field[at, j, a] = block.field[j, a] / count
+    for q in range(5):
+        out.drive[at, q] = block.drive[q] / count
+    block.drive[0] = 0.0
+
+
+@exact_entry
+def _repair_and_average(raw: Floats, drive: Floats, repair: _Repair, block: _OpenBlock, out: _OpenBlock) -> int:
+    """Repair samples raw (N + AHEAD, S, 3) taken at drive (N, 3): s, t, v; average them; return the blocks closed."""
+    sensors, closed = raw.shape[1], 0
+    check = _Check(np.empty((sensors, 3)), np.empty(sensors), np.empty(sensors, np.bool_), np.empty(sensors, np.bool_))
+    for i in range(drive.shape[0]):
+        _check_sample(raw, i, repair, check)
+        if block.drive[0] > 0 and drive[i, 0] - block.drive[1] > BLOCK_M:
+            _close_block(block, out, closed)
+            closed += 1
+        _add_sample(raw[i], drive[i], repair, check, block)
+    return closed

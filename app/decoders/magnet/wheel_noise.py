@@ -1,0 +1,266 @@
+"""Cancellation of the noise of magnetised wheels, which repeats with each turn of a wheel.
+
+A wheel's field at a sensor is a sum of harmonics of its rotation (rotating dipoles in its belt), the same turn after
+turn. A bar sensor and a reference sensor see it in different shape and phase, so the reference itself cannot be
+subtracted. It gives the length of a turn; the harmonics are then learnt for each channel by least mean squares
+(the adaptive notch filter of Widrow et al., Adaptive noise cancelling: principles and applications, 1975).
+
+Shapes: W wheels, S sensors, L trial circumferences, H harmonics.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.magnet.kernels import entry, step
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Complexes = npt.NDArray[np.complex128]
+
+HARMONICS = 8
+"""Harmonics of a turn that are cancelled. Source: chosen by hand, no measurement kept."""
+CIRCUMFERENCES_M = np.geomspace(1.6, 2.4, 64)
+"""Trial lengths of a turn. [m] Source: rolling circumferences of car tyres; steps of 0.6 %, refined by a parabola."""
+BANK_HARMONICS = 3
+"""Harmonics by which the length of a turn is found. Source: chosen by hand."""
+BANK_M = 30.0
+"""Distance over which the length of a turn is found. [m] Source: chosen by hand, some 15 turns."""
+RENEW_M = 0.1
+"""Distance after which the bank of trial lengths is renewed. [m] Source: chosen by hand for speed."""
+LEARN_M, FIRST_LEARN_M, LEARN_SLOPE = 25.0, 3.0, 0.3
+"""Distance over which harmonics are learnt: in the long run, at first, and its growth per distance. [m, m, 1] Source:
+chosen by hand, no measurement kept."""
+OFFSET_M, FIRST_OFFSET_M = 6.0, 0.5
+"""Distance over which a channel's offset is averaged, in the long run and at first. [m] Source: chosen by hand, three
+turns."""
+STRENGTH_M = 10.0
+"""Distance over which the strengths of noise and residual are averaged. [m] Source: chosen by hand, five turns."""
+MIN_PERIODIC = 0.2
+"""Smallest share of a reference's signal that repeats with the turns, for a wheel to count as noisy. Source: by
+hand."""
+MIN_POWER_UT2 = 4.0
+"""Smallest mean square of a reference's signal for that. [uT2] Source: chosen by hand, about a chip's noise."""
+START_M = 8.0
+"""Distance before a wheel can count as noisy, and for which a magnet is not looked for. [m] Source: by hand, four
+turns."""
+FADE_AFTER_M, FADE_M = 3.0, 8.0
+"""The noise is taken out gradually, from so far after a wheel was found noisy, over this. [m] Source: chosen by
+hand."""
+CLIP, FIRST_CLIP, FIRST_CLIP_M = 3.0, 3.0, 6.0
+"""Residuals count up to so many mean deviations, and so many times that over the first metres. Source: chosen by
+hand."""
+MEAN_DEVIATION = 1.25
+"""Standard deviation over mean absolute deviation of Gaussian noise: sqrt(pi / 2) = 1.253. Source: normal
+distribution."""
+HALF_GAIN = 0.1
+"""Strength of the noise over the residual's variance at which half of it is taken out. Source: chosen by hand."""
+OUTLIER_CHANNELS = 3
+"""So many channels off by more than `CLIP` deviations are a magnet or iron, from which nothing is learnt. Source: by
+hand; what magnets lost without it was not kept (change "learn wheel noise away from magnets")."""
+MAGNET_RATE = 0.1
+"""Factor on the rate at which the residual's strength follows over a magnet. Source: chosen by hand."""
+MAX_BOOST = 2.0
+"""Channels with strong noise are learnt up to so many times faster, and once more. Source: chosen by hand."""
+MAX_STEP_M = 0.5
+"""Longest step between two blocks: longer ones are gaps. [m] Source: chosen by hand."""
+FIRST_ERROR_UT, FIRST_LENGTH_M = 3.0, 2.0
+"""Residual and length of a turn that are assumed at first. [uT, m] Source: twice a chip's noise; the range's middle."""
+
+
+class _Turns(NamedTuple):
+    """The rotation of the wheels, as the references see it."""
+
+    references: Integers  # (W,) reference sensors
+    lengths_m: Floats  # (L,) trial lengths
+    bank: Complexes  # (W, L, H, 3) running correlations with each trial length
+    power: Floats  # (W, 3) running signal power [uT2 m]
+    pending: Floats  # (W, 4) distance and integral of the signal since the bank was renewed
+    length_m: Floats  # (W,) of a turn
+    periodic: Floats  # (W,) share of the signal that repeats with the turns
+    phase: Floats  # (W,) of the turn [rad]
+    locked_m: Floats  # (W,) distance since the wheel was found noisy
+
+
+class _Channels(NamedTuple):
+    """What was learnt of each channel."""
+
+    offset: Floats  # (S, 3) [uT]
+    weights: Floats  # (S, 3, 2 W HARMONICS) cosine and sine of each harmonic [uT]
+    error: Floats  # (S, 3) deviation of the residual [uT]
+    strength: Floats  # (S, 3) mean square of the noise [uT2]
+    residual: Floats  # (S, 3) of the present block [uT]
+    regressors: Floats  # (2 W HARMONICS,) of the present block
+
+
+class WheelNoiseCanceller:
+    """Takes wheel noise out of blocks, in their order.
+
+    Parameters
+    ----------
+    references : ndarray of int
+        Reference sensors, one for each wheel; without any, nothing is changed.
+    sensors : int
+        All sensors.
+    """
+
+    def __init__(self, references: npt.NDArray[np.intp], sensors: int) -> None:
+        wheels, regressors = len(references), 2 * len(references) * HARMONICS
+        self._turns = _Turns(
+            references.astype(np.int64),
+            CIRCUMFERENCES_M.copy(),
+            np.zeros((wheels, CIRCUMFERENCES_M.size, BANK_HARMONICS, 3), np.complex128),
+            np.zeros((wheels, 3)),
+            np.zeros((wheels, 4)),
+            np.full(wheels, FIRST_LENGTH_M),
+            np.zeros(wheels),
+            np.zeros(wheels),
+            np.zeros(wheels),
+        )
+        self._channels = _Channels(
+            np.zeros((sensors, 3)),
+            np.zeros((sensors, 3, regressors)),
+            np.full((sensors, 3), FIRST_ERROR_UT),
+            np.zeros((sensors, 3)),
+            np.zeros((sensors, 3)),
+            np.zeros(regressors),
+        )
+        self._drive = np.zeros(3)  # 1 once begun, s of the newest block, distance driven
+
+    def cancel(self, s: Floats, x: Floats) -> None:
+        """Take the noise out of blocks at odometers s (N,): x (N, S, 3), in place."""
+        if self._turns.references.size and s.size:
+            _cancel(s, x, self._turns, self._channels, self._drive)
+
+
+@entry
+def _cancel(s: Floats, x: Floats, turns: _Turns, channels: _Channels, drive: Floats) -> None:
+    """Follow the turns, take the noise out of each block and learn from what is left."""
+    for i in range(s.size):
+        if drive[0] == 0:
+            drive[0], drive[1] = 1.0, s[i]
+            _track_offset(x[i], 1.0, channels)
+            continue
+        step = min(max(s[i] - drive[1], 0.0), MAX_STEP_M)
+        drive[1] = s[i]
+        drive[2] += step
+        if step <= 0:
+            continue
+        _track_offset(x[i], min(step / min(OFFSET_M, FIRST_OFFSET_M + drive[2]), 1.0), channels)
+        for w in range(turns.references.size):
+            _follow_turn(w, s[i], step, drive[2], x[i], turns, channels)
+        locked_m = turns.locked_m.max()
+        if locked_m > 0:
+            outliers = _subtract_noise(x[i], step, locked_m, channels)
+            _learn(step, locked_m, outliers >= OUTLIER_CHANNELS and locked_m > START_M, channels)
+
+
+@step
+def _track_offset(x: Floats, rate: float, channels: _Channels) -> None:
+    """Move each channel's offset towards a block (S, 3)."""
+    for j in range(x.shape[0]):
+        for axis in range(3):
+            channels.offset[j, axis] += rate * (x[j, axis] - channels.offset[j, axis])
+
+
+@step
+def _follow_turn(w: int, s: float, step: float, driven_m: float, x: Floats, turns: _Turns, channels: _Channels) -> None:
+    """Advance a wheel's phase by a block (S, 3), and set its regressors: 0 unless the wheel is noisy."""
+    reference, pending = turns.references[w], turns.pending[w]
+    pending[0] += step
+    for axis in range(3):
+        pending[1 + axis] += step * (x[reference, axis] - channels.offset[reference, axis])
+    if pending[0] > RENEW_M:
+        _renew_length(w, s - pending[0] / 2, BANK_M * (1 - math.exp(-driven_m / BANK_M)) + 1e-6, turns)
+        pending[:] = 0.0
+    turns.phase[w] = (turns.phase[w] + 2 * math.pi * step / turns.length_m[w]) % (2 * math.pi)
+    noisy = turns.periodic[w] > MIN_PERIODIC and driven_m > START_M
+    turns.locked_m[w] = turns.locked_m[w] + step if noisy else 0.0
+    for h in range(HARMONICS):
+        k = 2 * (w * HARMONICS + h)
+        channels.regressors[k] = math.cos((h + 1) * turns.phase[w]) if noisy else 0.0
+        channels.regressors[k + 1] = math.sin((h + 1) * turns.phase[w]) if noisy else 0.0
+
+
+@step
+def _renew_length(w: int, s: float, seen_m: float, turns: _Turns) -> None:
+    """Add the pending piece of a reference's signal to its bank, and find the length of a turn in it.
+
+    The bank holds the first harmonics of a Fourier series for each trial length, forgetting over `BANK_M`.
+    """
+    pending, bank, lengths = turns.pending[w], turns.bank[w], turns.lengths_m
+    keep = math.exp(-pending[0] / BANK_M)
+    total = 1e-9
+    for axis in range(3):
+        turns.power[w, axis] = keep * turns.power[w, axis] + pending[1 + axis] ** 2 / pending[0]
+        total += turns.power[w, axis]
+    best, at = 0.0, 0
+    for c in range(lengths.size):
+        turn = 2 * math.pi * (s / lengths[c] % 1.0)
+        one = complex(math.cos(turn), -math.sin(turn))
+        spin = one
+        for h in range(bank.shape[1]):
+            for axis in range(3):
+                bank[c, h, axis] = keep * bank[c, h, axis] + pending[1 + axis] * spin
+            spin = spin * one
+        value = _bank_energy(bank[c])
+        if value > best:
+            best, at = value, c
+    turns.length_m[w] = lengths[at]
+    turns.periodic[w] = 2 * best / (seen_m * total) if total / seen_m > MIN_POWER_UT2 else 0.0
+    if 0 < at < lengths.size - 1:  # the parabola through the best and its neighbours
+        left, right = _bank_energy(bank[at - 1]), _bank_energy(bank[at + 1])
+        bend = left - 2 * best + right
+        if bend < 0:
+            turns.length_m[w] *= (lengths[1] / lengths[0]) ** (0.5 * (left - right) / bend)
+
+
+@step
+def _bank_energy(z: Complexes) -> float:
+    """Energy of the harmonics (H, 3) of one trial length."""
+    value = 0.0
+    for h in range(z.shape[0]):
+        for axis in range(3):
+            value += z[h, axis].real ** 2 + z[h, axis].imag ** 2
+    return value
+
+
+@step
+def _subtract_noise(x: Floats, step: float, locked_m: float, channels: _Channels) -> int:
+    """Take the predicted noise out of a block (S, 3), less where it is weak; returns the channels that are far off."""
+    share = min(step / STRENGTH_M, 1.0)
+    fade = min(max((locked_m - FADE_AFTER_M) / FADE_M, 0.0), 1.0)
+    outliers = 0
+    for j in range(x.shape[0]):
+        for axis in range(3):
+            predicted = 0.0
+            for k in range(channels.regressors.size):
+                predicted += channels.weights[j, axis, k] * channels.regressors[k]
+            residual = x[j, axis] - channels.offset[j, axis] - predicted
+            channels.residual[j, axis] = residual
+            outliers += abs(residual) > CLIP * channels.error[j, axis]
+            channels.strength[j, axis] += share * (predicted * predicted - channels.strength[j, axis])
+            ratio = channels.strength[j, axis] / (channels.error[j, axis] ** 2 + 1e-6)
+            x[j, axis] -= fade * predicted * ratio / (ratio + HALF_GAIN)
+    return outliers
+
+
+@step
+def _learn(step: float, locked_m: float, over_magnet: bool, channels: _Channels) -> None:
+    """Renew the residual's deviation, and the weights by least mean squares unless a magnet is passed."""
+    gain = 2 * step / min(LEARN_M, FIRST_LEARN_M + LEARN_SLOPE * locked_m)
+    share = min(step / STRENGTH_M, 1.0) * (MAGNET_RATE if over_magnet else 1.0)
+    clip = CLIP * (FIRST_CLIP if locked_m < FIRST_CLIP_M else 1.0)
+    for j in range(channels.error.shape[0]):
+        for axis in range(3):
+            limit = clip * channels.error[j, axis]
+            clipped = min(max(channels.residual[j, axis], -limit), limit)
+            channels.error[j, axis] += share * (MEAN_DEVIATION * abs(clipped) - channels.error[j, axis])
+            if not over_magnet:
+                boost = min(channels.strength[j, axis] / (channels.error[j, axis] ** 2 + 1e-6), MAX_BOOST)
+                for k in range(channels.regressors.size):
+                    channels.weights[j, axis, k] += gain * (1 + boost) * clipped * channels.regressors[k]

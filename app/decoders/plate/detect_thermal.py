@@ -1,0 +1,136 @@
+"""Heated plates in a thermal frame: warm quadrangles on a cooler road.
+
+There are no colours to find the triangle's corner by: each candidate is fitted in its four possible orientations, and
+the one that explains most of the pixels' variance is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.plate.fit import PlateFit, fit_plate
+from app.decoders.plate.layout import marker_centroids
+from app.markers.plate import PlateGeometry
+
+Frame = npt.NDArray[Any]
+Array = npt.NDArray[Any]
+
+MAX_QUADS = 8
+"""[candidates] of a frame. Source: chosen by hand, for speed."""
+MIN_EXTENT_PX = 8.0
+"""[px] least width and height of a warm region. Source: one pixel a unit on 8 x 8."""
+MIN_FILL, MAX_FILL = 0.45, 1.6
+"""[1] share of a quadrangle that the hull of its warm region fills at least, and at most. Source: chosen by hand."""
+MIN_CONTOUR, MIN_AREA_PX2 = 12, 40
+"""[points, px^2] least length and area of a warm region's outline. Source: chosen by hand."""
+MIN_CONTRAST = 6.0
+"""[grey levels] least warmth above the road. Source: chosen by hand."""
+SAME_PLACE, SAME_SIZE = 0.1, 0.2
+"""[extent, 1] distance and relative difference in size of quadrangles that are one. Source: chosen by hand."""
+SHARES = (0.3, 0.5)
+"""[strongest warmth] levels at which regions are cut out. Source: chosen by hand."""
+CLOSINGS = (1, 3, 7, 15, 27)
+"""[px] diameters of the closings that join warm units. Source: chosen by hand, about the pitch of units on plates of 16
+to 200 px."""
+ORIENTATION_EVIDENCE = 12.0
+"""[log likelihood] by which the best orientation must exceed the next. Source: chosen by hand; effect: `python -m
+benchmarks.plates.thresholds`."""
+MIN_MISFIT_RATIO = 1.3
+"""[1] unexplained variance of the next orientation over that of the best: errors of pixels are not independent. Source:
+four wrong frames of one drive in `python -m benchmarks.plates --sets thermal`, seed 75 (docs/benchmarks.md)."""
+
+
+def fit_warm_plates(image: Frame, geometry: PlateGeometry) -> Iterator[tuple[list[PlateFit], float]]:
+    """Fits of each warm quadrangle on the inverted frame, best orientation first, with the evidence for that one."""
+    inverted = cv2.bitwise_not(image)
+    for corners in detect_warm_quads(image):
+        centroids = _centroids(corners, geometry)
+        fits = []
+        for turn in range(4):
+            fit = fit_plate(inverted, np.roll(centroids, turn, axis=0), geometry, linear=True)
+            if fit is not None:
+                fits.append(fit)
+        if not fits:
+            continue
+        fits.sort(key=lambda fit: -fit.explained)
+        second = fits[1].explained if len(fits) > 1 else 0.0
+        ratio = (1 - second) / max(1 - fits[0].explained, 1e-6)
+        evidence = 0.5 * fits[0].pixels * float(np.log(ratio)) if ratio >= MIN_MISFIT_RATIO else 0.0
+        yield fits, evidence
+
+
+def _centroids(corners_px: Array, geometry: PlateGeometry) -> Array:
+    """Centroids of the markers as if all four were squares, shape (4, 2). [px]"""
+    near = float(marker_centroids(geometry)[3, 0])
+    square = np.array([(near, near), (1 - near, near), (1 - near, 1 - near), (near, 1 - near)], np.float32)
+    unit = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    homography = cv2.getPerspectiveTransform(unit, corners_px.astype(np.float32))
+    centroids: Array = cv2.perspectiveTransform(square[None], homography)[0].astype(float)
+    return centroids
+
+
+def detect_warm_quads(image: Frame) -> list[Array]:
+    """Corners of warm quadrangles, clockwise in the image, shape (4, 2) each. [px]"""
+    height, width = image.shape
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32)
+    reach = max(height, width) // 3 | 1
+    small = cv2.resize(smooth, (max(width // 8, 1), max(height // 8, 1)), interpolation=cv2.INTER_AREA)
+    level = cv2.medianBlur(np.clip(small, 0, 255).astype(np.uint8), min(reach // 8 | 1, 31))
+    warmth = smooth - cv2.resize(level, (width, height), interpolation=cv2.INTER_LINEAR)
+    strongest = float(warmth.max())
+    quads: list[tuple[float, Array]] = []
+    if strongest < MIN_CONTRAST:
+        return []
+    for share in SHARES:
+        mask = (warmth > max(share * strongest, MIN_CONTRAST / 2)).astype(np.uint8)
+        for size in CLOSINGS:
+            kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+            closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel) if size > 1 else mask
+            for contour in cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
+                quad = _quad_around(contour)
+                if quad is not None:
+                    quads.append(quad)
+    return _distinct(quads)
+
+
+def _quad_around(contour: npt.NDArray[Any]) -> tuple[float, Array] | None:
+    """Quadrangle around a region with its score, the larger and more solid the better; None where there is none."""
+    extent = np.ptp(contour[:, 0], axis=0)
+    if extent.min() < MIN_EXTENT_PX or len(contour) < MIN_CONTOUR:
+        return None
+    hull = cv2.convexHull(contour)
+    area = cv2.contourArea(hull)
+    if len(hull) < 4 or area < MIN_AREA_PX2:
+        return None
+    corners = cv2.approxPolyN(hull, 4, ensure_convex=True).reshape(-1, 2).astype(float)
+    if len(corners) != 4:
+        return None
+    fill = area / max(cv2.contourArea(corners.astype(np.float32)), 1.0)
+    if not MIN_FILL < fill < MAX_FILL:
+        return None
+    if _signed_area2(corners) < 0:
+        corners = corners[::-1]
+    solid = cv2.contourArea(contour) / area
+    return float(np.sqrt(area)) * solid, corners
+
+
+def _signed_area2(corners: Array) -> float:
+    """Twice the signed area of a polygon, positive when its corners are clockwise in the image. [px^2]"""
+    following = np.roll(corners, -1, axis=0)
+    return float(np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]))
+
+
+def _distinct(quads: list[tuple[float, Array]]) -> list[Array]:
+    """The best quadrangles, of those in about one place and size the best only."""
+    kept: list[Array] = []
+    for _, corners in sorted(quads, key=lambda item: -item[0]):
+        size = np.ptp(corners, axis=0).max()
+        if all(np.abs(corners.mean(axis=0) - k.mean(axis=0)).max() > SAME_PLACE * size or
+               abs(np.ptp(k, axis=0).max() / size - 1) > SAME_SIZE for k in kept):  # fmt: skip
+            kept.append(corners)
+    return kept[:MAX_QUADS]

@@ -1,0 +1,104 @@
+"""How red the triangle of a fitted plate is, and how green its squares are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.compiled import ieee_kernel
+from app.decoders.plate.colour import MarkerSignal
+
+Floats = npt.NDArray[np.float64]
+Grey = npt.NDArray[np.uint8]
+
+SPOT_PITCH = 0.03
+"""[plate sides] between the 3 x 3 points that are sampled on a marker. Source: chosen by hand; half a marker is 0.115
+on 8 x 8, 0.077 on 12 x 12."""
+_SPOTS = np.array([(x, y) for x in (-SPOT_PITCH, 0.0, SPOT_PITCH) for y in (-SPOT_PITCH, 0.0, SPOT_PITCH)])
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerColours:
+    """How red the triangle of a fitted plate is, and how green its squares are.
+
+    Attributes
+    ----------
+    margins : ndarray, shape (4,)
+        How far the signal of the triangle and the squares stands out of the units', in their spreads.
+    tints : ndarray, shape (4,)
+        Red of the triangle, green of the squares above their other colours, as shares of the median square's; grey
+        being the units' colour. A black square in the dark has none, whatever the ratio of its few grey levels.
+    cast : ndarray, shape (2,)
+        Blue and red of the units as shares of their green.
+    """
+
+    margins: Floats
+    tints: Floats
+    cast: Floats
+
+
+def marker_colours(signal: MarkerSignal, plate_from_image: Floats, centroids: Floats, units: Floats) -> MarkerColours:
+    """Colours of a fitted plate's markers.
+
+    Parameters
+    ----------
+    signal : MarkerSignal
+    plate_from_image : ndarray, shape (3, 3)
+        Full-resolution pixels to plate coordinates.
+    centroids : ndarray, shape (4, 2)
+        Of the markers, in plate coordinates.
+    units : ndarray, shape (U, 2)
+        Centres of the units, in plate coordinates.
+    """
+    points = np.concatenate([(centroids[:, None] + _SPOTS[None]).reshape(-1, 2), units])
+    planes = signal.planes
+    seen = np.empty((4, len(points)))
+    sampled = _Signal(signal.opponent, planes.blue, planes.green, planes.red, signal.scale)
+    _look_up(np.asarray(np.linalg.inv(plate_from_image), float), points, sampled, seen)
+    strength, blue, green, red = seen
+    spots = 4 * len(_SPOTS)
+    cast = np.array([plane[spots:].sum() for plane in (blue, green, red)])
+    cast = np.maximum(cast, 1.0) / max(cast[1], 1.0)
+    sign = np.array([1, -1, -1, -1])
+    inside = strength[:spots].reshape(4, -1).mean(axis=1)
+    between = strength[spots:]
+    # as grey units would look in the same light
+    blue, green, red = (
+        plane[:spots].reshape(4, -1).mean(axis=1) / c for plane, c in zip((blue, green, red), cast, strict=True)
+    )
+    tints = np.where(sign > 0, red - np.maximum(green, blue), green - np.maximum(red, blue))
+    return MarkerColours(sign * (inside - between.mean()) / (between.std() + 1.0),
+                         tints / max(float(np.median(tints[1:])), 1.0), cast[[0, 2]])  # fmt: skip
+
+
+class _Signal(NamedTuple):
+    """What is sampled: attributes of `MarkerSignal` and its planes, shape (H // scale, W // scale)."""
+
+    opponent: npt.NDArray[np.int16]
+    blue: Grey
+    green: Grey
+    red: Grey
+    scale: int
+
+
+@ieee_kernel
+def _look_up(image_from_plate: Floats, points: Floats, signal: _Signal, seen: Floats) -> None:
+    """Set the signal, blue, green and red at points of the plate, shape (4, points): those of the nearest pixels."""
+    height, width = signal.opponent.shape
+    scale = signal.scale
+    m = image_from_plate
+    for k in range(points.shape[0]):
+        u = points[k, 0]
+        v = points[k, 1]
+        w = m[2, 0] * u + m[2, 1] * v + m[2, 2]
+        x = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) / w - (scale - 1) / 2) / scale
+        y = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) / w - (scale - 1) / 2) / scale
+        column = int(np.rint(min(max(x, 0.0), width - 1.0)))
+        row = int(np.rint(min(max(y, 0.0), height - 1.0)))
+        seen[0, k] = signal.opponent[row, column]
+        seen[1, k] = signal.blue[row, column]
+        seen[2, k] = signal.green[row, column]
+        seen[3, k] = signal.red[row, column]

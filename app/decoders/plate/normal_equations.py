@@ -1,0 +1,230 @@
+"""The normal equations of the shapes' values and of the pose, summed over a plate's pixels."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from app.decoders.compiled import routine, step
+from app.decoders.plate.profiles import AxisProfiles, Floats, Ints
+from app.decoders.plate.quadrature import Quadrature
+from app.decoders.plate.synthesis import (
+    FIRST_GAP,
+    FIRST_ROAD,
+    POSE,
+    PixelPlace,
+    PixelRow,
+    PlateModel,
+    PlatePatch,
+    blur_on_plate,
+    field_light,
+    lens_blur,
+    place_pixel,
+    set_pose_derivatives,
+    synthesize,
+)
+
+ROAD_WEIGHT = 0.3
+"""[1] weight of a pixel of the road against one of the plate: four values cannot explain a road. Source: chosen by
+hand."""
+ROAD_SPREAD = 0.1
+"""[light] scale of the Cauchy weight 1 / (1 + r^2) of road pixels: what is further off, as a lane line, counts less.
+Source: chosen by hand; commit `a lane line beside a plate does not spoil its fit`."""
+
+
+class PatchArea(NamedTuple):
+    """The pixels of a patch that are used; changes in place.
+
+    Attributes
+    ----------
+    box : ndarray of int, shape (4,)
+        First column and row, and those after the last.
+    margin : ndarray, shape (2,)
+        How far around the plate pixels are used, along u and v. [plate sides]
+    extents : ndarray, shape (2,)
+        Width and height of the plate's image. [px]
+    """
+
+    box: Ints
+    margin: Floats
+    extents: Floats
+
+
+class NormalEquations(NamedTuple):
+    """Sums over the pixels of weight times products of derivatives; only lower triangles are used.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (shapes + 10, shapes + 10)
+        Shapes first, then the pose.
+    cross : ndarray, shape (shapes, 10)
+        The block of shapes and pose, with rows that lie together in memory.
+    pose : ndarray, shape (10, 10)
+        The block of the pose.
+    rhs : ndarray, shape (shapes + 10,)
+        Right side: weight times derivative times light.
+    misfit : ndarray, shape (n, n, 2)
+        Weight of the pixels on each unit with its half of the gaps around it, and their squared residuals.
+    """
+
+    matrix: Floats
+    cross: Floats
+    pose: Floats
+    rhs: Floats
+    misfit: Floats
+
+
+class PixelSums(NamedTuple):
+    """Sums over pixels: their number and squared light, then of those on the plate.
+
+    Attributes
+    ----------
+    pixels, inside : float
+        Number of pixels, and of those on the plate.
+    weight, light, light2 : float
+        Weight of all pixels, weighted light and squared light.
+    inside_weight, inside_light, inside_light2, inside_residual2 : float
+        The same of the pixels on the plate, and their weighted squared residuals.
+    """
+
+    pixels: float
+    weight: float
+    light: float
+    light2: float
+    inside: float
+    inside_weight: float
+    inside_light: float
+    inside_light2: float
+    inside_residual2: float
+
+
+@step
+def _is_used(pixel: PixelPlace, margin: Floats) -> bool:
+    """Whether a pixel lies in front of the camera, on the plate or within the margin around it."""
+    return (
+        pixel.inverse_depth > 0.0
+        and -margin[0] <= pixel.u <= 1.0 + margin[0]
+        and -margin[1] <= pixel.v <= 1.0 + margin[1]
+    )
+
+
+@step
+def _add_misfit(pixel: PixelPlace, model: PlateModel, weight: float, residual2: float, misfit: Floats) -> None:
+    """Add a pixel's squared residual to the unit on which it lies."""
+    n = model.edges.shape[0]
+    pitch = model.edges[1, 0] - model.edges[0, 0]
+    border = 0.5 * (model.edges[0, 0] + model.edges[0, 1] - pitch)  # where the first unit's half of the gap begins
+    row = min(max(int((pixel.v - border) / pitch), 0), n - 1)
+    column = min(max(int((pixel.u - border) / pitch), 0), n - 1)
+    misfit[row, column, 0] += weight
+    misfit[row, column, 1] += residual2
+
+
+@step
+def _add_row(row: PixelRow, entries: int, light: float, weight: float, equations: NormalEquations) -> None:
+    """Add a pixel's row to the normal equations and clear its shares."""
+    shapes = equations.cross.shape[0]
+    for e in range(entries):
+        j = row.shape[e]
+        b = weight * row.share[j]
+        equations.rhs[j] += b * light
+        for f in range(e + 1):
+            i = row.shape[f]
+            equations.matrix[max(i, j), min(i, j)] += b * row.share[i]
+        for p in range(POSE):
+            equations.cross[j, p] += b * row.by_pose[p]
+    for p in range(POSE):
+        b = weight * row.by_pose[p]
+        equations.rhs[shapes + p] += b * light
+        for q in range(POSE):
+            equations.pose[p, q] += b * row.by_pose[q]
+    for e in range(entries):
+        row.share[row.shape[e]] = 0.0
+
+
+@step
+def _clear(equations: NormalEquations) -> None:
+    equations.matrix[:] = 0.0
+    equations.cross[:] = 0.0
+    equations.pose[:] = 0.0
+    equations.rhs[:] = 0.0
+    equations.misfit[:] = 0.0
+
+
+@step
+def _join_blocks(equations: NormalEquations) -> None:
+    """Copy the blocks of the pose into the matrix."""
+    shapes = equations.cross.shape[0]
+    for p in range(POSE):
+        for j in range(shapes):
+            equations.matrix[shapes + p, j] = equations.cross[j, p]
+        for q in range(POSE):
+            equations.matrix[shapes + p, shapes + q] = equations.pose[p, q]
+
+
+@routine
+def set_normal_equations(
+    patch: PlatePatch, area: PatchArea, model: PlateModel, quadrature: Quadrature, equations: NormalEquations
+) -> PixelSums:
+    """Set the normal equations of the shapes' values and the pose from every pixel in an area.
+
+    The light of a pixel is a sum over shapes, values times shares, linear in the values; its derivatives by the pose
+    are taken at the model's present values. Each pixel adds w d d^T to the matrix and w d light to the right side,
+    where d are its shares and its derivatives by the pose.
+    """
+    n = model.edges.shape[0]
+    shapes = model.values.shape[0]
+    along_u = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
+    along_v = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
+    row = PixelRow(np.empty(shapes, np.int64), np.zeros(shapes), np.empty(POSE), np.empty(5))
+    lens = lens_blur(model.pose, patch.grid)
+    sums = PixelSums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    _clear(equations)
+    for y in range(area.box[1], area.box[3]):
+        for x in range(area.box[0], area.box[2]):
+            pixel = place_pixel(model.pose, model.frame, patch.grid, x, y)
+            if not _is_used(pixel, area.margin):
+                continue
+            variance_u, variance_v = blur_on_plate(pixel, lens, quadrature.nodes.shape[0] > 1)
+            u = min(max(pixel.u, 0.0), 1.0)
+            v = min(max(pixel.v, 0.0), 1.0)
+            gap_light = field_light(model, FIRST_GAP, u, v)
+            road_light = field_light(model, FIRST_ROAD, u, v)
+            entries, slopes = synthesize(
+                pixel, variance_u, variance_v, model, quadrature, gap_light, road_light, row, along_u, along_v
+            )
+            set_pose_derivatives(pixel, variance_u, variance_v, lens, slopes, quadrature, row.by_pose)
+            light = np.float64(patch.light[y, x])
+            weight = np.float64(patch.weights[y, x])
+            if 0.0 <= pixel.u <= 1.0 and 0.0 <= pixel.v <= 1.0:
+                residual = light
+                for e in range(entries):
+                    residual -= model.values[row.shape[e]] * row.share[row.shape[e]]
+                residual2 = weight * residual * residual
+                _add_misfit(pixel, model, weight, residual2, equations.misfit)
+                sums = _add_inside(sums, light, weight, residual2)
+            else:
+                off = (light - road_light) / ROAD_SPREAD
+                weight *= ROAD_WEIGHT / (1.0 + off * off)
+            sums = _add_pixel(sums, light, weight)
+            _add_row(row, entries, light, weight, equations)
+    _join_blocks(equations)
+    return sums
+
+
+@step
+def _add_pixel(sums: PixelSums, light: float, weight: float) -> PixelSums:
+    return PixelSums(
+        sums.pixels + 1.0, sums.weight + weight, sums.light + weight * light, sums.light2 + weight * light * light,
+        sums.inside, sums.inside_weight, sums.inside_light, sums.inside_light2, sums.inside_residual2,
+    )  # fmt: skip
+
+
+@step
+def _add_inside(sums: PixelSums, light: float, weight: float, residual2: float) -> PixelSums:
+    return PixelSums(
+        sums.pixels, sums.weight, sums.light, sums.light2,
+        sums.inside + 1.0, sums.inside_weight + weight, sums.inside_light + weight * light,
+        sums.inside_light2 + weight * light * light, sums.inside_residual2 + residual2,
+    )  # fmt: skip

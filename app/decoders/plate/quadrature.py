@@ -1,0 +1,107 @@
+"""Quadrature for a blur that lies on neither axis of the plate.
+
+A round blur in the image is an ellipse on the plate, long along the line of sight; so is the motion's. An upright plate
+has that line along its columns, where the profiles of the shapes are exact, and needs no quadrature.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from app.decoders.compiled import routine, step
+from app.decoders.plate.profiles import Floats
+
+UPRIGHT_SINE = 0.35
+"""[1] sine of the angle between the blur's long axis and the plate's columns up to which the blur counts as lying along
+them. Source: 20 degrees, chosen by hand."""
+ROUND_BLUR = 1.69
+"""[1] ratio of the blur's variances up to which it counts as round. Source: 1.3 squared, chosen by hand."""
+NODES_PER_RATIO = 1.2
+"""[1] quadrature nodes on each side of the middle per ratio of the blur's axes. Source: chosen by hand."""
+NODE_REACH = 2.2
+"""[standard deviations] of the outermost node. Source: chosen by hand."""
+MIN_MOTION2 = 0.0004
+"""[plate sides^2] square of the motion that the quadrature allows for at least, so that its derivative is not zero.
+Source: chosen by hand."""
+
+
+class Quadrature(NamedTuple):
+    """Nodes along the part of the blur that lies on neither axis of the plate; one node where there is none.
+
+    Attributes
+    ----------
+    nodes, weights : ndarray, shape (K,)
+        Places along `direction` [plate sides], and weights that sum to 1.
+    direction : ndarray, shape (2,)
+        Unit vector on the plate.
+    by_spread : ndarray, shape (2,)
+        Relative change of the nodes with the logarithm of the lens blur and with the motion's square.
+    """
+
+    nodes: Floats
+    weights: Floats
+    direction: Floats
+    by_spread: Floats
+
+
+class _Ellipse(NamedTuple):
+    """Blur on the plate: variances along the long and the short axis [plate sides^2], angle of the long axis [rad]."""
+
+    long2: float
+    short2: float
+    angle: float
+
+
+@step
+def _blur_ellipse(pose: Floats, wide: float, tall: float) -> _Ellipse:
+    """Blur at the frame's origin from its standard deviations in the image, in normalised coordinates.
+
+    The covariance is J diag(wide^2, tall^2) J^T with the homography's derivative J; its eigenvalues are the variances.
+    """
+    ux = (pose[0] - pose[2] * pose[6]) * wide
+    uy = (pose[1] - pose[2] * pose[7]) * tall
+    vx = (pose[3] - pose[5] * pose[6]) * wide
+    vy = (pose[4] - pose[5] * pose[7]) * tall
+    a = ux * ux + uy * uy
+    b = ux * vx + uy * vy
+    d = vx * vx + vy * vy
+    root = math.sqrt(0.25 * (a - d) * (a - d) + b * b)
+    return _Ellipse(0.5 * (a + d) + root, max(0.5 * (a + d) - root, 1e-18), 0.5 * math.atan2(2.0 * b, a - d))
+
+
+@routine
+def blur_quadrature(pose: Floats, frame: Floats, grid: Floats, max_nodes: int) -> Quadrature:
+    """Quadrature of the blur for a pose, with at most `max_nodes` nodes on each side of the middle.
+
+    The nodes are evenly spaced samples of a Gaussian whose variance is what the ellipse's long axis has beyond the
+    short one, with the motion's. Their spacing is scaled to give exactly this variance.
+    """
+    lens2 = math.exp(2.0 * pose[8])
+    wide = math.sqrt(lens2 + (grid[2] * grid[2] - 1.0) / 12.0) / frame[2]
+    tall = math.sqrt(lens2 + (grid[3] * grid[3] - 1.0) / 12.0) / frame[2]
+    blur = _blur_ellipse(pose, wide, tall)
+    direction = np.array([math.cos(blur.angle), math.sin(blur.angle)])
+    if blur.long2 < ROUND_BLUR * blur.short2 or abs(direction[0]) < UPRIGHT_SINE:
+        return Quadrature(np.zeros(1), np.ones(1), direction, np.zeros(2))
+    motion2 = max(pose[9], MIN_MOTION2)
+    spread2 = blur.long2 - blur.short2 + motion2 / 12.0
+    half = min(max(math.ceil(NODES_PER_RATIO * math.sqrt(spread2 / blur.short2)), 1), max_nodes)
+    nodes = np.empty(2 * half + 1)
+    weights = np.empty(2 * half + 1)
+    total = 0.0
+    second = 0.0
+    for k in range(2 * half + 1):
+        nodes[k] = NODE_REACH * (k - half) / half
+        weights[k] = math.exp(-0.5 * nodes[k] * nodes[k])
+        total += weights[k]
+        second += weights[k] * nodes[k] * nodes[k]
+    scale = math.sqrt(spread2 * total / second)
+    for k in range(2 * half + 1):
+        nodes[k] *= scale
+        weights[k] /= total
+    lens_share = 2.0 * lens2 / (frame[2] * frame[2] * (wide * wide + tall * tall))
+    by_spread = np.array([lens_share * (1.0 - motion2 / (12.0 * spread2)), 1.0 / (24.0 * spread2)])
+    return Quadrature(nodes, weights, direction, by_spread)

@@ -1,0 +1,319 @@
+"""Unit values to evidence: which units are dark, the cost of each symbol of a cell, and which units look damaged.
+
+The logarithm of a unit's light is a smooth illumination, minus one contrast where the unit is dark, plus noise whose
+covariance the fit gives: neighbours that share pixels share their error. Illumination is a Gaussian process, so the
+cost of any pattern of units is a quadratic form, and margins come from exact differences of it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.plate.fit import PlateFit
+from app.decoders.plate.layout import unit_shapes
+from app.decoders.plate.linear import invert
+from app.decoders.plate.unit_patterns import cell_costs, minimize_pattern
+from app.markers.plate import PlateCode, unit_index
+
+Array = npt.NDArray[Any]
+
+CONTRAST = 2.0
+"""[log light] expected difference of light and dark units once haze is taken off. Source: chosen by hand, near ln(1 /
+DARK_SHARE) = 2.1."""
+CONTRAST_SPREAD = 0.4
+"""[log light] standard deviation of that difference. Source: chosen by hand."""
+LIGHT_SPREAD = 0.45
+"""[log light] standard deviation of the illumination over a few units. Source: chosen by hand."""
+LIGHT_LENGTH = 4.0
+"""[units of 8] distance over which the illumination's correlation falls to 1/e. Source: chosen by hand."""
+MEAN_VARIANCE = 4.0
+"""[1] variance of the illumination's mean, which leaves it open. Source: chosen by hand."""
+WEAR = 0.16
+"""[log light] standard deviation of what units differ by themselves. Source: chosen by hand."""
+LEVELLED_LIGHT_SPREAD, LEVELLED_WEAR = 0.1, 0.1
+"""[light level] the same two on light whose illumination has been divided out. Source: chosen by hand."""
+LEVELLED_CONTRAST_SPREAD = 0.3
+"""[contrast] standard deviation of the levelled contrast. Source: chosen by hand."""
+LOG_FLOOR = 0.05
+"""[light level] added before the logarithm, so that noise around black stays small. Source: chosen by hand."""
+DARK_SHARE = 0.12
+"""[light level] light of dark units without haze: what they have beyond it is taken for haze. Source: chosen by hand;
+the simulated plates (`simulation.plate_face.draw_look`) have 0.02 to 0.2."""
+MIN_LEVEL_NOISE_RATIO = 4.0
+"""[standard deviations] by which the lightest units must stand above the darkest. Source: chosen by hand."""
+MIN_LIGHT = 1e-4
+"""[1 = saturation] below which there is no light to decode. Source: four grey levels of 255 at a gamma of 2.2, chosen
+by hand."""
+SCATTER_PRIOR = (8.0, 0.6)
+"""[units, 1] weight and value of the scatter that is expected against the model. Source: chosen by hand."""
+USUAL_BLUR_PX = 1.0
+"""[px] lens blur of a sharp camera. Source: chosen by hand; `simulation.conditions.draw_daylight` has 0.4 to 0.9."""
+FULL_WEIGHT_PX = 1.4
+"""[px] size of a unit in the image, in its usual blur, from which on its likelihood has full weight. Source: chosen by
+hand; effect: `python -m benchmarks.plates.thresholds`."""
+MAX_BLUR_UNITS = 0.6
+"""[units] standard deviation of lens and motion blur together up to which likelihoods have full weight. Source: `python
+-m benchmarks.plates.thresholds`."""
+CELL_LIGHT_RANGE = (0.65, 1.5)
+"""[1] light on a cell of one level over that around it, beyond which it may be a stain. Source: chosen by hand; effect:
+`python -m benchmarks.plates.thresholds`."""
+MAX_LEVEL_RESIDUAL = 0.23
+"""[contrast] distance of a unit from its level from which on it is an outlier, worn or stained. Source: chosen by hand;
+effect: `python -m benchmarks.plates.thresholds`."""
+MAX_LARGE_RESIDUAL, LARGE_UNIT_PX = 0.16, 3.0
+"""[contrast, px] the same on units of at least this size, whose own noise is smaller. Source: chosen by hand; effect:
+`python -m benchmarks.plates.thresholds`."""
+MAX_RESIDUAL_SPREAD = 0.12
+"""[contrast x units] distance from the level times standard deviation of the blur, the same. Source: chosen by hand;
+effect: `python -m benchmarks.plates.thresholds`."""
+STAIN_UNIT_PX = 2.0
+"""[px] size of a unit from which on damage counts fully: smaller ones show less. Source: chosen by hand; effect:
+`python -m benchmarks.plates.thresholds`."""
+STAIN_DARK, STAIN_LIGHT = 0.07, 0.105
+"""[contrast] residual of a dark or light unit's pixels from which on it may be a stain. Source: chosen by hand."""
+MIN_OF_A_LEVEL = 6
+"""[units] light or dark ones from which on their median is the usual residual. Source: chosen by hand."""
+TAIL_SHARE = 1 / 8
+"""[1] share of the units whose mean is the lightest and the darkest level. Source: chosen by hand."""
+MIN_LEVEL_DIFFERENCE, ONE_LEVEL_DIFFERENCE = 0.1, 0.8
+"""[light level] least difference of the levels, and that which is assumed while one is missing. Source: chosen by
+hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnitEvidence:
+    """Evidence of a fit about the symbols.
+
+    Attributes
+    ----------
+    cell_costs : ndarray, shape (cells, 16)
+        Cost of each symbol above the best pattern of all units, the other cells as in that pattern.
+    best : ndarray of int, shape (cells,)
+        Most likely symbols, any of sixteen.
+    dark : ndarray of bool, shape (units,)
+        The best pattern, in the order of the symbols' units.
+    weight, residual : ndarray
+        Quadratic form of the costs and its vector at the best pattern, for other patterns.
+    contrast : float
+        Between light and dark units, the light level being about 1.
+    disputed : ndarray of bool, shape (cells,)
+        Where the two classifiers differ.
+    level_residual : ndarray, shape (cells,)
+        Distance of each cell's worst unit from its level towards the other level, as a share of the contrast; scaled
+        up on plates whose units are large, or so blurred that they run into each other.
+    damage : float
+        Largest level residual times the outlier ratio of some unit's pixels: their residual over what is usual. A stain
+        that turns a light unit dark ends beside it, on gaps and neighbours, and the plate has others that end half way.
+    scatter : float
+        Mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model.
+    span : float
+        Light of the light units above the dark ones. [linear, 1 = saturation]
+    """
+
+    cell_costs: Array
+    best: npt.NDArray[np.intp]
+    dark: npt.NDArray[np.bool_]
+    disputed: npt.NDArray[np.bool_]
+    level_residual: Array
+    damage: float
+    weight: Array
+    residual: Array
+    contrast: float
+    scatter: float
+    span: float
+
+    @property
+    def cell_margin(self) -> Array:
+        """Cost of the second best symbol of each cell, shape (cells,)."""
+        margin: Array = np.partition(self.cell_costs, 1, axis=1)[:, 1]
+        return margin
+
+
+@lru_cache
+def _smooth(n: int, spread: float) -> Array:
+    """Covariance of a smooth field between units, in symbol order; its mean is left open."""
+    flat = unit_index(n).reshape(-1)
+    position = np.stack([flat // n, flat % n], axis=1).astype(float)
+    distance = np.linalg.norm(position[:, None] - position[None], axis=2)
+    covariance: Array = spread**2 * np.exp(-distance / (LIGHT_LENGTH * n / 8)) + MEAN_VARIANCE
+    return covariance
+
+
+@lru_cache
+def _shape_order(n: int) -> npt.NDArray[np.intp]:
+    """Numbers of the fitted shapes of each symbol's units, in symbol order."""
+    shapes: npt.NDArray[np.intp] = unit_shapes(n).reshape(-1)[unit_index(n).reshape(-1)]
+    return shapes
+
+
+_PATTERNS = np.array(list(itertools.product((0, 1), repeat=4)), dtype=float)  # row k holds the bits of k
+
+
+class _Levels(NamedTuple):
+    """The units' light in symbol order, their covariance, the light of the darkest and the lightest, and the haze."""
+
+    values: Array
+    covariance: Array
+    dark: float
+    light: float
+
+    @property
+    def haze(self) -> float:
+        """Light that dark units have beyond what their material sends back."""
+        return max(0.0, (self.dark - DARK_SHARE * self.light) / (1 - DARK_SHARE))
+
+
+def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
+    """Costs of all symbols; None when the units do not differ by more than their noise, or show one level only.
+
+    Two classifiers in turn: the first on logarithms, where any illumination is a sum, gives the light that falls on
+    each unit; the second on the light divided by that, where the noise is even.
+    """
+    n = fit.units.shape[0]
+    levels = _measure_levels(fit)
+    if levels is None:
+        return None
+    values = levels.values - levels.haze
+    light, first = _estimate_illumination(values, levels.covariance, levels.light - levels.haze, n)
+    levelled = values / light
+    total = _smooth(n, LEVELLED_LIGHT_SPREAD) + levels.covariance / np.outer(light, light)
+    total[np.diag_indices_from(total)] += LEVELLED_WEAR**2
+    weight = invert(total)
+    dark = first.copy()
+    difference = _level_difference(levelled, dark)
+    residual, contrast = minimize_pattern(
+        weight, levelled - levelled.mean(), dark, difference, LEVELLED_CONTRAST_SPREAD * difference
+    )
+    if dark.all() or not dark.any():
+        return None  # one level only may be anything; all zeros would satisfy any check
+    # how well this plate follows the model scales what a difference means
+    scatter = float(residual @ weight @ residual)
+    weight /= (scatter + SCATTER_PRIOR[0] * SCATTER_PRIOR[1]) / (len(residual) + SCATTER_PRIOR[0])
+    weight *= _resolution_weight(fit)
+    costs = cell_costs(weight, residual, dark, contrast, _PATTERNS)
+    level_residual = _level_residuals(levelled, dark, contrast).reshape(-1, 4).max(axis=1)
+    if fit.unit_px >= LARGE_UNIT_PX:
+        level_residual *= MAX_LEVEL_RESIDUAL / MAX_LARGE_RESIDUAL
+    misfit = np.sqrt(fit.unit_misfit.reshape(-1)[unit_index(n).reshape(-1)])
+    damage = float(level_residual.max()) * _worst_misfit(misfit, levels.values, dark)
+    level_residual *= max(1.0, _blur_units(fit) * MAX_LEVEL_RESIDUAL / MAX_RESIDUAL_SPREAD)
+    return UnitEvidence(
+        cell_costs=costs - costs.min(axis=1, keepdims=True),
+        best=np.argmin(costs, axis=1),
+        dark=dark > 0.5,
+        disputed=(first != dark).reshape(-1, 4).any(axis=1),
+        level_residual=np.where(_odd_light_cells(light, dark, n), 1.0, level_residual),
+        damage=damage * min(1.0, fit.unit_px / STAIN_UNIT_PX),
+        weight=weight,
+        residual=residual,
+        contrast=contrast,
+        scatter=scatter / len(residual),
+        span=levels.light - levels.dark,
+    )
+
+
+def _measure_levels(fit: PlateFit) -> _Levels | None:
+    """Light of the units and of the darkest and lightest of them; None when these differ by little more than noise."""
+    n = fit.units.shape[0]
+    order = _shape_order(n)
+    values = fit.units.reshape(-1)[unit_index(n).reshape(-1)]
+    covariance = fit.units_covariance[np.ix_(order, order)]
+    ranked = np.sort(values)
+    tail = max(int(len(values) * TAIL_SHARE), 1)
+    dark, light = float(ranked[:tail].mean()), float(ranked[-tail:].mean())
+    noise = math.sqrt(float(np.median(np.diag(covariance))))
+    if light - dark < MIN_LEVEL_NOISE_RATIO * noise or light < MIN_LIGHT:
+        return None
+    return _Levels(values, covariance, dark, light)
+
+
+def _blur_units(fit: PlateFit) -> float:
+    """Standard deviation of lens and motion blur together. [units]"""
+    return math.hypot(fit.blur_px / fit.unit_px, fit.motion * len(fit.units) / math.sqrt(12))
+
+
+def _resolution_weight(fit: PlateFit) -> float:
+    """Factor on the likelihoods of units that are small or blurred, where the blur's form, which is not known, matters.
+
+    Units of few pixels, a lens out of focus, motion over more than a unit, units seen through each other.
+    """
+    sharp_px = fit.unit_px / max(fit.blur_px, USUAL_BLUR_PX) * USUAL_BLUR_PX
+    weight = min(1.0, (sharp_px / FULL_WEIGHT_PX) ** 4) * min(1.0, (2 * USUAL_BLUR_PX / fit.blur_px) ** 2)
+    weight *= min(1.0, 1 / max(fit.motion * len(fit.units), 1e-9)) ** 2
+    return weight * min(1.0, MAX_BLUR_UNITS / _blur_units(fit)) ** 2
+
+
+def _worst_misfit(misfit: Array, values: Array, dark: Array) -> float:
+    """Largest residual of a unit's pixels over the median residual of its level.
+
+    Residuals that are small against the contrast do not count; on light units less, as stains make dark ones.
+    """
+    light = dark < 0.5
+    if min(light.sum(), len(dark) - light.sum()) < MIN_OF_A_LEVEL:
+        return float(misfit.max() / max(float(np.median(misfit)), 1e-9))
+    usual = np.where(light, np.median(misfit[light]), np.median(misfit[~light]))
+    contrast = float(np.median(values[light]) - np.median(values[~light]))
+    counts = misfit > np.where(light, STAIN_LIGHT, STAIN_DARK) * contrast
+    return float((misfit / np.maximum(usual, 1e-9))[counts].max(initial=0.0))
+
+
+def _odd_light_cells(light: Array, dark: Array, n: int) -> npt.NDArray[np.bool_]:
+    """Cells of one level whose light differs from that around: a stain over a whole cell looks like a shadow."""
+    flat = unit_index(n)
+    position = np.stack([flat.reshape(-1) // n, flat.reshape(-1) % n], axis=1)
+    patches = np.zeros(len(flat), dtype=bool)
+    for cell in range(len(flat)):
+        own = slice(4 * cell, 4 * cell + 4)
+        if 0 < dark[own].sum() < 4:
+            continue
+        away = np.abs(position - position[own].mean(axis=0)).max(axis=1)
+        around = (away > 1) & (away < 4)
+        ratio = float(np.median(light[own]) / np.median(light[around]))
+        patches[cell] = not CELL_LIGHT_RANGE[0] < ratio < CELL_LIGHT_RANGE[1]
+    return patches
+
+
+def _level_residuals(levelled: Array, dark: Array, contrast: float) -> Array:
+    """Distance of units from the median of their level towards the other one, as a share of the contrast."""
+    distance = np.zeros(len(levelled))
+    for level, towards in ((dark < 0.5, -1.0), (dark > 0.5, 1.0)):
+        if level.any():
+            distance[level] = towards * (levelled[level] - np.median(levelled[level])) / contrast
+    return distance
+
+
+def _estimate_illumination(values: Array, covariance: Array, light_level: float, n: int) -> tuple[Array, Array]:
+    """Light on each unit relative to the brightest level, and which units are dark, from the values' logarithms."""
+    floor = LOG_FLOOR * light_level
+    lifted = np.maximum(values, -0.6 * floor) + floor
+    logs = np.log(lifted)
+    slope = 1 / np.maximum(lifted, 2 * floor)
+    smooth = _smooth(n, LIGHT_SPREAD)
+    total = smooth + covariance * np.outer(slope, slope)
+    total[np.diag_indices_from(total)] += WEAR**2
+    weight = invert(total)
+    dark = (lifted < 0.6 * 0.5 * (light_level + 2 * floor)).astype(float)
+    residual, _ = minimize_pattern(weight, logs - logs.mean(), dark, CONTRAST, CONTRAST_SPREAD)
+    illumination: Array = np.exp(smooth @ (weight @ residual) + logs.mean())
+    return illumination, dark
+
+
+def _level_difference(values: Array, dark: Array) -> float:
+    """Difference of the levels of light and dark units; an assumed one while one of them is missing."""
+    if 0 < dark.sum() < len(dark):
+        return max(float(values[dark < 0.5].mean() - values[dark > 0.5].mean()), MIN_LEVEL_DIFFERENCE)
+    return ONE_LEVEL_DIFFERENCE
+
+
+def pattern_cost(evidence: UnitEvidence, code: PlateCode) -> float:
+    """Cost of a code above the best pattern of all units."""
+    dark = code.units.reshape(-1)[unit_index(code.n).reshape(-1)].astype(float)
+    delta = evidence.contrast * (dark - evidence.dark)
+    return float(delta @ evidence.weight @ (2 * evidence.residual + delta))

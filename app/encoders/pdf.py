@@ -1,0 +1,252 @@
+"""PDF 1.4 at true size: the file, its pages and properties, embedded fonts, and drawing in millimetres.
+
+Artwork needs spot inks, overprint, outlined text and a hundred plates a second; a drilling sheet needs text that can
+be searched. Both need a dozen kinds of PDF object (ISO 32000-1), which are written here once. Numbers in brackets are
+its clauses. The same calls always give the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+
+from fontTools.ttLib import TTFont
+
+from app.encoders.typeface import load_typeface
+
+POINTS_PER_MM = 72.0 / 25.4
+"""A point is 1/72 inch, an inch is 25.4 mm. [point/mm]"""
+Box = tuple[float, float, float, float]
+"""Left, bottom, right, top. [mm]"""
+_CATALOG, _PAGES, _INFO = 1, 2, 3
+_COMPRESSION = 6
+_CIRCLE = 0.5522847498
+"""Distance of the control points of a quarter circle of radius 1 from its ends: 4 / 3 (sqrt(2) - 1)."""
+
+
+class PdfFile:
+    """Objects by number, and the pages among them."""
+
+    def __init__(self, title: str, *, compress: bool = True) -> None:
+        self.compress = compress
+        properties = f"<< /Title {text_string(title)} /Creator (Waymark) /Producer (Waymark) /Trapped /False >>"
+        self._objects: list[bytes] = [b"", b"", properties.encode()]
+        self._pages: list[int] = []
+
+    @property
+    def next_number(self) -> int:
+        """Number of the object that is added next."""
+        return len(self._objects) + 1
+
+    def add(self, body: bytes) -> int:
+        """Add an object; returns its number."""
+        self._objects.append(body)
+        return len(self._objects)
+
+    def add_stream(self, content: bytes, entries: str = "") -> int:
+        """Add a stream (7.3.8), with further entries of its dictionary; returns its number."""
+        packing = "/Filter /FlateDecode " if self.compress else ""
+        if self.compress:
+            content = zlib.compress(content, _COMPRESSION)
+        head = f"<< {entries}{packing}/Length {len(content)} >>\nstream\n".encode()
+        return self.add(head + content + b"\nendstream")
+
+    def add_page(self, boxes: Mapping[str, Box], resources: int, content: bytes) -> None:
+        """Add a page (7.7.3.3) with its boxes (14.11.2), the number of its resources and its operators."""
+        rows = " ".join(f"/{name} [{' '.join(f'{v * POINTS_PER_MM:.4f}' for v in box)}]" for name, box in boxes.items())
+        page = f"<< /Type /Page /Parent {_PAGES} 0 R {rows} /Resources {resources} 0 R"
+        self._pages.append(self.add(f"{page} /Contents {self.next_number + 1} 0 R >>".encode()))
+        self.add_stream(content)
+
+    def to_bytes(self) -> bytes:
+        """The file: header, objects, cross-reference table and trailer (7.5)."""
+        kids = " ".join(f"{number} 0 R" for number in self._pages)
+        self._objects[_CATALOG - 1] = f"<< /Type /Catalog /Pages {_PAGES} 0 R >>".encode()
+        self._objects[_PAGES - 1] = f"<< /Type /Pages /Count {len(self._pages)} /Kids [{kids}] >>".encode()
+        chunks = [b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n"]
+        position, offsets = len(chunks[0]), []
+        for number, body in enumerate(self._objects, start=1):
+            chunk = b"%d 0 obj\n%b\nendobj\n" % (number, body)
+            offsets.append(position)
+            position += len(chunk)
+            chunks.append(chunk)
+        chunks.append(b"xref\n0 %d\n0000000000 65535 f \n" % self.next_number)
+        chunks += [b"%010d 00000 n \n" % offset for offset in offsets]
+        trailer = b"trailer\n<< /Size %d /Root %d 0 R /Info %d 0 R >>\nstartxref\n%d\n%%%%EOF\n"
+        chunks.append(trailer % (self.next_number, _CATALOG, _INFO, position))
+        return b"".join(chunks)
+
+
+def text_string(text: str) -> str:
+    """A text string of the document's properties, in UTF-16 with its mark (7.9.2.2)."""
+    return f"<feff{text.encode('utf-16-be').hex()}>"
+
+
+# --- text ---------------------------------------------------------------------------------------------------------
+
+
+class EmbeddedFont:
+    """One weight of the typeface, embedded with the glyphs that a file uses; its text can be searched and copied."""
+
+    def __init__(self, *, bold: bool = False) -> None:
+        self._face = load_typeface(bold=bold)
+        self._name = "WMVERA+BitstreamVeraSans-" + ("Bold" if bold else "Roman")
+        self._used: dict[int, tuple[str, str]] = {}
+        self._codes: dict[str, str] = {}
+        self._widths: dict[str, int] = {}
+        self._mm_per_unit = 1 / self._face.units_per_em / POINTS_PER_MM
+
+    def encode(self, text: str) -> str:
+        """A text as the operand of Tj: two bytes a glyph; characters that the typeface lacks are question marks."""
+        return f"<{''.join(self._codes.get(character) or self._encode(character) for character in text)}>"
+
+    def width_mm(self, text: str, points: float) -> float:
+        """Width of a text. [mm]"""
+        widths = self._widths
+        for character in set(text).difference(widths):
+            widths[character] = self._face.advance_units(self._face.glyph_name(character, "question"))
+        return sum(map(widths.__getitem__, text)) * points * self._mm_per_unit
+
+    def _encode(self, character: str) -> str:
+        name = self._face.glyph_name(character, "question")
+        glyph = self._face.font.getGlyphID(name)
+        self._used.setdefault(glyph, (name, character if ord(character) in self._face.names else "?"))
+        return self._codes.setdefault(character, f"{glyph:04x}")
+
+    def add_to(self, file: PdfFile) -> int:
+        """Add the composite font (9.7) of all texts encoded so far; returns its number."""
+        used = sorted(self._used.items())
+        per_mille = 1000 / self._face.units_per_em
+        program = self._subset()
+        font_file = file.add_stream(program, f"/Length1 {len(program)} ")
+        head, line = self._face.font["head"], self._face.font["hhea"]
+        box = " ".join(f"{v * per_mille:.0f}" for v in (head.xMin, head.yMin, head.xMax, head.yMax))
+        descriptor = file.add(
+            f"<< /Type /FontDescriptor /FontName /{self._name} /Flags 4 /FontBBox [{box}] /ItalicAngle 0 "
+            f"/Ascent {line.ascent * per_mille:.0f} /Descent {line.descent * per_mille:.0f} /CapHeight 729 /StemV 80 "
+            f"/FontFile2 {font_file} 0 R >>".encode()
+        )
+        widths = " ".join(f"{g} [{self._face.advance_units(name) * per_mille:.0f}]" for g, (name, _c) in used)
+        system = "<< /Registry (Adobe) /Ordering (Identity) /Supplement 0 >>"
+        descendant = file.add(
+            f"<< /Type /Font /Subtype /CIDFontType2 /BaseFont /{self._name} /CIDSystemInfo {system} "
+            f"/FontDescriptor {descriptor} 0 R /W [{widths}] /CIDToGIDMap /Identity >>".encode()
+        )
+        characters = file.add_stream(_to_unicode({glyph: character for glyph, (_name, character) in used}))
+        return file.add(
+            f"<< /Type /Font /Subtype /Type0 /BaseFont /{self._name} /Encoding /Identity-H "
+            f"/DescendantFonts [{descendant} 0 R] /ToUnicode {characters} 0 R >>".encode()
+        )
+
+    def _subset(self) -> bytes:
+        from fontTools import subset  # 0.1 s that only a drilling sheet needs
+
+        font = TTFont(BytesIO(self._face.content), recalcTimestamp=False)
+        options = subset.Options(hinting=False, retain_gids=True, notdef_outline=True, layout_features=[])
+        options.drop_tables += ["cmap", "name", "OS/2", "kern", "GSUB", "GPOS", "GDEF"]
+        subsetter = subset.Subsetter(options)
+        subsetter.populate(gids=sorted(self._used))
+        subsetter.subset(font)
+        stream = BytesIO()
+        font.save(stream)
+        return stream.getvalue()
+
+
+def _to_unicode(characters: Mapping[int, str]) -> bytes:
+    """The CMap from glyphs to characters (9.10.3)."""
+    pairs = [f"<{glyph:04x}> <{character.encode('utf-16-be').hex()}>" for glyph, character in characters.items()]
+    blocks = [pairs[start : start + 100] for start in range(0, len(pairs), 100)]  # no more stand in one block
+    mapped = "\n".join(f"{len(block)} beginbfchar\n" + "\n".join(block) + "\nendbfchar" for block in blocks)
+    return (
+        "/CIDInit /ProcSet findresource begin 12 dict begin begincmap\n"
+        "/CIDSystemInfo << /Registry (Adobe) /Ordering (UCS) /Supplement 0 >> def\n"
+        "/CMapName /Adobe-Identity-UCS def /CMapType 2 def\n"
+        f"1 begincodespacerange <0000> <ffff> endcodespacerange\n{mapped}\n"
+        "endcmap CMapName currentdict /CMap defineresource pop end end\n"
+    ).encode("ascii")
+
+
+# --- drawing ------------------------------------------------------------------------------------------------------
+
+
+class Canvas:
+    """What is painted on one page, in millimetres from its lower left corner. Colours are written as ``#rrggbb``."""
+
+    def __init__(self, fonts: Mapping[str, EmbeddedFont]) -> None:
+        self._fonts = fonts
+        self._pieces: list[str] = []
+
+    def content(self) -> bytes:
+        """The page's operators."""
+        return "\n".join(self._pieces).encode("ascii")
+
+    def text(
+        self, x: float, y: float, text: str, *, font: str, points: float, colour: str, anchor: str = "start",
+        angle_deg: float = 0.0,
+    ) -> None:  # fmt: skip
+        """A line of text, anchored at its start, middle or end; the angle is counter-clockwise."""
+        share = {"start": 0.0, "middle": 0.5, "end": 1.0}[anchor]
+        back = share * self._fonts[font].width_mm(text, points)
+        if angle_deg:
+            cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+            turn = f"{cos:.6f} {sin:.6f} {-sin:.6f} {cos:.6f}"
+            place = f"{turn} {_points(x - back * cos)} {_points(y - back * sin)} Tm"
+        else:
+            place = f"{_points(x - back)} {_points(y)} Td"
+        shown = self._fonts[font].encode(text)
+        self._pieces.append(f"BT /{font} {points:.3f} Tf {_colour(colour)} rg {place} {shown} Tj ET")
+
+    def lines(
+        self, points_mm: Iterable[tuple[float, float]], *, width_mm: float, colour: str, dash: Sequence[int] = ()
+    ) -> None:
+        """An open line through points; the dash pattern is in points."""
+        path = " ".join(f"{_points(x)} {_points(y)} {'l' if i else 'm'}" for i, (x, y) in enumerate(points_mm))
+        pattern = f"[{' '.join(map(str, dash))}] 0 d "
+        self._pieces.append(f"{pattern}{_colour(colour)} RG {_points(width_mm)} w {path} S")
+
+    def polygon(
+        self, points_mm: Iterable[tuple[float, float]], *, fill: str | None, outline: str | None, width_mm: float = 0.1
+    ) -> None:
+        """A closed area, filled, outlined, or both."""
+        path = " ".join(f"{_points(x)} {_points(y)} {'l' if i else 'm'}" for i, (x, y) in enumerate(points_mm))
+        filled = f"{_colour(fill)} rg " if fill else ""
+        lined = f"[] 0 d {_colour(outline)} RG {_points(width_mm)} w " if outline else ""
+        self._pieces.append(f"{filled}{lined}{path} {'b' if fill and outline else 'f' if fill else 's'}")
+
+    @contextmanager
+    def clipped(self, x: float, y: float, width: float, height: float) -> Iterator[None]:
+        """Within it, nothing is painted outside of a rectangle."""
+        sides = " ".join(map(_points, (x, y, width, height)))
+        self._pieces.append(f"q {sides} re W n")
+        yield
+        self._pieces.append("Q")
+
+    def box(self, x: float, y: float, width: float, height: float, *, fill: str) -> None:
+        """A filled rectangle."""
+        sides = " ".join(map(_points, (x, y, width, height)))
+        self._pieces.append(f"{_colour(fill)} rg {sides} re f")
+
+    def circle(self, x: float, y: float, radius: float, *, fill: str, outline: str, width_mm: float) -> None:
+        """A filled circle with an outline."""
+        reach = _CIRCLE * radius
+        quarters = (
+            (x + radius, y + reach, x + reach, y + radius, x, y + radius),
+            (x - reach, y + radius, x - radius, y + reach, x - radius, y),
+            (x - radius, y - reach, x - reach, y - radius, x, y - radius),
+            (x + reach, y - radius, x + radius, y - reach, x + radius, y),
+        )
+        curves = " ".join(" ".join(map(_points, quarter)) + " c" for quarter in quarters)
+        colours = f"[] 0 d {_colour(fill)} rg {_colour(outline)} RG {_points(width_mm)} w"
+        self._pieces.append(f"{colours} {_points(x + radius)} {_points(y)} m {curves} b")
+
+
+def _points(value_mm: float) -> str:
+    return f"{value_mm * POINTS_PER_MM:.3f}"
+
+
+def _colour(colour: str) -> str:
+    red, green, blue = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    return f"{red:.3g} {green:.3g} {blue:.3g}"

@@ -1,0 +1,33 @@
+"""The families of markers. A family is one object, and this is the one list of them."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable
+from functools import reduce
+from typing import TYPE_CHECKING, Any, Literal
+
+from app.families.cerpm.cerpms import CERPM
+from app.families.family import Family
+from app.families.fiducial.fiducials import FIDUCIAL
+from app.families.magnet.magnets import MAGNET
+from app.families.plate.plates import PLATE
+
+FAMILIES: tuple[Family[Any, Any], ...] = (PLATE, MAGNET, CERPM, FIDUCIAL)
+FAMILY_NAMES = tuple(family.name for family in FAMILIES)
+_BY_NAME = {family.name: family for family in FAMILIES}
+
+if TYPE_CHECKING:
+    FamilyName = str
+else:
+    FamilyName = Literal[FAMILY_NAMES]  # for the schemas of requests
+
+
+def get_family(name: str) -> Family[Any, Any]:
+    """The family with a name that the registry stores."""
+    return _BY_NAME[name]
+
+
+def union_of(shapes: Iterable[Any]) -> Any:
+    """The union of a shape that each family declares, for the schemas of requests and responses."""
+    return reduce(operator.or_, shapes)

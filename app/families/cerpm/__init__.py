@@ -1,0 +1,1 @@
+"""The family of chip-enabled raised pavement markers."""

@@ -1,0 +1,1 @@
+"""The family of square fiducial signs: ArUco and AprilTag."""

@@ -1,0 +1,1 @@
+"""The family of magnet markers: information tags and line tags."""

@@ -1,0 +1,219 @@
+"""Magnet markers as clients see them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, cast
+
+from typing_extensions import TypedDict
+
+from app.encoders.magnet import DrillingSheet
+from app.encoders.magnet.sheet_geojson import sheet_document
+from app.families.documents import MarkerDocument, marker_head, marker_place
+from app.families.magnet.spec import LinePlaceDocument, MagnetSpec, SiteDocument, TagPlaceDocument, meaning_of
+from app.markers.magnet import LineStyle, LineTag, parse_tag
+from app.markers.magnet_codebook import Meaning
+from app.registry.marker_rows import MarkerRow
+
+
+class MeaningDocument(TypedDict):
+    """What a code means: its kind, its value, and both in words."""
+
+    kind: str
+    value: float | str
+    unit: str
+    text: str
+
+
+class InformationTagDocument(TypedDict):
+    """The code of an information tag."""
+
+    scheme: Literal["information-tag"]
+    text: str
+    tuple: str
+    polarities: str
+    length_m: float
+    segment_m: float
+    gaps_m: list[float]
+    ratios: list[float]
+    codebook_id: str | None
+    meaning: MeaningDocument | None
+
+
+class LineTagDocument(TypedDict):
+    """The code of a line tag."""
+
+    scheme: Literal["line-tag"]
+    text: str
+    tuple: str
+    style: LineStyle
+
+
+class MagnetDocument(MarkerDocument):
+    """A magnet marker in a list; its position is that of the first magnet."""
+
+    code: InformationTagDocument | LineTagDocument
+    layout: TagPlaceDocument | LinePlaceDocument
+
+
+class LaneGeometryDocument(TypedDict):
+    """A GeoJSON LineString."""
+
+    type: Literal["LineString"]
+    coordinates: list[list[float]]
+
+
+class LaneDocument(TypedDict):
+    """The lane in WGS 84, and in `given` the coordinates that were sent where they were of another system."""
+
+    geometry: LaneGeometryDocument
+    length_m: float
+    height_m: float | None
+    given: list[list[float]] | None
+
+
+class HoleDocument(TypedDict):
+    """One magnet to be set."""
+
+    number: int
+    lon_deg: float
+    lat_deg: float
+    chainage_m: float
+    offset_m: float
+    from_first_m: float
+    east_m: float
+    north_m: float
+    polarity: Literal["N", "S"]
+    phi_deg: Literal[0, 90]
+    north_pole: str
+    north_pole_bearing_deg: float | None
+
+
+class CheckDocument(TypedDict):
+    """A check: its figure must stand in `relation` to its limit."""
+
+    name: str
+    figure: float
+    relation: Literal[">=", "<="]
+    limit: float
+    unit: str
+    passed: bool
+    source: str
+    note: str
+
+
+class CostDocument(TypedDict):
+    """A quantity of something and what it costs."""
+
+    item: str
+    quantity: float
+    unit: str
+    low_usd: float
+    high_usd: float
+    source: str
+
+
+class BillDocument(TypedDict):
+    """Materials, what else could mark the road, and the total of the materials at the highest price."""
+
+    materials: list[CostDocument]
+    alternatives: list[CostDocument]
+    total_usd: float
+
+
+class MagnetDetailDocument(MagnetDocument):
+    """A magnet marker with its lane, magnets, checks and costs. `warnings` names the checks that failed."""
+
+    length_m: float
+    lane: LaneDocument
+    site: SiteDocument
+    magnets: list[HoleDocument]
+    passed: bool
+    checks: list[CheckDocument]
+    warnings: list[str]
+    bill: BillDocument
+
+
+def magnet_document(row: MarkerRow) -> MagnetDocument:
+    """A magnet marker as lists and histories show it: without what follows from its layout."""
+    spec: MagnetSpec = row.spec
+    return {
+        **marker_head(row),
+        "code": _tag_document(spec),
+        "layout": spec["place"],
+        **marker_place(row),
+    }
+
+
+def magnet_detail(row: MarkerRow, sheet: DrillingSheet) -> MagnetDetailDocument:
+    """A magnet marker by itself: with its lane, its magnets, its checks and its costs."""
+    written = sheet_document(sheet)
+    summary, spec = written["waymark"], cast(MagnetSpec, row.spec)
+    return {
+        **magnet_document(row),
+        "length_m": summary["length_m"],
+        "lane": {
+            "geometry": {"type": "LineString", "coordinates": spec["lane"]["points_deg"]},
+            "length_m": round(sheet.layout.lane.length_m, 4),
+            "height_m": spec["lane"]["height_m"],
+            "given": spec["lane"]["given"],
+        },
+        "site": spec["site"],
+        "magnets": [_hole_document(hole) for hole in written["features"]],
+        "passed": summary["passed"],
+        "checks": summary["checks"],
+        "warnings": [check["name"] for check in summary["checks"] if not check["passed"]],
+        "bill": {
+            "materials": summary["bill"]["materials"],
+            "alternatives": summary["bill"]["alternatives"],
+            "total_usd": sheet.bill.total_usd,
+        },
+    }
+
+
+def _hole_document(hole: dict[str, Any]) -> HoleDocument:
+    """A hole of the drilling sheet's GeoJSON as a flat document."""
+    lon_deg, lat_deg = hole["geometry"]["coordinates"]
+    properties = {name: _plain(value) for name, value in hole["properties"].items()}
+    return {
+        "chainage_m": properties["chainage_m"],
+        "offset_m": properties["offset_m"],
+        "from_first_m": properties["from_first_m"],
+        "east_m": properties["east_m"],
+        "north_m": properties["north_m"],
+        "polarity": properties["polarity"],
+        "phi_deg": properties["phi_deg"],
+        "north_pole": properties["north_pole"],
+        "north_pole_bearing_deg": properties["north_pole_bearing_deg"],
+        "number": hole["id"],
+        "lon_deg": lon_deg,
+        "lat_deg": lat_deg,
+    }
+
+
+def _tag_document(spec: MagnetSpec) -> InformationTagDocument | LineTagDocument:
+    tag = parse_tag(spec["tag"])
+    if isinstance(tag, LineTag):
+        return {"scheme": "line-tag", "text": tag.text, "tuple": tag.tuple_text, "style": tag.style}
+    meaning = meaning_of(spec)
+    return {
+        "scheme": "information-tag",
+        "text": tag.text,
+        "tuple": tag.tuple_text,
+        "polarities": "".join(tag.polarities),
+        "length_m": tag.length_m,
+        "segment_m": tag.segment_m,
+        "gaps_m": list(tag.gaps_m),
+        "ratios": list(tag.ratios),
+        "codebook_id": spec["codebook_id"],
+        "meaning": None if meaning is None else meaning_document(meaning),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """The value without a negative zero."""
+    return 0.0 if value == 0 and isinstance(value, float) else value
+
+
+def meaning_document(meaning: Meaning) -> MeaningDocument:
+    """A meaning as clients see it."""
+    return {"kind": meaning.kind.value, "value": meaning.value, "unit": meaning.unit, "text": meaning.text}

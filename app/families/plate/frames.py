@@ -1,0 +1,252 @@
+"""Plates in camera frames: what is looked for, which registered plate a reading is of, and its document."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import sqlalchemy as sa
+from typing_extensions import TypedDict
+
+from app.decoders.plate import decode_plates
+from app.errors import NotFound
+from app.families.frame_documents import PoseDocument, pose_document, rounded
+from app.families.frames import (
+    ApproximatePosition,
+    FrameReader,
+    Match,
+    Nearby,
+    Pixels,
+    distance_to_row,
+    nearest_match,
+)
+from app.families.plate.rows import plate_code, plate_geometry
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate_position import resolve_position
+from app.markers.reading import PlateReading
+from app.registry import markers as store
+from app.registry.marker_rows import MarkerRow
+from app.registry.markers import MarkerFilter
+from app.registry.spatial import distance_m
+from app.sensors.camera import Camera
+
+DEFAULT_GEOMETRIES = tuple(PlateGeometry(n=n) for n in (8, 10, 12))
+_MAX_ELSEWHERE = 500
+_M_PER_DEG = 111_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class PlateSearch:
+    """What to look for in a frame.
+
+    Attributes
+    ----------
+    camera : Camera or None
+    codebook : tuple of PlateCode
+        Plates that the registry knows near by.
+    geometries : tuple of PlateGeometry
+        Dimensions to look for; the decoder's own where there are none.
+    """
+
+    camera: Camera | None = None
+    codebook: tuple[PlateCode, ...] = ()
+    geometries: tuple[PlateGeometry, ...] = ()
+
+
+class PlateGradeDocument(TypedDict):
+    """Print quality of a plate as the frame shows it."""
+
+    letter: str
+    overall: float
+    contrast: float
+    modulation: float
+    fixed_pattern: float
+    axial_nonuniformity: float
+    grid_nonuniformity: float
+    unused_correction: float
+
+
+class ReadGeometryDocument(TypedDict):
+    """Dimensions of a plate, as far as a frame shows them."""
+
+    n: int
+    unit_mm: float
+    gap_mm: float
+
+
+class PlateReadingDocument(TypedDict):
+    """A candidate plate in a frame and what was read from it."""
+
+    outcome: str
+    reason: str | None
+    digits: str | None
+    scheme: str | None
+    registry_number: int | None
+    confidence: float
+    cell_confidence: list[float]
+    corrected_cells: list[int]
+    from_codebook: bool
+    corners_px: list[list[float]] | None
+    corner_sigma_px: float | None
+    height_px: float
+    width_px: float
+    geometry: ReadGeometryDocument | None
+    grade: PlateGradeDocument | None
+    pose: PoseDocument | None
+
+
+class PlateFrames(FrameReader[PlateReading, PlateSearch]):
+    """Reads plates in frames.
+
+    Parameters
+    ----------
+    decode : callable, optional
+        The plate decoder; tests put another one in its place.
+    """
+
+    document_type = PlateReadingDocument
+
+    def __init__(self, decode: Callable[..., list[PlateReading]] = decode_plates) -> None:
+        self._decode = decode
+
+    def search(self, nearby: Nearby, camera: Camera | None) -> PlateSearch:
+        """The codes near by, and their dimensions beside the usual ones."""
+        geometries = _distinct([*DEFAULT_GEOMETRIES, *(plate_geometry(row) for row in nearby.rows)])
+        return PlateSearch(camera, plate_codebook(nearby), geometries)
+
+    def read(self, pixels: Pixels, search: PlateSearch, *, thermal: bool) -> Sequence[PlateReading]:
+        """Decode the plates of a frame."""
+        options = {"geometries": search.geometries} if search.geometries else {}
+        return self._decode(pixels, camera=search.camera, codebook=search.codebook, thermal=thermal, **options)
+
+    def match(
+        self,
+        connection: sa.Connection,
+        agency_id: str,
+        reading: PlateReading,
+        position: ApproximatePosition | None,
+        nearby: Nearby,
+    ) -> Match | None:
+        """The registered plate with the digits that were read, nearest to the approximate position.
+
+        Returns
+        -------
+        Match or None
+            None where nothing was read or there is no position to look from.
+        """
+        code = reading.code
+        if code is None or position is None:
+            return None
+        rows = [row for row in nearby.rows if _carries(row, code)]
+        if not nearby.complete:
+            around = MarkerFilter(near=(position.lon_deg, position.lat_deg, position.reach_m), digits=code.digits)
+            found = store.list_markers(connection, agency_id, around, after=None, limit=_MAX_ELSEWHERE)
+            rows = [row for row in found if row.status != "retired" and _carries(row, code)]
+        if rows:
+            return nearest_match(rows, position, "plate")
+        if code.scheme is PlateScheme.ID:
+            return _match_elsewhere(connection, agency_id, code, position)
+        return _resolve_unregistered(code, position)
+
+    def document(self, reading: PlateReading) -> PlateReadingDocument:
+        """A reading as clients see it."""
+        return _reading_document(reading)
+
+    def observation(self, reading: PlateReading) -> dict[str, Any]:
+        """Confidence, grade and corrections."""
+        return {
+            "confidence": float(reading.confidence),
+            "grade": reading.grade.letter if reading.grade else None,
+            "corrected_cells": len(reading.corrected_cells),
+            "from_codebook": bool(reading.from_codebook),
+        }
+
+
+def plate_codebook(nearby: Nearby) -> tuple[PlateCode, ...]:
+    """Codes of the plates near by, without repetitions; none if not all of them are known."""
+    return tuple(dict.fromkeys(plate_code(row) for row in nearby.rows)) if nearby.complete else ()
+
+
+def _distinct(geometries: Sequence[PlateGeometry]) -> tuple[PlateGeometry, ...]:
+    """The geometries without repetitions; thickness does not show in a frame."""
+    seen: dict[tuple[int, float, float], PlateGeometry] = {}
+    for geometry in geometries:
+        seen.setdefault((geometry.n, geometry.unit_mm, geometry.gap_mm), geometry)
+    return tuple(seen.values())
+
+
+def _carries(row: MarkerRow, code: PlateCode) -> bool:
+    return row.digits == code.digits and row.n == code.n
+
+
+def _match_elsewhere(
+    connection: sa.Connection, agency_id: str, code: PlateCode, position: ApproximatePosition
+) -> Match:
+    """An id plate names itself wherever it is: one far from its place was moved or copied."""
+    known = store.find_id_code(connection, code.digits, code.n)
+    try:
+        row = store.get_marker(connection, agency_id, known.id) if known is not None else None
+    except NotFound:  # another agency's
+        row = None
+    if row is None:
+        return Match(None, note="no plate of this agency carries this registry number")
+    note = "the plate is registered elsewhere: moved, copied, or the coarse position is wrong"
+    if row.status == "retired":
+        note = "the plate is retired"
+    return Match(row, row.lon_deg, row.lat_deg, distance_to_row(row, position), False, (), note)
+
+
+def _resolve_unregistered(code: PlateCode, position: ApproximatePosition) -> Match:
+    resolved = resolve_position(code, position.lon_deg, position.lat_deg)
+    away_m = distance_m(position.lon_deg, position.lat_deg, resolved.lon_deg, resolved.lat_deg)
+    next_m = resolved.next_distance_deg * _M_PER_DEG * math.cos(math.radians(position.lat_deg))
+    plausible = away_m <= position.reach_m
+    fits_two = plausible and next_m <= position.reach_m
+    if not plausible:
+        note = "the digits say a place out of reach of the coarse position: not a position plate, or a misread"
+    elif fits_two:
+        note = "ambiguous: the decimals fit two places within reach of the coarse position"
+    else:
+        note = "not registered; the position is what its digits say"
+    return Match(None, resolved.lon_deg, resolved.lat_deg, away_m, plausible, (), note, fits_two)
+
+
+def _reading_document(reading: PlateReading) -> PlateReadingDocument:
+    code, geometry, grade = reading.code, reading.geometry, reading.grade
+    return {
+        "outcome": str(reading.outcome),
+        "reason": reading.reason or None,
+        "digits": reading.digits,
+        "scheme": str(code.scheme) if code else None,
+        "registry_number": code.registry_number if code and code.scheme is PlateScheme.ID else None,
+        "confidence": float(reading.confidence),
+        "cell_confidence": [round(float(value), 6) for value in reading.cell_confidence],
+        "corrected_cells": [int(cell) for cell in reading.corrected_cells],
+        "from_codebook": bool(reading.from_codebook),
+        "corners_px": rounded(reading.corners_px, 3),
+        "corner_sigma_px": _corner_sigma_px(reading.corners_covariance_px2),
+        "height_px": round(float(reading.height_px), 2),
+        "width_px": round(float(reading.width_px), 2),
+        "geometry": {"n": geometry.n, "unit_mm": geometry.unit_mm, "gap_mm": geometry.gap_mm} if geometry else None,
+        "grade": {
+            "letter": grade.letter,
+            "overall": float(grade.overall),
+            "contrast": float(grade.contrast),
+            "modulation": float(grade.modulation),
+            "fixed_pattern": float(grade.fixed_pattern),
+            "axial_nonuniformity": float(grade.axial_nonuniformity),
+            "grid_nonuniformity": float(grade.grid_nonuniformity),
+            "unused_correction": float(grade.unused_correction),
+        }
+        if grade
+        else None,
+        "pose": pose_document(reading.pose),
+    }
+
+
+def _corner_sigma_px(covariance: npt.NDArray[np.float64] | None) -> float | None:
+    return None if covariance is None else float(np.sqrt(np.trace(covariance) / len(covariance)))

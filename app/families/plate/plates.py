@@ -1,0 +1,230 @@
+"""The family of plates: their codes, where these are free, and what follows when a plate moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.errors import CodeMismatch, CodeTaken, InvalidParameter, naming
+from app.families.family import Family, Registration
+from app.families.plate.artwork import PlateArtwork
+from app.families.plate.documents import PlateDocument, plate_document
+from app.families.plate.frames import PlateFrames
+from app.families.plate.inputs import PLATE_EXAMPLES, PlateIn
+from app.families.plate.planned import PlannedPlates
+from app.families.plate.registration import CodeInput, NewPlate
+from app.families.plate.rows import plate_code
+from app.families.plate.snapshot import PlateSnapshot
+from app.families.plate.survey import PlateSurvey
+from app.families.positions import place_input, position_columns
+from app.families.rules import PLANNED, is_placed_anew
+from app.geodesy import PlacedPosition
+from app.markers.plate import PlateCode, PlateScheme, plate_capacity
+from app.registry import markers as store
+from app.registry.marker_rows import MarkerRow
+
+_LETTERS = frozenset("ABCDEF")
+_MIN_LETTERS = 3
+_ALLOCATION_TRIES = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class _Plate:
+    """A code with its relation to the position."""
+
+    code: PlateCode
+    digits_match_position: bool | None
+    is_explicit: bool
+
+
+class Plates(Family[NewPlate, PlacedPosition]):
+    """The family of plates."""
+
+    name = "plate"
+    label = "plate"
+    title = "Plates"
+    schema = PlateIn
+    examples = PLATE_EXAMPLES
+    snapshot = PlateSnapshot()
+    survey = PlateSurvey()
+    planned = PlannedPlates()
+    artwork = PlateArtwork()
+    frames = PlateFrames()
+    document_type = PlateDocument
+    detail_type = PlateDocument
+
+    def prepare(self, registration: Registration, new: NewPlate) -> PlacedPosition:
+        """The plate's place in WGS 84."""
+        return place_input(new.position, registration.rules.crs_accuracy_m)
+
+    def columns(
+        self, connection: sa.Connection, registration: Registration, new: NewPlate, prepared: PlacedPosition
+    ) -> dict[str, Any]:
+        """Code, dimensions and place of a plate whose code is free.
+
+        Raises
+        ------
+        InvalidParameter, CodeMismatch
+            The code contradicts itself or the position.
+        CodeTaken
+            Another plate near by carries the code.
+        """
+        with naming("code"):
+            coded = _coded(connection, registration, new, prepared)
+        _check_free(connection, registration, coded, prepared.lon_deg, prepared.lat_deg)
+        geometry, code = new.geometry, coded.code
+        return {
+            "family": self.name,
+            "scheme": str(code.scheme),
+            "digits": code.digits,
+            "check_digits": code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else None,
+            "digits_match_position": coded.digits_match_position,
+            "n": geometry.n,
+            "unit_mm": geometry.unit_mm,
+            "gap_mm": geometry.gap_mm,
+            "thickness_mm": geometry.thickness_mm,
+            "heading_deg": new.heading_deg,
+            **position_columns(new.position, prepared),
+        }
+
+    def feature_members(self, properties: Mapping[str, Any]) -> dict[str, Any]:
+        """Scheme and digits."""
+        code = {"scheme": properties.get("scheme"), "digits": properties.get("code")}
+        return {"code": {name: value for name, value in code.items() if value is not None}}
+
+    def document(self, row: MarkerRow) -> PlateDocument:
+        """A plate."""
+        return plate_document(row)
+
+    def revise(
+        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Columns of the code after a move: a planned plate's digits follow, a built one's stay as they are.
+
+        Raises
+        ------
+        CodeTaken
+            At its new place, or back in use, its code collides with another plate's.
+        """
+        if not is_placed_anew(row, values):
+            return {}
+        merged = row._replace(**values)
+        code = plate_code(row)
+        matches = row.digits_match_position
+        is_explicit = matches is False
+        if code.scheme is not PlateScheme.ID:
+            expected = _position_code(merged.lon_deg, merged.lat_deg, code.n, code.scheme, row.check_digits)
+            if row.status == PLANNED and matches:
+                code = expected
+            matches = code == expected
+        coded = _Plate(code, matches, is_explicit)
+        _check_free(connection, registration, coded, merged.lon_deg, merged.lat_deg, row.id)
+        return {"digits": code.digits, "digits_match_position": matches}
+
+
+PLATE = Plates()
+
+
+def _coded(connection: sa.Connection, registration: Registration, plate: NewPlate, placed: PlacedPosition) -> _Plate:
+    """The code that was asked for, or the one that follows from the position or from a free registry number."""
+    wanted, n = plate.code, plate.geometry.n
+    _check_code_request(wanted)
+    if wanted.scheme is PlateScheme.ID:
+        if wanted.digits is not None:
+            return _Plate(PlateCode(wanted.digits, PlateScheme.ID, n), None, True)
+        if wanted.registry_number is not None:
+            return _Plate(PlateCode.from_registry_number(wanted.registry_number, n=n), None, True)
+        return _Plate(_allocate(connection, registration, n), None, False)
+    expected = _position_code(placed.lon_deg, placed.lat_deg, n, wanted.scheme, wanted.check_digits)
+    if wanted.digits is None:
+        return _Plate(expected, True, False)
+    code = PlateCode(wanted.digits, wanted.scheme, n, wanted.check_digits or 1)
+    matches = code == expected
+    if not matches and not wanted.allow_mismatched_digits:
+        raise CodeMismatch(
+            f"the digits {code.digits} do not fit the position {placed.lon_deg:.6f}, {placed.lat_deg:.6f}, "
+            f"whose digits are {expected.digits}",
+            field="code.digits",
+            limit=f"{expected.digits} at {placed.lon_deg:.6f}, {placed.lat_deg:.6f} deg",
+            cure="leave the digits out, correct the position, or set code.allow_mismatched_digits for a test plate",
+        )
+    return _Plate(code, matches, not matches)
+
+
+def _allocate(connection: sa.Connection, registration: Registration, n: int) -> PlateCode:
+    """A free registry number at random, whose codeword cannot be taken for a position with two cells damaged."""
+    bits = round(plate_capacity(n, PlateScheme.ID).bits)
+    for _ in range(_ALLOCATION_TRIES):
+        code = PlateCode.from_registry_number(registration.random_bits(bits), n=n)
+        if sum(d in _LETTERS for d in code.digits) < _MIN_LETTERS:
+            continue
+        if store.find_id_code(connection, code.digits, n) is None:
+            return code
+    raise CodeTaken("no free registry number was found", field="code.registry_number", cure="use a larger plate")
+
+
+def _check_free(
+    connection: sa.Connection,
+    registration: Registration,
+    plate: _Plate,
+    lon_deg: float,
+    lat_deg: float,
+    ignoring: str | None = None,
+) -> None:
+    if plate.code.scheme is PlateScheme.ID:
+        other = store.find_id_code(connection, plate.code.digits, plate.code.n)
+        limit = "a registry number names one plate for ever"
+    else:
+        wide_m = registration.rules.explicit_code_radius_m
+        radius_m = wide_m if plate.is_explicit else registration.rules.position_code_radius_m
+        other = store.find_code_near(
+            connection,
+            plate.code.digits,
+            lon_deg,
+            lat_deg,
+            radius_m,
+            mismatched_radius_m=wide_m,
+            ignoring=ignoring,
+        )
+        limit = f"no two plates with the same digits within {radius_m:g} m"
+    if other is None or other.id == ignoring:
+        return
+    own = other.agency_id == registration.agency_id
+    raise CodeTaken(
+        f"the digits {plate.code.digits} are taken by "
+        + (f"marker {other.id}" if own else "a marker of another agency"),
+        field="code.digits" if plate.is_explicit else "position",
+        limit=limit,
+        cure="choose other digits or another position, or retire the other plate",
+    )
+
+
+def _check_code_request(wanted: CodeInput) -> None:
+    is_id = wanted.scheme is PlateScheme.ID
+    for name, misplaced in (
+        ("registry_number", not is_id and wanted.registry_number is not None),
+        ("check_digits", wanted.scheme is not PlateScheme.POSITION_CHECK and wanted.check_digits is not None),
+        ("allow_mismatched_digits", is_id and wanted.allow_mismatched_digits),
+    ):
+        if misplaced:
+            raise InvalidParameter(
+                f"{name} means nothing in the scheme {wanted.scheme}",
+                field=f"code.{name}",
+                limit="registry_number: id; check_digits: position-check; allow_mismatched_digits: position schemes",
+                cure=f"leave {name} out or choose the scheme it belongs to",
+            )
+    if wanted.digits is not None and wanted.registry_number is not None:
+        raise InvalidParameter(
+            "give the digits or the registry number, not both",
+            field="code.registry_number",
+            limit="one of digits, registry_number",
+            cure="leave one of the two out",
+        )
+
+
+def _position_code(lon_deg: float, lat_deg: float, n: int, scheme: PlateScheme, check_digits: int | None) -> PlateCode:
+    checks = (check_digits or 1) if scheme is PlateScheme.POSITION_CHECK else 0
+    return PlateCode.from_position(lon_deg, lat_deg, n=n, check_digits=checks)

@@ -1,0 +1,148 @@
+"""How the points of a survey become markers of a family, thousands at a time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import sqlalchemy as sa
+from pydantic import BaseModel
+
+from app.families.rules import MarkerRules
+from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.table import Fault, Texts
+from app.markers.plate_digits import Digits
+from app.registry.columns import Columns
+from app.registry.marker_rows import CodeRow
+from app.surveys.georeference import GeoreferencedSurvey
+
+Rows = npt.NDArray[np.intp]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class RowCodes:
+    """Codes of the rows of a survey that can have one.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (N,)
+        Indices of the rows, rising.
+    digits : ndarray of bytes, shape (N,)
+        Empty where a code is still to be assigned.
+    from_file : ndarray of bool, shape (N,)
+        Whether the file has it.
+    scheme : str
+    """
+
+    rows: Rows
+    digits: Digits
+    from_file: Flags
+    scheme: str
+
+    def of(self, chosen: Flags | slice) -> RowCodes:
+        """The codes of some of the rows."""
+        return RowCodes(self.rows[chosen], self.digits[chosen], self.from_file[chosen], self.scheme)
+
+
+def listed_codes(survey: GeoreferencedSurvey, rows: Rows) -> Iterator[tuple[int, str]]:
+    """Place in `rows` and text of each row that has a code."""
+    texts = survey.table.texts.get("code", Texts())
+    place_of = np.full(survey.table.rows, -1, dtype=np.intp)
+    place_of[rows] = np.arange(len(rows))
+    start = 0
+    for part in texts.parts():
+        for k, text in zip(place_of[start : start + len(part)].tolist(), part, strict=True):
+            if text and k >= 0:
+                yield k, text
+        start += len(part)
+
+
+def unknown_texts(texts: Texts | None, wanted: Flags, name: str, known: set[str], limit: str) -> Iterator[Fault]:
+    """Faults of the wanted rows whose text in a column is not a known one."""
+    start = 0
+    for part in texts.parts() if texts is not None else ():
+        if not known.issuperset(part):
+            for k, text in enumerate(part, start):
+                if text and text not in known and text.upper() not in known and wanted[k]:
+                    yield Fault(k + 1, name, "not_a_marker", f"there is no {name} {text[:40]!r}", limit)
+        start += len(part)
+
+
+def texts_of(survey: GeoreferencedSurvey, rows: Rows, name: str) -> list[str]:
+    """Texts of some rows in a column."""
+    texts = survey.table.texts[name]
+    return [texts[row] for row in rows.tolist()]
+
+
+DefaultsT = TypeVar("DefaultsT")
+
+
+class SurveyImport(ABC, Generic[DefaultsT]):
+    """The part of an import that only one family knows: its codes, its columns, and when two codes collide.
+
+    Attributes
+    ----------
+    members : type of pydantic model
+        Members of a survey's declaration that only this family has.
+    """
+
+    members: ClassVar[type[BaseModel]]
+
+    @abstractmethod
+    def defaults(self, declared: Mapping[str, Any]) -> DefaultsT:
+        """What a survey's markers have in common, of the declared members.
+
+        Raises
+        ------
+        InvalidParameter
+            The members contradict each other.
+        """
+
+    def check_values(
+        self, survey: GeoreferencedSurvey, wanted: Flags, declaration: ImportDeclaration
+    ) -> Iterator[Fault]:
+        """Faults of the wanted rows that no marker of this family can have."""
+        yield from ()
+
+    @abstractmethod
+    def read_codes(self, survey: GeoreferencedSurvey, rows: Rows, defaults: DefaultsT) -> tuple[RowCodes, list[Fault]]:
+        """Codes of these rows (indices from 0), and the faults of rows whose code is none."""
+
+    def assign_missing(self, connection: sa.Connection, agency_id: str, codes: RowCodes) -> None:
+        """Give codes to the rows that are still without one."""
+
+    @abstractmethod
+    def is_unique(self, codes: RowCodes) -> bool:
+        """Whether two markers may not have the same code however far apart they are."""
+
+    @abstractmethod
+    def collides(
+        self,
+        codes: RowCodes,
+        defaults: DefaultsT,
+        place: tuple[float, float],
+        known: CodeRow,
+        agency_id: str,
+        rules: MarkerRules,
+    ) -> bool:
+        """Whether a stored marker, which has the code of a row, keeps the row from being stored.
+
+        Parameters
+        ----------
+        place : (float, float)
+            Longitude and latitude of the row. [deg]
+        """
+
+    @abstractmethod
+    def columns(self, survey: GeoreferencedSurvey, codes: RowCodes, defaults: DefaultsT) -> Columns:
+        """Columns that only markers of this family have."""
+
+
+def digits_column(codes: RowCodes) -> Sequence[str]:
+    """The codes as the registry stores them."""
+    return [code.decode() for code in codes.digits.tolist()]

@@ -1,0 +1,1 @@
+"""Uploaded and exported files: bytes in, values out, and back."""

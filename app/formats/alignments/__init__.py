@@ -1,0 +1,1 @@
+"""Files with roads: lane centre lines or boundaries, events along them, and areas to avoid."""

@@ -1,0 +1,364 @@
+"""Alignments of LandXML 1.2: lines, curves and spirals, station equations, profiles."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from app.errors import ReferenceSystemError, UnreadableUpload
+from app.formats.alignments.curves import GAP_WARNING_M as GAP_M
+from app.formats.alignments.curves import Curve, Ints, Piece, build_curve, clothoid, report_gap, sample
+from app.formats.alignments.geometry import MAX_VERTICES, AlignmentFile, Floats, LaneGeometry, StationEquation
+from app.formats.alignments.vertical import Profile, VerticalPoint, build_profile
+from app.formats.xml_tree import attribute, finite_number, parse_xml
+from app.geodesy import reference_system
+
+UNITS_M = {
+    "millimeter": 0.001, "centimeter": 0.01, "meter": 1.0, "kilometer": 1000.0, "inch": 0.0254, "foot": 0.3048,
+    "ussurveyfoot": 1200 / 3937, "mile": 1609.344,
+}  # fmt: skip
+"""Length of linear units. [m] Source: LandXML 1.2, metLinear and impLinear; NIST SP 811, appendix B."""
+_CURE = "correct the element at this place, or export the alignment again"
+Point = tuple[float, float]
+"""Easting and northing from the origin of the file. [m]"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """Coordinates of the file from metres about an origin near the road.
+
+    Attributes
+    ----------
+    unit_m : float
+        [m]
+    origin : tuple of two floats
+        Northing and easting in the unit of the file.
+    named : dict
+        Texts of CgPoints by name.
+    """
+
+    unit_m: float
+    origin: tuple[float, float]
+    named: dict[str, str]
+
+    def length(self, element: ET.Element, name: str, place: str) -> float:
+        return attribute(element, name, place) * self.unit_m
+
+    def point(self, element: ET.Element, tag: str, place: str) -> Point | None:
+        """A child with northing and easting, or with the name of a CgPoint; None without one."""
+        child = element.find(tag)
+        if child is None:
+            return None
+        text = self.named.get(child.get("pntRef", ""), "") if child.get("pntRef") else child.text or ""
+        parts = text.split()
+        if len(parts) < 2:
+            raise _wrong(f"{place}: {tag} is {text.strip()[:40]!r}", "northing and easting")
+        return self.local(parts[0], parts[1], place)
+
+    def local(self, northing: str, easting: str, place: str) -> Point:
+        north = finite_number(northing, "the northing", place) - self.origin[0]
+        return (finite_number(easting, "the easting", place) - self.origin[1]) * self.unit_m, north * self.unit_m
+
+
+def read_landxml(data: bytes) -> AlignmentFile:
+    """One lane for each alignment, along its line, with heights from its first profile.
+
+    Ends of elements are trusted, their directions (dir, dirStart) are not. Geometry and profile are in true distance;
+    station equations only change what is displayed. Equations and start station are those of the first alignment.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Returns
+    -------
+    AlignmentFile
+        In the unit of the file, easting first.
+
+    Raises
+    ------
+    UnreadableUpload
+        It is no LandXML, is damaged, contradicts itself, or has unknown elements; the message names the place.
+    """
+    root = parse_xml(data, "LandXML")
+    named = {point.get("name", ""): point.text or "" for point in root.iter("CgPoint")}
+    scale = _Scale(_unit_m(root), (0.0, 0.0), named)
+    warnings: list[str] = []
+    lanes: list[LaneGeometry] = []
+    stations: list[tuple[float, tuple[StationEquation, ...]]] = []
+    vertices = 0
+    for number, element in enumerate(root.iterfind("Alignments/Alignment"), 1):
+        name = _name(element, number, {lane.name for lane in lanes})
+        place = f"alignment {name}"
+        shape = element.find("CoordGeom")
+        if shape is None or not len(shape):
+            warnings.append(f"{place}: it has no CoordGeom; it is left out.")
+            continue
+        if not lanes:
+            scale = _Scale(scale.unit_m, _first_point(shape, scale, place), named)
+        start = attribute(element, "staStart", place, 0.0)
+        curve = _curve(shape, scale, place, warnings)
+        stations.append((start * scale.unit_m, _equations(element, start, curve.end_s, scale, place, warnings)))
+        lane = _lane(curve, _profile(element, start, scale, place, warnings), scale, name)
+        vertices += 0 if lane.station_m is None else len(lane.station_m)
+        if vertices > MAX_VERTICES:
+            raise _wrong("the alignments need too many vertices", f"{MAX_VERTICES} vertices", "cut the file into parts")
+        lanes.append(lane)
+    if not lanes:
+        raise _wrong("the file has no alignment with a CoordGeom", "one or more", "export the alignments as well")
+    if any(equations for _, equations in stations[1:]):
+        warnings.append("Station equations of the second and further alignments are left out.")
+    crs, problem = _crs(root)
+    return AlignmentFile(
+        format="landxml",
+        lanes=tuple(lanes),
+        crs=crs,
+        crs_problem=problem,
+        unit_m=scale.unit_m,
+        station_equations=stations[0][1],
+        start_station_m=stations[0][0],
+        warnings=tuple(warnings),
+    )
+
+
+def _wrong(message: str, limit: str, cure: str = _CURE) -> UnreadableUpload:
+    return UnreadableUpload(message, field="file", limit=limit, cure=cure)
+
+
+def _unit_m(root: ET.Element) -> float:
+    units = next((child for child in root.iterfind("Units/*") if child.get("linearUnit")), None)
+    name = "" if units is None else units.get("linearUnit", "")
+    unit_m = UNITS_M.get(name.lower())
+    if unit_m is None:
+        state = f"the linear unit {name[:40]!r} is not known" if name else "the file states no linear unit"
+        raise _wrong(state, ", ".join(UNITS_M), "export the file with Units in metres or feet")
+    return unit_m
+
+
+def _crs(root: ET.Element) -> tuple[str | None, str | None]:
+    """The CRS of the file; None with a reason if it states one that cannot be used."""
+    system = root.find("CoordinateSystem")
+    code = "" if system is None else system.get("epsgCode", "").strip()
+    if not code:
+        return None, None
+    crs = code if code.upper().startswith("EPSG:") else f"EPSG:{code}"
+    try:
+        reference_system(crs)
+    except ReferenceSystemError as error:
+        return None, f"The epsgCode {code[:20]!r} of the file cannot be used ({error.message}); declare the CRS."
+    return crs.upper(), None
+
+
+def _name(element: ET.Element, number: int, taken: set[str]) -> str:
+    name = element.get("name", "").strip()[:80] or f"{number}"
+    found, copy = name, 2
+    while found in taken:
+        found, copy = f"{name} ({copy})", copy + 1
+    return found
+
+
+def _first_point(shape: ET.Element, scale: _Scale, place: str) -> tuple[float, float]:
+    point = next((found for child in shape if (found := scale.point(child, "Start", place)) is not None), (0.0, 0.0))
+    return point[1] / scale.unit_m, point[0] / scale.unit_m
+
+
+def _curve(shape: ET.Element, scale: _Scale, place: str, warnings: list[str]) -> Curve:
+    pieces: list[Piece] = []
+    ends: list[Point] = []
+    s = 0.0
+    for child in shape:
+        where = f"{place}, {child.tag} at {s / scale.unit_m:.3f} from its start"
+        if child.tag not in _READERS:
+            if child.tag in ("Feature", "DocFileRef"):
+                continue
+            known = ", ".join(_READERS)
+            raise _wrong(f"{where}: the element is not known", known, "export the alignment with these elements")
+        start, end = scale.point(child, "Start", where), scale.point(child, "End", where)
+        if start is None or end is None:
+            raise _wrong(f"{where}: Start or End is missing", "Start and End")
+        for piece, stop in _READERS[child.tag](child, start, end, scale, where):
+            pieces.append(piece._replace(s=s))
+            ends.append(stop)
+            s += piece.length
+    curve = build_curve(pieces)
+    frame = curve.evaluate(curve.s + curve.length, np.arange(len(pieces)))
+    gaps = np.hypot(*(np.stack([frame.x, frame.y]) - np.array(ends).T))
+    for i in np.flatnonzero(~(gaps <= GAP_M)).tolist():
+        warnings.append(report_gap(pieces[i].place, float(gaps[i]), "the element misses its End by"))
+    warnings += curve.warnings
+    return curve
+
+
+Read = Callable[[ET.Element, Point, Point, _Scale, str], list[tuple[Piece, Point]]]
+
+
+def _line(start: Point, end: Point, place: str) -> tuple[Piece, Point]:
+    east, north = end[0] - start[0], end[1] - start[1]
+    return Piece(place, 0.0, math.hypot(east, north), *start, math.atan2(north, east)), end
+
+
+def _read_line(_element: ET.Element, start: Point, end: Point, _scale: _Scale, place: str) -> list[tuple[Piece, Point]]:
+    return [_line(start, end, place)]
+
+
+def _read_irregular(
+    element: ET.Element, start: Point, end: Point, scale: _Scale, place: str
+) -> list[tuple[Piece, Point]]:
+    points = [start]
+    for tag, size in (("PntList2D", 2), ("PntList3D", 3)):
+        numbers = (element.findtext(tag) or "").split()
+        if len(numbers) % size:
+            raise _wrong(f"{place}: {tag} has {len(numbers)} numbers", f"a multiple of {size}")
+        points += [scale.local(*pair, place) for pair in zip(numbers[::size], numbers[1::size], strict=True)]
+    points.append(end)
+    pairs = [pair for pair in pairwise(points) if math.dist(*pair) > GAP_M]
+    return [_line(*pair, place) for pair in pairs] or [_line(start, end, place)]
+
+
+def _read_curve(element: ET.Element, start: Point, end: Point, scale: _Scale, place: str) -> list[tuple[Piece, Point]]:
+    """An arc through both ends: its radius is their mean distance from the centre, or stated."""
+    sign = _rotation(element, place)
+    centre = scale.point(element, "Center", place)
+    chord = math.dist(start, end)
+    if centre is not None:
+        radii = math.dist(start, centre), math.dist(end, centre)
+        radius = sum(radii) / 2.0
+        if abs(radii[0] - radii[1]) > GAP_M:
+            report_gap(place, abs(radii[0] - radii[1]), "the distances of Start and End from Center differ by")
+        first, last = (math.atan2(point[1] - centre[1], point[0] - centre[0]) for point in (start, end))
+        turn = sign * (last - first) % math.tau
+    else:
+        radius = scale.length(element, "radius", place)
+        turn = scale.length(element, "length", place) / radius if radius and element.get("length") else 0.0
+    if not 0.0 < chord <= 2.0 * radius + GAP_M:
+        raise _wrong(
+            f"{place}: no arc of radius {radius / scale.unit_m:g} joins Start and End",
+            "a radius of half the distance of Start and End at least, which differ",
+        )
+    half = math.asin(min(chord / (2.0 * radius), 1.0))
+    half = math.pi - half if turn > math.pi else half
+    towards = math.atan2(end[1] - start[1], end[0] - start[0])
+    k = sign / radius
+    return [(Piece(place, 0.0, 2.0 * half * radius, *start, towards - sign * half, k, k), end)]
+
+
+def _read_spiral(element: ET.Element, start: Point, end: Point, scale: _Scale, place: str) -> list[tuple[Piece, Point]]:
+    """A clothoid, turned so that its chord has the direction from Start to End."""
+    kind = element.get("spiType", "clothoid")
+    if kind != "clothoid":
+        raise _wrong(f"{place}: the spiral is {kind[:40]!r}", "clothoid", "export the alignment with clothoids")
+    sign = _rotation(element, place)
+    length = scale.length(element, "length", place)
+    k0, k1 = (sign * _curvature(element, name, scale, place) for name in ("radiusStart", "radiusEnd"))
+    towards = math.atan2(end[1] - start[1], end[0] - start[0])
+    piece = Piece(place, 0.0, length, *start, towards, k0, k1)
+    if length > 0.0:
+        local = clothoid(*(np.array([value]) for value in (length, k0, k1, length)))
+        piece = piece._replace(hdg=towards - math.atan2(local[1][0], local[0][0]))
+    return [(piece, end)]
+
+
+def _rotation(element: ET.Element, place: str) -> float:
+    rot = element.get("rot", "")
+    if rot not in ("cw", "ccw"):
+        raise _wrong(f"{place}: rot is {rot[:20]!r}", "cw or ccw")
+    return 1.0 if rot == "ccw" else -1.0
+
+
+def _curvature(element: ET.Element, name: str, scale: _Scale, place: str) -> float:
+    if element.get(name, "").strip().upper() in ("INF", "INFINITY"):
+        return 0.0
+    radius = scale.length(element, name, place)
+    if radius <= 0.0:
+        raise _wrong(f"{place}: {name} is {radius / scale.unit_m:g}", "above 0, or INF")
+    return 1.0 / radius
+
+
+_READERS: dict[str, Read] = {
+    "Line": _read_line,
+    "Curve": _read_curve,
+    "Spiral": _read_spiral,
+    "IrregularLine": _read_irregular,
+}
+
+
+def _equations(
+    alignment: ET.Element, start: float, length_m: float, scale: _Scale, place: str, warnings: list[str]
+) -> tuple[StationEquation, ...]:
+    """Station equations in the order of the line. Without staInternal, the distance follows from staBack."""
+    found: list[StationEquation] = []
+    distance, ahead = 0.0, start
+    for element in alignment.iterfind("StaEquation"):
+        where = f"{place}, StaEquation {element.get('staInternal') or element.get('staBack') or '?'}"
+        if element.get("staIncrement") == "decreasing":
+            warnings.append(f"{where}: stations that decrease along the line are not displayed as such.")
+        new_ahead = attribute(element, "staAhead", where)
+        if element.get("staInternal") is None:
+            at = distance + attribute(element, "staBack", where) - ahead
+        else:
+            at = attribute(element, "staInternal", where) - start
+        back = attribute(element, "staBack", where, ahead + at - distance)
+        if not (distance <= at and at * scale.unit_m <= length_m + GAP_M):
+            warnings.append(f"{where}: it lies outside the line, or before the one before; it is left out.")
+            continue
+        distance, ahead = at, new_ahead
+        found.append(StationEquation(at * scale.unit_m, back * scale.unit_m, new_ahead * scale.unit_m))
+    return tuple(found)
+
+
+def _profile(alignment: ET.Element, start: float, scale: _Scale, place: str, warnings: list[str]) -> Profile | None:
+    """The first designed profile; surveyed ones (ProfSurf) are not used."""
+    designs = alignment.findall("Profile/ProfAlign")
+    if len(designs) > 1:
+        warnings.append(f"{place}: it has {len(designs)} profiles; heights are those of the first.")
+    points = []
+    for element in designs[0] if designs else ():
+        if element.tag not in ("PVI", "ParaCurve", "UnsymParaCurve", "CircCurve"):
+            if element.tag in ("Feature", "DocFileRef"):
+                continue
+            limit = "PVI, ParaCurve, UnsymParaCurve, CircCurve"
+            raise _wrong(f"{place}: the profile has an element {element.tag[:40]!r}", limit)
+        parts = (element.text or "").split()
+        where = f"{place}, {element.tag} at station {parts[0][:20] if parts else '?'}"
+        if len(parts) < 2:
+            raise _wrong(f"{where}: the text is {(element.text or '').strip()[:40]!r}", "station and elevation")
+        station = (finite_number(parts[0], "the station", where) - start) * scale.unit_m
+        lengths, radius = (0.0, 0.0), None
+        if element.tag == "ParaCurve":
+            lengths = (scale.length(element, "length", where) / 2.0,) * 2
+        elif element.tag == "UnsymParaCurve":
+            lengths = scale.length(element, "lengthIn", where), scale.length(element, "lengthOut", where)
+        elif element.tag == "CircCurve":
+            radius = abs(scale.length(element, "radius", where))
+        height = finite_number(parts[1], "the elevation", where) * scale.unit_m
+        points.append(VerticalPoint(where, station, height, *lengths, radius))
+    return build_profile(points) if points else None
+
+
+def _lane(curve: Curve, profile: Profile | None, scale: _Scale, name: str) -> LaneGeometry:
+    inner = [] if profile is None else [s for s in profile.breaks.tolist() if 0.0 < s < curve.end_s]
+    breaks = np.unique(np.concatenate([curve.s, [curve.end_s], inner]))
+    breaks = breaks[np.diff(breaks, prepend=-np.inf) > 1e-6]
+    breaks[-1] = curve.end_s
+    middle = (breaks[:-1] + breaks[1:]) / 2.0
+    piece = curve.piece_at(middle)
+
+    def bend(s: Floats, interval: Ints) -> Floats:
+        vertical = 0.0 if profile is None else profile.bend(middle[interval])
+        return np.hypot(curve.evaluate(s, piece[interval]).k, vertical)
+
+    s, interval = sample(breaks, bend, f"alignment {name}")
+    frame = curve.evaluate(s, piece[interval])
+    inside = (np.diff(s, prepend=-1.0) > 0.0) | (np.abs(np.diff(frame.k, prepend=math.inf)) > 1e-9)
+    s, x, y, k = s[inside], frame.x[inside], frame.y[inside], frame.k[inside]
+    twice = np.flatnonzero(np.diff(s) == 0.0)
+    x[twice + 1], y[twice + 1] = x[twice], y[twice]
+    height = np.full(len(s), np.nan) if profile is None else profile.height(s)
+    centre = np.stack([x, y, height], axis=1) / scale.unit_m
+    centre[:, :2] += scale.origin[::-1]
+    return LaneGeometry(name, centre=centre, curvature_per_m=k, station_m=s, road=name)

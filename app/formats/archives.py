@@ -1,0 +1,191 @@
+"""ZIP archives of frames, opened without trusting their headers.
+
+Names are for people only, never paths. Sizes are counted while inflating, never taken from a header.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
+
+FIELD = "file"
+ZIP_MAGIC = b"PK\x03\x04"
+_EOCD = b"PK\x05\x06"
+_ZIP64_LOCATOR = b"PK\x06\x07"
+_NAME_LENGTH = 120  # [character] chosen by hand
+_ENCRYPTED = 0x1  # bit 0 of the flags; PKWARE APPNOTE, section 4.4.4
+_CHUNK = 1 << 16  # [byte] inflated at a time
+_DEFECTS = (
+    zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ArchiveLimits:
+    """Limits of an archive.
+
+    Attributes
+    ----------
+    members : int
+        Largest number of frames.
+    member_bytes, total_bytes : int
+        Largest size of one frame and of all, as stored in the archive's files. [byte]
+    ratio : float
+        Largest expansion of one compressed byte; pictures are compressed already.
+    """
+
+    members: int = 500
+    member_bytes: int = 32 * 1024**2
+    total_bytes: int = 512 * 1024**2
+    ratio: float = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One file of an archive: its bytes, or the error that prevented reading it."""
+
+    index: int
+    name: str
+    data: bytes = b""
+    error: WaymarkError | None = None
+
+
+def is_archive(data: bytes) -> bool:
+    """Whether the bytes begin like a ZIP archive."""
+    return data.startswith((ZIP_MAGIC, _EOCD))
+
+
+def count_members(data: bytes, limits: ArchiveLimits | None = None) -> int:
+    """Number of files in an archive, after checking its directory.
+
+    Raises
+    ------
+    UnreadableUpload
+        Damaged or empty.
+    UploadTooLarge
+        More members than the limit.
+    UnsupportedUpload
+        ZIP64, which nothing below 4 GiB needs.
+    """
+    with _open(data, limits or ArchiveLimits()) as archive:
+        return len(_files(archive))
+
+
+def read_members(data: bytes, limits: ArchiveLimits | None = None, *, start: int = 0) -> Iterator[Member]:
+    """Inflate an archive file by file; a file that breaks a rule is reported and the rest goes on.
+
+    Raises
+    ------
+    UnreadableUpload, UploadTooLarge, UnsupportedUpload
+        As `count_members`; or all files together exceed the limit, which ends the iteration.
+    """
+    limits = limits or ArchiveLimits()
+    spent = 0
+    with _open(data, limits) as archive:
+        for index, info in enumerate(_files(archive)):
+            if index < start:
+                continue
+            name = _printable(info.filename)
+            try:
+                content = _inflate(archive, info, limits)
+            except WaymarkError as error:
+                yield Member(index, name, error=error)
+                continue
+            spent += len(content)
+            if spent > limits.total_bytes:
+                raise UploadTooLarge(
+                    "the archive's files are too large together",
+                    field=FIELD,
+                    limit=f"{limits.total_bytes} bytes when expanded",
+                    cure="send several smaller archives",
+                )
+            yield Member(index, name, content)
+
+
+def read_member(data: bytes, index: int, limits: ArchiveLimits | None = None) -> Member:
+    """One file of an archive."""
+    for member in read_members(data, limits, start=index):
+        return member
+    raise UnreadableUpload(f"the archive has no file {index}", field="frame")
+
+
+def _open(data: bytes, limits: ArchiveLimits) -> zipfile.ZipFile:
+    _check_directory(data, limits)
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+    except _DEFECTS as error:
+        raise _damaged() from error
+    count = len(_files(archive))
+    if count == 0:
+        raise UnreadableUpload("the archive is empty", field=FIELD, limit="at least one frame")
+    if count > limits.members:
+        raise _too_many(limits)
+    return archive
+
+
+def _check_directory(data: bytes, limits: ArchiveLimits) -> None:
+    """Bound the directory before it is parsed: a large one costs a kilobyte of memory per 46 bytes."""
+    at = len(data) - 22 if data[-22:-18] == _EOCD and data[-2:] == b"\x00\x00" else data.rfind(_EOCD, -(22 + 65535))
+    if at < 0 or at + 22 > len(data):
+        raise _damaged()
+    (directory_bytes,) = struct.unpack_from("<I", data, at + 12)
+    if data[max(at - 20, 0) : at][:4] == _ZIP64_LOCATOR or directory_bytes == 0xFFFFFFFF:
+        raise UnsupportedUpload("ZIP64 archives are not read", field=FIELD, limit="plain ZIP", cure="send a plain ZIP")
+    if directory_bytes > limits.members * 1024:
+        raise _too_many(limits)
+
+
+def _files(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+    return [info for info in archive.infolist() if not info.is_dir()]
+
+
+def _inflate(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limits: ArchiveLimits) -> bytes:
+    if info.flag_bits & _ENCRYPTED:
+        raise UnsupportedUpload("the file is encrypted", field=FIELD, cure="send the frames without a password")
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise UnsupportedUpload(
+            "the file is compressed by a method other than deflate", field=FIELD, limit="stored or deflate"
+        )
+    allowed = min(limits.member_bytes, int(max(info.compress_size, 1024) * limits.ratio))
+    parts, size = [], 0
+    try:
+        with archive.open(info) as stream:
+            while part := stream.read(_CHUNK):
+                size += len(part)
+                if size > allowed:
+                    break
+                parts.append(part)
+    except _DEFECTS as error:
+        raise UnreadableUpload("the file is damaged in the archive", field=FIELD, cure="pack it again") from error
+    if size > allowed:
+        raise UploadTooLarge(
+            "the file expands beyond its limit",
+            field=FIELD,
+            limit=f"{limits.member_bytes} bytes, {limits.ratio:g} times its compressed size",
+            cure="send pictures as the camera wrote them",
+        )
+    return b"".join(parts)
+
+
+def _printable(name: str) -> str:
+    last = name.replace("\\", "/").rsplit("/", 1)[-1]
+    return "".join(c if c.isprintable() and not 0xD800 <= ord(c) <= 0xDFFF else "?" for c in last)[:_NAME_LENGTH]
+
+
+def _damaged() -> UnreadableUpload:
+    return UnreadableUpload("the archive is damaged or cut short", field=FIELD, cure="pack it again and send it whole")
+
+
+def _too_many(limits: ArchiveLimits) -> UploadTooLarge:
+    return UploadTooLarge(
+        "the archive holds too many files",
+        field=FIELD,
+        limit=f"{limits.members} frames",
+        cure="send several smaller archives",
+    )

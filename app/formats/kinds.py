@@ -1,0 +1,88 @@
+"""The list of all formats of uploaded files, and what an upload is by its content."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from app.errors import WaymarkError
+from app.formats.alignments.formats import ALIGNMENT_FORMATS
+from app.formats.archives import is_archive
+from app.formats.format import Confidence, Format, Sample, Use, detect_format
+from app.formats.images import FRAME_FORMATS
+from app.formats.packets.formats import PACKET_FORMATS
+from app.formats.poses.formats import POSE_FORMATS
+from app.formats.surveys.formats import SURVEY_FORMATS
+from app.formats.traces.declaration import TraceLimits
+from app.formats.traces.formats import TRACE_FORMATS
+from app.formats.traces.parts import open_parts
+
+FORMATS: tuple[Format[object], ...] = (
+    *FRAME_FORMATS,
+    *TRACE_FORMATS,
+    *PACKET_FORMATS,
+    *POSE_FORMATS,
+    *SURVEY_FORMATS,
+    *ALIGNMENT_FORMATS,
+)
+"""Of equally likely formats the first is detected."""
+_SAMPLE_BYTES = 1 << 16  # [byte] chosen by hand; as much as `open_parts` reads of each file at first
+_POSE_SUFFIXES = (".gpx", ".nmea", ".nma")
+
+
+class UploadKind(StrEnum):
+    """What an upload is decoded as."""
+
+    FRAME = "frame"
+    TRACE = "trace"
+    PACKETS = "packets"
+
+
+_DECODED_AS = {
+    Use.FRAME: UploadKind.FRAME,
+    Use.TRACE: UploadKind.TRACE,
+    Use.PACKETS: UploadKind.PACKETS,
+    Use.POSES: UploadKind.PACKETS,
+}
+"""A track comes with a packet log."""
+
+
+def guess_kind(name: str, data: bytes) -> UploadKind | None:
+    """What an upload is; None if its content does not show it.
+
+    Parameters
+    ----------
+    name : str
+        Of the file.
+    data : bytes
+        A file, or a ZIP of files. Only the beginning of each file is looked at.
+
+    Returns
+    -------
+    UploadKind or None
+        A ZIP of nothing but pictures is frames; one with a packet log or a track in it is packets.
+    """
+    if not is_archive(data):
+        return _guess_file(name, data)
+    try:
+        parts = [part for part in open_parts({name: data}, TraceLimits()) if not part.name.startswith(".")]
+    except WaymarkError:
+        return UploadKind.FRAME  # too many files for a recording; the archive's reader reports any other fault
+    kinds = {_guess_file(part.name, part.head) for part in parts} - {UploadKind.FRAME}
+    if not kinds:
+        return UploadKind.FRAME
+    return next((kind for kind in (UploadKind.PACKETS, UploadKind.TRACE) if kind in kinds), None)
+
+
+def _guess_file(name: str, data: bytes) -> UploadKind | None:
+    decoded = [found for found in FORMATS if found.use in _DECODED_AS]
+    found = detect_format(Sample(name, data[:_SAMPLE_BYTES]), decoded, Confidence.PLAUSIBLE)
+    return None if found is None else _DECODED_AS[found.use]
+
+
+def detect_drive_file(name: str, data: bytes) -> Use:
+    """What a file of a drive past CERPMs is: a camera frame, the vehicle's poses, or else packets."""
+    if name.lower().endswith(_POSE_SUFFIXES) and detect_format(Sample(name, data), FRAME_FORMATS) is None:
+        return Use.POSES
+    formats = [found for found in FORMATS if found.use in (Use.FRAME, Use.PACKETS, Use.POSES)]
+    found = detect_format(Sample(name, data[:_SAMPLE_BYTES]), formats, Confidence.LIKELY)
+    return Use.PACKETS if found is None else found.use

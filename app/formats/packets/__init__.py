@@ -1,0 +1,1 @@
+"""Packet logs of receivers: CSV, JSON lines, raw bytes, and uplinks of LoRaWAN network servers."""

@@ -1,0 +1,1 @@
+"""A vehicle's own track: CSV, GPX and NMEA 0183."""

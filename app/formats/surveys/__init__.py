@@ -1,0 +1,1 @@
+"""Survey files: CSV, GeoJSON, GeoPackage, Shapefile, KML, LandXML and DXF."""

@@ -1,0 +1,131 @@
+"""What is declared of a survey: CRS, datum, units, columns and checks, which most files do not contain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from app.errors import InvalidParameter
+
+FORMATS = ("csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf")
+LAYOUTS = ("pnezd", "penzd", "named")
+METRES = {"m": 1.0, "ft-us": 1200.0 / 3937.0, "ft-intl": 0.3048}
+"""Metres to a unit of length: US survey foot and international foot (NIST SP 811)."""
+TEXT_ROLES = ("point", "code", "description", "road", "side", "status")
+NUMBER_ROLES = ("heading_deg", "measure_m", "offset_m", "horizontal_rmse_m", "vertical_rmse_m")
+COORDINATE_ROLES = ("lon_deg", "lat_deg", "easting", "northing", "height")
+ROLES = (*COORDINATE_ROLES, *TEXT_ROLES, *NUMBER_ROLES)
+MATCHES = ("code", "nearest")
+MAX_AREA_DEG = 30.0
+"""Largest side of a declared area: a larger one would check nothing. [deg] Chosen by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportDeclaration:
+    """What is declared of a survey.
+
+    Attributes
+    ----------
+    format : str, optional
+        One of `FORMATS`; detected by the content if it is left out.
+    layout : str
+        Of CSV: ``pnezd``, ``penzd`` (no header needed), or ``named`` columns.
+    columns : mapping
+        Role to the column's name; common names are found without. Roles are `ROLES`.
+    layer : str, optional
+        Of a GeoPackage or a DXF.
+    decimal, delimiter : str, optional
+        Of CSV.
+    crs, realization, epoch, vertical_datum
+        Frame of the coordinates. [epoch: decimal year]
+    unit, height_unit : str, optional
+        ``m``, ``ft-us`` or ``ft-intl``; that of the CRS without.
+    ignore_heights : bool
+        Leave heights out.
+    area_deg : tuple of four floats, optional
+        west, south, east, north of a box that contains all rows. [deg]
+    height_range_m : tuple of two floats, optional
+        Lowest and highest plausible height. [m]
+    family, status, road
+        Of the markers.
+    compare : bool
+        The survey finds registered markers as built: rows are matched, and moved markers get a new version.
+    match : str
+        ``code`` or ``nearest``.
+    tolerance_m : float
+        Residuals beyond it are reported. [m]
+    survey : mapping
+        horizontal_rmse_m, vertical_rmse_m, survey_method, surveyor, instrument, check_points.
+    """
+
+    format: str | None = None
+    layout: str = "named"
+    columns: Mapping[str, str] = field(default_factory=dict)
+    layer: str | None = None
+    decimal: str = "."
+    delimiter: str | None = None
+    crs: str | None = None
+    realization: str | None = None
+    epoch: float | None = None
+    vertical_datum: str | None = None
+    unit: str | None = None
+    height_unit: str | None = None
+    ignore_heights: bool = False
+    area_deg: tuple[float, float, float, float] | None = None
+    height_range_m: tuple[float, float] | None = None
+    family: str = "plate"
+    status: str | None = None
+    road: str | None = None
+    compare: bool = False
+    match: str = "code"
+    tolerance_m: float = 0.1
+    survey: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, value, allowed in (
+            ("format", self.format, (None, *FORMATS)),
+            ("layout", self.layout, LAYOUTS),
+            ("decimal", self.decimal, (".", ",")),
+            ("delimiter", self.delimiter, (None, ",", ";", "\t", "space")),
+            ("unit", self.unit, (None, *METRES)),
+            ("height_unit", self.height_unit, (None, *METRES)),
+            ("match", self.match, MATCHES),
+        ):
+            if value not in allowed:
+                known = ", ".join(repr(name) for name in allowed if name is not None)
+                raise InvalidParameter(f"there is no {name} {str(value)[:40]!r}", field=name, limit=known, cure=_CURE)
+        unknown = next((role for role in self.columns if role not in ROLES), None)
+        if unknown is not None:
+            raise InvalidParameter(
+                f"there is no role {unknown[:40]!r}", field="columns", limit=", ".join(ROLES), cure=_CURE
+            )
+        if self.decimal == "," and self.delimiter == ",":
+            raise InvalidParameter(
+                "a comma cannot separate columns and decimals", field="delimiter", limit="two characters", cure=_CURE
+            )
+        _check_area(self.area_deg)
+        if self.height_range_m is not None and not self.height_range_m[0] < self.height_range_m[1]:
+            raise InvalidParameter(
+                "the lowest height is not below the highest", field="height_range_m", limit="low < high", cure=_CURE
+            )
+        if not (math.isfinite(self.tolerance_m) and 0 < self.tolerance_m <= 100):
+            raise InvalidParameter("the tolerance is out of range", field="tolerance_m", limit="0 to 100 m", cure=_CURE)
+
+
+_CURE = "docs/imports.md lists what can be declared"
+
+
+def _check_area(area: tuple[float, float, float, float] | None) -> None:
+    if area is None:
+        return
+    west, south, east, north = area
+    fits = -180 <= west < east <= 180 and -90 <= south < north <= 90
+    if not fits or max(east - west, north - south) > MAX_AREA_DEG:
+        raise InvalidParameter(
+            "area_deg is no box of west, south, east, north, or one too large to check anything",
+            field="area_deg",
+            limit=f"west < east, south < north, at most {MAX_AREA_DEG:g} degrees wide",
+            cure="send the box of the project; split a survey that crosses the antimeridian",
+        )

@@ -1,0 +1,146 @@
+"""Surveys as XML: the placemarks of KML and the CgPoints of LandXML. No document type, so no entity expands."""
+
+from __future__ import annotations
+
+import io
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from app.errors import UnreadableUpload
+from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable
+from app.formats.xml_tree import check_xml, local_name
+
+MAX_ELEMENTS = 20 * MAX_ROWS
+"""Elements of a document. Chosen by hand."""
+_LANDXML_UNITS = {"meter": "m", "foot": "ft-intl", "ussurveyfoot": "ft-us"}
+
+
+def read_kml(data: bytes) -> SourceTable:
+    """Placemarks that are points; their names, descriptions and data are columns. Longitude first, as KML has it.
+
+    Raises
+    ------
+    UnreadableUpload
+        It is no XML, has a document type, or too many elements.
+    """
+    rows: list[dict[str, Any]] = []
+    points: list[tuple[float, float, float]] = []
+    faults: list[Fault] = []
+    for placemark in _elements(data, "Placemark"):
+        text = next((e.text or "" for e in _below(placemark, "Point") for e in _below(e, "coordinates")), "")
+        point = _numbers(text.split(","))
+        rows.append(_kml_values(placemark))
+        if point is None or len(point) not in (2, 3):
+            faults.append(Fault(len(rows), "geometry", "no_point", "the placemark is no point with finite numbers"))
+            point = [math.nan, math.nan]
+        points.append((point[0], point[1], point[2] if len(point) == 3 else math.nan))
+    return _table("kml", rows, points, faults, crs="EPSG:4326")
+
+
+def read_landxml(data: bytes) -> SourceTable:
+    """CgPoints, which are always north, east, elevation, with the units and the CRS that the file declares.
+
+    Raises
+    ------
+    UnreadableUpload
+        It is no XML, has a document type, names units that are not known, or too many elements.
+    """
+    rows: list[dict[str, Any]] = []
+    points: list[tuple[float, float, float]] = []
+    faults: list[Fault] = []
+    crs = unit = None
+    for element in _elements(data, "CgPoint", "CoordinateSystem", "Metric", "Imperial"):
+        kind = local_name(element.tag)
+        if kind == "CoordinateSystem":
+            code = element.get("epsgCode")
+            crs = f"EPSG:{code}" if code else crs
+        elif kind != "CgPoint":
+            unit = _linear_unit(element.get("linearUnit", ""))
+        else:
+            found = _numbers((element.text or "").split())
+            rows.append({"point": element.get("name"), "code": element.get("code"), "description": element.get("desc")})
+            if found is None or len(found) not in (2, 3):
+                faults.append(Fault(len(rows), "geometry", "no_point", "the CgPoint has no two or three numbers"))
+                found = [math.nan, math.nan]
+            points.append((found[1], found[0], found[2] if len(found) == 3 else math.nan))
+    return _table("landxml", rows, points, faults, crs=crs, unit=unit)
+
+
+def _linear_unit(name: str) -> str:
+    unit = _LANDXML_UNITS.get(name.lower())
+    if unit is None:
+        raise UnreadableUpload(
+            f"the linear unit {name[:40]!r} is not known",
+            field="file",
+            limit="meter, foot, USSurveyFoot",
+            cure="export the survey in metres or feet",
+        )
+    return unit
+
+
+def _elements(data: bytes, *names: str) -> Iterator[ET.Element]:
+    """Elements of these names; each is forgotten after its turn."""
+    check_xml(data, max_elements=MAX_ELEMENTS, cure="send the points alone")
+    parents: list[ET.Element] = []
+    for event, element in ET.iterparse(io.BytesIO(data), events=("start", "end")):
+        if event == "start":
+            parents.append(element)
+            continue
+        parents.pop()
+        if local_name(element.tag) in names:
+            yield element
+            element.clear()
+        if parents and not any(local_name(parent.tag) in names for parent in parents):
+            parents[-1].remove(element)
+
+
+def _below(element: ET.Element, name: str) -> Iterator[ET.Element]:
+    return (child for child in element.iter() if local_name(child.tag) == name)
+
+
+def _kml_values(placemark: ET.Element) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for child in placemark.iter():
+        kind = local_name(child.tag)
+        if kind in ("name", "description") and kind not in values:
+            values[{"name": "point"}.get(kind, kind)] = (child.text or "").strip()
+        elif kind == "SimpleData" and child.get("name"):
+            values[child.get("name", "")] = (child.text or "").strip()
+        elif kind == "Data" and child.get("name"):
+            inner = next(_below(child, "value"), None)
+            values[child.get("name", "")] = (inner.text or "").strip() if inner is not None else None
+    return values
+
+
+def _numbers(parts: list[str]) -> list[float] | None:
+    try:
+        found = [float(part) for part in parts if part.strip()]
+    except ValueError:
+        return None
+    return found if all(math.isfinite(v) for v in found) else None
+
+
+def _table(
+    kind: str,
+    rows: list[dict[str, Any]],
+    points: list[tuple[float, float, float]],
+    faults: list[Fault],
+    *,
+    crs: str | None = None,
+    unit: str | None = None,
+) -> SourceTable:
+    names = tuple(dict.fromkeys(name for row in rows for name in row))
+    if len(names) > MAX_COLUMNS or len(rows) > MAX_ROWS:
+        raise UnreadableUpload(
+            "the file has too many points or names",
+            field="file",
+            limit=f"{MAX_ROWS} points, {MAX_COLUMNS} names",
+            cure="cut the file",
+        )
+    columns = tuple([row.get(name) for row in rows] for name in names)
+    xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
+    return SourceTable(kind, names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), crs, unit, Faults(faults))

@@ -1,0 +1,210 @@
+"""The files of one recording and what is declared of them, to one trace and a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from app.errors import InvalidParameter
+from app.formats.traces.align import align_speed
+from app.formats.traces.declaration import AngleUnit, SpeedUnit, TraceDeclaration, TraceFormat, TraceLimits
+from app.formats.traces.field import convert_field
+from app.formats.traces.formats import TraceContents, TraceReading, find_trace_format
+from app.formats.traces.parts import open_parts
+from app.formats.traces.report import TraceFile, TraceReport
+from app.formats.traces.series import Series, check_sampling, clean_heading, clean_speed, coverage, rising_rows
+from app.sensors.magnetometer_bar import MagnetTrace
+
+Floats = npt.NDArray[np.float64]
+
+_EPOCH_S = 1e6  # [s] a first time above this counts from some epoch, so the trace starts at 0; source: by hand, 11 days
+_MISSING_SPEED_CURE = "send the recorder's RawSpeed file, a CAN log or a speed column, or declare a constant speed"
+_SPEED_ALIASES = {"kph": "km/h", "kmh": "km/h", "kmph": "km/h", "mps": "m/s", "mi/h": "mph", "knots": "kn", "kt": "kn"}
+
+
+def read_trace(
+    parts: Mapping[str, bytes | BinaryIO],
+    declaration: TraceDeclaration | None = None,
+    limits: TraceLimits | None = None,
+) -> TraceFile:
+    """Read the files of one recording.
+
+    Parameters
+    ----------
+    parts : mapping of str to bytes or binary stream
+        Files by name; ZIP archives stand for the files within.
+    declaration : TraceDeclaration, optional
+        Needed for plain CSV, Parquet and CAN logs.
+    limits : TraceLimits, optional
+
+    Returns
+    -------
+    TraceFile
+        The trace in ISO 8855 axes and microtesla, and a report of gaps, clock offsets and what was left out.
+
+    Raises
+    ------
+    InvalidParameter
+        What is declared and what the files hold do not fit: columns, units, axes, times, a missing speed.
+    UnreadableUpload, UnsupportedUpload, UploadTooLarge
+        A file is damaged, empty, of no kind that is read here, or beyond a limit.
+    Unavailable
+        An optional library is not installed.
+    """
+    declaration, limits = declaration or TraceDeclaration(), limits or TraceLimits()
+    report = TraceReport()
+    opened = open_parts(parts, limits)
+    formats = {part.name: find_trace_format(part, declaration.formats.get(part.name)) for part in opened}
+    report.formats |= {name: TraceFormat(found.name) for name, found in formats.items()}
+    dbc = [part for part in opened if report.formats[part.name] is TraceFormat.DBC]
+    reading = TraceReading(declaration, limits, report, dbc)
+    for part in opened:
+        formats[part.name].read(part, reading)
+        if shift_s := reading.shift_s(part):
+            report.clock_offsets_s[part.name] = shift_s
+    return _assemble(reading.contents, declaration, limits, report)
+
+
+def _assemble(
+    found: TraceContents, declaration: TraceDeclaration, limits: TraceLimits, report: TraceReport
+) -> TraceFile:
+    if found.t_s is None or found.field_ut is None:
+        raise InvalidParameter(
+            "no file holds magnetic fields",
+            field="parts",
+            limit="a stream, RawData, CSV or Parquet with the sensors' columns",
+            cure="send the magnetometers' recording",
+        )
+    rows = rising_rows(found.t_s, found.field_part, limits, report)
+    t = found.t_s[rows]
+    values = found.field_ut[rows] if rows.size < len(found.field_ut) else found.field_ut
+    origin = float(t[0]) if abs(t[0]) > _EPOCH_S else 0.0
+    if origin:
+        t = t - origin
+        others = [s.part for s, _ in found.speeds] + [s.part for s, _ in found.headings]
+        for name in {found.field_part, *others}:
+            report.clock_offsets_s[name] = declaration.clock_offsets_s.get(name, 0.0) - origin
+    check_sampling(t, found.field_part, limits, report)
+    values = convert_field(values, found.field_part, declaration, found.metro, report)
+
+    def placed(series: Series) -> Series:
+        kept = rows if series.part == found.field_part else slice(None)
+        return Series(series.part, series.t_s[kept] - origin, series.value[kept])
+
+    speeds = [clean_speed(placed(s), u, limits, report) for s, u in found.speeds]
+    headings = [clean_heading(placed(s), u, limits, report) for s, u in found.headings]
+    _add_can(found, t, values, declaration, limits, report, speeds, headings)
+    speed = _choose_speed(t, speeds, declaration, report)
+    heading = _choose(headings, "heading", report)
+    heading_t = heading.t_s if heading else None
+    report.samples, report.rate_hz = int(t.size), float(1 / np.median(np.diff(t)))
+    report.duration_s = float(t[-1] - t[0])
+    report.speed_coverage = coverage(t, speed.t_s) if declaration.speed_m_s is None or speeds else 1.0
+    report.heading_coverage = coverage(t, heading_t) if heading_t is not None else 0.0
+    _check_coverage(t, speed, speeds, report)
+    trace = MagnetTrace(t, values, speed.t_s, speed.value, heading_t, heading.value if heading else None)
+    return TraceFile(trace, report)
+
+
+def _add_can(
+    found: TraceContents,
+    t: Floats,
+    values: npt.NDArray[np.float32],
+    declaration: TraceDeclaration,
+    limits: TraceLimits,
+    report: TraceReport,
+    speeds: list[Series],
+    headings: list[Series],
+) -> None:
+    """Put the series of CAN logs on the trace's clock."""
+    for part, series in found.can:
+        cleaned: dict[str, Series] = {}
+        if raw := series.get("speed"):
+            cleaned["speed"] = clean_speed(
+                Series(part, raw.t_s, raw.value), _speed_unit(raw.unit, part), limits, report
+            )
+        if raw := series.get("heading"):
+            cleaned["heading"] = clean_heading(
+                Series(part, raw.t_s, raw.value), _angle_unit(raw.unit, part), limits, report
+            )
+        assert declaration.can is not None
+        offset = declaration.can.offset_s
+        if offset is None:
+            offset = align_speed(t, values, declaration.references, cleaned.get("speed"), part, report)
+        report.clock_offsets_s[part] = offset
+        if "speed" in cleaned:
+            speeds.insert(0, Series(part, cleaned["speed"].t_s + offset, cleaned["speed"].value))
+        if "heading" in cleaned:
+            headings.insert(0, Series(part, cleaned["heading"].t_s + offset, cleaned["heading"].value))
+
+
+def _speed_unit(unit: str | None, part: str) -> SpeedUnit:
+    text = (unit or "").strip().lower()
+    try:
+        return SpeedUnit(_SPEED_ALIASES.get(text, text))
+    except ValueError as error:
+        raise InvalidParameter(
+            f"the unit of speed in {part} is {unit!r}" if unit else f"the unit of speed in {part} is not declared",
+            field="can.speed.unit",
+            limit=", ".join(u.value for u in SpeedUnit),
+            cure="declare the unit of the signal",
+        ) from error
+
+
+def _angle_unit(unit: str | None, part: str) -> AngleUnit:
+    text = (unit or "").strip().lower()
+    if text in ("deg", "degree", "degrees", "°"):
+        return AngleUnit.DEGREE
+    if text in ("rad", "radian", "radians"):
+        return AngleUnit.RADIAN
+    raise InvalidParameter(
+        f"the unit of heading in {part} is {unit!r}" if unit else f"the unit of heading in {part} is not declared",
+        field="can.heading.unit",
+        limit=", ".join(u.value for u in AngleUnit),
+        cure="declare the unit of the signal",
+    )
+
+
+def _choose_speed(t: Floats, speeds: list[Series], declaration: TraceDeclaration, report: TraceReport) -> Series:
+    chosen = _choose(speeds, "speed", report)
+    if chosen is not None:
+        return chosen
+    if declaration.speed_m_s is not None and not speeds:
+        return Series("declared", np.array([t[0], t[-1]]), np.full(2, declaration.speed_m_s))
+    raise InvalidParameter(
+        "the recording has no speed" if not speeds else f"{speeds[0].part} has no usable speed",
+        field="speed",
+        limit="one value or more",
+        cure=_MISSING_SPEED_CURE,
+    )
+
+
+def _choose(series: list[Series], name: str, report: TraceReport) -> Series | None:
+    usable = [s for s in series if s.t_s.size]
+    if len(usable) > 1:
+        report.warn(
+            f"several files have a {name}: {usable[0].part} is used, not {', '.join(s.part for s in usable[1:])}"
+        )
+    return usable[0] if usable else None
+
+
+def _check_coverage(t: Floats, speed: Series, speeds: list[Series], report: TraceReport) -> None:
+    if not speeds:
+        report.warn("the speed is declared, not measured: distances are as good as it is")
+        return
+    if report.speed_coverage == 0.0:
+        raise InvalidParameter(
+            f"speeds in {speed.part} run from {speed.t_s[0]:.3f} to {speed.t_s[-1]:.3f} s, "
+            f"samples from {t[0]:.3f} to {t[-1]:.3f} s",
+            field="clock_offsets_s",
+            limit="times that overlap",
+            cure="declare the offset between the clocks",
+        )
+    if report.speed_coverage < 0.99:
+        report.warn(
+            f"{100 * (1 - report.speed_coverage):.1f} % of the samples have no speed within a second; "
+            "the last one is held there"
+        )

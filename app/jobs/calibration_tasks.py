@@ -1,0 +1,62 @@
+"""Photos of a calibration board, read and calibrated inside a decoder process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from app.calibration.board_view import BoardView, ViewFault, find_board
+from app.calibration.calibrate import calibrate_camera
+from app.calibration.results import CameraCalibration, Photo
+from app.errors import UnsupportedUpload, UploadTooLarge, WaymarkError
+from app.formats.archives import is_archive, read_members
+from app.formats.images import load_image
+from app.jobs.memory_limit import memory_is_the_limit
+from app.services.fleet.calibrations import MAX_PHOTOS, CalibrationTask
+
+_PHOTO = ("photo", "send photos at the camera's resolution")
+
+
+def calibrate_photos(task: CalibrationTask, _before: None) -> CameraCalibration:
+    """Find the board in each photo, one after the other, and calibrate the camera that took them."""
+    photos: list[Photo] = []
+    for name, content in _each(task):
+        if len(photos) == MAX_PHOTOS:
+            raise UploadTooLarge(
+                "there are too many photos", field="photos", limit=f"{MAX_PHOTOS} photos", cure="send 12 to 20"
+            )
+        photos.append(_look(name, content, task))
+    with memory_is_the_limit(*_PHOTO):
+        return calibrate_camera(photos, task.board, coefficients=task.coefficients)
+
+
+def _each(task: CalibrationTask) -> Iterator[tuple[str, bytes | WaymarkError]]:
+    for name, data in task.photos:
+        if not is_archive(data):
+            yield name, data
+            continue
+        for member in read_members(data, task.archives):
+            if not member.name.startswith("."):  # what a desktop leaves in a ZIP
+                yield member.name, member.error or member.data
+
+
+def _look(name: str, content: bytes | WaymarkError, task: CalibrationTask) -> Photo:
+    try:
+        if isinstance(content, WaymarkError):
+            raise content
+        with memory_is_the_limit(*_PHOTO):
+            frame = load_image(content, task.images)
+            grey = cv2.cvtColor(frame.pixels, cv2.COLOR_BGR2GRAY)
+            view = find_board(np.asarray(grey, np.uint8), task.board)
+    except WaymarkError as error:
+        fault = ViewFault.UNREADABLE
+        if isinstance(error, UploadTooLarge):
+            fault = ViewFault.TOO_LARGE
+        elif isinstance(error, UnsupportedUpload):
+            fault = ViewFault.NOT_A_PICTURE
+        nothing = BoardView(np.empty(0, np.intp), np.empty((0, 2)), fault=fault, detail=error.message)
+        return Photo(name, None, 0, nothing)
+    header = frame.header
+    return Photo(name, (header.width_px, header.height_px), header.orientation or 1, view)

@@ -1,0 +1,55 @@
+"""Roads and plans, inside a decoder process."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+from app.formats.alignments.geometry import AlignmentFile
+from app.formats.alignments.read import read_alignment
+from app.jobs.memory_limit import memory_is_the_limit
+from app.markers.magnet_codebook import Codebook
+from app.planning.alignment import Alignment
+from app.planning.build_alignment import build_alignment
+from app.planning.outputs.files import OutputOptions, write_plan_file
+from app.planning.outputs.plan_document import read_plan, write_plan
+from app.planning.placement import place_plan
+from app.planning.placement.codes import unused_numbers
+from app.planning.plan_checks import check_plan
+from app.planning.read_rules import check_rules
+from app.planning.rules import RoadRules
+from app.services.plans.summaries import plan_summary, road_summary
+from app.services.plans.tasks import MadePlan, MakePlanTask, RoadFile, SummarizeRoadTask, WritePlanFileTask
+
+_CURE = "cut the road into sections"
+
+
+def summarize_road(task: SummarizeRoadTask, _before: None) -> dict[str, Any]:
+    """Read a road and describe it."""
+    with memory_is_the_limit("road", _CURE):
+        file = read_alignment(task.road.data, task.road.file_name)
+        return dict(road_summary(_build(file, task.road, RoadRules()), file.format))
+
+
+def make_plan(task: MakePlanTask, _before: None) -> MadePlan:
+    """Place and check a plan."""
+    with memory_is_the_limit("road", _CURE):
+        rules = check_rules(task.rules)
+        file = read_alignment(task.road.data, task.road.file_name)
+        alignment = _build(file, task.road, rules.road)
+        numbers = unused_numbers(task.taken, zlib.crc32(task.name.encode()))
+        book = Codebook.from_document(task.codebook) if task.codebook is not None else None
+        plan = place_plan(alignment, rules, name=task.name, codebook=book, numbers=numbers)
+        plan = check_plan(plan, task.existing)
+        codes = tuple((marker.family, marker.code) for marker in plan.markers if marker.family != "magnet")
+        return MadePlan(zlib.compress(write_plan(plan), 6), plan_summary(plan), codes)
+
+
+def write_file_of_plan(task: WritePlanFileTask, _before: None) -> bytes:
+    """Write a file of a plan."""
+    with memory_is_the_limit("plan", _CURE):
+        return write_plan_file(read_plan(zlib.decompress(task.document)), task.name, OutputOptions(task.crs, task.unit))
+
+
+def _build(file: AlignmentFile, road: RoadFile, rules: RoadRules) -> Alignment:
+    return build_alignment(file, rules, road.declaration, name=road.name, accuracy_m=road.accuracy_m)

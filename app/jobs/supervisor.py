@@ -1,0 +1,243 @@
+"""A thread that supervises one decoder process: starts it, sends it tasks, stops it at its limits, replaces it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, Generic, TypeVar
+
+import structlog
+
+from app.errors import Unavailable, UnreadableUpload
+from app.jobs.decoder_process import READY, ProcessLimits, serve_tasks
+from app.jobs.frame_tasks import DecodePlates
+from app.jobs.tasks import STEPS
+
+T = TypeVar("T")
+_START_S = 300.0
+_PATIENCE_S = 300.0
+_CHECK_S = 1.0
+_RETRY_S = 30.0
+_LOG = structlog.get_logger(__name__)
+_PROCESSES = multiprocessing.get_context("forkserver")
+"""One process imports the decoders, and the decoder processes are its forks: each starts in a part of the time."""
+_PROCESSES.set_forkserver_preload(["app.jobs.tasks"])
+
+
+class Pending(Generic[T]):
+    """A task on its way through a decoder process.
+
+    Parameters
+    ----------
+    steps : tuple of object
+        Arguments of the task's steps (`app.jobs.tasks.STEPS`). One may be a Future that the caller has yet to set.
+    interrupt : callable
+        Stops the process that works on this, if one does.
+    timeout_s : float
+        Longest time in the process. [s]
+    """
+
+    def __init__(self, steps: tuple[object, ...], interrupt: Callable[[Pending[Any]], None], timeout_s: float) -> None:
+        self.steps = steps
+        self.future: Future[T] = Future()
+        self.timeout_s = timeout_s
+        self.stopped = False
+        self._interrupt = interrupt
+
+    def result(self) -> T:
+        """Wait for the result; an error in the process is raised here."""
+        try:
+            return self.future.result(self.timeout_s + _PATIENCE_S)
+        except CancelledError as error:
+            raise _was_stopped() from error
+        except FutureTimeout as error:
+            if self.future.done():
+                raise
+            self.cancel()
+            raise Unavailable("no decoder process is free", cure="try again later") from error
+
+    def cancel(self) -> None:
+        """Stop it, also when it runs already."""
+        self.stopped = True
+        for argument in self.steps:
+            if isinstance(argument, Future):
+                argument.cancel()
+        if not self.future.cancel():
+            self._interrupt(self)
+
+
+class WorkerSupervisor(threading.Thread):
+    """Runs tasks one after the other in a process of its own.
+
+    Parameters
+    ----------
+    tasks : SimpleQueue of Pending or None
+        Shared with the other supervisors; None ends one of them.
+    decode : callable
+        `decode_plates`, imported by name in the process.
+    limits : ProcessLimits
+    """
+
+    def __init__(
+        self, tasks: queue.SimpleQueue[Pending[Any] | None], decode: DecodePlates, limits: ProcessLimits
+    ) -> None:
+        super().__init__(name="decoder-supervisor", daemon=True)
+        self._tasks = tasks
+        self._decode = decode
+        self._limits = limits
+        self._lock = threading.Lock()
+        self._process: BaseProcess | None = None
+        self._connection: Connection | None = None
+        self._current: Pending[Any] | None = None
+        self._closing = False
+        self._failed_at: float | None = None
+
+    @property
+    def is_up(self) -> bool:
+        """Whether its process runs or is being started."""
+        with self._lock:
+            return self._failed_at is None and (self._process is None or self._process.is_alive())
+
+    def interrupt(self, pending: Pending[Any]) -> None:
+        """Kill the process if it works on this task."""
+        with self._lock:
+            if self._current is pending and self._process is not None:
+                self._process.kill()
+
+    def close(self) -> None:
+        """Kill the process and refuse further tasks; the thread ends at the next None."""
+        with self._lock:
+            self._closing = True
+            if self._process is not None:
+                self._process.kill()
+
+    def run(self) -> None:
+        """Serve until a None comes."""
+        self._start_early()
+        while True:
+            try:
+                pending = self._tasks.get(timeout=_CHECK_S)
+            except queue.Empty:
+                self._start_early()
+                continue
+            if pending is None:
+                break
+            if pending.future.set_running_or_notify_cancel():
+                try:
+                    answer = self._run_in_process(pending)
+                except BaseException as error:  # noqa: BLE001 - raised again where the task is waited for
+                    pending.future.set_exception(error)
+                else:
+                    pending.future.set_result(answer)
+        self._drop()
+
+    # --- one task ---------------------------------------------------------------------------------------------------
+
+    def _run_in_process(self, pending: Pending[Any]) -> Any:
+        """Run a task; once more if the process dies, which need not be the task's fault: memory may have run short."""
+        for _attempt in range(2):
+            connection = self._connection if self._is_alive() else self._start()
+            if connection is None:
+                raise Unavailable("no decoder process could be started", cure="try again in a few seconds")
+            try:
+                succeeded, answer = self._exchange(connection, pending)
+            except (EOFError, OSError):
+                self._drop()
+                if self._closing or pending.stopped:
+                    raise _was_stopped() from None
+                continue
+            if succeeded:
+                return answer
+            raise answer
+        raise UnreadableUpload(
+            "the file stopped the decoder process, twice",
+            field="file",
+            cure="send the frame as the camera wrote it; if it is, report it as a defect",
+        )
+
+    def _exchange(self, connection: Connection, pending: Pending[Any]) -> tuple[bool, Any]:
+        with self._lock:
+            if self._closing or pending.stopped:
+                raise _was_stopped()
+            self._current = pending
+        try:
+            for number, step in enumerate(pending.steps, 1):
+                argument = self._wait_for(step) if isinstance(step, Future) else step
+                connection.send((STEPS[type(argument)], argument, number == len(pending.steps)))
+            if connection.poll(pending.timeout_s):
+                answer: tuple[bool, Any] = connection.recv()
+                return answer
+        finally:
+            with self._lock:
+                self._current = None
+        self._drop()
+        raise UnreadableUpload(
+            "decoding took too long and was stopped",
+            field="file",
+            limit=f"{pending.timeout_s:g} s a file",
+            cure="send the frame as the camera wrote it, or a shorter recording; if it is, report it as a defect",
+        )
+
+    def _wait_for(self, argument: Future[Any]) -> Any:
+        try:
+            return argument.result(self._limits.timeout_s)
+        except (CancelledError, FutureTimeout) as error:
+            self._drop()  # it is in the middle of the task
+            raise _was_stopped() from error
+
+    # --- the process ------------------------------------------------------------------------------------------------
+
+    def _is_alive(self) -> bool:
+        return self._process is not None and self._process.is_alive()
+
+    def _start_early(self) -> None:
+        """Have a process ready before a task needs it; if none starts, try again every `_RETRY_S`."""
+        if self._closing or self._is_alive():
+            return
+        if self._failed_at is None or time.monotonic() - self._failed_at > _RETRY_S:
+            self._start()
+
+    def _start(self) -> Connection | None:
+        """Start a process and wait until it is warm."""
+        self._drop()
+        ours, theirs = _PROCESSES.Pipe()
+        process = _PROCESSES.Process(target=serve_tasks, args=(theirs, self._decode, self._limits), daemon=True)
+        try:
+            process.start()
+            theirs.close()
+            with self._lock:
+                self._process, self._connection = process, ours
+                if self._closing:
+                    process.kill()
+            if ours.poll(_START_S) and ours.recv() == READY:
+                self._failed_at = None
+                return ours
+        except (EOFError, OSError):
+            pass
+        self._drop()
+        self._failed_at = time.monotonic()
+        if not self._closing:
+            _LOG.error("a decoder process did not start")
+        return None
+
+    def _drop(self) -> None:
+        """Kill the process, if there is one."""
+        with self._lock:
+            process, connection = self._process, self._connection
+            self._process = self._connection = None
+        if connection is not None:
+            connection.close()
+        if process is not None:
+            process.kill()
+            process.join()
+
+
+def _was_stopped() -> Unavailable:
+    return Unavailable("the decoder process was stopped", cure="try again in a few seconds")

@@ -1,0 +1,66 @@
+"""The functions that decoder processes call: one line for each step of each task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from app.jobs.calibration_tasks import calibrate_photos
+from app.jobs.decoder_process import ProcessIdTask, process_id
+from app.jobs.frame_tasks import annotate_frame, find_markers, load_frame
+from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
+from app.jobs.plan_tasks import make_plan, summarize_road, write_file_of_plan
+from app.jobs.survey_tasks import read_survey_file
+from app.jobs.trace_tasks import decode_recording
+from app.services.decoder_processes import Task
+from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameSearch
+from app.services.decodes.packet_task import DriveTask, LaneTask, OverlayTask
+from app.services.decodes.trace_task import TraceTask
+from app.services.fleet.calibrations import CalibrationTask
+from app.services.plans.tasks import MakePlanTask, SummarizeRoadTask, WritePlanFileTask
+from app.services.surveys.imports import SurveyTask
+
+ResultT = TypeVar("ResultT")
+StepFunction = Callable[[Any, Any], Any]
+"""Called with the step's argument and the result of the step before it; None for the first."""
+
+STEPS: dict[type, StepFunction] = {
+    FramePicture: load_frame,
+    FrameSearch: find_markers,
+    AnnotationTask: annotate_frame,
+    TraceTask: decode_recording,
+    DriveTask: read_drive,
+    LaneTask: estimate_lane,
+    OverlayTask: draw_overlay,
+    SurveyTask: read_survey_file,
+    CalibrationTask: calibrate_photos,
+    SummarizeRoadTask: summarize_road,
+    MakePlanTask: make_plan,
+    WritePlanFileTask: write_file_of_plan,
+    ProcessIdTask: process_id,
+}
+
+
+class Finished(Generic[ResultT]):
+    """A task that is done."""
+
+    def __init__(self, result: ResultT) -> None:
+        self._result = result
+
+    def result(self) -> ResultT:
+        """The result."""
+        return self._result
+
+    def cancel(self) -> None:
+        """Nothing is left to stop."""
+
+
+class SameProcess:
+    """Carries tasks out in this process: an operator's own files need no process with limits."""
+
+    def submit(self, task: Task[ResultT], *, wait_s: float = 0.0) -> Finished[ResultT]:
+        """Carry a task out."""
+        result: Any = None
+        for argument in task.steps():
+            result = STEPS[type(argument)](argument, result)
+        return Finished(result)

@@ -1,0 +1,221 @@
+"""Verified markers to the lane's reference path."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from app.errors import InvalidParameter
+from app.geodesy import check_lon_lat
+from app.lanes.driven_line import TRUSTED_TRACK_M, DrivenLine, driven_line_from_track
+from app.lanes.initial_line import fit_initial_line, largest_group
+from app.lanes.lane_fit import LaneFit
+from app.lanes.lane_path import path_from_fit, path_from_splines, refused_path
+from app.lanes.local_plane import plane_from_wgs84
+from app.lanes.observations import LaneObservations, distinct_places, observations_from_markers
+from app.lanes.paper_spline import boundaries_by_splines
+from app.lanes.smooth_line import SmoothLine
+from app.lanes.types import (
+    LEFT,
+    RIGHT,
+    UNKNOWN,
+    Bools,
+    Ints,
+    Lane,
+    LaneMarkers,
+    LaneRules,
+    LeftOut,
+    LeftOutReason,
+    Notes,
+)
+from app.sensors.pose_track import PoseTrack
+
+__all__ = ["Lane", "LaneMarkers", "LaneRules", "LeftOut", "LeftOutReason", "fit_lane", "preview_m"]
+
+_BEYOND_TRACK_M = 15.0  # [m] further past its ends a track is not used; source: by hand, sensitivity 1.00, 1.00
+_PRECISE_TRACK_M = (
+    0.1  # [m] noise of a track that shows sides by itself; source: by hand: between RTK and other receivers
+)
+_MAX_BESIDE_TRACK_M = 4.0  # [m] such sides are of markers at most a lane's width away; source: by hand
+_MIN_SIDE_CHANGES = (
+    0.35  # share of markers after one of the other side, below it they are one row; source: by hand: of pairs
+)
+# half or more change
+
+
+def fit_lane(
+    markers: LaneMarkers,
+    track: PoseTrack | None = None,
+    *,
+    method: Literal["waymark", "paper"] = "waymark",
+    rules: LaneRules | None = None,
+) -> Lane:
+    """Fit the reference path of a lane to its markers.
+
+    Parameters
+    ----------
+    markers : LaneMarkers
+        Shape (K,), in any order, with or without sides.
+    track : PoseTrack, optional
+        The vehicle's own positions: give the direction of travel and the approximate shape of the lane, not its place.
+    method : {'waymark', 'paper'}
+        'paper' is section 2.2 of the CERPM paper: a cubic spline a side, and midpoints.
+    rules : LaneRules, optional
+
+    Returns
+    -------
+    Lane
+        With a `refusal` and without stations if the lane cannot be determined.
+
+    Raises
+    ------
+    InvalidParameter
+        The method is unknown.
+    """
+    if method not in ("waymark", "paper"):
+        raise InvalidParameter(f"method is {method}", field="method", limit="waymark or paper")
+    rules = rules or LaneRules()
+    notes = Notes()
+    observations = observations_from_markers(markers, rules, notes)
+    taken = distinct_places(observations.point_m)
+    if taken.sum() < 2:
+        return refused_path(observations, notes, "there are no two markers in different places", method)
+    drive = _driven_line(track, observations, notes)
+    line, taken = _initial_line(observations, taken, drive, rules, notes)
+    if method == "paper":
+        return _fit_by_splines(observations, taken, line, notes)
+    return _fit_by_least_squares(observations, taken, line, drive, rules, notes)
+
+
+def preview_m(lane: Lane, lon_deg: float, lat_deg: float) -> float:
+    """Length of the path ahead of a place beside it; 0 past its end or without a path. [m]"""
+    check_lon_lat(lon_deg, lat_deg)
+    if not len(lane.station_m):
+        return 0.0
+    origin = (lane.origin_lon_deg, lane.origin_lat_deg)
+    here = plane_from_wgs84(np.array([lon_deg]), np.array([lat_deg]), origin)
+    nearest = int(np.argmin(np.hypot(*(lane.position_enu_m - here).T)))
+    return float(lane.station_m[-1] - lane.station_m[nearest])
+
+
+# --- initial line -------------------------------------------------------------------------------------------------
+
+
+def _driven_line(track: PoseTrack | None, observations: LaneObservations, notes: Notes) -> DrivenLine | None:
+    """The track near the markers; a warning if it cannot be used."""
+    if track is None:
+        return None
+    drive = driven_line_from_track(track, observations.origin, observations.point_m)
+    if drive is None:
+        notes.warn("the vehicle's track is not beside the markers or does not move: it is not used")
+    return drive
+
+
+def _initial_line(
+    observations: LaneObservations, taken: Bools, drive: DrivenLine | None, rules: LaneRules, notes: Notes
+) -> tuple[SmoothLine | None, Bools]:
+    """A line near the lane's centre in the direction of travel, and the markers that belong to it."""
+    half = rules.usual_width_m / 2
+    side = observations.side
+    if drive is not None:
+        station, left = drive.line.project_markers(observations.point_m, side, half)
+        beyond = (station < -_BEYOND_TRACK_M) | (station > drive.line.length_m + _BEYOND_TRACK_M)
+        if not (beyond & taken).any():
+            return drive.line, taken
+        if (side[taken] == UNKNOWN).all() and drive.sigma_m < _PRECISE_TRACK_M:
+            beside = ~beyond & (np.abs(left) < _MAX_BESIDE_TRACK_M)
+            side = np.where(beside, np.where(left > 0, LEFT, RIGHT), UNKNOWN)
+    belongs = _connected_markers(observations, taken, rules, notes)
+    if belongs.sum() < 2:
+        return None, belongs
+    line = fit_initial_line(observations.point_m[belongs], side[belongs], half)
+    if line is not None and drive is not None:
+        at, _ = line.project(drive.line.points_m)
+        if np.sum(np.diff(at)) < 0:
+            line = SmoothLine(line.points_m[::-1])
+    return line, belongs
+
+
+def _connected_markers(observations: LaneObservations, taken: Bools, rules: LaneRules, notes: Notes) -> Bools:
+    """The markers of the largest group; the others are left out."""
+    belongs = np.zeros(len(taken), bool)
+    belongs[np.flatnonzero(taken)[largest_group(observations.point_m[taken], rules.bridge_m)]] = True
+    for k in np.flatnonzero(taken & ~belongs):
+        row, number = int(observations.row[k]), int(observations.number[k])
+        notes.left_out.append(LeftOut(row, number, LeftOutReason.APART, float("nan")))
+    return belongs
+
+
+# --- methods ------------------------------------------------------------------------------------------------------
+
+
+def _fit_by_least_squares(
+    observations: LaneObservations,
+    taken: Bools,
+    line: SmoothLine | None,
+    drive: DrivenLine | None,
+    rules: LaneRules,
+    notes: Notes,
+) -> Lane:
+    """Waymark's method, with all reasons to refuse a lane."""
+
+    def refused(reason: str) -> Lane:
+        return refused_path(observations, notes, reason, "waymark")
+
+    if line is None:
+        return refused("the markers do not lie along a lane, or are one row without a known side")
+    fit = LaneFit(line, observations, taken, drive, rules, notes)
+    try:
+        found = fit.run()
+    except np.linalg.LinAlgError:  # weights too different for float64
+        return refused("the accuracies of markers and track are too different to be combined")
+    for k, (reason, off) in fit.left_out.items():
+        notes.left_out.append(LeftOut(int(observations.row[k]), int(observations.number[k]), reason, off))
+    if not found:
+        return refused(f"the markers share no line: {len(fit.left_out)} of them lie off it")
+    if _is_row_of_unknown_side(fit, observations, drive):
+        return refused("one row of markers, and nothing shows on which side of the lane it is")
+    _warn_of_guessed_sides(fit, observations, drive, notes)
+    lane = path_from_fit(fit, observations, rules, notes)
+    if not len(lane.sigma_m) or float(np.median(lane.sigma_m)) > rules.max_median_sigma_m:
+        return refused("the markers are too few or too inaccurate to show where the lane runs")
+    return lane
+
+
+def _fit_by_splines(observations: LaneObservations, taken: Bools, line: SmoothLine | None, notes: Notes) -> Lane:
+    """Section 2.2 of the CERPM paper, which gives no accuracy."""
+    bounds = boundaries_by_splines(observations.point_m, observations.side, taken, line) if line is not None else None
+    if bounds is None:
+        return refused_path(observations, notes, "a side of the lane has no two markers", "paper")
+    return path_from_splines(bounds, observations, taken, notes)
+
+
+def _is_row_of_unknown_side(fit: LaneFit, observations: LaneObservations, drive: DrivenLine | None) -> bool:
+    """Whether the markers are one row, and neither a message nor an accurate track shows its side."""
+    accurate = drive is not None and drive.accuracy_m < TRUSTED_TRACK_M
+    if accurate or bool((observations.side[fit.used] != UNKNOWN).any()):
+        return False
+    return len(_sides_found(fit)) == 1 or _is_single_row(fit)
+
+
+def _is_single_row(fit: LaneFit) -> bool:
+    """Whether sides hardly ever change from marker to marker: a row that an inaccurate track cuts into two sides."""
+    side = fit.side[fit.used][np.argsort(fit.station_m[fit.used], kind="stable")]
+    return float(np.mean(side[1:] != side[:-1])) < _MIN_SIDE_CHANGES
+
+
+def _warn_of_guessed_sides(
+    fit: LaneFit, observations: LaneObservations, drive: DrivenLine | None, notes: Notes
+) -> None:
+    if len(_sides_found(fit)) == 1:
+        notes.warn("only one side of the lane was received: the path is half the usual width beside it")
+    if drive is None and not (observations.side[fit.used] != UNKNOWN).any():
+        notes.warn(
+            "neither a track nor a marker shows a side: sides are guessed, and the direction of travel may be the "
+            "opposite one"
+        )
+
+
+def _sides_found(fit: LaneFit) -> Ints:
+    return np.unique(fit.side[fit.used])

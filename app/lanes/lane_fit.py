@@ -1,0 +1,280 @@
+"""The lane along an initial line: sides of markers, least squares, and outliers."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from app.lanes.boundary_sides import SideAssignment, assign_sides
+from app.lanes.driven_line import TRUSTED_TRACK_M, DrivenLine
+from app.lanes.even_spacing import NO_KNOWN_LENGTHS, find_known_lengths
+from app.lanes.least_squares import (
+    OFFSET_MODELS,
+    Hyperparameters,
+    LaneProblem,
+    LaneSolution,
+    Measurements,
+    OffsetModel,
+    choose_hyperparameters,
+)
+from app.lanes.marker_pairs import find_pairs
+from app.lanes.observations import LaneObservations
+from app.lanes.smooth_line import SmoothLine, lengths_along
+from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints, LaneRules, LeftOutReason, Notes
+
+_MAX_ROUNDS = 8  # of solving beside a line and moving the line; source: by hand, sensitivity 1.23, 0.93
+_CONVERGED_M = 0.1  # [m] a line that moves less is the centre; source: by hand, sensitivity 1.00, 1.18
+_NEARLY_CONVERGED_M = 0.5  # [m] a line that moved less shows no new outliers; source: by hand, sensitivity 1.00, 1.00
+_MAX_REJECTIONS = 12  # of outliers beside one line; source: by hand, sensitivity 1.00, 1.00
+_MAX_GROWTH = 2.0  # of the length of the initial line; more is a line that winds between outliers; source: by hand
+_REJECTION_STRETCH_M = 60.0  # [m] within it one outlier at a time; source: by hand, sensitivity 1.00, 1.00
+_OPPOSITE_SHARE = (
+    0.2  # of sides that agree with the track, below which they are of the other direction; source: by hand
+)
+_MIN_SIDED_MARKERS = 4  # to compare sides with the track; source: by hand
+_SIDE_OFFSETS_M = (0.5, 4.0)  # [m] nearest and farthest offset at which a side is clear; source: by hand
+_PRECISE_TRACK_M = 0.06  # [m] noise of an RTK track: three times `driven_line._MIN_SIGMA_M`
+_PRECISE_WANDER, _COARSE_WANDER = 0.06, 0.2  # [m/sqrt(m)] of the centre; source: by hand, sensitivity 1.00, 1.00
+_UNKNOWN_ACCURACY_M = 3.0  # [m] assumed where a receiver reports none; source: by hand: a receiver without corrections
+_SINGLE_SIDE_DRIFTS = (0.05, 0.15, 0.4)  # [m/sqrt(m)] source: the receivers of `least_squares.OFFSET_MODELS`
+_FIX_SIGMAS, _MIN_FIX_REACH_M = (
+    8.0,
+    6.0,
+)  # [1, m] fixes further from the track's median offset are not used; source: by hand
+_UNKNOWN_WIDTH = {"width_sd_m": 0.4, "width_length_m": 400.0}  # of a lane with one known side; source: by hand
+
+
+class FixOffsets(NamedTuple):
+    """Fixes beside a line, each shape (F,) or (F, 2); empty without a track. [m]"""
+
+    station_m: Floats
+    left_m: Floats
+    position_m: Floats
+    sigma_m: Floats
+
+
+NO_FIXES = FixOffsets(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty(0))
+
+
+class LaneFit:
+    """A lane while it is fitted: a line, the measurements beside it, and the solution beside it.
+
+    Parameters
+    ----------
+    line : SmoothLine
+        Near the lane's centre, in the direction of travel.
+    observations : LaneObservations
+    taken : ndarray of bool, shape (M,)
+        Markers that may be used.
+    drive : DrivenLine or None
+    rules : LaneRules
+    notes : Notes
+
+    Attributes
+    ----------
+    used : ndarray of bool, shape (M,)
+        Markers that are used.
+    side : ndarray of int, shape (M,)
+    residual_m, station_m : ndarray, shape (M,)
+        Distance of each marker from its boundary, and its station. [m]
+    left_out : dict
+        Row of the observations to reason and distance.
+    """
+
+    problem: LaneProblem
+    solution: LaneSolution
+
+    def __init__(
+        self,
+        line: SmoothLine,
+        observations: LaneObservations,
+        taken: Bools,
+        drive: DrivenLine | None,
+        rules: LaneRules,
+        notes: Notes,
+    ) -> None:
+        self.line, self._observations, self._drive, self._rules = line, observations, drive, rules
+        half = rules.usual_width_m / 2
+        self.station_m, self._left_m = line.project_markers(observations.point_m, observations.side, half)
+        named = _sides_along_track(self._left_m, observations, taken, drive, notes)
+        if named is not observations.side:
+            self.station_m, self._left_m = line.project_markers(observations.point_m, named, half)
+        sides = _assign_taken_sides(self.station_m, self._left_m, named, taken, drive)
+        self.side = sides.side
+        self.used = taken & (sides.side != UNKNOWN)
+        self.left_out = {
+            int(k): (
+                LeftOutReason.WRONG_SIDE if sides.contradicts[k] else LeftOutReason.OFF_THE_LINE,
+                float(sides.off_m[k]),
+            )
+            for k in np.flatnonzero(taken & ~self.used)
+        }
+        self.residual_m = np.full(len(taken), np.nan)
+        self._hyperparameters = _initial_hyperparameters(sides, self.used, rules)
+        self._fixes = _fixes_beside(line, drive)
+
+    def run(self) -> bool:
+        """Solve beside the line, move the line to the solution, and repeat. Returns whether a lane was found."""
+        longest_m = _MAX_GROWTH * (self.line.length_m + 2 * self._rules.reach_m) + 2 * self._rules.bridge_m
+        moved = np.inf
+        for turn in range(_MAX_ROUNDS):
+            reach = np.ptp(self.station_m[self.used]) if self.used.any() else 0.0
+            if self.used.sum() < 2 or self.outlier_ratio > self._rules.max_outlier_ratio or not reach < longest_m:
+                return False
+            self._solve(turn, nearly_converged=moved < _NEARLY_CONVERGED_M)
+            moved = float(np.abs(self.solution.centre_m).max())
+            if turn and moved < _CONVERGED_M:
+                break
+            if turn < _MAX_ROUNDS - 1:
+                self._move_line()
+        return self.outlier_ratio <= self._rules.max_outlier_ratio
+
+    @property
+    def outlier_ratio(self) -> float:
+        """Share of the markers that lie off the line."""
+        return len(self.left_out) / max(len(self.left_out) + int(self.used.sum()), 1)
+
+    def _solve(self, turn: int, *, nearly_converged: bool) -> None:
+        """Solve beside one line, leaving out outliers until there are none; not beside a nearly converged line."""
+        offset_models = _offset_models(self.side[self.used], self._drive)
+        choosing = turn < (1 if self._drive is not None else 2)
+        for left in range(_MAX_REJECTIONS, -1, -1):
+            self.problem = self._problem(turn)
+            if choosing:
+                self._hyperparameters = choose_hyperparameters(self.problem, self._hyperparameters, offset_models)
+            self.solution = self.problem.solve(self._hyperparameters)
+            residual = self.solution.residuals()
+            if nearly_converged or not left:
+                break
+            if not self._drop_outliers(residual, self.solution.residual_variance_shares()):
+                break
+            choosing = True
+        self.residual_m[:] = np.nan
+        self.residual_m[self.used] = residual
+
+    def _problem(self, turn: int) -> LaneProblem:
+        """The problem of all used markers and of the fixes beside them."""
+        start, end = float(self.station_m[self.used].min()), float(self.station_m[self.used].max())
+        fixes = self._fixes
+        if len(fixes.station_m):
+            start = min(start, max(start - self._rules.reach_m, float(fixes.station_m.min())))
+            end = max(end, min(end + self._rules.reach_m, float(fixes.station_m.max())))
+        inside = (fixes.station_m >= start) & (fixes.station_m <= end)
+        known_lengths = NO_KNOWN_LENGTHS
+        if self._drive is None and turn:  # lengths along an initial line are too inaccurate
+            known_lengths = find_known_lengths(self.line, self.station_m, self.used, self._hyperparameters.width_m)
+        used_side = np.where(self.used, self.side, UNKNOWN)
+        pair_station, pair_slope, pair_sigma = find_pairs(
+            self.station_m, self._left_m, used_side, self._observations.sigma_m
+        )
+        measured = Measurements(
+            station_m=self.station_m[self.used],
+            left_m=self._left_m[self.used],
+            sigma_m=self._observations.sigma_m[self.used],
+            sign=np.where(self.side == LEFT, 1.0, -1.0)[self.used],
+            fix_station_m=fixes.station_m[inside],
+            fix_left_m=fixes.left_m[inside],
+            fix_sigma_m=fixes.sigma_m[inside],
+            pair_station_m=pair_station,
+            pair_slope=pair_slope,
+            pair_sigma=pair_sigma,
+            known_lengths=known_lengths,
+        )
+        return LaneProblem(self.line, measured, start, end)
+
+    def _drop_outliers(self, residual_m: Floats, share: Floats) -> bool:
+        """Leave out the worst of the markers that are far from where the others predict them; whether any was."""
+        rows = np.flatnonzero(self.used)
+        z = np.abs(residual_m) / (self._observations.sigma_m[rows] * np.sqrt(share))
+        off = residual_m / share
+        outlier = (z > self._rules.off_the_line_z) & (np.abs(off) > self._rules.off_the_line_m)
+        if len(rows) <= 2 or not outlier.any():
+            return False
+        for k in _worst_apart(z * outlier, self.station_m[rows])[: len(rows) - 2]:
+            self.used[rows[k]] = False
+            self.left_out[int(rows[k])] = (LeftOutReason.OFF_THE_LINE, float(off[k]))
+        return True
+
+    def _move_line(self) -> None:
+        """Replace the line by the solution, and measure beside it."""
+        knots = self.problem.station_m
+        points = self.line.offset_points(knots, self.solution.centre_m)
+        along = lengths_along(points)
+
+        def moved(station_m: Floats) -> Floats:
+            return np.interp(station_m, knots, along) + station_m - np.clip(station_m, knots[0], knots[-1])
+
+        self.line = SmoothLine(points)
+        self.station_m, self._left_m = self.line.refine_stations(self._observations.point_m, moved(self.station_m))
+        position = self._fixes.position_m
+        station, left = self.line.refine_stations(position, moved(self._fixes.station_m))
+        self._fixes = FixOffsets(station, left, position, self._fixes.sigma_m)
+
+
+def _sides_along_track(
+    left: Floats, observations: LaneObservations, taken: Bools, drive: DrivenLine | None, notes: Notes
+) -> Ints:
+    """Sides sent by the markers, exchanged where the track runs in the other direction of travel."""
+    named = observations.side
+    nearest, farthest = _SIDE_OFFSETS_M
+    clear = taken & (named != UNKNOWN) & (np.abs(left) > nearest) & (np.abs(left) < farthest)
+    if drive is None or clear.sum() < _MIN_SIDED_MARKERS:
+        return named
+    agreeing = np.mean((left[clear] > 0) == (named[clear] == LEFT))
+    if agreeing >= _OPPOSITE_SHARE:
+        return named
+    notes.warn("the sides sent by the markers are those of the other direction of travel: the path follows the track")
+    return np.where(named == LEFT, RIGHT, np.where(named == RIGHT, LEFT, UNKNOWN))
+
+
+def _assign_taken_sides(
+    station: Floats, left: Floats, named: Ints, taken: Bools, drive: DrivenLine | None
+) -> SideAssignment:
+    """Sides of the markers that may be used; UNKNOWN for the others."""
+    precise = drive is not None and drive.sigma_m < _PRECISE_TRACK_M
+    wander = _PRECISE_WANDER if precise else _COARSE_WANDER
+    found = assign_sides(station[taken], left[taken], named[taken], wander=wander, near_track=drive is not None)
+    side, off = np.zeros(len(station), np.int64), np.full(len(station), np.nan)
+    contradicts = np.zeros(len(station), bool)
+    side[taken], off[taken], contradicts[taken] = found.side, found.off_m, found.contradicts
+    return SideAssignment(side, off, contradicts, found.width_m)
+
+
+def _initial_hyperparameters(sides: SideAssignment, used: Bools, rules: LaneRules) -> Hyperparameters:
+    """Width of the lane as far as the sides show it."""
+    both = (sides.side[used] == LEFT).any() and (sides.side[used] == RIGHT).any()
+    if both:
+        return Hyperparameters(width_m=sides.width_m)
+    return Hyperparameters(width_m=rules.usual_width_m, **_UNKNOWN_WIDTH)
+
+
+def _offset_models(side: Ints, drive: DrivenLine | None) -> tuple[OffsetModel, ...]:
+    """Candidates for the vehicle's offset: a driver's wander, or a receiver's slow error."""
+    if drive is None:
+        return ()
+    single_side = (side == LEFT).all() or (side == RIGHT).all()
+    if single_side and not drive.accuracy_m < TRUSTED_TRACK_M:  # a common offset of the track would not show
+        slow = drive.accuracy_m if np.isfinite(drive.accuracy_m) else _UNKNOWN_ACCURACY_M
+        return tuple({"drift": value, "slow_m": slow} for value in _SINGLE_SIDE_DRIFTS)
+    return OFFSET_MODELS
+
+
+def _fixes_beside(line: SmoothLine, drive: DrivenLine | None) -> FixOffsets:
+    """Fixes beside a line, without those far from the others."""
+    if drive is None:
+        return NO_FIXES
+    station, left = line.project(drive.fix_m)
+    good = np.abs(left - np.median(left)) < max(_FIX_SIGMAS * drive.sigma_m, _MIN_FIX_REACH_M)
+    return FixOffsets(station[good], left[good], drive.fix_m[good], np.full(int(good.sum()), drive.sigma_m))
+
+
+def _worst_apart(z: Floats, station: Floats) -> list[int]:
+    """The largest outliers, no two of them near each other."""
+    chosen: list[int] = []
+    for k in np.argsort(-z):
+        if z[k] <= 0:
+            break
+        if all(abs(station[k] - station[other]) > _REJECTION_STRETCH_M for other in chosen):
+            chosen.append(int(k))
+    return chosen

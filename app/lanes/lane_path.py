@@ -1,0 +1,186 @@
+"""Results of a fit as a reference path: stations, boundaries, speed limits, accuracy."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import erf
+
+from app.lanes.lane_fit import LaneFit
+from app.lanes.local_plane import headings_deg, wgs84_from_plane
+from app.lanes.observations import LaneObservations
+from app.lanes.paper_spline import SplineBoundaries
+from app.lanes.smooth_line import SmoothLine, left_normals, lengths_along
+from app.lanes.types import UNKNOWN, Bools, Floats, Ints, Lane, LaneRules, Notes
+
+_MAX_WIDTH_SIGMA_M = (
+    0.3  # [m] a width that is less certain is not published; source: by hand: an eighth of narrow lanes
+)
+_MAX_BOUNDARY_SIGMA_M = 0.4  # [m] a boundary that is less certain is not published; source: by hand
+_SAME_STATION_M = (
+    3.0  # [m] speed limits closer along the path must agree; source: by hand: a quarter of the paper's 12.2 m
+)
+_MIN_OTHER_ROW = 3  # so many outliers, and
+_MIN_OTHER_ROW_SHARE = 0.08  # such a share of all markers may be a row that the path should follow; source: by hand
+_OTHER_ROW_SIGMA_M = 0.6  # [m] added then; source: by hand: the path's confidence falls below one half
+_MIN_SIGMA_M = 1e-6  # [m] keeps the confidence finite; source: below every survey, above rounding
+
+
+def path_from_fit(fit: LaneFit, observations: LaneObservations, rules: LaneRules, notes: Notes) -> Lane:
+    """The fit at stations of its path, from the first marker to the last and beyond while the path is accurate."""
+    problem, solution = fit.problem, fit.solution
+    knots_m = fit.line.offset_points(problem.station_m, solution.centre_m)
+    path = SmoothLine(knots_m)
+    along = lengths_along(knots_m)
+    along *= path.length_m / along[-1]
+    at = path.station_m
+    probes, *deviations = solution.sigmas()
+    probes = np.interp(probes, problem.station_m, along)
+    sigma, sigma_left, sigma_right, sigma_width = (np.interp(at, probes, values) for values in deviations)
+    width = np.interp(at, along, solution.width_m)
+    markers_at = np.interp(fit.station_m, problem.station_m, along)
+    inner = markers_at[fit.used]
+    keep = _accurate_stations(at, sigma, inner.min(), inner.max(), rules.max_end_sigma_m)
+    sigma = _sigma_with_other_row(sigma, fit, notes)
+    left, right = (
+        np.where(
+            (known < _MAX_BOUNDARY_SIGMA_M)[:, None],
+            path.points_m + sign * left_normals(path.tangent) * width[:, None] / 2,
+            np.nan,
+        )
+        for sign, known in ((1, sigma_left), (-1, sigma_right))
+    )
+    lon, lat = wgs84_from_plane(path.points_m, observations.origin)
+    limit = _speed_limits(at, inner, observations.speed_limit_km_h[fit.used], notes)
+    row_side, row_residual = _by_row(fit, observations)
+    if len(at[keep]) and float(np.max(sigma[keep])) > rules.max_end_sigma_m:
+        notes.warn(f"the path is inaccurate in places: up to {float(np.max(sigma[keep])):.2f} m")
+    return Lane(
+        origin_lon_deg=observations.origin[0],
+        origin_lat_deg=observations.origin[1],
+        station_m=at[keep] - at[keep][0],
+        position_enu_m=path.points_m[keep],
+        left_enu_m=left[keep],
+        right_enu_m=right[keep],
+        lon_deg=lon[keep],
+        lat_deg=lat[keep],
+        heading_deg=headings_deg(lon, lat)[keep],
+        curvature_1pm=path.curvature_1pm[keep],
+        width_m=np.where(sigma_width < _MAX_WIDTH_SIGMA_M, width, np.nan)[keep],
+        speed_limit_km_h=limit[keep],
+        sigma_m=sigma[keep],
+        confidence=erf(rules.tolerance_m / (np.sqrt(2) * np.maximum(sigma[keep], _MIN_SIGMA_M))),
+        side=row_side,
+        residual_m=row_residual,
+        left_out=tuple(notes.left_out),
+        localization_warnings=tuple(notes.localization_warnings),
+    )
+
+
+def path_from_splines(bounds: SplineBoundaries, observations: LaneObservations, taken: Bools, notes: Notes) -> Lane:
+    """Midpoints between the splines of both sides, without accuracy."""
+    left, right = bounds.left_m, bounds.right_m
+    middle = (left + right) / 2
+    moved = np.concatenate([[True], np.hypot(*np.diff(middle, axis=0).T) > 1e-6])
+    left, right, middle = left[moved], right[moved], middle[moved]
+    if len(middle) < 3:
+        return refused_path(observations, notes, "the markers have no length", "paper")
+    at = lengths_along(middle)
+    lon, lat = wgs84_from_plane(middle, observations.origin)
+    none = np.full(len(at), np.nan)
+    slope = np.gradient(middle, at, axis=0)
+    bend = np.gradient(slope, at, axis=0)
+    curvature = (slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]) / np.maximum(np.hypot(*slope.T), 1e-9) ** 3
+    markers_at = at[cKDTree(middle).query(observations.point_m)[1]]
+    known = observations.of_row >= 0
+    return Lane(
+        origin_lon_deg=observations.origin[0],
+        origin_lat_deg=observations.origin[1],
+        station_m=at,
+        position_enu_m=middle,
+        left_enu_m=left,
+        right_enu_m=right,
+        lon_deg=lon,
+        lat_deg=lat,
+        heading_deg=headings_deg(lon, lat),
+        curvature_1pm=curvature,
+        width_m=np.hypot(*(left - right).T),
+        speed_limit_km_h=_speed_limits(at, markers_at[taken], observations.speed_limit_km_h[taken], notes),
+        sigma_m=none,
+        confidence=none,
+        side=np.where(known, bounds.side[observations.of_row], UNKNOWN),
+        residual_m=np.full(len(known), np.nan),
+        left_out=tuple(notes.left_out),
+        localization_warnings=tuple(notes.localization_warnings),
+        method="paper",
+    )
+
+
+def refused_path(observations: LaneObservations, notes: Notes, reason: str, method: str) -> Lane:
+    """A lane without stations, with the reason."""
+    none, points = np.empty(0), np.empty((0, 2))
+    rows = len(observations.of_row)
+    return Lane(
+        origin_lon_deg=observations.origin[0],
+        origin_lat_deg=observations.origin[1],
+        station_m=none,
+        position_enu_m=points,
+        left_enu_m=points,
+        right_enu_m=points,
+        lon_deg=none,
+        lat_deg=none,
+        heading_deg=none,
+        curvature_1pm=none,
+        width_m=none,
+        speed_limit_km_h=none,
+        sigma_m=none,
+        confidence=none,
+        side=np.zeros(rows, np.int64),
+        residual_m=np.full(rows, np.nan),
+        left_out=tuple(notes.left_out),
+        localization_warnings=tuple(notes.localization_warnings),
+        refusal=reason,
+        method=method,
+    )
+
+
+def _accurate_stations(at: Floats, sigma: Floats, first: float, last: float, max_sigma_m: float) -> slice:
+    """Stations from the first to the last marker, and beyond while the standard deviation is small enough."""
+    bad = sigma > max_sigma_m
+    low = np.flatnonzero(bad & (at < first))
+    high = np.flatnonzero(bad & (at > last))
+    return slice(int(low[-1]) + 1 if len(low) else 0, int(high[0]) if len(high) else len(at))
+
+
+def _sigma_with_other_row(sigma: Floats, fit: LaneFit, notes: Notes) -> Floats:
+    """Standard deviations, larger where outliers may be a row of markers that the path should follow."""
+    if len(fit.left_out) < _MIN_OTHER_ROW or fit.outlier_ratio <= _MIN_OTHER_ROW_SHARE:
+        return sigma
+    out, count = len(fit.left_out), len(fit.left_out) + int(fit.used.sum())
+    notes.warn(f"{out} of {count} markers lie off the line: another lane's row, or a lane that merges or splits")
+    return np.hypot(sigma, _OTHER_ROW_SIGMA_M)
+
+
+def _speed_limits(at: Floats, station: Floats, limit: Floats, notes: Notes) -> Floats:
+    """Speed limit of the marker passed last; the lower one where two markers side by side differ."""
+    posted = np.isfinite(limit) & (limit > 0)
+    if not posted.any():
+        return np.full(len(at), np.nan)
+    order = np.argsort(station[posted], kind="stable")
+    place, value = station[posted][order], limit[posted][order]
+    side_by_side = np.diff(place) < _SAME_STATION_M
+    if (side_by_side & (np.diff(value) != 0)).any():
+        notes.warn("markers side by side have different speed limits: the lower one is used")
+        lower = np.minimum(value[1:], value[:-1])
+        value[1:] = np.where(side_by_side, lower, value[1:])
+        value[:-1] = np.where(side_by_side, lower, value[:-1])
+    return value[np.maximum(np.searchsorted(place, at, side="right") - 1, 0)]
+
+
+def _by_row(fit: LaneFit, observations: LaneObservations) -> tuple[Ints, Floats]:
+    """Side and residual of each row of the markers."""
+    known = observations.of_row >= 0
+    side, residual = np.zeros(len(known), np.int64), np.full(len(known), np.nan)
+    side[known] = np.where(fit.used, fit.side, UNKNOWN)[observations.of_row[known]]
+    residual[known] = np.where(fit.used, fit.residual_m, np.nan)[observations.of_row[known]]
+    return side, residual

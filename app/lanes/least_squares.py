@@ -1,0 +1,358 @@
+"""Centre, width and the vehicle's offset along a line, in one least-squares problem.
+
+At knots along a line near the lane's centre there are three unknown fields: how far the centre is left of the line (c),
+the lane's width (w), and how far the vehicle's track is left of the centre (v). A marker of the left boundary measures
+c + w / 2, one of the right boundary c - w / 2, a fix of the vehicle c + v. Between the measurements
+
+- the curvature of the centre changes as little as possible: third differences of the curve are small;
+- the width is an Ornstein-Uhlenbeck process about its mean: lanes change by decimetres where a line is painted again;
+- the vehicle's offset is Matern 3/2 noise for a driver, or a random walk for a receiver's slow error.
+
+The strength of each of these is chosen by the likelihood of the measurements (`choose_hyperparameters`).
+
+Without a track the third field sums up the length of the centre on stretches of known length (`even_spacing`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.lanes.banded_matrix import (
+    apply,
+    covariances,
+    difference_gram,
+    factor,
+    gather,
+    gram,
+    log_determinant,
+    solve,
+)
+from app.lanes.even_spacing import NO_KNOWN_LENGTHS, KnownLengths
+from app.lanes.smooth_line import SmoothLine, left_normals
+from app.lanes.types import Floats, Ints
+
+KNOT_M = 3.0  # [m] between knots; source: by hand, sensitivity 0.95, 1.02
+_MIN_KNOTS = 5  # source: third differences need four
+_PROBE_KNOTS = 2  # every so many knots the standard deviation is computed, between them interpolated; exact at 1
+_MEMORY_M = 256.0  # [m] measurements further away have no effect on a place; source: by hand, sensitivity 1.00, 1.00
+_BAND = 9  # source: a third difference spans four knots of three fields: 3 x 3
+_LENGTH_SUM_SIGMA_M = 1e-3  # [m] of one step of the summed length; source: a 30th of `even_spacing._LENGTH_SIGMA_M`
+_MIN_VARIANCE_SHARE = 1e-9  # source: keeps the division by 1 - h finite
+
+
+@dataclass(frozen=True, slots=True)
+class Hyperparameters:
+    """Strengths of the priors.
+
+    Attributes
+    ----------
+    bend : float
+        Standard deviation of the change of curvature over a metre. [1/(m^2 sqrt(m))]
+    wander_m, wander_length_m : float
+        Of the vehicle's offset: standard deviation, and correlation length. [m]
+    drift, slow_m : float
+        Of the receiver's slow error, which replaces the wander if not 0: growth [m/sqrt(m)], and size. [m]
+    width_m, width_sd_m, width_length_m : float
+        Of the lane's width: mean, standard deviation, correlation length. [m]
+    """
+
+    bend: float = 0.003  # source: middle of `_BENDS`
+    wander_m: float = 0.2  # source: drivers keep 0.18 m RMS (`simulation.radio.driving.Driver`)
+    wander_length_m: float = 30.0  # source: 2.5 s (`Driver.wander_time_s`) at 45 km/h
+    drift: float = 0.0
+    slow_m: float = 3.0  # source: by hand, sensitivity 1.00, 1.00
+    width_m: float = 3.3  # source: `LaneRules.usual_width_m`
+    width_sd_m: float = 0.25  # source: by hand, sensitivity 1.42, 0.96
+    width_length_m: float = 60.0  # source: by hand, sensitivity 1.03, 1.00
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
+    """Measurements at stations of a line.
+
+    Attributes
+    ----------
+    station_m, left_m, sigma_m, sign : ndarray, shape (M,)
+        Markers: station, left offset, standard deviation [m]; 1 on the left boundary, -1 on the right.
+    fix_station_m, fix_left_m, fix_sigma_m : ndarray, shape (F,)
+        Fixes of the vehicle. [m]
+    pair_station_m, pair_slope, pair_sigma : ndarray, shape (P,)
+        Slope of the centre against the line, from pairs of markers.
+    known_lengths : KnownLengths
+    """
+
+    station_m: Floats
+    left_m: Floats
+    sigma_m: Floats
+    sign: Floats
+    fix_station_m: Floats
+    fix_left_m: Floats
+    fix_sigma_m: Floats
+    pair_station_m: Floats
+    pair_slope: Floats
+    pair_sigma: Floats
+    known_lengths: KnownLengths = NO_KNOWN_LENGTHS
+
+
+class LaneProblem:
+    """The least-squares problem of measurements beside a line.
+
+    Parameters
+    ----------
+    line : SmoothLine
+    measured : Measurements
+    start_m, end_m : float
+        Stations between which the lane is estimated. [m]
+    """
+
+    def __init__(self, line: SmoothLine, measured: Measurements, start_m: float, end_m: float) -> None:
+        self.tracked = len(measured.fix_left_m) > 0
+        self.fields = 3 if self.tracked or len(measured.known_lengths.start_m) else 2
+        self.count = max(int(np.ceil((end_m - start_m) / KNOT_M)) + 1, _MIN_KNOTS)
+        self.knot_m = (end_m - start_m) / (self.count - 1)
+        self.start_m = start_m
+        self.size = self.fields * self.count
+        self.station_m: Floats = start_m + self.knot_m * np.arange(self.count, dtype=np.float64)
+        self.measured = measured
+        self.data: Floats = np.zeros((_BAND + 1, self.size))
+        self.right: Floats = np.zeros(self.size)
+        self.energy = 0.0
+        self.marker_index, self.marker_value = self._rows(measured.station_m, [1.0, None], measured.sign / 2)
+        self._add(self.marker_index, self.marker_value, measured.sigma_m, measured.left_m)
+        if self.tracked:
+            self._add_fixes()
+        self._add_pairs()
+        self._set_priors(line)
+        if self.fields == 3 and not self.tracked:
+            self._add_known_lengths(line)
+
+    def _rows(self, station_m: Floats, parts: list[float | None], varying: Floats | None = None) -> tuple[Ints, Floats]:
+        """Sparse rows for a linear combination of the fields at stations.
+
+        Parameters
+        ----------
+        station_m : ndarray, shape (R,)
+        parts : list of float or None
+            One coefficient a field; None for `varying`.
+        varying : ndarray, shape (R,), optional
+        """
+        place = np.clip((station_m - self.start_m) / self.knot_m, 0, self.count - 1 - 1e-9)
+        knot = place.astype(np.int64)
+        share = place - knot
+        index, value = [], []
+        for k, part in enumerate(parts):
+            scale = varying if part is None and varying is not None else np.full(len(place), part or 0.0)
+            index += [self.fields * knot + k, self.fields * (knot + 1) + k]
+            value += [scale * (1 - share), scale * share]
+        return np.stack(index, 1), np.stack(value, 1)
+
+    def _add(self, index: Ints, value: Floats, sigma: Floats, target: Floats) -> None:
+        """Add measurements to the normal equations."""
+        weight = sigma**-2.0
+        self.data += gram(index, value, weight, self.size, _BAND)
+        self.right += gather(index, value, weight * target, self.size)
+        self.energy += float(np.sum(weight * target**2))
+
+    def _add_fixes(self) -> None:
+        """A fix of the vehicle measures c + v."""
+        index, value = self._rows(self.measured.fix_station_m, [1.0, 0.0, 1.0])
+        index, value = index[:, [0, 1, 4, 5]], value[:, [0, 1, 4, 5]]
+        self._add(index, value, self.measured.fix_sigma_m, self.measured.fix_left_m)
+
+    def _add_pairs(self) -> None:
+        """A pair of markers measures the slope of c."""
+        place = (self.measured.pair_station_m - self.start_m) / self.knot_m
+        knot = np.clip(place.astype(np.int64), 0, self.count - 2)
+        index = self.fields * np.stack([knot, knot + 1], 1)
+        value = np.broadcast_to(np.array([-1.0, 1.0]) / self.knot_m, (len(knot), 2))
+        self._add(index, value, self.measured.pair_sigma, self.measured.pair_slope)
+
+    def _set_priors(self, line: SmoothLine) -> None:
+        """Third differences of the centre as a curve in the plane, and squared derivatives of the other fields."""
+        n, h = self.count, self.knot_m
+        point, tangent = line.points_at(self.station_m)
+        normal = left_normals(tangent)
+        third = np.array([-1.0, 3.0, -3.0, 1.0])
+        across = normal[1:-2] + normal[2:-1]
+        across /= np.maximum(np.hypot(*across.T), 1e-9)[:, None]
+        k = np.arange(n - 3)[:, None] + np.arange(4)
+        index = self.fields * k
+        value = third * np.einsum("rjx,rx->rj", normal[k], across)
+        target = -np.einsum("j,rjx,rx->r", third, point[k], across)
+        self.bend = gram(index, value, np.ones(n - 3), self.size, _BAND) / h**5
+        self.bend_right = gather(index, value, target, self.size) / h**5
+        self.bend_energy = float(np.sum(target**2)) / h**5
+        self.smooth = [[self._squared_derivative(order, k) for order in range(3)] for k in range(1, self.fields)]
+
+    def _add_known_lengths(self, line: SmoothLine) -> None:
+        """Stretches of known length: beside a line of curvature k the centre is shorter by the sum of c k ds.
+
+        The third field sums this up from the start of each stretch, so that the matrix stays banded.
+        """
+        e, h, n = self.measured.known_lengths, self.knot_m, self.count
+        first = np.clip(np.ceil((e.start_m - self.start_m) / h).astype(np.int64), 0, n - 1)
+        last = np.clip(np.floor((e.end_m - self.start_m) / h).astype(np.int64), 0, n - 1)
+        apart = last > first
+        first, last = first[apart], last[apart]
+        inside = np.zeros(n + 1, np.int64)
+        np.add.at(inside, first, 1)
+        np.add.at(inside, last, -1)
+        k = np.flatnonzero(np.cumsum(inside)[:-1] > 0)
+        bend = np.interp(self.station_m, line.station_m, line.curvature_1pm)
+        index = np.stack([3 * k, 3 * k + 2, 3 * k + 3, 3 * k + 5], 1)
+        ones = np.ones(len(k))
+        value = np.stack([h * bend[k] / 2, -ones, h * bend[k + 1] / 2, ones], 1)
+        # A stretch ends where the next begins: its last knot is the next one's first, so it ends one knot before.
+        closing = np.isin(k + 1, first)
+        exact = np.full(int((~closing).sum()), _LENGTH_SUM_SIGMA_M**-2.0)
+        self.data += gram(index[~closing], value[~closing], exact, self.size, _BAND)
+        self.data[0, 2::3] += 1e-6  # outside of all stretches the third field is 0
+        self.data[0, 3 * first + 2] += _LENGTH_SUM_SIGMA_M**-2.0
+        ends = np.where(np.isin(last, first), last - 1, last)
+        weight = e.sigma_m[apart] ** -2.0
+        self.data[0, 3 * ends + 2] += weight
+        self.right[3 * ends + 2] += weight * e.excess_m[apart]
+        self.energy += float(np.sum(weight * e.excess_m[apart] ** 2))
+
+    def _squared_derivative(self, order: int, field: int) -> Floats:
+        """Integral of the squared derivative of a field."""
+        own = difference_gram(order, self.count, order)
+        spread = np.zeros((_BAND + 1, self.size))
+        spread[: self.fields * order + 1 : self.fields, field :: self.fields] = own
+        return spread * self.knot_m ** (1 - 2 * order)
+
+    def matrix(self, s: Hyperparameters) -> tuple[Floats, Floats, float]:
+        """Normal matrix, right-hand side, and the sum of squares at zero."""
+        width = _ornstein_weights(s.width_sd_m, s.width_length_m)
+        total = self.data + self.bend / s.bend**2
+        total += width[0] * self.smooth[0][0] + width[1] * self.smooth[0][1]
+        right = self.right + self.bend_right / s.bend**2
+        mean_width = width[0] * self.smooth[0][0][0] * s.width_m
+        right = right + mean_width
+        energy = self.energy + self.bend_energy / s.bend**2 + float(np.sum(mean_width)) * s.width_m
+        if self.tracked:
+            for order, weight in enumerate(_offset_weights(s)):
+                if weight:
+                    total += weight * self.smooth[1][order]
+        return total, right, energy
+
+    def log_likelihood(self, s: Hyperparameters) -> float:
+        """Log likelihood of the measurements, without terms that do not depend on bend and vehicle offset."""
+        total, right, energy = self.matrix(s)
+        cholesky = factor(total)
+        x = solve(cholesky, right)
+        fit = energy - float(right @ x)
+        value = -0.5 * (fit + log_determinant(cholesky)) - (self.count - 3) * float(np.log(s.bend))
+        return value + (0.5 * self._offset_log_prior(_offset_weights(s)) if self.tracked else 0.0)
+
+    def _offset_log_prior(self, weights: list[float]) -> float:
+        """Log determinant of the prior precision of the vehicle's offset."""
+        own = sum(weight * self.smooth[1][order][:7:3, 2::3] for order, weight in enumerate(weights))
+        return log_determinant(factor(np.asarray(own)))
+
+    def solve(self, s: Hyperparameters) -> LaneSolution:
+        """Centre, width and offset, with their covariance."""
+        total, right, _ = self.matrix(s)
+        cholesky = factor(total)
+        return LaneSolution(self, cholesky, solve(cholesky, right))
+
+
+class LaneSolution:
+    """A solved problem."""
+
+    def __init__(self, problem: LaneProblem, cholesky: Floats, x: Floats) -> None:
+        self.problem, self._cholesky, self._x = problem, cholesky, x
+        self.centre_m = x[:: problem.fields]
+        self.width_m = x[1 :: problem.fields]
+
+    def residuals(self) -> Floats:
+        """Distance of each marker left of its boundary. [m]"""
+        p = self.problem
+        return p.measured.left_m - apply(p.marker_index, p.marker_value, self._x)
+
+    def residual_variance_shares(self) -> Floats:
+        """1 - h of each marker, where its leverage h is the share of its own measurement in the prediction.
+
+        Against the prediction of the other markers alone its residual is r / (1 - h), with the standard deviation
+        sigma / sqrt(1 - h).
+        """
+        p = self.problem
+        group, groups = _independent_groups(p.measured.station_m)
+        variance = covariances(self._cholesky, p.marker_index, p.marker_value, p.marker_value, group, p.size, groups)
+        return np.maximum(1 - variance / p.measured.sigma_m**2, _MIN_VARIANCE_SHARE)
+
+    def sigmas(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """Some stations, and standard deviations there of the centre, left boundary, right boundary and width. [m]"""
+        p = self.problem
+        knots = np.unique(np.append(np.arange(0, p.count, _PROBE_KNOTS), p.count - 1))
+        groups = min(len(knots), max(int(_MEMORY_M / (p.knot_m * _PROBE_KNOTS)), 1))
+        group = np.arange(len(knots)) % groups
+        right = np.zeros((p.size, 2 * groups))
+        right[p.fields * knots, group] = 1
+        right[p.fields * knots + 1, group + groups] = 1
+        solved = solve(self._cholesky, right)
+        cc = solved[p.fields * knots, group]
+        cw = solved[p.fields * knots + 1, group]
+        ww = solved[p.fields * knots + 1, group + groups]
+        left, right_side = (np.sqrt(np.maximum(cc + k * cw + ww / 4, 0)) for k in (1, -1))
+        return p.station_m[knots], np.sqrt(np.maximum(cc, 0)), left, right_side, np.sqrt(np.maximum(ww, 0))
+
+
+def _independent_groups(station_m: Floats) -> tuple[Ints, int]:
+    """The fewest groups of rows in which no two rows are within `_MEMORY_M`: group of each row, and their number."""
+    order = np.argsort(station_m, kind="stable")
+    ordered = station_m[order]
+    within = np.searchsorted(ordered, ordered + _MEMORY_M, side="left") - np.arange(len(ordered))
+    groups = int(within.max())
+    group = np.empty(len(ordered), np.int64)
+    group[order] = np.arange(len(ordered)) % groups
+    return group, groups
+
+
+def _ornstein_weights(sd: float, length: float) -> tuple[float, float]:
+    """Weights of the squared value and slope of an Ornstein-Uhlenbeck process: precision (k^2 + w^2) / (2 sd^2 k)."""
+    k = 1 / length
+    return k / (2 * sd**2), 1 / (2 * sd**2 * k)
+
+
+def _offset_weights(s: Hyperparameters) -> list[float]:
+    """Weights of the squared value, slope and second derivative of the vehicle's offset.
+
+    Matern 3/2 noise has the precision (k^2 + w^2)^2 / (4 sd^2 k^3), k = 1 / length.
+    """
+    if s.drift:
+        return [s.drift**2 / (4 * s.slow_m**4), s.drift**-2.0, 0.0]
+    k = 1 / s.wander_length_m
+    return [k / (4 * s.wander_m**2), 1 / (2 * k * s.wander_m**2), 1 / (4 * k**3 * s.wander_m**2)]
+
+
+OffsetModel = dict[str, float]
+OFFSET_MODELS: tuple[OffsetModel, ...] = (
+    {"wander_m": 0.2, "wander_length_m": 30.0}, {"wander_m": 0.2, "wander_length_m": 15.0},
+    {"wander_m": 0.5, "wander_length_m": 30.0}, {"drift": 0.05}, {"drift": 0.15}, {"drift": 0.4},
+)  # fmt: skip
+"""Candidates for the vehicle's offset: calm and lively drivers, receivers of 0.05 to 0.4 m/sqrt(m). Source: chosen by
+hand to span a driver's 0.18 m RMS and receivers of 0.5 to 4 m over 100 m; the likelihood decides for each drive."""
+_BENDS = (0.0005, 0.0015, 0.003, 0.006, 0.015)
+"""Candidates for `Hyperparameters.bend`. Source: by hand, factors of two to three apart; the likelihood decides for
+each drive. [1/(m^2 sqrt(m))]"""
+
+
+def choose_hyperparameters(
+    problem: LaneProblem, start: Hyperparameters, offset_models: tuple[OffsetModel, ...]
+) -> Hyperparameters:
+    """The most likely of the candidates: first for the vehicle's offset, then for the lane's bends."""
+    best = start
+    if problem.tracked and offset_models:
+        bases = [replace(start, drift=0.0) if "drift" not in model else start for model in offset_models]
+        best = _most_likely(problem, bases, offset_models)
+    return _most_likely(problem, [best] * len(_BENDS), tuple({"bend": value} for value in _BENDS))
+
+
+def _most_likely(
+    problem: LaneProblem, bases: list[Hyperparameters], changes: tuple[dict[str, float], ...]
+) -> Hyperparameters:
+    candidates = [replace(base, **change) for base, change in zip(bases, changes, strict=True)]
+    return max(candidates, key=problem.log_likelihood)

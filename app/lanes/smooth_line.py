@@ -1,0 +1,126 @@
+"""A smooth line in the plane, with positions along it (stations) and across it (left offsets)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from app.lanes.types import LEFT, RIGHT, Floats, Ints
+
+STEP_M = 1.0  # [m] between stations; source: the published path has a station each metre (docs/cerpms.md)
+_SEPARATE_LEG_M = 20.0  # [m] along the line between two legs; source: by hand, sensitivity 1.00, 1.00
+_MAX_NEWTON_STEPS = 4  # source: Newton's method converges quadratically; from 1 m it needs three steps to a nanometre
+_NEWTON_TOLERANCE_M = 1e-4  # [m] source: a 50th of the smallest survey error, `observations._MIN_SIGMA_M`
+_MAX_NEWTON_STEP_M = 5.0  # [m] source: by hand, a fifth of the tightest radius of 25 m
+_NEAREST_STATIONS = 24  # source: 24 m of one leg, so a second leg within about 12 m is among them
+
+
+def lengths_along(points_m: Floats) -> Floats:
+    """Length along a polyline up to each of its points, shape (N,). [m]"""
+    step = np.diff(points_m, axis=0)
+    return np.concatenate([np.zeros(1), np.cumsum(np.hypot(step[:, 0], step[:, 1]))])
+
+
+def left_normals(tangent: Floats) -> Floats:
+    """Unit vectors to the left of unit tangents, shape (N, 2)."""
+    return np.stack([-tangent[:, 1], tangent[:, 0]], 1)
+
+
+class SmoothLine:
+    """A cubic spline through ordered points, with a station each metre.
+
+    Parameters
+    ----------
+    points_m : ndarray, shape (N, 2)
+        At least two, no two neighbours alike. [m]
+    """
+
+    def __init__(self, points_m: Floats) -> None:
+        along = lengths_along(points_m)
+        if len(points_m) > 2:
+            spline = CubicSpline(along, points_m, axis=0, bc_type="natural")
+        else:
+            slope = (points_m[1] - points_m[0]) / along[1]
+            spline = CubicSpline(along, points_m, axis=0, bc_type=((1, slope), (1, slope)))
+        count = max(round(along[-1] / STEP_M), 2) + 1
+        knots = np.linspace(0.0, along[-1], count)
+        self.points_m: Floats = spline(knots)
+        self.station_m: Floats = lengths_along(self.points_m)
+        slope = spline(knots, 1)
+        self.tangent = slope / np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-9)[:, None]
+        bend = spline(knots, 2)
+        speed = np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-3)
+        self.curvature_1pm: Floats = (slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]) / speed**3
+        self._step_m = float(self.station_m[-1]) / (count - 1)
+
+    @property
+    def length_m(self) -> float:
+        """[m]"""
+        return float(self.station_m[-1])
+
+    def points_at(self, station_m: Floats) -> tuple[Floats, Floats]:
+        """Points and unit tangents at stations; straight beyond the ends. Shapes (N, 2). [m]"""
+        place = np.clip(station_m / self._step_m, 0, len(self.station_m) - 1 - 1e-9)
+        i = place.astype(np.int64)
+        u = (place - i)[:, None]
+        p, t = self.points_m, self.tangent
+        tangent = t[i] * (1 - u) + t[i + 1] * u
+        # cubic Hermite interpolation between stations
+        a, b, h = p[i], p[i + 1], self._step_m
+        point = (
+            a * ((1 + 2 * u) * (1 - u) ** 2) + b * (u * u * (3 - 2 * u))
+            + h * (t[i] * (u * (1 - u) ** 2) + t[i + 1] * (u * u * (u - 1)))
+        )  # fmt: skip
+        beyond = station_m - np.clip(station_m, 0, self.length_m)
+        return point + tangent * beyond[:, None], tangent
+
+    def offset_points(self, station_m: Floats, left_m: Floats) -> Floats:
+        """Points at offsets to the left of stations, shape (N, 2). [m]"""
+        point, tangent = self.points_at(station_m)
+        return point + left_normals(tangent) * left_m[:, None]
+
+    def refine_stations(self, points_m: Floats, station_m: Floats) -> tuple[Floats, Floats]:
+        """Station and left offset of points, by Newton's method from approximate stations. [m]"""
+        station = station_m.copy()
+        for _ in range(_MAX_NEWTON_STEPS):
+            point, tangent = self.points_at(station)
+            step = np.sum((points_m - point) * tangent, 1)
+            station = station + np.clip(step, -_MAX_NEWTON_STEP_M, _MAX_NEWTON_STEP_M)
+            if not len(step) or np.abs(step).max() < _NEWTON_TOLERANCE_M:
+                break
+        off = points_m - point
+        return station, tangent[:, 0] * off[:, 1] - tangent[:, 1] * off[:, 0]
+
+    def project(self, points_m: Floats) -> tuple[Floats, Floats]:
+        """Station and left offset of points, on the nearest leg of the line. [m]"""
+        _, index = cKDTree(self.points_m).query(points_m)
+        return self.refine_stations(points_m, self.station_m[index])
+
+    def project_markers(self, points_m: Floats, side: Ints, half_width_m: float) -> tuple[Floats, Floats]:
+        """Station and left offset of markers on the lane's boundaries. [m]
+
+        Where the line passes a marker twice, the leg is chosen whose offset is closest to half a lane width on the
+        marker's side.
+        """
+        tree = cKDTree(self.points_m)
+        near = min(_NEAREST_STATIONS, len(self.points_m))
+        far, index = (np.asarray(found) for found in tree.query(points_m, k=near))
+        first = index[:, :1]
+        other = np.abs(self.station_m[index] - self.station_m[first]) > _SEPARATE_LEG_M
+        other &= far < far[:, :1] + 3 * half_width_m
+        station, left = self.refine_stations(points_m, self.station_m[first[:, 0]])
+        rows = np.flatnonzero(other.any(1))
+        if len(rows):
+            second = index[rows, np.argmax(other[rows], 1)]
+            station_2, left_2 = self.refine_stations(points_m[rows], self.station_m[second])
+            errors = [_boundary_error(value, side[rows], half_width_m) for value in (left_2, left[rows])]
+            better = errors[0] < errors[1]
+            station[rows[better]], left[rows[better]] = station_2[better], left_2[better]
+        return station, left
+
+
+def _boundary_error(left_m: Floats, side: Ints, half_width_m: float) -> Floats:
+    """Distance of offsets from the boundary of the side, or from the nearer boundary where the side is unknown. [m]"""
+    to_left, to_right = np.abs(left_m - half_width_m), np.abs(left_m + half_width_m)
+    return np.where(side == LEFT, to_left, np.where(side == RIGHT, to_right, np.minimum(to_left, to_right)))

@@ -1,0 +1,238 @@
+"""Inputs and results of estimating a lane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from app.errors import InvalidParameter
+from app.markers.cerpm import LaneSide
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+UNKNOWN, LEFT, RIGHT = (int(side) for side in (LaneSide.UNKNOWN, LaneSide.LEFT, LaneSide.RIGHT))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaneMarkers:
+    """Verified markers of one lane, one row for each position that a marker number has sent.
+
+    Parameters
+    ----------
+    number : array_like of int, shape (K,)
+    lon_deg, lat_deg : array_like, shape (K,)
+        WGS 84 / ITRF; a row that is not a position on Earth is left out and reported. [deg]
+    side : array_like of int, shape (K,)
+        `LaneSide` values.
+    sigma_m : array_like, shape (K,)
+        Standard deviation of the survey on each axis; 0.02 m where it is not known. [m]
+    speed_limit_km_h : array_like, shape (K,)
+        NaN where none is posted. [km/h]
+
+    Raises
+    ------
+    InvalidParameter
+        Lengths differ, or a side is not a `LaneSide`.
+    """
+
+    number: Ints
+    lon_deg: Floats
+    lat_deg: Floats
+    side: Ints
+    sigma_m: Floats
+    speed_limit_km_h: Floats
+
+    def __post_init__(self) -> None:
+        lengths = set()
+        for name in self.__slots__:
+            kind = np.int64 if name in ("number", "side") else np.float64
+            try:
+                values = np.asarray(getattr(self, name))
+                if kind is np.int64 and values.size and not np.issubdtype(values.dtype, np.integer):
+                    raise TypeError("not whole numbers")
+                values = np.atleast_1d(values.astype(kind))
+            except (TypeError, ValueError) as error:
+                raise InvalidParameter(f"{name} of the markers is not numeric", field=f"markers.{name}") from error
+            lengths.add(values.shape)
+            object.__setattr__(self, name, values)
+        if len(lengths) != 1 or self.number.ndim != 1:
+            raise InvalidParameter("markers have one value of each kind per row", field="markers")
+        if ((self.side < UNKNOWN) | (self.side > RIGHT)).any():
+            raise InvalidParameter("a marker's side is not a known side", field="markers.side", limit="0, 1 or 2")
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+
+@dataclass(frozen=True, slots=True)
+class LaneRules:
+    """Limits of the lane estimate. All are checked to be positive and finite.
+
+    Attributes
+    ----------
+    usual_width_m : float
+        Lane width where only one side is known. [m]
+    off_the_line_m, off_the_line_z : float
+        A marker is left out if the line through its neighbours is at least this far away, both in metres and in
+        standard deviations. [m, 1]
+    same_place_m : float
+        Two positions of one marker number further apart than this are two places. [m]
+    reach_m : float
+        How far past the outermost markers the path follows the vehicle's track. [m]
+    max_end_sigma_m : float
+        Past the outermost markers, the path ends where its standard deviation exceeds this. [m]
+    bridge_m : float
+        Without a track, the longest stretch without a marker that the path bridges. [m]
+    max_median_sigma_m : float
+        The lane is refused if the median standard deviation of its stations exceeds this. [m]
+    max_outlier_ratio : float
+        The lane is refused if more than this share of the markers lies off the line.
+    tolerance_m : float
+        Confidence is the probability that the path is within this distance of the lane's centre. [m]
+    """
+
+    usual_width_m: float = 3.3  # [m] source: by hand, 11 ft; lanes are 9 to 12 ft wide (AASHTO Green Book, 4.3)
+    off_the_line_m: float = 0.6  # [m] source: by hand, sensitivity 1.00, 0.99
+    off_the_line_z: float = 5.0  # source: by hand, sensitivity 1.00, 0.99
+    same_place_m: float = 0.3  # [m] source: by hand, a survey of 0.1 m at three sigma
+    reach_m: float = 25.0  # [m] source: by hand, two spacings of the paper's 12.2 m
+    max_end_sigma_m: float = 0.5  # [m] source: by hand, sensitivity 1.00, 1.00
+    bridge_m: float = 150.0  # [m] source: by hand, sensitivity 1.00, 1.00
+    max_median_sigma_m: float = 1.0  # [m] source: by hand, sensitivity 1.00, 1.00
+    max_outlier_ratio: float = 0.25  # source: by hand, sensitivity 1.00, 1.00
+    tolerance_m: float = 0.25  # [m] source: the definition of confidence (docs/nomenclature.md)
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidParameter(f"{name} is {value}", field=f"rules.{name}", limit="positive and finite")
+
+
+class LeftOutReason(StrEnum):
+    """Why a marker was not used for the path."""
+
+    NOT_A_PLACE = "not_a_place"
+    """Its position is not finite or not on Earth."""
+    TWO_PLACES = "two_places"
+    """Its number was received with two positions."""
+    OFF_THE_LINE = "off_the_line"
+    """Its position is off the line of its neighbours: spoofed, moved or wrongly programmed."""
+    WRONG_SIDE = "wrong_side"
+    """Its position is on one boundary, its message names the other."""
+    APART = "apart"
+    """It is too far from the rest to belong to the same stretch of lane."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A marker that was left out.
+
+    Attributes
+    ----------
+    row : int
+        Row of `LaneMarkers`.
+    number : int
+    reason : LeftOutReason
+    off_m : float
+        Distance from the position that the other markers predict; NaN where there is no prediction. [m]
+    """
+
+    row: int
+    number: int
+    reason: LeftOutReason
+    off_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lane:
+    """The reference path of a lane, at stations in the direction of travel; without stations if it was refused.
+
+    Attributes
+    ----------
+    origin_lon_deg, origin_lat_deg : float
+        Origin of the local frames, on the ellipsoid. [deg]
+    station_m : ndarray, shape (S,)
+        Distance along the path. [m]
+    position_enu_m, left_enu_m, right_enu_m : ndarray, shape (S, 2)
+        Path and boundaries, east and north of the origin; boundaries are NaN where no marker determines
+        them. [m]
+    lon_deg, lat_deg : ndarray, shape (S,)
+        Of the path. [deg]
+    heading_deg : ndarray, shape (S,)
+        In the direction of travel, clockwise from true north there. [deg]
+    curvature_1pm : ndarray, shape (S,)
+        Positive to the left. [1/m]
+    width_m : ndarray, shape (S,)
+        NaN where only the usual width is known. [m]
+    speed_limit_km_h : ndarray, shape (S,)
+        Sent by the marker passed last; NaN where none is posted. [km/h]
+    sigma_m : ndarray, shape (S,)
+        Standard deviation of the path across its direction. [m]
+    confidence : ndarray, shape (S,)
+        Probability that the path is within `LaneRules.tolerance_m` of the centre: erf(tolerance / (sqrt(2) sigma)).
+    side : ndarray of int, shape (K,)
+        Boundary that each marker was assigned to; 0 for markers that were not used.
+    residual_m : ndarray, shape (K,)
+        Distance of each marker from its boundary, left positive; NaN for markers that were not used. [m]
+    left_out : tuple of LeftOut
+    localization_warnings : tuple of str
+        Why the path may be wrong or less accurate than usual, for people.
+    refusal : str or None
+        Why there is no path.
+    method : str
+    """
+
+    origin_lon_deg: float
+    origin_lat_deg: float
+    station_m: Floats
+    position_enu_m: Floats
+    left_enu_m: Floats
+    right_enu_m: Floats
+    lon_deg: Floats
+    lat_deg: Floats
+    heading_deg: Floats
+    curvature_1pm: Floats
+    width_m: Floats
+    speed_limit_km_h: Floats
+    sigma_m: Floats
+    confidence: Floats
+    side: Ints
+    residual_m: Floats
+    left_out: tuple[LeftOut, ...] = ()
+    localization_warnings: tuple[str, ...] = ()
+    refusal: str | None = None
+    method: str = "waymark"
+
+    @property
+    def east_m(self) -> Floats:
+        """East of the origin, shape (S,). [m]"""
+        return self.position_enu_m[:, 0]
+
+    @property
+    def north_m(self) -> Floats:
+        """North of the origin, shape (S,). [m]"""
+        return self.position_enu_m[:, 1]
+
+    @property
+    def down_m(self) -> Floats:
+        """Below the origin's plane: 0, the path is flat. Shape (S,). [m]"""
+        return np.zeros(len(self.station_m))
+
+
+@dataclass(slots=True)
+class Notes:
+    """Markers left out and warnings collected while a lane is estimated."""
+
+    left_out: list[LeftOut] = field(default_factory=list)
+    localization_warnings: list[str] = field(default_factory=list)
+
+    def warn(self, text: str) -> None:
+        """Add a warning, once."""
+        if text not in self.localization_warnings:
+            self.localization_warnings.append(text)

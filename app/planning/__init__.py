@@ -1,0 +1,1 @@
+"""Where markers go, whether a plan works, and what it costs."""

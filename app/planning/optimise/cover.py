@@ -1,0 +1,238 @@
+"""Exact solvers for places along one line: the cheapest chain with bounded gaps, the cheapest cover of all windows."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import Bounds, LinearConstraint, OptimizeResult, milp
+from scipy.sparse import csr_array
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+_SECTION_WINDOWS = 8.0
+"""Length of the sections that a long line is solved in, in windows; the first half of each is kept. Source: chosen by
+measurement: 3 km in windows of 100 m with 30 candidates each take 4 s in sections and cost 1.2 % more than the proved
+optimum, which takes 13 s; 10 km at once do not end."""
+_NODES = 5000  # nodes of branch and bound of one section, so that the same input gives the same result; source: by hand
+_GAP = 1e-6  # relative, below the price of one marker in a thousand; source: by hand
+_TOUCH_M = 1e-9  # [m] by which a window is closed at its end; source: rounding of chainages
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cover:
+    """Chosen candidates.
+
+    Attributes
+    ----------
+    chosen : ndarray of int, shape (K,)
+        Increasing.
+    cost : float
+    bound : float
+        No choice is cheaper than this.
+    """
+
+    chosen: Indices
+    cost: float
+    bound: float
+
+    @property
+    def is_optimal(self) -> bool:
+        """Whether the cost is proved to be the least."""
+        return self.cost <= self.bound * (1 + 2 * _GAP) + 1e-9
+
+
+def cheapest_chain(
+    chainage_m: Floats, cost: Floats, reach_m: Floats, *, first_before_m: float, last_after_m: float
+) -> Indices | None:
+    """The cheapest candidates of which each is within reach of the one before it.
+
+    Parameters
+    ----------
+    chainage_m : ndarray, shape (N,)
+        Increasing. [m]
+    cost : ndarray, shape (N,)
+        Not negative.
+    reach_m : ndarray, shape (N,)
+        Chainage up to which the next one must follow. [m]
+    first_before_m, last_after_m : float
+        Chainages that the first one is at or before, and the last one at or after. [m]
+
+    Returns
+    -------
+    ndarray of int, shape (K,), or None
+        Increasing; None where a gap has no candidates.
+
+    Notes
+    -----
+    A shortest path: candidates are visited in order, and a heap holds those before by the cost of the best chain that
+    ends in them. One that no longer reaches the visited candidate reaches none after it either and is dropped.
+    """
+    previous = np.full(len(cost), -1, dtype=np.intp)
+    heap: list[tuple[float, int]] = []
+    reach = reach_m.tolist()
+    totals = []
+    for j, (at, price) in enumerate(zip(chainage_m.tolist(), cost.tolist(), strict=True)):
+        while heap and reach[heap[0][1]] < at - _TOUCH_M:
+            heapq.heappop(heap)
+        if at <= first_before_m + _TOUCH_M:
+            total = price
+        elif heap:
+            total, previous[j] = heap[0][0] + price, heap[0][1]
+        else:
+            total = np.inf
+        totals.append(total)
+        if total < np.inf:
+            heapq.heappush(heap, (total, j))
+    last = np.flatnonzero(chainage_m >= last_after_m - _TOUCH_M)
+    if not len(last) or not np.isfinite(np.asarray(totals)[last]).any():
+        return None
+    chain = [int(last[np.argmin(np.asarray(totals)[last])])]
+    while previous[chain[-1]] >= 0:
+        chain.append(int(previous[chain[-1]]))
+    return np.array(chain[::-1], dtype=np.intp)
+
+
+def window_rows(chainage_m: Floats, window_m: float, length_m: float) -> tuple[Indices, Indices]:
+    """First candidate of each window that matters and the one after its last, each of shape (R,).
+
+    Every stretch of a window's length contains all candidates of one of these: the first stretch, and those that begin
+    just after a candidate. A line shorter than a window is one.
+    """
+    if length_m <= window_m:
+        return np.zeros(1, dtype=np.intp), np.array([len(chainage_m)])
+    starts = np.unique(chainage_m[chainage_m + window_m < length_m - _TOUCH_M])
+    first = np.searchsorted(chainage_m, starts, side="right")
+    last = np.searchsorted(chainage_m, starts + window_m + _TOUCH_M, side="right")
+    whole = np.searchsorted(chainage_m, window_m + _TOUCH_M, side="right")
+    return np.concatenate([[0], first]), np.concatenate([[whole], last])
+
+
+def least_gain(chainage_m: Floats, gain: Floats, window_m: float, length_m: float) -> float:
+    """Least sum of gains in any window."""
+    first, last = window_rows(chainage_m, window_m, length_m)
+    total = np.concatenate([[0.0], np.cumsum(gain)])
+    return float((total[last] - total[first]).min())
+
+
+def uncovered_m(chainage_m: Floats, gain: Floats, need: float, window_m: float, length_m: float) -> float | None:
+    """Where the first window begins in which even all candidates are not enough; None if there is none. [m]"""
+    first, last = window_rows(chainage_m, window_m, length_m)
+    total = np.concatenate([[0.0], np.cumsum(gain)])
+    missing = np.flatnonzero(total[last] - total[first] < need - 1e-9)
+    if not len(missing):
+        return None
+    return 0.0 if first[missing[0]] == 0 else float(chainage_m[first[missing[0]] - 1])
+
+
+def cheapest_cover(
+    chainage_m: Floats, cost: Floats, gain: Floats, *, need: float, window_m: float, length_m: float
+) -> Cover:
+    """The cheapest candidates whose gains add up to a need in every window of a line.
+
+    Parameters
+    ----------
+    chainage_m : ndarray, shape (N,)
+        Not decreasing. [m]
+    cost, gain : ndarray, shape (N,)
+        Not negative.
+    need : float
+    window_m, length_m : float
+        [m]
+
+    Returns
+    -------
+    Cover
+        Proved optimal by the chain where every candidate alone is enough, else by branch and bound on lines of up to
+        eight windows. Longer lines are solved in overlapping sections: the bound is then that of the relaxation, which
+        lies about a tenth below the least cost.
+
+    Raises
+    ------
+    ValueError
+        A window is not covered by all candidates together (see `uncovered_m`).
+    """
+    if uncovered_m(chainage_m, gain, need, window_m, length_m) is not None:
+        raise ValueError("a window has too few candidates")
+    if np.all(gain >= need):
+        chain = cheapest_chain(
+            chainage_m, cost, chainage_m + window_m,
+            first_before_m=min(window_m, length_m), last_after_m=max(length_m - window_m, 0.0),
+        )  # fmt: skip
+        assert chain is not None
+        total = float(cost[chain].sum())
+        return Cover(chain, total, total)
+    return cheapest_sums(chainage_m, cost, gain, need=need, window_m=window_m, length_m=length_m)
+
+
+def cheapest_sums(
+    chainage_m: Floats, cost: Floats, gain: Floats, *, need: float, window_m: float, length_m: float
+) -> Cover:
+    """`cheapest_cover` as an integer program."""
+    rows = window_rows(chainage_m, window_m, length_m)
+    gain = np.minimum(gain, need)
+    section_m = _SECTION_WINDOWS * window_m
+    if length_m <= section_m:
+        free = np.ones(len(cost), dtype=bool)
+        return _solve(cost, gain, rows, need, free, np.zeros(len(cost), dtype=bool))
+    chosen = np.zeros(len(cost), dtype=bool)
+    starts = np.where(rows[0] > 0, chainage_m[rows[0] - 1], 0.0)
+    kept_m = 0.0
+    while kept_m < length_m:
+        inside = (starts >= kept_m - window_m) & (starts <= kept_m + section_m - window_m)
+        free = (chainage_m > kept_m) & (chainage_m <= kept_m + section_m + _TOUCH_M) | (chainage_m <= 0) & (kept_m == 0)
+        part = _solve(cost, gain, (rows[0][inside], rows[1][inside]), need, free, chosen)
+        end_m = kept_m + (section_m if kept_m + section_m >= length_m else section_m / 2)
+        found = part.chosen[chainage_m[part.chosen] <= end_m + _TOUCH_M]
+        chosen[found] = True
+        kept_m = end_m
+    indices = np.flatnonzero(chosen)
+    relaxed = _program(cost, gain, rows, np.full(len(rows[0]), need), integral=False)
+    return Cover(indices, float(cost[indices].sum()), float(relaxed.fun))
+
+
+def _solve(
+    cost: Floats,
+    gain: Floats,
+    rows: tuple[Indices, Indices],
+    need: float,
+    free: npt.NDArray[np.bool_],
+    chosen: npt.NDArray[np.bool_],
+) -> Cover:
+    """The cheapest of the free candidates that complete, with those that are chosen already, all rows."""
+    index = np.flatnonzero(free)
+    before = np.concatenate([[0], np.cumsum(free)])
+    known = np.concatenate([[0.0], np.cumsum(np.where(chosen, gain, 0.0))])
+    missing = need - (known[rows[1]] - known[rows[0]])
+    open_rows = missing > 1e-9
+    own = before[rows[0][open_rows]], before[rows[1][open_rows]]
+    if not open_rows.any():
+        return Cover(np.empty(0, dtype=np.intp), 0.0, 0.0)
+    result = _program(cost[index], gain[index], own, missing[open_rows], integral=True)
+    if result.x is None:  # within the limit of nodes no choice was found: all that the relaxation uses are one
+        result = _program(cost[index], gain[index], own, missing[open_rows], integral=False)
+        picked = index[result.x > 1e-9]
+        return Cover(picked, float(cost[picked].sum()), float(result.fun))
+    picked = index[result.x > 0.5]
+    total = float(cost[picked].sum())
+    return Cover(picked, total, min(float(result.mip_dual_bound), total))
+
+
+def _program(
+    cost: Floats, gain: Floats, rows: tuple[Indices, Indices], need: Floats, *, integral: bool
+) -> OptimizeResult:
+    """Result of scipy's solver for one group of rows."""
+    first, last = rows
+    columns = np.concatenate([np.arange(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)])
+    pointers = np.concatenate([[0], np.cumsum(last - first)])
+    matrix = csr_array((gain[columns], columns, pointers), shape=(len(first), len(cost)))
+    return milp(
+        cost,
+        integrality=np.full(len(cost), int(integral)),
+        bounds=Bounds(0, 1),
+        constraints=LinearConstraint(matrix, need, np.inf),
+        options={"mip_rel_gap": _GAP, "node_limit": _NODES},
+    )

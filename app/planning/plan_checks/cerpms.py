@@ -1,0 +1,118 @@
+"""CERPMs: the path that vehicles compute from them, and the radio where most of them are in range of each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from app.geodesy.ellipsoid import ecef_from_wgs84
+from app.markers.checks import Verdict
+from app.planning.placement.cerpms import path_error_m
+from app.planning.plan import Plan, PlanFinding, PlannedCerpm, PlannedMarker
+from app.planning.plan_checks.finding import compare
+from app.planning.radio_checks import PreviewRule, RadioCheck, RadioPlan, check_radio
+from app.planning.radio_recommendation import recommend_settings
+from app.planning.rules import CerpmRules
+from app.radio.reception import MAX_MARKERS, MAX_OFFSET_M, SPACINGS_M, RoadMarkers
+from app.radio.settings import RadioSettings
+
+
+def check_cerpms(plan: Plan) -> Iterator[PlanFinding]:
+    """Path error of every lane, and the radio at the busiest place."""
+    rules = plan.rules.cerpm
+    cerpms = [marker for marker in plan.markers if isinstance(marker.detail, PlannedCerpm)]
+    if rules is None or not cerpms:
+        return
+    yield from _path_error(plan, cerpms, rules)
+    yield from _radio(plan, cerpms, rules)
+
+
+def _path_error(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterator[PlanFinding]:
+    """Exact markers and a cubic spline; the survey's error comes on top."""
+    worst, error = None, 0.0
+    for name in dict.fromkeys(marker.lane for marker in cerpms):
+        lane = plan.alignment.lane(name)
+        own = [marker for marker in cerpms if marker.lane == name]
+        chainages = np.array([marker.chainage_m for marker in own])
+        if np.ptp(chainages) < lane.length_m / 2:
+            continue
+        found = path_error_m(lane, chainages)
+        if float(found.max()) > error:
+            error = float(found.max())
+            at = float(lane.chainage_m[int(found.argmax())])
+            worst = min(own, key=lambda marker: abs(marker.chainage_m - at))
+    limit = rules.max_path_error_m if rules.max_path_error_m is not None else error
+    yield compare(
+        "path-error", error, "<=", limit, "m", "CERPM paper, section 2.3: cubic spline through the markers",
+        "greatest distance of the path through exactly surveyed markers from the centre line", worst,
+    )  # fmt: skip
+
+
+def _radio(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterator[PlanFinding]:
+    """The radio checks where most markers are in reach of each other, with the real markers of the plan."""
+    radio = radio_plan(plan, cerpms, rules)
+    markers, busiest = _busiest(cerpms, radio.air.reach_m + radio.air.harm_m)
+    check = check_radio(replace(radio, markers=markers))
+    settings = radio.settings
+    setting = f"SF{settings.spreading_factor}, {settings.bandwidth_hz / 1000:g} kHz, every {settings.interval_s:g} s, "
+    setting += f"{settings.channels} channels: "
+    for finding in check.checks:
+        yield PlanFinding(
+            f"radio {finding.name}", finding.figure, finding.relation, finding.limit, finding.unit, finding.source,
+            finding.verdict, setting + finding.sentence, busiest.lane, busiest.station_m, busiest.lon_deg,
+            busiest.lat_deg,
+        )  # fmt: skip
+    yield _collisions(check, rules, busiest)
+
+
+def radio_plan(plan: Plan, cerpms: Sequence[PlannedMarker], rules: CerpmRules) -> RadioPlan:
+    """The radio of a plan's CERPMs: the settings of the rules, or recommended ones for the mean spacing of a lane."""
+    speed_mps = max(float(lane.design_speed_mps.max()) for lane in plan.alignment.lanes)
+    preview = PreviewRule(distance_m=rules.preview_m)
+    lanes = {marker.lane for marker in cerpms}
+    length_m = sum(plan.alignment.lane(name).length_m for name in lanes)
+    spacing_m = min(max(2 * length_m / len(cerpms), SPACINGS_M[0]), SPACINGS_M[1])
+    if rules.spreading_factor is not None and rules.interval_s is not None:
+        settings = RadioSettings(
+            spreading_factor=rules.spreading_factor, interval_s=rules.interval_s, bandwidth_hz=rules.bandwidth_hz
+        )
+        return RadioPlan(settings, rules.region, spacing_m=spacing_m, design_speed_mps=speed_mps, preview=preview)
+    # as many markers in reach as all lanes side by side have
+    dense = RadioPlan(
+        RadioSettings(), rules.region, spacing_m=max(spacing_m / len(lanes), SPACINGS_M[0]),
+        design_speed_mps=speed_mps, preview=preview,
+    )  # fmt: skip
+    found = recommend_settings(dense).settings
+    if found is None:
+        return dense
+    receiver = replace(dense.receiver, channels=max(found.channels, dense.receiver.channels))
+    return replace(dense, settings=found, receiver=receiver)
+
+
+def _collisions(check: RadioCheck, rules: CerpmRules, busiest: PlannedMarker) -> PlanFinding:
+    lost = 1.0 - check.packet_success
+    sentence = (
+        f"share of packets that are lost at {check.preview_m:.0f} m, minimum over the markers of the busiest place"
+    )
+    return compare(
+        "radio collisions", lost, "<=", rules.collisions_max, "share", "pure ALOHA with capture", sentence, busiest,
+        missed=Verdict.WARN,
+    )  # fmt: skip
+
+
+def _busiest(cerpms: list[PlannedMarker], reach_m: float) -> tuple[RoadMarkers, PlannedMarker]:
+    """The marker with most others in reach, and those around it along and across its direction of travel."""
+    lon, lat = np.array([m.lon_deg for m in cerpms]), np.array([m.lat_deg for m in cerpms])
+    tree = cKDTree(ecef_from_wgs84(lon, lat))
+    counts = tree.query_ball_point(tree.data, reach_m, return_length=True)
+    centre = int(np.argmax(counts))
+    near = np.array(tree.query_ball_point(tree.data[centre], reach_m)[:MAX_MARKERS])
+    east = np.radians((lon[near] - lon[centre] + 180.0) % 360.0 - 180.0) * np.cos(np.radians(lat[centre])) * 6_371_000.0
+    north = np.radians(lat[near] - lat[centre]) * 6_371_000.0
+    heading = np.radians(cerpms[centre].heading_deg)
+    along = east * np.sin(heading) + north * np.cos(heading)
+    across = np.clip(north * np.sin(heading) - east * np.cos(heading), -MAX_OFFSET_M, MAX_OFFSET_M)
+    return RoadMarkers(along, across), cerpms[centre]

@@ -1,0 +1,321 @@
+"""Units of a proof and how one is computed: pure, with seeds by drive and marker, so that any order gives the same."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from app.geodesy.ellipsoid import ecef_from_wgs84
+from app.markers.plate import PlateCode
+from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
+from app.planning.plan_checks.cerpms import radio_plan
+from app.planning.plan_checks.plates import camera_of
+from app.planning.proof.cerpms import ASIDE_M, AUDIBLE_M, LanePass, drive_cerpms, simulated_radio
+from app.planning.proof.conditions import draw_drive, draw_plate
+from app.planning.proof.magnets import LEAD_M, TAIL_M, MagnetPass, drive_line, drive_tag
+from app.planning.proof.nearby import BesideLane, LaneFrame, markers_beside
+from app.planning.proof.plates import PLACEMENT_SD_M, ROTATION_SD_DEG, PlatePass, drive_plate
+from app.planning.proof.report import ProofReport, summarize
+from app.planning.proof.results import MarkerPass, UnitResult
+from app.planning.proof.sampling import cut_stretches, sample_markers, spread
+from app.planning.proof.terms import (
+    Condition,
+    DriveTerms,
+    ProofTerms,
+    ProofUnit,
+    UnitKind,
+    drive_terms,
+    parse_conditions,
+)
+from app.simulation.conditions import Conditions
+from app.simulation.radio.link import Radio
+
+PLATES_A_UNIT, TAGS_A_UNIT = 4, 8
+"""Markers of a unit. Source: chosen by hand, some seconds of work."""
+LINE_STRETCH_M, LANE_STRETCH_M = 60.0, 500.0
+"""[m] driven over a line's magnets, and past CERPMs. Source: chosen by hand, some seconds of work."""
+TAGS_NEAR_M = 500.0
+"""[m] within which tags are looked for. Source: chosen by hand, a road with one codebook."""
+NEAR_M = 200.0
+"""[m] within which plates are in the codebook of a frame. Source: ten times the 20 m of a coarse position."""
+_MIN_MARKERS = 4  # in a stretch that is driven; source: chosen by hand, two pairs
+_BESIDE_M = 0.8  # [m] beyond a boundary, where its markers still are; source: twice `CerpmRules` and paint, by hand
+_LINE_OFFSET_SD_M = 0.25  # [m] of the bar's middle over a line; source: chosen by hand, a quarter of the bar
+_NO_PASS = MarkerPass(marker=0, weight=0.0, lost=True, readable=0, seen=0, read=0, fix_m=None, cause="lost")
+
+
+class Prover:
+    """A plan and terms, with what units share; one a process."""
+
+    def __init__(self, plan: Plan, terms: ProofTerms) -> None:
+        self.plan = plan
+        self.terms = terms
+        self.lanes = {lane.name: lane for lane in plan.alignment.lanes}
+        self.by_number = {marker.number: marker for marker in plan.markers}
+        self._frames: dict[str, LaneFrame] = {}
+        self._near: dict[tuple[str, type, float], list[BesideLane]] = {}
+
+    @property
+    def _min_frames(self) -> int:
+        return self.plan.rules.plates.min_frames if self.plan.rules.plates is not None else 1
+
+    # --- units ------------------------------------------------------------------------------------------------------
+
+    def list_units(self) -> list[ProofUnit]:
+        """All units, drive by drive."""
+        return [unit for drive in range(self.terms.drives) for unit in self._drive_units(drive)]
+
+    def _drive_units(self, drive: int) -> list[ProofUnit]:
+        most = self.terms.max_markers_per_drive
+        units: list[ProofUnit] = []
+        for kind, of, size in (
+            (UnitKind.PLATES, PlannedPlate, PLATES_A_UNIT),
+            (UnitKind.TAGS, PlannedTag, TAGS_A_UNIT),
+        ):
+            markers = [marker for marker in self.plan.markers if isinstance(marker.detail, of)]
+            chosen = sample_markers(markers, self.lanes, most, self.rng(drive, kind, 0))
+            units += _chunks(kind, drive, chosen, size)
+        for kind, stretches in ((UnitKind.LINE, self._line_stretches), (UnitKind.LANE, self._lane_stretches)):
+            count = min(len(stretches), self.terms.max_sections_per_drive)
+            for k in spread(len(stretches), count, self.rng(drive, kind)) if count < len(stretches) else range(count):
+                lane, low, high = stretches[k]
+                units.append(ProofUnit(kind, drive, lane, (), low, high, (len(stretches) / count,)))
+        return units
+
+    @cached_property
+    def _line_stretches(self) -> list[tuple[str, float, float]]:
+        """Stretches of lanes that have line magnets."""
+        return self._stretches(PlannedLineMagnet, LINE_STRETCH_M)
+
+    @cached_property
+    def _lane_stretches(self) -> list[tuple[str, float, float]]:
+        """Stretches of lanes that have CERPMs."""
+        return self._stretches(PlannedCerpm, LANE_STRETCH_M)
+
+    def _stretches(self, of: type, longest_m: float) -> list[tuple[str, float, float]]:
+        found = []
+        for lane in self.lanes.values():
+            at = np.sort([at for _, at, _ in self._beside(lane.name, of)])
+            for low, high in cut_stretches(lane.length_m, longest_m):
+                if np.searchsorted(at, high) - np.searchsorted(at, low) >= _MIN_MARKERS:
+                    found.append((lane.name, low, high))
+        return found
+
+    def _beside(self, lane: str, of: type, aside_m: float = _BESIDE_M) -> list[BesideLane]:
+        """Markers of a kind on a lane and its boundaries, or farther aside, with chainage and offset."""
+        key = (lane, of, aside_m)
+        if key not in self._near:
+            frame = self._frames.setdefault(lane, LaneFrame(self.lanes[lane]))
+            markers = [marker for marker in self.plan.markers if isinstance(marker.detail, of)]
+            self._near[key] = markers_beside(frame, markers, float(self.lanes[lane].width_m.max()) / 2 + aside_m)
+        return self._near[key]
+
+    def _along(
+        self, lane: str, of: type, low: float, high: float, drive: int, aside_m: float = _BESIDE_M
+    ) -> list[BesideLane]:
+        """Those along a stretch that are not missing in a drive."""
+        beside = self._beside(lane, of, aside_m)
+        return [one for one in beside if low <= one[1] <= high and not self.is_lost(drive, one[0].number)]
+
+    def prove_unit(self, unit: ProofUnit) -> UnitResult:
+        """Compute one unit."""
+        drive = drive_terms(self.plan, self.terms, unit.drive)
+        result = UnitResult(
+            key=unit.key, kind=str(unit.kind), drive=unit.drive, lane=unit.lane, condition=drive.condition,
+            camera=drive.camera.name, weight=unit.weight[0], passes=[], wrong=[], path=None,
+        )  # fmt: skip
+        match unit.kind:
+            case UnitKind.PLATES:
+                self._prove_plates(unit, drive, result)
+            case UnitKind.TAGS:
+                self._prove_tags(unit, result)
+            case UnitKind.LINE:
+                result["passes"], result["wrong"] = drive_line(self._line_pass(unit), unit.weight[0])
+            case UnitKind.LANE:
+                result["path"] = drive_cerpms(self._lane_pass(unit))
+        return result
+
+    def rng(self, *key: int | str) -> np.random.Generator:
+        """Random numbers of one purpose alone, from the seed of the terms."""
+        return np.random.default_rng(self.seed_of(*key))
+
+    def seed_of(self, *key: int | str) -> tuple[int, ...]:
+        """Seed of one purpose."""
+        return (self.terms.seed, *(zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key))
+
+    def is_lost(self, drive: int, marker: int) -> bool:
+        """Whether a marker is missing in a drive."""
+        return bool(self.rng(drive, "lost", marker).random() < self.terms.lost_share)
+
+    # --- magnets and CERPMs -----------------------------------------------------------------------------------------
+
+    def _prove_tags(self, unit: ProofUnit, result: UnitResult) -> None:
+        for number, weight in zip(unit.markers, unit.weight, strict=True):
+            if self.is_lost(unit.drive, number):
+                result["passes"].append({**_NO_PASS, "marker": number, "weight": weight})
+                continue
+            done, wrong = drive_tag(self.tag_pass(self.by_number[number], unit.drive), weight)
+            result["passes"].append(done)
+            result["wrong"] += wrong
+
+    def tag_pass(self, marker: PlannedMarker, drive: int) -> MagnetPass:
+        """A drive over a tag in the middle of its lane."""
+        assert isinstance(marker.detail, PlannedTag)
+        low, high = marker.chainage_m, marker.chainage_m + marker.detail.tag.length_m
+        habit_m = float(self.rng(drive, "habit").normal(0, PLACEMENT_SD_M / math.sqrt(2)))
+        wander_m = float(self.rng(drive, "tag", marker.number).normal(0, PLACEMENT_SD_M / math.sqrt(2)))
+        return self._magnet_pass(
+            marker.lane, (low, high), drive, self.seed_of(drive, "tag noise", marker.number), habit_m + wander_m, marker
+        )
+
+    def _line_pass(self, unit: ProofUnit) -> MagnetPass:
+        """A drive with the bar over one of the lines along a stretch, as in a departure from the lane."""
+        rng = self.rng(unit.drive, "line", unit.lane, int(unit.from_m))
+        lines = [left for _, at, left in self._beside(unit.lane, PlannedLineMagnet) if unit.from_m <= at <= unit.to_m]
+        sides = [side for side in (1.0, -1.0) if sum(left * side > 0 for left in lines) > 0]
+        side = sides[int(rng.integers(len(sides)))]
+        left_m = float(np.mean([left for left in lines if left * side > 0])) + float(rng.normal(0, _LINE_OFFSET_SD_M))
+        seed = self.seed_of(unit.drive, "line noise", unit.lane, int(unit.from_m))
+        return self._magnet_pass(unit.lane, (unit.from_m, unit.to_m), unit.drive, seed, left_m)
+
+    def _magnet_pass(
+        self, lane: str, stretch_m: tuple[float, float], drive: int, seed: tuple[int, ...], left_m: float,
+        tag: PlannedMarker | None = None,
+    ) -> MagnetPass:  # fmt: skip
+        low, high = stretch_m
+        reach_m = (low - LEAD_M, high + TAIL_M)
+        tags = [
+            one for one in self._tags if one.lane == lane and low - TAGS_NEAR_M <= one.chainage_m <= high + TAGS_NEAR_M
+        ]
+        return MagnetPass(
+            lane=self.lanes[lane],
+            from_m=low,
+            to_m=high,
+            tag=tag,
+            lines=self._along(lane, PlannedLineMagnet, *reach_m, drive),
+            nearby=tags,
+            left_m=left_m,
+            speed_m_s=self._speed_m_s(lane, (low + high) / 2),
+            clearance_m=self.terms.clearance_m,
+            survey_rmse_m=self.terms.survey_rmse_m,
+            seed=seed,
+        )
+
+    @cached_property
+    def _tags(self) -> list[PlannedMarker]:
+        return [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedTag)]
+
+    def _lane_pass(self, unit: ProofUnit) -> LanePass:
+        low, high = unit.from_m - AUDIBLE_M, unit.to_m + AUDIBLE_M
+        own = self._beside(unit.lane, PlannedCerpm)
+        return LanePass(
+            lane=self.lanes[unit.lane],
+            from_m=unit.from_m,
+            to_m=unit.to_m,
+            markers=self._along(unit.lane, PlannedCerpm, low, high, unit.drive, ASIDE_M),
+            own=frozenset(one.detail.number for one, _, _ in own if isinstance(one.detail, PlannedCerpm)),
+            radio=self._radio,
+            speed_m_s=self._speed_m_s(unit.lane, (unit.from_m + unit.to_m) / 2),
+            survey_rmse_m=self.terms.survey_rmse_m,
+            rng=self.rng(unit.drive, "lane", unit.lane, int(unit.from_m)),
+        )
+
+    @cached_property
+    def _radio(self) -> Radio:
+        """Of the CERPMs, as the checks of the plan have it."""
+        rules = self.plan.rules.cerpm
+        assert rules is not None
+        cerpms = [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedCerpm)]
+        return simulated_radio(radio_plan(self.plan, cerpms, rules).settings)
+
+    def _speed_m_s(self, lane: str, at_m: float) -> float:
+        one = self.lanes[lane]
+        return self.terms.speed_share * float(one.value_at(one.design_speed_mps, at_m))
+
+    # --- plates -----------------------------------------------------------------------------------------------------
+
+    def _prove_plates(self, unit: ProofUnit, drive: DriveTerms, result: UnitResult) -> None:
+        for number, weight in zip(unit.markers, unit.weight, strict=True):
+            if self.is_lost(drive.drive, number):
+                result["passes"].append({**_NO_PASS, "marker": number, "weight": weight})
+                continue
+            done, wrong = drive_plate(self.plate_pass(self.by_number[number], drive), weight, self._min_frames)
+            result["passes"].append(done)
+            result["wrong"] += wrong
+
+    def plate_pass(self, marker: PlannedMarker, drive: DriveTerms) -> PlatePass:
+        """A pass over a plate with everything drawn."""
+        lane = self.lanes[marker.lane]
+        parts = parse_conditions(drive.condition)
+        same, fair = (self._drive_conditions(drive, which) for which in (parts, frozenset({Condition.DAY})))
+        rng = self.rng(drive.drive, "plate", marker.number)
+        conditions = draw_plate(same, parts, rng)
+        fair = draw_plate(fair, frozenset({Condition.DAY}), self.rng(drive.drive, "plate", marker.number))
+        habit_m = float(self.rng(drive.drive, "habit").normal(0, PLACEMENT_SD_M / math.sqrt(2)))
+        return PlatePass(
+            marker=marker,
+            lane=lane,
+            camera=camera_of(drive.camera),
+            conditions=conditions,
+            fair=fair,
+            parts=parts,
+            speed_m_s=self._speed_m_s(marker.lane, marker.chainage_m),
+            fps=drive.camera.frames_per_s,
+            left_m=marker.offset_m + habit_m + float(rng.normal(0, PLACEMENT_SD_M / math.sqrt(2))),
+            rotation_deg=float(rng.normal(0, ROTATION_SD_DEG)),
+            codebook=self.plates_near(marker),
+            survey_error_m=rng.normal(0, self.terms.survey_rmse_m / math.sqrt(2), 2),
+            survey_rmse_m=self.terms.survey_rmse_m,
+            noise_seed=self.seed_of(drive.drive, "noise", marker.number),
+        )
+
+    def _drive_conditions(self, drive: DriveTerms, parts: frozenset[Condition]) -> Conditions:
+        return draw_drive(drive.camera, parts, self.rng(drive.drive, "drive"))
+
+    def plates_near(self, marker: PlannedMarker) -> tuple[PlateCode, ...]:
+        """Codes of the plan's plates that a vehicle would look for at a marker, its own among them."""
+        plates, tree = self._plates
+        near = tree.query_ball_point(ecef_from_wgs84(np.array(marker.lon_deg), np.array(marker.lat_deg)), NEAR_M)
+        return tuple(plates[k] for k in sorted(near))
+
+    @cached_property
+    def _plates(self) -> tuple[list[PlateCode], cKDTree]:
+        found = [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedPlate)]
+        codes = [marker.detail.code for marker in found if isinstance(marker.detail, PlannedPlate)]
+        places = ecef_from_wgs84(
+            np.array([marker.lon_deg for marker in found]), np.array([marker.lat_deg for marker in found])
+        )
+        return codes, cKDTree(places)
+
+
+def _chunks(kind: UnitKind, drive: int, chosen: Sequence[tuple[PlannedMarker, float]], size: int) -> list[ProofUnit]:
+    """Chosen markers lane by lane, some at a time."""
+    units = []
+    for lane in dict.fromkeys(marker.lane for marker, _ in chosen):
+        own = [one for one in chosen if one[0].lane == lane]
+        for start in range(0, len(own), size):
+            part = own[start : start + size]
+            numbers = tuple(marker.number for marker, _ in part)
+            units.append(ProofUnit(kind, drive, lane, numbers, weight=tuple(weight for _, weight in part)))
+    return units
+
+
+def list_units(plan: Plan, terms: ProofTerms) -> list[ProofUnit]:
+    """All units of a proof, drive by drive; the same for the same plan and terms."""
+    return Prover(plan, terms).list_units()
+
+
+def prove_unit(plan: Plan, terms: ProofTerms, unit: ProofUnit) -> UnitResult:
+    """Compute one unit; for many units of one plan, `Prover` saves the preparation."""
+    return Prover(plan, terms).prove_unit(unit)
+
+
+def prove_plan(plan: Plan, terms: ProofTerms) -> ProofReport:
+    """Compute all units here, one after the other, and summarize them."""
+    prover = Prover(plan, terms)
+    return summarize(plan, terms, [prover.prove_unit(unit) for unit in prover.list_units()])

@@ -1,0 +1,299 @@
+"""Checks of a radio plan: whether markers along a road can be read in time, and lawfully."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from app.markers.cerpm import MESSAGE_BYTES
+from app.markers.checks import RadioFinding, Verdict, at_least
+from app.planning.magnet_checks import DECELERATION_MPS2, REACTION_S, reaction_distance_m
+from app.radio.airtime import check_between
+from app.radio.battery import Battery, battery_life_days
+from app.radio.collisions import Receiver, packet_success
+from app.radio.link import LinkModel
+from app.radio.lorawan import DATA_RATES, Region
+from app.radio.reception import (
+    LANE_WIDTH_M,
+    Air,
+    Approach,
+    RoadMarkers,
+    RoadReception,
+    approach,
+    read_probability,
+    road_reception,
+)
+from app.radio.regulation import check_legal
+from app.radio.settings import RadioSettings
+
+CAMERA_PREVIEW_M = 31.0  # [m] of lane that a camera sees, beacons must give more; source: CERPM paper, section 5
+SPACING_M = 12.192  # [m] 40 ft; source: CERPM paper, section 3.2
+_SAMPLES = 60  # markers that are checked; source: by hand, bounds the time of a check
+_STATIONS = 200  # points of the road that are checked; source: by hand, bounds the time of a check
+_STATION_STEP_M = 5.0  # [m] source: by hand, no measurement kept
+
+
+@dataclass(frozen=True, slots=True)
+class PreviewRule:
+    """Distance ahead at which a marker must have been read.
+
+    Parameters
+    ----------
+    distance_m : float, optional
+        Fixed, 1 to 2,000. By default it is the distance in which the vehicle stops, and at least the camera's 31 m. [m]
+    reaction_s, deceleration_mps2 : float
+        Of the driver or the system; AASHTO Green Book (2018), section 3.2.2, by default. [s], [m/s2]
+
+    Raises
+    ------
+    InvalidParameter
+        A value is outside its limits.
+    """
+
+    distance_m: float | None = None
+    reaction_s: float = REACTION_S
+    deceleration_mps2: float = DECELERATION_MPS2
+
+    def __post_init__(self) -> None:
+        if self.distance_m is not None:
+            check_between("preview.distance_m", self.distance_m, 1.0, 2000.0, "m")
+        check_between("preview.reaction_s", self.reaction_s, 0.0, 10.0, "s")
+        check_between("preview.deceleration_mps2", self.deceleration_mps2, 0.5, 10.0, "m/s2")
+
+    def needed_m(self, speed_mps: float) -> float:
+        """Preview distance at a speed. [m]"""
+        if self.distance_m is not None:
+            return self.distance_m
+        return max(CAMERA_PREVIEW_M, reaction_distance_m(speed_mps, self.reaction_s, self.deceleration_mps2))
+
+
+@dataclass(frozen=True, slots=True)
+class RadioPlan:
+    """Markers along a road, their radios, and the requirements.
+
+    Parameters
+    ----------
+    settings : RadioSettings
+    region : Region
+    spacing_m, sides, lane_width_m
+        Of a long road with markers at even distances on one or two sides; used without `markers`.
+        1 to 1,000 m; 1 or 2; 1 to 20 m.
+    markers : RoadMarkers, optional
+        Their positions.
+    design_speed_mps : float
+        0.5 to 70. [m/s]
+    preview : PreviewRule
+    link : LinkModel
+    receiver : Receiver
+    battery : Battery
+    min_probability : float
+        That a marker is read before the preview distance, 0.5 to 0.9999.
+    min_battery_days : float
+        0 to 36,500. [day]
+
+    Raises
+    ------
+    InvalidParameter
+        A value is outside its limits.
+    """
+
+    settings: RadioSettings
+    region: Region = Region.US915
+    spacing_m: float = SPACING_M
+    sides: int = 2
+    lane_width_m: float = LANE_WIDTH_M
+    markers: RoadMarkers | None = None
+    design_speed_mps: float = 13.4
+    preview: PreviewRule = field(default_factory=PreviewRule)
+    link: LinkModel = field(default_factory=LinkModel)
+    receiver: Receiver = field(default_factory=Receiver)
+    battery: Battery = field(default_factory=Battery)
+    min_probability: float = 0.99
+    min_battery_days: float = 365.0
+
+    def __post_init__(self) -> None:
+        check_between("design_speed_mps", self.design_speed_mps, 0.5, 70.0, "m/s")
+        check_between("min_probability", self.min_probability, 0.5, 0.9999, "")
+        check_between("min_battery_days", self.min_battery_days, 0.0, 36_500.0, "days")
+        RoadMarkers.evenly(self.spacing_m, 0.0, sides=self.sides, lane_width_m=self.lane_width_m)
+
+    @property
+    def preview_m(self) -> float:
+        """Distance ahead at which a marker must have been read. [m]"""
+        return self.preview.needed_m(self.design_speed_mps)
+
+    @property
+    def air(self) -> Air:
+        """Everything that determines whether a packet is read."""
+        return Air(self.settings, self.link, self.receiver)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RadioCheck:
+    """Results of checking a radio plan.
+
+    Attributes
+    ----------
+    time_on_air_s, range_m, preview_m : float
+        Of a packet; distance at which its mean level falls to the receiver's sensitivity; distance ahead at which a
+        marker must have been read. [s], [m], [m]
+    road : RoadReception
+        Markers in range and share of packets read at points of the road; one spacing of it where it is even.
+    packet_success : float
+        Share of a marker's packets read at the preview distance, minimum over the road's markers.
+    read_probability : float
+        That a marker is read in time, minimum over the road's markers.
+    battery_days : float
+        [day]
+    checks : tuple of RadioFinding
+    """
+
+    time_on_air_s: float
+    range_m: float
+    preview_m: float
+    road: RoadReception
+    packet_success: float
+    read_probability: float
+    battery_days: float
+    checks: tuple[RadioFinding, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of all checks."""
+        found = {check.verdict for check in self.checks}
+        return next((v for v in (Verdict.FAIL, Verdict.WARN) if v in found), Verdict.OK)
+
+
+def check_radio(plan: RadioPlan) -> RadioCheck:
+    """Check a radio plan: law, link, collisions, reading in time, battery.
+
+    Raises
+    ------
+    InvalidParameter
+        More than 20,000 markers are within range of one receiver.
+
+    Notes
+    -----
+    On a road with its own markers, each of them, or 60 evenly chosen ones, is approached; the road before and after
+    is assumed to have no markers.
+    """
+    air, preview_m = plan.air, plan.preview_m
+    markers, wanted = markers_of(plan)
+    approaches = [approach(markers, index, preview_m, air) for index in wanted]
+    probability = min(read_probability(one, plan.design_speed_mps, air) for one in approaches)
+    success = min(_success_at_preview(one, air) for one in approaches)
+    road = road_reception(markers, _stations(plan, markers), air)
+    days = battery_life_days(plan.settings, plan.battery)
+    checks = (
+        *check_legal(plan.settings, plan.region),
+        *_lorawan_room(plan),
+        _level(plan),
+        _channels(plan),
+        _jitter(plan.settings),
+        _probability(plan, probability, success, int(road.in_range.max())),
+        _battery(plan, days),
+    )
+    return RadioCheck(plan.settings.time_on_air_s, air.range_m, preview_m, road, success, probability, days, checks)
+
+
+def markers_of(plan: RadioPlan) -> tuple[RoadMarkers, list[int]]:
+    """Markers of a plan, and the indices of those to check."""
+    if plan.markers is None:
+        reach_m = plan.air.reach_m + plan.air.harm_m
+        even = RoadMarkers.evenly(plan.spacing_m, reach_m, sides=plan.sides, lane_width_m=plan.lane_width_m)
+        return even, [0]
+    count = len(plan.markers.chainage_m)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).round().astype(int))
+    return plan.markers, np.argsort(plan.markers.chainage_m, kind="stable")[chosen].tolist()
+
+
+def _stations(plan: RadioPlan, markers: RoadMarkers) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Stations to check: within one spacing of an even road, otherwise every 5 m or 200 in all."""
+    if plan.markers is None:
+        return np.linspace(0.0, plan.spacing_m, 5)
+    low, high = float(markers.chainage_m.min()), float(markers.chainage_m.max())
+    return np.linspace(low, high, min(_STATIONS, 1 + math.ceil((high - low) / _STATION_STEP_M)))
+
+
+def _success_at_preview(reception: Approach, air: Air) -> float:
+    if len(reception.ahead_m) == 0:
+        return 0.0
+    return float(packet_success(reception.level_dbm[0], reception.harmful[0], air.settings, air.link, air.receiver))
+
+
+def _lorawan_room(plan: RadioPlan) -> tuple[RadioFinding, ...]:
+    """Whether LoRaWAN has a data rate of these settings, with room for the message."""
+    if not plan.settings.lorawan:
+        return ()
+    modulation = (plan.settings.spreading_factor, plan.settings.bandwidth_hz)
+    room = next(
+        (r.payload_bytes for r in DATA_RATES[plan.region] if (r.spreading_factor, r.bandwidth_hz) == modulation), 0
+    )
+    sentence = f"application payload of this data rate in {plan.region}" if room else "no data rate of uplinks"
+    return (at_least("lorawan-room", room, MESSAGE_BYTES, "bytes", "LoRaWAN Regional Parameters", sentence),)
+
+
+def _level(plan: RadioPlan) -> RadioFinding:
+    air = plan.air
+    level_dbm = float(air.level_dbm(math.hypot(plan.preview_m, plan.lane_width_m / 2)))
+    margin_db = level_dbm - air.threshold_dbm
+    return at_least(
+        "link-margin",
+        margin_db,
+        2 * plan.link.fading_db,
+        "dB",
+        "CERPM paper, section 4.1; SX1276 data sheet, table 10",
+        f"{level_dbm:.1f} dBm at {plan.preview_m:.0f} m over {air.threshold_dbm:g} dBm; twice the fading is required",
+        worst=Verdict.WARN if margin_db >= 0 else Verdict.FAIL,
+    )
+
+
+def _channels(plan: RadioPlan) -> RadioFinding:
+    sent, received = plan.settings.channels, plan.receiver.channels
+    return at_least(
+        "receiver-channels",
+        min(received, sent),
+        sent,
+        "channels",
+        "packets are spread evenly over the channels",
+        f"the receiver receives {min(1.0, received / sent):.0%} of the channels at the same time",
+        worst=Verdict.WARN,
+    )
+
+
+def _jitter(settings: RadioSettings) -> RadioFinding:
+    return at_least(
+        "jitter",
+        2 * settings.jitter_share * settings.interval_s,
+        2 * settings.time_on_air_s,
+        "s",
+        "pure ALOHA: packets begin independently",
+        "span of the interval; with less, two markers that collide once collide every time",
+        worst=Verdict.WARN,
+    )
+
+
+def _probability(plan: RadioPlan, probability: float, success: float, in_range: int) -> RadioFinding:
+    return at_least(
+        "read-in-time",
+        probability,
+        plan.min_probability,
+        "probability",
+        "pure ALOHA with capture; preview by AASHTO section 3.2.2 and the CERPM paper, section 5",
+        f"that a marker is read before the vehicle is {plan.preview_m:.0f} m from it, at {plan.design_speed_mps:g} m/s "
+        f"with {in_range} markers in range; {success:.0%} of its packets are read there",
+    )
+
+
+def _battery(plan: RadioPlan, days: float) -> RadioFinding:
+    return at_least(
+        "battery-life",
+        days,
+        plan.min_battery_days,
+        "days",
+        "CERPM paper, section 2.2; SX1276 data sheet, table 6",
+        f"{plan.battery.capacity_mah:g} mAh without being charged",
+        worst=Verdict.WARN,
+    )

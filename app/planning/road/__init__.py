@@ -1,0 +1,1 @@
+"""From lines of a file to lanes in WGS 84: reference systems, true distances, directions, checks and events."""

@@ -1,0 +1,1 @@
+"""LoRa radio of CERPMs: time on air, link budget, collisions, regulation, LoRaWAN."""

@@ -1,0 +1,240 @@
+"""Radio regulation of a region: checks of a marker's radio settings.
+
+Sources: 47 CFR 15.247 and 15.249 (United States, 902-928 MHz); ERC Recommendation 70-03 annex 1 and ETSI EN 300 220-2
+V3.2.1 table B.1 (Europe, 863-870 MHz, without listen before talk). Figures here are calculated from settings; for
+certification they are measured on the device.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from app.markers.checks import RadioFinding, Verdict, at_least, at_most
+from app.radio.lorawan import Region
+from app.radio.settings import RadioSettings
+
+US_BAND_HZ = (902_000_000, 928_000_000)  # [Hz] source: 47 CFR 15.247(a)
+DWELL_S = 0.4  # [s] source: 47 CFR 15.247(a)(1)(i)
+DIGITAL_BANDWIDTH_HZ = 500_000  # [Hz] source: 47 CFR 15.247(a)(2)
+US_POWER_DBM = 30.0  # [dBm] source: 47 CFR 15.247(b)(2), (b)(3)
+FEW_CHANNELS_POWER_DBM = 24.0  # [dBm] with less than 50 hopping channels; source: 47 CFR 15.247(b)(2)
+DENSITY_DBM = 8.0  # [dBm] in any 3 kHz; source: 47 CFR 15.247(e)
+_DENSITY_HZ = 3000  # [Hz] source: 47 CFR 15.247(e)
+NARROW_HZ = 250_000  # [Hz] 20 dB bandwidth below which channels are narrow; source: 47 CFR 15.247(a)(1)(i)
+NARROW_CHANNELS, NARROW_PERIOD_S = 50, 20.0  # [1, s] source: 47 CFR 15.247(a)(1)(i)
+WIDE_CHANNELS, WIDE_PERIOD_S = 25, 10.0  # [1, s] source: 47 CFR 15.247(a)(1)(i)
+FIELD_EIRP_DBM = 10 * math.log10((0.05 * 3) ** 2 / 30 * 1000)  # [dBm] 50 mV/m at 3 m, P = (E d)^2 / 30; 15.249(a)
+_ERP_DB = 2.15  # [dB] of a dipole over an isotropic antenna; source: ERP and EIRP by definition
+_20_DB_BANDWIDTH = 1.1  # LoRa's 20 dB bandwidth over its nominal one; source: by hand, no measurement kept
+
+
+@dataclass(frozen=True, slots=True)
+class SubBand:
+    """A part of the European band with its limits: [Hz], share of an hour, [dBm]."""
+
+    low_hz: int
+    high_hz: int
+    duty_cycle: float
+    erp_dbm: float
+
+
+EU_SUB_BANDS = (
+    SubBand(863_000_000, 865_000_000, 0.001, 14.0),
+    SubBand(865_000_000, 868_000_000, 0.01, 14.0),
+    SubBand(868_000_000, 868_600_000, 0.01, 14.0),
+    SubBand(868_700_000, 869_200_000, 0.001, 14.0),
+    SubBand(869_400_000, 869_650_000, 0.1, 27.0),
+    SubBand(869_700_000, 870_000_000, 0.01, 14.0),
+)
+"""Source: EN 300 220-2 V3.2.1, table B.1, bands K, L, M, N, P and Q."""
+
+
+def check_legal(settings: RadioSettings, region: Region) -> tuple[RadioFinding, ...]:
+    """Check radio settings against the rules of a region.
+
+    Parameters
+    ----------
+    settings : RadioSettings
+    region : Region
+
+    Returns
+    -------
+    tuple of RadioFinding
+        ``warn`` where no rule covers the settings as they are, ``fail`` where one is broken.
+    """
+    return _check_us(settings) if region is Region.US915 else _check_eu(settings)
+
+
+def is_legal(settings: RadioSettings, region: Region) -> bool:
+    """Whether every rule is met."""
+    return all(finding.passed for finding in check_legal(settings, region))
+
+
+def _within(settings: RadioSettings, low_hz: float, high_hz: float, source: str) -> RadioFinding:
+    """Whether all channels lie in a band."""
+    lowest_hz, highest_hz = settings.band_hz
+    return at_least(
+        "band",
+        min(lowest_hz - low_hz, high_hz - highest_hz) / 1e6,
+        0.0,
+        "MHz",
+        source,
+        f"from the channels, {lowest_hz / 1e6:g} to {highest_hz / 1e6:g} MHz, to the edge of {low_hz / 1e6:g} to "
+        f"{high_hz / 1e6:g} MHz",
+    )
+
+
+# --- United States ------------------------------------------------------------------------------------------------
+
+
+def _check_us(settings: RadioSettings) -> tuple[RadioFinding, ...]:
+    band = _within(settings, *US_BAND_HZ, "47 CFR 15.247(a)")
+    if settings.hopping:
+        return band, *_check_hopping(settings)
+    if settings.bandwidth_hz < DIGITAL_BANDWIDTH_HZ:
+        return band, _fixed_narrow(settings), _occupancy(settings, *_hopping_rule(settings.bandwidth_hz))
+    return band, *_check_digital(settings)
+
+
+def _check_digital(settings: RadioSettings) -> tuple[RadioFinding, ...]:
+    return (
+        at_least(
+            "digital-bandwidth",
+            settings.bandwidth_hz / 1000,
+            DIGITAL_BANDWIDTH_HZ / 1000,
+            "kHz",
+            "47 CFR 15.247(a)(2)",
+            "6 dB bandwidth, taken as LoRa's own; to be measured on the device",
+        ),
+        _power(settings, US_POWER_DBM, "47 CFR 15.247(b)(3)"),
+        _density(settings),
+    )
+
+
+def _hopping_rule(bandwidth_hz: int) -> tuple[int, float]:
+    """Minimum number of channels, and the period for the dwell time. [s]"""
+    if bandwidth_hz < NARROW_HZ:
+        return NARROW_CHANNELS, NARROW_PERIOD_S
+    return WIDE_CHANNELS, WIDE_PERIOD_S
+
+
+def _check_hopping(settings: RadioSettings) -> tuple[RadioFinding, ...]:
+    if settings.bandwidth_hz >= DIGITAL_BANDWIDTH_HZ:
+        wide = at_most(
+            "hopping-bandwidth",
+            settings.bandwidth_hz * _20_DB_BANDWIDTH / 1000,
+            500.0,
+            "kHz",
+            "47 CFR 15.247(a)(1)(i)",
+            "20 dB bandwidth of LoRa at 500 kHz is above the limit of a hopping channel: checked as digital modulation",
+            worst=Verdict.WARN,
+        )
+        return wide, *_check_digital(settings)
+    min_channels, period_s = _hopping_rule(settings.bandwidth_hz)
+    if settings.channels < min_channels:
+        return _check_hybrid(settings, min_channels)
+    limit_dbm = US_POWER_DBM if settings.channels >= NARROW_CHANNELS else FEW_CHANNELS_POWER_DBM
+    return (
+        at_least(
+            "hopping-channels", settings.channels, min_channels, "channels", "47 CFR 15.247(a)(1)(i)", "hopped over"
+        ),
+        _occupancy(settings, min_channels, period_s),
+        _power(settings, limit_dbm, "47 CFR 15.247(b)(2)"),
+    )
+
+
+def _check_hybrid(settings: RadioSettings, min_channels: int) -> tuple[RadioFinding, ...]:
+    return (
+        at_least(
+            "hopping-channels",
+            settings.channels,
+            min_channels,
+            "channels",
+            "47 CFR 15.247(a)(1)(i), (f)",
+            f"too few to be a hopping system; as a hybrid under (f) it must dwell at most 0.4 s in "
+            f"{DWELL_S * settings.channels:g} s and keep the density of digital modulation",
+            worst=Verdict.WARN,
+        ),
+        _occupancy(settings, settings.channels, DWELL_S * settings.channels),
+        _power(settings, FEW_CHANNELS_POWER_DBM, "47 CFR 15.247(b)(2)"),
+        _density(settings),
+    )
+
+
+def _fixed_narrow(settings: RadioSettings) -> RadioFinding:
+    khz = settings.bandwidth_hz / 1000
+    return at_most(
+        "fixed-narrow-channel",
+        settings.eirp_dbm,
+        FIELD_EIRP_DBM,
+        "dBm EIRP",
+        "47 CFR 15.247(a)(1)(i), (a)(2); 15.249(a)",
+        f"a beacon on {settings.channels} fixed channel{'s' if settings.channels > 1 else ''} of {khz:g} kHz is no "
+        f"hopping system ((a)(1)(i): at least {_hopping_rule(settings.bandwidth_hz)[0]} channels) and no digital "
+        "modulation ((a)(2): at least 500 kHz); it is left with 15.249: 50 mV/m at 3 m",
+        worst=Verdict.WARN,
+    )
+
+
+def _occupancy(settings: RadioSettings, min_channels: int, period_s: float) -> RadioFinding:
+    channels = settings.channels if settings.hopping else 1
+    packets = max(1, math.ceil(period_s / (settings.interval_s * channels) - 1e-9))
+    return at_most(
+        "dwell-time",
+        packets * settings.time_on_air_s,
+        DWELL_S,
+        "s",
+        "47 CFR 15.247(a)(1)(i)" if min_channels in (NARROW_CHANNELS, WIDE_CHANNELS) else "47 CFR 15.247(f)",
+        f"of one marker on one channel in {period_s:g} s: {packets} packets of "
+        f"{1000 * settings.time_on_air_s:.1f} ms, spread evenly over its channels",
+        worst=Verdict.FAIL if settings.hopping else Verdict.WARN,
+    )
+
+
+def _power(settings: RadioSettings, limit_dbm: float, source: str) -> RadioFinding:
+    return at_most("power", settings.power_dbm, limit_dbm, "dBm", source, "conducted, with an antenna of at most 6 dBi")
+
+
+def _density(settings: RadioSettings) -> RadioFinding:
+    density_dbm = settings.power_dbm - 10 * math.log10(settings.bandwidth_hz / _DENSITY_HZ)
+    return at_most(
+        "power-density",
+        density_dbm,
+        DENSITY_DBM,
+        "dBm/3 kHz",
+        "47 CFR 15.247(e)",
+        "power spread evenly over the band; to be measured on the device",
+    )
+
+
+# --- Europe -------------------------------------------------------------------------------------------------------
+
+
+def _sub_band(settings: RadioSettings) -> SubBand | None:
+    return next((band for band in EU_SUB_BANDS if band.low_hz <= settings.frequency_hz <= band.high_hz), None)
+
+
+def _check_eu(settings: RadioSettings) -> tuple[RadioFinding, ...]:
+    source = "ERC/REC 70-03 annex 1; EN 300 220-2 table B.1"
+    band = _sub_band(settings)
+    if band is None:
+        off_hz = min(max(b.low_hz - settings.frequency_hz, settings.frequency_hz - b.high_hz) for b in EU_SUB_BANDS)
+        sentence = (
+            f"{settings.frequency_hz / 1e6:g} MHz is in no sub-band for devices of any kind; distance from the "
+            "nearest one"
+        )
+        return (RadioFinding("band", off_hz / 1e6, "<=", 0.0, "MHz", source, Verdict.FAIL, sentence),)
+    name = f"{band.low_hz / 1e6:g} to {band.high_hz / 1e6:g} MHz"
+    return (
+        _within(settings, band.low_hz, band.high_hz, source),
+        at_most(
+            "duty-cycle",
+            settings.time_on_air_s / settings.interval_s,
+            band.duty_cycle,
+            "of an hour",
+            source,
+            f"of one marker in {name}, however many channels it uses there",
+        ),
+        at_most("power", settings.eirp_dbm - _ERP_DB, band.erp_dbm, "dBm ERP", source, f"radiated in {name}"),
+    )

@@ -1,0 +1,158 @@
+"""Queries on jobs: work that outlives the request that asked for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from enum import StrEnum
+from typing import Any, Literal, NamedTuple
+
+import sqlalchemy as sa
+
+from app.errors import NotFound
+from app.registry.rows import fetch_all, find_one, select_rows
+from app.registry.tables import jobs
+
+JobState = Literal["queued", "running", "done", "failed", "cancelled"]
+UNFINISHED = ("queued", "running")
+
+
+class JobKind(StrEnum):
+    """What a job does; `app.services.jobs` has one handler for each."""
+
+    DECODE = "decode"
+    """Decodes the upload of the row of `decodes` with the same id. The result is stored there."""
+    IMPORT = "import"
+    """Imports a survey. The input is its declaration, the result its report."""
+
+
+class JobRow(NamedTuple):
+    """A job.
+
+    Attributes
+    ----------
+    holder_id : str or None
+        Of the key that asked for it.
+    progress : float
+        From 0 to 1.
+    input : dict
+        What the job needs to know besides its upload.
+    upload_key : str or None
+        Key of the blob that the job reads.
+    result, error : dict or None
+        What the job returned, or why it failed.
+    """
+
+    id: str
+    agency_id: str
+    holder_id: str | None
+    kind: str
+    state: JobState
+    attempts: int
+    progress: float
+    cancel_requested: bool
+    input: dict[str, Any]
+    upload_key: str | None
+    result: dict[str, Any] | None
+    error: dict[str, str] | None
+    created_at: datetime
+    finished_at: datetime | None
+
+
+def new_job(
+    kind: JobKind, job_id: str, agency_id: str, holder_id: str, now: datetime,
+    *, job_input: Mapping[str, Any] | None = None, upload_key: str | None = None,
+) -> JobRow:  # fmt: skip
+    """A job that waits to be started."""
+    return JobRow(
+        job_id, agency_id, holder_id, kind, "queued", 0, 0.0, False, dict(job_input or {}), upload_key, None, None, now,
+        None,
+    )  # fmt: skip
+
+
+def add_job(connection: sa.Connection, job: JobRow) -> None:
+    """Store a new job."""
+    connection.execute(sa.insert(jobs), job._asdict())
+
+
+def get_job(connection: sa.Connection, agency_id: str, kind: JobKind, job_id: str) -> JobRow:
+    """One job of the agency.
+
+    Raises
+    ------
+    NotFound
+        There is none of this kind with this id, or it belongs to another agency.
+    """
+    query = select_rows(JobRow, jobs).where(jobs.c.id == job_id, jobs.c.agency_id == agency_id, jobs.c.kind == kind)
+    row = find_one(connection, query, JobRow)
+    if row is None:
+        raise NotFound(f"there is no {kind} {job_id}", field=f"{kind}_id")
+    return row
+
+
+def list_jobs(
+    connection: sa.Connection, agency_id: str, kind: JobKind, *, state: str | None, before: str | None, limit: int
+) -> list[JobRow]:
+    """Jobs of one kind without their results, newest first."""
+    columns = [sa.null().label("result") if name == "result" else jobs.c[name] for name in JobRow._fields]
+    query = sa.select(*columns).where(jobs.c.agency_id == agency_id, jobs.c.kind == kind)
+    if state is not None:
+        query = query.where(jobs.c.state == state)
+    if before is not None:
+        query = query.where(jobs.c.id < before)
+    return fetch_all(connection, query.order_by(jobs.c.id.desc()).limit(limit), JobRow)
+
+
+def list_unfinished(connection: sa.Connection) -> list[str]:
+    """Ids of the jobs of all agencies that are still to be done, oldest first."""
+    query = sa.select(jobs.c.id).where(jobs.c.state.in_(UNFINISHED)).order_by(jobs.c.id)
+    return list(connection.execute(query).scalars())
+
+
+def start_job(connection: sa.Connection, job_id: str) -> JobRow | None:
+    """Start a job that is queued, or that an earlier process left running; None if it is finished or gone."""
+    statement = (
+        sa.update(jobs)
+        .where(jobs.c.id == job_id, jobs.c.state.in_(UNFINISHED))
+        .values(state="running", attempts=jobs.c.attempts + 1)
+    )
+    if connection.execute(statement).rowcount != 1:
+        return None
+    return find_one(connection, select_rows(JobRow, jobs).where(jobs.c.id == job_id), JobRow)
+
+
+def record_progress(connection: sa.Connection, job_id: str, progress: float) -> bool:
+    """Record how far a running job is. Returns False if it was cancelled or is gone, so that it has to stop."""
+    statement = sa.update(jobs).where(
+        jobs.c.id == job_id, jobs.c.state == "running", jobs.c.cancel_requested.is_(False)
+    )
+    return connection.execute(statement.values(progress=progress)).rowcount == 1
+
+
+def request_cancel(
+    connection: sa.Connection, agency_id: str, job_id: str, now: datetime, *, below_progress: float = 2.0
+) -> None:
+    """Ask a job to stop: a queued one is cancelled now, a running one when it reports its progress next.
+
+    Parameters
+    ----------
+    below_progress : float, optional
+        A running job that has come so far is not stopped any more.
+    """
+    own = (jobs.c.id == job_id, jobs.c.agency_id == agency_id)
+    queued = sa.update(jobs).where(*own, jobs.c.state == "queued")
+    connection.execute(queued.values(state="cancelled", cancel_requested=True, finished_at=now))
+    running = sa.update(jobs).where(*own, jobs.c.state == "running", jobs.c.progress < below_progress)
+    connection.execute(running.values(cancel_requested=True))
+
+
+def finish_job(
+    connection: sa.Connection, job_id: str, state: JobState, now: datetime,
+    *, result: Mapping[str, Any] | None = None, error: Mapping[str, object] | None = None,
+) -> bool:  # fmt: skip
+    """Record how a job ended, unless it has ended before. Returns whether it did now."""
+    values: dict[str, Any] = {"state": state, "finished_at": now, "result": result, "error": error}
+    if state == "done":
+        values["progress"] = 1.0
+    statement = sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state.in_(UNFINISHED)).values(**values)
+    return connection.execute(statement).rowcount == 1

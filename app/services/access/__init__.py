@@ -1,0 +1,1 @@
+"""Agencies, keys, tokens and the audit log."""

@@ -1,0 +1,265 @@
+"""Who may call: agencies, their keys and what a key's scope covers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import sqlalchemy as sa
+
+from app.errors import InvalidParameter, NotAllowed, NotAuthenticated, Unavailable
+from app.registry import agencies
+from app.registry.database import Database
+from app.registry.tenancy import across_agencies
+from app.services.access.key_text import check_key, new_key, shown_part
+from app.services.ports import Clock
+
+FIRST_AGENCY = "default"
+_ENVIRONMENT = "WAYMARK_ADMIN_KEY"
+_REMEMBERED_FOR = timedelta(seconds=1)
+_MAX_REMEMBERED = 10_000
+
+
+class Scope(StrEnum):
+    """Scope of a key. app/api/http/permissions.py lists the routes of each scope, docs/access.md explains them."""
+
+    ADMIN = "admin"
+    PLANNER = "planner"
+    SURVEYOR = "surveyor"
+    VIEWER = "viewer"
+    VEHICLE = "vehicle"
+
+
+def parse_scope(name: str) -> Scope:
+    """The scope with a name.
+
+    Raises
+    ------
+    InvalidParameter
+        There is none.
+    """
+    if name not in list(Scope):
+        raise InvalidParameter(f"there is no scope {name!r}", field="scope", limit=", ".join(Scope))
+    return Scope(name)
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """An authenticated caller.
+
+    Attributes
+    ----------
+    agency_id : str
+        Whose rows it works on.
+    key_id : str
+        Who it is: the same for keys that replace one another.
+    label : str
+        What histories call it.
+    scope : Scope
+    """
+
+    agency_id: str
+    key_id: str
+    label: str
+    scope: Scope
+
+    def require(self, allowed: Collection[Scope]) -> None:
+        """Refuse unless the key's scope is one of these.
+
+        Raises
+        ------
+        NotAllowed
+            It is not.
+        """
+        if self.scope not in allowed:
+            limit = " or ".join(scope for scope in Scope if scope in allowed) or "nobody"
+            raise NotAllowed(
+                f"a key with the scope {self.scope} may not do this",
+                limit=f"scope {limit}",
+                cure="ask an admin of your agency for a key with such a scope",
+            )
+
+    @property
+    def own_key_id(self) -> str | None:
+        """The key whose rows alone this caller sees among its agency's: a vehicle its own, others all (None)."""
+        return self.key_id if self.scope is Scope.VEHICLE else None
+
+
+class Bearer(NamedTuple):
+    """Who a token speaks for: the agency by its name, and when the token ends."""
+
+    agency: str
+    holder_id: str
+    label: str
+    scope: Scope
+    expires_at: datetime
+
+
+class _Remembered(NamedTuple):
+    """A caller, when that was known, until when it holds, and after how many writes it was read."""
+
+    caller: Caller
+    at: datetime
+    until: datetime
+    writes: int
+
+
+class Access:
+    """Checks keys, and makes those that need no key to make them.
+
+    Parameters
+    ----------
+    database : Database
+    clock : Clock
+    verify : callable, optional
+        Who a token speaks for, where an issuer's tokens are taken.
+    """
+
+    def __init__(self, database: Database, clock: Clock, verify: Callable[[str], Bearer] | None = None) -> None:
+        self._database = database
+        self._clock = clock
+        self._verify = verify
+        self._uses: dict[str, datetime] = {}  # of keys, not written yet
+        self._remembered: dict[str, _Remembered] = {}
+
+    def recall(self, key: str) -> Caller | None:
+        """The caller behind a key that was checked within the last second, if nothing was written since.
+
+        Requests come in runs, and this asks no database. A key that another process revoked is refused a second later.
+        """
+        known = self._remembered.get(key)
+        if known is None or known.writes != self._database.writes or not known.at <= self._clock() < known.until:
+            return None
+        return known.caller
+
+    def was_valid(self, key: str) -> bool:
+        """Whether a key was valid when it was last asked about, as far as is remembered."""
+        return key in self._remembered
+
+    def authenticate(self, key: str) -> Caller:
+        """The caller behind a key, or behind a token where an issuer's are taken.
+
+        Raises
+        ------
+        NotAuthenticated
+            The key is mistyped, unknown, expired or revoked; the token is not valid.
+        NotAllowed
+            The token names no agency that is here, or no scope.
+        """
+        now, writes = self._clock(), self._database.writes
+        ends_at: datetime | None
+        try:
+            if self._verify is not None and is_token(key):
+                caller, ends_at = self._token_caller(self._verify(key))
+            else:
+                caller, ends_at = self._key_caller(key, now)
+        except NotAuthenticated:
+            self._remembered.pop(key, None)
+            raise
+        until = min(now + _REMEMBERED_FOR, ends_at or now + _REMEMBERED_FOR)
+        if len(self._remembered) >= _MAX_REMEMBERED:
+            self._remembered.clear()
+        self._remembered[key] = _Remembered(caller, now, until, writes)
+        return caller
+
+    def _key_caller(self, key: str, now: datetime) -> tuple[Caller, datetime | None]:
+        check_key(key)
+        with across_agencies(), self._database.read() as connection:
+            row = agencies.find_key(connection, key)
+        if row is None or row.revoked_at is not None or (row.expires_at is not None and row.expires_at <= now):
+            raise NotAuthenticated(
+                "the key is unknown, expired or revoked", field="Authorization", cure="ask your agency for a valid key"
+            )
+        self._uses[row.id] = now
+        return Caller(row.agency_id, row.holder_id, row.label, Scope(row.scope)), row.expires_at
+
+    def _token_caller(self, bearer: Bearer) -> tuple[Caller, datetime]:
+        with across_agencies(), self._database.read() as connection:
+            agency_id = agencies.find_agency(connection, bearer.agency)
+        if agency_id is None:
+            raise NotAllowed(
+                "the token's agency is not on this server",
+                limit="the name of an agency that has a key here",
+                cure="have the operator make a key for it: waymark key AGENCY",
+            )
+        return Caller(agency_id, bearer.holder_id, bearer.label, bearer.scope), bearer.expires_at
+
+    def last_use(self, key: agencies.KeyRow) -> datetime | None:
+        """When a key was last used, as far as this process knows."""
+        times = (key.last_used_at, self._uses.get(key.id))
+        return max((time for time in times if time is not None), default=None)
+
+    def write_uses(self) -> None:
+        """Store which keys were used since the last time. Called once a minute: no request waits for it."""
+        taken, self._uses = self._uses, {}
+        uses = dict(taken)  # a request may still be adding to it
+        if not uses:
+            return
+        try:
+            with across_agencies(), self._database.write() as connection:
+                agencies.write_uses(connection, uses)
+        except (Unavailable, sa.exc.SQLAlchemyError):
+            self._uses = {**uses, **self._uses}  # next time
+
+    def ensure_first_key(self, admin_key: str | None = None) -> str | None:
+        """On an empty database create an agency with an admin key; afterwards keep `admin_key` in step.
+
+        Returns
+        -------
+        str or None
+            The key to show once, if one was made up here.
+        """
+        now = self._clock()
+        if admin_key is not None:
+            _check_given_key(admin_key)
+        with across_agencies(), self._database.write() as connection:
+            first = agencies.find_first_agency(connection)
+            agency_id = first or agencies.add_agency(connection, FIRST_AGENCY, now)
+            if admin_key is not None:
+                known = agencies.find_key(connection, admin_key)
+                agencies.revoke_keys_labelled(connection, _ENVIRONMENT, now)
+                if known is None:
+                    add_key(connection, admin_key, agency_id=agency_id, scope=Scope.ADMIN, label=_ENVIRONMENT, now=now)
+                elif known.label == _ENVIRONMENT:
+                    agencies.restore_key(connection, known.id)
+                return None
+            if first is not None:
+                return None
+            key = new_key()
+            add_key(connection, key, agency_id=agency_id, scope=Scope.ADMIN, label="first admin key", now=now)
+            return key
+
+    def create_key(self, agency: str, scope: Scope, label: str, expires_at: datetime | None = None) -> str:
+        """A new key for an agency, which is created if there is none of that name. Shown once, stored as a hash."""
+        if not agency.strip() or len(agency) > 200:
+            raise InvalidParameter("an agency's name has 1 to 200 characters", field="agency", limit="1 to 200")
+        now = self._clock()
+        key = new_key()
+        with across_agencies(), self._database.write() as connection:
+            agency_id = agencies.find_agency(connection, agency) or agencies.add_agency(connection, agency, now)
+            add_key(connection, key, agency_id=agency_id, scope=scope, label=label, now=now, expires_at=expires_at)
+        return key
+
+
+def is_token(key: str) -> bool:
+    """Whether a key has the form of a JWT: three parts, the first a JSON object in base64."""
+    return key.startswith("eyJ") and key.count(".") == 2
+
+
+def add_key(connection: sa.Connection, key: str, *, agency_id: str, scope: Scope, label: str, **more: Any) -> str:
+    """Store a key with what lists show of it; returns its id."""
+    return agencies.add_key(
+        connection, key, agency_id=agency_id, scope=scope, label=label, prefix=shown_part(key), **more
+    )
+
+
+def _check_given_key(key: str) -> None:
+    try:
+        check_key(key)
+    except NotAuthenticated as error:
+        raise InvalidParameter(
+            error.message, field="WAYMARK_ADMIN_KEY", cure="copy it again, or take a key that does not start with wm_"
+        ) from error

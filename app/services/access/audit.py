@@ -1,0 +1,109 @@
+"""The audit log: who appends to it, and how an agency reads it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from datetime import datetime
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.errors import InvalidParameter, NotFound
+from app.registry import agencies
+from app.registry import audit as store
+from app.registry.audit import Author
+from app.registry.audit_check import ChainReport, Fault, check_history
+from app.registry.database import Database
+from app.services.access.access import Caller
+from app.services.access.documents import AuditEntryDocument, AuditHead, AuditPage
+from app.services.documents import document_of
+
+_NUMBER = re.compile(r"[1-9][0-9]{0,14}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+def author_of(caller: Caller) -> Author:
+    """Whom the history names for what a caller does."""
+    return Author(caller.label, caller.key_id)
+
+
+def log_change(
+    connection: sa.Connection,
+    caller: Caller,
+    action: str,
+    *,
+    now: datetime,
+    subject: str | None = None,
+    document: Mapping[str, object] | None = None,
+    **detail: Any,
+) -> None:
+    """Append an entry for a change that writes no versions of markers.
+
+    Parameters
+    ----------
+    connection : Connection
+        Of the transaction that makes the change.
+    caller : Caller
+    action, subject : str
+        What was done, and the id or name of what it was done to.
+    document : mapping, optional
+        What it is now; its hash goes into the log.
+    **detail
+        Further details; never a secret.
+    """
+    if document is not None:
+        detail["sha256"] = store.content_sha256(document)
+    store.record(connection, caller.agency_id, author_of(caller), action, now=now, subject=subject, detail=detail)
+
+
+class AuditLog:
+    """Reading an agency's chain of changes."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def page(self, caller: Caller, *, after: int = 0, limit: int = 100) -> tuple[AuditPage, int | None]:
+        """A page of entries, oldest first, with the log's head; and the number to continue after if there are more."""
+        with self._database.read() as connection:
+            rows = store.list_entries(connection, caller.agency_id, after=after, limit=limit + 1)
+            head = store.find_head(connection, caller.agency_id)
+        page = AuditPage(
+            items=[document_of(AuditEntryDocument, row) for row in rows[:limit]],
+            head=document_of(AuditHead, head) if head is not None else None,
+        )
+        return page, rows[limit - 1].number if len(rows) > limit else None
+
+    def verify(
+        self, agency: str | None = None, expected_head: tuple[int, str] | None = None
+    ) -> Iterator[tuple[str, ChainReport, Iterator[Fault]]]:
+        """For each agency, or the one of this name: its name, what was gone through, and the faults as they are found.
+
+        Raises
+        ------
+        NotFound
+            There is no agency of this name.
+        """
+        with self._database.read(long=True) as connection:
+            found = [row for row in agencies.list_agencies(connection) if agency in (None, row.name)]
+            if agency is not None and not found:
+                raise NotFound(f"there is no agency {agency[:80]!r}", field="agency")
+            for row in found:
+                report = ChainReport()
+                yield row.name, report, check_history(connection, row.id, report, expected_head)
+
+
+def parse_head(text: str) -> tuple[int, str]:
+    """An entry's number and hash, written NUMBER:HASH.
+
+    Raises
+    ------
+    InvalidParameter
+        It is written otherwise.
+    """
+    number, _, digest = text.partition(":")
+    if not (_NUMBER.fullmatch(number) and _SHA256.fullmatch(digest)):
+        raise InvalidParameter(
+            f"{text[:90]!r} is no head of a log", field="expect-head", limit="NUMBER:HASH", cure="as verify prints it"
+        )
+    return int(number), digest

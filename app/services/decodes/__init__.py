@@ -1,0 +1,1 @@
+"""Use cases on uploads and their decodes."""

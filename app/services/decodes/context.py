@@ -1,0 +1,274 @@
+"""The context of an upload: where the vehicle was, which camera took it, which kind of upload it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
+from typing import Any
+
+from app.errors import InvalidParameter
+from app.formats.images import ImageHeader, check_thermal_range
+from app.geodesy import check_lon_lat
+from app.sensors.camera import Camera
+from app.services.decodes.packet_task import packet_terms
+from app.services.decodes.trace_task import trace_terms
+
+VIEW_RANGE_M = 100.0
+MAX_ACCURACY_M = 20_000.0
+_INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
+
+
+@dataclass(frozen=True, slots=True)
+class CoarsePosition:
+    """The vehicle's approximate position.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg : float
+        WGS 84. [deg]
+    accuracy_m : float
+        Radius that holds the true position with near certainty, at most 20 km. [m]
+    """
+
+    lon_deg: float
+    lat_deg: float
+    accuracy_m: float
+
+    def __post_init__(self) -> None:
+        check_lon_lat(self.lon_deg, self.lat_deg, field="coarse_position")
+        if not 0 < self.accuracy_m <= MAX_ACCURACY_M:
+            raise InvalidParameter(
+                f"accuracy_m is {self.accuracy_m:g}",
+                field="coarse_position.accuracy_m",
+                limit=f"above 0, at most {MAX_ACCURACY_M:g} m",
+                cure="give the radius that holds the vehicle; decimals alone cannot place a plate much further away",
+            )
+
+    @property
+    def reach_m(self) -> float:
+        """How far from here a plate in view can be. [m]"""
+        return self.accuracy_m + VIEW_RANGE_M
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSetup:
+    """A camera as a vehicle declares it: intrinsics, or the horizontal field of view, and the mount.
+
+    Parameters
+    ----------
+    width_px, height_px : int, optional
+        Size of the frames; must be theirs. [px]
+    fx_px, fy_px, cx_px, cy_px : float, optional
+        All four, or none with `horizontal_fov_deg`. [px]
+    distortion : tuple of float
+        OpenCV's coefficients, with intrinsics only.
+    horizontal_fov_deg : float, optional
+        Field of view of an undistorted camera. [deg]
+    height_m, depression_deg, azimuth_deg, roll_deg, forward_m, left_m : float
+        Mount, as in `Camera`.
+    """
+
+    width_px: int | None = None
+    height_px: int | None = None
+    fx_px: float | None = None
+    fy_px: float | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    distortion: tuple[float, ...] = ()
+    horizontal_fov_deg: float | None = None
+    height_m: float = 1.57
+    depression_deg: float = 23.0
+    azimuth_deg: float = 0.0
+    roll_deg: float = 0.0
+    forward_m: float = 0.0
+    left_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        intrinsics = [name for name in _INTRINSICS if getattr(self, name) is not None]
+        if bool(intrinsics) == (self.horizontal_fov_deg is not None) or len(intrinsics) not in (0, 4):
+            raise InvalidParameter(
+                "a camera has four intrinsics or a horizontal field of view",
+                field="camera.horizontal_fov_deg" if not intrinsics else "camera.fx_px",
+                limit="fx_px, fy_px, cx_px, cy_px; or horizontal_fov_deg",
+                cure="send all four intrinsics with width_px and height_px, or horizontal_fov_deg alone",
+            )
+        if intrinsics and (self.width_px is None or self.height_px is None):
+            raise InvalidParameter(
+                "intrinsics belong to one size of frame",
+                field="camera.width_px",
+                limit="width_px and height_px beside intrinsics",
+                cure="send the size of the frames that the camera was calibrated with",
+            )
+        if self.distortion and not intrinsics:
+            raise InvalidParameter(
+                "distortion needs the four intrinsics", field="camera.distortion", limit="with intrinsics only"
+            )
+        for name, value in asdict(self).items():
+            values = value if isinstance(value, tuple) else (value,)
+            if any(isinstance(v, float) and not math.isfinite(v) for v in values):
+                raise InvalidParameter(f"{name} is not finite", field=f"camera.{name}", limit="finite numbers")
+        self._camera(self.width_px or 1920, self.height_px or 1080)
+
+    def camera_for(self, header: ImageHeader) -> Camera:
+        """The camera of a frame.
+
+        Raises
+        ------
+        InvalidParameter
+            The frame has another size than the camera.
+        """
+        for name, declared, actual in (
+            ("width_px", self.width_px, header.width_px),
+            ("height_px", self.height_px, header.height_px),
+        ):
+            if declared is not None and declared != actual:
+                raise InvalidParameter(
+                    f"the camera's {name} is {declared}, the frame's is {actual} (upright)",
+                    field=f"camera.{name}",
+                    limit=f"{header.width_px} x {header.height_px} px",
+                    cure="send the camera parameters of these frames, or the frames as the camera wrote them",
+                )
+        return self._camera(header.width_px, header.height_px)
+
+    def _camera(self, width_px: int, height_px: int) -> Camera:
+        if self.horizontal_fov_deg is not None:
+            return Camera.from_field_of_view(
+                width_px,
+                height_px,
+                self.horizontal_fov_deg,
+                height_m=self.height_m,
+                depression_deg=self.depression_deg,
+                azimuth_deg=self.azimuth_deg,
+                roll_deg=self.roll_deg,
+                forward_m=self.forward_m,
+                left_m=self.left_m,
+            )
+        fx, fy, cx, cy = (float(getattr(self, name)) for name in _INTRINSICS)
+        return Camera(
+            width_px, height_px, fx, fy, cx, cy, self.distortion,
+            self.height_m, self.depression_deg, self.azimuth_deg, self.roll_deg, self.forward_m, self.left_m,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ContextInput:
+    """The context as it was sent with an upload, before its vehicle's profile completes it.
+
+    Attributes
+    ----------
+    stated : dict
+        Members of the context that were sent and nothing else.
+    vehicle : str or None
+        Name or id of the vehicle.
+    file_name : str
+        Of the file; empty where it has none.
+    """
+
+    stated: dict[str, Any] = field(default_factory=dict)
+    vehicle: str | None = None
+    file_name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeContext:
+    """Everything that comes with an upload.
+
+    Parameters
+    ----------
+    coarse_position : CoarsePosition, optional
+        Without it nothing is looked up in the registry.
+    heading_deg : float, optional
+        Of the vehicle, clockwise from true north. [deg]
+    camera : CameraSetup, optional
+    thermal : bool
+    thermal_range : (float, float), optional
+        Counts that become 0 and 255 in 16-bit thermal frames. [counts]
+    captured_at : datetime, optional
+        Aware.
+    trace : dict, optional
+        The upload is a magnetometer trace, declared like this (`app.services.decodes.trace_task.trace_terms`).
+    packets : dict, optional
+        The upload is a packet log, declared like this (`app.services.decodes.packet_task.packet_terms`).
+    vehicle : dict, optional
+        Id, name and version of the vehicle, and the source of each member
+        (`app.services.fleet.profiles.inherit`).
+    """
+
+    coarse_position: CoarsePosition | None = None
+    heading_deg: float | None = None
+    camera: CameraSetup | None = None
+    thermal: bool = False
+    thermal_range: tuple[float, float] | None = None
+    captured_at: datetime | None = None
+    trace: dict[str, Any] | None = None
+    packets: dict[str, Any] | None = None
+    vehicle: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.trace is not None and self.packets is not None:
+            raise InvalidParameter(
+                "an upload is a trace or a packet log", field="packets", limit="one of trace, packets", cure="send one"
+            )
+        if self.trace is not None:
+            trace_terms(self.trace)
+        if self.packets is not None:
+            packet_terms(self.packets)
+        if self.heading_deg is not None and not 0 <= self.heading_deg <= 360:
+            raise InvalidParameter(
+                f"heading_deg is {self.heading_deg:g}",
+                field="heading_deg",
+                limit="0 to 360 deg",
+                cure="give degrees clockwise from true north",
+            )
+        if self.thermal_range is not None:
+            check_thermal_range(self.thermal_range)
+            if not self.thermal:
+                raise InvalidParameter(
+                    "thermal_range means nothing in a frame that is not thermal",
+                    field="thermal_range",
+                    limit="with thermal only",
+                    cure="set thermal to true, or leave thermal_range out",
+                )
+        if self.captured_at is not None and self.captured_at.tzinfo is None:
+            raise InvalidParameter(
+                "captured_at has no time zone",
+                field="captured_at",
+                limit="RFC 3339 with an offset",
+                cure="add Z for UTC",
+            )
+
+    def document(self) -> dict[str, Any]:
+        """The context as it is stored: the members that have a value."""
+        stated = _without_none(asdict(replace(self, trace=None, packets=None, vehicle=None)))
+        document = {name: value for name, value in stated.items() if value is not False}
+        declared = {"trace": self.trace, "packets": self.packets, "vehicle": self.vehicle}
+        return {**document, **{name: value for name, value in declared.items() if value is not None}}
+
+
+def context_from_document(document: dict[str, Any]) -> DecodeContext:
+    """The context that `DecodeContext.document` stored."""
+    position, camera = document.get("coarse_position"), document.get("camera")
+    captured_at, counts = document.get("captured_at"), document.get("thermal_range")
+    context = DecodeContext(
+        coarse_position=CoarsePosition(**position) if position else None,
+        heading_deg=document.get("heading_deg"),
+        thermal=document.get("thermal", False),
+        thermal_range=(counts[0], counts[1]) if counts else None,
+        captured_at=datetime.fromisoformat(captured_at) if isinstance(captured_at, str) else captured_at,
+        trace=document.get("trace"),
+        packets=document.get("packets"),
+        vehicle=document.get("vehicle"),
+    )
+    if camera is not None:
+        setup = CameraSetup(**{**camera, "distortion": tuple(camera.get("distortion", ()))})
+        context = replace(context, camera=setup)
+    return context
+
+
+def _without_none(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: _without_none(value) if isinstance(value, dict) else value
+        for name, value in values.items()
+        if value is not None and value != ()
+    }

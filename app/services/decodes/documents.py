@@ -1,0 +1,119 @@
+"""Decodes as clients see them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Annotated, Any, NotRequired, cast
+
+from pydantic import Field, JsonValue
+from typing_extensions import TypedDict
+
+from app.registry.decodes import DecodeRow
+from app.registry.jobs import JobState
+from app.services.decodes.frame_documents import AnyReading, FixDocument, FrameDocument, FrameSummary
+from app.services.decodes.kinds import DecodeKind
+from app.services.decodes.lane_documents import DecodedLaneDocument, OverlayDocument, SteeringDocument
+from app.services.decodes.packet_documents import (
+    PacketReportDocument,
+    PacketSummary,
+    PathLossDocument,
+    ReceivedMarkerDocument,
+)
+from app.services.decodes.trace_documents import (
+    CrossingDocument,
+    NoiseDocument,
+    PassedMagnetDocument,
+    TagDocument,
+    TagFixDocument,
+    TraceReportDocument,
+    TraceSummary,
+)
+from app.services.error_documents import ErrorDocument
+
+
+class DecodeLinks(TypedDict):
+    """Paths of the decode and of what can be drawn from it."""
+
+    self: str
+    annotated: NotRequired[str]
+    plot: NotRequired[str]
+    lane: NotRequired[str]
+    overlay: NotRequired[str]
+
+
+class DecodeHead(TypedDict):
+    """A decode without its result."""
+
+    id: str
+    state: JobState
+    kind: DecodeKind
+    progress: Annotated[float, Field(description="0 to 1.")]
+    attempts: int
+    created_at: datetime
+    finished_at: datetime | None
+    context: Annotated[dict[str, JsonValue], Field(description="What was declared of the upload.")]
+    error: ErrorDocument | None
+    links: DecodeLinks
+
+
+class DecodeDocument(DecodeHead):
+    """A decode. `decoder` and what follows it are there once it is done."""
+
+    decoder: NotRequired[str]
+    summary: NotRequired[FrameSummary | TraceSummary | PacketSummary]
+    codebook_plates: NotRequired[int]
+    readings: NotRequired[list[AnyReading]]
+    frames: NotRequired[list[FrameDocument]]
+    fix: NotRequired[FixDocument | TagFixDocument | None]
+    codebook_tags: NotRequired[int]
+    report: NotRequired[TraceReportDocument | PacketReportDocument]
+    tags: NotRequired[list[TagDocument]]
+    crossings: NotRequired[list[CrossingDocument]]
+    magnets: NotRequired[list[PassedMagnetDocument]]
+    noise: NotRequired[list[NoiseDocument]]
+    markers: NotRequired[list[ReceivedMarkerDocument]]
+    lane: NotRequired[DecodedLaneDocument]
+    steering: NotRequired[SteeringDocument | None]
+    overlay: NotRequired[OverlayDocument | None]
+    path_loss: NotRequired[PathLossDocument | None]
+
+
+class DecodePage(TypedDict):
+    """A page of decodes without their results, newest first; the Link header leads to the next one."""
+
+    items: list[DecodeHead]
+
+
+def decode_document(row: DecodeRow) -> DecodeDocument:
+    """A decode with its result, once there is one."""
+    return cast("DecodeDocument", {**decode_head(row), **(row.result or {})})
+
+
+def decode_head(row: DecodeRow) -> DecodeHead:
+    """A decode without its result."""
+    return {
+        "id": row.id,
+        "state": row.state,
+        "kind": DecodeKind(row.kind),
+        "progress": row.progress,
+        "attempts": row.attempts,
+        "created_at": row.created_at,
+        "finished_at": row.finished_at,
+        "context": row.context,
+        "error": cast("ErrorDocument | None", row.error),
+        "links": _links(f"/v1/decodes/{row.id}", row.kind, row.result or {}),
+    }
+
+
+def _links(path: str, kind: str, result: Mapping[str, Any]) -> DecodeLinks:
+    links: DecodeLinks = {"self": path}
+    if kind in (DecodeKind.FRAME, DecodeKind.ARCHIVE):
+        links["annotated"] = f"{path}/annotated.jpg"
+    else:
+        links["plot"] = f"{path}/plot.svg"
+    if kind == DecodeKind.PACKETS:
+        links["lane"] = f"{path}/lane.geojson"
+        if result.get("overlay"):
+            links["overlay"] = f"{path}/overlay.jpg"
+    return links

@@ -1,0 +1,261 @@
+"""Decoded frames as clients see them. Built by hand: a long drive has thousands of readings."""
+
+from __future__ import annotations
+
+import types
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from typing_extensions import TypedDict
+
+from app import __version__
+from app.decoders.plate import DECODER_VERSION
+from app.errors import WaymarkError
+from app.families import get_family, union_of
+from app.families.frames import FrameReading, Match
+from app.families.plate.plates import PLATE
+from app.formats.images import ImageHeader
+from app.geodesy import LocalizationGrade
+from app.markers.reading import PlateOutcome
+from app.services.decodes.fixes import Fix
+from app.services.decodes.matching import FRAME_READERS
+from app.services.decodes.wording import count_of
+from app.services.error_documents import ErrorDocument, error_document
+
+DECODER = f"waymark {__version__} {DECODER_VERSION}"
+
+
+@dataclass(frozen=True, slots=True)
+class ReadMarker:
+    """One candidate of a frame with its match in the registry and the vehicle's position by it."""
+
+    reading: FrameReading
+    match: Match | None = None
+    fix: Fix | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReadFrame:
+    """One frame: its markers and fix, or why it could not be read."""
+
+    index: int
+    name: str | None = None
+    header: ImageHeader | None = None
+    markers: tuple[ReadMarker, ...] = ()
+    fix: Fix | None = None
+    error: WaymarkError | None = None
+    load_ms: float = 0.0
+    decode_ms: float = 0.0
+
+
+class SigmaDocument(TypedDict):
+    """Standard deviations of a position."""
+
+    east_m: float
+    north_m: float
+    up_m: float | None
+    heading_deg: float
+
+
+class FixDocument(TypedDict):
+    """The vehicle's position; the covariance is of east, north, up [m] and heading [rad]."""
+
+    lon_deg: float
+    lat_deg: float
+    height_m: float | None
+    heading_deg: float
+    covariance: list[list[float]]
+    sigma: SigmaDocument
+    localization_grade: LocalizationGrade
+    notes: list[str]
+    marker_ids: list[str]
+
+
+class MatchDocument(TypedDict):
+    """The registered marker of a reading, or where an unregistered one would be by its digits."""
+
+    registered: bool
+    marker_id: str | None
+    status: str | None
+    localization_grade: str | None
+    lon_deg: float | None
+    lat_deg: float | None
+    distance_m: float | None
+    plausible: bool
+    ambiguous: bool
+    other_marker_ids: list[str]
+    note: str | None
+
+
+class ReadingPlace(TypedDict):
+    """What every reading has besides what its family reads: its frame, its match and the vehicle's position by it."""
+
+    frame: int
+    family: str
+    match: MatchDocument | None
+    fix: FixDocument | None
+
+
+def _in_frame(document: Any) -> Any:
+    return types.new_class(f"{document.__name__}InFrame", (ReadingPlace, document))
+
+
+AnyReading: Any = union_of(_in_frame(reader.document_type) for reader in FRAME_READERS.values())
+"""One candidate marker of any family; digits only where the outcome is `read`."""
+
+
+class FrameDocument(TypedDict):
+    """One frame of the upload."""
+
+    frame: int
+    name: str | None
+    error: ErrorDocument | None
+    width_px: int | None
+    height_px: int | None
+    format: str | None
+    orientation: int | None
+    ignored_trailing_bytes: int
+    load_ms: float
+    decode_ms: float
+    readings: int
+    fix: FixDocument | None
+
+
+class FrameSummary(TypedDict):
+    """Frames and plates in numbers, and in one sentence."""
+
+    text: str
+    frames: int
+    frames_failed: int
+    plates_read: int
+    plates_matched: int
+    fixes: int
+    outcomes: dict[str, int]
+
+
+class FramesResult(TypedDict):
+    """The result of decoding frames."""
+
+    decoder: str
+    codebook_plates: int
+    summary: FrameSummary
+    readings: list[AnyReading]
+    fix: FixDocument | None
+    frames: list[FrameDocument]
+
+
+def frames_result(frames: Sequence[ReadFrame], *, codebook_plates: int) -> FramesResult:
+    """The result of decoding frames, as it is stored."""
+    readings = [{"frame": frame.index, **_reading(marker)} for frame in frames for marker in frame.markers]
+    return {
+        "decoder": DECODER,
+        "codebook_plates": codebook_plates,
+        "summary": _summary(frames),
+        "readings": readings,
+        "fix": fix_document(frames[0].fix) if len(frames) == 1 else None,
+        "frames": [_frame(frame) for frame in frames],
+    }
+
+
+def fix_document(fix: Fix | None) -> FixDocument | None:
+    """A vehicle's position; the covariance is of east, north, up [m] and heading [rad]."""
+    if fix is None:
+        return None
+    sigma = np.sqrt(np.diag(fix.vehicle.covariance))
+    return {
+        "lon_deg": float(fix.vehicle.lon_deg),
+        "lat_deg": float(fix.vehicle.lat_deg),
+        "height_m": float(fix.vehicle.height_m) if fix.has_height else None,
+        "heading_deg": float(fix.vehicle.heading_deg),
+        "covariance": fix.vehicle.covariance.tolist(),
+        "sigma": {
+            "east_m": float(sigma[0]),
+            "north_m": float(sigma[1]),
+            "up_m": float(sigma[2]) if fix.has_height else None,
+            "heading_deg": float(np.degrees(sigma[3])),
+        },
+        "localization_grade": fix.grade,
+        "notes": list(fix.notes),
+        "marker_ids": list(fix.marker_ids),
+    }
+
+
+def _summary(frames: Sequence[ReadFrame]) -> FrameSummary:
+    markers = [marker for frame in frames for marker in frame.markers]
+    read = [marker for marker in markers if marker.reading.outcome == PlateOutcome.READ]
+    matched = [marker for marker in read if marker.match is not None and marker.match.row is not None]
+    failed = sum(frame.error is not None for frame in frames)
+    outcomes: dict[str, int] = {}
+    for marker in markers:
+        outcome = str(marker.reading.outcome)
+        outcomes[outcome] = outcomes.get(outcome, 0) + 1
+    refused = len(markers) - len(read)
+    text = f"{_counts(read)} read" if read else "no plate read"
+    text += f" in {count_of(len(frames), 'frame')}, {len(matched)} of them registered" if read else ""
+    text += f"; {count_of(refused, 'candidate')} refused" if refused else ""
+    text += f"; {count_of(failed, 'frame')} could not be decoded" if failed else ""
+    return {
+        "text": text,
+        "frames": len(frames),
+        "frames_failed": failed,
+        "plates_read": sum(marker.reading.family == PLATE.name for marker in read),
+        "plates_matched": sum(marker.reading.family == PLATE.name for marker in matched),
+        "fixes": sum(frame.fix is not None for frame in frames),
+        "outcomes": outcomes,
+    }
+
+
+def _counts(read: Sequence[ReadMarker]) -> str:
+    """How many markers of each family were read, in words."""
+    numbers = Counter(marker.reading.family for marker in read)
+    return " and ".join(count_of(number, get_family(name).label) for name, number in numbers.items())
+
+
+def _frame(frame: ReadFrame) -> FrameDocument:
+    header = frame.header
+    return {
+        "frame": frame.index,
+        "name": frame.name,
+        "error": error_document(frame.error) if frame.error else None,
+        "width_px": header.width_px if header else None,
+        "height_px": header.height_px if header else None,
+        "format": str(header.kind) if header else None,
+        "orientation": header.orientation if header else None,
+        "ignored_trailing_bytes": header.trailing_bytes if header else 0,
+        "load_ms": round(frame.load_ms, 3),
+        "decode_ms": round(frame.decode_ms, 3),
+        "readings": len(frame.markers),
+        "fix": fix_document(frame.fix),
+    }
+
+
+def _reading(marker: ReadMarker) -> dict[str, Any]:
+    reading = marker.reading
+    return {
+        "family": reading.family,
+        **FRAME_READERS[reading.family].document(reading),
+        "match": _match(marker.match),
+        "fix": fix_document(marker.fix),
+    }
+
+
+def _match(match: Match | None) -> MatchDocument | None:
+    if match is None:
+        return None
+    row = match.row
+    return {
+        "registered": row is not None,
+        "marker_id": row.id if row is not None else None,
+        "status": row.status if row is not None else None,
+        "localization_grade": row.localization_grade if row is not None else None,
+        "lon_deg": match.lon_deg,
+        "lat_deg": match.lat_deg,
+        "distance_m": round(match.distance_m, 3) if match.distance_m is not None else None,
+        "plausible": match.plausible,
+        "ambiguous": match.ambiguous,
+        "other_marker_ids": list(match.others),
+        "note": match.note or None,
+    }

@@ -1,0 +1,139 @@
+"""What is drawn from decodes that are stored: frames with outlines, lanes over frames, GeoJSON and plots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from app.errors import NotFound
+from app.formats.archives import read_member
+from app.plots.annotated_frame import Outline
+from app.registry import decodes as store
+from app.registry.database import Database
+from app.registry.decodes import DecodeRow
+from app.services.access.access import Caller
+from app.services.decoder_processes import DecoderProcesses
+from app.services.decodes.context import context_from_document
+from app.services.decodes.frame_task import AnnotationTask
+from app.services.decodes.kinds import DecodeKind
+from app.services.decodes.lane_documents import LaneCollection, lane_geojson, overlay_from_document
+from app.services.decodes.packet_task import OverlayTask
+from app.services.decodes.rules import DecodeRules
+from app.services.ports import Blobs
+
+
+class DecodeOutputs:
+    """Use cases on the pictures and files of a decode.
+
+    Parameters
+    ----------
+    database : Database
+    blobs : Blobs
+        Where uploads and plots are stored.
+    processes : DecoderProcesses
+    rules : DecodeRules, optional
+    """
+
+    def __init__(
+        self, database: Database, *, blobs: Blobs, processes: DecoderProcesses, rules: DecodeRules | None = None
+    ) -> None:
+        self._database, self._blobs, self._processes = database, blobs, processes
+        self._rules = rules or DecodeRules()
+
+    def annotated(self, caller: Caller, decode_id: str, suffix: str, frame: int = 0) -> bytes:
+        """A frame with its readings drawn over it, encoded as ``png`` or ``jpg``.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode or frame, or it is not done.
+        """
+        row, result = self._result(caller, decode_id)
+        shown = next((entry for entry in result.get("frames", ()) if entry["frame"] == frame), None)
+        if shown is None or shown["error"] is not None:
+            raise NotFound(f"decode {decode_id} has no readable frame {frame}", field="frame")
+        data = self._upload(row)
+        if row.kind == DecodeKind.ARCHIVE:
+            data = read_member(data, frame, self._rules.archives).data
+        context = context_from_document(row.context)
+        outlines = tuple(_outline(reading) for reading in result["readings"] if reading["frame"] == frame)
+        task = AnnotationTask(data, outlines, suffix, context.thermal, context.thermal_range, limits=self._rules.images)
+        return self._processes.submit(task).result()
+
+    def overlay(self, caller: Caller, decode_id: str, suffix: str) -> bytes:
+        """The camera frame of a drive with its lane drawn over it, encoded as ``png`` or ``jpg``.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode, or no overlay in it.
+        """
+        row, result = self._result(caller, decode_id)
+        overlay = result.get("overlay")
+        if not overlay:
+            raise NotFound(
+                f"decode {decode_id} has no overlay",
+                field="decode_id",
+                limit="a packet log with a camera frame, a camera and the vehicle's pose",
+                cure="report.warnings lists what was missing",
+            )
+        task = OverlayTask(
+            self._upload(row), overlay["frame"], overlay_from_document(overlay), suffix, self._rules.images
+        )
+        return self._processes.submit(task).result()
+
+    def lane(self, caller: Caller, decode_id: str) -> LaneCollection:
+        """Path, boundaries and markers of a drive as GeoJSON.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode, or it is not of a packet log.
+        """
+        _row, result = self._result(caller, decode_id)
+        if "lane" not in result:
+            raise NotFound(
+                f"decode {decode_id} is of no packet log", field="decode_id", limit="packet logs have a lane"
+            )
+        return lane_geojson(result["lane"], result["markers"])
+
+    def plot(self, caller: Caller, decode_id: str) -> bytes:
+        """Plot of a trace or a lane with what was found, SVG.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode, it is of frames, or it is not done.
+        """
+        row = self._get(caller, decode_id)
+        if row.picture_key is None:
+            has_plot = row.kind in (DecodeKind.TRACE, DecodeKind.PACKETS)
+            raise NotFound(
+                f"decode {decode_id} has no plot: it is {row.state}, of kind {row.kind}",
+                field="decode_id",
+                cure="wait until it is done" if has_plot else "frames have annotated.png and annotated.jpg",
+            )
+        return self._blobs.get(row.picture_key)
+
+    def _get(self, caller: Caller, decode_id: str) -> DecodeRow:
+        with self._database.read() as connection:
+            return store.get_decode(connection, caller.agency_id, decode_id, holder_id=caller.own_key_id)
+
+    def _result(self, caller: Caller, decode_id: str) -> tuple[DecodeRow, dict[str, Any]]:
+        row = self._get(caller, decode_id)
+        if row.result is None:
+            raise NotFound(
+                f"decode {decode_id} has no result: it is {row.state}",
+                field="decode_id",
+                cure="wait until it is done",
+            )
+        return row, row.result
+
+    def _upload(self, row: DecodeRow) -> bytes:
+        assert row.upload_key is not None
+        return self._blobs.get(row.upload_key)
+
+
+def _outline(reading: dict[str, Any]) -> Outline:
+    corners = tuple((float(x), float(y)) for x, y in reading["corners_px"] or ())
+    label = f"{reading['digits']} {reading['confidence']:.1%}" if reading["digits"] else reading["outcome"]
+    return Outline(corners, reading["outcome"], label)

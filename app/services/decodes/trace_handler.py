@@ -1,0 +1,119 @@
+"""Recordings of magnetometers: through a decoder process, then matched against the registered information tags."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+
+import sqlalchemy as sa
+
+from app.decoders.magnet.identify import TagFormat
+from app.decoders.magnet.match import ReadTrace, match_tags
+from app.errors import UnreadableUpload
+from app.registry.codebooks import CODEBOOKS, book_of
+from app.registry.database import Database
+from app.registry.decodes import NewObservation
+from app.services.decoder_processes import DecoderProcesses, Pending
+from app.services.decodes.context import DecodeContext
+from app.services.decodes.kinds import DecodeKind
+from app.services.decodes.rules import DecodeRules
+from app.services.decodes.trace_documents import trace_document
+from app.services.decodes.trace_matching import NearbyTags, find_nearby_tags
+from app.services.decodes.trace_task import TraceResult, TraceTask, trace_terms
+from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
+from app.services.markers.codebook_documents import MAX_BOOKS_SEARCHED
+
+
+@dataclass(frozen=True, slots=True)
+class TraceSignal:
+    """What a decoder process found in a recording, and the tags that it was looking for."""
+
+    result: TraceResult
+    nearby: NearbyTags
+
+
+@dataclass(frozen=True, slots=True)
+class StartedTrace:
+    """A recording in a decoder process."""
+
+    nearby: NearbyTags
+    pending: Pending[TraceResult]
+
+    def result(self) -> TraceSignal:
+        """Wait for the findings."""
+        return TraceSignal(self.pending.result(), self.nearby)
+
+    def cancel(self) -> None:
+        """Stop the process."""
+        self.pending.cancel()
+
+
+class TraceHandler(UploadHandler[TraceSignal]):
+    """Magnetometer traces. Short ones are decoded while the caller waits."""
+
+    kind = DecodeKind.TRACE
+
+    def __init__(self, database: Database, processes: DecoderProcesses, rules: DecodeRules) -> None:
+        self._database, self._processes, self._rules = database, processes, rules
+
+    def accepts(self, context: DecodeContext, data: bytes) -> bool:
+        """Uploads whose context declares a trace."""
+        return context.trace is not None
+
+    def is_job(self, data: bytes) -> bool:
+        """Whether the recording is longer than `DecodeRules.immediate_trace_bytes`."""
+        check_not_empty(data)
+        return len(data) > self._rules.immediate_trace_bytes
+
+    def start(self, upload: Upload) -> StartedTrace:
+        """Hand the recording over with the tags that the drive can have passed."""
+        declared = upload.context.trace or {}
+        position, reach_m = upload.context.coarse_position, trace_terms(declared).reach_m
+        with self._database.read() as connection:
+            nearby = find_nearby_tags(connection, upload.agency_id, position, reach_m)
+            formats = () if nearby.texts else _book_formats(connection, upload.agency_id)
+        name = str(declared.get("file_name") or "recording")
+        task = TraceTask(name, upload.data, declared, nearby.texts, formats, self._rules.traces)
+        return StartedTrace(nearby, self._processes.submit(task, wait_s=upload.wait_s))
+
+    def plot(self, signal: TraceSignal) -> bytes:
+        """The trace with what was found in it."""
+        return signal.result.plot
+
+    def match(self, connection: sa.Connection, upload: Upload, signal: TraceSignal) -> Decoded:
+        """Match the findings against the registered tags."""
+        terms = trace_terms(upload.context.trace or {})
+        trace = match_tags(signal.result.findings, signal.nearby.tags, terms.bar)
+        document = trace_document(signal.result, trace, codebook_tags=len(signal.nearby.texts))
+        return Decoded(document, _observations(trace, upload.observed_at))
+
+
+def check_not_empty(data: bytes) -> None:
+    """Raise `UnreadableUpload` for a file without content."""
+    if not data:
+        raise UnreadableUpload("the file is empty", field="file", cure="send the recording again, whole")
+
+
+def _book_formats(connection: sa.Connection, agency_id: str) -> tuple[TagFormat, ...]:
+    """Formats of the agency's codebooks: what tags look like where none is registered near by."""
+    rows, _ = CODEBOOKS.page(connection, agency_id, limit=MAX_BOOKS_SEARCHED)
+    designs = [book_of(row).design for row in rows]
+    return tuple(dict.fromkeys(TagFormat(d.magnets, d.length_m, d.segment_m) for d in designs))
+
+
+def _observations(trace: ReadTrace, observed_at: datetime) -> list[NewObservation]:
+    """One row for each registered tag; of one that was passed twice the more confident reading counts."""
+    rows: dict[str, NewObservation] = {}
+    for tag in sorted(trace.tags, key=lambda tag: -tag.reading.confidence):
+        if tag.match is None or tag.match.tag is None:
+            continue
+        reading, marker_id = tag.reading, tag.match.tag.marker_id
+        detail = {
+            "confidence": float(reading.confidence),
+            "missing_magnets": reading.missing,
+            "extra_magnets": reading.extra,
+            "lateral_cm": round(float(reading.lateral_cm), 2),
+        }
+        what = "wrong-way" if reading.wrong_way else "seen"
+        rows.setdefault(marker_id, NewObservation(marker_id, 0, observed_at, what, detail))
+    return list(rows.values())

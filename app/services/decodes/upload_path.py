@@ -1,0 +1,286 @@
+"""The path of every upload: start, decode, match, store; the same for an immediate response and for a job.
+
+`UploadHandler` is what one kind of upload adds to it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import sqlalchemy as sa
+
+from app.errors import Unavailable
+from app.registry import cerpms
+from app.registry import decodes as store
+from app.registry.database import Database
+from app.registry.decodes import DecodeRow, NewObservation
+from app.registry.ids import new_id
+from app.services.access.access import Caller
+from app.services.decodes.context import DecodeContext
+from app.services.decodes.documents import DecodeDocument, decode_document
+from app.services.decodes.frame_documents import FramesResult
+from app.services.decodes.kinds import DecodeKind
+from app.services.decodes.packet_documents import PacketsResult
+from app.services.decodes.trace_documents import TraceResultDocument
+from app.services.fleet.vehicle_uploads import count_driven, count_upload
+from app.services.idempotency import IdempotencyKey, idempotent
+from app.services.jobs import RunningJob
+from app.services.ports import Blobs, Clock
+from app.services.staged_blobs import StagedBlobs, staged
+
+UPLOADS, PICTURES = "uploads", "pictures"
+"""Folders of the blob store."""
+MAX_TRIES = 12
+"""How often an upload is matched anew because another one was stored in between."""
+SignalT = TypeVar("SignalT")
+SignalT_co = TypeVar("SignalT_co", covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """A file with its context.
+
+    Attributes
+    ----------
+    agency_id : str
+    data : bytes
+    context : DecodeContext
+    received_at : datetime
+    wait_s : float
+        How long to wait for a decoder process. [s]
+    report_progress : callable
+        Called with a number from 0 to 1 by handlers that work for long; what it raises stops the decode.
+    """
+
+    agency_id: str
+    data: bytes
+    context: DecodeContext
+    received_at: datetime
+    wait_s: float = 0.0
+    report_progress: Callable[[float], None] = lambda _progress: None
+
+    @property
+    def observed_at(self) -> datetime:
+        """When markers were observed: when the upload was captured, else when it was received."""
+        return self.context.captured_at or self.received_at
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """An upload that was decoded and matched, ready to be stored.
+
+    Attributes
+    ----------
+    document
+        The result.
+    observations : sequence of NewObservation
+    spans : sequence of dict
+        Transmissions of CERPMs that were received.
+    """
+
+    document: FramesResult | TraceResultDocument | PacketsResult
+    observations: Sequence[NewObservation] = ()
+    spans: Sequence[dict[str, Any]] = ()
+
+
+class OutdatedMatch(Exception):
+    """What an upload was matched against has changed: it has to be matched anew."""
+
+
+class Started(Protocol[SignalT_co]):
+    """An upload in the decoder processes."""
+
+    def result(self) -> SignalT_co:
+        """Wait for the signal; after an `OutdatedMatch` it is called again."""
+
+    def cancel(self) -> None:
+        """Stop the decoder processes."""
+
+
+class UploadHandler(ABC, Generic[SignalT]):
+    """What one kind of upload adds to the common path."""
+
+    kind: ClassVar[DecodeKind]
+
+    @abstractmethod
+    def accepts(self, context: DecodeContext, data: bytes) -> bool:
+        """Whether an upload is of this kind."""
+
+    @abstractmethod
+    def is_job(self, data: bytes) -> bool:
+        """Whether an upload takes too long for an immediate response. Raises if it is not worth decoding."""
+
+    @abstractmethod
+    def start(self, upload: Upload) -> Started[SignalT]:
+        """Hand the upload to the decoder processes.
+
+        Raises
+        ------
+        UnreadableUpload, UnsupportedUpload, UploadTooLarge, InvalidParameter
+            The upload is refused.
+        Unavailable
+            The decoder processes are busy.
+        """
+
+    @abstractmethod
+    def match(self, connection: sa.Connection, upload: Upload, signal: SignalT) -> Decoded:
+        """Match the signal against the registry, in the transaction that stores the result.
+
+        Raises
+        ------
+        OutdatedMatch
+            The signal rests on rows that have changed.
+        """
+
+    def plot(self, signal: SignalT) -> bytes | None:
+        """A plot of the signal, SVG."""
+        return None
+
+
+class DecodeRecord(Protocol):
+    """Where a decode is stored: in a new row, or in the row that was queued."""
+
+    def stage(self, stage: StagedBlobs) -> None:
+        """Write the upload, if it is not stored yet."""
+
+    def store(self, connection: sa.Connection, match: Callable[[], Decoded], picture_key: str | None) -> bool:
+        """Store what `match` returns. Returns False if the result was stored before."""
+
+
+class UploadPath:
+    """Takes uploads through their handlers.
+
+    Parameters
+    ----------
+    database : Database
+    blobs : Blobs
+        Where uploads and plots are stored.
+    """
+
+    def __init__(self, database: Database, blobs: Blobs) -> None:
+        self._database, self._blobs = database, blobs
+
+    def decode(self, upload: Upload, handler: UploadHandler[SignalT], record: DecodeRecord) -> None:
+        """Decode an upload, match it and store the result. Nothing is stored unless the transaction commits.
+
+        Raises
+        ------
+        Unavailable
+            The decoder processes are busy, or other uploads about the same markers were stored in between each time.
+        """
+        with staged(self._blobs) as stage, _cancelled_on_error(handler.start(upload)) as started:
+            record.stage(stage)  # while the decoder process works
+            for _try in range(MAX_TRIES):
+                signal = started.result()
+                plot = handler.plot(signal)
+                picture_key = stage.put(PICTURES, plot) if plot is not None else None
+                try:
+                    with self._database.write() as connection:
+                        is_new = record.store(connection, _bound(handler, connection, upload, signal), picture_key)
+                except OutdatedMatch:
+                    stage.delete(picture_key)
+                    continue
+                if is_new:
+                    stage.keep()
+                return
+        raise Unavailable("other drives past the same markers are being stored", cure="try again in a few seconds")
+
+
+def _bound(
+    handler: UploadHandler[SignalT], connection: sa.Connection, upload: Upload, signal: SignalT
+) -> Callable[[], Decoded]:
+    return lambda: handler.match(connection, upload, signal)
+
+
+@contextmanager
+def _cancelled_on_error(started: Started[SignalT]) -> Iterator[Started[SignalT]]:
+    try:
+        yield started
+    except BaseException:
+        started.cancel()
+        raise
+
+
+# --- records ----------------------------------------------------------------------------------------------------------
+
+
+class NewRecord:
+    """The decode of an upload whose sender waits for the response.
+
+    Attributes
+    ----------
+    response : DecodeDocument
+        The decode, once it is stored.
+    replayed : bool
+        Another request with the same Idempotency-Key was faster; nothing was stored.
+    """
+
+    response: DecodeDocument
+
+    def __init__(
+        self, caller: Caller, handler: UploadHandler[Any], upload: Upload, clock: Clock,
+        *, key: IdempotencyKey | None, ttl: timedelta,
+    ) -> None:  # fmt: skip
+        self._caller, self._upload, self._clock = caller, upload, clock
+        self._key, self._ttl = key, ttl
+        self._row = new_decode(handler, upload)
+        self.replayed = False
+
+    def stage(self, stage: StagedBlobs) -> None:
+        """Write the upload."""
+        self._row = self._row._replace(upload_key=stage.put(UPLOADS, self._upload.data))
+
+    def store(self, connection: sa.Connection, match: Callable[[], Decoded], picture_key: str | None) -> bool:
+        """Store a new decode that is done."""
+        agency_id, now = self._caller.agency_id, self._upload.received_at
+        with idempotent(connection, agency_id, self._key, now, self._ttl) as answer:
+            if not answer.replayed:
+                decoded = match()
+                row = self._row._replace(
+                    state="done", progress=1.0, attempts=1, picture_key=picture_key, result=dict(decoded.document),
+                    finished_at=self._clock(),
+                )  # fmt: skip
+                store.add_decode(connection, agency_id, self._caller.key_id, row)
+                count_upload(connection, agency_id, row.id, self._upload.context, now)
+                _store_decoded(connection, self._upload, row.id, decoded)
+                answer.store(decode_document(row))
+        self.response, self.replayed = answer.response, answer.replayed
+        return not answer.replayed
+
+
+class QueuedRecord:
+    """The decode of a job."""
+
+    def __init__(self, job: RunningJob, upload: Upload, clock: Clock) -> None:
+        self._job, self._upload, self._clock = job, upload, clock
+
+    def stage(self, stage: StagedBlobs) -> None:
+        """The upload was stored when it was queued."""
+
+    def store(self, connection: sa.Connection, match: Callable[[], Decoded], picture_key: str | None) -> bool:
+        """Store the result of the decode, and finish its job."""
+        decoded, decode_id = match(), self._job.row.id
+        if not self._job.finish(connection):
+            return False
+        store.store_result(
+            connection, self._upload.agency_id, decode_id,
+            result=decoded.document, picture_key=picture_key, now=self._clock(),
+        )  # fmt: skip
+        _store_decoded(connection, self._upload, decode_id, decoded)
+        return True
+
+
+def new_decode(handler: UploadHandler[Any], upload: Upload) -> DecodeRow:
+    """A decode that waits for its result."""
+    return DecodeRow(new_id(upload.received_at), handler.kind, upload.context.document(), upload.received_at)
+
+
+def _store_decoded(connection: sa.Connection, upload: Upload, decode_id: str, decoded: Decoded) -> None:
+    cerpms.add_spans(connection, upload.agency_id, decode_id, decoded.spans)
+    store.add_observations(connection, upload.agency_id, decode_id, decoded.observations)
+    count_driven(connection, upload.agency_id, decode_id, upload.context, decoded.document)

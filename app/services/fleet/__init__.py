@@ -1,0 +1,1 @@
+"""Use cases on vehicles, calibrations and snapshots."""

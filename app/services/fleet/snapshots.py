@@ -1,0 +1,124 @@
+"""Snapshots of an area for vehicles without a connection."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import sqlalchemy as sa
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from app.encoders.snapshot import write_snapshot
+from app.errors import InvalidParameter
+from app.families import FAMILIES
+from app.markers.snapshot import MAX_MARKERS, key_id_of
+from app.registry import bulk
+from app.registry.codebooks import CODEBOOKS, book_of
+from app.registry.database import Database
+from app.registry.marker_rows import MarkerRow
+from app.registry.spatial import Box
+from app.services.access.access import Caller
+from app.services.decodes.fixes import horizontal_rmse_m
+from app.services.markers.codebook_documents import MAX_BOOKS_SEARCHED
+from app.services.ports import Clock
+
+MAX_HOURS = 24.0 * 366
+_MEMBERS = (
+    "id", "family", "status", "lon_deg", "lat_deg", "height_m", "vertical_datum", "heading_deg", "vertical_rmse_m",
+    "heading_rmse_deg", "localization_grade",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class PublicKey:
+    """What vehicles verify snapshots with."""
+
+    key_id: bytes
+    public_key: bytes
+
+
+class Snapshots:
+    """Use cases on snapshots.
+
+    Parameters
+    ----------
+    database : Database
+    clock : Clock
+    signing_key : callable
+        The server's key; asked for at the first use.
+    """
+
+    def __init__(self, database: Database, clock: Clock, signing_key: Callable[[], Ed25519PrivateKey]) -> None:
+        self._database = database
+        self._clock = clock
+        self._signing_key = signing_key
+
+    def make(self, caller: Caller, box: Box, hours: float) -> bytes:
+        """A signed snapshot of the agency's markers in a box, all but the retired ones, and its codebooks.
+
+        It holds no secret: the keys of CERPMs are symmetric, who can verify with one can sign with it.
+
+        Raises
+        ------
+        InvalidParameter
+            There are too many, or it would hold for too long.
+        """
+        if not 0 < hours <= MAX_HOURS:
+            raise InvalidParameter(
+                f"a snapshot cannot hold for {hours:g} h", field="hours", limit=f"above 0, at most {MAX_HOURS:g} h"
+            )
+        now = self._clock()
+        with self._database.read() as connection:
+            markers = list_markers(connection, caller.agency_id, box)
+            books, _ = CODEBOOKS.page(connection, caller.agency_id, limit=MAX_BOOKS_SEARCHED)
+        return write_snapshot(
+            markers,
+            agency_id=caller.agency_id,
+            area_deg=(box.west_deg, box.south_deg, box.east_deg, box.north_deg),
+            made_at=now,
+            expires_at=now + timedelta(hours=hours),
+            key=self._signing_key(),
+            codebooks=[book_of(row).to_document() for row in books],
+        )
+
+    def public_key(self) -> PublicKey:
+        """The key that this server's snapshots are verified with."""
+        public = self._signing_key().public_key().public_bytes_raw()
+        return PublicKey(key_id_of(public), public)
+
+
+def list_markers(connection: sa.Connection, agency_id: str, box: Box) -> list[dict[str, Any]]:
+    """The agency's markers in a box as a snapshot holds them, in the order of their ids.
+
+    If there are more than fit, one more than fits is returned.
+    """
+    records: list[dict[str, Any]] = []
+    for family in FAMILIES:
+        left = MAX_MARKERS + 1 - len(records)
+        if left <= 0:
+            break
+        snapshot = family.snapshot
+        rows = bulk.list_for_snapshot(
+            connection,
+            agency_id,
+            family.name,
+            box,
+            columns=snapshot.columns(),
+            with_retired=snapshot.with_retired,
+            limit=left,
+        )
+        members = snapshot.members(connection, agency_id, rows) if len(rows) < left else {}
+        records += [_record(row, snapshot.kind(row), members.get(row.id, {})) for row in rows]
+    return sorted(records, key=lambda record: str(record["id"]))
+
+
+def _record(row: MarkerRow, kind: dict[str, Any], members: dict[str, Any]) -> dict[str, Any]:
+    note = None if row.localization_grade == "exact" else row.transform_note
+    record = (
+        {name: getattr(row, name) for name in _MEMBERS}
+        | (row.spec or {})
+        | {"code": row.digits, "horizontal_rmse_m": horizontal_rmse_m(row)}
+    )
+    return record | members | {"kind": kind | {"transform_note": note}}

@@ -1,0 +1,1 @@
+"""Use cases on markers, codebooks, artwork and searches."""

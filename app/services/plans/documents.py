@@ -1,0 +1,205 @@
+"""Documents of alignments and plans, as clients see them."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+
+from typing_extensions import TypedDict
+
+PlanStatus = Literal["draft", "checked", "proved", "approved", "committed", "built", "surveyed"]
+
+
+class LaneSummary(TypedDict):
+    """A lane of an alignment."""
+
+    name: str
+    road: str
+    length_m: float
+    width_m: list[float]
+    """Least and greatest. [m]"""
+    design_speed_kmh: list[float]
+    """Least and greatest. [km/h]"""
+    min_radius_m: float | None
+    """Of its sharpest bend; null on a straight. [m]"""
+    max_grade: float
+    left_style: str
+    right_style: str
+
+
+class EventSummary(TypedDict):
+    """Something on a lane that vehicles must know ahead of time."""
+
+    kind: str
+    lane: str
+    chainage_m: float
+    value: float | str | None
+
+
+class RoadSummary(TypedDict):
+    """What was read of a road."""
+
+    format: str
+    lanes: list[LaneSummary]
+    events: list[EventSummary]
+    areas: int
+    lane_length_m: float
+    extent_deg: list[float]
+    """West, south, east, north; west is greater than east across the antimeridian. [deg]"""
+    crs: str
+    realization: str | None
+    surveyed: bool
+    localization_grade: str
+    warnings: list[str]
+
+
+class AlignmentDocument(RoadSummary):
+    """A road that plans are made for."""
+
+    id: str
+    name: str
+    declaration: dict[str, Any]
+    source_sha256: str
+    version: int
+    created_at: datetime
+    updated_at: datetime
+
+
+class AlignmentPage(TypedDict):
+    """A page of alignments."""
+
+    items: list[AlignmentDocument]
+
+
+class FindingDocument(TypedDict):
+    """One check of a plan, at its worst place."""
+
+    name: str
+    figure: float
+    relation: str
+    limit: float
+    unit: str
+    source: str
+    verdict: str
+    sentence: str
+    lane: str | None
+    station_m: float | None
+    lon_deg: float | None
+    lat_deg: float | None
+
+
+class LeftOutDocument(TypedDict):
+    """A place that the rules ask for and that got no marker, or a moved one."""
+
+    family: str
+    lane: str
+    chainage_m: float
+    reason: str
+    moved_m: float | None
+
+
+class PlanSummary(TypedDict):
+    """What was placed, and what the checks found."""
+
+    counts: dict[str, int]
+    lane_length_m: float
+    verdict: str
+    """The worst of all findings."""
+    findings: list[FindingDocument]
+    left_out: list[LeftOutDocument]
+    left_out_count: int
+    cost: float
+    cost_complete: bool
+    currency: str
+    codebook_entries: int
+
+
+class PlanOverview(TypedDict):
+    """A plan in a list, so that variants stand side by side."""
+
+    id: str
+    name: str
+    alignment_id: str
+    status: PlanStatus
+    counts: dict[str, int]
+    verdict: str
+    cost: float
+    cost_complete: bool
+    currency: str
+    version: int
+    created_at: datetime
+    updated_at: datetime
+
+
+class PlanDocument(PlanSummary):
+    """A plan with its rules and its findings."""
+
+    id: str
+    name: str
+    alignment_id: str
+    status: PlanStatus
+    rules: dict[str, Any]
+    author: str
+    approver: str | None
+    version: int
+    created_at: datetime
+    updated_at: datetime
+
+
+class PlanPage(TypedDict):
+    """A page of plans."""
+
+    items: list[PlanOverview]
+
+
+class PlanVersionDocument(TypedDict):
+    """A version of a plan."""
+
+    version: int
+    at: datetime
+    who: str
+    why: str | None
+    plan: dict[str, Any]
+
+
+class PlanVersionPage(TypedDict):
+    """A page of a plan's history."""
+
+    items: list[PlanVersionDocument]
+
+
+class CommittedPlan(PlanDocument):
+    """A plan whose markers are in the registry."""
+
+    markers: int
+    """Markers of the registry that it became: a line of magnets is one."""
+    uncommitted: int
+    """Planned magnets that stand alone on their line and became no marker."""
+
+
+class BuiltMarker(TypedDict):
+    """A marker of a plan beside what was built."""
+
+    number: int
+    marker_id: str
+    status: str
+    along_m: float
+    """Built before (negative) or behind its planned place, in the direction of travel. [m]"""
+    across_m: float
+    """Built left (positive) of its planned place. [m]"""
+    heading_deg: float | None
+    """Built heading less the planned one. [deg]"""
+    in_tolerance: bool
+
+
+class AsBuiltDocument(TypedDict):
+    """A plan beside what was built."""
+
+    surveyed: int
+    not_surveyed: int
+    out_of_tolerance: int
+    tolerances: dict[str, float]
+    rms_along_m: float | None
+    rms_across_m: float | None
+    markers: list[BuiltMarker]
+    """Those out of tolerance first, then by the size of their residuals; at most 1,000."""

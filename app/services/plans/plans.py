@@ -1,0 +1,382 @@
+"""Plans: markers placed on an alignment by rules, checked, approved, and committed to the registry."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.errors import CodeTaken, Conflict, InvalidParameter
+from app.families import FAMILIES
+from app.families.rules import MarkerRules
+from app.planning.outputs.plan_document import read_plan
+from app.planning.plan import Plan
+from app.planning.plan_checks import ExistingMarker
+from app.registry import bulk
+from app.registry.codebooks import CODEBOOKS, book_of
+from app.registry.database import Database
+from app.registry.plans import ALIGNMENTS, PLANS, PlanRow, list_built, list_existing
+from app.registry.resources import first_version
+from app.registry.spatial import Box
+from app.services.access.access import Caller
+from app.services.access.audit import log_change
+from app.services.decoder_processes import DecoderProcesses
+from app.services.documents import document_of
+from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
+from app.services.plans.alignments import BUSY_WAIT_S, road_of
+from app.services.plans.as_built import compare_as_built
+from app.services.plans.commit import commit_markers
+from app.services.plans.documents import (
+    AsBuiltDocument,
+    CommittedPlan,
+    PlanDocument,
+    PlanOverview,
+    PlanPage,
+    PlanVersionDocument,
+    PlanVersionPage,
+)
+from app.services.plans.tasks import MadePlan, MakePlanTask, WritePlanFileTask
+from app.services.ports import Blobs, Clock
+from app.services.staged_blobs import staged
+
+DRAFT, CHECKED, PROVED, APPROVED, COMMITTED = "draft", "checked", "proved", "approved", "committed"
+MAX_EXISTING = 200_000
+"""Markers of the registry near a road that a plan is checked against. Source: chosen by hand, bounds the memory."""
+_MARGIN_DEG = 0.001  # [deg] around the road; source: chosen by hand, about 100 m
+_TRIES = 4  # of drawing registry numbers that nobody has; source: chosen by hand
+
+
+@dataclass(frozen=True, slots=True)
+class PlanChange:
+    """What to change of a plan; what is not in `values` (name, rules) stays."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    reason: str | None = None
+
+
+class Plans:
+    """Use cases on plans, one transaction each.
+
+    Parameters
+    ----------
+    database, clock, blobs, processes
+    rules : MarkerRules
+        Of the markers that plans become.
+    """
+
+    def __init__(
+        self, database: Database, clock: Clock, blobs: Blobs, processes: DecoderProcesses, rules: MarkerRules
+    ) -> None:
+        self._database, self._clock, self._blobs, self._processes = database, clock, blobs, processes
+        self._rules = rules
+
+    @property
+    def _ttl(self) -> timedelta:
+        return self._rules.idempotency_ttl
+
+    def make(
+        self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any], key: IdempotencyKey | None = None
+    ) -> tuple[PlanDocument, bool]:
+        """Place and check the markers of a new plan, and store it.
+
+        Returns
+        -------
+        plan : PlanDocument
+            With the status ``checked``, or ``draft`` if a check fails.
+        replayed : bool
+            The request had been made before under the same Idempotency-Key.
+
+        Raises
+        ------
+        NotFound
+            There is no such alignment.
+        InvalidParameter
+            The rules cannot be, or do not fit the road.
+        Conflict
+            The agency has a plan of this name.
+        """
+        now, agency_id = self._clock(), caller.agency_id
+        if earlier := find_earlier(self._database, agency_id, key, now):
+            return earlier, True
+        with self._database.read() as connection:
+            PLANS.check_name(connection, agency_id, name)
+        made = self._made(caller, name, alignment_id, rules)
+        with staged(self._blobs) as stage:
+            document_key = stage.put("plans", made.document, durable=True)
+            with (
+                self._database.write() as connection,
+                idempotent(connection, agency_id, key, now, self._ttl) as answer,
+            ):
+                if answer.replayed:
+                    return answer.response, True
+                PLANS.check_name(connection, agency_id, name)
+                values = {
+                    **first_version(now),
+                    "name": name,
+                    "alignment_id": alignment_id,
+                    **_made_columns(caller, made, rules, document_key),
+                }
+                row = PLANS.add(connection, agency_id, values, who=caller.label)
+                document = answer.store(plan_document(row))
+                log_change(connection, caller, "plan.made", now=now, subject=row.id, document=rules)
+            stage.keep()
+        return document, False
+
+    def get(self, caller: Caller, plan_id: str) -> PlanDocument:
+        """One plan."""
+        return plan_document(self._get(caller, plan_id))
+
+    def page(
+        self,
+        caller: Caller,
+        *,
+        alignment_id: str | None = None,
+        status: str | None = None,
+        after: str | None = None,
+        limit: int = 100,
+    ) -> tuple[PlanPage, str | None]:
+        """A page of plans without their findings, and the id to continue after if there are more."""
+        with self._database.read() as connection:
+            rows, last = PLANS.page(
+                connection, caller.agency_id, beyond=after, limit=limit, alignment_id=alignment_id, status=status
+            )
+        return {"items": [document_of(PlanOverview, row, **_members(row, PlanOverview)) for row in rows]}, last
+
+    def history(
+        self, caller: Caller, plan_id: str, *, after: int = 0, limit: int = 100
+    ) -> tuple[PlanVersionPage, int | None]:
+        """A page of a plan's history, oldest first, and the version to continue after if there are more."""
+        with self._database.read() as connection:
+            rows, last = PLANS.history(connection, caller.agency_id, plan_id, after=after, limit=limit)
+        return {"items": [document_of(PlanVersionDocument, row, plan=row.stored) for row in rows]}, last
+
+    def change(self, caller: Caller, plan_id: str, change: PlanChange, version: int | None) -> PlanDocument:
+        """Rename a plan, or place and check it again by other rules; the proof and the approval are then gone.
+
+        Raises
+        ------
+        NotFound, StaleVersion, InvalidParameter
+        Conflict
+            Another plan has the name, or the plan is committed.
+        """
+        row = self._get(caller, plan_id)
+        _check_status(row, (DRAFT, CHECKED, PROVED, APPROVED), "changed", "make another plan on the same alignment")
+        name, rules = change.values.get("name", row.name), change.values.get("rules", row.rules)
+        made = self._made(caller, name, row.alignment_id, rules) if "rules" in change.values else None
+        now, agency_id = self._clock(), caller.agency_id
+        with staged(self._blobs) as stage:
+            changes: dict[str, Any] = {"name": name}
+            if made is not None:
+                changes |= _made_columns(caller, made, rules, stage.put("plans", made.document, durable=True))
+            with self._database.write() as connection:
+                row = PLANS.get_at(connection, agency_id, plan_id, version)
+                _check_status(row, (DRAFT, CHECKED, PROVED, APPROVED), "changed", "make another plan")
+                if name != row.name:
+                    PLANS.check_name(connection, agency_id, name)
+                document = _changed(connection, caller, row, changes, now, "plan.changed", change.reason)
+            stage.keep()
+        return document
+
+    def approve(self, caller: Caller, plan_id: str, version: int | None) -> PlanDocument:
+        """Approve a plan that somebody else made and that passed its checks.
+
+        Raises
+        ------
+        NotFound, StaleVersion
+        Conflict
+            The author approves, a check fails, or the plan is approved already.
+        """
+        with self._database.write() as connection:
+            row = PLANS.get_at(connection, caller.agency_id, plan_id, version)
+            _check_status(row, (CHECKED, PROVED), "approved", "change its rules until every check passes")
+            if row.author_id == caller.key_id:
+                raise Conflict(
+                    "the author of a plan cannot approve it",
+                    field="approver",
+                    limit="author and approver differ",
+                    cure="let the holder of another key approve it",
+                )
+            changes = {"status": APPROVED, "approver": caller.label}
+            return _changed(connection, caller, row, changes, self._clock(), "plan.approved", None)
+
+    def commit(
+        self, caller: Caller, plan_id: str, version: int | None, key: IdempotencyKey | None = None
+    ) -> tuple[CommittedPlan, bool]:
+        """Make the markers of an approved plan planned markers of the registry: all or none.
+
+        Raises
+        ------
+        NotFound, StaleVersion
+        Conflict
+            The plan is not approved, or its codebook was changed.
+        CodeTaken
+            Another marker has got one of its codes since it was placed.
+        """
+        now, agency_id = self._clock(), caller.agency_id
+        if earlier := find_earlier(self._database, agency_id, key, now):
+            return earlier, True
+        row = self._get(caller, plan_id)
+        plan = read_plan(zlib.decompress(self._blobs.get(row.document_key)))
+        with (
+            self._database.write(long=True) as connection,
+            idempotent(connection, agency_id, key, now, self._ttl) as answer,
+        ):
+            if answer.replayed:
+                return answer.response, True
+            row = PLANS.get_at(connection, agency_id, plan_id, row.version if version is None else version)
+            _check_status(row, (APPROVED,), "committed", "let somebody approve it first")
+            if taken := self._taken(connection, agency_id, [(m.family, m.code) for m in plan.markers]):
+                raise CodeTaken(
+                    f"{len(taken)} codes of the plan belong to other markers by now, e.g. {min(taken)}",
+                    field="plan",
+                    limit="codes that no other marker has",
+                    cure="PATCH the plan with its own rules: its markers get new codes",
+                )
+            markers, uncommitted = commit_markers(connection, caller, row, plan, self._rules, now)
+            committed = _changed(connection, caller, row, {"status": COMMITTED}, now, None, None)
+            document = answer.store(CommittedPlan(**committed, markers=markers, uncommitted=uncommitted))
+        return document, False
+
+    def file(
+        self, caller: Caller, plan_id: str, name: str, *, crs: str | None = None, unit: str | None = None
+    ) -> tuple[bytes, int]:
+        """A file of a plan, and the plan's version; CRS and unit are those of the crew that stakes it out.
+
+        Raises
+        ------
+        NotFound
+            There is no such plan, or it has no such file.
+        InvalidParameter, ReferenceSystemError
+            The CRS or the unit cannot be used.
+        """
+        row = self._get(caller, plan_id)
+        task = WritePlanFileTask(self._blobs.get(row.document_key), name, crs, unit)
+        return self._processes.submit(task, wait_s=BUSY_WAIT_S).result(), row.version
+
+    def as_built(self, caller: Caller, plan_id: str) -> AsBuiltDocument:
+        """A plan beside what was built and surveyed; nothing is, before it is committed.
+
+        Raises
+        ------
+        NotFound
+        """
+        row = self._get(caller, plan_id)
+        with self._database.read() as connection:
+            built = list_built(connection, caller.agency_id, plan_id)
+        return compare_as_built(self._plan(row), built)
+
+    # --- steps ------------------------------------------------------------------------------------------------------
+
+    def _get(self, caller: Caller, plan_id: str) -> PlanRow:
+        with self._database.read() as connection:
+            return PLANS.get(connection, caller.agency_id, plan_id)
+
+    def _plan(self, row: PlanRow) -> Plan:
+        return read_plan(zlib.decompress(self._blobs.get(row.document_key)))
+
+    def _made(self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any]) -> MadePlan:
+        """The plan, with codes that no stored marker has."""
+        with self._database.read() as connection:
+            row = ALIGNMENTS.get(connection, caller.agency_id, alignment_id)
+            existing = self._existing(connection, caller, row.summary["extent_deg"])
+            codebook = _codebook(connection, caller, rules)
+        road = road_of(row, self._blobs.get(row.source_key), self._rules.crs_accuracy_m)
+        taken: set[int] = set()
+        for _ in range(_TRIES):
+            task = MakePlanTask(road, rules, name, frozenset(taken), existing, codebook)
+            made = self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
+            with self._database.read() as connection:
+                found = self._taken(connection, caller.agency_id, made.numbers)
+            if not found:
+                return made
+            taken |= found
+        raise Conflict("no unused registry numbers were found", field="rules", cure="try again, or name the plan anew")
+
+    def _existing(
+        self, connection: sa.Connection, caller: Caller, extent_deg: list[float]
+    ) -> tuple[ExistingMarker, ...]:
+        west, south, east, north = extent_deg
+        box = Box(
+            west - _MARGIN_DEG, max(south - _MARGIN_DEG, -90.0), east + _MARGIN_DEG, min(north + _MARGIN_DEG, 90.0)
+        )
+        found = list_existing(connection, caller.agency_id, box, limit=MAX_EXISTING)
+        return tuple(ExistingMarker(m.id, m.family, m.digits or "", m.lon_deg, m.lat_deg, m.status) for m in found)
+
+    def _taken(self, connection: sa.Connection, agency_id: str, codes: Sequence[tuple[str, str]]) -> set[int]:
+        """Registry numbers of these codes that other markers have."""
+        taken: set[int] = set()
+        for family in FAMILIES:
+            if family.planned is None:
+                continue
+            own = [code for name, code in codes if name == family.name]
+            found = bulk.list_by_digits(connection, family.name, own)
+            taken |= family.planned.taken_numbers(agency_id, found)
+        return taken
+
+
+def plan_document(row: PlanRow) -> PlanDocument:
+    """A plan as clients see it."""
+    return document_of(PlanDocument, row, **_members(row, PlanDocument))
+
+
+def _members(row: PlanRow, document: Any) -> dict[str, Any]:
+    return {name: value for name, value in row.summary.items() if name in document.__annotations__}
+
+
+def _made_columns(caller: Caller, made: MadePlan, rules: Mapping[str, Any], document_key: str) -> dict[str, Any]:
+    passed = made.summary["verdict"] != "fail"
+    return {
+        "status": CHECKED if passed else DRAFT,
+        "rules": dict(rules),
+        "document_key": document_key,
+        "summary": made.summary,
+        "proof": None,
+        "author": caller.label,
+        "author_id": caller.key_id,
+        "approver": None,
+    }
+
+
+def _codebook(connection: sa.Connection, caller: Caller, rules: Mapping[str, Any]) -> dict[str, Any] | None:
+    tags = rules.get("tags")
+    name = tags.get("codebook") if isinstance(tags, dict) else None
+    if not isinstance(name, str):
+        return None
+    row = CODEBOOKS.find(connection, caller.agency_id, name=name)
+    if row is None:
+        raise InvalidParameter(
+            f"the agency has no codebook {name[:80]!r}",
+            field="rules.tags.codebook",
+            limit="a codebook of the agency",
+            cure="GET /v1/codebooks lists yours; leave the member out for a new one",
+        )
+    return book_of(row).to_document()
+
+
+def _check_status(row: PlanRow, allowed: tuple[str, ...], what: str, cure: str) -> None:
+    if row.status not in allowed:
+        raise Conflict(
+            f"the plan is {row.status} and cannot be {what}", field="status", limit=", ".join(allowed), cure=cure
+        )
+
+
+def _changed(
+    connection: sa.Connection,
+    caller: Caller,
+    row: PlanRow,
+    changes: Mapping[str, Any],
+    now: datetime,
+    action: str | None,
+    why: str | None,
+) -> PlanDocument:
+    """Change a plan; `action` names the entry of the audit log, None where another entry covers the change."""
+    changed = PLANS.update(
+        connection, caller.agency_id, row.id, changes, version=row.version, now=now, who=caller.label, why=why
+    )
+    if action is not None:
+        log_change(connection, caller, action, now=now, subject=row.id, document=changed.rules, status=changed.status)
+    return plan_document(changed)

@@ -1,0 +1,79 @@
+"""What decoder processes are asked to do for plans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from app.planning.alignment_declaration import AlignmentDeclaration
+from app.planning.plan_checks import ExistingMarker
+from app.services.decoder_processes import Task
+
+
+@dataclass(frozen=True, slots=True)
+class RoadFile:
+    """A file with a road, as it came, and what is declared of it."""
+
+    data: bytes
+    file_name: str
+    declaration: AlignmentDeclaration
+    name: str
+    accuracy_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class SummarizeRoadTask(Task[dict[str, Any]]):
+    """A road to read: its lanes, events, warnings and extent."""
+
+    road: RoadFile
+
+
+@dataclass(frozen=True, slots=True)
+class MadePlan:
+    """A plan that was placed and checked.
+
+    Attributes
+    ----------
+    document : bytes
+        As `app.planning.outputs.plan_document.write_plan` writes it, compressed by zlib.
+    summary : dict
+        What lists and the plan's page show.
+    numbers : tuple of (family, code)
+        Codes that no other marker may have.
+    """
+
+    document: bytes
+    summary: dict[str, Any]
+    numbers: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class MakePlanTask(Task[MadePlan]):
+    """A plan to place and to check.
+
+    Attributes
+    ----------
+    taken : frozenset of int
+        Registry numbers that other markers have.
+    existing : tuple of ExistingMarker
+        Markers of the registry near the road.
+    codebook : dict or None
+        Document of the agency's codebook.
+    """
+
+    road: RoadFile
+    rules: dict[str, Any]
+    name: str
+    taken: frozenset[int] = frozenset()
+    existing: tuple[ExistingMarker, ...] = ()
+    codebook: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WritePlanFileTask(Task[bytes]):
+    """A file of a plan to write: its name, and CRS and unit of the stakeout."""
+
+    document: bytes
+    name: str
+    crs: str | None = None
+    unit: str | None = None

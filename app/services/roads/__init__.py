@@ -1,0 +1,1 @@
+"""Use cases on roads and linear references."""

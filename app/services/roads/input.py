@@ -1,0 +1,155 @@
+"""The lines and the calibration of a road as they are sent, brought to WGS 84 and onto the axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from app.errors import InvalidParameter
+from app.geodesy import PlacedPositions, place_positions
+from app.roads.axis import Axis
+from app.roads.measures import CalibrationPoint
+
+_REACH_M = 50.0
+_AMBIGUOUS_M = 1.0
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class LinesInput:
+    """The axis of a road as it was sent.
+
+    Attributes
+    ----------
+    parts : tuple of lines of points
+        Longitude and latitude [deg], or easting and northing in the unit of the CRS.
+    crs, realization, epoch
+        As of a marker's position; WGS 84 without.
+    several : bool
+        It came as a MultiLineString.
+    """
+
+    parts: tuple[tuple[Point, ...], ...]
+    crs: str | None = None
+    realization: str | None = None
+    epoch: float | None = None
+    several: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationInput:
+    """A place with a known measure: a vertex of a part, or a position beside the axis in the road's CRS."""
+
+    measure_m: float
+    ahead_m: float | None = None
+    part: int = 0
+    vertex: int | None = None
+    position: Point | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedLines:
+    """Lines in WGS 84 / ITRF, and how good that is."""
+
+    parts: list[list[list[float]]]
+    crs: str
+    realization: str | None
+    grade: str
+    note: str | None
+
+
+def place_lines(lines: LinesInput, accuracy_m: float) -> PlacedLines:
+    """Bring lines to WGS 84 / ITRF.
+
+    Raises
+    ------
+    InvalidParameter, ReferenceSystemError
+        The CRS is unknown, or a vertex is out of its range.
+    """
+    flat = np.array([point for part in lines.parts for point in part], dtype=np.float64)
+    placed = _placed(flat, lines, accuracy_m, "geometry.coordinates")
+    points = np.stack([placed.lon_deg, placed.lat_deg], axis=1).tolist()
+    ends = np.cumsum([len(part) for part in lines.parts]).tolist()
+    parts = [points[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+    return PlacedLines(parts, placed.crs, placed.realization, str(placed.grade), placed.note)
+
+
+def resolve_calibration(
+    axis: Axis, lines: LinesInput, points: Sequence[CalibrationInput], accuracy_m: float
+) -> list[CalibrationPoint]:
+    """Calibration points on the axis, in its order.
+
+    Raises
+    ------
+    InvalidParameter
+        A vertex or a part that is not there, or a position that is too far from the axis or beside it twice.
+    """
+    settled = [_settled(axis, lines, point, f"calibration.{k}", accuracy_m) for k, point in enumerate(points)]
+    return sorted(settled, key=lambda point: (point.part, point.chainage_m))
+
+
+def _settled(axis: Axis, lines: LinesInput, point: CalibrationInput, field: str, accuracy_m: float) -> CalibrationPoint:
+    if (point.vertex is None) == (point.position is None):
+        raise InvalidParameter(
+            "a calibration point is a vertex or a position",
+            field=field,
+            limit="vertex (and part), or position",
+            cure="send one of the two",
+        )
+    if point.vertex is not None:
+        vertices_m = axis.vertex_chainages_m
+        if point.part >= len(vertices_m) or point.vertex >= len(vertices_m[point.part]):
+            raise InvalidParameter(
+                f"there is no vertex {point.vertex} in part {point.part}",
+                field=f"{field}.vertex",
+                limit=f"{len(vertices_m)} parts of {', '.join(str(len(v)) for v in vertices_m[:20])} vertices, from 0",
+                cure="count parts and vertices from 0",
+            )
+        chainage_m = float(vertices_m[point.part][point.vertex])
+        return CalibrationPoint(point.part, chainage_m, point.measure_m, point.ahead_m)
+    placed = _placed(np.array([point.position], dtype=np.float64), lines, accuracy_m, f"{field}.position")
+    feet = axis.locate(placed.lon_deg, placed.lat_deg, _REACH_M)[0]
+    if not feet:
+        raise InvalidParameter(
+            f"the position of measure {point.measure_m:g} m is not at the road",
+            field=f"{field}.position",
+            limit=f"{_REACH_M:g} m from the axis",
+            cure="give a position on the axis, in the road's own CRS",
+        )
+    if len(feet) > 1 and feet[1].distance_m - feet[0].distance_m < _AMBIGUOUS_M:
+        raise InvalidParameter(
+            f"the road passes the position of measure {point.measure_m:g} m more than once",
+            field=f"{field}.position",
+            limit="one place on the axis",
+            cure="give the vertex instead",
+        )
+    return CalibrationPoint(feet[0].part, feet[0].chainage_m, point.measure_m, point.ahead_m)
+
+
+def _placed(points: npt.NDArray[np.float64], lines: LinesInput, accuracy_m: float, field: str) -> PlacedPositions:
+    try:
+        placed = place_positions(
+            points[:, 0],
+            points[:, 1],
+            np.full(len(points), np.nan),
+            crs=lines.crs,
+            realization=lines.realization,
+            epoch=lines.epoch,
+            accuracy_m=accuracy_m,
+        )
+    except InvalidParameter as error:
+        error.field = "crs" if error.field == "position.crs" else field
+        raise
+    if not placed.placed.all():
+        k = int(np.argmin(placed.placed))
+        raise InvalidParameter(
+            f"vertex {k}, {points[k, 0]:g} {points[k, 1]:g}, is not in the area of {placed.crs}",
+            field=field,
+            limit=f"coordinates of {placed.crs}, longitude or easting first",
+            cure="check the CRS and the order of the axes",
+        )
+    return placed

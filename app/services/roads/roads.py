@@ -1,0 +1,347 @@
+"""Roads: registered with an axis and a calibration, changed by versions, and asked for measures and positions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.errors import InvalidParameter
+from app.families.documents import MarkerDocument
+from app.geodesy import check_lon_lat
+from app.registry import roads as store
+from app.registry.audit import recording
+from app.registry.database import Database
+from app.registry.marker_rows import MarkerRow
+from app.registry.resources import first_version
+from app.registry.roads import ROAD_SUMMARIES, ROADS, RoadRow
+from app.registry.rows import row_of
+from app.services.access.access import Caller
+from app.services.access.audit import author_of, log_change
+from app.services.documents import document_of
+from app.services.idempotency import IdempotencyKey, find_earlier, write_once
+from app.services.markers.searches import marker_document
+from app.services.ports import Clock
+from app.services.roads.documents import (
+    ChangedRoad,
+    MeasuredMarkers,
+    OnRoad,
+    RoadDocument,
+    RoadLocatedMany,
+    RoadPage,
+    RoadPlacedMany,
+    RoadVersionDocument,
+    RoadVersionPage,
+    located_position,
+    placed_reference,
+    road_document,
+    road_summary,
+    sections,
+)
+from app.services.roads.input import CalibrationInput, LinesInput, place_lines, resolve_calibration
+from app.services.roads.routes import (
+    Route,
+    build_route,
+    references_of,
+    route_of,
+)
+from app.services.version_kinds import VersionKind
+
+MAX_NAMED = 100
+_SAME_M = 5e-5
+
+Range = tuple[float | None, float | None]
+Measured = tuple[dict[str, Any], Route]
+
+
+@dataclass(frozen=True, slots=True)
+class NewRoad:
+    """A road to register."""
+
+    name: str
+    lines: LinesInput
+    calibration: tuple[CalibrationInput, ...] = ()
+    measure_markers: bool = True
+    dry_run: bool = False
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RoadChange:
+    """What to change; None stays."""
+
+    lines: LinesInput | None = None
+    calibration: tuple[CalibrationInput, ...] | None = None
+    measure_markers: bool = True
+    dry_run: bool = False
+    reason: str | None = None
+
+
+class _NotStored(Exception):
+    """Ends a transaction whose changes shall not stay."""
+
+
+class Roads:
+    """Use cases on roads, one transaction each.
+
+    Parameters
+    ----------
+    database : Database
+    clock : Clock
+    crs_accuracy_m : float
+        Worst stated accuracy of a transformation that counts as exact. [m]
+    idempotency_ttl : timedelta
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        clock: Clock,
+        crs_accuracy_m: float = 0.1,
+        idempotency_ttl: timedelta = timedelta(hours=24),
+    ) -> None:
+        self._database = database
+        self._clock = clock
+        self._accuracy_m = crs_accuracy_m
+        self._ttl = idempotency_ttl
+
+    def register(self, caller: Caller, new: NewRoad, key: IdempotencyKey | None = None) -> tuple[ChangedRoad, bool]:
+        """Store a new road, and measure the markers that name it.
+
+        Returns
+        -------
+        road : dict
+            With what became of the markers.
+        replayed : bool
+
+        Raises
+        ------
+        InvalidParameter, ReferenceSystemError
+            The lines or the calibration cannot be.
+        Conflict
+            The agency has a road of this name.
+        """
+        now = self._clock()
+        if earlier := find_earlier(self._database, caller.agency_id, key, now):
+            return earlier, True
+        columns, route = self._columns(new.lines, new.calibration)
+        try:
+            with write_once(self._database, caller.agency_id, key, now, self._ttl, long=True) as (connection, answer):
+                if answer.replayed:
+                    return answer.response, True
+                ROADS.check_name(connection, caller.agency_id, new.name)
+                values = {**columns, **first_version(now), "name": new.name}
+                row = ROADS.add(connection, caller.agency_id, values, who=caller.label, why=new.reason)
+                document: ChangedRoad = {**road_document(row), "markers": None}
+                if new.measure_markers:
+                    document["markers"] = _measure(connection, caller, row, route, None, now, new.reason)
+                log_change(connection, caller, "road.registered", now=now, subject=row.id, document=document)
+                if new.dry_run:
+                    raise _NotStored
+                answer.store(document)
+        except _NotStored:
+            document["id"] = None
+        return document, False
+
+    def change(self, caller: Caller, road_id: str, change: RoadChange, version: int | None) -> ChangedRoad:
+        """Change a road that is still at `version`, and measure its markers again: their positions stay.
+
+        Raises
+        ------
+        StaleVersion
+            The road was changed since the caller read it.
+        InvalidParameter, ReferenceSystemError
+            The lines or the calibration cannot be, or lines come without their calibration.
+        """
+        now = self._clock()
+        try:
+            with self._database.write(long=True) as connection:
+                row = ROADS.get_at(connection, caller.agency_id, road_id, version)
+                old = route_of(row)
+                columns, route = self._changed(row, change)
+                at, who, why = row.version, caller.label, change.reason
+                changed = ROADS.update(
+                    connection, caller.agency_id, road_id, columns, version=at, now=now, who=who, why=why
+                )
+                document: ChangedRoad = {**road_document(changed), "markers": None}
+                if change.measure_markers:
+                    document["markers"] = _measure(connection, caller, changed, route, old, now, change.reason)
+                log_change(connection, caller, "road.changed", now=now, subject=road_id, document=document)
+                if change.dry_run:
+                    raise _NotStored
+        except _NotStored:
+            pass
+        return document
+
+    def get(self, caller: Caller, road_id: str) -> RoadDocument:
+        """One road."""
+        with self._database.read() as connection:
+            return road_document(ROADS.get(connection, caller.agency_id, road_id))
+
+    def page(
+        self, caller: Caller, *, name: str | None = None, after: str | None = None, limit: int = 100
+    ) -> tuple[RoadPage, str | None]:
+        """A page of roads without their geometry, and the id to continue after."""
+        with self._database.read() as connection:
+            rows, last = ROAD_SUMMARIES.page(connection, caller.agency_id, beyond=after, limit=limit, name=name)
+        return RoadPage(items=[road_summary(row) for row in rows]), last
+
+    def history(
+        self, caller: Caller, road_id: str, *, after: int = 0, limit: int = 100
+    ) -> tuple[RoadVersionPage, int | None]:
+        """A page of a road's versions, oldest first, and the version to continue after."""
+        with self._database.read() as connection:
+            rows, last = ROADS.history(connection, caller.agency_id, road_id, after=after, limit=limit)
+        items = [document_of(RoadVersionDocument, row, road=road_document(row_of(RoadRow, row.stored))) for row in rows]
+        return {"items": items}, last
+
+    def locate(
+        self,
+        caller: Caller,
+        road_id: str,
+        positions: Sequence[tuple[float, float]],
+        reach_m: float,
+        version: int | None = None,
+    ) -> RoadLocatedMany:
+        """Measures and offsets of positions (lon_deg, lat_deg); several feet where the road passes more than once."""
+        for position in positions:
+            check_lon_lat(*position)
+        head, route = self._route(caller, road_id, version)
+        items = [located_position(route, feet) for feet in route.feet(positions, reach_m)]
+        return {**head, "items": items}
+
+    def place(
+        self,
+        caller: Caller,
+        road_id: str,
+        references: Sequence[tuple[float, float]],
+        version: int | None = None,
+    ) -> RoadPlacedMany:
+        """Positions of (measure_m, offset_m); none where the measure is on no road, several where it repeats."""
+        head, route = self._route(caller, road_id, version)
+        return {**head, "items": [placed_reference(route, *reference) for reference in references]}
+
+    def markers(
+        self,
+        caller: Caller,
+        road_id: str,
+        *,
+        measures_m: Range = (None, None),
+        offsets_m: Range = (None, None),
+        after: tuple[float, str] | None = None,
+        limit: int = 100,
+    ) -> tuple[list[MarkerDocument], str | None]:
+        """A page of the markers on a road in the order of their measures, and where it ended."""
+        with self._database.read() as connection:
+            road = ROADS.get(connection, caller.agency_id, road_id).name
+            rows = store.list_on_road(
+                connection,
+                caller.agency_id,
+                road,
+                measures_m=measures_m,
+                offsets_m=offsets_m,
+                after=after,
+                limit=limit + 1,
+            )
+        page = [marker_document(row) for row in rows[:limit]]
+        return page, f"{page[-1]['measure_m']!r},{page[-1]['id']}" if len(rows) > limit else None
+
+    # --- steps ------------------------------------------------------------------------------------------------------
+
+    def _route(self, caller: Caller, road_id: str, version: int | None) -> tuple[OnRoad, Route]:
+        with self._database.read() as connection:
+            row = ROADS.get(connection, caller.agency_id, road_id)
+            if version is not None and version != row.version:
+                row = row_of(RoadRow, ROADS.get_version(connection, caller.agency_id, road_id, version).stored)
+        route = route_of(row)
+        return {"road_id": road_id, "road": row.name, "version": row.version, "sections": sections(route)}, route
+
+    def _columns(self, lines: LinesInput, given: Sequence[CalibrationInput]) -> Measured:
+        placed = place_lines(lines, self._accuracy_m)
+        points = resolve_calibration(build_route(placed.parts, ()).axis, lines, given, self._accuracy_m)
+        route = build_route(placed.parts, points)
+        columns = {
+            "parts": placed.parts,
+            "given": {
+                "crs": placed.crs,
+                "realization": placed.realization,
+                "epoch": lines.epoch,
+                "several": lines.several,
+            },
+            "calibration": [asdict(point) for point in points],
+            "localization_grade": placed.grade,
+            "transform_note": placed.note,
+            **_extent(route),
+        }
+        return columns, route
+
+    def _changed(self, row: RoadRow, change: RoadChange) -> Measured:
+        if change.lines is not None:
+            if change.calibration is None and row.calibration:
+                raise InvalidParameter(
+                    "a new geometry comes with its calibration",
+                    field="calibration",
+                    limit="the calibration points on the new geometry, or []",
+                    cure="send calibration; [] for true metres from 0",
+                )
+            return self._columns(change.lines, change.calibration or ())
+        if change.calibration is None:
+            return {}, route_of(row)
+        lines = LinesInput((), crs=row.given["crs"], epoch=row.given["epoch"])
+        points = resolve_calibration(route_of(row).axis, lines, change.calibration, self._accuracy_m)
+        route = build_route(row.parts, points)
+        return {"calibration": [asdict(point) for point in points], **_extent(route)}, route
+
+
+def _extent(route: Route) -> dict[str, float]:
+    sections = route.measures.sections
+    return {
+        "length_m": route.axis.length_m,
+        "from_m": min(float(section.measures_m[0]) for section in sections),
+        "to_m": max(float(section.measures_m[-1]) for section in sections),
+    }
+
+
+def _measure(
+    connection: sa.Connection,
+    caller: Caller,
+    road: RoadRow,
+    route: Route,
+    old: Route | None,
+    now: datetime,
+    reason: str | None,
+) -> MeasuredMarkers:
+    """Measure every marker that names the road: a version of each whose measure or offset changes."""
+    report: MeasuredMarkers = {"measured": 0, "unchanged": 0, "left": 0, "largest_change_m": 0.0, "left_out": []}
+    why = f"measured on version {road.version} of road {road.name}" + (f": {reason}" if reason else "")
+    with recording(connection, caller.agency_id, author_of(caller), "road.measured", now=now, subject=road.id) as entry:
+        for rows in store.walk_named(connection, caller.agency_id, road.name):
+            positions = [(row.lon_deg, row.lat_deg) for row in rows]
+            references = references_of(route, positions, [row.measure_m for row in rows], old)
+            changed, values = [], []
+            for row, reference in zip(rows, references, strict=True):
+                if reference.measure_m is None or reference.offset_m is None:
+                    report["left"] += 1
+                    if len(report["left_out"]) < MAX_NAMED:
+                        report["left_out"].append({"marker_id": row.id, "why": reference.why_not})
+                    continue
+                if _is_same(row, reference.measure_m, reference.offset_m):
+                    report["unchanged"] += 1
+                    continue
+                if row.measure_m is not None:
+                    moved_m = abs(row.measure_m - reference.measure_m)
+                    report["largest_change_m"] = max(report["largest_change_m"], moved_m)
+                changed.append(row)
+                values.append((reference.measure_m, reference.offset_m))
+            report["measured"] += len(changed)
+            store.remeasure(connection, entry, changed, values, kind=VersionKind.CHANGE, why=why[:500])
+    return report
+
+
+def _is_same(row: MarkerRow, measure_m: float, offset_m: float) -> bool:
+    if row.measure_m is None or row.offset_m is None:
+        return False
+    return bool(abs(row.measure_m - measure_m) < _SAME_M and abs(row.offset_m - offset_m) < _SAME_M)

@@ -1,0 +1,58 @@
+"""Blobs that are written before the transaction that refers to them, and deleted if it does not commit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import structlog
+
+from app.errors import Unavailable
+from app.services.ports import Blobs
+from app.storage.blobs import new_blob_key
+
+_LOG = structlog.get_logger(__name__)
+
+
+class StagedBlobs:
+    """Blobs that were written and are not referred to yet."""
+
+    def __init__(self, blobs: Blobs) -> None:
+        self._blobs = blobs
+        self._keys: list[str] = []
+
+    def put(self, folder: str, data: bytes, *, durable: bool = False) -> str:
+        """Write a blob. Returns its key."""
+        key = new_blob_key(folder)
+        self._keys.append(key)
+        self._blobs.put(key, data, durable=durable)
+        return key
+
+    def keep(self) -> None:
+        """Leave the blobs where they are: the transaction that refers to them has committed."""
+        self._keys.clear()
+
+    def delete(self, key: str | None) -> None:
+        """Delete a blob that is not needed any more. One that cannot be deleted stays, and is logged."""
+        if key is None:
+            return
+        self._keys.remove(key)
+        try:
+            self._blobs.delete(key)
+        except Unavailable:
+            _LOG.warning("a blob that nothing refers to could not be deleted", blob_key=key)
+
+    def delete_all(self) -> None:
+        """Delete the blobs that were not kept."""
+        for key in list(self._keys):
+            self.delete(key)
+
+
+@contextmanager
+def staged(blobs: Blobs) -> Iterator[StagedBlobs]:
+    """Write blobs inside the block; when it ends, those that were not kept are deleted."""
+    stage = StagedBlobs(blobs)
+    try:
+        yield stage
+    finally:
+        stage.delete_all()

@@ -1,0 +1,119 @@
+"""What the API returns about imports of surveys."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal, cast
+
+from pydantic import Field
+from typing_extensions import TypedDict
+
+from app.formats.surveys.table import Fault
+from app.registry.jobs import JobRow, JobState
+from app.services.documents import document_of
+from app.services.error_documents import ErrorDocument
+from app.services.markers.accuracy import AccuracyDocument
+from app.surveys.comparison import ComparisonFigures
+
+Outcome = Literal["checked", "stored", "refused"]
+
+
+class FaultDocument(TypedDict):
+    """Something wrong with a row, or with the file where row is null."""
+
+    row: int | None
+    field: str
+    code: str
+    message: str
+    proposal: str | None
+    severity: Literal["refused", "warning"]
+
+
+class Residual(TypedDict):
+    """Surveyed position minus registered position of one row."""
+
+    row: int
+    marker_id: str
+    east_m: float
+    north_m: float
+    up_m: float | None
+    horizontal_m: float
+
+
+class ComparisonDocument(ComparisonFigures):
+    """Figures, residuals row by row, and a map of them."""
+
+    residuals: list[Residual]
+    map_svg: str | None
+
+
+class ImportReport(TypedDict):
+    """What was found in a survey, and what was stored of it."""
+
+    outcome: Outcome
+    dry_run: bool
+    mode: Literal["all", "good"]
+    warnings: Literal["store", "refuse"]
+    format: str
+    file_sha256: str
+    crs: str
+    localization_grade: str
+    transform_note: str | None
+    accuracy: Annotated[AccuracyDocument, Field(description="Of the RMSE that was declared for the whole survey.")]
+    rows: int
+    good_rows: int
+    refused_rows: int
+    warned_rows: int
+    stored: int
+    extent_deg: Annotated[list[float] | None, Field(description="West, south, east, north.")]
+    counts: Annotated[dict[str, int], Field(description="Faults by code.")]
+    comparison: ComparisonDocument | None
+    faults: Annotated[list[FaultDocument], Field(description="The first thousand, refusals first.")]
+    faults_left_out: int
+
+
+class ImportJobLinks(TypedDict):
+    """Where to read the job again."""
+
+    self: str
+
+
+class ImportJobSummary(TypedDict):
+    """An import that is or was a job, without its report."""
+
+    id: str
+    state: JobState
+    progress: Annotated[float, Field(description="0 to 1.")]
+    attempts: int
+    cancel_requested: Annotated[bool, Field(description="A running import stops before it stores anything.")]
+    created_at: datetime
+    finished_at: datetime | None
+    error: Annotated[ErrorDocument | None, Field(description="Why the file or its declaration cannot be used.")]
+    links: ImportJobLinks
+
+
+class ImportJobDocument(ImportJobSummary):
+    """An import that is or was a job."""
+
+    report: ImportReport | None
+
+
+class ImportJobPage(TypedDict):
+    """A page of imports, newest first; the Link header leads to the next one."""
+
+    items: list[ImportJobSummary]
+
+
+def import_job_document(job: JobRow) -> ImportJobDocument:
+    """An import with its report, once there is one."""
+    return {**import_job_summary(job), "report": cast("ImportReport | None", job.result)}
+
+
+def import_job_summary(job: JobRow) -> ImportJobSummary:
+    """An import without its report."""
+    return document_of(ImportJobSummary, job, links={"self": f"/v1/imports/{job.id}"})
+
+
+def fault_document(fault: Fault) -> FaultDocument:
+    """A fault as reports of imports have it."""
+    return document_of(FaultDocument, fault, severity=fault.severity.value)

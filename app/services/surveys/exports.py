@@ -1,0 +1,115 @@
+"""Markers go out as files for GIS and surveyors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from app.errors import InvalidParameter
+from app.formats import exports as write
+from app.registry import bulk
+from app.registry.database import Database
+from app.registry.markers import MarkerFilter
+from app.services.access.access import Caller
+
+STREAMED = {"csv": "text/csv; charset=utf-8", "geojson": "application/geo+json"}
+WHOLE = {
+    "gpkg": "application/geopackage+sqlite3",
+    "shapefile": "application/zip",
+    "kml": "application/vnd.google-earth.kml+xml",
+    "landxml": "application/xml",
+    "dxf": "image/vnd.dxf",
+}
+KINDS = (*STREAMED, *WHOLE)
+MAX_WHOLE = {"gpkg": 10_000_000, "shapefile": 2_000_000, "kml": 200_000, "landxml": 200_000, "dxf": 200_000}
+_PAGE = 5_000
+_GIS_PAGE = 50_000
+_BLOCK = 2**20
+
+
+class Exports:
+    """Use cases on exports; each page is read by itself, so an export holds no transaction open."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def stream(self, caller: Caller, kind: str, filtered: MarkerFilter) -> Iterator[bytes]:
+        """CSV or GeoJSON in the order of the ids, at flat memory."""
+        pages = self._pages(caller, filtered)
+        return write.write_csv(pages) if kind == "csv" else write.write_geojson(pages)
+
+    def whole(self, caller: Caller, kind: str, filtered: MarkerFilter) -> Iterator[bytes]:
+        """One file, written before this returns and gone when it has been read.
+
+        Raises
+        ------
+        InvalidParameter
+            There are none, too many for one file, or too far apart for one zone.
+        """
+        folder = TemporaryDirectory(prefix="waymark-export-")
+        try:
+            path = self.write_file(caller, kind, filtered, Path(folder.name))
+        except BaseException:
+            folder.cleanup()
+            raise
+        return _blocks(path, folder)
+
+    def write_file(self, caller: Caller, kind: str, filtered: MarkerFilter, folder: Path) -> Path:
+        """One file of any kind, in an empty folder; raises as `whole`."""
+        if kind in STREAMED:
+            path = folder / f"markers.{kind}"
+            with path.open("wb") as file:
+                file.writelines(self.stream(caller, kind, filtered))
+            return path
+        pages = self._pages(caller, filtered, most=MAX_WHOLE[kind])
+        first = next(pages, None)
+        if first is None:
+            raise InvalidParameter(
+                "no marker is in the selection", field="bbox", limit="one at least", cure="widen the filter"
+            )
+        records = chain.from_iterable(chain((first,), pages))
+        if kind in ("landxml", "dxf"):
+            path = folder / f"markers.{kind}"
+            path.write_bytes((write.write_landxml if kind == "landxml" else write.write_dxf)(list(records)))
+            return path
+        with self._database.read() as connection:
+            has_heights = bulk.has_heights(connection, caller.agency_id, filtered)
+        batches = _batched(records, MAX_WHOLE["kml"] if kind == "kml" else _GIS_PAGE)
+        return write.write_gis(batches, kind, folder, has_heights=has_heights)
+
+    def _pages(
+        self, caller: Caller, filtered: MarkerFilter, *, most: int | None = None
+    ) -> Iterator[list[dict[str, Any]]]:
+        after: str | None = None
+        count = 0
+        while True:
+            with self._database.read() as connection:
+                page = bulk.list_records(connection, caller.agency_id, filtered, write.FIELDS, after=after, limit=_PAGE)
+            if not page:
+                return
+            count += len(page)
+            if most is not None and count > most:
+                raise InvalidParameter(
+                    "too many markers for one file",
+                    field="bbox",
+                    limit=f"{most} markers",
+                    cure="export a smaller box, or CSV or GeoJSON",
+                )
+            for record in page:
+                record["updated_at"] = record["updated_at"].isoformat()
+            yield page
+            after = page[-1]["id"]
+
+
+def _batched(records: Iterator[dict[str, Any]], count: int) -> Iterator[list[dict[str, Any]]]:
+    while batch := list(islice(records, count)):
+        yield batch
+
+
+def _blocks(path: Path, folder: TemporaryDirectory[str]) -> Iterator[bytes]:
+    with folder, path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            yield block

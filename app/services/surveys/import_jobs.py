@@ -1,0 +1,159 @@
+"""Imports of large surveys as jobs: the file is stored, the caller gets the job, and the report comes later."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import timedelta
+from typing import Any
+
+from app.errors import Conflict
+from app.registry import jobs as store
+from app.registry.database import Database
+from app.registry.ids import new_id
+from app.registry.jobs import JobKind, JobRow, new_job
+from app.services.access.access import Caller, Scope
+from app.services.idempotency import IdempotencyKey, write_once
+from app.services.jobs import RunningJob
+from app.services.ports import Blobs, Clock, JobQueue
+from app.services.staged_blobs import staged
+from app.services.surveys.declarations import import_input
+from app.services.surveys.documents import (
+    ImportJobDocument,
+    ImportJobPage,
+    import_job_document,
+    import_job_summary,
+)
+from app.services.surveys.imports import SETTLED, Imports
+
+IMMEDIATE_BYTES = 8 * 1024**2
+"""Surveys up to this size are imported while the caller waits, larger ones become jobs. [byte]"""
+_STARTED = 0.1
+_TOO_LATE = "read its report; what it stored is in the history, and is changed or retired marker by marker"
+
+
+class ImportJobs:
+    """Use cases on imports that are jobs.
+
+    Parameters
+    ----------
+    database, clock, blobs, queue
+    idempotency_ttl : timedelta
+    imports : Imports
+        Does the work.
+    """
+
+    def __init__(
+        self, database: Database, clock: Clock, blobs: Blobs, queue: JobQueue,
+        *, imports: Imports, idempotency_ttl: timedelta,
+    ) -> None:  # fmt: skip
+        self._database, self._clock, self._blobs, self._queue = database, clock, blobs, queue
+        self._imports, self._ttl = imports, idempotency_ttl
+
+    def submit(
+        self, caller: Caller, declared: Mapping[str, Any], data: bytes, key: IdempotencyKey | None
+    ) -> tuple[ImportJobDocument, bool]:
+        """Store the file and queue its import.
+
+        Parameters
+        ----------
+        caller : Caller
+        declared : mapping
+            See `import_input`.
+        data : bytes
+        key : IdempotencyKey or None
+
+        Returns
+        -------
+        job : ImportJobDocument
+        replayed : bool
+            The request had been made before under the same Idempotency-Key.
+
+        Raises
+        ------
+        InvalidParameter
+            The declaration contradicts itself.
+        """
+        import_input(declared, data)
+        now, agency_id = self._clock(), caller.agency_id
+        with staged(self._blobs) as stage:
+            job = new_job(
+                JobKind.IMPORT, new_id(now), agency_id, caller.key_id, now,
+                job_input={"declaration": dict(declared), "label": caller.label},
+                upload_key=stage.put("uploads", data, durable=True),
+            )  # fmt: skip
+            with write_once(self._database, agency_id, key, now, self._ttl) as (connection, answer):
+                if answer.replayed:
+                    return answer.response, True
+                store.add_job(connection, job)
+                document = answer.store(import_job_document(job))
+            stage.keep()
+        self._queue.submit(job.id)
+        return document, False
+
+    def get(self, caller: Caller, import_id: str) -> ImportJobDocument:
+        """A job with its report, once there is one.
+
+        Raises
+        ------
+        NotFound
+            There is none with this id, or it belongs to another agency.
+        """
+        with self._database.read() as connection:
+            return import_job_document(store.get_job(connection, caller.agency_id, JobKind.IMPORT, import_id))
+
+    def page(
+        self, caller: Caller, *, state: str | None = None, before: str | None = None, limit: int = 100
+    ) -> tuple[ImportJobPage, str | None]:
+        """A page of jobs without their reports, newest first, and the id to continue before."""
+        with self._database.read() as connection:
+            rows = store.list_jobs(
+                connection, caller.agency_id, JobKind.IMPORT, state=state, before=before, limit=limit + 1
+            )
+        page = ImportJobPage(items=[import_job_summary(row) for row in rows[:limit]])
+        return page, rows[limit - 1].id if len(rows) > limit else None
+
+    def cancel(self, caller: Caller, import_id: str) -> ImportJobDocument:
+        """Cancel a job: a queued one never starts, a running one stops before it stores anything.
+
+        Raises
+        ------
+        NotFound
+            There is none with this id, or it belongs to another agency.
+        Conflict
+            It is too late: it is storing, or finished. One that was cancelled before stays cancelled.
+        """
+        with self._database.read() as connection:
+            _check_in_time(store.get_job(connection, caller.agency_id, JobKind.IMPORT, import_id))
+        with self._database.write() as connection:
+            store.request_cancel(connection, caller.agency_id, import_id, self._clock(), below_progress=SETTLED)
+            job = store.get_job(connection, caller.agency_id, JobKind.IMPORT, import_id)
+            _check_in_time(job)
+        return import_job_document(job)
+
+    def run(self, job: RunningJob) -> None:
+        """Import a survey that was queued; the handler of jobs of the kind `JobKind.IMPORT`."""
+        row = job.row
+        assert row.upload_key is not None
+        # nobody acts with this caller but the import itself: the key's permissions were checked when it was queued
+        caller = Caller(row.agency_id, row.holder_id or "", row.input["label"], Scope.SURVEYOR)
+
+        def step(progress: float) -> None:
+            if row.progress < SETTLED:  # else it was storing when an earlier process stopped, and goes on to the end
+                job.report_progress(progress)
+
+        step(_STARTED)
+        given = import_input(row.input["declaration"], self._blobs.get(row.upload_key))
+        report, _ = self._imports.run(caller, given, IdempotencyKey(f"import {row.id}", row.id), step)
+        with self._database.write() as connection:
+            job.finish(connection, report)
+
+
+def _check_in_time(job: JobRow) -> None:
+    if job.state in ("done", "failed"):
+        raise Conflict(
+            f"the import is {job.state}", field="import_id", limit="imports that are not finished", cure=_TOO_LATE
+        )
+    if job.state == "running" and job.progress >= SETTLED:
+        raise Conflict(
+            "the import is storing already", field="import_id", limit="imports that store nothing yet", cure=_TOO_LATE
+        )

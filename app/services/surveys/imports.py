@@ -1,0 +1,445 @@
+"""Surveys come in: read in a decoder process, checked, held against the registry, stored in one transaction."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final, Literal
+
+import numpy as np
+import sqlalchemy as sa
+
+from app.errors import InvalidParameter
+from app.families import FAMILIES, FAMILY_NAMES, get_family
+from app.families.family import Family, Registration
+from app.families.rules import PLANNED, MarkerRules
+from app.families.surveys import RowCodes, Rows
+from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.table import Fault, Floats, Severity, SurveyTable
+from app.plots.residual_map import draw_residuals
+from app.registry import bulk
+from app.registry import markers as store
+from app.registry.audit import AuditEntry, recording
+from app.registry.bulk import PlaceRow
+from app.registry.bulk_load import LARGE
+from app.registry.columns import Columns
+from app.registry.database import Database
+from app.registry.ids import new_ids
+from app.registry.marker_rows import MarkerRow
+from app.registry.spatial import Box
+from app.services.access.access import Caller
+from app.services.access.audit import author_of
+from app.services.decoder_processes import DecoderProcesses, Task
+from app.services.idempotency import IdempotencyKey, find_earlier, write_once
+from app.services.markers.accuracy import accuracy_document
+from app.services.ports import Clock
+from app.services.roads.routes import linear_references
+from app.services.surveys.documents import (
+    ComparisonDocument,
+    ImportReport,
+    Outcome,
+    Residual,
+    fault_document,
+)
+from app.services.surveys.import_codes import assign_codes
+from app.services.surveys.import_rows import check_values, common_columns, marker_columns
+from app.services.version_kinds import kind_of_change, kind_of_new
+from app.surveys.comparison import Comparison, check_residuals, compare_survey
+from app.surveys.consistency_checks import check_consistency
+from app.surveys.georeference import GeoreferencedSurvey, georeference_survey
+from app.surveys.location_checks import NEAR_M, Neighbours, check_location
+
+ALL: Final = "all"
+SURVEYED = tuple(name for name, family in zip(FAMILY_NAMES, FAMILIES, strict=True) if family.survey is not None)
+"""Families whose markers can be imported from points."""
+READ, SETTLED = 0.3, 0.5
+"""How far an import is when its file was read, and when it goes to store what is good."""
+MAX_FAULTS = 1000
+_KNOWN_M = 5_000.0
+_NEIGHBOURS = 50_000
+_BUSY_WAIT_S = 10.0
+_PART = 2000
+_ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
+_STANDING = "place_by_area_only"
+"""The caution that every survey of a new road gets, however well it is declared."""
+_MARGIN_DEG = NEAR_M / 90_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyTask(Task[SurveyTable]):
+    """A survey to read."""
+
+    data: bytes
+    declaration: ImportDeclaration
+
+
+@dataclass(frozen=True, slots=True)
+class ImportInput:
+    """A file with what is declared of it."""
+
+    data: bytes
+    declaration: ImportDeclaration
+    defaults: Any = None
+    dry_run: bool = False
+    mode: Literal["all", "good"] = ALL
+    reason: str | None = None
+    refuse_warnings: bool = False
+
+
+class Imports:
+    """Use cases on imports, one transaction each."""
+
+    def __init__(self, database: Database, clock: Clock, processes: DecoderProcesses, rules: MarkerRules) -> None:
+        self._database = database
+        self._clock = clock
+        self._processes = processes
+        self._rules = rules
+
+    def run(
+        self,
+        caller: Caller,
+        given: ImportInput,
+        key: IdempotencyKey | None = None,
+        step: Callable[[float], None] = lambda progress: None,
+    ) -> tuple[ImportReport, bool]:
+        """Import a survey, or say what an import would do.
+
+        Parameters
+        ----------
+        caller, given, key
+        step : callable, optional
+            Called with `READ` when the file was read, and with `SETTLED` before anything is stored, outside of any
+            transaction; what it raises stops the import.
+
+        Returns
+        -------
+        report : dict
+            `outcome` is ``checked`` (dry run), ``stored`` or ``refused``; nothing is stored of what is refused.
+        replayed : bool
+
+        Raises
+        ------
+        UnreadableUpload, UnsupportedUpload, InvalidParameter, ReferenceSystemError
+            The file, the declaration, or both together cannot be used.
+        Unavailable
+            The decoder processes are busy.
+        """
+        _check_family(given.declaration)
+        now = self._clock()
+        if earlier := find_earlier(self._database, caller.agency_id, key, now):
+            return earlier, True
+        pending = self._processes.submit(SurveyTask(given.data, given.declaration), wait_s=_BUSY_WAIT_S)
+        survey = georeference_survey(pending.result(), given.declaration, self._rules.crs_accuracy_m)
+        step(READ)
+        registration = Registration(caller.agency_id, now, self._rules, self._database)
+        running = _Running(caller, given, survey, registration, hashlib.sha256(given.data).hexdigest())
+        with self._database.read() as connection:
+            running.check(connection)
+        step(SETTLED)
+        if given.dry_run:
+            with self._database.read() as connection:
+                running.prepare(connection)
+            return running.report("checked"), False
+        if running.is_hopeless:
+            return running.report("refused"), False
+        ttl, is_long = self._rules.idempotency_ttl, survey.table.rows >= LARGE
+        with write_once(self._database, caller.agency_id, key, now, ttl, long=is_long) as (connection, answer):
+            if answer.replayed:
+                return answer.response, True
+            running.prepare(connection)
+            if running.is_refused:
+                return running.report("refused"), False
+            running.store(connection, get_family(given.declaration.family))
+            return answer.store(running.report("stored")), False
+
+
+class _Running:
+    """An import between its steps."""
+
+    def __init__(
+        self, caller: Caller, given: ImportInput, survey: GeoreferencedSurvey, registration: Registration, sha256: str
+    ) -> None:
+        self._caller, self._given, self._survey, self._now = caller, given, survey, registration.now
+        self._sha256, self._registration, self._rules = sha256, registration, registration.rules
+        self._faults = survey.table.faults
+        self._faults.add(check_consistency(survey))
+        self._codes: RowCodes | None = None
+        self._defaults = _defaults(given)
+        self._known: list[MarkerRow] = []
+        self._comparison: Comparison | None = None
+        self._stored = 0
+
+    def check(self, connection: sa.Connection) -> None:
+        """Hold the survey against the registry's places."""
+        neighbours = self._neighbours(connection)
+        is_known = partial(self._is_known, connection)
+        self._faults.add(check_location(self._survey, self._given.declaration, neighbours, is_known))
+
+    def prepare(self, connection: sa.Connection) -> None:
+        """What would be stored."""
+        good = self._good_rows()
+        if self._given.declaration.compare:
+            self._compare(connection, good)
+            return
+        family, survey = get_family(self._given.declaration.family), self._survey
+        assert family.survey is not None  # `run` refuses the others
+        wanted = np.zeros(survey.table.rows, dtype=bool)
+        wanted[good] = True
+        self._faults.add(check_values(survey, wanted))
+        self._faults.add(family.survey.check_values(survey, wanted, self._given.declaration))
+        codes, wrong = family.survey.read_codes(survey, self._good_rows(), self._defaults)
+        self._faults.add(wrong)
+        self._faults.add(assign_codes(connection, self._registration, family, codes, survey, self._defaults))
+        self._codes = codes.of(np.isin(codes.rows, self._good_rows()))
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether nothing can be stored, whatever the codes are."""
+        return self._refuses_file or (self._given.mode == ALL and len(self._good_rows()) < self._survey.table.rows)
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether nothing is to be stored."""
+        return self.is_hopeless or not len(self._good_rows())
+
+    def store(self, connection: sa.Connection, family: Family[Any, Any]) -> None:
+        """Store what was prepared."""
+        if self._given.declaration.compare:
+            self._resurvey(connection, family)
+            return
+        assert self._codes is not None
+        why = self._given.reason or f"import of {self._sha256[:12]}"
+        total = len(self._codes.rows)
+        survey_import = family.survey
+        assert survey_import is not None
+        with self._recording(connection) as entry, bulk.many_markers(connection, total):
+            for number, start in enumerate(range(0, total, _PART)):
+                part = self._codes.of(slice(start, start + _PART))
+                ids = new_ids(self._now, len(part.rows), number)
+                columns = marker_columns(
+                    self._survey, part, self._given.declaration, survey_import, self._defaults,
+                    ids=ids, now=self._now, file_sha256=self._sha256,
+                )  # fmt: skip
+                columns = self._measured(connection, columns)
+                bulk.add_markers(connection, entry, columns, kind=kind_of_new, why=why)
+                self._stored += columns.count
+
+    def report(self, outcome: Outcome) -> ImportReport:
+        """What was found, and what was stored of it."""
+        table, placed = self._survey.table, self._survey.placed
+        refused = self._faults.flags(table.rows, Severity.REFUSED)
+        warned = self._faults.flags(table.rows, Severity.WARNING)
+        shown = self._faults.shown(MAX_FAULTS)
+        good = len(self._good_rows())
+        lon, lat = placed.lon_deg[placed.placed], placed.lat_deg[placed.placed]
+        return {
+            "outcome": outcome,
+            "dry_run": self._given.dry_run,
+            "mode": self._given.mode,
+            "warnings": "refuse" if self._given.refuse_warnings else "store",
+            "format": table.format,
+            "file_sha256": self._sha256,
+            "crs": table.crs,
+            "localization_grade": str(placed.grade),
+            "transform_note": placed.note,
+            "accuracy": accuracy_document(*(self._given.declaration.survey.get(name) for name in _ACCURACY)),
+            "rows": table.rows,
+            "good_rows": good,
+            "refused_rows": int(refused.sum()),
+            "warned_rows": int((warned & ~refused).sum()),
+            "stored": self._stored,
+            "extent_deg": [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]
+            if len(lon)
+            else None,
+            "counts": dict(self._faults.counts),
+            "comparison": self._comparison_document(),
+            "faults": [fault_document(fault) for fault in shown],
+            "faults_left_out": len(self._faults) - len(shown),
+        }
+
+    # --- steps ------------------------------------------------------------------------------------------------------
+
+    @property
+    def _refuses_file(self) -> bool:
+        strict = self._given.refuse_warnings and self._faults.file_warnings - {_STANDING}
+        return self._faults.refuses_file or bool(strict)
+
+    def _good_rows(self) -> Rows:
+        if self._refuses_file:
+            return np.empty(0, dtype=np.intp)
+        rows = self._survey.table.rows
+        bad = self._faults.flags(rows, Severity.REFUSED)
+        if self._given.refuse_warnings:
+            bad |= self._faults.flags(rows, Severity.WARNING)
+        return np.flatnonzero(~bad & self._survey.placed.placed)
+
+    def _is_known(self, connection: sa.Connection, lon_deg: float, lat_deg: float) -> bool:
+        return bulk.is_any_near(connection, self._caller.agency_id, lon_deg, lat_deg, _KNOWN_M)
+
+    def _box(self) -> Box | None:
+        """The box of the middle nine tenths of the rows, widened: one row far away must not stretch it."""
+        placed = self._survey.placed
+        if not placed.placed.any():
+            return None
+        west, east = np.quantile(placed.lon_deg[placed.placed], [0.05, 0.95])
+        south, north = np.quantile(placed.lat_deg[placed.placed], [0.05, 0.95])
+        wide, high = _MARGIN_DEG * 2 + (east - west) / 8, _MARGIN_DEG + (north - south) / 8
+        clipped = np.clip([west - wide, east + wide], -180.0, 180.0), np.clip([south - high, north + high], -90.0, 90.0)
+        return Box(float(clipped[0][0]), float(clipped[1][0]), float(clipped[0][1]), float(clipped[1][1]))
+
+    def _neighbours(self, connection: sa.Connection) -> Neighbours:
+        box = self._box()
+        agency_id = self._caller.agency_id
+        found = bulk.list_places_in(connection, agency_id, box, limit=_NEIGHBOURS) if box is not None else []
+        return Neighbours(
+            *_places(found),
+            tuple(row.vertical_datum for row in found),
+        )
+
+    def _compare(self, connection: sa.Connection, good: Rows) -> None:
+        declaration = self._given.declaration
+        codes = self._survey.table.texts.get("code")
+        if declaration.match == "code" and codes is None:
+            raise InvalidParameter(
+                "the survey has no codes to find its markers by",
+                field="declaration.match",
+                limit="a column with the role code",
+                cure='declare the column, or match "nearest"',
+            )
+        matched: Any = None
+        if declaration.match == "code":
+            assert codes is not None
+            matched = self._by_code(connection, codes, good)
+        elif (box := self._box()) is not None:
+            self._known = bulk.list_markers_in(
+                connection, self._caller.agency_id, declaration.family, box, limit=_NEIGHBOURS
+            )
+        lon, lat, height = _places(self._known)
+        self._comparison = compare_survey(self._survey, lon, lat, height, matched)
+        self._faults.add(check_residuals(self._comparison, declaration.tolerance_m))
+
+    def _by_code(self, connection: sa.Connection, codes: Sequence[str], good: Rows) -> Any:
+        """Index of the marker that each row names: of several with the same digits the nearest."""
+        named = {codes[row] for row in good.tolist()}
+        family, agency_id = self._given.declaration.family, self._caller.agency_id
+        found = bulk.list_by_digits(connection, family, [code for code in named if code])
+        ids = [row.id for row in found if row.agency_id == agency_id and row.status != "retired"]
+        self._known = store.get_markers(connection, agency_id, ids)
+        by_digits: dict[str, list[int]] = {}
+        for index, marker in enumerate(self._known):
+            by_digits.setdefault(marker.digits, []).append(index)
+        placed = self._survey.placed
+        matched = np.full(self._survey.table.rows, -1, dtype=np.intp)
+        used: set[int] = set()
+        for row in good.tolist():
+            candidates = by_digits.get(codes[row], [])
+            if candidates:
+                lon, lat = placed.lon_deg[row], placed.lat_deg[row]
+                best = min(candidates, key=lambda k: _square_deg(self._known[k], lon, lat))
+                if best in used:
+                    self._faults.add([Fault(row + 1, "code", "duplicate_code", "another row has the same code")])
+                used.add(best)
+                matched[row] = best
+        return matched
+
+    def _measured(self, connection: sa.Connection, columns: Columns) -> Columns:
+        """With the measures and offsets of rows that name a registered road and give no measure."""
+        if columns.same.get("road", "") is None:
+            return columns
+        names = ("road", "lon_deg", "lat_deg")
+        rows = [dict(zip(names, row, strict=True)) for row in zip(*map(columns.values, names), strict=True)]
+        measures, offsets = columns.values("measure_m"), columns.values("offset_m")
+        found = linear_references(connection, self._caller.agency_id, rows, [None] * columns.count)
+        for k, reference in enumerate(found):
+            if measures[k] is None and reference:
+                measures[k], offsets[k] = reference["measure_m"], reference["offset_m"]
+        return columns.but(measure_m=measures, offset_m=offsets)
+
+    def _resurvey(self, connection: sa.Connection, family: Family[Any, Any]) -> None:
+        """A new version of every marker that a good row measured."""
+        assert self._comparison is not None
+        rows = self._good_rows()
+        surveyed = common_columns(self._survey, rows, self._given.declaration, file_sha256=self._sha256).rows()
+        markers = [self._known[k] for k in self._comparison.matched[rows].tolist()]
+        kept_measures = [marker.measure_m for marker in markers]
+        moved = [{**columns, "road": marker.road} for marker, columns in zip(markers, surveyed, strict=True)]
+        measured = linear_references(connection, self._caller.agency_id, moved, kept_measures)
+        found = sorted(zip(markers, surveyed, measured, strict=True), key=lambda item: item[0].id)
+        with self._recording(connection) as entry:
+            for marker, columns, reference in found:
+                kept = ("family", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")
+                values = {name: v for name, v in columns.items() if name not in kept} | reference
+                values["status"] = self._given.declaration.status or "surveyed"
+                # what stands on the road keeps its digits, whatever was planned
+                built = marker._replace(status="built" if marker.status == PLANNED else marker.status)
+                values |= family.revise(connection, self._registration, built, values)
+                store.update_marker(
+                    connection,
+                    entry,
+                    marker.id,
+                    values,
+                    version=marker.version,
+                    kind=kind_of_change(marker.status, values["status"], moved=True),
+                    why=self._given.reason or f"as built, import of {self._sha256[:12]}",
+                )
+                self._stored += 1
+
+    def _recording(self, connection: sa.Connection) -> AbstractContextManager[AuditEntry]:
+        """The entry of the audit log that stands for the whole import."""
+        return recording(
+            connection,
+            self._caller.agency_id,
+            author_of(self._caller),
+            "import.stored",
+            now=self._now,
+            subject=self._sha256,
+            detail={"format": self._survey.table.format, "compare": self._given.declaration.compare},
+        )
+
+    def _comparison_document(self) -> ComparisonDocument | None:
+        if self._comparison is None:
+            return None
+        found = self._comparison
+        residuals: list[Residual] = [
+            {
+                "row": int(row) + 1,
+                "marker_id": self._known[int(found.matched[row])].id,
+                "east_m": round(float(found.east_m[row]), 4),
+                "north_m": round(float(found.north_m[row]), 4),
+                "up_m": round(float(found.up_m[row]), 4) if np.isfinite(found.up_m[row]) else None,
+                "horizontal_m": round(float(found.horizontal_m[row]), 4),
+            }
+            for row in np.flatnonzero(np.isfinite(found.east_m))[:MAX_FAULTS]
+        ]
+        tolerance_m = self._given.declaration.tolerance_m
+        drawn = draw_residuals(self._survey, found, tolerance_m)
+        return {**found.document(tolerance_m), "residuals": residuals, "map_svg": drawn}
+
+
+def _places(rows: Sequence[MarkerRow | PlaceRow]) -> tuple[Floats, Floats, Floats]:
+    values = [(row.lon_deg, row.lat_deg, np.nan if row.height_m is None else row.height_m) for row in rows]
+    array = np.array(values, dtype=np.float64).reshape(-1, 3)
+    return array[:, 0], array[:, 1], array[:, 2]
+
+
+def _square_deg(marker: MarkerRow, lon_deg: float, lat_deg: float) -> float:
+    return (marker.lon_deg - lon_deg) ** 2 + (marker.lat_deg - lat_deg) ** 2
+
+
+def _defaults(given: ImportInput) -> Any:
+    """What the survey's markers have in common; the family's own defaults where nothing is declared."""
+    survey = get_family(given.declaration.family).survey
+    return survey.defaults({}) if given.defaults is None and survey is not None else given.defaults
+
+
+def _check_family(declaration: ImportDeclaration) -> None:
+    if declaration.family not in SURVEYED:
+        raise InvalidParameter(
+            f"{declaration.family[:40]!r} cannot be imported from points",
+            field="declaration.family",
+            limit=", ".join(SURVEYED),
+            cure="register markers of the other families one by one or in bulk: POST /v1/markers",
+        )

@@ -1,0 +1,152 @@
+"""As-built surveys against the plan: the registered marker that each row measured, and the residual."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NotRequired
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+from typing_extensions import TypedDict
+
+from app.formats.surveys.read import warn
+from app.formats.surveys.table import Fault, Floats
+from app.surveys.georeference import GeoreferencedSurvey, east_north_m
+
+REACH_M = 30.0
+"""Longest residual of a row that is matched to its nearest marker; a longer one of a named marker is refused if it is
+also 20 times the usual. [m] Chosen by hand, checked by `python -m benchmarks.imports`."""
+_SHIFT_ROWS = 4  # rows from which on a common shift is reported; chosen by hand
+
+
+class ComparisonFigures(TypedDict):
+    """How far a survey is from the registry; a survey that matches no marker has no residuals."""
+
+    matched: int
+    tolerance_m: float
+    beyond_tolerance: NotRequired[int]
+    median_m: NotRequired[float]
+    max_m: NotRequired[float]
+    rmse_m: NotRequired[float]
+    shift_east_m: NotRequired[float]
+    shift_north_m: NotRequired[float]
+    shift_up_m: NotRequired[float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Rows of a survey beside the registered markers that they measured.
+
+    Attributes
+    ----------
+    matched : ndarray of int, shape (N,)
+        Index of the marker of each row; -1 without one.
+    east_m, north_m, up_m : ndarray, shape (N,)
+        Surveyed minus registered; NaN where unknown. [m]
+    """
+
+    matched: npt.NDArray[np.intp]
+    east_m: Floats
+    north_m: Floats
+    up_m: Floats
+
+    @property
+    def horizontal_m(self) -> Floats:
+        """Length of the residuals. [m]"""
+        return np.hypot(self.east_m, self.north_m)
+
+    def document(self, tolerance_m: float) -> ComparisonFigures:
+        """Figures of the comparison."""
+        known = self.horizontal_m[np.isfinite(self.horizontal_m)]
+        if not len(known):
+            return {"matched": 0, "tolerance_m": tolerance_m}
+        up = self.up_m[np.isfinite(self.up_m)]
+        return {
+            "matched": len(known),
+            "tolerance_m": tolerance_m,
+            "beyond_tolerance": int((known > tolerance_m).sum()),
+            "median_m": round(float(np.median(known)), 4),
+            "max_m": round(float(known.max()), 4),
+            "rmse_m": round(float(np.sqrt(np.mean(known**2))), 4),
+            "shift_east_m": round(float(np.nanmedian(self.east_m)), 4),
+            "shift_north_m": round(float(np.nanmedian(self.north_m)), 4),
+            "shift_up_m": round(float(np.median(up)), 4) if len(up) else None,
+        }
+
+
+def compare_survey(
+    survey: GeoreferencedSurvey,
+    lon_deg: Floats,
+    lat_deg: Floats,
+    height_m: Floats,
+    matched: npt.NDArray[np.intp] | None,
+) -> Comparison:
+    """Residuals of a survey at registered markers, shape (M,): those that its rows name, or else the mutual nearest."""
+    others = np.column_stack(east_north_m(lon_deg, lat_deg, survey.origin_deg)).reshape(-1, 2)
+    points = np.column_stack([survey.east_m, survey.north_m])
+    if matched is None:
+        matched = _nearest_once(points, others)
+    known = matched >= 0
+    east, north, up = (np.full(len(points), np.nan) for _ in range(3))
+    east[known] = points[known, 0] - others[matched[known], 0]
+    north[known] = points[known, 1] - others[matched[known], 1]
+    up[known] = survey.height_m[known] - height_m[matched[known]]
+    return Comparison(matched, east, north, up)
+
+
+def _nearest_once(points: Floats, others: Floats) -> npt.NDArray[np.intp]:
+    """Mutual nearest pairs within reach."""
+    matched = np.full(len(points), -1, dtype=np.intp)
+    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if not len(others) or not len(rows):
+        return matched
+    distance, forth = cKDTree(others).query(points[rows], k=1)
+    back = np.asarray(cKDTree(points[rows]).query(others, k=1)[1])
+    mutual = (np.asarray(distance) <= REACH_M) & (back[np.asarray(forth)] == np.arange(len(rows)))
+    matched[rows[mutual]] = np.asarray(forth)[mutual]
+    return matched
+
+
+def check_residuals(comparison: Comparison, tolerance_m: float) -> list[Fault]:
+    """Faults that the residuals reveal: rows beyond the tolerance, rows without a marker, one shift of all rows."""
+    faults = []
+    residual = comparison.horizontal_m
+    usual = float(np.nanmedian(residual)) if np.isfinite(residual).any() else 0.0
+    for row in np.flatnonzero(comparison.matched < 0):
+        message = "no registered marker belongs to the row"
+        faults.append(
+            Fault(int(row) + 1, "code", "no_marker", message, "correct the code, or import it without compare")
+        )
+    for row in np.flatnonzero(residual > tolerance_m):
+        message = f"the marker was found {residual[row]:.3f} m from its registered place"
+        far = residual[row] > max(REACH_M, 20 * usual)
+        proposal = "check that the row belongs to this marker, its coordinates, and the declaration"
+        faults.append(
+            Fault(int(row) + 1, "position", "residual", message, proposal)
+            if far
+            else warn(int(row) + 1, "position", "residual", message, proposal)
+        )
+    return faults + _check_shift(comparison, tolerance_m) + _check_up(comparison)
+
+
+def _check_shift(comparison: Comparison, tolerance_m: float) -> list[Fault]:
+    known = np.isfinite(comparison.east_m)
+    if known.sum() < _SHIFT_ROWS:
+        return []
+    east, north = np.median(comparison.east_m[known]), np.median(comparison.north_m[known])
+    scatter = np.median(np.hypot(comparison.east_m[known] - east, comparison.north_m[known] - north))
+    shift = float(np.hypot(east, north))
+    if shift <= max(tolerance_m, 4 * float(scatter)):
+        return []
+    message = f"all rows are shifted alike by {east:+.3f} m east, {north:+.3f} m north"
+    proposal = "check the CRS's datum, realization and epoch, and US survey against international feet"
+    return [warn(None, "position", "systematic_shift", message, proposal)]
+
+
+def _check_up(comparison: Comparison) -> list[Fault]:
+    up = comparison.up_m[np.isfinite(comparison.up_m)]
+    if len(up) < _SHIFT_ROWS or abs(float(np.median(up))) <= 0.5:
+        return []
+    message = f"the heights differ by {float(np.median(up)):+.2f} m from the registered ones"
+    return [warn(None, "height", "height_shift", message, "check the unit and vertical_datum (geoid or ellipsoid)")]

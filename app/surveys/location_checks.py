@@ -1,0 +1,255 @@
+"""Checks of a survey against the declared area, the CRS's area of use and the registered markers around it.
+
+Thresholds without another source were chosen by hand and are checked by `python -m benchmarks.imports`: planted faults
+must be found, clean surveys must not be refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.read import warn
+from app.formats.surveys.table import Fault, Floats
+from app.surveys.consistency_checks import nearest_of
+from app.surveys.georeference import Alternative, GeoreferencedSurvey, east_north_m, list_alternatives
+
+HasMarkersNear = Callable[[float, float], bool]
+"""Whether markers are registered within some kilometres of a longitude and latitude."""
+
+NEAR_M = 300.0
+"""Registered markers within this distance of a row are compared with it. [m]"""
+_MIN_NEAR_SHARE = 0.3  # [1] of rows with a registered marker near, below which the area alone is checked
+_BESIDE_M = 20.0  # [m] a survey whose median offset from the registered line is larger runs beside it
+_ALREADY_THERE_M = 0.5  # [m] a row within this distance of a registered marker is probably that marker
+_HEIGHT_SHIFT_M = 3.0  # [m] difference of heights that is allowed where markers are at the same place
+_GRADE = 0.06  # [m/m] grade of the road that is allowed for between a row and a registered marker
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbours:
+    """Registered markers around a survey.
+
+    Attributes
+    ----------
+    lon_deg, lat_deg, height_m : ndarray, shape (M,)
+        NaN where there is no height.
+    vertical_datum : tuple of str or None
+    """
+
+    lon_deg: Floats
+    lat_deg: Floats
+    height_m: Floats
+    vertical_datum: tuple[str | None, ...]
+
+
+def check_location(
+    survey: GeoreferencedSurvey, declaration: ImportDeclaration, neighbours: Neighbours, is_known: HasMarkersNear
+) -> Iterator[Fault]:
+    """Faults that the declared area, the CRS and the registered markers reveal."""
+    yield from _check_range(survey)
+    outside = _outside(survey, declaration)
+    for row in np.flatnonzero(outside):
+        yield Fault(int(row) + 1, "position", "outside_area", "the row lies outside the declared area", _row_cure())
+    yield from _check_whole(survey, declaration, outside, is_known, near=len(neighbours.lon_deg) > 0)
+    yield from _check_height_range(survey, declaration)
+    if survey.placed.placed.any():
+        yield from _check_neighbours(survey, declaration, neighbours, is_known)
+
+
+def _check_range(survey: GeoreferencedSurvey) -> Iterator[Fault]:
+    """Rows whose coordinates are numbers and still have no position."""
+    table = survey.table
+    lost = np.isfinite(table.first) & np.isfinite(table.second) & ~survey.placed.placed
+    message = f"the coordinates lie outside the range or the area of use of {table.crs}"
+    for row in np.flatnonzero(lost):
+        yield Fault(int(row) + 1, "position", "outside_crs", message, _row_cure(table.first[row], table.second[row]))
+
+
+def _row_cure(first: float = 0.0, second: float = 0.0) -> str:
+    shown = f"{first:g}, {second:g}: " if first or second else ""
+    return f"{shown}check the order of the axes, signs, decimals, unit and zone"
+
+
+def _outside(survey: GeoreferencedSurvey, declaration: ImportDeclaration) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    if declaration.area_deg is None:
+        return np.zeros(survey.table.rows, dtype=bool)
+    west, south, east, north = declaration.area_deg
+    lon, lat = survey.placed.lon_deg, survey.placed.lat_deg
+    with np.errstate(invalid="ignore"):
+        inside = (lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)
+    return survey.placed.placed & ~inside
+
+
+def _check_whole(
+    survey: GeoreferencedSurvey,
+    declaration: ImportDeclaration,
+    outside: np.ndarray[tuple[int], np.dtype[np.bool_]],
+    is_known: HasMarkersNear,
+    *,
+    near: bool,
+) -> list[Fault]:
+    """One fault for the file if most rows are in the wrong place, with the reading that would correct it."""
+    placed = survey.placed.placed
+    if declaration.area_deg is not None:
+        if placed.any() and outside.sum() <= 0.5 * placed.sum():
+            return []
+        west, south, east, north = declaration.area_deg
+        hit = _first_hit(survey, declaration, lambda lon, lat: west <= lon <= east and south <= lat <= north)
+        message = "most rows lie outside the declared area"
+        return [_whole(hit, message, "outside_area", "declare the area the survey lies in, or correct the file")]
+    if near or (placed.any() and is_known(*survey.origin_deg)):
+        return [] if placed.mean() > 0.5 else [_no_position(survey, declaration, is_known)]
+    if not placed.any() or placed.mean() <= 0.5:
+        return [_no_position(survey, declaration, is_known)]
+    hit = _first_hit(survey, declaration, is_known)
+    if hit is not None:
+        return [
+            _whole(
+                hit, "no registered marker is near, but another reading of the coordinates is near many", hit.code, ""
+            )
+        ]
+    return [
+        warn(
+            None, "position", "place_unchecked",
+            "no area is declared and no marker is registered near: the location cannot be checked",
+            "declare area_deg, the box that the survey lies in",
+        )
+    ]  # fmt: skip
+
+
+def _no_position(survey: GeoreferencedSurvey, declaration: ImportDeclaration, is_known: HasMarkersNear) -> Fault:
+    hit = _first_hit(survey, declaration, is_known) or _first_hit(survey, declaration, lambda _lon, _lat: True)
+    return _whole(hit, f"most rows have no position in {survey.table.crs}", "outside_crs", "check the CRS")
+
+
+def _first_hit(survey: GeoreferencedSurvey, declaration: ImportDeclaration, fits: HasMarkersNear) -> Alternative | None:
+    return next((a for a in list_alternatives(survey.table, declaration) if fits(a.lon_deg, a.lat_deg)), None)
+
+
+def _whole(hit: Alternative | None, message: str, code: str, cure: str) -> Fault:
+    if hit is None:
+        return Fault(None, "position", code, message, cure)
+    return Fault(None, "position", hit.code, message, f"{hit.proposal}; the survey then fits")
+
+
+def _check_height_range(survey: GeoreferencedSurvey, declaration: ImportDeclaration) -> Iterator[Fault]:
+    if declaration.height_range_m is None:
+        return
+    low, high = declaration.height_range_m
+    with np.errstate(invalid="ignore"):
+        outside = np.flatnonzero((survey.height_m < low) | (survey.height_m > high))
+    cure = "check the unit of the heights and what they are above (geoid or ellipsoid)"
+    for row in outside:
+        message = f"the height {survey.height_m[row]:.2f} m is outside {low:g} to {high:g} m"
+        yield Fault(int(row) + 1, "height", "height_out_of_range", message, cure)
+
+
+def _check_neighbours(
+    survey: GeoreferencedSurvey, declaration: ImportDeclaration, neighbours: Neighbours, is_known: HasMarkersNear
+) -> Iterator[Fault]:
+    rows = np.flatnonzero(survey.placed.placed)
+    points = np.column_stack([survey.east_m[rows], survey.north_m[rows]])
+    others = np.column_stack(east_north_m(neighbours.lon_deg, neighbours.lat_deg, survey.origin_deg))
+    if not len(others):
+        yield from _area_only(declaration, known=is_known(*survey.origin_deg))
+        return
+    k = min(3, len(others))
+    distance, index = nearest_of(points, others, k)
+    close = distance[:, 0] <= NEAR_M
+    if close.mean() < _MIN_NEAR_SHARE:
+        yield from _area_only(declaration, known=True)
+        return
+    if not declaration.compare:
+        yield from _check_already_there(rows, distance[:, 0])
+    yield from _check_beside(points[close], others[index[close]], distance[close])
+    yield from _check_heights(survey, declaration, neighbours, rows[close], distance[close], index[close])
+
+
+def _area_only(declaration: ImportDeclaration, *, known: bool) -> list[Fault]:
+    """The warning that even a correct survey of a new road gets: only its area could be checked."""
+    if declaration.compare or not (known or declaration.area_deg is not None):
+        return []
+    inside = "inside the declared area" if declaration.area_deg is not None else "within kilometres of others"
+    return [
+        warn(
+            None, "position", "place_by_area_only",
+            f"no marker is registered within {NEAR_M:g} m: it was only checked that the survey lies {inside}; "
+            "a shift of all rows, or heights above another datum, would not be noticed",
+            "check one row against the map; declare height_range_m where heights matter",
+        )
+    ]  # fmt: skip
+
+
+def _check_already_there(rows: np.ndarray[tuple[int], np.dtype[np.intp]], distance_m: Floats) -> Iterator[Fault]:
+    return (
+        warn(
+            int(rows[k]) + 1, "position", "marker_already_there",
+            f"a registered marker lies {distance_m[k]:.2f} m from here",
+            "declare compare if the survey measures registered markers",
+        )
+        for k in np.flatnonzero(distance_m <= _ALREADY_THERE_M)
+    )  # fmt: skip
+
+
+def _check_beside(points: Floats, nearest: Floats, distance_m: Floats) -> list[Fault]:
+    """The survey runs beside the registered line: a wrong datum, zone or scale shifts all rows alike."""
+    offsets = distance_m[:, 0]
+    if nearest.shape[1] >= 2:
+        chord = nearest[:, 1] - nearest[:, 0]
+        length = np.hypot(chord[:, 0], chord[:, 1])
+        away = points - nearest[:, 0]
+        across = np.abs(chord[:, 0] * away[:, 1] - chord[:, 1] * away[:, 0]) / np.maximum(length, 1e-6)
+        offsets = np.where(length > 1.0, np.minimum(across, offsets), offsets)
+    median = float(np.median(offsets))
+    if median <= _BESIDE_M:
+        return []
+    return [
+        warn(
+            None, "position", "beside_the_registered_line",
+            f"the survey runs about {median:.0f} m beside the registered markers",
+            "check the datum of the CRS, its zone, and whether distances are grid or ground",
+        )
+    ]  # fmt: skip
+
+
+def _check_heights(
+    survey: GeoreferencedSurvey,
+    declaration: ImportDeclaration,
+    neighbours: Neighbours,
+    rows: np.ndarray[tuple[int], np.dtype[np.intp]],
+    distance_m: Floats,
+    index: np.ndarray[tuple[int, int], np.dtype[np.intp]],
+) -> list[Fault]:
+    if survey.table.height is None:
+        return []
+    datum = declaration.vertical_datum or "ellipsoid"
+    nearest = index[:, 0]
+    same = np.array([(neighbours.vertical_datum[k] or "ellipsoid") == datum for k in nearest])
+    rise = survey.height_m[rows] - neighbours.height_m[nearest]
+    allowed = _HEIGHT_SHIFT_M + _GRADE * distance_m[:, 0]
+    comparable, foreign = same & np.isfinite(rise), ~same & np.isfinite(rise)
+    if comparable.sum() >= 3 and np.mean(np.abs(rise[comparable]) > allowed[comparable]) > 0.5:
+        shift = float(np.median(rise[comparable]))
+        message = f"the heights differ by {shift:+.1f} m from those of the registered markers beside them"
+        return [warn(None, "height", "height_shift", message, _height_cure(survey, rows, nearest, neighbours))]
+    if not comparable.sum() and foreign.sum() >= 3 and np.median(np.abs(rise[foreign])) < 1.0:
+        message = "the heights agree with those of registered markers whose heights are above another datum"
+        return [warn(None, "height", "height_datum", message, "check vertical_datum (geoid or ellipsoid)")]
+    return []
+
+
+def _height_cure(
+    survey: GeoreferencedSurvey,
+    rows: np.ndarray[tuple[int], np.dtype[np.intp]],
+    nearest: np.ndarray[tuple[int], np.dtype[np.intp]],
+    neighbours: Neighbours,
+) -> str:
+    ratio = float(np.nanmedian(survey.height_m[rows]) / np.nanmedian(neighbours.height_m[nearest]))
+    for factor, unit in ((3.2808, "ft"), (0.3048, "m")):
+        if abs(ratio / factor - 1) < 0.05:
+            return f"the heights seem to be in {unit}: declare height_unit"
+    return "check vertical_datum: heights above the geoid and above the ellipsoid differ by up to 100 m"

@@ -1,0 +1,133 @@
+"""Decoded paths against the true centre line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from app.lanes.estimate import Lane
+from app.sensors.pose_track import PoseTrack
+from app.simulation.radio.lanes import TrueLane
+
+Floats = npt.NDArray[np.float64]
+
+NEAR_M = 1.0  # [m] a true place is covered if the path is within this
+MIN_CONFIDENCE = 0.5  # and if the path's confidence there is at least this
+TOLERANCE_M = 0.25  # [m] source: the definition of confidence (docs/nomenclature.md)
+
+
+@dataclass
+class Tally:
+    """Errors at true places every 0.25 m between the first and the last marker, over runs."""
+
+    off_m: list[Floats] = field(default_factory=list)
+    curvature_1pm: list[Floats] = field(default_factory=list)
+    confidence: list[Floats] = field(default_factory=list)
+    right: list[Floats] = field(default_factory=list)
+    covered: int = 0
+    places: int = 0
+    runs: int = 0
+    refused: int = 0
+
+    def add(self, other: Tally) -> None:
+        """Add the runs of another tally."""
+        for name in ("off_m", "curvature_1pm", "confidence", "right"):
+            getattr(self, name).extend(getattr(other, name))
+        for name in ("covered", "places", "runs", "refused"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+    @property
+    def rms_m(self) -> float:
+        """Of the distance from the true centre line to the path. [m]"""
+        return _rms(self.off_m)
+
+    @property
+    def worst_m(self) -> float:
+        """[m]"""
+        return max((float(o.max()) for o in self.off_m if len(o)), default=float("nan"))
+
+    @property
+    def curvature_rms_1pm(self) -> float:
+        """[1/m]"""
+        return _rms(self.curvature_1pm)
+
+    @property
+    def coverage(self) -> float:
+        """Share of true places that a path covers."""
+        return self.covered / max(self.places, 1)
+
+    @property
+    def confidence_and_share_right(self) -> tuple[float, float]:
+        """Mean confidence of paths, and the share of places that were within 0.25 m of the centre."""
+        parts = [np.concatenate(p) if p else np.full(1, np.nan) for p in (self.confidence, self.right)]
+        return float(parts[0].mean()), float(parts[1].mean())
+
+
+def path_errors(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> Tally:
+    """Errors of a path.
+
+    Parameters
+    ----------
+    lane : TrueLane
+    path : Lane
+    first_m, last_m : float
+        Chainages of the first and the last marker received. [m]
+
+    Notes
+    -----
+    At each true place the error is the distance to the path; places beyond the path's ends have none, but count as not
+    covered. A method without confidence counts as certain.
+    """
+    inside = (lane.chainage_m >= first_m) & (lane.chainage_m <= last_m)
+    tally = Tally(places=int(inside.sum()), runs=1)
+    if path.refusal is not None or len(path.lon_deg) < 2:
+        tally.refused = 1
+        return tally
+    points = lane.enu_from_wgs84(path.lon_deg, path.lat_deg)
+    off, at, beside = _distances_from_line(lane.centre_m[inside], points)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    confidence = np.interp(at, along, path.confidence)
+    reported = np.isfinite(confidence)
+    tally.covered = int(((off <= NEAR_M) & (~reported | (confidence >= MIN_CONFIDENCE))).sum())
+    tally.off_m.append(off[beside])
+    bend = np.interp(at, along, path.curvature_1pm) - lane.curvature_1pm[inside]
+    tally.curvature_1pm.append(bend[beside])
+    tally.confidence.append(confidence[beside & reported])
+    tally.right.append((off[beside & reported] <= TOLERANCE_M).astype(float))
+    return tally
+
+
+def track_errors(lane: TrueLane, track: PoseTrack, first_m: float, last_m: float) -> Tally:
+    """Errors of the vehicle's own positions, taken as the path."""
+    inside = (lane.chainage_m >= first_m) & (lane.chainage_m <= last_m)
+    points = lane.enu_from_wgs84(track.lon_deg, track.lat_deg)
+    off, _at, beside = _distances_from_line(lane.centre_m[inside], points)
+    return Tally([off[beside]], covered=int((off <= NEAR_M).sum()), places=int(inside.sum()), runs=1)
+
+
+def _distances_from_line(places_m: Floats, line_m: Floats) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
+    """Distance of places from a line, where along it, and whether they are beside it rather than beyond an end.
+
+    The nearest place of the line is on one of the two pieces at the nearest of its points, which are close together.
+    """
+    line = line_m[np.concatenate([[True], np.linalg.norm(np.diff(line_m, axis=0), axis=1) > 1e-9])]
+    pieces = np.diff(line, axis=0)
+    lengths = np.linalg.norm(pieces, axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    nearest = cKDTree(line).query(places_m)[1]
+    off, at = np.full(len(places_m), np.inf), np.zeros(len(places_m))
+    for piece in (np.maximum(nearest - 1, 0), np.minimum(nearest, len(pieces) - 1)):
+        beside = places_m - line[piece]
+        share = np.clip(np.einsum("ij,ij->i", beside, pieces[piece]) / lengths[piece] ** 2, 0.0, 1.0)
+        away = np.linalg.norm(beside - share[:, None] * pieces[piece], axis=1)
+        closer = away < off
+        off, at = np.where(closer, away, off), np.where(closer, along[piece] + share * lengths[piece], at)
+    return off, at, (at > 1e-6) & (at < along[-1] - 1e-6)
+
+
+def _rms(parts: list[Floats]) -> float:
+    together = np.concatenate(parts) if parts else np.zeros(0)
+    return float(np.sqrt(np.mean(together**2))) if len(together) else float("nan")

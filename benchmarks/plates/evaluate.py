@@ -1,0 +1,142 @@
+"""Frames to records: readings of the decoder and of its peers in each frame, compared with the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from app.decoders.plate import decode_plates
+from app.markers.plate import PlateCode
+from app.markers.reading import PlateOutcome, PlateReading
+from app.simulation.plate_scene import FaceTruth
+from benchmarks.plates.peers import FAMILIES, reads_tag, tag_face
+from benchmarks.plates.sets import Job, Shot, Unseen, replace_face, shoot
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One frame.
+
+    Attributes
+    ----------
+    set_name, label, seed, share
+        Where it comes from; ``share`` of that set's frames was taken.
+    index, number : int
+        Job and place in it: what ``python -m benchmarks.plates.show`` takes.
+    height_px : float
+        Of the plate's image; NaN where there is none.
+    decoded, decoded_known : bool
+        Its digits were read from the frame alone, or with the codebook.
+    wrong, wrong_known : tuple of str
+        Digits returned as valid that are on no plate in the frame.
+    corner_errors_px : tuple of float
+        Distance of each corner to the truth, where decoded.
+    position_error_m : float
+        Distance of the camera's position to the truth, where decoded; else NaN.
+    rolling : bool
+        The camera has a rolling shutter.
+    tags : tuple of bool or None
+        Whether each peer's tag was read in the same scene.
+    """
+
+    set_name: str
+    label: str
+    seed: int
+    share: float
+    index: int
+    number: int
+    height_px: float
+    decoded: bool = False
+    decoded_known: bool = False
+    wrong: tuple[str, ...] = ()
+    wrong_known: tuple[str, ...] = ()
+    corner_errors_px: tuple[float, ...] = ()
+    position_error_m: float = math.nan
+    rolling: bool = False
+    tags: tuple[bool, ...] | None = None
+
+
+def evaluate_job(job: Job) -> list[Record]:
+    """Render and evaluate the frames of a job."""
+    cv2.setNumThreads(1)
+    return [_evaluate(job, number, shot) for number, shot in enumerate(shoot(job))]
+
+
+def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> Record:
+    if isinstance(shot, Unseen):
+        tags = (False,) * len(FAMILIES) if job.peers else None
+        return Record(job.set_name, shot.label, job.seed, job.share, job.index, number, shot.height_px, tags=tags)
+    truth = shot.frame.truths[0] if shot.code is not None else None
+    alone = decode_plates(shot.frame.image, camera=shot.camera, thermal=shot.thermal)
+    known = decode_plates(shot.frame.image, camera=shot.camera, codebook=shot.codebook, thermal=shot.thermal)
+    hit, wrong = find_right(alone, shot.code, truth)
+    hit_known, wrong_known = find_right(known, shot.code, truth)
+    return Record(
+        set_name=job.set_name,
+        label=shot.label,
+        seed=job.seed,
+        share=job.share,
+        index=job.index,
+        number=number,
+        height_px=truth.height_px if truth else math.nan,
+        decoded=hit is not None,
+        decoded_known=hit_known is not None,
+        wrong=wrong,
+        wrong_known=wrong_known,
+        corner_errors_px=_corner_errors(hit, truth),
+        position_error_m=_position_error(hit, truth),
+        rolling=shot.scene is not None and shot.scene.sensor.readout_s > 0,
+        tags=_evaluate_tags(job, shot, truth),
+    )
+
+
+def find_right(
+    readings: Sequence[PlateReading], code: PlateCode | None, truth: FaceTruth | None
+) -> tuple[PlateReading | None, tuple[str, ...]]:
+    """The reading that is right in digits and place, and the digits of all that are not."""
+    hit, wrong = None, []
+    for reading in readings:
+        if reading.outcome is not PlateOutcome.READ or reading.code is None:
+            continue
+        right = code is not None and reading.code.digits == code.digits and _is_there(reading, truth)
+        if right and hit is None:
+            hit = reading
+        elif not right:
+            wrong.append(reading.code.digits)
+    return hit, tuple(wrong)
+
+
+def _is_there(reading: PlateReading, truth: FaceTruth | None) -> bool:
+    if truth is None or reading.corners_px is None:
+        return False
+    apart = np.linalg.norm(reading.corners_px.mean(axis=0) - truth.corners_px.mean(axis=0))
+    return bool(apart < max(truth.width_px, truth.height_px) / 2)
+
+
+def _corner_errors(hit: PlateReading | None, truth: FaceTruth | None) -> tuple[float, ...]:
+    if hit is None or hit.corners_px is None or truth is None:
+        return ()
+    return tuple(float(v) for v in np.linalg.norm(hit.corners_px - truth.corners_px, axis=1))
+
+
+def _position_error(hit: PlateReading | None, truth: FaceTruth | None) -> float:
+    if hit is None or hit.pose is None or truth is None:
+        return math.nan
+    position_m = -hit.pose.rotation.T @ hit.pose.translation_m
+    return float(np.linalg.norm(position_m - truth.camera_position_m))
+
+
+def _evaluate_tags(job: Job, shot: Shot, truth: FaceTruth | None) -> tuple[bool, ...] | None:
+    if not job.peers or truth is None or shot.conditions is None:
+        return None
+    read = []
+    for family in FAMILIES:
+        rng = np.random.default_rng([shot.noise_seed, family.modules])
+        number = int(rng.integers(50))
+        frame = replace_face(shot, tag_face(family, number, shot.conditions, rng))
+        read.append(reads_tag(family, number, frame.image, truth))
+    return tuple(read)

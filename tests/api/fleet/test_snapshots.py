@@ -1,0 +1,107 @@
+"""/v1/snapshots over HTTP, on both databases."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime, timedelta
+
+import httpx
+import pytest
+
+from app.decoders.snapshot import open_snapshot
+from app.markers.snapshot import ExpiredSnapshot
+from app.services.access.access import Scope
+from app.settings import Settings
+from app.storage.signing_key import load_signing_key
+from tests.conftest import LiveServer
+
+pytestmark = pytest.mark.both_databases
+
+
+BOX = "8.3,48.9,8.6,49.1"
+
+
+def _public_key(server: LiveServer) -> bytes:
+    with server.client() as client:
+        answer = client.get("/v1/snapshots/public-key")
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["algorithm"] == "Ed25519"
+    return bytes.fromhex(answer.json()["public_key"])
+
+
+def test_a_vehicle_gets_its_agencys_markers_and_no_others(server: LiveServer, client: httpx.Client) -> None:
+    place = {"lon_deg": 8.412345678, "lat_deg": 49.012345678, "height_m": 120.5, "horizontal_rmse_m": 0.02}
+    limit = {"value": 30, "unit": "mph"}
+    cerpm = {"family": "cerpm", "position": place, "side": "right", "speed_limit": limit}
+    bare = {"family": "cerpm", "position": place}
+    made = [client.post("/v1/markers", json=body).json() for body in ({"position": place}, cerpm, bare)]
+    retired = client.post("/v1/markers", json={"position": {"lon_deg": 8.5, "lat_deg": 49.0}}).json()
+    client.patch(f"/v1/markers/{retired['id']}", json={"status": "retired"}, headers={"If-Match": "*"})
+    client.post("/v1/markers", json={"position": {"lon_deg": 8.7, "lat_deg": 49.0}})
+    answer = client.get("/v1/snapshots", params={"bbox": BOX, "hours": 2})
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "application/vnd.waymark.snapshot"
+    snapshot = open_snapshot(answer.content, _public_key(server), datetime.now(UTC))
+    assert len(snapshot) == 3
+    plate = snapshot.near("plate", 8.4123, 49.0123, 100.0)[0]
+    assert (plate.marker_id, plate.code) == (made[0]["id"], made[0]["code"]["digits"])
+    assert (plate.lon_deg, plate.lat_deg, plate.height_m) == (8.412345678, 49.012345678, 120.5)
+    known = {marker.code: marker.kind for marker in snapshot.near("cerpm", 8.4123, 49.0123, 100.0)}
+    said = {"family": "cerpm", "min_interval_s": 0.8, "transform_note": None}
+    assert known["1"] == {**said, "side": "right", "speed_limit": limit}
+    assert known["2"] == {**said, "side": "unknown", "speed_limit": None}
+    with pytest.raises(ExpiredSnapshot):
+        open_snapshot(answer.content, _public_key(server), datetime.now(UTC) + timedelta(hours=2))
+    with server.agency("snapshots of another", Scope.VEHICLE) as other:
+        foreign = other.get("/v1/snapshots", params={"bbox": BOX})
+        nothing = open_snapshot(foreign.content, _public_key(server), datetime.now(UTC))
+        assert (len(nothing), nothing.codebooks) == (0, ())
+
+
+def test_a_survey_in_another_frame_is_as_good_as_its_transformation(server: LiveServer, client: httpx.Client) -> None:
+    place = {"lon_deg": 8.41, "lat_deg": 49.01, "horizontal_rmse_m": 0.02}
+    exact = client.post("/v1/markers", json={"position": {**place, "crs": "EPSG:4258", "epoch": 2020.0}}).json()
+    vague = client.post("/v1/markers", json={"position": {**place, "lon_deg": 8.42, "crs": "EPSG:4258"}}).json()
+    answer = client.get("/v1/snapshots", params={"bbox": BOX})
+    snapshot = open_snapshot(answer.content, _public_key(server), datetime.now(UTC))
+    for marker in (exact, vague):
+        position = marker["position"]
+        (found,) = snapshot.near("plate", position["lon_deg"], position["lat_deg"], 1.0)
+        bound_m = position["transform_accuracy_m"] or 0.0
+        assert found.horizontal_rmse_m == pytest.approx(math.hypot(0.02, bound_m), abs=0.001)
+        assert found.horizontal_rmse_m >= math.hypot(0.02, bound_m) - 1e-9
+        assert found.grade == position["localization_grade"]
+        approximate = [] if found.grade == "exact" else [position["transform_note"]]
+        assert found.localization_warnings("plate") == (
+            *approximate,
+            "the plate is planned, its position is not surveyed",
+        )
+    assert {exact["position"]["localization_grade"], vague["position"]["localization_grade"]} > {"exact"}
+
+
+@pytest.mark.parametrize(
+    ("params", "field"),
+    [
+        ({}, "bbox"),
+        ({"bbox": "1,2,3"}, "bbox"),
+        ({"bbox": "1,5,3,2"}, "bbox"),
+        ({"bbox": "nan,1,2,3"}, "bbox"),
+        ({"bbox": BOX, "hours": "0"}, "hours"),
+        ({"bbox": BOX, "hours": "nan"}, "hours"),
+        ({"bbox": BOX, "hours": "1e9"}, "hours"),
+        ({"bbox": BOX, "hours": "-1"}, "hours"),
+    ],
+)
+def test_bad_input_is_a_problem(client: httpx.Client, params: dict[str, str], field: str) -> None:
+    answer = client.get("/v1/snapshots", params=params)
+    assert answer.status_code == 422, answer.text
+    assert field in answer.json()["field"]
+
+
+def test_the_key_stays_the_same_and_is_only_the_owners(server: LiveServer, settings: Settings) -> None:
+    path = settings.resolved_signing_key_file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    first, again = load_signing_key(path), load_signing_key(path)
+    assert first.private_bytes_raw() == again.private_bytes_raw()
+    assert path.stat().st_mode & 0o077 == 0
+    assert _public_key(server) != first.public_key().public_bytes_raw()

@@ -1,0 +1,54 @@
+"""The OpenAPI document: one for all settings, with the headers that requests carry and the media types of files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.main import create_app
+from app.settings import Settings
+from tests.conftest import LiveServer
+from tests.documented import DEVIATIONS
+
+
+def test_the_document_does_not_depend_on_settings(server: LiveServer, tmp_path: Path) -> None:
+    other = create_app(Settings(data_dir=tmp_path, public_url="https://example.org", max_upload_bytes=1 << 20))
+    assert other.openapi() == server.app.openapi()
+
+
+def _headers(document: dict[str, Any], path: str, method: str) -> dict[str, bool]:
+    parameters = document["paths"][path][method]["parameters"]
+    return {one["name"]: one["required"] for one in parameters if one["in"] == "header"}
+
+
+def test_headers_of_requests_are_parameters(server: LiveServer) -> None:
+    document = server.app.openapi()
+    assert _headers(document, "/v1/markers/{marker_id}", "patch") == {"If-Match": True}
+    assert _headers(document, "/v1/markers/{marker_id}", "get") == {"If-None-Match": False}
+    assert _headers(document, "/v1/imports", "post") == {"Idempotency-Key": False, "Prefer": False}
+    assert _headers(document, "/v1/decodes", "post") == {"Idempotency-Key": False, "Waymark-Context": False}
+
+
+def test_files_have_media_types_and_are_binary(server: LiveServer) -> None:
+    artwork = server.app.openapi()["paths"]["/v1/markers/{marker_id}/artwork.{form}"]["get"]["responses"]
+    assert set(artwork["200"]["content"]) == {"image/svg+xml", "application/pdf", "image/vnd.dxf", "image/png"}
+    assert artwork["200"]["content"]["image/png"]["schema"] == {"type": "string", "format": "binary"}
+    assert "content" not in artwork["304"]
+
+
+@pytest.mark.parametrize(
+    ("document", "fault"),
+    [({"status": "fine"}, "status: "), ({"status": "ok", "load": 1}, "'load'"), ({}, "required property")],
+)
+def test_a_deviation_is_found(
+    server: LiveServer, monkeypatch: pytest.MonkeyPatch, document: dict[str, Any], fault: str
+) -> None:
+    monkeypatch.setattr("app.api.http.system.ProcessHealth", lambda **_: document)
+    with server.client() as client:
+        client.get("/healthz")
+    found = DEVIATIONS.pop()
+    assert found.startswith("GET /healthz: 200 application/json: ")
+    assert fault in found
+    assert DEVIATIONS == []

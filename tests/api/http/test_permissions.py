@@ -1,0 +1,364 @@
+"""Every route x every kind of caller, by real requests; the routes come from the application itself."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import sqlalchemy as sa
+from fastapi import FastAPI
+from starlette.routing import Mount
+
+from app.api.http.permissions import EVERYBODY, PERMISSIONS, PUBLIC, Permissions
+from app.main import create_app
+from app.registry.tables import api_keys, calibrations
+from app.services.access.access import Scope
+from app.settings import Settings
+from tests.api.markers.test_cerpm_markers import cerpm
+from tests.api.markers.test_codebooks import DESIGN, MEANINGS
+from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
+from tests.formats.pictures import corner_frame, png
+from tests.jobs import standin
+
+pytestmark = pytest.mark.both_databases
+
+CALIBRATED: dict[str, Any] = {
+    "decoder": "waymark", "summary": "", "rms_px": 0.1, "tilt_spread_deg": 1.0, "views": [],
+    "camera": {"width_px": 1, "height_px": 1, "fx_px": 1.0, "fy_px": 1.0, "cx_px": 0.0, "cy_px": 0.0, "distortion": []},
+    "sigma": {"fx_px": 1.0, "fy_px": 1.0, "cx_px": 0.0, "cy_px": 0.0, "distortion": []},
+    "coverage": {"share": 0.5, "cells": [[1]]},
+    "board": {"columns": 7, "rows": 10, "square_mm": 25.0, "marker_mm": 18.0, "dictionary": "DICT_4X4_100"},
+}  # fmt: skip
+NOBODY_ID = "019cb624-0000-7000-8000-00000000ffff"
+UPLOAD = "POST /v1/decodes"
+# what a parameter of a path may be where it names no row
+FORMS = {"artwork": "svg", "board": "svg", "layout": "csv", "payload": "json"}
+VALUES = {
+    "version": ("1",),
+    "kind": ("geojson",),
+    "suffix": ("png",),
+    "collection": ("markers",),
+    "matrix_set": ("WebMercatorQuad",),
+    "zoom": ("0",),
+    "row": ("0",),
+    "column": ("0",),
+    "name": ("bill.csv",),
+}
+# bodies that are refused for nothing but the row that they are about
+BODIES: dict[str, Any] = {
+    "PATCH /v1/markers/{marker_id}": {"status": "active"},
+    "POST /v1/codebooks/{codebook_id}/entries": {"meanings": [{"kind": "speed-limit-mph", "value": 45}]},
+    "PATCH /v1/vehicles/{vehicle_id}": {"note": "seen"},
+    "PUT /v1/vehicles/{vehicle_id}/calibration": {"calibration_id": NOBODY_ID},
+    "PATCH /v1/roads/{road_id}": {"calibration": []},
+    "PATCH /v1/plans/{plan_id}": {"name": "q"},
+    "POST /v1/roads/{road_id}/locate": {"positions": [[33.501, 43.5]]},
+    "POST /v1/roads/{road_id}/position": {"references": [{"measure_m": 10}]},
+    "PUT /ogc/collections/{collection}/items/{feature}": {
+        "type": "Feature",
+        "geometry": {"type": "Point", "coordinates": [9.0, 49.0]},
+        "properties": {},
+    },
+    "PATCH /ogc/collections/{collection}/items/{feature}": {"type": "Feature", "properties": {"status": "active"}},
+}
+# and such queries
+QUERIES = {
+    "GET /v1/roads/{road_id}/locate": "?lon=33.501&lat=43.5",
+    "GET /v1/roads/{road_id}/position": "?measure_m=10",
+}
+# what the things made below do not have
+NOT_MADE = ("/artwork.{form}", "/plot.svg", "/lane.geojson", "/overlay.{suffix}")
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Any) -> Iterator[LiveServer]:
+    folder: Path = tmp_path_factory.mktemp("permissions") / "var"
+    url = new_database_url(folder)
+    settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, decode_workers=1, **UNLIMITED)
+    with LiveServer(create_app(settings, decode=standin.decode)) as running:
+        yield running
+
+
+def list_routes(app: FastAPI) -> set[str]:
+    """Method and path of all that the application answers, HEAD left out; a mount counts as GET."""
+    found = set()
+    for route in app.routes:
+        contexts = route.effective_route_contexts() if hasattr(route, "effective_route_contexts") else [route]
+        for context in contexts:
+            methods = {"GET"} if isinstance(context, Mount) else context.methods
+            found |= {f"{method} {context.path}" for method in methods if method != "HEAD"}
+    return found
+
+
+def fill(path: str, given: dict[str, str]) -> str:
+    """A path template with its parameters filled in."""
+    return re.sub(r"\{(\w+)\}", lambda found: given[found[1]], path)
+
+
+def parameters(route: str) -> list[str]:
+    return re.findall(r"\{(\w+)\}", route)
+
+
+def values(route: str) -> dict[str, tuple[str, ...]]:
+    """What the parameters of a route may be where they name no row."""
+    form = re.search(r"(\w+)\.\{form\}", route)
+    return VALUES | ({"form": (FORMS[form[1]],)} if form else {})
+
+
+def nobodys(route: str) -> dict[str, str]:
+    """Parameters of a route about a row that nobody has."""
+    known = values(route)
+    return {name: known.get(name, (NOBODY_ID,))[0] for name in parameters(route)}
+
+
+def names_a_row(parameter: str) -> bool:
+    return parameter == "feature" or parameter.endswith("_id")
+
+
+def ask(client: httpx.Client, route: str, path: str) -> httpx.Response:
+    """Make a request with a body that fits."""
+    method = route.partition(" ")[0]
+    headers = {"If-Match": '"1"'}
+    if method not in ("POST", "PUT", "PATCH"):
+        return client.request(method, path + QUERIES.get(route, ""), headers=headers)
+    if route == UPLOAD:
+        return client.post(path, content=b"this is no picture", headers={"Content-Type": "image/png"})
+    body = json.dumps(BODIES.get(route, {}))
+    return client.request(method, path, content=body, headers=headers | {"Content-Type": "application/json"})
+
+
+# --- the table ----------------------------------------------------------------------------------------------------
+
+
+def test_every_route_is_classified_and_nothing_else(server: LiveServer) -> None:
+    routes = list_routes(server.app)
+    described = {f"{m.upper()} {path}" for path, ways in server.app.openapi()["paths"].items() for m in ways}
+    assert described <= routes
+    assert routes - set(PERMISSIONS) == set(), "not in app/api/http/permissions.py: nobody may call these"
+    assert set(PERMISSIONS) - routes == set(), "in app/api/http/permissions.py, but no route"
+
+
+def test_the_table_and_the_router_mean_the_same_route() -> None:
+    permissions = Permissions({route: frozenset({route}) for route in PERMISSIONS})  # type: ignore[misc]
+    for route in PERMISSIONS:
+        method, _, path = route.partition(" ")
+        filled = fill(path, nobodys(route))
+        assert permissions.find(method, filled) == {route}
+        assert permissions.find("HEAD", filled) == permissions.find("GET", filled)
+    for path in ("/v1", "/v1/markers/", "/v1/markers/a/b/c", "/v1/marker", "/ogc/x", "/v1/decodes/a/overlay.png/b"):
+        assert permissions.find("GET", path) is None
+    assert permissions.find("PUT", "/v1/markers") is None
+
+
+def test_a_route_that_is_not_classified_is_refused_to_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(PERMISSIONS, "GET /v1/codebooks")
+    monkeypatch.delitem(PERMISSIONS, "GET /ogc/collections")
+    settings = Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY, warm_decoders=False)
+    with LiveServer(create_app(settings)) as server, server.client() as admin:
+        assert admin.get("/v1/codebooks").status_code == 401
+        assert admin.get("/ogc/collections").status_code == 401
+        assert admin.get("/v1/markers").status_code == 200
+
+
+# --- the matrix ---------------------------------------------------------------------------------------------------
+
+KEYLESS = ("no key", "unknown", "revoked", "expired")
+
+
+@pytest.fixture(scope="module")
+def keys(server: LiveServer) -> dict[str, str | None]:
+    """A key of each kind, all of one agency."""
+    access = server.app.state.access
+    made: dict[str, str | None] = {scope: access.create_key("matrix", scope, scope) for scope in Scope}
+    made |= {kind: access.create_key("matrix", Scope.ADMIN, kind) for kind in KEYLESS}
+    past = datetime.now(UTC) - timedelta(days=1)
+    with server.app.state.database.write() as connection:
+        for label, change in (("revoked", {"revoked_at": past}), ("expired", {"expires_at": past})):
+            connection.execute(sa.update(api_keys).where(api_keys.c.label == label).values(change))
+    return made | {"no key": None, "unknown": "a-key-that-nobody-was-given-0000000"}
+
+
+@pytest.mark.parametrize("kind", [*Scope, *KEYLESS])
+def test_every_route_for_each_kind_of_caller(server: LiveServer, keys: dict[str, str | None], kind: str) -> None:
+    wrong = []
+    with server.client(keys[kind]) as client:
+        for route in sorted(list_routes(server.app)):
+            allowed, path = PERMISSIONS[route], route.partition(" ")[2]
+            answer = ask(client, route, fill(path, nobodys(route)))
+            if allowed == PUBLIC:
+                expected = answer.status_code in (200, 307)  # /static leads to /static/
+            elif kind in KEYLESS:
+                expected = answer.status_code == 401 and "www-authenticate" in answer.headers
+            elif kind not in allowed:
+                expected = answer.status_code == 403 and Scope.ADMIN in answer.json()["limit"]
+            else:
+                expected = answer.status_code in (200, 201, 204, 400, 404, 409, 415, 422)
+            if not expected:
+                wrong.append(f"{route}: {answer.status_code} {answer.text[:200]}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_a_scope_is_refused_before_the_body_is_read(server: LiveServer, keys: dict[str, str | None]) -> None:
+    sent = 0
+
+    def parts() -> Iterator[bytes]:
+        nonlocal sent
+        for _ in range(256):
+            sent += 1
+            yield b" " * 65536
+
+    with server.client(keys[Scope.VIEWER]) as viewer:
+        try:
+            answer = viewer.post("/v1/markers", content=parts(), headers={"Content-Type": "application/json"})
+        except httpx.WriteError:
+            return  # the server hung up while we were still sending
+    assert answer.status_code == 403
+    assert answer.headers["connection"] == "close"
+
+
+# --- the rows of others -------------------------------------------------------------------------------------------
+
+
+def _made(response: httpx.Response) -> dict[str, Any]:
+    assert response.status_code == 201, response.text
+    return dict(response.json())
+
+
+@pytest.fixture(scope="module")
+def things(server: LiveServer) -> dict[str, list[str]]:
+    """Ids of what one agency has, by the parameter that names it."""
+    with server.agency("owners", Scope.ADMIN) as owner:
+        place = {"lon_deg": 31.5, "lat_deg": 41.5}
+        plate = _made(owner.post("/v1/markers", json={"position": place}))["id"]
+        radio = _made(owner.post("/v1/markers", json=cerpm({"lon_deg": 32.5, "lat_deg": 42.5})))["id"]
+        way = {"type": "LineString", "coordinates": [[33.5, 43.5], [33.502, 43.5]]}
+        line = {"family": "magnet", "lane": {"geometry": way}, "line": {"style": "solid"}}
+        magnets = _made(owner.post("/v1/markers", json=line))["id"]
+        road = _made(owner.post("/v1/roads", json={"name": "r", "geometry": way}))["id"]
+        book = _made(owner.post("/v1/codebooks", json={"name": "b", "design": DESIGN, "meanings": MEANINGS}))
+        decode = _made(owner.post("/v1/decodes", content=png(corner_frame()), headers={"Content-Type": "image/png"}))
+        vehicle = _made(owner.post("/v1/vehicles", json={"name": "v", "profile": {}}))["id"]
+        survey, later = {"file": ("survey.csv", b"lon,lat\n1,2\n")}, {"Prefer": "respond-async"}
+        queued = owner.post("/v1/imports", files=survey, headers=later).json()["id"]
+        road_file = {
+            "file": ("road.geojson", way_file(way), "application/geo+json"),
+            "declaration": (None, '{"name": "r"}', "application/json"),
+        }
+        alignment = _made(owner.post("/v1/alignments", files=road_file))["id"]
+        rules = {"version": 1, "plates": {}}
+        plan = _made(owner.post("/v1/plans", json={"name": "p", "alignment_id": alignment, "rules": rules}))["id"]
+    access = server.app.state.access
+    caller = access.authenticate(owner.headers["authorization"].split()[1])
+    calibration = {"id": "019cb624-0000-7000-8000-00000000cccc", "who": "w", "result": CALIBRATED}
+    with server.app.state.database.write() as connection:  # from photos it takes long
+        row = {**calibration, "agency_id": caller.agency_id, "created_at": datetime.now(UTC)}
+        connection.execute(sa.insert(calibrations).values(row))
+    return {
+        "calibration_id": [calibration["id"]],
+        "road_id": [road],
+        "vehicle_id": [vehicle],
+        "key_id": [caller.key_id],
+        "marker_id": [plate, magnets, radio],
+        "feature": [plate],
+        "codebook_id": [book["id"]],
+        "code": [book["entries"][0]["code"]],
+        "decode_id": [decode["id"]],
+        "import_id": [queued],
+        "alignment_id": [alignment],
+        "plan_id": [plan],
+    }
+
+
+def way_file(way: dict[str, Any]) -> bytes:
+    """A road file of one line."""
+    feature = {"type": "Feature", "properties": {"speed_limit_kmh": 50}, "geometry": way}
+    return json.dumps({"type": "FeatureCollection", "features": [feature]}).encode()
+
+
+def _paths(route: str, things: dict[str, list[str]]) -> Iterator[tuple[str, str]]:
+    """Paths of a route about each of the things, and about things that nobody has."""
+    path, names = route.partition(" ")[2], parameters(route)
+    known: dict[str, Any] = values(route) | things
+    missing = [name for name in names if name not in known]
+    assert not missing, f"{route}: make a row for {missing} in `things`, or say in VALUES what it may be"
+    for chosen in itertools.product(*(known[name] for name in names)):
+        real = dict(zip(names, chosen, strict=True))
+        yield fill(path, real), fill(path, {n: NOBODY_ID if names_a_row(n) else value for n, value in real.items()})
+
+
+def _same_for(response: httpx.Response, path: str) -> str:
+    """The body, without what tells two requests apart anyway."""
+    body = re.sub(r'"request_id":\s*"\w+"', "", response.text)
+    for segment in path.split("/"):
+        if len(segment) >= 36:
+            body = body.replace(segment[:36], "ID")
+    return body
+
+
+@pytest.fixture(scope="module")
+def stranger(server: LiveServer) -> Iterator[httpx.Client]:
+    with server.agency("strangers to everything", Scope.ADMIN) as client:
+        yield client
+
+
+ABOUT_ROWS = sorted(route for route in PERMISSIONS if any(map(names_a_row, parameters(route))))
+
+
+@pytest.mark.parametrize("route", ABOUT_ROWS)
+def test_a_row_of_another_agency_is_as_if_it_were_not_there(
+    stranger: httpx.Client, things: dict[str, list[str]], route: str
+) -> None:
+    for theirs, nobodys in _paths(route, things):
+        answers = [ask(stranger, route, path) for path in (theirs, nobodys)]
+        if route.startswith("OPTIONS"):
+            assert {answer.status_code for answer in answers} == {200}
+            continue
+        assert [a.status_code for a in answers] == [404, 404], f"{route}: {answers[0].text} {answers[1].text}"
+        assert _same_for(answers[0], theirs) == _same_for(answers[1], nobodys)
+
+
+@pytest.mark.parametrize(
+    "route", [route for route in ABOUT_ROWS if route.startswith("GET") and not route.endswith(NOT_MADE)]
+)
+def test_and_its_owner_finds_it(server: LiveServer, things: dict[str, list[str]], route: str) -> None:
+    with server.agency("owners", Scope.ADMIN) as owner:
+        answers = [ask(owner, route, path) for path, _ in _paths(route, things)]
+    assert any(answer.status_code == 200 for answer in answers), [answer.text for answer in answers]
+
+
+@pytest.mark.parametrize("path", ["/v1/artwork", "/v1/programs"])
+def test_ids_in_bodies_are_as_if_they_were_not_there(
+    stranger: httpx.Client, things: dict[str, list[str]], path: str
+) -> None:
+    for theirs in things["marker_id"]:
+        answers = [stranger.post(path, json={"marker_ids": [marker]}) for marker in (theirs, NOBODY_ID)]
+        assert [answer.status_code for answer in answers] == [404, 404]
+        bodies = [re.sub(r'"request_id":"\w+"', "", answer.text) for answer in answers]
+        assert bodies[0].replace(theirs, NOBODY_ID) == bodies[1]
+
+
+def test_vehicles_see_their_own_decodes_only(server: LiveServer) -> None:
+    with (
+        server.agency("fleet", Scope.VEHICLE) as one,
+        server.agency("fleet", Scope.VEHICLE) as other,
+        server.agency("fleet", Scope.VIEWER) as viewer,
+    ):
+        upload = {"content": png(corner_frame()), "headers": {"Content-Type": "image/png"}}
+        mine, theirs = (_made(vehicle.post("/v1/decodes", **upload))["id"] for vehicle in (one, other))
+        assert [item["id"] for item in one.get("/v1/decodes").json()["items"]] == [mine]
+        assert {item["id"] for item in viewer.get("/v1/decodes").json()["items"]} == {mine, theirs}
+        for route, allowed in PERMISSIONS.items():
+            if "{decode_id}" not in route or allowed < EVERYBODY - {Scope.VIEWER}:
+                continue
+            path = route.partition(" ")[2].replace("{suffix}", "png")
+            answers = [ask(one, route, path.replace("{decode_id}", decode)) for decode in (theirs, NOBODY_ID)]
+            assert [answer.status_code for answer in answers] == [404, 404], route
+            bodies = [re.sub(r'"request_id":"\w+"', "", answer.text) for answer in answers]
+            assert bodies[0].replace(theirs, NOBODY_ID) == bodies[1]

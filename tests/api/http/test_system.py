@@ -1,0 +1,185 @@
+"""Health, metrics, logs and the OpenAPI document."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import orjson
+import pytest
+import sqlalchemy as sa
+import structlog
+from fastapi.routing import APIRoute
+
+from app.api.http.middleware import PROTECTED
+from app.api.http.problems import MEDIA_TYPE, PROBLEMS, kind_of
+from app.errors import WaymarkError
+from app.logs import configure_logs
+from app.settings import Settings
+from tests.conftest import LiveServer
+
+OPEN = {"/", "/healthz", "/readyz", "/metrics", "/docs", "/docs/oauth2-redirect", "/redoc", "/openapi.json"}
+
+
+def _descendants(kind: type) -> set[type]:
+    return {kind}.union(*(_descendants(child) for child in kind.__subclasses__()))
+
+
+def test_every_error_of_the_domain_is_in_the_table() -> None:
+    missing = {kind for kind in _descendants(WaymarkError) if kind_of(kind("x")) is None}
+    assert missing == {WaymarkError}
+    assert len({kind.slug for kind in PROBLEMS.values()}) == len(PROBLEMS)
+
+
+def test_ready_only_while_the_database_is_migrated(fresh_server: LiveServer, settings: Settings) -> None:
+    with fresh_server.client(None) as anyone:
+        assert anyone.get("/healthz").json() == {"status": "ok"}
+        ready = anyone.get("/readyz")
+        assert ready.status_code == 200
+        assert ready.json()["parts"]["database"] is True
+        engine = sa.create_engine(settings.resolved_database_url)
+        with engine.begin() as connection:
+            connection.exec_driver_sql("UPDATE alembic_version SET version_num = 'other'")
+        engine.dispose()
+        late = anyone.get("/readyz")
+        assert (late.status_code, late.json()["parts"]["database"]) == (503, False)
+        assert anyone.get("/healthz").status_code == 200
+
+
+def test_readiness_asks_every_part(fresh_server: LiveServer) -> None:
+    fresh_server.app.state.readiness["workers"] = lambda: False
+    with fresh_server.client(None) as anyone:
+        answer = anyone.get("/readyz")
+    assert answer.status_code == 503
+    assert answer.json()["status"] == "not ready"
+
+
+def test_metrics_count_by_route_not_by_path(server: LiveServer, client: httpx.Client) -> None:
+    for number in range(3):
+        client.get(f"/v1/markers/01a1fb99-93e6-79ab-93c1-fe6e9560000{number}")
+    client.get("/v1/some/path/that/is/not/there")
+    client.request("BREW", "/healthz")
+    text = client.get("/metrics").text
+    counts = dict(re.findall(r"^waymark_http_requests_total(\{.*\}) (\S+)$", text, re.M))
+    assert float(counts['{method="GET",route="/v1/markers/{marker_id}",status="404"}']) >= 3
+    assert float(counts['{method="GET",route="unmatched",status="404"}']) >= 1
+    assert "fe6e9560000" not in text
+    assert "BREW" not in text
+    assert "waymark_http_request_seconds_bucket" in text
+
+
+def test_request_ids_are_kept_if_they_are_harmless(client: httpx.Client) -> None:
+    assert client.get("/healthz", headers={"X-Request-ID": "trace-1.a_b"}).headers["x-request-id"] == "trace-1.a_b"
+    for bad in ("a b", "x" * 65, '{"a":1}', ""):
+        given = client.get("/healthz", headers={"X-Request-ID": bad}).headers["x-request-id"]
+        assert re.fullmatch(r"[0-9a-f]{32}", given)
+
+
+def test_only_known_paths_need_no_key(server: LiveServer) -> None:
+    paths = set(server.app.openapi()["paths"]) | {
+        route.path for route in server.app.routes if isinstance(route, APIRoute)
+    }
+    assert {path for path in paths if not path.startswith(PROTECTED)} <= OPEN
+
+
+# --- OpenAPI ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def document(server: LiveServer) -> dict[str, Any]:
+    with server.client(None) as anyone:
+        return dict(anyone.get("/openapi.json").json())
+
+
+def _operations(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    return [
+        (f"{method.upper()} {path}", operation)
+        for path, methods in document["paths"].items()
+        for method, operation in methods.items()
+    ]
+
+
+def test_every_protected_operation_documents_keys_and_problems(document: dict[str, Any]) -> None:
+    assert "Problem" in document["components"]["schemas"]
+    protected = [(name, op) for name, op in _operations(document) if " /v1/" in name]
+    assert len(protected) >= 5
+    for name, operation in protected:
+        assert operation["security"] == [{"bearer": []}, {"apiKey": []}], name
+        for status in ("400", "401", "403", "413", "422", "500", "503"):
+            assert MEDIA_TYPE in operation["responses"][status]["content"], (name, status)
+        assert operation["summary"], name
+
+
+def test_every_reference_resolves(document: dict[str, Any]) -> None:
+    for reference in set(re.findall(r'"\$ref":"#/([^"]+)"', orjson.dumps(document).decode())):
+        node: Any = document
+        for part in reference.split("/"):
+            node = node[part]
+
+
+def test_the_examples_of_every_json_body_are_accepted(client: httpx.Client, document: dict[str, Any]) -> None:
+    schemas = document["components"]["schemas"]
+    seen = 0
+    for name, operation in _operations(document):
+        content = operation.get("requestBody", {}).get("content", {})
+        if "application/json" not in content:
+            continue
+        if "$ref" not in content["application/json"]["schema"]:
+            continue  # a file as it comes
+        schema = schemas[content["application/json"]["schema"]["$ref"].split("/")[-1]]
+        assert schema.get("examples") or schema.get("example"), name
+        seen += 1
+    assert seen >= 2
+    for number, example in enumerate(schemas["PlateIn"]["examples"]):
+        moved = {
+            **example,
+            "position": {**example["position"], "lon_deg": example["position"]["lon_deg"] + 1.5 * number},
+        }
+        assert client.post("/v1/markers", json=moved).status_code == 201, example
+    path = f"/v1/markers/{client.get('/v1/markers').json()['items'][0]['id']}"
+    for example in schemas["MarkerPatch"]["examples"]:
+        changed = client.patch(path, json=example, headers={"If-Match": "*"})
+        assert changed.status_code == 200, changed.text
+
+
+def test_every_schema_has_a_name_of_its_own(document: dict[str, Any]) -> None:
+    assert [name for name in document["components"]["schemas"] if "__" in name] == []
+
+
+def test_responses_have_the_documented_members(client: httpx.Client, document: dict[str, Any]) -> None:
+    schemas = document["components"]["schemas"]
+    made = client.post("/v1/markers", json={"position": {"lon_deg": 71.5, "lat_deg": 5.25}}).json()
+    assert set(made) == set(schemas["PlateDocument"]["properties"])
+    for part, shape in (("code", "PlateCode"), ("geometry", "PlateGeometry"), ("position", "Position")):
+        assert set(made[part]) == set(schemas[f"{shape}Document"]["properties"])
+    entry = client.get(f"/v1/markers/{made['id']}/versions").json()["items"][0]
+    assert set(entry) == set(schemas["VersionDocument"]["properties"])
+
+
+# --- logs ---------------------------------------------------------------------------------------------------------
+
+
+def test_logs_are_one_json_object_a_line(
+    serve: Callable[[Settings], LiveServer], settings: Settings, capsys: pytest.CaptureFixture[str]
+) -> None:
+
+    root = logging.getLogger()
+    before, level = root.handlers, root.level
+    try:
+        configure_logs("json", "INFO")
+        with serve(settings).client() as client:
+            client.get("/v1/markers", headers={"X-Request-ID": "one"})
+        logging.getLogger("elsewhere").warning("from the standard library")
+        lines = [orjson.loads(line) for line in capsys.readouterr().err.splitlines()]
+    finally:
+        root.handlers, root.level = before, level
+        structlog.reset_defaults()
+    access = next(line for line in lines if line.get("request_id") == "one")
+    assert (access["event"], access["status"], access["route"]) == ("request", 200, "/v1/markers")
+    assert {"agency", "ms", "timestamp", "level"} <= access.keys()
+    assert lines[-1]["event"] == "from the standard library"
+    assert settings.admin_key is not None
+    assert settings.admin_key.get_secret_value() not in str(lines)

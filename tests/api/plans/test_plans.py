@@ -1,0 +1,232 @@
+"""The life of a plan over HTTP: from a road to planned markers, and what was built beside them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+from pyproj import Geod
+
+from tests.conftest import LiveServer
+from tests.http import created, refused
+
+pytestmark = pytest.mark.both_databases
+
+GEOD = Geod(ellps="WGS84")
+PLACES = itertools.count(1)
+RULES: dict[str, Any] = {
+    "version": 1,
+    "plates": {"spacing_m": 100},
+    "lines": {},
+    "tags": {"magnets": 4},
+    "cerpm": {"straight": 2.0, "max_path_error_m": 0.05},
+    "costs": {"currency": "EUR", "items": [{"item": "plate", "per": "plate", "price": 120.0}]},
+}
+
+
+def road(lon_deg: float, lat_deg: float, length_m: float = 800.0) -> bytes:
+    """A straight lane to the east with a stop line at its end, as GeoJSON."""
+    points = [(lon_deg, lat_deg)]
+    for at in range(20, int(length_m) + 1, 20):
+        lon, lat, _ = GEOD.fwd(lon_deg, lat_deg, 90.0, at)
+        points.append((lon, lat))
+    lane = {
+        "type": "Feature",
+        "properties": {
+            "lane": "1", "width_m": 3.5, "speed_limit_kmh": 70, "left_style": "dashed", "right_style": "solid",
+        },
+        "geometry": {"type": "LineString", "coordinates": points},
+    }  # fmt: skip
+    stop = {
+        "type": "Feature",
+        "properties": {"kind": "stop_line"},
+        "geometry": {"type": "Point", "coordinates": points[-2]},
+    }
+    return json.dumps({"type": "FeatureCollection", "features": [lane, stop]}).encode()
+
+
+def send_road(client: httpx.Client, data: bytes, **declared: Any) -> httpx.Response:
+    declared.setdefault("name", f"road {next(PLACES)}")
+    parts = {"file": ("road.geojson", data, "application/geo+json"), "declaration": (None, json.dumps(declared))}
+    return client.post("/v1/alignments", files=parts, timeout=300)
+
+
+@pytest.fixture
+def alignment(client: httpx.Client) -> dict[str, Any]:
+    """A road of the test's agency."""
+    step = next(PLACES)
+    response = send_road(client, road(8.0, 47.0 + step * 0.02))
+    assert response.status_code == 201, response.text
+    document: dict[str, Any] = response.json()
+    return document
+
+
+@pytest.fixture
+def agency() -> str:
+    """Name of an agency that only this test uses."""
+    return f"planners {next(PLACES)}"
+
+
+@pytest.fixture
+def client(server: LiveServer, agency: str) -> Iterator[httpx.Client]:
+    """The author of plans."""
+    with server.agency(agency) as author:
+        yield author
+
+
+@pytest.fixture
+def other_planner(server: LiveServer, agency: str) -> Iterator[httpx.Client]:
+    """The holder of another key of the same agency."""
+    with server.agency(agency) as colleague:
+        yield colleague
+
+
+def make_plan(client: httpx.Client, alignment: dict[str, Any], **more: Any) -> dict[str, Any]:
+    client.timeout = httpx.Timeout(300)
+    rules = RULES | more
+    return created(client, "/v1/plans", name=f"plan {next(PLACES)}", alignment_id=alignment["id"], rules=rules)
+
+
+def test_a_road_is_stored_with_its_lanes(client: httpx.Client, alignment: dict[str, Any]) -> None:
+    assert client.get(f"/v1/alignments/{alignment['id']}").json() == alignment
+    [lane] = alignment["lanes"]
+    assert lane["length_m"] == pytest.approx(800.0, abs=0.01)
+    assert lane["design_speed_kmh"] == pytest.approx([70.0, 70.0])
+    assert alignment["events"][0]["kind"] == "stop_line"
+    assert alignment in client.get("/v1/alignments").json()["items"]
+    assert json.loads(client.get(f"/v1/alignments/{alignment['id']}/source").content)["features"]
+
+
+def test_bad_roads_are_refused_and_nothing_is_stored(client: httpx.Client) -> None:
+    refused(send_road(client, b"{}", name="nothing"), 422, field="file")
+    refused(send_road(client, road(5.0, 47.0), name="two", crs="EPSG:4326", origin=[5.0, 47.0]), 422)
+    refused(client.post("/v1/alignments", json={}), 415)
+    assert client.get("/v1/alignments").json()["items"] == []
+
+
+def test_a_plan_is_made_checked_approved_and_committed(
+    client: httpx.Client, alignment: dict[str, Any], other_planner: httpx.Client
+) -> None:
+    plan = make_plan(client, alignment)
+    assert plan["status"] == "checked", [f for f in plan["findings"] if f["verdict"] == "fail"]
+    assert plan["counts"].keys() == {"plate", "magnet", "cerpm"}
+    assert plan["cost"] == 120.0 * plan["counts"]["plate"]
+    assert not plan["cost_complete"]
+    url = f"/v1/plans/{plan['id']}"
+    head = {"If-Match": '"1"'}
+    refused(client.post(f"{url}/commit", headers=head), 409, field="status")
+    refused(client.post(f"{url}/approve", headers=head), 409, field="approver")
+    refused(other_planner.post(f"{url}/approve"), 428)
+    approved = other_planner.post(f"{url}/approve", headers=head).json()
+    assert approved["status"] == "approved"
+    assert approved["approver"]
+    refused(other_planner.post(f"{url}/approve", headers={"If-Match": '"2"'}), 409, field="status")
+    refused(client.post(f"{url}/commit", headers=head), 412)
+    key = {"Idempotency-Key": "commit"}
+    response = client.post(f"{url}/commit", headers={"If-Match": '"2"'} | key)
+    assert response.status_code == 201, response.text
+    committed = response.json()
+    assert committed["status"] == "committed"
+    assert committed["uncommitted"] == 0
+    again = client.post(f"{url}/commit", headers={"If-Match": '"2"'} | key)
+    assert again.json() == committed
+    markers = client.get("/v1/markers", params={"limit": 1000}).json()["items"]
+    assert len(markers) == committed["markers"]
+    assert {marker["status"] for marker in markers} == {"planned"}
+    by_family = {family: [m for m in markers if m["family"] == family] for family in plan["counts"]}
+    assert len(by_family["plate"]) == plan["counts"]["plate"]
+    assert len(by_family["cerpm"]) == plan["counts"]["cerpm"]
+    holes = [client.get(f"/v1/markers/{m['id']}").json()["magnets"] for m in by_family["magnet"]]
+    planned = client.get(f"{url}/files/plan.json").json()["markers"]
+    magnets = [m for m in planned if m["family"] == "magnet"]
+    assert sum(len(found) for found in holes) == sum(len(m["detail"].get("magnets", [1])) for m in magnets)
+    [entry] = [e for e in client.get(f"{url}/versions").json()["items"] if e["plan"]["status"] == "committed"]
+    assert entry["version"] == 3
+    refused(client.patch(url, json={"name": "late"}, headers={"If-Match": '"3"'}), 409, field="status")
+
+
+def test_other_rules_place_it_again_and_take_the_approval_back(
+    client: httpx.Client, alignment: dict[str, Any], other_planner: httpx.Client
+) -> None:
+    plan = make_plan(client, alignment)
+    url = f"/v1/plans/{plan['id']}"
+    other_planner.post(f"{url}/approve", headers={"If-Match": '"1"'})
+    rules = {"version": 1, "plates": {"spacing_m": 50}}
+    changed = client.patch(url, json={"rules": rules, "reason": "closer"}, headers={"If-Match": '"2"'}).json()
+    assert changed["status"] == "checked"
+    assert changed["approver"] is None
+    assert changed["counts"] == {"plate": 16}
+    assert [v["version"] for v in client.get(f"{url}/versions").json()["items"]] == [1, 2, 3]
+
+
+def test_files_of_a_plan(client: httpx.Client, alignment: dict[str, Any]) -> None:
+    plan = make_plan(client, alignment)
+    url = f"/v1/plans/{plan['id']}/files"
+    assert client.get(f"{url}/bill.csv").text.count("plate")
+    document = client.get(f"{url}/plan.json").json()
+    assert len(document["markers"]) == sum(plan["counts"].values())
+    assert client.get(f"{url}/plan.geojson").json()["features"]
+    assert "stakeout-pnezd.csv" in refused(client.get(f"{url}/plan.exe"), 404, field="name")["limit"]
+    metres, feet = (
+        client.get(f"{url}/stakeout-pnezd.csv", params={"crs": "EPSG:32632", "unit": u}) for u in ("m", "ft-intl")
+    )
+    first, in_feet = (float(text.text.splitlines()[-1].split(",")[1]) for text in (metres, feet))
+    assert first == pytest.approx(in_feet * 0.3048, abs=1e-3)
+    refused(client.get(f"{url}/stakeout-pnezd.csv", params={"crs": "EPSG:1"}), 422)
+
+
+@pytest.mark.parametrize(
+    ("rules", "field"),
+    [
+        ({"version": 1}, None),
+        ({"version": 1, "plates": {"spacing": 10}}, "plates.spacing"),
+        ({"version": 1, "plates": {"spacing_m": -1}}, "plates.spacing_m"),
+        ({"version": 1, "plates": {}, "road": {"lanes": ["7"]}}, "road.lanes"),
+        ({"version": 1, "tags": {"codebook": "none such"}}, "rules.tags.codebook"),
+    ],
+)
+def test_bad_rules_are_refused_and_no_plan_is_stored(
+    client: httpx.Client, alignment: dict[str, Any], rules: dict[str, Any], field: str | None
+) -> None:
+    body = {"name": "bad", "alignment_id": alignment["id"], "rules": rules}
+    refused(client.post("/v1/plans", json=body, timeout=300), 422, field=field)
+    assert client.get("/v1/plans").json()["items"] == []
+
+
+def test_as_built_residuals_are_those_of_the_survey(
+    client: httpx.Client, alignment: dict[str, Any], other_planner: httpx.Client
+) -> None:
+    plan = make_plan(client, alignment, lines=None, tags=None, cerpm=None)
+    url = f"/v1/plans/{plan['id']}"
+    assert client.get(f"{url}/as-built").json()["markers"] == []
+    other_planner.post(f"{url}/approve", headers={"If-Match": '"1"'})
+    assert client.post(f"{url}/commit", headers={"If-Match": '"2"'}).status_code == 201
+    markers = client.get("/v1/markers").json()["items"]
+    for marker, (along, across) in zip(markers[:2], [(0.03, 0.0), (0.0, 0.20)], strict=True):
+        lon, lat = marker["position"]["lon_deg"], marker["position"]["lat_deg"]
+        lon, lat, _ = GEOD.fwd(lon, lat, 90.0, along)
+        lon, lat, _ = GEOD.fwd(lon, lat, 0.0, across)
+        change = {"status": "surveyed", "position": {"lon_deg": lon, "lat_deg": lat, "horizontal_rmse_m": 0.01}}
+        response = client.patch(f"/v1/markers/{marker['id']}", json=change, headers={"If-Match": '"1"'})
+        assert response.status_code == 200, response.text
+    built = client.get(f"{url}/as-built").json()
+    assert (built["surveyed"], built["not_surveyed"], built["out_of_tolerance"]) == (2, len(markers) - 2, 1)
+    far, near = built["markers"]
+    assert far["across_m"] == pytest.approx(0.20, abs=1e-3)
+    assert near["along_m"] == pytest.approx(0.03, abs=1e-3)
+    assert near["in_tolerance"]
+
+
+def test_plans_of_another_agency_are_not_found(
+    server: LiveServer, client: httpx.Client, alignment: dict[str, Any]
+) -> None:
+    plan = make_plan(client, alignment)
+    with server.agency("a stranger to plans") as stranger:
+        refused(stranger.get(f"/v1/plans/{plan['id']}"), 404)
+        refused(stranger.get(f"/v1/alignments/{alignment['id']}"), 404)
+        body = {"name": "mine", "alignment_id": alignment["id"], "rules": RULES}
+        refused(stranger.post("/v1/plans", json=body), 404)

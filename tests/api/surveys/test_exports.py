@@ -1,0 +1,162 @@
+"""Markers as files: read back by GDAL, ezdxf and our own import; formulas harmless; streams whole."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import tempfile
+import zipfile
+from pathlib import Path
+
+import ezdxf
+import httpx
+import pytest
+import shapely
+from pyogrio import raw, read_info
+
+from app.formats.exports import FIELDS, SHAPEFILE_NAMES, write_csv
+from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.read import read_survey
+from app.services.surveys import exports
+from app.surveys.georeference import georeference_survey
+
+pytestmark = pytest.mark.both_databases
+
+LON, LAT = 8.416412345, 49.005112345
+
+
+@pytest.fixture
+def markers(client: httpx.Client) -> list[dict[str, float]]:
+    """Three CERPMs, one with a road that a spreadsheet would run."""
+    made = []
+    for k in range(3):
+        position = {"lon_deg": LON + k * 2e-4, "lat_deg": LAT, "height_m": 160.25 + k, "horizontal_rmse_m": 0.01}
+        road = "=HYPERLINK(1)" if k == 0 else "B 10"
+        marker = {"family": "cerpm", "position": position, "side": "left", "road": road}
+        answer = client.post("/v1/markers", json=marker)
+        assert answer.status_code == 201, answer.text
+        made.append(position)
+    return made
+
+
+def test_csv_is_harmless_and_its_numbers_are_exact(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    answer = client.get("/v1/exports/csv", params={"family": "cerpm"})
+    assert answer.headers["content-type"].startswith("text/csv")
+    rows = list(csv.DictReader(io.StringIO(answer.text)))
+    assert [float(row["lon_deg"]) for row in rows] == [m["lon_deg"] for m in markers]
+    assert rows[0]["road"] == "'=HYPERLINK(1)"
+    assert rows[1]["road"] == "B 10"
+    assert tuple(rows[0]) == FIELDS
+
+
+@pytest.mark.parametrize("text", ["=1", "+1", "-1", "@A1", "\t=1"])
+def test_texts_like_formulas_get_an_apostrophe_and_numbers_none(text: str) -> None:
+    record = dict.fromkeys(FIELDS) | {"road": text, "lon_deg": -77.15, "lat_deg": 1e-9}
+    row = next(csv.DictReader(io.StringIO(b"".join(write_csv([[record]])).decode())))
+    assert (row["road"], row["lon_deg"], row["lat_deg"]) == ("'" + text, "-77.15", "1e-09")
+
+
+def test_geojson_comes_whole_also_when_empty(client: httpx.Client) -> None:
+    empty = client.get("/v1/exports/geojson").json()
+    assert empty == {"type": "FeatureCollection", "features": []}
+
+
+@pytest.mark.parametrize("kind", ["geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"])
+def test_what_is_exported_can_be_imported(client: httpx.Client, markers: list[dict[str, float]], kind: str) -> None:
+    answer = client.get(f"/v1/exports/{kind}")
+    assert answer.status_code == 200, answer.text
+    declaration = ImportDeclaration(
+        family="cerpm", vertical_datum="ellipsoid", crs="EPSG:32632" if kind == "dxf" else None
+    )
+    table = read_survey(answer.content, declaration)
+    assert table.format == kind
+    placed = georeference_survey(table, declaration, 0.1).placed
+    assert placed.lon_deg == pytest.approx([m["lon_deg"] for m in markers], abs=2e-9)
+    assert placed.lat_deg == pytest.approx([m["lat_deg"] for m in markers], abs=2e-9)
+    if kind != "kml":
+        assert placed.height_m == pytest.approx([m["height_m"] for m in markers])
+    named = table.texts["point" if kind == "landxml" else "code"]
+    assert list(named) == ["1", "2", "3"]
+
+
+def test_gdal_reads_every_field(client: httpx.Client, markers: list[dict[str, float]], tmp_path: Path) -> None:
+    path = tmp_path / "markers.gpkg"
+    path.write_bytes(client.get("/v1/exports/gpkg").content)
+    meta, _, geometry, _ = raw.read(path)
+    assert tuple(meta["fields"]) == FIELDS
+    assert shapely.get_x(shapely.from_wkb(geometry)) == pytest.approx([m["lon_deg"] for m in markers])
+
+
+def test_a_shapefile_has_the_fixed_names(client: httpx.Client, markers: list[dict[str, float]], tmp_path: Path) -> None:
+    with zipfile.ZipFile(io.BytesIO(client.get("/v1/exports/shapefile").content)) as archive:
+        archive.extractall(tmp_path)
+    meta, *_ = raw.read(tmp_path / "markers.shp")
+    assert list(meta["fields"]) == [SHAPEFILE_NAMES[name] for name in FIELDS]
+    assert all(len(name) <= 10 for name in SHAPEFILE_NAMES.values())
+    assert len(set(SHAPEFILE_NAMES.values())) == len(FIELDS)
+
+
+def test_dxf_is_in_metres(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    document = ezdxf.read(io.StringIO(client.get("/v1/exports/dxf").text))
+    assert document.header["$INSUNITS"] == 6
+    assert len(document.modelspace()) == 3
+
+
+def test_filters_and_refusals(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    box = f"{LON - 1e-5},{LAT - 1e-5},{LON + 1e-5},{LAT + 1e-5}"
+    found = json.loads(client.get("/v1/exports/geojson", params={"bbox": box}).text)["features"]
+    assert len(found) == 1
+    assert client.get("/v1/exports/gpkg", params={"status": "retired"}).status_code == 422
+    assert client.get("/v1/exports/gpkg", params={"bbox": "1,2"}).json()["field"] == "bbox"
+    assert client.get("/v1/exports/exe").status_code == 422
+
+
+def test_the_filters_are_those_of_the_list(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    around = f"POLYGON(({LON - 1e-4} 49, {LON + 1e-4} 49, {LON + 1e-4} 49.1, {LON - 1e-4} 49.1, {LON - 1e-4} 49))"
+    for wanted, params in (
+        (["2", "3"], {"road": "B 10"}),
+        (["2"], {"code": "2"}),
+        (["1"], {"polygon": around}),
+        ([], {"family": "plate"}),
+        (["1", "2", "3"], {"status": "planned", "family": "cerpm"}),
+    ):
+        rows = list(csv.DictReader(io.StringIO(client.get("/v1/exports/csv", params=params).text)))
+        assert [row["code"] for row in rows] == wanted, params
+        listed = client.get("/v1/markers", params=params).json()["items"]
+        assert [row["id"] for row in rows] == [marker["id"] for marker in listed]
+    assert client.get("/v1/exports/csv", params={"from_m": 3}).json()["field"] == "road"
+    assert client.get("/v1/exports/csv", params={"road": "A", "to_m": "nan"}).status_code == 422
+
+
+@pytest.mark.parametrize("kind", ["gpkg", "shapefile"])
+def test_files_of_several_pages_hold_every_value(
+    client: httpx.Client, markers: list[dict[str, float]], kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(exports, "_PAGE", 2)
+    monkeypatch.setattr(exports, "_GIS_PAGE", 2)
+    low = {"family": "cerpm", "position": {"lon_deg": -77.15, "lat_deg": -1e-9}, "road": "Straße =1"}
+    assert client.post("/v1/markers", json=low).status_code == 201
+    path = tmp_path / ("markers.gpkg" if kind == "gpkg" else "markers.zip")
+    path.write_bytes(client.get(f"/v1/exports/{kind}").content)
+    meta, _, geometry, fields = raw.read(path)
+    names = {name: SHAPEFILE_NAMES[name] if kind == "shapefile" else name for name in FIELDS}
+    of = {name: fields[list(meta["fields"]).index(given)].tolist() for name, given in names.items()}
+    assert of["code"] == ["1", "2", "3", "4"]
+    assert of["road"] == ["=HYPERLINK(1)", "B 10", "B 10", "Straße =1"]
+    assert of["side"][:1] == ["left"]
+    assert of["lon_deg"] == pytest.approx([*(m["lon_deg"] for m in markers), -77.15], abs=1e-9)
+    assert of["horizontal_rmse_m"][:3] == pytest.approx([0.01] * 3)
+    points = shapely.from_wkb(geometry)
+    assert shapely.get_y(points) == pytest.approx([m["lat_deg"] for m in markers] + [-1e-9], abs=1e-12)
+    assert shapely.get_z(points).tolist() == [160.25, 161.25, 162.25, 0.0]
+    info = read_info(path)
+    assert info["features"] == 4
+    assert info["geometry_type"] == "Point Z"
+
+
+def test_no_file_is_left_behind(client: httpx.Client, markers: list[dict[str, float]]) -> None:
+    before = set(Path(tempfile.gettempdir()).glob("waymark-export-*"))
+    assert client.get("/v1/exports/gpkg").status_code == 200
+    assert client.get("/v1/exports/kml", params={"status": "retired"}).status_code == 422
+    assert set(Path(tempfile.gettempdir()).glob("waymark-export-*")) <= before

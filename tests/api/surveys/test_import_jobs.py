@@ -1,0 +1,161 @@
+"""Imports that are jobs, listed and called off, on both databases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from app.errors import Unavailable
+from app.main import create_app
+from app.services.surveys import imports
+from app.settings import Settings
+from tests.api.surveys.test_imports import DEGREES, _csv, _finished, _markers, _send
+from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
+from tests.jobs import standin
+
+pytestmark = pytest.mark.both_databases
+
+LATER = {"Prefer": "respond-async"}
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str]) -> Iterator[LiveServer]:
+    """A server that the tests of this module share."""
+    folder = tmp_path_factory.mktemp("jobs") / "var"
+    url = new_database_url(folder)
+    settings = Settings(data_dir=folder, database_url=url, admin_key=ADMIN_KEY, decode_workers=1, **UNLIMITED)
+    with LiveServer(create_app(settings, decode=standin.decode)) as running:
+        yield running
+
+
+@pytest.fixture
+def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Ids of the jobs that were queued and wait until a test runs them."""
+    queued: list[str] = []
+
+    class Held:
+        def submit(self, job_id: str) -> None:
+            queued.append(job_id)
+
+    monkeypatch.setattr(server.app.state.import_jobs, "_queue", Held())
+    return queued
+
+
+def _cancel(client: httpx.Client, import_id: str) -> httpx.Response:
+    return client.post(f"/v1/imports/{import_id}/cancel")
+
+
+def test_jobs_are_listed_newest_first(server: LiveServer, client: httpx.Client, waiting: list[str]) -> None:
+    first = _finished_here(server, client, _send(client, _csv(), DEGREES, **LATER))
+    ids = [first, *(_send(client, _csv(), DEGREES, **LATER).json()["id"] for _ in range(3))]
+    _send(client, _csv(3), {**DEGREES, "dry_run": True})  # answered at once: no job
+    found, url, pages = [], "/v1/imports?limit=3", 0
+    while url:
+        answer = client.get(url)
+        assert answer.status_code == 200, answer.text
+        found += answer.json()["items"]
+        url, pages = answer.links.get("next", {}).get("url", ""), pages + 1
+    assert ([job["id"] for job in found], pages) == (ids[::-1], 2)
+    assert all("report" not in job for job in found)
+    assert client.get(found[-1]["links"]["self"]).json()["report"]["stored"] == 8
+    by_state = {
+        state: [job["id"] for job in client.get("/v1/imports", params={"state": state}).json()["items"]]
+        for state in ("queued", "running", "done", "failed", "cancelled")
+    }
+    assert by_state == {"queued": ids[:0:-1], "running": [], "done": [first], "failed": [], "cancelled": []}
+    for wrong in ({"state": "lost"}, {"limit": 0}, {"limit": 1001}, {"before": "x\u0000"}, {"after": ids[0]}):
+        assert client.get("/v1/imports", params=wrong).status_code in (400, 422)
+    with server.agency("imports of others") as other:
+        assert other.get("/v1/imports").json()["items"] == []
+
+
+def _finished_here(server: LiveServer, client: httpx.Client, answer: httpx.Response) -> str:
+    import_id: str = answer.json()["id"]
+    server.app.state.jobs.run_job(import_id)
+    assert client.get(f"/v1/imports/{import_id}").json()["state"] == "done"
+    return import_id
+
+
+def test_one_that_waits_never_starts(server: LiveServer, client: httpx.Client, waiting: list[str]) -> None:
+    job = _send(client, _csv(), DEGREES, **LATER).json()
+    assert (job["state"], job["cancel_requested"], waiting) == ("queued", False, [job["id"]])
+    with server.agency("imports of others") as other:
+        assert _cancel(other, job["id"]).status_code == 404
+    cancelled = _cancel(client, job["id"])
+    assert (cancelled.status_code, cancelled.json()["state"]) == (200, "cancelled")
+    assert cancelled.json()["finished_at"] is not None
+    server.app.state.jobs.run_job(job["id"])
+    assert _markers(client) == []
+    assert client.get(f"/v1/imports/{job['id']}").json() == cancelled.json()
+    assert _cancel(client, job["id"]).json() == cancelled.json()
+    assert client.get("/v1/imports?state=cancelled").json()["items"][0]["id"] == job["id"]
+
+
+def test_one_that_runs_stops_before_it_stores(
+    server: LiveServer, client: httpx.Client, waiting: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = _send(client, _csv(), DEGREES, **LATER).json()
+    processes, asked = server.app.state.imports._processes, []
+
+    class Slow:
+        def submit(self, task: Any, *, wait_s: float = 0.0) -> Any:
+            pending = processes.submit(task, wait_s=wait_s)
+            asked.append(_cancel(client, job["id"]))
+            return pending
+
+    monkeypatch.setattr(server.app.state.imports, "_processes", Slow())
+    server.app.state.jobs.run_job(job["id"])
+    assert (asked[0].status_code, asked[0].json()["state"]) == (200, "running")
+    assert asked[0].json()["cancel_requested"]
+    ended = client.get(f"/v1/imports/{job['id']}").json()
+    assert (ended["state"], ended["report"], ended["error"]) == ("cancelled", None, None)
+    assert _markers(client) == []
+    monkeypatch.undo()
+    again = _finished(client, _send(client, _csv(), DEGREES, **LATER))
+    assert again["report"]["stored"] == 8
+
+
+def test_one_that_stores_says_that_it_is_too_late(
+    server: LiveServer, client: httpx.Client, waiting: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = _send(client, _csv(), DEGREES, **LATER).json()
+    store, asked = imports._Running.store, []
+
+    def slow(*given: Any) -> None:
+        asked.append(_cancel(client, job["id"]))  # while the writer has the database
+        store(*given)
+
+    monkeypatch.setattr(imports._Running, "store", slow)
+    server.app.state.jobs.run_job(job["id"])
+    asked.append(_cancel(client, job["id"]))
+    assert [answer.status_code for answer in asked] == [409, 409]
+    assert [answer.json()["detail"] for answer in asked] == [
+        "the import is storing already", "the import is done"
+    ]  # fmt: skip
+    assert all(answer.json()["field"] == "import_id" and answer.json()["cure"] for answer in asked)
+    ended = client.get(f"/v1/imports/{job['id']}").json()
+    assert (ended["state"], ended["cancel_requested"], ended["report"]["stored"]) == ("done", False, 8)
+
+
+def test_one_that_was_storing_when_the_server_stopped_goes_on(
+    server: LiveServer, client: httpx.Client, waiting: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = _send(client, _csv(), DEGREES, **LATER).json()
+    store = imports._Running.store
+
+    def broken(*given: Any) -> None:
+        store(*given)
+        raise Unavailable("the server stops")
+
+    monkeypatch.setattr(imports._Running, "store", broken)
+    with pytest.raises(Unavailable):
+        server.app.state.jobs.run_job(job["id"])
+    assert _markers(client) == []
+    assert _cancel(client, job["id"]).status_code == 409
+    monkeypatch.setattr(imports._Running, "store", store)
+    server.app.state.jobs.run_job(job["id"])
+    assert client.get(f"/v1/imports/{job['id']}").json()["report"]["stored"] == 8

@@ -1,0 +1,439 @@
+"""Surveys over HTTP: every format in, reports, all or nothing, as built against the plan, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import ezdxf
+import httpx
+import numpy as np
+import pytest
+import shapely
+from pyogrio import raw
+
+from app.main import create_app
+from app.settings import Settings
+from tests.conftest import ADMIN_KEY, LiveServer
+from tests.http import finished
+
+LON, LAT = 8.416412345, 49.0051
+STEP = 0.00015
+DEGREES = {"crs": "EPSG:4326", "family": "cerpm", "columns": {"code": "number"}, "area_deg": [8.4, 48.9, 8.5, 49.1]}
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:
+    """A server that the tests of this module share."""
+    folder = tmp_path_factory.mktemp("server")
+    settings = Settings(
+        data_dir=folder / "var", admin_key=ADMIN_KEY, warm_decoders=False, decode_workers=1, max_import_bytes=2**24
+    )
+    with LiveServer(create_app(settings)) as running:
+        yield running
+
+
+def _csv(rows: int = 8, **changes: str) -> bytes:
+    lines = [f"{k},{LON + k * STEP:.9f},{LAT + k % 3 * 1e-8:.9f}" for k in range(1, rows + 1)]
+    for row, line in changes.items():
+        lines[int(row.removeprefix("row")) - 1] = line
+    return "\n".join(["number,lon,lat", *lines]).encode()
+
+
+def _send(client: httpx.Client, data: bytes, declaration: dict[str, Any], **headers: str) -> httpx.Response:
+    form = {"file": ("survey", data), "declaration": ("", json.dumps(declaration), "application/json")}
+    return client.post("/v1/imports", files=form, headers=headers)
+
+
+def _markers(client: httpx.Client) -> list[dict[str, Any]]:
+    return client.get("/v1/markers", params={"limit": 1000}).json()["items"]
+
+
+def test_a_dry_run_stores_nothing_and_says_what_would_be(client: httpx.Client) -> None:
+    answer = _send(client, _csv(), {**DEGREES, "dry_run": True})
+    assert answer.status_code == 200
+    report = answer.json()
+    assert (report["outcome"], report["rows"], report["good_rows"], report["stored"]) == ("checked", 8, 8, 0)
+    assert report["extent_deg"] == pytest.approx([LON + STEP, LAT, LON + 8 * STEP, LAT], abs=1e-7)
+    assert _markers(client) == []
+
+
+def test_an_import_keeps_where_each_marker_comes_from(client: httpx.Client) -> None:
+    survey = {"surveyor": "A. Muster", "instrument": "R12i", "horizontal_rmse_m": 0.015, "check_points": 20}
+    answer = _send(client, _csv(), {**DEGREES, "survey": survey, "side": "left", "status": "built", "road": "B 10"})
+    assert answer.status_code == 201, answer.text
+    first = _markers(client)[0]
+    assert first["position"]["original"]["survey"] == {
+        **survey, "file_sha256": answer.json()["file_sha256"], "format": "csv", "row": 1,
+    }  # fmt: skip
+    assert first["position"]["horizontal_rmse_m"] == 0.015
+    assert (first["status"], first["road"], first["side"], first["code"]["number"]) == ("built", "B 10", "left", 1)
+    versions = client.get(f"/v1/markers/{first['id']}/versions").json()["items"]
+    assert len(versions) == 1
+    assert versions[0]["marker"] == first
+    near = client.get("/v1/markers", params={"near": f"{LON + STEP},{LAT},2"}).json()["items"]
+    assert [marker["id"] for marker in near] == [first["id"]]
+
+
+def test_all_or_nothing_and_accept_the_good(client: httpx.Client) -> None:
+    data = _csv(row3="3,8.4,abc", row5="2,8.417,49.0052")
+    answer = _send(client, data, DEGREES)
+    assert answer.status_code == 422
+    problem = answer.json()
+    assert problem["type"] == "urn:waymark:problem:import-refused"
+    assert [(f["row"], f["code"]) for f in problem["report"]["faults"] if f["severity"] == "refused"] == [
+        (3, "not_a_number")
+    ]
+    assert _markers(client) == []
+    stored = _send(client, data, {**DEGREES, "mode": "good"})
+    assert stored.status_code == 201
+    assert stored.json()["stored"] == 6
+    assert {f["row"]: f["code"] for f in stored.json()["faults"] if f["severity"] == "refused"} == {
+        3: "not_a_number", 5: "duplicate_code",
+    }  # fmt: skip
+    assert sorted(marker["code"]["number"] for marker in _markers(client)) == [1, 2, 4, 6, 7, 8]
+
+
+def test_codes_that_are_taken_are_named(client: httpx.Client) -> None:
+    assert _send(client, _csv(), DEGREES).status_code == 201
+    again = _send(client, _csv(2), {**DEGREES, "dry_run": True}).json()
+    assert again["counts"]["code_taken"] == 2
+    assert again["good_rows"] == 0
+
+
+def test_a_repeated_request_gets_the_first_answer(client: httpx.Client) -> None:
+    key = {"Idempotency-Key": "once"}
+    first = _send(client, _csv(), DEGREES, **key)
+    again = _send(client, _csv(), DEGREES, **key)
+    assert again.headers["Idempotency-Replayed"] == "true"
+    assert again.json() == first.json()
+    assert len(_markers(client)) == 8
+
+
+def test_plates_get_the_digits_of_their_places(client: httpx.Client) -> None:
+    declared = {"crs": "EPSG:4326", "columns": {"point": "number"}, "area_deg": DEGREES["area_deg"]}
+    assert _send(client, _csv(), declared).status_code == 201
+    plate = _markers(client)[0]
+    assert plate["code"]["digits"] == "416562005100"
+    assert plate["position"]["original"]["point"] == "1"
+    ids = _send(client, _csv(), {**declared, "scheme": "id", "columns": {"code": "number"}, "geometry": {"n": 10}})
+    assert ids.status_code == 201, ids.text
+    assert {p["code"]["registry_number"] for p in _markers(client) if p["code"]["scheme"] == "id"} == set(range(1, 9))
+
+
+def test_as_built_is_compared_with_the_plan_and_makes_new_versions(client: httpx.Client) -> None:
+    assert _send(client, _csv(), DEGREES).status_code == 201
+    north = 0.04 / 111_195
+    lines = [f"{k},{LON + k * STEP:.9f},{LAT + k % 3 * 1e-8 + north:.9f}" for k in range(1, 9)]
+    data = "\n".join(["number,lon,lat", *lines]).encode()
+    declared = {**DEGREES, "compare": True, "tolerance_m": 0.03}
+    report = _send(client, data, {**declared, "dry_run": True}).json()
+    assert report["comparison"]["matched"] == 8
+    assert report["comparison"]["shift_north_m"] == pytest.approx(0.04, abs=0.002)
+    assert report["counts"] == {"residual": 8, "systematic_shift": 1}
+    assert _send(client, data, declared).status_code == 201
+    marker = _markers(client)[0]
+    assert (marker["version"], marker["status"]) == (2, "surveyed")
+    assert marker["position"]["lat_deg"] == pytest.approx(LAT + 1e-8 + north, abs=1e-9)
+    old = client.get(f"/v1/markers/{marker['id']}/versions").json()["items"][0]["marker"]
+    assert old["position"]["lat_deg"] == pytest.approx(LAT + 1e-8, abs=1e-9)
+
+
+def test_the_residuals_are_drawn(client: httpx.Client) -> None:
+    assert _send(client, _csv(), DEGREES).status_code == 201
+    lines = [f"{k},{LON + k * STEP:.9f},{LAT + k % 3 * 1e-8 + (2e-6 if k == 5 else 2e-7):.9f}" for k in range(1, 9)]
+    data = "\n".join(["number,lon,lat", *lines]).encode()
+    declared = {**DEGREES, "compare": True, "tolerance_m": 0.1, "dry_run": True}
+    drawn = _send(client, data, declared).json()["comparison"]["map_svg"]
+    root = ElementTree.fromstring(drawn)
+    strokes = [path.get("stroke") for path in root.iter("{http://www.w3.org/2000/svg}path")]
+    assert (strokes.count("#2b6cb0"), strokes.count("#c53030")) == (7, 1)
+    texts = " ".join(text.text or "" for text in root.iter("{http://www.w3.org/2000/svg}text"))
+    assert "Residuals of 8 markers" in texts
+    assert "row 5: 222 mm" in texts
+    assert "map: " in texts
+    assert "arrows: " in texts
+    assert " N" in texts
+
+
+def test_warnings_can_keep_a_survey_out(client: httpx.Client) -> None:
+    off = _csv(20, row9=f"9,{LON + 9 * STEP:.9f},{LAT + 1e-4:.9f}")
+    near = {**DEGREES, "dry_run": True}
+    faults = _send(client, off, near).json()["faults"]
+    warned = {fault["row"] for fault in faults if fault["row"] is not None}
+    assert 9 in warned
+    assert {fault["severity"] for fault in faults} == {"warning"}
+    strict = {**DEGREES, "warnings": "refuse"}
+    refused = _send(client, off, strict)
+    assert refused.status_code == 422
+    assert refused.json()["report"]["warnings"] == "refuse"
+    assert _markers(client) == []
+    good = _send(client, off, {**strict, "mode": "good"})
+    assert (good.status_code, good.json()["stored"], good.json()["good_rows"]) == (
+        201,
+        20 - len(warned),
+        20 - len(warned),
+    )
+    assert [m["code"]["number"] for m in _markers(client)] == [k for k in range(1, 21) if k not in warned]
+    # a sound survey of a new road passes; one that nothing can be held against does not
+    for k, status in ((0, 422), (1, 201)):  # beside those that are there, and 4 km from them
+        moved = _csv().replace(f"{LAT:.4f}".encode(), f"{LAT + 0.04 * k:.4f}".encode()).replace(b"\n", b"\n10", 8)
+        assert _send(client, moved, strict).status_code == status
+    nowhere = {name: value for name, value in strict.items() if name != "area_deg"}
+    far = _csv().replace(b"8.4", b"9.4").replace(b"\n", b"\n20", 8)
+    answer = _send(client, far, nowhere)
+    assert answer.status_code == 422
+    assert "place_unchecked" in answer.json()["report"]["counts"]
+    assert _send(client, _csv(), {**DEGREES, "warnings": "shout"}).status_code == 422
+
+
+def test_swapped_axes_are_refused_with_the_cure(client: httpx.Client) -> None:
+    report = _send(client, _csv().replace(b"lon,lat", b"lat,lon"), {**DEGREES, "dry_run": True}).json()
+    whole = next(fault for fault in report["faults"] if fault["row"] is None)
+    assert whole["code"] == "swapped_axes"
+    assert "swap" in whole["proposal"]
+
+
+# --- every format -----------------------------------------------------------------------------------------------------
+
+POINTS = [(str(k), LON + k * STEP, LAT, 160.0 + k / 10) for k in range(1, 9)]
+
+
+def _geojson() -> bytes:
+    features = [
+        {"type": "Feature", "properties": {"number": n}, "geometry": {"type": "Point", "coordinates": [x, y, z]}}
+        for n, x, y, z in POINTS
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features}).encode()
+
+
+def _kml() -> bytes:
+    marks = "".join(
+        f"<Placemark><name>{n}</name><Point><coordinates>{x},{y},{z}</coordinates></Point></Placemark>"
+        for n, x, y, z in POINTS
+    )
+    return f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{marks}</Document></kml>'.encode()
+
+
+def _utm() -> list[tuple[str, float, float, float]]:
+    from pyproj import Transformer
+
+    transform = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True).transform
+    return [(n, *transform(x, y), z) for n, x, y, z in POINTS]
+
+
+def _landxml() -> bytes:
+    points = "".join(f'<CgPoint name="{n}">{y:.4f} {x:.4f} {z}</CgPoint>' for n, x, y, z in _utm())
+    return (
+        '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2"><Units><Metric linearUnit="meter"/></Units>'
+        f'<CoordinateSystem epsgCode="32632"/><CgPoints>{points}</CgPoints></LandXML>'
+    ).encode()
+
+
+def _dxf() -> bytes:
+    document = ezdxf.new("R2010", units=6)
+    block = document.blocks.new("MARKER")
+    block.add_attdef("NUMBER", (0, 0))
+    for number, *place in _utm():
+        document.modelspace().add_blockref("MARKER", place).add_auto_attribs({"NUMBER": number})
+    text = io.StringIO()
+    document.write(text)
+    return text.getvalue().encode()
+
+
+def _pnezd() -> bytes:
+    return "\n".join(f"{n},{y:.4f},{x:.4f},{z},M,left" for n, x, y, z in _utm()).encode()
+
+
+def _layer(tmp_path: Path, driver: str, name: str) -> Path:
+    shapes = shapely.to_wkb(shapely.points([p[1:] for p in POINTS]))
+    numbers = np.array([p[0] for p in POINTS], dtype=object)
+    path = tmp_path / name
+    raw.write(path, shapes, [numbers], ["number"], driver=driver, geometry_type="Point Z", crs="EPSG:4326")
+    return path
+
+
+def _shapefile(tmp_path: Path) -> bytes:
+    _layer(tmp_path, "ESRI Shapefile", "survey.shp")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for part in tmp_path.glob("survey.*"):
+            archive.write(part, part.name)
+    return packed.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"])
+def test_every_format_gives_the_same_markers(client: httpx.Client, kind: str, tmp_path: Path) -> None:
+    declared = {"family": "cerpm", "vertical_datum": "ellipsoid", "columns": {"code": "number"}}
+    data, more = {
+        "csv": lambda: (_pnezd(), {"layout": "pnezd", "crs": "EPSG:32632", "columns": {"code": "point"}}),
+        "geojson": lambda: (_geojson(), {}),
+        "gpkg": lambda: (_layer(tmp_path, "GPKG", "survey.gpkg").read_bytes(), {}),
+        "shapefile": lambda: (_shapefile(tmp_path), {}),
+        "kml": lambda: (_kml(), {"columns": {"code": "point"}}),
+        "landxml": lambda: (_landxml(), {"columns": {"code": "point"}}),
+        "dxf": lambda: (_dxf(), {"crs": "EPSG:32632"}),
+    }[kind]()
+    answer = _send(client, data, {**declared, **more})
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["format"] == kind
+    found = [
+        (str(m["code"]["number"]), m["position"]["lon_deg"], m["position"]["lat_deg"], m["position"]["height_m"])
+        for m in _markers(client)
+    ]
+    for (number, *place), (name, *true) in zip(sorted(found), POINTS, strict=True):
+        assert number == name
+        assert place[:2] == pytest.approx(true[:2], abs=2e-9)
+        assert place[2] == pytest.approx(true[2], abs=1e-6)
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+BOMB = b'<?xml version="1.0"?><!DOCTYPE k [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]><kml>&b;</kml>'
+
+
+def _bad_zip(name: str, content: bytes) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(f"{name}.shp", content)
+        archive.writestr(f"{name}.shx", content[:200])
+        archive.writestr(f"{name}.dbf", content[:200])
+    return packed.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "declared", "field"),
+    [
+        (BOMB, {}, "file"),
+        (b"<kml><Document></kml>", {}, "file"),
+        (b"<kml>" + b"<a>" * 5000 + b"</a>" * 5000 + b"</kml>", {}, "file"),
+        (b"SQLite format 3\x00" + b"\x00" * 1000, {}, "file"),
+        (b"PK\x03\x04 no archive", {}, "file"),
+        (_bad_zip("survey", b"\x00" * 200), {}, "file"),
+        (_bad_zip("../../etc/passwd", b"\x00\x00\x27\x0a" + b"\xff" * 300), {}, "file"),
+        (_bad_zip("bomb", b"\x00\x00\x27\x0a" + b"\x00" * 600 * 2**20), {}, "file"),
+        (b'{"type": "FeatureCollection", "features": ' + b"[" * 100_000, {}, "file"),
+        (b'{"type": "Point"}', {}, "file"),
+        (b"0\nSECTION\n2\nHEADER\n9\n", {"crs": "EPSG:32632"}, "file"),
+        (b"number,lon,lat\n1,8,49\x00\n", {}, "file"),
+        (b"number,lon,lat\n1,8,\xff\n", {}, "file"),
+        (b"number,lon,lon\n1,8,49\n", {}, "file"),
+        (b'number,lon,lat\n1,8,"49\n', {}, "file"),
+        (b"number,lon,lat\n", {}, "file"),
+        (b"number,a,b\n1,8,49\n", {}, "declaration.columns"),
+        (b"1,8,49\n2,8,49\n", {}, "file"),
+        (b"\x00\x01\x02\x03", {}, "file"),
+        (_csv(), {"crs": "EPSG:25832"}, "declaration.crs"),
+        (_csv(), {"crs": "+proj=longlat +datum=WGS84"}, "declaration.crs"),
+        (b"number,lon,lat,height\n1,8.42,49,5\n", {}, "declaration.vertical_datum"),
+        (_csv(), {"columns": {"code": "none"}}, "declaration.columns.code"),
+        (_csv(), {"columns": {"nonsense": "lon"}}, "declaration.columns"),
+        (_csv(), {"family": "magnet"}, "declaration.family"),
+        (_csv(), {"unit": "feet"}, "declaration.unit"),
+        (_csv(), {"area_deg": [8, 49, 7, 50]}, "declaration.area_deg"),
+        (_csv(), {"epoch": 1e99}, "declaration.epoch"),
+        (_csv(), {"nothing": 1}, "declaration.nothing"),
+        (b"", {}, "file"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_a_problem_with_field_limit_and_cure(
+    client: httpx.Client, data: bytes, declared: dict[str, Any], field: str
+) -> None:
+    answer = _send(client, data, {**DEGREES, "columns": {}, **declared})
+    assert 400 <= answer.status_code < 500, answer.text
+    problem = answer.json()
+    assert problem["field"] == field, problem
+    assert problem["limit"]
+    assert problem["cure"]
+    assert _markers(client) == []
+
+
+def test_a_geopackage_with_a_view_is_refused(client: httpx.Client, tmp_path: Path) -> None:
+    import sqlite3
+
+    path = _layer(tmp_path, "GPKG", "survey.gpkg")
+    with sqlite3.connect(path) as connection:
+        connection.execute("CREATE VIEW endless AS SELECT 1")
+    connection.close()
+    answer = _send(client, path.read_bytes(), {"family": "cerpm", "vertical_datum": "ellipsoid"})
+    assert answer.status_code == 422
+    assert "view" in answer.json()["detail"]
+
+
+def test_a_viewer_cannot_import_and_a_large_file_is_refused_unread(server: LiveServer, client: httpx.Client) -> None:
+    from app.services.access.access import Scope
+
+    with server.agency("viewers", Scope.VIEWER) as viewer:
+        assert _send(viewer, _csv(), DEGREES).status_code == 403
+    assert _send(client, b"x" * 2**25, DEGREES).status_code == 413
+
+
+def _finished(client: httpx.Client, answer: httpx.Response) -> dict[str, Any]:
+    """A queued import when it is done."""
+    assert answer.status_code == 202, answer.text
+    assert answer.json()["state"] == "queued"
+    return finished(client, answer.headers["location"])
+
+
+def test_an_import_can_be_a_job(server: LiveServer, client: httpx.Client) -> None:
+    later = {"Prefer": "respond-async", "Idempotency-Key": "once"}
+    job = _finished(client, _send(client, _csv(), DEGREES, **later))
+    assert (job["state"], job["progress"], job["error"], job["report"]["stored"]) == ("done", 1.0, None, 8)
+    again = _send(client, _csv(), DEGREES, **later)
+    assert (again.status_code, again.json()["id"]) == (202, job["id"])
+    assert again.headers["idempotency-replayed"] == "true"
+    assert len(_markers(client)) == 8
+    versions = client.get(f"/v1/markers/{_markers(client)[0]['id']}/versions").json()["items"]
+    assert [version["who"] for version in versions] == [versions[0]["who"]]
+    refused = _finished(client, _send(client, _csv(), DEGREES, Prefer="respond-async"))
+    assert (refused["state"], refused["report"]["outcome"]) == ("done", "refused")
+    assert refused["report"]["counts"]["code_taken"] == 8
+    failed = _finished(client, _send(client, b"\x00\x01", DEGREES, Prefer="respond-async"))
+    assert (failed["state"], failed["report"]) == ("failed", None)
+    assert failed["error"]["field"] == "file"
+    assert client.get("/v1/decodes").json()["items"] == []
+    assert client.get(f"/v1/decodes/{job['id']}").status_code == 404
+    with server.agency("imports of another") as other:
+        assert other.get(f"/v1/imports/{job['id']}").status_code == 404
+
+
+def test_a_large_file_becomes_a_job_and_runs_once(server: LiveServer, client: httpx.Client) -> None:
+    blank = b"\n" * (8 * 2**20)  # empty lines count for nothing but bytes
+    job = _finished(client, _send(client, _csv(20) + blank, DEGREES))
+    assert job["report"]["stored"] == 20
+    jobs = server.app.state.jobs
+    jobs.run_job(job["id"])  # once more, as after a crash
+    assert client.get(f"/v1/imports/{job['id']}").json() == job
+    assert len(_markers(client)) == 20
+
+
+def test_form_parts_are_checked(client: httpx.Client) -> None:
+    assert client.post("/v1/imports", content=b"x").status_code == 415
+    assert client.post("/v1/imports", files={"other": ("a", b"b")}).status_code == 400
+    assert client.post("/v1/imports", data={"declaration": "{}"}, files={"x": ("", b"")}).status_code == 400
+    twice = [("file", ("a", b"b")), ("file", ("a", b"b"))]
+    assert client.post("/v1/imports", files=twice).status_code == 400
+
+
+def test_rows_on_a_registered_road_get_its_measures_and_keep_them_right_when_they_are_surveyed(
+    client: httpx.Client,
+) -> None:
+    line = {"type": "LineString", "coordinates": [[LON, LAT], [LON + 10 * STEP, LAT]]}
+    road = {"name": "K 1", "geometry": line, "calibration": [{"measure_m": 500, "vertex": 0}]}
+    length_m = client.post("/v1/roads", json=road).json()["length_m"]
+    assert _send(client, _csv(), {**DEGREES, "road": "K 1"}).status_code == 201
+
+    def measures() -> list[float]:
+        return [m["measure_m"] for m in sorted(_markers(client), key=lambda m: m["code"]["number"])]
+
+    expected = [500 + length_m * k / 10 for k in range(1, 9)]
+    assert measures() == pytest.approx(expected, abs=1e-3)
+    moved = "\n".join(["number,lon,lat", *(f"{k},{LON + (k + 0.01) * STEP:.9f},{LAT:.9f}" for k in range(1, 9))])
+    built = {**DEGREES, "compare": True, "tolerance_m": 5.0, "status": "surveyed"}
+    assert _send(client, moved.encode(), built).status_code == 201
+    assert measures() == pytest.approx([m + length_m / 1000 for m in expected], abs=1e-3)

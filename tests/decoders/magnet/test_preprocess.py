@@ -1,0 +1,110 @@
+"""Faulty samples are replaced, wheel noise is cancelled, and the path on the plane."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.decoders.magnet.preprocess import Blocks, Preprocessor
+from app.decoders.magnet.vehicle_path import VehiclePath
+from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
+from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
+
+BAR = MagnetometerBar.metro()
+
+
+def blocks_of(field: np.ndarray, pieces: int = 1) -> Blocks:
+    """Field (N, 14, 3), 350 Hz at 10 m/s."""
+    t = np.arange(len(field)) / 350
+    front, blocks = Preprocessor(BAR), Blocks(BAR.sensor_count)
+    for part in np.array_split(np.arange(len(t)), pieces):
+        front.feed(MagnetTrace(t[part], field[part], t[part], np.full(len(part), 10.0)))
+        front.take(blocks)
+    front.take(blocks, final=True)
+    return blocks
+
+
+def quiet_field(n: int = 60) -> np.ndarray:
+    return 40 + np.random.default_rng(1).normal(0, 1.0, (n, BAR.sensor_count, 3))
+
+
+FAULTS: dict[str, dict[int, float | str]] = {
+    "a spike": {30: 300.0},
+    "a spike and its repeat": {30: 300.0, 31: 300.0},
+    "a repeat, then a spike": {29: "repeat", 30: 300.0},
+}
+
+
+@pytest.mark.parametrize("fault", list(FAULTS))
+@pytest.mark.parametrize("pieces", [1, 60])
+def test_faulty_samples_are_repaired(fault: str, pieces: int) -> None:
+    field = quiet_field()
+    for i, value in FAULTS[fault].items():
+        field[i, 3] = field[i - 1, 3] if isinstance(value, str) else value
+    repaired = blocks_of(field, pieces)
+    assert np.abs(repaired.x - repaired.x[0]).max() < 8
+    assert repaired.w[:, 3].min() < 1
+
+
+def test_a_fast_magnet_is_no_spike() -> None:
+    at = (np.arange(60) - 30) * 10 / 350 * 3  # 30 m/s
+    field = quiet_field()
+    for j, y in zip(BAR.array, BAR.positions_m[BAR.array, 1], strict=True):
+        r2 = at**2 + (y - 0.08) ** 2 + 0.16**2
+        field[:, j, 2] += 0.1 * 2.47 * (3 * 0.16**2 - r2) / r2**2.5
+    assert blocks_of(field).w.min() == 1
+
+
+def test_wheel_noise_is_learnt_and_taken_out_but_not_a_magnet() -> None:
+    rng = np.random.default_rng(2)
+    s = np.arange(0, 200, 0.03)
+    turns = s / 1.95
+    noise = np.zeros((s.size, 4, 3))
+    for h, size in ((1, 8.0), (2, 4.0), (3, 2.0)):
+        phase = rng.uniform(0, 2 * np.pi, (4, 3))
+        noise += size * np.cos(2 * np.pi * h * turns[:, None, None] + phase)
+    noise[:, 3] *= 5  # the reference
+    x = noise + rng.normal(0, 0.5, noise.shape)
+    bump = 40 * np.exp(-(((s - 150) / 0.15) ** 2))
+    x[:, :3, 2] += bump[:, None]
+    WheelNoiseCanceller(np.array([3]), 4).cancel(s, x)
+    late = (s > 80) & (abs(s - 150) > 1)
+    assert x[late][:, :3].std(axis=0).max() < 0.25 * noise[late][:, :3].std(axis=0).min()
+    near = abs(s - 150) < 0.2
+    np.testing.assert_allclose(x[near][:, :3, 2], np.repeat(bump[near][:, None], 3, 1), atol=6)
+
+
+def test_without_references_nothing_is_changed() -> None:
+    x = np.random.default_rng(3).normal(0, 5, (400, 4, 3))
+    kept = x.copy()
+    WheelNoiseCanceller(np.empty(0, np.intp), 4).cancel(np.arange(400) * 0.03, x)
+    np.testing.assert_array_equal(x, kept)
+
+
+def test_the_path_of_a_bend() -> None:
+    # a right-hand quarter circle of 20 m radius; heading clockwise from north, the plane's x where it starts
+    s = np.linspace(0, 20 * np.pi / 2, 500)
+    path = VehiclePath(0.0)
+    path.append(s, s / 10, np.stack([s / 10, np.degrees(s / 20)], 1), final=True)
+    np.testing.assert_allclose(path.position_m(s[-1], 0.0), [20, -20], atol=0.02)
+    np.testing.assert_allclose(path.position_m(s[-1], 0.5), [20.5, -20], atol=0.02)  # heading south, left is east
+    np.testing.assert_allclose(path.position_m(0.0, 0.5), [0, 0.5], atol=0.02)
+
+
+def test_the_path_turns_through_north_and_waits_for_headings() -> None:
+    s = np.arange(0, 40, 0.1)
+    heading = np.stack([s / 10, (355 + s / 4) % 360], 1)
+    path = VehiclePath(1.0)
+    path.append(s, s / 10, heading[:200])
+    assert path.reach_m == pytest.approx(s[199])
+    path.append(np.empty(0), np.empty(0), heading[200:], final=True)
+    assert path.reach_m == s[-1]
+    step = np.linalg.norm(np.diff([path.position_m(x, 0.0) for x in s], axis=0), axis=1)
+    np.testing.assert_allclose(step, 0.1, atol=1e-3)
+
+
+def test_without_headings_the_path_is_straight() -> None:
+    s = np.arange(0, 5, 0.1)
+    path = VehiclePath(2.0)
+    path.append(s, s, np.empty((0, 2)))
+    np.testing.assert_allclose(path.position_m(3.0, -0.4), [5.0, -0.4])

@@ -1,0 +1,435 @@
+"""Packet logs of all formats, whole and broken."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from datetime import UTC, datetime
+from time import process_time
+
+import pytest
+
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
+from app.formats.log_times import LogClock, TimeScale, utc_from_gps_s
+from app.formats.packets.declaration import PacketDeclaration, PacketFormat, PacketLimits
+from app.formats.packets.read import PacketLog, read_packets
+from app.formats.packets.rows import PayloadText
+from app.markers.cerpm import LaneSide, SpeedLimit, SpeedUnit
+from app.sensors.receiver import PlainClaim
+from tests.decoders.cerpm.events import STORED, chirpstack, things_stack
+from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, body, signed
+
+PAYLOAD = signed(body(sequence=9))
+PAPER = (
+    "id,latitude,longitude,altitude,rssi,snr,timestamp\n"
+    "7,42.2834567,-85.6123456,251.2,-108,6.5,2026-03-16T13:39:32Z\n"
+    "8,42.2835,-85.6124,,-125,-11.25,2026-03-16T13:39:33.5Z\n"
+)
+AT_S = datetime(2026, 3, 16, 13, 39, 32, tzinfo=UTC).timestamp()
+
+
+def read(content: str | bytes, declaration: PacketDeclaration | None = None, **limits: int) -> PacketLog:
+    """A log without a telling name."""
+    data = content.encode() if isinstance(content, str) else content
+    return read_packets("upload", data, declaration, PacketLimits(**limits))
+
+
+def payloads(log: PacketLog) -> list[bytes | None]:
+    """Of each packet."""
+    return [packet.payload for packet in log.packets]
+
+
+# --- rows ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_papers_columns() -> None:
+    log = read(PAPER)
+    first, second = log.packets
+    assert log.report.format == PacketFormat.CSV
+    assert first.claim == PlainClaim(7, LON_DEG, LAT_DEG, 251.2)
+    assert (first.received_at_s, first.rssi_dbm, first.snr_db) == (AT_S, -108.0, 6.5)
+    assert second.claim is not None
+    assert second.claim.height_m is None
+    assert second.received_at_s == AT_S + 1.5
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        PAPER.replace(",", ";"),
+        PAPER.replace(",", "\t").replace("\n", "\r\n"),
+        PAPER.replace(",", ";").replace(".", ",").replace("33,5Z", "33.5Z"),
+        PAPER.replace("id,latitude,longitude", "Marker ID,Latitude [deg],lng"),
+        "\ufeff" + PAPER,
+        PAPER + "\n\n",
+        "# " + PAPER,
+        '"id","latitude","longitude","altitude","rssi","snr","timestamp"\n7,"42.2834567",-85.6123456,251.2,-108,6.5,"'
+        '2026-03-16T13:39:32Z"\n8,42.2835,-85.6124,,-125,-11.25,2026-03-16T13:39:33.5Z\n',
+    ],
+)
+def test_ways_to_write_a_table(text: str) -> None:
+    assert read(text).packets == read(PAPER).packets
+
+
+def test_utf_16_is_read() -> None:
+    assert read(PAPER.encode("utf-16")).packets == read(PAPER).packets
+
+
+def test_speed_limits_and_sides_of_claims() -> None:
+    log = read("id,lat,lon,side,speed_limit_mph\n1,42,-85,left,35\n2,42,-85,R,\n3,42,-85,?,0\n")
+    claims = [packet.claim for packet in log.packets if packet.claim]
+    assert [claim.side for claim in claims] == [LaneSide.LEFT, LaneSide.RIGHT, LaneSide.UNKNOWN]
+    assert [claim.speed_limit for claim in claims] == [SpeedLimit(35, SpeedUnit.MPH), None, None]
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        PAYLOAD.hex(),
+        "0x" + PAYLOAD.hex().upper(),
+        PAYLOAD.hex(" "),
+        PAYLOAD.hex(":"),
+        base64.b64encode(PAYLOAD).decode(),
+    ],
+)
+def test_payloads_in_columns(written: str) -> None:
+    log = read(f"time,payload,rssi\n{AT_S},{written},-110\n")
+    assert payloads(log) == [PAYLOAD]
+    assert log.packets[0].received_at_s == AT_S
+    assert payloads(read(json.dumps({"payload": written, "rssi": -110}))) == [PAYLOAD]
+
+
+def test_text_that_is_hex_and_base64_is_read_as_declared() -> None:
+    both = "10" * 16  # 16 bytes in hex, 24 in base64
+    assert len(payloads(read(f"payload,rssi\n{both},-1\n"))[0] or b"") == 24
+    declared = PacketDeclaration(payload_text=PayloadText.HEX)
+    assert payloads(read(f"payload,rssi\n{both},-1\n", declared)) == [b"\x10" * 16]
+    assert payloads(read(f"payload_hex,rssi\n{both},-1\n")) == [b"\x10" * 16]
+
+
+def test_broken_rows_are_counted_and_left_out() -> None:
+    rows = [
+        "7,42.28,-85.61,,-108,6,2026-03-16T13:39:32Z",
+        "7,42.28,-85.61",
+        "seven,42.28,-85.61,,-108,6,",
+        "7,99,-85.61,,-108,6,",
+        "7,nan,-85.61,,-108,6,",
+        "7,42.28,1e999,,-108,6,",
+        "7,42.28,-85.61,,loud,6,",
+        "999999999999999999999999,42.28,-85.61,,-108,6,",
+        '7,"42.28,-85.61,,-108,6,',
+        "7,42.28,-85.61,,-108,6,\0",
+        "7,42.28,-85.61,,-108,6," + "x" * 300_000,
+        "0,42.28,-85.61,,-108,6,",
+        "7,42.28,-85.61,,-108,6,2026-03-16T13:39:40Z",
+    ]
+    log = read("id,latitude,longitude,altitude,rssi,snr,timestamp\n" + "\n".join(rows))
+    assert [packet.entry for packet in log.packets] == [0, 9, 12]
+    assert math.isnan(log.packets[1].received_at_s)
+    assert log.report.entries == 13
+    assert log.report.left_out_count == 10
+    assert [left.entry for left in log.report.left_out] == [1, 2, 3, 4, 5, 6, 7, 8, 10, 11]
+    assert "lat_deg is 99" in log.report.left_out[2].reason
+
+
+def test_positions_of_another_datum_are_left_out_by_name() -> None:
+    log = read("id,lat,lon,crs\n1,42,-85,WGS84\n2,42,-85,EPSG:6318\n")
+    assert len(log.packets) == 1
+    assert "epsg:6318" in log.report.left_out[0].reason
+
+
+def test_declared_columns() -> None:
+    text = "a,b,c,d\n7,-85.6,42.2,1773668372000\n"
+    declared = PacketDeclaration(columns={"number": "a", "lon": "b", "lat": "c", "time": "d"})
+    assert read(text, declared).packets[0].received_at_s == AT_S
+    with pytest.raises(InvalidParameter, match="no column 'e' for snr"):
+        read(text, PacketDeclaration(columns={"number": "a", "lon": "b", "lat": "c", "snr": "e"}))
+    with pytest.raises(InvalidParameter, match="colour"):
+        PacketDeclaration(columns={"colour": "a"})
+
+
+# --- times --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("written", "clock"),
+    [
+        (AT_S, LogClock()),
+        (AT_S * 1e3, LogClock()),
+        (int(AT_S * 1e6), LogClock()),
+        (int(AT_S) * 10**9, LogClock()),
+        (f"{AT_S:.3f}", LogClock()),
+        ("2026-03-16 13:39:32", LogClock()),
+        ("2026-03-16T09:39:32-04:00", LogClock()),
+        ("2026-03-16T09:39:32", LogClock(utc_offset_s=-4 * 3600)),
+        (1457703590, LogClock(TimeScale.GPS_S)),
+        (1457703590000, LogClock(TimeScale.GPS_MS)),
+        ("12.5", LogClock(TimeScale.UNIX_S, offset_s=AT_S - 12.5)),
+    ],
+)
+def test_times(written: object, clock: LogClock) -> None:
+    assert clock.read(written) == pytest.approx(AT_S, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "written", ["", "soon", "12.5", 0, True, math.nan, math.inf, 10**30, "0001-01-01T00:00:00Z", None, [], "1" * 30]
+)
+def test_no_times(written: object) -> None:
+    assert math.isnan(LogClock().read(written))
+
+
+def test_gps_time_at_leap_seconds() -> None:
+    # IERS bulletin C 52: UTC - TAI was -36 s until 2017-01-01, -37 s from then on; TAI - GPS is 19 s
+    assert utc_from_gps_s(1_167_264_016) == datetime(2016, 12, 31, 23, 59, 59, tzinfo=UTC).timestamp()
+    assert utc_from_gps_s(1_167_264_018) == datetime(2017, 1, 1, tzinfo=UTC).timestamp()
+    assert utc_from_gps_s(0) == datetime(1980, 1, 6, tzinfo=UTC).timestamp()
+
+
+def test_what_times_do_not_say_is_said() -> None:
+    untimed = read("id,lat,lon,timestamp\n1,42,-85,12.5\n")
+    assert "no time between 2000 and 2100" in untimed.report.warnings[0]
+    local = read("id,lat,lon,timestamp\n1,42,-85,2026-03-16 13:39:32\n")
+    assert "without a zone" in local.report.warnings[0]
+
+
+# --- raw ----------------------------------------------------------------------------------------------------------
+
+
+def test_raw_payloads() -> None:
+    log = read(PAYLOAD * 3)
+    assert payloads(log) == [PAYLOAD] * 3
+    assert log.report.format == PacketFormat.RAW
+    cut = read(PAYLOAD * 3 + PAYLOAD[:5])
+    assert payloads(cut) == [PAYLOAD] * 3
+    assert "last 5 bytes" in cut.report.left_out[0].reason
+    assert payloads(read(PAYLOAD + b"\1")) == [PAYLOAD + b"\1"]  # refused by name when it is decoded
+    assert payloads(read(b"\x24" + bytes(23))) == [b"\x24" + bytes(23)]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        PAYLOAD.hex(),
+        f"2026-03-16T13:39:32Z {PAYLOAD.hex()} -110",
+        f"{AT_S:.0f},{PAYLOAD.hex(' ')},-110",
+        f"2026-03-16 13:39:32; 0x{PAYLOAD.hex().upper()}; -110.0",
+    ],
+)
+def test_lines_of_hex(line: str) -> None:
+    log = read(line + "\n" + line + "\n# the end\n")
+    assert log.report.format == PacketFormat.HEX
+    assert payloads(log) == [PAYLOAD] * 2
+    if line != PAYLOAD.hex():
+        assert (log.packets[1].received_at_s, log.packets[1].rssi_dbm) == (AT_S, -110.0)
+
+
+def test_a_broken_line_of_hex() -> None:
+    log = read(f"{PAYLOAD.hex()}\n{PAYLOAD.hex()[:-1]}\n{PAYLOAD.hex()}\nhello\n")
+    assert payloads(log) == [PAYLOAD] * 2
+    assert log.report.left_out_count == 2
+
+
+# --- network servers ----------------------------------------------------------------------------------------------
+
+
+def test_chirpstack() -> None:
+    log = read(json.dumps(chirpstack(PAYLOAD), indent=2))
+    (packet,) = log.packets
+    assert log.report.format == PacketFormat.CHIRPSTACK
+    assert packet.payload == PAYLOAD
+    assert packet.received_at_s == pytest.approx(AT_S + 0.656322, abs=1e-5)
+    assert (packet.rssi_dbm, packet.snr_db) == (-103.0, 0.0)  # the stronger gateway; its SNR of 0 is left out
+    assert packet.device == "0101010101010107"
+    assert packet.event == "e3eb5131-fb38-481a-b9df-000000000007"
+
+
+def test_chirpstacks_times_where_some_are_missing() -> None:
+    event = chirpstack(PAYLOAD)
+    event["time"] = None
+    event["rxInfo"] = event["rxInfo"][:1]
+    for name, seconds in (("gwTime", 32.6), ("nsTime", 32.7), ("timeSinceGpsEpoch", 32.656)):
+        (packet,) = read(json.dumps(event)).packets
+        assert packet.received_at_s == pytest.approx(AT_S - 32 + seconds, abs=1e-5)
+        event["rxInfo"][0][name] = None
+    assert math.isnan(read(json.dumps(event)).packets[0].received_at_s)
+
+
+def test_the_things_stack() -> None:
+    log = read(json.dumps(things_stack(PAYLOAD)))
+    (packet,) = log.packets
+    assert log.report.format == PacketFormat.THINGS_STACK
+    assert packet.payload == PAYLOAD
+    assert packet.received_at_s == pytest.approx(datetime(2026, 5, 25, 13, 42, 11, 412680, UTC).timestamp(), abs=1e-5)
+    assert (packet.rssi_dbm, packet.snr_db) == (-99.0, 0.0)
+    assert packet.device == "70B3D57ED005B89A"
+    assert packet.event == "70B3D57ED005B89A/AWNbm/4zfqx0jZ5q1NlBmw==/43"
+    (first,) = read(json.dumps(things_stack(PAYLOAD, count=0))).packets
+    assert first.event == "70B3D57ED005B89A/AWNbm/4zfqx0jZ5q1NlBmw==/0"
+
+
+def test_the_things_stacks_storage_as_documented() -> None:
+    log = read(STORED + "\n" + STORED.replace('"f_cnt":43', '"f_cnt":44') + "\n")
+    assert payloads(log) == [bytes.fromhex("010a010a010a010a")] * 2
+    assert [p.event for p in log.packets] == [f"1111111111111111/AXPoziFRvbcEguvZQoCCZw==/{n}" for n in (43, 44)]
+    assert math.isnan(log.packets[0].rssi_dbm)
+
+
+EVENTS = [chirpstack(PAYLOAD, count=n) for n in range(3)]
+TOPIC = "application/ca739e26/device/0101010101010107/event/up"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps(EVENTS),
+        json.dumps(EVENTS, indent=1),
+        "\n".join(json.dumps(event) for event in EVENTS),
+        "\n".join(json.dumps(event, indent=4) for event in EVENTS),
+        json.dumps({"events": EVENTS}),
+        "\n".join(f"{TOPIC} {json.dumps(event)}" for event in EVENTS),
+        "\n".join(f"event: up\ndata: {json.dumps(event)}\n" for event in EVENTS),
+        "\n".join(json.dumps({"topic": TOPIC, "received_at": "2026-03-16T13:39:32Z", "payload": e}) for e in EVENTS),
+        "\n".join(json.dumps({"topic": TOPIC, "qos": 1, "payload": json.dumps(e)}) for e in EVENTS),
+    ],
+)
+def test_events_as_they_are_stored(text: str) -> None:
+    log = read(text)
+    assert payloads(log) == [PAYLOAD] * 3
+    assert [p.entry for p in log.packets] == [0, 1, 2]
+    assert log.report.format == PacketFormat.CHIRPSTACK
+    assert not log.report.left_out
+
+
+def test_an_event_in_a_console_stream() -> None:
+    event = {"name": "as.up.data.forward", "time": "2026-05-25T13:42:12Z", "data": things_stack(PAYLOAD)}
+    assert payloads(read(json.dumps([event]))) == [PAYLOAD]
+
+
+def test_what_is_no_uplink_is_named() -> None:
+    join = {k: v for k, v in things_stack(PAYLOAD).items() if k != "uplink_message"} | {"join_accept": {}}
+    simulated = things_stack(PAYLOAD) | {"simulated": True}
+    status = {k: v for k, v in chirpstack(PAYLOAD).items() if k not in ("rxInfo", "data")} | {"margin": 7}
+    empty = {k: v for k, v in chirpstack(PAYLOAD).items() if k != "data"}
+    old = {"applicationID": "1", "devEUI": "AgICAgICAgI=", "rxInfo": [], "data": "MQ=="}
+    encrypted = chirpstack(PAYLOAD) | {"joinServerContext": {"sessionKeyId": "AWNb"}}
+    error = {"error": {"code": 5, "message": "not found"}}
+    other = {"temperature": 21.5}
+    events = [chirpstack(PAYLOAD), join, simulated, status, empty, old, encrypted, error, other, 17, None]
+    log = read("\n".join(json.dumps(event) for event in events))
+    assert len(log.packets) == 1
+    assert log.report.left_out_count == 10
+    said = " | ".join(left.reason for left in log.report.left_out)
+    for words in (
+        "join_accept", "simulated", "no uplink", "without a payload", "v3 or older", "encrypted", "not found",
+        "neither",
+    ):  # fmt: skip
+        assert words in said
+
+
+# --- traps --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        '{"payload": "z!"}',
+        '{"payload": {"a": ' * 400 + "1" + "}}" * 400,
+        '{"a":' * 100_000,
+        "[" * 100_000,
+        '{"id": 1, "id": 2, "lat": 42, "lon": -85}',
+        '{"id": 1, "lat": NaN, "lon": -85}',
+        '{"id": 1, "lat": 42, "lon": -Infinity}',
+        '{"id": 1, "lat": 1e999, "lon": -85}',
+        '{"id": 111111111111111111111111, "lat": 42, "lon": -85}',
+        '{"id": ' + "1" * 5000 + ', "lat": 42, "lon": -85}',
+        '{"id": true, "lat": 42, "lon": -85}',
+        '{"id": 1, "lat": [42], "lon": {"a": 1}}',
+        '{"id": 1, "lat": "4_2", "lon": -85}',
+        '{"payload": [300, 1]}',
+        '{"payload": "' + "A" * 300_000 + '"}',
+        '{"id": 1, "lat": 42,',
+        '{"topic": "x", "payload": "{broken"}',
+        '{"payload": 7.5}',
+        '{"deduplicationId": [], "deviceInfo": 3, "rxInfo": [3, null, {"rssi": "loud"}], "data": 17}',
+        '{"end_device_ids": 4, "uplink_message": {"frm_payload": "AA==", "rx_metadata": {}, "f_cnt": {}}, "simulated": 1}',  # noqa: E501
+        "\0\0\0",
+    ],
+)
+def test_a_broken_line_costs_only_itself(broken: str) -> None:
+    good = json.dumps({"payload": PAYLOAD.hex(), "time": AT_S})
+    for text in (f"{good}\n{broken}\n{good}\n", f"{broken}\n{good}\n{good}"):
+        log = read(text)
+        assert payloads(log) == [PAYLOAD] * 2
+        assert log.report.left_out_count == 1
+        assert log.report.left_out[0].reason
+
+
+def test_odd_texts_are_made_fit_to_store() -> None:
+    event = json.dumps(chirpstack(PAYLOAD)).replace("0101010101010107", "\\ud800\\u0000" + "x" * 1000)
+    (packet,) = read(event).packets
+    assert packet.device is not None
+    assert packet.device.startswith("??xxx")
+    assert len(packet.device) <= 120
+
+
+def test_a_file_of_no_known_format_names_what_is_expected() -> None:
+    for content in (
+        b"hello, world\n",
+        b"PK\3\4" + bytes(92),
+        b"\x89PNG\r\n\x1a\n" + bytes(88),
+        b"\xff" * 25,
+        b"<html></html>",
+    ):
+        with pytest.raises(UnsupportedUpload, match="no format that packet logs") as caught:
+            read(content)
+        assert caught.value.limit
+        assert "ChirpStack v4" in caught.value.limit
+    with pytest.raises(UnsupportedUpload, match="'speed', 'colour'"):
+        read("speed,colour\n1,2\n")
+
+
+def test_files_without_a_single_packet() -> None:
+    for content in (
+        b"",
+        b" \n\n",
+        b"\xff\xfe\x00",
+        b'{"a": 1}',
+        b"[[1], 2]",
+        PAPER.split("\n", 1)[0].encode() + b"\nx\n",
+    ):
+        with pytest.raises(UnreadableUpload):
+            read(content)
+    assert read(PAPER.split("\n", 1)[0] + "\n").packets == []
+    assert read("[]").packets == []
+
+
+def test_limits() -> None:
+    with pytest.raises(UploadTooLarge, match="bytes"):
+        read(PAPER, file_bytes=10)
+    with pytest.raises(UploadTooLarge, match="too many"):
+        read(PAPER, packets=1)
+    with pytest.raises(UploadTooLarge, match="one JSON document"):
+        read(json.dumps(EVENTS, indent=1), document_bytes=100)
+    assert len(read("\n".join(json.dumps(e) for e in EVENTS), document_bytes=100).packets) == 3
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "id,latitude,longitude,rssi,timestamp\n" + "7,42.2834567,-85.6123456,-108,2026-03-16T13:39:32Z\n" * 20_000,
+        (json.dumps({"payload": PAYLOAD.hex(), "time": AT_S}) + "\n") * 20_000,
+        (f"2026-03-16T13:39:32Z {PAYLOAD.hex()} -110\n") * 20_000,
+        '{"a":"\n' * 20_000 + json.dumps({"payload": PAYLOAD.hex()}),
+        "[\n" * 20_000 + json.dumps({"payload": PAYLOAD.hex()}),
+        '"' + "id,latitude,longitude\n" + '"7,42,-85\n' * 20_000 + "7,42,-85\n",
+    ],
+    ids=["csv", "json", "hex", "open-texts", "open-arrays", "open-quotes"],
+)
+def test_long_logs_take_a_second(text: str) -> None:
+    began = process_time()
+    try:
+        read(text)
+    except UnreadableUpload:
+        assert text[0] == '"'
+    assert process_time() - began < 3

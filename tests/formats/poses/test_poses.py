@@ -1,0 +1,355 @@
+"""Tracks of vehicles: CSV, GPX and NMEA, whole and broken."""
+
+from __future__ import annotations
+
+from datetime import UTC, date, datetime
+from time import process_time
+
+import numpy as np
+import pytest
+
+from app.errors import (
+    InvalidParameter,
+    ReferenceSystemError,
+    UnreadableUpload,
+    UnsupportedUpload,
+    UploadTooLarge,
+)
+from app.formats.log_report import LogReport
+from app.formats.log_times import LogClock
+from app.formats.poses.declaration import PoseDeclaration, PoseLimits
+from app.formats.poses.read import read_poses
+from app.geodesy import enu_from_wgs84
+from app.sensors.pose_track import PoseTrack
+
+CSV = (
+    "time,longitude,latitude,heading,accuracy\n"
+    "2026-03-16T13:39:32Z,-85.6123456,42.2834567,91.5,0.02\n"
+    "2026-03-16T13:39:33Z,-85.6122,42.2834567,,\n"
+)
+AT_S = datetime(2026, 3, 16, 13, 39, 32, tzinfo=UTC).timestamp()
+POINT = '<trkpt lat="42.2834567" lon="-85.6123456"><time>2026-03-16T13:39:32Z</time>{}</trkpt>'
+GPX = (
+    '<?xml version="1.0" encoding="UTF-8"?><gpx version="1.1" creator="t" xmlns="http://www.topografix.com/GPX/1/1" '
+    'xmlns:x="http://www.garmin.com/xmlschemas/TrackPointExtension/v2"><trk><trkseg>{}</trkseg></trk></gpx>'
+)
+
+
+def read(content: str | bytes, **declared: object) -> tuple[PoseTrack, LogReport]:
+    """A track without a telling name."""
+    data = content.encode() if isinstance(content, str) else content
+    return read_poses("upload", data, PoseDeclaration(**declared))  # type: ignore[arg-type]
+
+
+def nmea(*contents: str) -> str:
+    """Sentences with their checksums."""
+    lines = []
+    for content in contents:
+        value = 0
+        for byte in content.encode():
+            value ^= byte
+        lines.append(f"${content}*{value:02X}")
+    return "\r\n".join(lines) + "\r\n"
+
+
+def rmc(clock: str, day: str = "160326", *, talker: str = "GN", status: str = "A", lat: str = "4217.00740") -> str:
+    """A position with its date."""
+    return f"{talker}RMC,{clock},{status},{lat},N,08536.74074,W,022.4,084.4,{day},,,A"
+
+
+def gga(clock: str, quality: int = 4, *, talker: str = "GN", lat: str = "4217.00740") -> str:
+    """A position without a date."""
+    return f"{talker}GGA,{clock},{lat},N,08536.74074,W,{quality},12,0.6,250.0,M,-33.0,M,,"
+
+
+# --- CSV ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        CSV,
+        CSV.replace(",", ";"),
+        CSV.replace("longitude,latitude", "Lon [deg],LAT"),
+        CSV.replace("2026-03-16T13:39:32Z", f"{AT_S * 1000:.0f}").replace(
+            "2026-03-16T13:39:33Z", f"{AT_S * 1000 + 1000:.0f}"
+        ),
+        "\n".join([CSV.split("\n")[0], CSV.split("\n")[2], CSV.split("\n")[1]]),
+    ],
+)
+def test_columns_by_name(text: str) -> None:
+    track, report = read(text)
+    assert track.time_s.tolist() == [AT_S, AT_S + 1]
+    assert track.lon_deg[0] == -85.6123456
+    np.testing.assert_array_equal(track.heading_deg, [91.5, np.nan])
+    np.testing.assert_array_equal(track.accuracy_m, [0.02, np.nan])
+    assert report.format == "csv"
+
+
+def test_rows_that_are_no_positions_are_left_out() -> None:
+    rows = [
+        "2026-03-16T13:39:34Z,0,0,,",
+        "x,1,2,,",
+        "2026-03-16T13:39:35Z,-85.6,north,,",
+        "a,b",
+        "2026-03-16T13:39:36Z,,,,",
+        "2026-03-16T13:39:33Z,-85.61,42.28,,",
+        "2026-03-16T13:39:37Z,-85.6,95,,",
+        "\0,,,,",
+    ]
+    track, report = read(CSV + "\n".join(rows))
+    assert len(track.time_s) == 2
+    assert report.left_out_count == len(rows)
+    assert report.reasons["null-island"] == 1
+    assert report.reasons["same-time"] == 1
+
+
+def test_a_jump_there_and_back_is_left_out() -> None:
+    rows = [f"{AT_S + i},{-85.6 + i * 1e-4},{42.28 + (i == 5) * 0.05},," for i in range(10)]
+    track, report = read("time,lon,lat,heading,accuracy\n" + "\n".join(rows))
+    assert len(track.time_s) == 9
+    assert report.left_out[0].entry == 5
+
+
+def test_swapped_columns_are_named() -> None:
+    with pytest.raises(InvalidParameter, match="swapped") as caught:
+        read("time,lon,lat\n" + "".join(f"{AT_S + i},22.28,{114.17 + i * 1e-5}\n" for i in range(5)))
+    assert caught.value.cure
+
+
+@pytest.mark.parametrize("crs", ["EPSG:6318", "NAD83(2011)", "epsg:4258", "27700", "ED50"])
+def test_another_datum_is_refused_with_a_cure(crs: str) -> None:
+    with pytest.raises(ReferenceSystemError, match="not WGS 84") as caught:
+        read(f"time,lon,lat,crs\n{AT_S},-85.6,42.28,{crs}\n")
+    assert "transform" in str(caught.value.cure)
+    with pytest.raises(ReferenceSystemError):
+        read(CSV, crs=crs)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "WGS84", "wgs 84 (G2139)", "ITRF2014", "EPSG:7912", "", "4979"])
+def test_wgs_84_has_many_names(crs: str) -> None:
+    track, _report = read(f"time,lon,lat,crs\n{AT_S},-85.6,42.28,{crs}\n")
+    assert len(track.time_s) == 1
+
+
+def test_declared_columns_and_clocks() -> None:
+    text = "when,x,y\n10,-85.6,42.28\n11,-85.6,42.28\n"
+    columns = {"time": "when", "lon": "x", "lat": "y"}
+    track, _report = read(text, columns=columns, clock=LogClock(offset_s=AT_S - 10))
+    assert track.time_s.tolist() == [AT_S, AT_S + 1]
+    with pytest.raises(UnreadableUpload, match="no time between"):
+        read(text, columns=columns)
+    with pytest.raises(InvalidParameter, match="no column of the lat"):
+        read(text, columns={"time": "when", "lon": "x", "lat": "z"})
+
+
+# --- GPX ----------------------------------------------------------------------------------------------------------
+
+
+def test_gpx() -> None:
+    turned = POINT.replace("13:39:32Z", "09:39:33.5-04:00").format(
+        "<extensions><x:TrackPointExtension><x:course>271.5</x:course></x:TrackPointExtension></extensions>"
+    )
+    track, report = read(
+        GPX.format(POINT.format("") + turned + POINT.format("").replace("<time>", "<!-- ").replace("</time>", "-->"))
+    )
+    assert track.time_s.tolist() == [AT_S, AT_S + 1.5]
+    assert (track.lon_deg[0], track.lat_deg[0]) == (-85.6123456, 42.2834567)
+    np.testing.assert_array_equal(track.heading_deg, [np.nan, 271.5])
+    assert (report.format, report.left_out_count) == ("gpx", 1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<!DOCTYPE gpx [<!ENTITY a "aaaa">]>' + GPX,
+        '<?xml version="1.0"?><!doctype gpx SYSTEM "file:///etc/passwd">' + GPX.split("?>")[1],
+        GPX.format(POINT)[:-30],
+        GPX.format('<trkpt lat="north" lon="1"><time>2026-03-16T13:39:32Z</time></trkpt>'),
+        GPX.format("<trkpt><time>2026-03-16T13:39:32Z</time></trkpt>"),
+        GPX.format("&undefined;"),
+        GPX.format(""),
+        "<gpx" + "<a>" * 50_000,
+    ],
+)  # fmt: skip
+def test_broken_and_hostile_gpx(text: str) -> None:
+    with pytest.raises(UnreadableUpload):
+        read(text)
+    with pytest.raises(UnreadableUpload):
+        read(text.encode("utf-16"))
+
+
+# --- NMEA ---------------------------------------------------------------------------------------------------------
+
+
+def test_known_sentences() -> None:
+    # the example sentences that receivers' manuals share, in another year: their checksums are not ours
+    track, report = read(
+        "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230326,003.1,W*63\r\n"
+        "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+    )
+    assert track.time_s.tolist() == [datetime(2026, 3, 23, 12, 35, 19, tzinfo=UTC).timestamp()]
+    assert track.lat_deg[0] == pytest.approx(48.1173)
+    assert track.lon_deg[0] == pytest.approx(11.5166667)
+    assert track.heading_deg[0] == 84.4
+    assert report.format == "nmea"
+
+
+def test_headings_and_accuracies() -> None:
+    track, _report = read(
+        nmea(
+            rmc("133932.00"), gga("133932.00"), "GNGST,133932.00,1,,,,0.03,0.04,0.05", "GPHDT,91.5,T",
+            rmc("133933.00"), "GNVTG,80.0,T,,M,5.5,N,10.2,K",
+            rmc("133934.00").replace("022.4", "000.3"), "GNVTG,80.0,T,,M,0.3,N,0.5,K",
+            gga("133935.00"), "GPTHS,359.0,A",
+        )
+    )  # fmt: skip
+    assert (track.time_s - AT_S).tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal(track.heading_deg, [91.5, 80.0, np.nan, 359.0])
+    assert track.accuracy_m[0] == pytest.approx(np.hypot(0.03, 0.04) / np.sqrt(2))
+
+
+def test_checksums_and_voids() -> None:
+    text = nmea(rmc("133932.00"), rmc("133933.00", status="V"), gga("133934.00", 0), rmc("133935.00"))
+    broken = (
+        text.replace("133932.00,A", "133932.00,B") + "$GNRMC,133936.00,A,4217.00740,N,08536.74074,W,1,2,160326,,,A\r\n"
+    )
+    broken += "garbage $GNRMC\r\n" + "\0\1\2\r\n" + "$" * 5000 + "\r\n"
+    track, report = read(broken)
+    assert (track.time_s - AT_S).tolist() == [3]
+    assert report.reasons["checksum"] == 2
+    assert report.reasons["no-fix"] == 2
+
+
+def test_cut_sentences_are_left_out() -> None:
+    track, report = read(
+        nmea(
+            rmc("133932.00"),
+            "GNGST,133932.00,1",
+            "GNRMC,133933.00",
+            "GPHDT",
+            "GNZDA,133934.00",
+            "GNZDA,133934.00,16,03,99999999999999999999,00,00",
+            rmc("133935.00"),
+        )
+    )
+    assert (track.time_s - AT_S).tolist() == [0, 3]
+    assert report.reasons["malformed"] >= 2
+
+
+def test_headings_that_are_not_finite_are_not_known() -> None:
+    track, _report = read(nmea(rmc("133932.00"), "GPHDT,1e999,T"))
+    assert np.isnan(track.heading_deg).all() or track.heading_deg[0] == 84.4
+
+
+def test_midnight() -> None:
+    text = nmea(
+        gga("235958.00"), rmc("235959.00", "311226"), gga("000000.00"), gga("000001.00"), rmc("000002.00", "010127")
+    )
+    track, _report = read(text)
+    new_year_s = datetime(2027, 1, 1, tzinfo=UTC).timestamp()
+    assert (track.time_s - new_year_s).tolist() == [-2, -1, 0, 1, 2]
+    track, _report = read(nmea(gga("235959.50"), gga("000000.50"), rmc("000001.50", "010127")))
+    assert (track.time_s - new_year_s).tolist() == [-0.5, 0.5, 1.5]
+
+
+def test_dates_may_be_declared_and_are_never_guessed() -> None:
+    text = nmea(gga("133932.00"), gga("133933.00"))
+    with pytest.raises(InvalidParameter, match="no sentence has a date"):
+        read(text)
+    track, _report = read(text, date=date(2026, 3, 16))
+    assert (track.time_s - AT_S).tolist() == [0, 1]
+    dated = nmea("GNZDA,133932.00,16,03,2026,00,00", gga("133932.00"))
+    assert read(dated)[0].time_s.tolist() == [AT_S]
+
+
+def test_the_combined_solution_of_several_talkers() -> None:
+    text = nmea(
+        gga("133932.00", talker="GP", lat="4217.10000"),
+        gga("133932.00", talker="GL", lat="4217.20000"),
+        gga("133932.00", talker="GN"),
+        rmc("133932.00", talker="GP"),
+    )
+    track, _report = read(text)
+    assert track.lat_deg.tolist() == [pytest.approx(42.28345667)]
+
+
+def test_a_datum_in_the_log_is_refused() -> None:
+    good = "GPDTM,W84,,0.0,N,0.0,E,0.0,W84"
+    assert len(read(nmea(good, rmc("133932.00")))[0].time_s) == 1
+    for content in (
+        "GPDTM,999,,0.08,N,0.07,E,-47.7,W84",
+        "GPDTM,NAS,,0.0,N,0.0,E,0.0,W84",
+        "GPDTM,W84,,0.1,N,0.0,E,0.0,W84",
+    ):
+        with pytest.raises(ReferenceSystemError, match="DTM") as caught:
+            read(nmea(content, rmc("133932.00")))
+        assert "WGS 84" in str(caught.value.cure)
+
+
+def test_sentences_behind_a_loggers_own_time() -> None:
+    lines = nmea(rmc("133932.00"), rmc("133933.00")).splitlines()
+    track, _report = read("\n".join(f"1773668372.1 {line}" for line in lines))
+    assert (track.time_s - AT_S).tolist() == [0, 1]
+
+
+# --- any ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_track_names_what_is_expected() -> None:
+    for content in (b"hello\nworld\n", b"\x89PNG\r\n\x1a\n" + bytes(50), b"<html></html>", b"a,b\n1,2\n"):
+        with pytest.raises(UnsupportedUpload) as caught:
+            read(content)
+        assert "GPX" in str(caught.value.limit)
+    for content in (b"", b"  \n"):
+        with pytest.raises(UnreadableUpload, match="empty"):
+            read(content)
+
+
+def test_limits() -> None:
+    for limits in (PoseLimits(file_bytes=10), PoseLimits(points=1)):
+        for text in (CSV, GPX.format(POINT.format("") * 2), nmea(rmc("133932.00"), rmc("133933.00"))):
+            with pytest.raises(UploadTooLarge):
+                read_poses("upload", text.encode(), None, limits)
+
+
+def test_a_long_track_takes_seconds() -> None:
+    rows = "".join(f"{AT_S + i / 20},{-85.6 + i * 1e-7:.7f},42.28,90,0.02\n" for i in range(20_000))
+    began = process_time()
+    track, _report = read("time,lon,lat,heading,accuracy\n" + rows)
+    assert process_time() - began < 2
+    assert len(track.time_s) == 20_000
+
+
+# --- what a vehicle's profile says of its track -------------------------------------------------------------------
+
+
+def test_a_lever_arm_brings_the_track_to_the_vehicles_reference() -> None:
+    for heading, east_m, north_m in ((90.0, -2.0, -0.5), (0.0, 0.5, -2.0), (225.0, 1.0607, 1.7678)):
+        text = f"time,longitude,latitude,heading\n2026-03-16T13:39:32Z,10.0,50.0,{heading}\n"
+        track, report = read(text, forward_m=2.0, left_m=0.5)
+        moved_m = enu_from_wgs84(float(track.lon_deg[0]), float(track.lat_deg[0]), 0.0, (10.0, 50.0, 0.0))
+        assert moved_m[:2] == pytest.approx([east_m, north_m], abs=1e-3)
+        assert not report.warnings
+    unturned, report = read("time,longitude,latitude\n2026-03-16T13:39:32Z,10.0,50.0\n", forward_m=2.0)
+    assert (unturned.lon_deg[0], unturned.lat_deg[0]) == (10.0, 50.0)
+    assert any("no heading" in warning for warning in report.warnings)
+
+
+def test_an_accuracy_is_declared_where_the_track_has_none() -> None:
+    track, _report = read(CSV, accuracy_m=0.5)
+    assert track.accuracy_m.tolist() == [0.02, 0.5]
+
+
+def test_the_way_driven_leaves_out_wandering_and_gaps() -> None:
+    rng = np.random.default_rng(3)
+    seconds = np.arange(0.0, 700.0, 0.1)
+    along_m = np.where(seconds < 600, 0.0, (seconds - 600) * 12.0)  # ten minutes at a stop, then 1.2 km
+    lat = 50.0 + (along_m + rng.normal(0, 0.7, len(seconds))) / 111_230.0
+    lon = 179.9999 + rng.normal(0, 0.7, len(seconds)) / 71_700.0
+    nothing = np.full(len(seconds), np.nan)
+    track = PoseTrack(seconds, (lon + 180) % 360 - 180, lat, nothing, np.full(len(seconds), 0.7))
+    assert track.driven_m() == pytest.approx(1200.0, rel=0.02)
+    far = PoseTrack([0.0, 1.0, 2.0], [10.0, 11.0, 11.0002], [50.0] * 3, [np.nan] * 3, [np.nan] * 3)
+    assert far.driven_m() == pytest.approx(14.34, abs=0.05)
+    assert PoseTrack([0.0], [10.0], [50.0], [np.nan], [np.nan]).driven_m() == 0.0

@@ -1,0 +1,50 @@
+"""Numbers as people type them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.formats.surveys.cells import read_numbers
+
+
+def test_plain_numbers_are_read_at_once_and_one_by_one() -> None:
+    cells = ["1.5", " -2 ", "3e2", ".5"]
+    values, faults = read_numbers(cells, "lon_deg", required=True)
+    assert values.tolist() == [1.5, -2.0, 300.0, 0.5]
+    slow, wrong = read_numbers([*cells, ""], "lon_deg", required=False)
+    assert slow[:4].tolist() == values.tolist()
+    assert np.isnan(slow[4])
+    assert not faults
+    assert not wrong
+
+
+@pytest.mark.parametrize(
+    ("cell", "code", "proposal"),
+    [
+        ("8,4164", "decimal_comma", "8.4164"),
+        ("4,312,345.12", "grouped_digits", "4312345.12"),
+        ("77.15W", "hemisphere_letter", "-77.15"),
+        ("S 12.5", "hemisphere_letter", "-12.5"),
+        ("12.5 ft", "unit_in_value", "12.5"),
+        ("77°08'54\"W", "degrees_minutes", "-77.148333333"),
+        ("-77 8 54", "degrees_minutes", "-77.148333333"),
+        ("1_000", "not_a_number", ""),
+        ("nan", "not_a_number", ""),
+        ("inf", "not_a_number", ""),
+        ("1e999", "not_a_number", ""),
+        ("0x10", "not_a_number", ""),
+        ("", "missing", ""),
+    ],
+)
+def test_what_is_no_number_is_named(cell: str, code: str, proposal: str) -> None:
+    values, faults = read_numbers(["1.0", cell], "lon_deg", required=True)
+    assert np.isnan(values[1])
+    assert [(fault.row, fault.code) for fault in faults] == [(2, code)]
+    assert proposal in (faults[0].proposal or "")
+
+
+def test_declared_decimal_commas_are_read() -> None:
+    values, faults = read_numbers(["8,5", "-7,25"], "lon_deg", decimal=",", required=True)
+    assert values.tolist() == [8.5, -7.25]
+    assert not faults

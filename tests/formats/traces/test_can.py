@@ -1,0 +1,239 @@
+"""Speed and heading from CAN logs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.errors import InvalidParameter, Unavailable, UnreadableUpload, UploadTooLarge
+from app.formats.traces.declaration import (
+    ByteOrder,
+    CanDeclaration,
+    CanSignal,
+    TraceDeclaration,
+    TraceFormat,
+    TraceLimits,
+)
+from app.formats.traces.read import read_trace
+from app.formats.traces.report import TraceFile
+from app.sensors.magnetometer_bar import MagnetTrace
+from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.recorder import write_array_stream
+from app.simulation.magnetic.road import Road
+from app.simulation.magnetic.vehicle import Course, Vehicle
+from tests.formats.traces.recordings import make_trace
+
+can = pytest.importorskip("can")
+cantools = pytest.importorskip("cantools")
+
+DBC = b"""VERSION ""
+NS_ :
+BS_:
+BU_: ECU
+BO_ 874 VehicleSpeed: 8 ECU
+ SG_ Speed : 23|12@0+ (0.015625,0) [0|300] "km/h" ECU
+BO_ 1796 Attitude: 8 ECU
+ SG_ Mux M : 0|8@1+ (1,0) [0|255] "" ECU
+ SG_ Heading m1 : 8|16@1+ (0.01,0) [0|360] "deg" ECU
+ SG_ Pitch m2 : 8|16@1- (0.01,0) [-90|90] "deg" ECU
+"""
+SPEED = CanSignal(
+    arbitration_id=0x36A, start_bit=23, length=12, byte_order=ByteOrder.BIG, factor=1 / 64, unit="km/h", maximum=300
+)
+HEADING = CanSignal(arbitration_id=0x705, start_bit=0, length=16, signed=True, factor=0.01, offset=180, unit="deg")
+EPOCH_S = 1_700_000_000.0
+
+
+def messages(trace: MagnetTrace, *, after_s: float = 0.0) -> list[Any]:
+    """Frames of a drive with a clock of their own: speed at 10 Hz, heading at 100 Hz, and others."""
+    assert trace.heading_t_s is not None
+    assert trace.heading_deg is not None
+    found = []
+    for t, v in zip(trace.speed_t_s, trace.speed_m_s, strict=True):
+        raw = round(float(v) * 3.6 * 64)
+        found.append((t, 0x36A, bytes([7, 0, raw >> 4, (raw & 15) << 4 | 9, 0, 0, 0, 0])))
+    for t, heading in zip(trace.heading_t_s, trace.heading_deg, strict=True):
+        raw = round((float(heading) - 180) * 100)
+        found.append((t, 0x705, raw.to_bytes(2, "little", signed=True) + bytes(6)))
+        found.append((t + 0.001, 0x704, bytes([1]) + round(float(heading) * 100).to_bytes(2, "little") + bytes(5)))
+        found.append((t + 0.002, 0x704, bytes([2]) + (-100).to_bytes(2, "little", signed=True) + bytes(5)))
+    return [
+        can.Message(timestamp=float(EPOCH_S + t), arbitration_id=i, data=data, is_extended_id=False, channel=0)
+        for t, i, data in sorted(found)
+        if t >= after_s
+    ]
+
+
+def log(trace: MagnetTrace, suffix: str, folder: Path, *, after_s: float = 0.0) -> bytes:
+    path = folder / f"log.{suffix}"
+    with can.Logger(path) as writer:
+        for message in messages(trace, after_s=after_s):
+            writer.on_message_received(message)
+    return path.read_bytes()
+
+
+def declared(**changes: Any) -> TraceDeclaration:
+    return TraceDeclaration(can=CanDeclaration(**{"speed": SPEED, "heading": HEADING, "offset_s": 0.0, **changes}))
+
+
+def read(trace: MagnetTrace, name: str, content: bytes, declaration: TraceDeclaration, **parts: bytes) -> TraceFile:
+    return read_trace({"array.bin": write_array_stream(trace), name: content, **parts}, declaration)
+
+
+@pytest.mark.parametrize("suffix", ["asc", "blf", "csv", "log", "trc"])
+def test_every_format_with_declared_bits(suffix: str, tmp_path: Path) -> None:
+    trace = make_trace(1500)
+    result = read(trace, f"drive.{suffix}", log(trace, suffix, tmp_path), declared())
+    assert result.report.formats[f"drive.{suffix}"] is TraceFormat.CAN
+    assert np.allclose(result.trace.speed_t_s, trace.speed_t_s, atol=2e-3)
+    assert np.allclose(result.trace.speed_m_s, trace.speed_m_s, atol=0.5 / 64 / 3.6)
+    assert result.trace.heading_t_s is not None
+    assert np.allclose(result.trace.heading_deg, trace.heading_deg, atol=0.006)
+
+
+def test_a_dbc_with_multiplexed_signals(tmp_path: Path) -> None:
+    trace = make_trace(800)
+    content = log(trace, "blf", tmp_path)
+    by_name = declared(speed=CanSignal(name="Speed"), heading=CanSignal(name="Attitude.Heading"))
+    result = read(trace, "drive.blf", content, by_name, **{"car.dbc": DBC})
+    assert np.allclose(result.trace.speed_m_s, trace.speed_m_s, atol=0.5 / 64 / 3.6)
+    assert result.trace.heading_deg is not None
+    assert np.allclose(result.trace.heading_deg, trace.heading_deg, atol=0.006)
+
+
+def test_bits_are_read_as_cantools_reads_them() -> None:
+    from app.formats.traces.can_log import _extract
+
+    rng = np.random.default_rng(4)
+    for _ in range(300):
+        length = int(rng.integers(1, 65))
+        big, signed = bool(rng.integers(2)), bool(rng.integers(2))
+        start = int(rng.integers(0, 65 - length))
+        if big:  # the place of the highest bit, as a DBC has it
+            start = 8 * (start // 8) + 7 - start % 8
+        name = f"{start}|{length}@{0 if big else 1}{'-' if signed else '+'}"
+        text = f'VERSION ""\nBO_ 5 M: 8 E\n SG_ S : {name} (0.5,-3) [0|0] "" E\n'
+        message = cantools.database.load_string(text, "dbc").messages[0]
+        frames = [rng.bytes(8) for _ in range(5)]
+        order = ByteOrder.BIG if big else ByteOrder.LITTLE
+        signal = CanSignal(
+            arbitration_id=5, start_bit=start, length=length, byte_order=order, signed=signed, factor=0.5, offset=-3
+        )
+        want = [float(message.decode(frame)["S"]) for frame in frames]
+        assert np.allclose(_extract(frames, signal), want, rtol=1e-15), name
+
+
+def test_absolute_times_of_the_log_mean_nothing(tmp_path: Path) -> None:
+    trace = make_trace(2000)
+    result = read(trace, "drive.log", log(trace, "log", tmp_path, after_s=2.0), declared(offset_s=2.0))
+    assert result.trace.speed_t_s[0] == pytest.approx(2.0, abs=0.01)
+    assert result.report.clock_offsets_s["drive.log"] == 2.0
+    speed = np.interp(3.0, trace.speed_t_s, trace.speed_m_s)
+    assert np.interp(3.0, result.trace.speed_t_s, result.trace.speed_m_s) == pytest.approx(speed, abs=0.01)
+
+
+def _drive(seed: int, *, wheels_am2: float, steady: bool = False) -> MagnetTrace:
+    speeds = () if steady else ((0, 8), (120, 14), (230, 8), (420, 16.5), (600, 12))
+    scene = Scene(Road(600.0), Vehicle.compact(wheel_moment_am2=wheels_am2), Course(speeds=speeds))
+    return simulate_drive(scene, np.random.default_rng(seed)).trace
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_undeclared_offset_is_found_by_the_wheels(seed: int, tmp_path: Path) -> None:
+    trace = _drive(seed, wheels_am2=0.1)
+    start = 3.7 * seed
+    result = read(trace, "drive.blf", log(trace, "blf", tmp_path, after_s=start), declared(offset_s=None))
+    # the simulated bus stamps speeds 50 ms late, which the alignment takes off
+
+    assert result.report.clock_offsets_s["drive.blf"] == pytest.approx(start - 0.05, abs=0.06)
+    assert any("aligned by the wheels" in text for text in result.report.warnings)
+
+
+@pytest.mark.parametrize(("wheels_am2", "steady"), [(0.0, False), (0.1, True)])
+def test_without_wheels_or_changes_of_speed_the_offset_is_asked_for(
+    wheels_am2: float, steady: bool, tmp_path: Path
+) -> None:
+    trace = _drive(3, wheels_am2=wheels_am2, steady=steady)
+    with pytest.raises(InvalidParameter) as error:
+        read(trace, "drive.blf", log(trace, "blf", tmp_path), declared(offset_s=None))
+    assert error.value.field == "can.offset_s"
+    assert error.value.cure
+
+
+def test_values_that_say_no_value_are_left_out(tmp_path: Path) -> None:
+    trace = make_trace(1500)
+    speeds = trace.speed_m_s.copy()
+    speeds[5:8] = 0xFFF / 64 / 3.6
+    broken = MagnetTrace(trace.t_s, trace.field_ut, trace.speed_t_s, speeds, trace.heading_t_s, trace.heading_deg)
+    tight = CanSignal(**{name: getattr(SPEED, name) for name in CanSignal.__slots__} | {"maximum": 60.0})
+    result = read(trace, "a.log", log(broken, "log", tmp_path), declared(speed=tight))
+    assert len(result.trace.speed_t_s) == len(speeds) - 3
+    assert ("speed-invalid", 3) in [(e.what, e.count) for e in result.report.left_out]
+
+
+def test_bad_declarations(tmp_path: Path) -> None:
+    trace = make_trace(400)
+    content = log(trace, "log", tmp_path)
+
+    def refused(field: str, declaration: TraceDeclaration, **parts: bytes) -> str:
+        with pytest.raises(InvalidParameter) as error:
+            read(trace, "a.log", content, declaration, **parts)
+        assert error.value.field == field
+        assert error.value.cure
+        return error.value.message
+
+    refused("can", TraceDeclaration())
+    refused("can.speed", TraceDeclaration(can=CanDeclaration()))
+    assert "0x36A" in refused("can.speed", declared(speed=CanSignal(arbitration_id=0x111, unit="km/h")))
+    refused("can.speed.unit", declared(speed=CanSignal(arbitration_id=0x36A)))
+    refused("can.heading.unit", declared(heading=CanSignal(arbitration_id=0x705, unit="furlong")))
+    refused("can.speed", declared(speed=CanSignal(name="Speed")))
+    assert "'Speed'" in refused("the DBC", declared(speed=CanSignal(name="Sped")), **{"car.dbc": DBC})
+    refused("speed", declared(speed=CanSignal(arbitration_id=0x36A, start_bit=0, length=64, unit="m/s")))
+    with pytest.raises(InvalidParameter):
+        CanSignal()
+    with pytest.raises(InvalidParameter):
+        CanSignal(arbitration_id=1, length=65)
+
+
+def test_damaged_logs(tmp_path: Path) -> None:
+    trace = make_trace(400)
+    declaration = declared(heading=None)
+    for suffix in ("asc", "blf", "log", "trc", "csv"):
+        content = log(trace, suffix, tmp_path)
+        half = read(trace, f"a.{suffix}", content[: int(0.7 * len(content))], declaration)
+        assert 3 < len(half.trace.speed_t_s) <= len(trace.speed_t_s)
+        for seed in range(15):
+            rng = np.random.default_rng(seed)
+            noisy = bytearray(content)
+            for at in rng.integers(0, len(noisy), 8):
+                noisy[at] = int(rng.integers(0, 256))
+            try:
+                result = read(trace, f"a.{suffix}", bytes(noisy), declaration)
+            except (InvalidParameter, UnreadableUpload):
+                continue
+            assert np.isfinite(result.trace.speed_m_s).all()
+            assert (np.diff(result.trace.speed_t_s) > 0).all()
+    with pytest.raises(UnreadableUpload):
+        read(trace, "a.blf", b"LOGG" + bytes(300), declaration)
+    with pytest.raises(UnreadableUpload):
+        read(trace, "a.asc", b"hello\nworld\n", declaration)
+    with pytest.raises(UnreadableUpload):
+        read(trace, "a.log", log(trace, "log", tmp_path), declared(speed=CanSignal(name="S")), **{"c.dbc": b"BO_ x"})
+    limits = TraceLimits(can_frames=50)
+    with pytest.raises(UploadTooLarge):
+        read_trace({"b.bin": write_array_stream(trace), "a.log": log(trace, "log", tmp_path)}, declared(), limits)
+
+
+@pytest.mark.parametrize("library", ["can", "cantools"])
+def test_without_the_libraries(library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trace = make_trace(200)
+    content = log(trace, "log", tmp_path)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(Unavailable) as error:
+        read(trace, "a.log", content, declared(speed=CanSignal(name="Speed") if library == "cantools" else SPEED))
+    assert "waymark[can]" in (error.value.cure or "")

@@ -1,0 +1,121 @@
+"""Checks of plans: figures against known ones, and a road for each that fails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.formats.alignments.geometry import EventKind
+from app.markers.checks import Verdict
+from app.markers.plate import PlateGeometry
+from app.planning.alignment import Alignment, RoadEvent
+from app.planning.placement import place_plan
+from app.planning.plan import Plan, PlanFinding
+from app.planning.plan_checks import ExistingMarker, check_plan
+from app.planning.plan_checks.plates import camera_of, frames_per_pass, readable_zone_m
+from app.planning.rules import CameraRules, PlanRules
+from tests.planning.roads import bend, opposite, road, straight
+
+ALL = {"plates": {}, "decision_points": {}, "lines": {}, "tags": {"magnets": 4}, "cerpm": {}}
+
+
+def checked(alignment: Alignment, existing: tuple[ExistingMarker, ...] = (), **rules: object) -> Plan:
+    made = place_plan(alignment, PlanRules.model_validate({"version": 1, **rules}), name="test plan")
+    return check_plan(made, existing)
+
+
+def finding(plan: Plan, name: str) -> PlanFinding:
+    [found] = [one for one in plan.findings if one.name == name]
+    return found
+
+
+def test_a_plan_of_all_families_passes_its_checks() -> None:
+    events = (RoadEvent(EventKind.STOP_LINE, "1", 480.0), RoadEvent(EventKind.SPEED_LIMIT, "1", 300.0, 50.0))
+    lane = straight(500, speed_kmh=50.0)
+    plan = checked(road(lane, opposite(lane, "2"), events=events), **ALL)
+    assert plan.counts.keys() == {"cerpm", "magnet", "plate"}
+    failed = [f"{one.name}: {one.sentence}" for one in plan.findings if one.verdict is Verdict.FAIL]
+    assert not failed
+    assert {"frames-per-pass camera", "line-spacing", "codebook-room", "path-error", "overlaps"} <= {
+        one.name for one in plan.findings
+    }
+    assert all(one.source and one.sentence for one in plan.findings)
+
+
+def test_frames_per_pass_fall_with_speed_and_end_with_blur() -> None:
+    camera, geometry = CameraRules(), PlateGeometry()
+    slow, fast = (frames_per_pass(camera, geometry, speed / 3.6) for speed in (50.0, 100.0))
+    assert slow == pytest.approx(2 * fast)
+    assert frames_per_pass(camera.model_copy(update={"exposure_s": 0.004}), geometry, 100 / 3.6) == 0.0
+
+
+def test_the_readable_zone_is_that_of_the_projected_plate() -> None:
+    """A camera 1.5 m high that looks down steeply: the unit of 40 mm covers two rows up to where h f u / z^2 = 2."""
+    rules = CameraRules(height_m=1.5, depression_deg=20.0)
+    camera = camera_of(rules)
+    zone = readable_zone_m(camera, PlateGeometry())
+    fine = readable_zone_m(camera, PlateGeometry(unit_mm=50.0))
+    assert 3.0 < zone < 8.0
+    assert fine > zone
+
+
+def test_few_frames_fail_with_the_place_and_the_cure() -> None:
+    plan = checked(road(straight(500, speed_kmh=130.0)), plates={"min_frames": 30})
+    found = finding(plan, "frames-per-pass camera")
+    assert found.verdict is Verdict.FAIL
+    assert found.figure < 30
+    assert found.lane == "1"
+    assert "larger units" in found.sentence
+
+
+def test_path_error_is_found_at_the_change_of_curvature() -> None:
+    plan = checked(road(bend(62.5, 195, 90.0)), cerpm={"max_path_error_m": None, "straight": 2.5, "curve": 2.5})
+    found = finding(plan, "path-error")
+    # R 62.5 m without a spiral, 30.5 m apart: up to 0.030 x 30.5^2 / 62.5 = 0.45 m, by the phase of the markers
+    assert 0.1 < found.figure < 0.47
+    assert found.station_m is not None
+    assert min(abs(found.station_m - 195), abs(found.station_m - 293)) < 40
+
+
+def test_equal_codes_side_by_side_are_named() -> None:
+    lane = straight(500, speed_kmh=50.0)
+    lon, lat = lane.position_at(lane.chainage_m, 3.5)
+    beside = replace(lane, name="2", lon_deg=lon, lat_deg=lat)
+    events = tuple(RoadEvent(EventKind.STOP_LINE, name, 480.0) for name in ("1", "2"))
+    plan = checked(road(lane, beside, events=events), tags={})
+    found = finding(plan, "confusable-codes")
+    assert found.figure == 1
+    assert found.verdict is Verdict.WARN
+
+
+def test_conflicts_with_existing_markers_are_named() -> None:
+    alone = checked(road(straight(500)), plates={})
+    first, second = alone.markers[0], alone.markers[1]
+    existing = (
+        ExistingMarker("here", "cerpm", "7", first.lon_deg, first.lat_deg, "active"),
+        ExistingMarker("same", "plate", second.code, second.lon_deg + 0.01, second.lat_deg, "planned"),
+    )
+    plan = checked(road(straight(500)), existing, plates={})
+    assert finding(plan, "existing-markers").figure == 1
+    assert "here" in finding(plan, "existing-markers").sentence
+    assert finding(plan, "existing-codes").figure == 1
+    assert "same" in finding(plan, "existing-codes").sentence
+
+
+def test_plates_keep_clear_of_tags() -> None:
+    events = tuple(RoadEvent(EventKind.SPEED_LIMIT, "1", at, 30.0 + at / 100) for at in np.arange(100.0, 900.0, 25.0))
+    plan = checked(road(straight(1000, speed_kmh=36.0), events=events), plates={"spacing_m": 10}, tags={"magnets": 5})
+    assert finding(plan, "overlaps").figure == 0, finding(plan, "overlaps").sentence
+
+
+def test_busy_radio_fails_at_the_busiest_place() -> None:
+    plan = checked(
+        road(straight(2000)),
+        cerpm={"interval_s": 0.1, "spreading_factor": 7, "straight": 0.5, "max_path_error_m": None},
+    )
+    found = finding(plan, "radio collisions")
+    assert found.verdict is Verdict.WARN
+    assert found.station_m is not None
+    assert 500 < found.station_m < 1500

@@ -1,0 +1,228 @@
+"""All checks of a radio plan, its battery, and the settings that are recommended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.errors import InvalidParameter
+from app.markers.checks import RadioFinding, Verdict
+from app.planning.radio_checks import PreviewRule, RadioCheck, RadioPlan, check_radio
+from app.planning.radio_recommendation import recommend_settings
+from app.radio.battery import Battery, battery_life_days, mean_current_ma, transmit_current_ma
+from app.radio.collisions import Receiver
+from app.radio.link import LinkModel
+from app.radio.lorawan import Region
+from app.radio.reception import RoadMarkers
+from app.radio.regulation import is_legal
+from app.radio.settings import RadioSettings
+
+TEN_A_SIDE = RoadMarkers(np.repeat(np.arange(10) * 12.192, 2), np.tile([1.8, -1.8], 10))
+PAPERS_RADIO = RadioSettings(bandwidth_hz=125_000, interval_s=2.0)
+EUROPE = RadioSettings(frequency_hz=868_100_000, bandwidth_hz=125_000, power_dbm=14.0, interval_s=10.0)
+
+
+def named(check: RadioCheck, name: str) -> RadioFinding:
+    (finding,) = [finding for finding in check.checks if finding.name == name]
+    return finding
+
+
+def test_every_check_says_what_it_has_and_why() -> None:
+    check = check_radio(RadioPlan(RadioSettings(lorawan=True)))
+    names = [finding.name for finding in check.checks]
+    assert len(set(names)) == len(names)
+    assert {"lorawan-room", "link-margin", "read-in-time", "receiver-channels", "jitter", "battery-life"} <= set(names)
+    for finding in check.checks:
+        assert finding.unit
+        assert finding.source
+        assert finding.sentence
+        met = finding.figure >= finding.limit if finding.relation == ">=" else finding.figure <= finding.limit
+        assert finding.passed is met
+
+
+def test_the_papers_radio_on_a_long_road_is_neither_lawful_nor_heard() -> None:
+    check = check_radio(RadioPlan(PAPERS_RADIO))
+    assert check.verdict is Verdict.FAIL
+    assert named(check, "fixed-narrow-channel").verdict is Verdict.WARN
+    assert named(check, "read-in-time").verdict is Verdict.FAIL
+    assert check.range_m > 4 * check.preview_m
+    assert named(check, "link-margin").passed
+
+
+def test_ten_markers_a_side_are_read_at_the_cameras_preview() -> None:
+    check = check_radio(RadioPlan(RadioSettings(), markers=TEN_A_SIDE, preview=PreviewRule(31.0)))
+    assert check.read_probability >= 0.99
+    assert check.road.in_range.max() == 20
+    assert np.all((check.road.success_min > 0) & (check.road.success_mean <= 1))
+    assert check.verdict is Verdict.WARN
+    assert [finding.name for finding in check.checks if not finding.passed] == ["battery-life"]
+
+
+def test_an_even_road_is_checked_at_its_middle() -> None:
+    plan = RadioPlan(RadioSettings(), preview=PreviewRule(31.0))
+    long_road = RoadMarkers.evenly(plan.spacing_m, 1200.0)
+    middle = RoadMarkers(np.append(long_road.chainage_m, 0.0)[1:], np.append(long_road.offset_m, 1.8)[1:])
+    given = check_radio(replace(plan, markers=middle))
+    even = check_radio(plan)
+    assert given.read_probability == pytest.approx(even.read_probability, abs=0.03)
+    assert given.road.in_range.max() == even.road.in_range.max()
+
+
+def test_reading_in_time_is_harder_the_faster_the_denser_and_the_farther() -> None:
+    plan = RadioPlan(RadioSettings(), preview=PreviewRule(31.0))
+    base = check_radio(plan).read_probability
+    assert check_radio(replace(plan, design_speed_mps=25.0)).read_probability < base
+    assert check_radio(replace(plan, spacing_m=6.0)).read_probability < base
+    assert check_radio(replace(plan, preview=PreviewRule(60.0))).read_probability < base
+    assert check_radio(replace(plan, sides=1)).read_probability > base
+    assert check_radio(replace(plan, link=LinkModel(near_dbm=-118.0))).read_probability < base
+
+
+@pytest.mark.parametrize(("speed_mps", "preview_m"), [(3.0, 31.0), (13.4, 59.9), (30.0, 207.4)])
+def test_the_preview_is_the_stopping_distance_and_at_least_the_cameras(speed_mps: float, preview_m: float) -> None:
+    assert RadioPlan(RadioSettings(), design_speed_mps=speed_mps).preview_m == pytest.approx(preview_m, abs=0.1)
+
+
+def test_channels_that_nobody_hears_are_warned_of() -> None:
+    settings = RadioSettings(frequency_hz=902_500_000, channels=8)
+    finding = named(check_radio(RadioPlan(settings)), "receiver-channels")
+    assert (finding.verdict, finding.figure, finding.limit) == (Verdict.WARN, 1, 8)
+    assert named(check_radio(RadioPlan(settings, receiver=Receiver(channels=8))), "receiver-channels").passed
+
+
+def test_clockwork_markers_are_warned_of() -> None:
+    assert named(check_radio(RadioPlan(RadioSettings(jitter_share=0.0))), "jitter").verdict is Verdict.WARN
+
+
+@pytest.mark.parametrize(
+    ("spreading_factor", "bandwidth_hz", "verdict"),
+    [(10, 125_000, Verdict.FAIL), (9, 125_000, Verdict.OK), (8, 500_000, Verdict.OK), (7, 500_000, Verdict.FAIL)],
+)
+def test_lorawan_needs_a_data_rate_with_room(spreading_factor: int, bandwidth_hz: int, verdict: Verdict) -> None:
+    settings = RadioSettings(
+        spreading_factor=spreading_factor, bandwidth_hz=bandwidth_hz, interval_s=10.0, lorawan=True
+    )
+    assert named(check_radio(RadioPlan(settings)), "lorawan-room").verdict is verdict
+
+
+def test_a_receiver_among_two_thousand_reads_nothing() -> None:
+    markers = RoadMarkers(np.linspace(0.0, 240.0, 2000), np.tile([1.8, -1.8], 1000))
+    check = check_radio(RadioPlan(RadioSettings(), markers=markers, preview=PreviewRule(31.0)))
+    assert check.read_probability < 1e-6
+    assert check.road.in_range.max() > 1900
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"design_speed_mps": 0.0}, "design_speed_mps"),
+        ({"design_speed_mps": float("nan")}, "design_speed_mps"),
+        ({"spacing_m": 0.5}, "spacing_m"),
+        ({"sides": 0}, "sides"),
+        ({"lane_width_m": 50.0}, "lane_width_m"),
+        ({"min_probability": 1.0}, "min_probability"),
+        ({"min_battery_days": -1.0}, "min_battery_days"),
+    ],
+)
+def test_plans_outside_their_limits_are_refused(values: dict[str, float], field: str) -> None:
+    with pytest.raises(InvalidParameter) as caught:
+        RadioPlan(RadioSettings(), **values)  # type: ignore[arg-type]
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: PreviewRule(0.0), "preview.distance_m"),
+        (lambda: PreviewRule(deceleration_mps2=0.0), "preview.deceleration_mps2"),
+        (lambda: Battery(capacity_mah=0.0), "battery.capacity_mah"),
+        (lambda: Battery(usable_share=1.1), "battery.usable_share"),
+        (lambda: Battery(sleep_ma=-1.0), "battery.sleep_ma"),
+    ],
+)
+def test_rules_and_batteries_outside_their_limits_are_refused(make: object, field: str) -> None:
+    with pytest.raises(InvalidParameter) as caught:
+        make()  # type: ignore[operator]
+    assert caught.value.field == field
+
+
+# --- battery ------------------------------------------------------------------------------------------------------
+
+
+def test_a_battery_lasts_by_what_is_drawn() -> None:
+    settings, battery = RadioSettings(interval_s=1.0), Battery()
+    drawn_ma = 0.8 + 0.015424 * 120 + (0.015424 + 0.01) * 40
+    assert mean_current_ma(settings, battery) == pytest.approx(drawn_ma, abs=1e-6)
+    assert battery_life_days(settings, battery) == pytest.approx(800 / drawn_ma / 24, rel=1e-6)
+    asleep = replace(settings, interval_s=86_400.0)
+    assert battery_life_days(asleep, battery) == pytest.approx(1000 * 0.8 / 0.8 / 24, rel=1e-3)
+
+
+@pytest.mark.parametrize(("power_dbm", "current_ma"), [(20, 120), (18, 120), (17, 87), (13, 29), (7, 20), (-4, 20)])
+def test_power_costs_what_the_data_sheet_says(power_dbm: float, current_ma: float) -> None:
+    assert transmit_current_ma(power_dbm) == current_ma
+
+
+# --- recommendation -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        RadioPlan(PAPERS_RADIO, markers=TEN_A_SIDE, preview=PreviewRule(31.0)),
+        RadioPlan(RadioSettings(), spacing_m=24.384, preview=PreviewRule(31.0)),
+        RadioPlan(RadioSettings()),
+    ],
+    ids=["ten a side", "80 ft", "40 ft at the stopping distance"],
+)
+def test_recommended_settings_pass_the_checks(plan: RadioPlan) -> None:
+    found = recommend_settings(plan)
+    assert found.reaches
+    assert found.settings is not None
+    assert is_legal(found.settings, plan.region)
+    receiver = replace(plan.receiver, channels=found.receiver_channels)
+    check = check_radio(replace(plan, settings=found.settings, receiver=receiver))
+    assert named(check, "read-in-time").passed
+    assert check.battery_days == found.battery_days
+    if plan.markers is None:
+        assert check.read_probability == pytest.approx(found.read_probability)
+
+
+def test_a_quieter_air_needs_no_more_channels() -> None:
+    ten = recommend_settings(RadioPlan(RadioSettings(), markers=TEN_A_SIDE, preview=PreviewRule(31.0)))
+    long_road = recommend_settings(RadioPlan(RadioSettings(), preview=PreviewRule(31.0)))
+    assert ten.receiver_channels == 1
+    assert long_road.receiver_channels > 1
+    alone = recommend_settings(RadioPlan(RadioSettings(), preview=PreviewRule(31.0)), more_channels=False)
+    assert not alone.reaches
+    assert "no lawful settings tried reach" in alone.sentence
+
+
+def test_of_those_that_reach_the_longest_lived_is_recommended() -> None:
+    plan = RadioPlan(RadioSettings(), markers=TEN_A_SIDE, preview=PreviewRule(31.0))
+    found = recommend_settings(plan)
+    assert found.settings is not None
+    assert found.battery_days > battery_life_days(replace(found.settings, interval_s=1.0), plan.battery)
+    rarer = replace(found.settings, interval_s=1.3 * found.settings.interval_s)
+    assert check_radio(replace(plan, settings=rarer)).read_probability < plan.min_probability
+
+
+def test_more_markers_than_a_check_takes_are_refused_and_not_recommended() -> None:
+    crowded = RadioPlan(replace(PAPERS_RADIO, spreading_factor=12, interval_s=20.0), spacing_m=1.0)
+    with pytest.raises(InvalidParameter, match="in reach") as caught:
+        check_radio(crowded)
+    assert caught.value.field == "spacing_m"
+    assert not recommend_settings(crowded, more_channels=False).reaches
+
+
+def test_what_cannot_be_reached_lawfully_is_said() -> None:
+    found = recommend_settings(RadioPlan(EUROPE, region=Region.EU868))
+    assert not found.reaches
+    assert found.settings is not None
+    assert is_legal(found.settings, Region.EU868)
+    assert found.read_probability < 0.99
+    nowhere = recommend_settings(RadioPlan(RadioSettings(), region=Region.EU868))
+    assert nowhere.settings is None
+    assert "no settings are lawful" in nowhere.sentence

@@ -1,0 +1,162 @@
+"""Rules of the United States and of Europe."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from app.errors import InvalidParameter
+from app.markers.checks import RadioFinding, Verdict
+from app.radio.lorawan import Region
+from app.radio.regulation import FIELD_EIRP_DBM, check_legal, is_legal
+from app.radio.settings import RadioSettings
+
+HOPPING = RadioSettings(
+    frequency_hz=902_300_000, bandwidth_hz=125_000, spreading_factor=10, interval_s=2.0, channels=64, hopping=True
+)
+EUROPE = RadioSettings(
+    frequency_hz=868_100_000, bandwidth_hz=125_000, spreading_factor=7, interval_s=10.0, power_dbm=14.0
+)
+
+
+def findings(settings: RadioSettings, region: Region = Region.US915) -> dict[str, RadioFinding]:
+    found = check_legal(settings, region)
+    assert len({finding.name for finding in found}) == len(found)
+    return {finding.name: finding for finding in found}
+
+
+def test_500_khz_on_one_channel_is_digital_modulation() -> None:
+    found = findings(RadioSettings())
+    assert {finding.verdict for finding in found.values()} == {Verdict.OK}
+    assert found["digital-bandwidth"].source == "47 CFR 15.247(a)(2)"
+    # 20 dBm over 166.7 slices of 3 kHz.
+    assert found["power-density"].figure == pytest.approx(-2.218, abs=1e-3)
+
+
+@pytest.mark.parametrize("bandwidth_hz", [125_000, 250_000])
+@pytest.mark.parametrize("channels", [1, 64])
+def test_a_fixed_beacon_in_a_narrow_channel_fits_neither_rule(bandwidth_hz: int, channels: int) -> None:
+    settings = RadioSettings(frequency_hz=902_300_000, bandwidth_hz=bandwidth_hz, channels=channels, interval_s=5.0)
+    finding = findings(settings)["fixed-narrow-channel"]
+    assert finding.verdict is Verdict.WARN
+    assert "15.247(a)(1)(i), (a)(2)" in finding.source
+    assert "no hopping system" in finding.sentence
+    assert "no digital modulation" in finding.sentence
+    assert not is_legal(settings, Region.US915)
+
+
+def test_a_whisper_in_a_narrow_channel_is_allowed_by_field_strength() -> None:
+    assert pytest.approx(-1.249, abs=1e-3) == FIELD_EIRP_DBM
+    settings = RadioSettings(bandwidth_hz=125_000, interval_s=5.0, power_dbm=-4.0, antenna_gain_dbi=2.15)
+    assert is_legal(settings, Region.US915)
+    assert not is_legal(replace(settings, power_dbm=-3.0), Region.US915)
+
+
+def test_hopping_over_50_narrow_channels_is_allowed_up_to_400_ms() -> None:
+    assert 0.37 < HOPPING.time_on_air_s < 0.4
+    assert is_legal(HOPPING, Region.US915)
+    slow = replace(HOPPING, spreading_factor=11, interval_s=20.0)
+    found = findings(slow)
+    assert found["dwell-time"].verdict is Verdict.FAIL
+    assert found["dwell-time"].figure == pytest.approx(slow.time_on_air_s)
+
+
+def test_dwell_counts_all_packets_on_one_channel_in_20_s() -> None:
+    # 64 channels, a packet each 0.2 s: 1.56 packets on a channel in 20 s, 2 at worst.
+    fast = replace(HOPPING, spreading_factor=9, interval_s=0.25, jitter_share=0.1)
+    assert findings(fast)["dwell-time"].figure == pytest.approx(2 * fast.time_on_air_s)
+    assert is_legal(replace(fast, interval_s=0.32), Region.US915)
+
+
+def test_too_few_channels_are_a_hybrid_at_best() -> None:
+    found = findings(replace(HOPPING, channels=8, interval_s=5.0))
+    assert found["hopping-channels"].verdict is Verdict.WARN
+    assert "(f)" in found["hopping-channels"].source
+    assert found["dwell-time"].source == "47 CFR 15.247(f)"
+    assert found["power-density"].verdict is Verdict.OK
+
+
+def test_wide_hopping_channels_need_25_and_less_power_below_50() -> None:
+    settings = replace(HOPPING, bandwidth_hz=250_000, channels=25)
+    found = findings(settings)
+    assert found["hopping-channels"].limit == 25
+    assert found["power"].limit == 24.0
+    assert is_legal(settings, Region.US915)
+    assert not is_legal(replace(settings, channels=24), Region.US915)
+
+
+def test_500_khz_does_not_hop() -> None:
+    settings = RadioSettings(frequency_hz=902_500_000, bandwidth_hz=500_000, channels=30, hopping=True)
+    assert findings(settings)["hopping-bandwidth"].verdict is Verdict.WARN
+
+
+@pytest.mark.parametrize(("frequency_hz", "legal"), [(902_250_000, True), (902_200_000, False), (927_800_000, False)])
+def test_channels_lie_within_the_band(frequency_hz: int, legal: bool) -> None:
+    assert is_legal(RadioSettings(frequency_hz=frequency_hz), Region.US915) is legal
+
+
+def test_all_channels_lie_within_the_band() -> None:
+    settings = RadioSettings(frequency_hz=915_000_000)
+    assert is_legal(replace(settings, channels=16), Region.US915)
+    assert not is_legal(replace(settings, channels=17), Region.US915)
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "duty_cycle"),
+    [
+        (864_000_000, 0.001),
+        (867_100_000, 0.01),
+        (868_300_000, 0.01),
+        (868_950_000, 0.001),
+        (869_525_000, 0.1),
+        (869_850_000, 0.01),
+    ],
+)
+def test_sub_bands_have_their_duty_cycles(frequency_hz: int, duty_cycle: float) -> None:
+    settings = replace(EUROPE, frequency_hz=frequency_hz)
+    min_s = settings.time_on_air_s / duty_cycle
+    allowed = findings(replace(settings, interval_s=min_s * 1.001), Region.EU868)
+    assert allowed["duty-cycle"].verdict is Verdict.OK
+    broken = findings(replace(settings, interval_s=min_s * 0.99), Region.EU868)
+    assert broken["duty-cycle"].verdict is Verdict.FAIL
+    assert broken["duty-cycle"].limit == duty_cycle
+
+
+def test_europe_counts_power_against_a_dipole() -> None:
+    found = findings(EUROPE, Region.EU868)
+    assert found["power"].figure == pytest.approx(14.0)
+    assert found["power"].verdict is Verdict.OK
+    assert findings(replace(EUROPE, power_dbm=17.0), Region.EU868)["power"].verdict is Verdict.FAIL
+    loud = replace(EUROPE, frequency_hz=869_525_000, power_dbm=20.0)
+    assert findings(loud, Region.EU868)["power"].verdict is Verdict.OK
+
+
+def test_frequencies_of_another_region_are_in_no_band() -> None:
+    (finding,) = check_legal(RadioSettings(), Region.EU868)
+    assert finding.verdict is Verdict.FAIL
+    assert finding.figure == pytest.approx(45.0)
+    assert findings(EUROPE)["band"].verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"frequency_hz": 433_000_000}, "frequency_hz"),
+        ({"interval_s": 0.01}, "interval_s"),
+        ({"interval_s": float("nan")}, "interval_s"),
+        ({"jitter_share": 0.95}, "jitter_share"),
+        ({"power_dbm": 21.0}, "power_dbm"),
+        ({"antenna_gain_dbi": 9.0}, "antenna_gain_dbi"),
+        ({"channels": 0}, "channels"),
+        ({"hopping": True}, "channels"),
+        ({"spreading_factor": 6}, "spreading_factor"),
+        ({"explicit_header": False, "lorawan": True}, "explicit_header"),
+        ({"spreading_factor": 12, "bandwidth_hz": 125_000, "interval_s": 1.0}, "interval_s"),
+    ],
+)
+def test_settings_that_no_radio_has_are_refused(values: dict[str, object], field: str) -> None:
+    with pytest.raises(InvalidParameter) as caught:
+        RadioSettings(**values)  # type: ignore[arg-type]
+    assert caught.value.field == field
+    assert caught.value.limit
