@@ -38,6 +38,7 @@ def _list_commands(short: bool) -> list[list[str]]:
         ["magnets", "-m", "benchmarks.magnets", *(["--short"] if short else [])],
         ["cerpm", "-m", "benchmarks.cerpm", *(["--short"] if short else [])],
         ["imports", "-m", "benchmarks.imports", *(["--short"] if short else [])],
+        ["planning", "-m", "benchmarks.planning", *(["--short"] if short else [])],
         ["registry", "-m", "benchmarks.registry", *(["--short"] if short else [])],
     ]
 

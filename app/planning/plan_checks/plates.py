@@ -9,9 +9,9 @@ import numpy as np
 
 from app.markers.checks import Verdict
 from app.markers.plate import PlateGeometry, PlateScheme, plate_capacity
-from app.planning.alignment import Floats
 from app.planning.plan import Plan, PlanFinding, PlannedMarker, PlannedPlate
 from app.planning.plan_checks.finding import compare
+from app.planning.plate_view import camera_of, project_road
 from app.planning.rules import CameraRules, PlateRules
 from app.sensors.camera import Camera
 
@@ -25,14 +25,6 @@ MAX_SHEAR_SHARE = 0.1
 """Share of its length by which a rolling shutter may stretch a plate. Source: chosen by hand, the pose fit's slack."""
 _STEP_M = 0.02  # [m] between distances that are tried; source: chosen by hand
 _NEAREST_M, _FARTHEST_M = 0.3, 40.0  # [m] source: beyond it no unit of 50 mm covers two rows of a camera up to 5 m high
-
-
-def camera_of(rules: CameraRules) -> Camera:
-    """The camera that rules describe."""
-    return Camera.from_field_of_view(
-        rules.width_px, rules.height_px, rules.horizontal_fov_deg, height_m=rules.height_m,
-        depression_deg=rules.depression_deg,
-    )  # fmt: skip
 
 
 def readable_zone_m(camera: Camera, geometry: PlateGeometry, left_m: float = 0.0, grade_change: float = 0.0) -> float:
@@ -52,12 +44,12 @@ def readable_zone_m(camera: Camera, geometry: PlateGeometry, left_m: float = 0.0
     corners = [(forward, across) for forward in (-side / 2, side / 2) for across in (-side / 2, side / 2)]
     inside = np.ones(len(ahead), dtype=bool)
     for forward, across in corners:
-        u, v = _project(camera, ahead + forward, left_m + across, grade_change * ahead)
+        u, v = project_road(camera, ahead + forward, left_m + across, grade_change * ahead)
         inside &= (u >= 0) & (u <= camera.width_px - 1) & (v >= 0) & (v <= camera.height_px - 1)
     unit = (geometry.unit_mm + geometry.gap_mm) / 1000
     rise = grade_change * ahead
-    _, far = _project(camera, ahead + side / 2, np.full_like(ahead, left_m), rise)
-    _, near = _project(camera, ahead + side / 2 - unit, np.full_like(ahead, left_m), rise)
+    _, far = project_road(camera, ahead + side / 2, np.full_like(ahead, left_m), rise)
+    _, near = project_road(camera, ahead + side / 2 - unit, np.full_like(ahead, left_m), rise)
     return float(np.count_nonzero(inside & (near - far >= ROWS_PER_UNIT)) * _STEP_M)
 
 
@@ -115,8 +107,8 @@ def _rolling_shutter(plan: Plan, plates: Sequence[PlannedMarker], camera: Camera
     view = camera_of(camera)
     length = detail.geometry.side_mm / 1000
     ahead = view.height_m / math.tan(math.radians(max(view.depression_deg, 5.0)))
-    _, far = _project(view, np.array([ahead + length / 2]), np.zeros(1), np.zeros(1))
-    _, near = _project(view, np.array([ahead - length / 2]), np.zeros(1), np.zeros(1))
+    _, far = project_road(view, np.array([ahead + length / 2]), np.zeros(1), np.zeros(1))
+    _, near = project_road(view, np.array([ahead - length / 2]), np.zeros(1), np.zeros(1))
     seconds = float(near[0] - far[0]) / camera.height_px * camera.rolling_shutter_s
     share = speed * seconds / length
     sentence = f"share of its length by which {camera.name} stretches a plate at {speed * 3.6:.0f} km/h"
@@ -140,12 +132,3 @@ def _room(plates: Sequence[PlannedMarker], rules: PlateRules) -> PlanFinding:
 def _speed_mps(plan: Plan, marker: PlannedMarker) -> float:
     lane = plan.alignment.lane(marker.lane)
     return float(lane.value_at(lane.design_speed_mps, marker.chainage_m))
-
-
-def _project(camera: Camera, ahead_m: Floats, left_m: float | Floats, up_m: Floats) -> tuple[Floats, Floats]:
-    """Columns and rows of places ahead of the camera on the road; NaN behind it."""
-    vehicle = np.stack([ahead_m, np.broadcast_to(left_m, ahead_m.shape), up_m - camera.height_m], axis=1)
-    x, y, z = (camera.camera_from_vehicle @ vehicle.T).astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px
-    return np.where(z > 0.05, u, np.nan), np.where(z > 0.05, v, np.nan)

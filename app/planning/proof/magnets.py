@@ -93,7 +93,7 @@ class MagnetPass:
 def drive_tag(one: MagnetPass, weight: float) -> tuple[MarkerPass, list[WrongReading]]:
     """Read a tag in one pass; a miss is repeated without one difficulty at a time, to find its cause."""
     assert one.tag is not None
-    read, fix_m, wrong = _read_tag(one)
+    read, fix_m, wrong = read_tag(one)
     cause = None if read else _tag_cause(one)
     number = one.tag.number
     result = MarkerPass(
@@ -130,7 +130,7 @@ def drive_line(one: MagnetPass, weight: float) -> tuple[list[MarkerPass], list[W
     return passes, wrong
 
 
-def _read_tag(one: MagnetPass) -> tuple[bool, list[float] | None, list[str]]:
+def read_tag(one: MagnetPass) -> tuple[bool, list[float] | None, list[str]]:
     """Whether the tag was read, error of the fix along and across, and codes that are not there."""
     assert one.tag is not None
     scene = one.scene()
@@ -163,7 +163,7 @@ def _tag_cause(one: MagnetPass) -> str:
         ("clearance", replace(one, clearance_m=min(one.clearance_m, 0.16))),
     )  # fmt: skip
     for cause, easier in tries:
-        if _read_tag(easier)[0]:
+        if read_tag(easier)[0]:
             return cause
     return "sensor noise"
 

@@ -14,7 +14,7 @@ from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.plate import PlateCode
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
 from app.planning.plan_checks.cerpms import radio_plan
-from app.planning.plan_checks.plates import camera_of
+from app.planning.plate_view import camera_of
 from app.planning.proof.cerpms import ASIDE_M, AUDIBLE_M, LanePass, drive_cerpms, simulated_radio
 from app.planning.proof.conditions import draw_drive, draw_plate
 from app.planning.proof.magnets import LEAD_M, TAIL_M, MagnetPass, drive_line, drive_tag
@@ -135,9 +135,9 @@ class Prover:
             case UnitKind.TAGS:
                 self._prove_tags(unit, result)
             case UnitKind.LINE:
-                result["passes"], result["wrong"] = drive_line(self._line_pass(unit), unit.weight[0])
+                result["passes"], result["wrong"] = drive_line(self.line_pass(unit), unit.weight[0])
             case UnitKind.LANE:
-                result["path"] = drive_cerpms(self._lane_pass(unit))
+                result["path"] = drive_cerpms(self.lane_pass(unit))
         return result
 
     def rng(self, *key: int | str) -> np.random.Generator:
@@ -173,7 +173,7 @@ class Prover:
             marker.lane, (low, high), drive, self.seed_of(drive, "tag noise", marker.number), habit_m + wander_m, marker
         )
 
-    def _line_pass(self, unit: ProofUnit) -> MagnetPass:
+    def line_pass(self, unit: ProofUnit) -> MagnetPass:
         """A drive with the bar over one of the lines along a stretch, as in a departure from the lane."""
         rng = self.rng(unit.drive, "line", unit.lane, int(unit.from_m))
         lines = [left for _, at, left in self._beside(unit.lane, PlannedLineMagnet) if unit.from_m <= at <= unit.to_m]
@@ -210,7 +210,7 @@ class Prover:
     def _tags(self) -> list[PlannedMarker]:
         return [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedTag)]
 
-    def _lane_pass(self, unit: ProofUnit) -> LanePass:
+    def lane_pass(self, unit: ProofUnit) -> LanePass:
         low, high = unit.from_m - AUDIBLE_M, unit.to_m + AUDIBLE_M
         own = self._beside(unit.lane, PlannedCerpm)
         return LanePass(

@@ -1,0 +1,1 @@
+"""Plans of whole roads: speed and growth, predictions against proofs, the optimiser, commits, the papers' set-ups."""
