@@ -1,6 +1,6 @@
 """Coordinate reference systems, transformations with a stated accuracy, local frames and bearings."""
 
-from app.geodesy.frames import check_lon_lat, enu_from_heading, enu_from_wgs84, wgs84_from_enu
+from app.geodesy.frames import check_lon_lat, enu_from_heading, enu_from_wgs84, lon_lat_from_enu, wgs84_from_enu
 from app.geodesy.operations import use_grids
 from app.geodesy.place import (
     LocalizationGrade,
@@ -18,6 +18,7 @@ __all__ = [
     "check_lon_lat",
     "enu_from_heading",
     "enu_from_wgs84",
+    "lon_lat_from_enu",
     "normalize_crs",
     "place_position",
     "place_positions",

@@ -12,9 +12,9 @@ from app.errors import InvalidParameter
 
 
 def enu_from_wgs84(
-    lon_deg: float, lat_deg: float, height_m: float, origin: tuple[float, float, float]
+    lon_deg: npt.ArrayLike, lat_deg: npt.ArrayLike, height_m: float, origin: tuple[float, float, float]
 ) -> npt.NDArray[np.float64]:
-    """East, north, up from an origin (lon_deg, lat_deg, ellipsoidal height_m), shape (3,). [m]"""
+    """East, north, up from an origin (lon_deg, lat_deg, ellipsoidal height_m), shape (3,) or (3, K). [m]"""
     return np.array(pymap3d.geodetic2enu(lat_deg, lon_deg, height_m, origin[1], origin[0], origin[2]), dtype=float)
 
 
@@ -25,6 +25,15 @@ def wgs84_from_enu(
     east, north, up = (float(v) for v in position_enu_m)
     lat, lon, height = pymap3d.enu2geodetic(east, north, up, origin[1], origin[0], origin[2])
     return (float(lon) + 180.0) % 360.0 - 180.0, float(lat), float(height)
+
+
+def lon_lat_from_enu(
+    points_enu_m: npt.NDArray[np.float64], origin: tuple[float, float, float]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Longitudes and latitudes of points of a local frame, shape (..., 3), east, north, up. [deg]"""
+    east, north, up = np.moveaxis(points_enu_m, -1, 0)
+    lat, lon, _height = pymap3d.enu2geodetic(east, north, up, origin[1], origin[0], origin[2])
+    return (np.asarray(lon) + 180.0) % 360.0 - 180.0, np.asarray(lat)
 
 
 def enu_from_heading(heading_deg: float) -> npt.NDArray[np.float64]:

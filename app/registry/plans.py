@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.registry.bulk_load import load_columns
+from app.registry.columns import Columns
 from app.registry.resources import Resource
 from app.registry.rows import columns_of, fetch_all
 from app.registry.spatial import Box, within_box
@@ -85,12 +87,9 @@ def list_existing(connection: sa.Connection, agency_id: str, box: Box, *, limit:
 
 def link_markers(connection: sa.Connection, agency_id: str, plan_id: str, ids: Sequence[tuple[int, str]]) -> None:
     """Store which marker each number of a plan became."""
-    rows = [
-        {"plan_id": plan_id, "agency_id": agency_id, "number": number, "marker_id": marker_id}
-        for number, marker_id in ids
-    ]
-    if rows:
-        connection.execute(sa.insert(plan_markers), rows)
+    numbers, marker_ids = [number for number, _ in ids], [marker_id for _, marker_id in ids]
+    same = {"plan_id": plan_id, "agency_id": agency_id}
+    load_columns(connection, plan_markers, Columns.of(len(ids), same, {"number": numbers, "marker_id": marker_ids}))
 
 
 def list_built(connection: sa.Connection, agency_id: str, plan_id: str) -> list[BuiltRow]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter
-from app.geodesy import check_lon_lat, enu_from_wgs84, wgs84_from_enu
+from app.geodesy import check_lon_lat, enu_from_wgs84, lon_lat_from_enu
 
 FloatArray = npt.NDArray[np.float64]
 MAX_LENGTH_M = 20_000.0
@@ -63,7 +63,8 @@ class LaneLine:
         for i, (lon_deg, lat_deg, *_) in enumerate(points_deg):
             check_lon_lat(lon_deg, lat_deg, f"lane[{i}]")
         origin = (float(points_deg[0][0]), float(points_deg[0][1]), float(height_m))
-        points = np.array([enu_from_wgs84(p[0], p[1], height_m, origin) for p in points_deg])
+        lon_lat = np.array([(lon_deg, lat_deg) for lon_deg, lat_deg, *_ in points_deg], dtype=np.float64)
+        points = enu_from_wgs84(lon_lat[:, 0], lon_lat[:, 1], height_m, origin).T
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         points = points[np.concatenate([[True], steps > _SAME_PLACE_M])]
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -103,10 +104,9 @@ class LaneLine:
         chainage = self.chainages_m[i] + share[i] * (self.chainages_m[i + 1] - self.chainages_m[i])
         return float(chainage), math.copysign(float(np.linalg.norm(away[i])), left)
 
-    def lon_lat(self, point_enu_m: FloatArray) -> tuple[float, float]:
-        """Longitude and latitude of a point of the local frame. [deg]"""
-        lon_deg, lat_deg, _ = wgs84_from_enu(point_enu_m, self.origin)
-        return lon_deg, lat_deg
+    def lon_lat(self, points_enu_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Longitudes and latitudes of points of the local frame, shape (..., 3). [deg]"""
+        return lon_lat_from_enu(points_enu_m, self.origin)
 
     def from_position(self, lon_deg: float, lat_deg: float) -> FloatArray:
         """A position in the local frame, shape (3,). [m]"""

@@ -8,6 +8,7 @@ figure 4). A line of magnets follows the painted line.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -151,11 +152,12 @@ def place_tag(
     direction = (last - first) / float(np.linalg.norm(last - first))
     start = first + offset_m * left_of(direction)
     bearing = bearing_deg(direction)
-    holes = []
-    for number, magnet in enumerate(tag.magnets, start=1):
-        point = start + magnet.along_m * direction
-        holes.append(_hole(lane, number, magnet.along_m, point, magnet.polarity, bearing))
-    return MagnetLayout(name, tag, lane, tuple(holes), bearing, meaning)
+    along_m = np.array([magnet.along_m for magnet in tag.magnets])
+    points = start + along_m[:, None] * direction
+    located = np.array([lane.locate(point) for point in points])
+    polarities = [magnet.polarity for magnet in tag.magnets]
+    holes = _holes(lane, along_m, located, points, polarities, bearing)
+    return MagnetLayout(name, tag, lane, holes, bearing, meaning)
 
 
 def place_line(
@@ -206,11 +208,9 @@ def place_line(
     tag = LineTag.of_style(style)
     along_m = np.linspace(0.0, end_m - from_m, steps + 1)
     points = line.at(from_m + along_m)
-    holes = [
-        _hole(line, i + 1, float(along), point, tag.polarity, None)
-        for i, (along, point) in enumerate(zip(along_m, points, strict=True))
-    ]
-    return MagnetLayout(name, tag, line, tuple(holes), bearing_deg(line.direction_at(from_m)))
+    on_line = np.stack([from_m + along_m, np.zeros(len(along_m))], axis=1)
+    holes = _holes(line, along_m, on_line, points, [tag.polarity] * len(points), None)
+    return MagnetLayout(name, tag, line, holes, bearing_deg(line.direction_at(from_m)))
 
 
 def _check_chainage(field: str, chainage_m: float, lane: LaneLine) -> None:
@@ -246,24 +246,26 @@ def _point_ahead(lane: LaneLine, chainage_m: float, length_m: float) -> FloatArr
     return lane.at(chainage_m + arc_m)
 
 
-def _hole(
-    lane: LaneLine, number: int, along_m: float, point: FloatArray, polarity: Polarity, forward_deg: float | None
-) -> Hole:
-    """A hole at a point; upright without the bearing of the tag."""
-    chainage_m, offset_m = lane.locate(point)
-    lon_deg, lat_deg = lane.lon_lat(point)
-    turned = 0.0 if polarity is Polarity.N else 180.0
-    return Hole(
-        number=number,
-        along_m=along_m,
-        chainage_m=chainage_m,
-        offset_m=offset_m,
-        lon_deg=lon_deg,
-        lat_deg=lat_deg,
-        east_m=float(point[0]),
-        north_m=float(point[1]),
-        up_m=float(point[2]),
-        polarity=polarity,
-        orientation=Orientation.UP if forward_deg is None else Orientation.FORWARD,
-        north_pole_bearing_deg=None if forward_deg is None else (forward_deg + turned) % 360.0,
+def _holes(
+    lane: LaneLine,
+    along_m: FloatArray,
+    located_m: FloatArray,
+    points: FloatArray,
+    polarities: Sequence[Polarity],
+    forward_deg: float | None,
+) -> tuple[Hole, ...]:
+    """Holes at points, shape (K, 3), with chainages and offsets, shape (K, 2); upright without the tag's bearing."""
+    lon_deg, lat_deg = lane.lon_lat(points)
+    orientation = Orientation.UP if forward_deg is None else Orientation.FORWARD
+    turned_deg = {Polarity.N: 0.0, Polarity.S: 180.0}
+    columns = np.column_stack([along_m, located_m, lon_deg, lat_deg, points]).tolist()
+    return tuple(
+        Hole(
+            number,
+            *values,
+            polarity=polarity,
+            orientation=orientation,
+            north_pole_bearing_deg=None if forward_deg is None else (forward_deg + turned_deg[polarity]) % 360.0,
+        )
+        for number, (values, polarity) in enumerate(zip(columns, polarities, strict=True), start=1)
     )

@@ -8,10 +8,9 @@ from itertools import groupby
 import numpy as np
 from pyproj import Geod
 
-from app.encoders.magnet.layout import MAX_HOLES
 from app.families.inputs import PositionIn
 from app.families.magnet.columns import magnet_columns
-from app.families.magnet.layouts import LaneInput, PlacedLine, PlacedTag
+from app.families.magnet.layouts import MAX_MAGNETS, LaneInput, PlacedLine, PlacedTag
 from app.families.magnet.registration import LineInput, NewMagnets, TagInput
 from app.families.planned import PLAN_METHOD, Commitment, PlannedMarkers, PlannedRow
 from app.markers.magnet import LineStyle
@@ -94,7 +93,7 @@ def _even_stretches(line: list[PlannedMarker]) -> Iterator[list[PlannedMarker]]:
     while start + 1 < len(line):
         end, length = start + 1, float(apart[start])
         while end + 1 < len(line) and abs(apart[end] - apart[start]) <= _EVEN_M and length < _MAX_LINE_M:
-            if end - start + 1 >= MAX_HOLES:
+            if end - start + 1 >= MAX_MAGNETS:
                 break
             length += float(apart[end])
             end += 1

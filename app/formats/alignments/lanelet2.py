@@ -152,9 +152,13 @@ def _lanelets(osm: OsmMap, warnings: list[str]) -> list[_Lanelet]:
 
 
 def _is_for_vehicles(relation: Relation) -> bool:
-    if relation.tags.get("participant:vehicle") in ("yes", "true"):
-        return True
-    return relation.tags.get("subtype") in VEHICLE_SUBTYPES and relation.tags.get("participant:vehicle") != "no"
+    """As the traffic rules of lanelet2: tags of participants, where there are any, replace what the subtype says."""
+    participants = {key: value for key, value in relation.tags.items() if key.startswith("participant:")}
+    if participants:
+        return any(
+            key.startswith("participant:vehicle") and participants[key] in ("yes", "true") for key in participants
+        )
+    return relation.tags.get("subtype") in VEHICLE_SUBTYPES
 
 
 def _sides(osm: OsmMap, relation: Relation) -> tuple[Way, Way] | None:
