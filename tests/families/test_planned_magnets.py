@@ -15,7 +15,7 @@ from tests.planning.roads import road, straight
 
 def test_a_long_line_becomes_several_markers_of_no_more_magnets_than_one_may_have() -> None:
     rules = PlanRules.model_validate({"version": 1, "lines": {"sides": "left"}})
-    made = place_plan(road(straight(6500.0)), rules, name="a long line")
+    made = place_plan(road(straight(6500)), rules, name="a long line")
     commitment = Commitment("plan", made.alignment, MarkerRules(), datetime(2026, 1, 1, tzinfo=UTC))
     rows = list(PlannedMagnets().rows(commitment, made.markers))
     assert len(made.markers) > MAX_MAGNETS

@@ -258,14 +258,23 @@ def _holes(
     lon_deg, lat_deg = lane.lon_lat(points)
     orientation = Orientation.UP if forward_deg is None else Orientation.FORWARD
     turned_deg = {Polarity.N: 0.0, Polarity.S: 180.0}
-    columns = np.column_stack([along_m, located_m, lon_deg, lat_deg, points]).tolist()
+    rows = np.column_stack([along_m, located_m, lon_deg, lat_deg, points]).tolist()
     return tuple(
         Hole(
-            number,
-            *values,
+            number=number,
+            along_m=along,
+            chainage_m=chainage,
+            offset_m=offset,
+            lon_deg=lon,
+            lat_deg=lat,
+            east_m=east,
+            north_m=north,
+            up_m=up,
             polarity=polarity,
             orientation=orientation,
             north_pole_bearing_deg=None if forward_deg is None else (forward_deg + turned_deg[polarity]) % 360.0,
         )
-        for number, (values, polarity) in enumerate(zip(columns, polarities, strict=True), start=1)
+        for number, ((along, chainage, offset, lon, lat, east, north, up), polarity) in enumerate(
+            zip(rows, polarities, strict=True), start=1
+        )
     )
