@@ -16,6 +16,7 @@ from app.families.planned import PLAN_METHOD, Commitment, PlannedMarkers, Planne
 from app.markers.magnet import LineStyle
 from app.planning.alignment import Floats
 from app.planning.plan import PlannedLineMagnet, PlannedMarker, PlannedTag
+from app.roads.lane_line import LaneLine
 
 _EVEN_M = 0.005  # [m] difference of neighbouring distances in one line; source: a drill's tolerance, METRO section 8.2
 _MAX_LINE_M = 19_000.0  # [m] source: below `app.roads.lane_line.MAX_LENGTH_M`
@@ -58,7 +59,8 @@ class PlannedMagnets(PlannedMarkers):
         lane_input = _lane_input(commitment, lon, lat, stretch[0].height_m)
         detail = stretch[0].detail
         assert isinstance(detail, PlannedLineMagnet)
-        spacing_m = float(_apart_m(stretch).max()) + _EVEN_M / len(stretch)
+        line = LaneLine.from_lon_lat(list(zip(lon, lat, strict=True)), stretch[0].height_m or 0.0)
+        spacing_m = float(np.diff(line.chainages_m).max()) + _EVEN_M / len(stretch)
         style = LineStyle.SOLID if detail.tag.style is LineStyle.SOLID else LineStyle.DASHED
         what = LineInput(PlacedLine(spacing_m=spacing_m), style)
         columns = magnet_columns(
