@@ -24,6 +24,7 @@ from app.families.planned import PlannedMarkers
 from app.families.rules import MarkerRules
 from app.families.snapshot import SnapshotRecord
 from app.families.surveys import SurveyImport
+from app.planning.outputs.hd_map import MapMarker
 from app.registry.database import Database
 from app.registry.lines import LineSource
 from app.registry.marker_rows import MarkerRow
@@ -169,3 +170,15 @@ class Family(ABC, Generic[New, Prepared]):
     def detail(self, row: MarkerRow) -> MarkerDocument:
         """A marker by itself."""
         return self.document(row)
+
+    def map_markers(self, row: MarkerRow) -> Sequence[MapMarker]:
+        """A marker as HD maps contain it: one point, where the family declares nothing else."""
+        return (map_point(row),)
+
+
+def map_point(row: MarkerRow, **members: Any) -> MapMarker:
+    """A marker as one thing of an HD map, with members that only its family knows."""
+    return MapMarker(
+        row.id, row.family, row.digits, row.lon_deg, row.lat_deg, row.height_m, row.heading_deg,
+        vertical_datum=row.vertical_datum, **members,
+    )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from typing import Any
 
+from app.families import get_family
 from app.formats.alignments.geometry import AlignmentFile
 from app.formats.alignments.read import read_alignment
 from app.jobs.memory_limit import memory_is_the_limit
@@ -12,6 +13,9 @@ from app.markers.magnet_codebook import Codebook
 from app.planning.alignment import Alignment
 from app.planning.build_alignment import build_alignment
 from app.planning.outputs.files import OutputOptions, write_plan_file
+from app.planning.outputs.hd_lanelet2 import write_lanelet2
+from app.planning.outputs.hd_map import map_of_road
+from app.planning.outputs.hd_opendrive import write_opendrive
 from app.planning.outputs.plan_document import read_plan, write_plan
 from app.planning.placement import place_plan
 from app.planning.placement.codes import unused_numbers
@@ -19,7 +23,14 @@ from app.planning.plan_checks import check_plan
 from app.planning.read_rules import check_rules
 from app.planning.rules import RoadRules
 from app.services.plans.summaries import plan_summary, road_summary
-from app.services.plans.tasks import MadePlan, MakePlanTask, RoadFile, SummarizeRoadTask, WritePlanFileTask
+from app.services.plans.tasks import (
+    MadePlan,
+    MakePlanTask,
+    RoadFile,
+    SummarizeRoadTask,
+    WriteMapTask,
+    WritePlanFileTask,
+)
 
 _CURE = "cut the road into sections"
 
@@ -49,6 +60,15 @@ def write_file_of_plan(task: WritePlanFileTask, _before: None) -> bytes:
     """Write a file of a plan."""
     with memory_is_the_limit("plan", _CURE):
         return write_plan_file(read_plan(zlib.decompress(task.document)), task.name, OutputOptions(task.crs, task.unit))
+
+
+def write_map(task: WriteMapTask, _before: None) -> bytes:
+    """Write a road and the markers near it as an HD map."""
+    with memory_is_the_limit("road", _CURE):
+        road = _build(read_alignment(task.road.data, task.road.file_name), task.road, RoadRules())
+        markers = [point for row in task.markers for point in get_family(row.family).map_markers(row)]
+        content = map_of_road(road, markers, within_m=task.within_m)
+        return write_lanelet2(content) if task.form == "osm" else write_opendrive(content, leave_out=True)
 
 
 def _build(file: AlignmentFile, road: RoadFile, rules: RoadRules) -> Alignment:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
+from app.geodesy import LocalizationGrade
 from app.planning.alignment import Alignment, AvoidedArea, Lane
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.road.checks import (
@@ -86,6 +87,7 @@ def build_alignment(
     flat = _has_no_heights(geometries)
     reference = find_reference(file, declaration, has_heights=not flat and not declaration.ignore_heights)
     placed = _place(file, geometries, reference, accuracy_m, flat)
+    source = _with_earlier(file, placed.road)
     check_length(placed.lines)
     warnings = list(file.warnings)
     lanes: list[Lane] = []
@@ -103,25 +105,35 @@ def build_alignment(
         )
     warnings += check_radii(lanes)
     events = find_events(file, geometries, lanes, placed.events, rules, warnings)
-    if placed.road.note is not None:
-        warnings.append(placed.road.note)
+    if source.note is not None:
+        warnings.append(source.note)
     has_heights = any(bool(np.isfinite(lane.height_m).any()) for lane in lanes)
     return Alignment(
         name,
         tuple(lanes),
         tuple(events),
         tuple(_areas(file, placed.rings)),
-        placed.road.grade,
-        placed.road.surveyed,
-        placed.road.crs,
-        placed.road.realization,
+        source.grade,
+        source.surveyed,
+        source.crs,
+        source.realization,
         declaration.epoch,
         declaration.vertical_datum if has_heights else None,
-        placed.road.transform_accuracy_m,
+        source.transform_accuracy_m,
         file.start_station_m,
         file.station_equations,
         tuple(warnings),
     )
+
+
+def _with_earlier(file: AlignmentFile, road: PlacedRoad) -> PlacedRoad:
+    """What the transformation before the file leaves of the accuracy."""
+    earlier = file.earlier
+    if earlier is None:
+        return road
+    if earlier.exact:
+        return replace(road, transform_accuracy_m=None)
+    return replace(road, grade=LocalizationGrade.APPROXIMATE, transform_accuracy_m=None, note=earlier.note or road.note)
 
 
 def _areas(file: AlignmentFile, rings: Sequence[Floats]) -> Iterator[AvoidedArea]:

@@ -10,6 +10,8 @@ import sqlalchemy as sa
 
 from app.registry.bulk_load import load_columns
 from app.registry.columns import Columns
+from app.registry.marker_rows import MARKERS, MarkerRow
+from app.registry.markers import MarkerFilter, conditions_of
 from app.registry.resources import Resource
 from app.registry.rows import columns_of, fetch_all
 from app.registry.spatial import Box, within_box
@@ -83,6 +85,16 @@ def list_existing(connection: sa.Connection, agency_id: str, box: Box, *, limit:
         markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box)
     )
     return fetch_all(connection, query.limit(limit), ExistingRow)
+
+
+def list_for_map(
+    connection: sa.Connection, agency_id: str, filtered: MarkerFilter, box: Box, *, limit: int
+) -> list[MarkerRow]:
+    """Markers of a filter in a box that are planned or on the road, in the order of their ids."""
+    query = MARKERS.where(
+        markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box), *conditions_of(filtered)
+    )
+    return fetch_all(connection, query.order_by(markers.c.id).limit(limit), MarkerRow)
 
 
 def link_markers(connection: sa.Connection, agency_id: str, plan_id: str, ids: Sequence[tuple[int, str]]) -> None:

@@ -56,6 +56,17 @@ class Box:
             Box(-180.0, self.south_deg, self.east_deg, self.north_deg),
         )
 
+    def widened(self, margin_m: float) -> Box:
+        """The box with at least this margin on each side."""
+        margin_deg = margin_m / _M_PER_DEG
+        south, north = max(self.south_deg - margin_deg, -90.0), min(self.north_deg + margin_deg, 90.0)
+        shortest = math.cos(math.radians(max(abs(south), abs(north))))
+        across_deg = margin_deg / shortest * 1.01 if shortest > margin_deg / 180.0 else 180.0
+        width_deg = self.east_deg - self.west_deg + (360.0 if self.west_deg > self.east_deg else 0.0)
+        if width_deg + 2 * across_deg >= 360.0:
+            return Box(-180.0, south, 180.0, north)
+        return Box(_wrapped(self.west_deg - across_deg), south, _wrapped(self.east_deg + across_deg), north)
+
 
 @dataclass(frozen=True, slots=True)
 class Area:

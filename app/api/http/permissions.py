@@ -71,6 +71,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/alignments": PLANNERS,
     "GET /v1/alignments/{alignment_id}": READERS,
     "GET /v1/alignments/{alignment_id}/source": READERS,
+    "GET /v1/alignments/{alignment_id}/map.{form}": READERS,
     "GET /v1/plans": READERS,
     "POST /v1/plans": PLANNERS,
     "GET /v1/plans/{plan_id}": READERS,

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from starlette.datastructures import UploadFile
 
+from app.api.http.components import reference
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
 from app.api.http.forms import FORM, form_body, idempotency_of, media_type_of, read_declaration, read_text
 from app.api.http.problems import problem_responses
@@ -22,21 +23,27 @@ from app.api.http.responses import (
     page_response,
     versioned_response,
 )
-from app.api.plans.schemas import AlignmentIn
+from app.api.markers.filters import Filtered
+from app.api.plans.schemas import AlignmentIn, RoadAlignmentIn
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
 from app.services.idempotency import IdempotencyKey
 from app.services.plans.alignments import Alignments
 from app.services.plans.documents import AlignmentDocument, AlignmentPage
+from app.services.plans.tasks import MapForm
 
 router = APIRouter(prefix="/v1/alignments", tags=["plans"])
 
 MAX_DECLARATION_BYTES = 64 * 1024
-_CURE = "send multipart/form-data with the parts file and declaration"
+MAX_WITHIN_M = 100.0
+"""Farthest markers that a map of a road may have. [m] Source: `app.planning.outputs.hd_opendrive.MAX_BESIDE_M`."""
+JSON = "application/json"
+_CURE = f"send multipart/form-data with the parts file and declaration, or {JSON} with road_id and lanes"
 _BODY = form_body(
     {"file": {**BINARY, "description": "GeoJSON, GeoPackage, zipped Shapefile, LandXML, DXF, lanelet2 or OpenDRIVE."}},
     "declaration",
     AlignmentIn,
     {"file": "road.geojson", "declaration": {"name": "L 560, km 12 to 14"}},
+    **{JSON: {"schema": reference(RoadAlignmentIn)}},
 )
 
 AlignmentId = Annotated[Identifier, Path(description="Id of the alignment.")]
@@ -47,20 +54,27 @@ Service = Annotated[Alignments, use_cases("alignments")]
 class _Upload:
     data: bytes
     file_name: str
-    declared: AlignmentIn
+    declared: AlignmentIn | RoadAlignmentIn
     idempotency: IdempotencyKey | None
 
 
 async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = None) -> _Upload:
-    """Read the file and its declaration from the form.
+    """Read the file and its declaration from the form, or the registered road and its lanes from JSON.
 
     Raises
     ------
     UnsupportedUpload, UnreadableUpload, MalformedRequest
-        The request is no form, has no file, or other parts than a file and a declaration.
+        The request is neither, has no file, or other parts than a file and a declaration.
     """
+    if media_type_of(request) == JSON:
+        text = await request.body()
+        _check_length(text)
+        road = read_declaration(RoadAlignmentIn, text, "body")
+        return _Upload(b"", "", road, idempotency_of(request, idempotency_key, text))
     if media_type_of(request) != FORM:
-        raise UnsupportedUpload("a road comes as a form", field="Content-Type", limit=FORM, cure=_CURE)
+        raise UnsupportedUpload(
+            "a road comes as a form, or is named in JSON", field="Content-Type", limit=f"{FORM}, {JSON}", cure=_CURE
+        )
     async with request.form(max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
         names = [name for name, _value in form.multi_items()]
         if set(names) - {"file", "declaration"} or len(set(names)) != len(names):
@@ -75,21 +89,30 @@ async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = N
             raise UnreadableUpload("there is no file in the form", field="file", limit="a part file", cure=_CURE)
         data, file_name = await file.read(), (file.filename or "")[:200]
         text = await read_text(form, "declaration")
-    if len(text) > MAX_DECLARATION_BYTES:
-        raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
+    _check_length(text)
     declared = read_declaration(AlignmentIn, text, "body", "declaration")
     return _Upload(data, file_name, declared, idempotency_of(request, idempotency_key, text, data))
+
+
+def _check_length(declaration: bytes) -> None:
+    if len(declaration) > MAX_DECLARATION_BYTES:
+        raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
 
 
 @router.post(
     "",
     status_code=201,
     openapi_extra=_BODY,
-    responses=document_response(AlignmentDocument, 409, 415, status=201, description="Stored"),
+    responses=document_response(AlignmentDocument, 404, 409, 415, status=201, description="Stored"),
 )
 def post_alignment(upload: Annotated[_Upload, Depends(get_upload)], caller: Caller, alignments: Service) -> Response:
-    """Store a road: its lanes with width, direction, curvature, grade and design speed."""
+    """Store a road of a file or of the registry: its lanes with width, direction, curvature, grade and design speed."""
     declared = upload.declared
+    if isinstance(declared, RoadAlignmentIn):
+        document, replayed = alignments.add_of_road(
+            caller, declared.name, declared.road_id, declared.lanes, upload.idempotency
+        )
+        return created_response(document, replayed, path="/v1/alignments")
     document, replayed = alignments.add(
         caller, declared.name, upload.data, upload.file_name, declared.declaration(), upload.idempotency
     )
@@ -121,3 +144,22 @@ def get_source(alignment_id: AlignmentId, caller: Caller, alignments: Service) -
     """The file as it came."""
     data, _name = alignments.source(caller, alignment_id)
     return Response(data, media_type="application/octet-stream")
+
+
+@router.get(
+    "/{alignment_id}/map.{form}",
+    responses={**file_response(["application/xml"], "The map"), **problem_responses(404)},
+)
+def get_map(
+    alignment_id: AlignmentId,
+    form: Annotated[MapForm, Path(description="`osm` for lanelet2, `xodr` for OpenDRIVE 1.7.")],
+    caller: Caller,
+    alignments: Service,
+    filtered: Filtered,
+    within_m: Annotated[
+        float, Query(gt=0, le=MAX_WITHIN_M, allow_inf_nan=False, description="From the nearest lane's centre line.")
+    ] = 20.0,
+) -> Response:
+    """The lanes with the agency's markers near them, planned or on the road, as an HD map."""
+    data = alignments.write_map(caller, alignment_id, form, filtered, within_m)
+    return Response(data, media_type="application/xml")

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.families.inputs import Identifier, Number, Text
+from app.formats.alignments.registered_road import RoadLanes
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.services.plans.plans import PlanChange
 
@@ -40,6 +41,29 @@ class AlignmentIn(_Body):
         """The declaration of the file."""
         values = self.model_dump(exclude={"name"})
         return AlignmentDeclaration(**values)
+
+
+class RoadAlignmentIn(_Body):
+    """Lanes along a registered road; they stay as they are when the road is changed."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "L 560, two lanes",
+                    "road_id": "019cb624-0000-7000-8000-0000000000aa",
+                    "lanes": {
+                        "forward": 1, "backward": 1, "width_m": 3.5, "speed_limit_kmh": 70, "centre_style": "dashed",
+                    },
+                }
+            ]
+        },
+    )  # fmt: skip
+
+    name: Name
+    road_id: Identifier
+    lanes: RoadLanes
 
 
 class PlanIn(_Body):

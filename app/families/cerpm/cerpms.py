@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -16,9 +16,10 @@ from app.families.cerpm.planned import PlannedCerpms
 from app.families.cerpm.registration import NewCerpm
 from app.families.cerpm.snapshot import CerpmSnapshot
 from app.families.cerpm.survey import CerpmSurvey
-from app.families.family import Family, Registration
+from app.families.family import Family, Registration, map_point
 from app.families.positions import place_input, position_columns
 from app.geodesy import PlacedPosition
+from app.planning.outputs.hd_map import MapMarker
 from app.registry import cerpms
 from app.registry.cerpm_runs import CerpmRuns
 from app.registry.marker_rows import MarkerRow
@@ -107,6 +108,11 @@ class Cerpms(Family[NewCerpm, PlacedPosition]):
     def document(self, row: MarkerRow) -> CerpmDocument:
         """A CERPM."""
         return cerpm_document(row)
+
+    def map_markers(self, row: MarkerRow) -> Sequence[MapMarker]:
+        """A point, with the side of the lane that it is on."""
+        side = row.spec["side"]
+        return (map_point(row, kind="" if side == "unknown" else side),)
 
 
 CERPM = Cerpms()

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import sqlalchemy as sa
 
 from app.errors import CodeTaken, InvalidParameter
-from app.families.family import Family, Registration
+from app.families.family import Family, Registration, map_point
 from app.families.fiducial.artwork import FiducialArtwork
 from app.families.fiducial.documents import FiducialDocument, fiducial_document
 from app.families.fiducial.frames import FiducialFrames
 from app.families.fiducial.inputs import FIDUCIAL_EXAMPLES, FiducialIn
 from app.families.fiducial.registration import NewFiducial
+from app.families.fiducial.rows import fiducial_geometry
 from app.families.fiducial.snapshot import FiducialSnapshot
 from app.families.fiducial.survey import FiducialSurvey
 from app.families.positions import place_input, position_columns
 from app.families.rules import is_placed_anew
 from app.geodesy import PlacedPosition
+from app.markers.fiducial import Mounting
+from app.planning.outputs.hd_map import MapMarker
 from app.registry import markers as store
 from app.registry.marker_rows import MarkerRow
 
@@ -94,6 +97,12 @@ class Fiducials(Family[NewFiducial, PlacedPosition]):
     def document(self, row: MarkerRow) -> FiducialDocument:
         """A sign."""
         return fiducial_document(row)
+
+    def map_markers(self, row: MarkerRow) -> Sequence[MapMarker]:
+        """The square of its border, upright or on the road."""
+        geometry = fiducial_geometry(row)
+        upright = geometry.mounting is Mounting.UPRIGHT
+        return (map_point(row, kind=row.scheme, side_m=geometry.side_mm / 1000, upright=upright),)
 
 
 FIDUCIAL = Fiducials()

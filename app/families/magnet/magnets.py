@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import sqlalchemy as sa
@@ -19,6 +19,7 @@ from app.families.magnet.layouts import (
     resurveyed,
     sheet_of,
 )
+from app.families.magnet.map_markers import magnets_of_map
 from app.families.magnet.neighbours import find_neighbours
 from app.families.magnet.planned import PlannedMagnets
 from app.families.magnet.registration import LineInput, NewMagnets, TagInput
@@ -27,6 +28,7 @@ from app.families.magnet.spec import MagnetSpec
 from app.families.rules import is_placed_anew
 from app.markers.magnet import InformationTag, LineTag, Tag, parse_tag
 from app.markers.magnet_codebook import Meaning
+from app.planning.outputs.hd_map import MapMarker
 from app.registry.codebooks import CODEBOOKS, book_of
 from app.registry.magnet_lines import MagnetLines
 from app.registry.magnets import replace_magnets
@@ -131,6 +133,10 @@ class Magnets(Family[NewMagnets, dict[str, Any]]):
     def detail(self, row: MarkerRow) -> MagnetDetailDocument:
         """A magnet marker with its lane, its magnets, its checks and its costs."""
         return magnet_detail(row, sheet_of(row.id, row.spec))
+
+    def map_markers(self, row: MarkerRow) -> Sequence[MapMarker]:
+        """Each magnet."""
+        return magnets_of_map(row)
 
 
 MAGNET = Magnets()

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import sqlalchemy as sa
 
 from app.errors import CodeMismatch, CodeTaken, InvalidParameter, naming
-from app.families.family import Family, Registration
+from app.families.family import Family, Registration, map_point
 from app.families.plate.artwork import PlateArtwork
 from app.families.plate.documents import PlateDocument, plate_document
 from app.families.plate.frames import PlateFrames
 from app.families.plate.inputs import PLATE_EXAMPLES, PlateIn
 from app.families.plate.planned import PlannedPlates
 from app.families.plate.registration import CodeInput, NewPlate
-from app.families.plate.rows import plate_code
+from app.families.plate.rows import plate_code, plate_geometry
 from app.families.plate.snapshot import PlateSnapshot
 from app.families.plate.survey import PlateSurvey
 from app.families.positions import place_input, position_columns
 from app.families.rules import PLANNED, is_placed_anew
 from app.geodesy import PlacedPosition
 from app.markers.plate import PlateCode, PlateScheme, plate_capacity
+from app.planning.outputs.hd_map import MapMarker
 from app.registry import markers as store
 from app.registry.marker_rows import MarkerRow
 
@@ -98,6 +99,10 @@ class Plates(Family[NewPlate, PlacedPosition]):
     def document(self, row: MarkerRow) -> PlateDocument:
         """A plate."""
         return plate_document(row)
+
+    def map_markers(self, row: MarkerRow) -> Sequence[MapMarker]:
+        """A square that lies on the road."""
+        return (map_point(row, kind=row.scheme, side_m=plate_geometry(row).side_mm / 1000),)
 
     def revise(
         self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: dict[str, Any]

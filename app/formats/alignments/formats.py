@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from app.formats.alignments.geojson import read_geojson
 from app.formats.alignments.geometry import AlignmentFile
+from app.formats.alignments.registered_road import ROAD_FORMAT, read_registered_road
 from app.formats.format import Confidence, Format, Sample, Use, detect_signature
 
 AlignmentReader = Callable[[bytes], AlignmentFile]
@@ -21,6 +22,12 @@ def _head(sample: Sample) -> bytes:
 
 def _detect_geojson(sample: Sample) -> Confidence:
     return Confidence.CERTAIN if _head(sample).startswith(b"{") else Confidence.NONE
+
+
+def _detect_registered_road(sample: Sample) -> Confidence:
+    """By the first member, before GeoJSON."""
+    start = f'{{"format":"{ROAD_FORMAT}"'.encode()
+    return Confidence.CERTAIN if _head(sample).startswith(start) else Confidence.NONE
 
 
 def _detect_dxf(sample: Sample) -> Confidence:
@@ -76,6 +83,7 @@ def _read_dxf(data: bytes) -> AlignmentFile:
 
 
 ALIGNMENT_FORMATS: tuple[Format[AlignmentReader], ...] = (
+    Format("road", Use.ALIGNMENT, "registered road", _detect_registered_road, read_registered_road),
     Format("geojson", Use.ALIGNMENT, "GeoJSON", _detect_geojson, read_geojson),
     Format("gpkg", Use.ALIGNMENT, "GeoPackage", detect_signature(b"SQLite format 3\x00"), _read_gpkg),
     Format("shapefile", Use.ALIGNMENT, "zipped Shapefile", detect_signature(b"PK\x03\x04"), _read_shapefile),

@@ -140,6 +140,22 @@ class StationEquation:
 
 
 @dataclass(frozen=True, slots=True)
+class EarlierTransformation:
+    """Coordinates that were transformed into the file's CRS before.
+
+    Attributes
+    ----------
+    exact : bool
+        Whether a transformation with a stated accuracy did it; otherwise positions are approximate.
+    note : str or None
+        How, for people.
+    """
+
+    exact: bool
+    note: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class AlignmentFile:
     """Content of a file with a road.
 
@@ -160,6 +176,8 @@ class AlignmentFile:
         Displayed station of the start of the reference line. [m]
     warnings : tuple of str
         What was left out or repaired, in sentences for people.
+    earlier : EarlierTransformation or None
+        Of all coordinates, before they came into the file.
     """
 
     format: str
@@ -172,3 +190,4 @@ class AlignmentFile:
     station_equations: tuple[StationEquation, ...] = ()
     start_station_m: float = 0.0
     warnings: tuple[str, ...] = ()
+    earlier: EarlierTransformation | None = None

@@ -6,9 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 
-from app.errors import NotFound
+from app.errors import InvalidParameter, NotFound
 from app.planning.outputs.bill import plan_bill, write_bill_csv
 from app.planning.outputs.cerpm_programs import plan_programs, write_plan_programs_csv, write_plan_programs_json
+from app.planning.outputs.hd_lanelet2 import write_lanelet2
+from app.planning.outputs.hd_map import map_of_plan
+from app.planning.outputs.hd_opendrive import OpenDriveMap
 from app.planning.outputs.plan_document import write_plan
 from app.planning.outputs.plan_geojson import write_plan_geojson
 from app.planning.outputs.report import write_report
@@ -75,6 +78,8 @@ def write_plan_file(plan: Plan, name: str, options: OutputOptions | None = None)
 def plan_files(plan: Plan, options: OutputOptions | None = None) -> Iterator[OutputFile]:
     """Files of a plan in the order in which they are written; without markers, those that need none.
 
+    A map in OpenDRIVE is left out where a marker lies beside no lane; the report then has the reason.
+
     Raises
     ------
     InvalidParameter, ReferenceSystemError
@@ -85,7 +90,8 @@ def plan_files(plan: Plan, options: OutputOptions | None = None) -> Iterator[Out
     drawings = Drawings(plan, options.drawings) if plan.markers else None
     yield OutputFile("plan.json", lambda: write_plan(plan))
     yield OutputFile("plan.geojson", lambda: write_plan_geojson(plan))
-    yield OutputFile("report.md", lambda: write_report(plan))
+    opendrive = cache(lambda: _opendrive(plan))
+    yield OutputFile("report.md", lambda: write_report(plan, _left_out(opendrive())))
     yield OutputFile("bill.csv", lambda: write_bill_csv(plan_bill(plan)))
     yield OutputFile("schedule.csv", lambda: write_schedule_csv(plan))
     if drawings is not None:
@@ -98,3 +104,20 @@ def plan_files(plan: Plan, options: OutputOptions | None = None) -> Iterator[Out
         programs = cache(lambda: plan_programs(plan))  # two files need them, and the radio's settings take seconds
         yield OutputFile("cerpm-programs.csv", lambda: write_plan_programs_csv(programs()))
         yield OutputFile("cerpm-programs.json", lambda: write_plan_programs_json(plan, programs()))
+    yield OutputFile("map.osm", lambda: write_lanelet2(map_of_plan(plan)))
+    road_map = opendrive()
+    if isinstance(road_map, OpenDriveMap):
+        yield OutputFile("map.xodr", road_map.write)
+
+
+def _opendrive(plan: Plan) -> OpenDriveMap | InvalidParameter:
+    """The map in OpenDRIVE, or why there is none."""
+    try:
+        return OpenDriveMap(map_of_plan(plan))
+    except InvalidParameter as error:
+        return error
+
+
+def _left_out(road_map: OpenDriveMap | InvalidParameter) -> dict[str, str]:
+    """Files that a plan does not have, with the reason."""
+    return {"map.xodr": road_map.message} if isinstance(road_map, InvalidParameter) else {}

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.cerpm import LaneSide
-from app.planning.alignment import Floats, Lane, RoadEvent
+from app.planning.alignment import Alignment, Floats, Lane, RoadEvent
 from app.planning.plan import Plan, PlannedCerpm, PlannedMarker, PlannedPlate, PlannedTag
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # source: XML 1.0, section 2.2
@@ -46,6 +47,8 @@ class MapMarker:
         Whether a square face stands and faces the traffic; it lies with its upper edge forward otherwise.
     grade, crossfall : float
         Rise of the road in the direction of the heading, and to its left. [-]
+    vertical_datum : str or None
+        Of the height; None where it is that of the map, or where there is no height.
     """
 
     id: str
@@ -60,6 +63,7 @@ class MapMarker:
     upright: bool = False
     grade: float = 0.0
     crossfall: float = 0.0
+    vertical_datum: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +136,58 @@ def _map_markers(marker: PlannedMarker, grade: float, crossfall: float) -> list[
     else:
         kind, side_m = "line", None
     return [MapMarker(name, marker.family, marker.code, *at, kind, side_m, grade=grade, crossfall=crossfall)]
+
+
+def map_of_road(road: Alignment, markers: Sequence[MapMarker], *, within_m: float) -> HdMap:
+    """The lanes of a road, and the markers near them.
+
+    Parameters
+    ----------
+    road : Alignment
+    markers : sequence of MapMarker
+        Grade and crossfall are those of the road.
+    within_m : float
+        Greatest distance of a marker from the centre line of the nearest lane. [m]
+
+    Notes
+    -----
+    A height in another datum than that of the road's heights is left out: it would lie above or below the road.
+    """
+    near: list[MapMarker] = []
+    if markers:
+        lane, sample, distance_m = _nearest_samples(road.lanes, markers)
+        for k in np.flatnonzero(distance_m <= within_m).tolist():
+            near.append(_on_road(road, markers[k], road.lanes[lane[k]], int(sample[k])))
+    return HdMap(road.name, road.lanes, tuple(near), road.events, vertical_datum=road.vertical_datum)
+
+
+def _nearest_samples(
+    lanes: Sequence[Lane], markers: Sequence[MapMarker]
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Floats]:
+    """Number of the nearest lane and of its nearest sample, and the distance from its centre line, shape (M,)."""
+    number = np.repeat(np.arange(len(lanes)), [len(lane.chainage_m) for lane in lanes])
+    samples = np.concatenate([np.arange(len(lane.chainage_m)) for lane in lanes])
+    lon, lat = (np.concatenate([getattr(lane, name) for lane in lanes]) for name in ("lon_deg", "lat_deg"))
+    places = np.array([(marker.lon_deg, marker.lat_deg) for marker in markers])
+    away, found = cKDTree(ecef_from_wgs84(lon, lat)).query(ecef_from_wgs84(places[:, 0], places[:, 1]))
+    half_step = np.array([lane.step_m / 2 for lane in lanes])[number[found]]
+    # the centre line passes nearer than its samples, by half a step along it at most
+    distance = np.sqrt(np.maximum(np.asarray(away) ** 2 - half_step**2, 0.0))
+    return number[found], samples[found], distance
+
+
+def _on_road(road: Alignment, marker: MapMarker, lane: Lane, sample: int) -> MapMarker:
+    """A marker with the slopes of the road in its own direction, and its height in the road's datum."""
+    grade, crossfall = float(lane.grade[sample]), math.tan(float(lane.superelevation_rad[sample]))
+    turn = 0.0 if marker.heading_deg is None else math.radians(marker.heading_deg - float(lane.heading_deg[sample]))
+    along, left = math.cos(turn), -math.sin(turn)
+    same_datum = road.vertical_datum is not None and marker.vertical_datum == road.vertical_datum
+    return replace(
+        marker,
+        height_m=marker.height_m if same_datum else None,
+        grade=grade * along + crossfall * left,
+        crossfall=crossfall * along - grade * left,
+    )
 
 
 # --- geometry of lanes ----------------------------------------------------------------------------------------------

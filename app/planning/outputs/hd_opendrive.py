@@ -28,18 +28,20 @@ _MARKS = {
 }
 
 
-def write_opendrive(content: HdMap) -> bytes:
-    """An OpenDRIVE map.
+def write_opendrive(content: HdMap, *, leave_out: bool = False) -> bytes:
+    """An OpenDRIVE map; see `OpenDriveMap`."""
+    return OpenDriveMap(content, leave_out=leave_out).write()
+
+
+class OpenDriveMap:
+    """An OpenDRIVE map whose markers have their places on roads.
 
     Parameters
     ----------
     content : HdMap
         With at least one lane.
-
-    Returns
-    -------
-    bytes
-        An ``.xodr`` file, valid by ASAM's schema of version 1.7.
+    leave_out : bool
+        Leave out markers that lie beside no lane, and name them in the file, instead of refusing them.
 
     Raises
     ------
@@ -56,31 +58,50 @@ def write_opendrive(content: HdMap) -> bytes:
       CARLA keeps only signals. Family, code and id are the user data of the object; the signal has the code as text and
       the id as name. Its country ``OpenDRIVE`` says that types are of no country's catalogue.
     - zOffset is the height above the reference line (XSD of 1.7), 0 where the height is unknown.
+    - The header names the markers that are left out as user data ``left_out``, separated by spaces.
     """
-    if not content.lanes:
-        raise InvalidParameter(
-            "an OpenDRIVE map without lanes",
-            field="lanes",
-            limit="at least one, because objects and signals belong to roads",
-            cure="choose a road, or write a lanelet2 map",
-        )
-    projection, text = _projection(content.lanes)
-    lines = [ReferenceLine(lane, *projection(lane.lon_deg, lane.lat_deg)) for lane in content.lanes]
-    placed = _place(content.markers, lines, projection)
-    links = _links(lines)
-    xy = np.concatenate([line.xy for line in lines])
-    (west, south), (east, north) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
-    datum = f'<userData code="vertical_datum" value={attribute(content.vertical_datum or "unknown")}/>'
-    parts = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        "<OpenDRIVE>",
-        f'<header revMajor="1" revMinor="7" name={attribute(content.name)} version="1.00" vendor="Waymark"'
-        f' north="{number(north)}" south="{number(south)}" east="{number(east)}" west="{number(west)}">'
-        f"<geoReference><![CDATA[{text}]]></geoReference>{datum}</header>",
-    ]
-    for k, line in enumerate(lines):
-        parts += _road(k, line, links, placed.get(k, []), "town" if content.urban else "rural")
-    return "\n".join([*parts, "</OpenDRIVE>\n"]).encode()
+
+    def __init__(self, content: HdMap, *, leave_out: bool = False) -> None:
+        if not content.lanes:
+            raise InvalidParameter(
+                "an OpenDRIVE map without lanes",
+                field="lanes",
+                limit="at least one, because objects and signals belong to roads",
+                cure="choose a road, or write a lanelet2 map",
+            )
+        self._content = content
+        projection, self._georeference = _projection(content.lanes)
+        self._lines = [ReferenceLine(lane, *projection(lane.lon_deg, lane.lat_deg)) for lane in content.lanes]
+        self._placed, missing = _place(content.markers, self._lines, projection)
+        self._left_out = [content.markers[k].id for k in missing]
+        if missing and not leave_out:
+            marker = content.markers[missing[0]]
+            raise InvalidParameter(
+                f"marker {marker.id} at {marker.lon_deg:.6f}, {marker.lat_deg:.6f} lies beside no lane of the map",
+                field="markers",
+                limit=f"within {MAX_BESIDE_M:g} m, square to a lane between its ends",
+                cure="leave the marker out, or add its road",
+            )
+
+    def write(self) -> bytes:
+        """An ``.xodr`` file, valid by ASAM's schema of version 1.7."""
+        content, lines = self._content, self._lines
+        links = _links(lines)
+        xy = np.concatenate([line.xy for line in lines])
+        (west, south), (east, north) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
+        more = f'<userData code="vertical_datum" value={attribute(content.vertical_datum or "unknown")}/>'
+        if self._left_out:
+            more += f'<userData code="left_out" value={attribute(" ".join(self._left_out))}/>'
+        parts = [
+            '<?xml version="1.0" encoding="UTF-8"?>',
+            "<OpenDRIVE>",
+            f'<header revMajor="1" revMinor="7" name={attribute(content.name)} version="1.00" vendor="Waymark"'
+            f' north="{number(north)}" south="{number(south)}" east="{number(east)}" west="{number(west)}">'
+            f"<geoReference><![CDATA[{self._georeference}]]></geoReference>{more}</header>",
+        ]
+        for k, line in enumerate(lines):
+            parts += _road(k, line, links, self._placed.get(k, []), "town" if content.urban else "rural")
+        return "\n".join([*parts, "</OpenDRIVE>\n"]).encode()
 
 
 def _projection(lanes: Sequence[Lane]) -> tuple[Proj, str]:
@@ -125,39 +146,67 @@ class _Placed(NamedTuple):
     heading_rad: float
 
 
-def _place(markers: Sequence[MapMarker], lines: Sequence[ReferenceLine], projection: Proj) -> dict[int, list[_Placed]]:
-    """Markers by the number of the nearest road, by s."""
+class _Place(NamedTuple):
+    """Where a marker lies along and beside road `k`, and how high the road is there."""
+
+    k: int
+    s: float
+    t: float
+    heading_rad: float
+    ground_m: float
+
+
+class _Feet(NamedTuple):
+    """Where markers lie along and beside one road, and how high it is there; arrays of shape (K,)."""
+
+    s: Floats
+    t: Floats
+    heading_rad: Floats
+    ground_m: Floats
+    is_beside: npt.NDArray[np.bool_]
+
+
+def _place(
+    markers: Sequence[MapMarker], lines: Sequence[ReferenceLine], projection: Proj
+) -> tuple[dict[int, list[_Placed]], list[int]]:
+    """Markers by the number of the nearest road beside which they lie, by s; and those that lie beside none."""
     if not markers:
-        return {}
+        return {}, []
     lon, lat = np.array([(marker.lon_deg, marker.lat_deg) for marker in markers]).T
     xy = np.column_stack(projection(lon, lat))
     convergence = np.asarray(projection.get_factors(lon, lat).meridian_convergence)
     road, sample = _nearest(markers, lines, xy)
-    placed: dict[int, list[_Placed]] = {}
+    places: dict[int, _Place] = {}
     for k in np.unique(road).tolist():
         own = np.flatnonzero(road == k)
-        line = lines[k]
-        foot = line.project(xy[own], line.lane.chainage_m[sample[own]])
-        wrong = np.flatnonzero((foot.residual_m > _MISPLACED_M) | (np.abs(foot.t) > MAX_BESIDE_M))
-        if len(wrong):
-            marker = markers[own[wrong[0]]]
-            raise InvalidParameter(
-                f"marker {marker.id} at {marker.lon_deg:.6f}, {marker.lat_deg:.6f} lies beside no lane of the map",
-                field="markers",
-                limit=f"within {MAX_BESIDE_M:g} m, square to a lane between its ends",
-                cure="leave the marker out, or add its road",
-            )
-        ground = line.elevation.at(foot.s) if line.elevation else np.zeros(len(own))
-        rows = zip(own.tolist(), foot.s.tolist(), foot.t.tolist(), foot.heading_rad.tolist(), ground, strict=True)
-        placed[k] = [
-            _Placed(
-                i + 1, markers[i], s, t, 0.0 if (height := markers[i].height_m) is None else height - float(level),
-                _turn(markers[i].heading_deg, float(convergence[i]), direction),
-            )
-            for i, s, t, direction, level in rows
-        ]  # fmt: skip
-        placed[k].sort(key=lambda item: item.s)
-    return placed
+        _add_places(places, k, own, _feet(lines[k], xy[own], sample[own]))
+    rest = np.array([i for i in range(len(markers)) if i not in places], dtype=np.intp)
+    if len(rest):  # beyond the end of the nearest road they may lie beside another one
+        for k, line in enumerate(lines):
+            _add_places(places, k, rest, _feet(line, xy[rest], np.asarray(cKDTree(line.xy).query(xy[rest])[1])))
+    placed: dict[int, list[_Placed]] = {}
+    for i, (k, s, t, direction, ground_m) in sorted(places.items(), key=lambda item: item[1][:2]):
+        marker = markers[i]
+        z_offset = 0.0 if marker.height_m is None else marker.height_m - ground_m
+        turn = _turn(marker.heading_deg, float(convergence[i]), direction)
+        placed.setdefault(k, []).append(_Placed(i + 1, marker, s, t, z_offset, turn))
+    return placed, [i for i in range(len(markers)) if i not in places]
+
+
+def _feet(line: ReferenceLine, xy: Floats, sample: npt.NDArray[np.intp]) -> _Feet:
+    foot = line.project(xy, line.lane.chainage_m[sample])
+    is_beside = (foot.residual_m <= _MISPLACED_M) & (np.abs(foot.t) <= MAX_BESIDE_M)
+    ground_m = line.elevation.at(foot.s) if line.elevation else np.zeros(len(xy))
+    return _Feet(foot.s, foot.t, foot.heading_rad, ground_m, is_beside)
+
+
+def _add_places(places: dict[int, _Place], k: int, own: npt.NDArray[np.intp], feet: _Feet) -> None:
+    """Keep the place of each marker beside road `k`, unless it lies nearer to another road."""
+    columns = (feet.s, feet.t, feet.heading_rad, feet.ground_m)
+    rows = zip(own.tolist(), feet.is_beside.tolist(), *(column.tolist() for column in columns), strict=True)
+    for i, is_beside, s, t, direction, ground_m in rows:
+        if is_beside and (i not in places or abs(t) < abs(places[i].t)):
+            places[i] = _Place(k, s, t, direction, ground_m)
 
 
 def _nearest(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 
 from app.markers.checks import Verdict
 from app.planning.alignment import format_station
@@ -50,8 +51,15 @@ def finding_figures(finding: PlanFinding) -> tuple[str, str]:
     return f"{figure:.5g}{unit}", f"{finding.relation} {finding.limit:.5g}{unit}"
 
 
-def write_report(plan: Plan) -> bytes:
-    """The report as Markdown in UTF-8."""
+def write_report(plan: Plan, missing_files: Mapping[str, str] | None = None) -> bytes:
+    """The report as Markdown in UTF-8.
+
+    Parameters
+    ----------
+    plan : Plan
+    missing_files : mapping of str to str, optional
+        Files that cannot be written of this plan, with the reason.
+    """
     road = plan.alignment
     lines = [f"# Plan {_cell(plan.name)}", ""]
     if not road.surveyed:
@@ -86,6 +94,9 @@ def write_report(plan: Plan) -> bytes:
         lines.append(f"- and {len(plan.left_out) - _MAX_LEFT_OUT} more, in plan.json")
     if not plan.left_out:
         lines.append("Nothing.")
+    if missing_files:
+        lines += ["", "## Files that are left out", ""]
+        lines += [f"- {name}: {_cell(reason)}" for name, reason in missing_files.items()]
     return ("\n".join(lines) + "\n").encode()
 
 

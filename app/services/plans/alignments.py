@@ -3,26 +3,40 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import timedelta
 from typing import Any
 
+from app.errors import InvalidParameter
+from app.formats.alignments.registered_road import (
+    RegisteredRoad,
+    RoadLanes,
+    RoadStation,
+    write_registered_road,
+)
+from app.geodesy import LocalizationGrade
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.registry.database import Database
-from app.registry.plans import ALIGNMENTS, AlignmentRow
+from app.registry.markers import MarkerFilter
+from app.registry.plans import ALIGNMENTS, AlignmentRow, list_for_map
 from app.registry.resources import first_version
+from app.registry.roads import ROADS, RoadRow
+from app.registry.spatial import Box
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
 from app.services.decoder_processes import DecoderProcesses
 from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
 from app.services.plans.documents import AlignmentDocument, AlignmentPage
-from app.services.plans.tasks import RoadFile, SummarizeRoadTask
+from app.services.plans.tasks import MapForm, RoadFile, SummarizeRoadTask, WriteMapTask
 from app.services.ports import Blobs, Clock
 from app.services.staged_blobs import staged
 
 BUSY_WAIT_S = 10.0
 """How long a request waits for a decoder process. [s] Source: chosen by hand, as imports."""
+MAX_MAP_MARKERS = 50_000
+"""Markers around a road that a map is chosen from. Source: chosen by hand, bounds the memory."""
+_DECLARED = frozenset(field.name for field in fields(AlignmentDeclaration))
 
 
 class Alignments:
@@ -61,16 +75,44 @@ class Alignments:
         Conflict
             The agency has an alignment of this name.
         """
-        now, agency_id = self._clock(), caller.agency_id
-        if earlier := find_earlier(self._database, agency_id, key, now):
+        if earlier := find_earlier(self._database, caller.agency_id, key, self._clock()):
+            return earlier, True
+        road = RoadFile(data, file_name, declaration, name, self._accuracy_m)
+        return self._add(caller, road, {**asdict(declaration), "file_name": file_name}, key)
+
+    def add_of_road(
+        self, caller: Caller, name: str, road_id: str, lanes: RoadLanes, key: IdempotencyKey | None = None
+    ) -> tuple[AlignmentDocument, bool]:
+        """Store lanes along a registered road, as it is now; returns as `add`.
+
+        Raises
+        ------
+        NotFound
+            There is no such road.
+        InvalidParameter
+            No lanes are declared, or they cannot be along this axis.
+        Conflict
+            The agency has an alignment of this name.
+        """
+        if earlier := find_earlier(self._database, caller.agency_id, key, self._clock()):
             return earlier, True
         with self._database.read() as connection:
+            row = ROADS.get(connection, caller.agency_id, road_id)
+        data = write_registered_road(_registered_road(row, lanes))
+        declaration = AlignmentDeclaration(realization=row.given["realization"], epoch=row.given["epoch"])
+        source = {"road_id": road_id, "road_version": row.version, "lanes": lanes.model_dump(mode="json")}
+        road = RoadFile(data, "road.json", declaration, name, self._accuracy_m)
+        return self._add(caller, road, {**asdict(declaration), "file_name": road.file_name, **source}, key)
+
+    def _add(
+        self, caller: Caller, road: RoadFile, declared: dict[str, Any], key: IdempotencyKey | None
+    ) -> tuple[AlignmentDocument, bool]:
+        now, agency_id, name = self._clock(), caller.agency_id, road.name
+        with self._database.read() as connection:
             ALIGNMENTS.check_name(connection, agency_id, name)
-        road = RoadFile(data, file_name, declaration, name, self._accuracy_m)
         summary = self._processes.submit(SummarizeRoadTask(road), wait_s=BUSY_WAIT_S).result()
-        declared = {**asdict(declaration), "file_name": file_name}
         with staged(self._blobs) as stage:
-            source_key = stage.put("alignments", data, durable=True)
+            source_key = stage.put("alignments", road.data, durable=True)
             with (
                 self._database.write() as connection,
                 idempotent(connection, agency_id, key, now, self._ttl) as answer,
@@ -82,7 +124,7 @@ class Alignments:
                     **first_version(now),
                     "name": name,
                     "source_key": source_key,
-                    "source_sha256": hashlib.sha256(data).hexdigest(),
+                    "source_sha256": hashlib.sha256(road.data).hexdigest(),
                     "declaration": {member: value for member, value in declared.items() if value is not None},
                     "summary": summary,
                 }
@@ -90,6 +132,36 @@ class Alignments:
                 log_change(connection, caller, "alignment.added", now=now, subject=document["id"], document=document)
             stage.keep()
         return document, False
+
+    def write_map(
+        self, caller: Caller, alignment_id: str, form: MapForm, filtered: MarkerFilter, within_m: float
+    ) -> bytes:
+        """The lanes of an alignment with the agency's markers near them as an HD map; retired markers are left out.
+
+        Raises
+        ------
+        NotFound
+            There is no such alignment.
+        InvalidParameter
+            The filter asks for retired markers, or there are too many around the road.
+        """
+        if filtered.status == "retired":
+            raise InvalidParameter(
+                "maps have no retired markers", field="status", limit="any other status", cure="leave status out"
+            )
+        with self._database.read() as connection:
+            row = ALIGNMENTS.get(connection, caller.agency_id, alignment_id)
+            box = Box(*row.summary["extent_deg"]).widened(within_m)
+            found = list_for_map(connection, caller.agency_id, filtered, box, limit=MAX_MAP_MARKERS + 1)
+        if len(found) > MAX_MAP_MARKERS:
+            raise InvalidParameter(
+                f"more than {MAX_MAP_MARKERS} markers lie around the road",
+                field="bbox",
+                limit=f"{MAX_MAP_MARKERS} markers",
+                cure="send a bbox, a family or another filter, or cut the road into sections",
+            )
+        road = road_of(row, self._blobs.get(row.source_key), self._accuracy_m)
+        return self._processes.submit(WriteMapTask(road, form, tuple(found), within_m), wait_s=BUSY_WAIT_S).result()
 
     def get(self, caller: Caller, alignment_id: str) -> AlignmentDocument:
         """One alignment."""
@@ -111,7 +183,7 @@ class Alignments:
 
 def road_of(row: AlignmentRow, data: bytes, accuracy_m: float) -> RoadFile:
     """The road of a stored alignment."""
-    declared = {name: value for name, value in row.declaration.items() if name != "file_name"}
+    declared = {name: value for name, value in row.declaration.items() if name in _DECLARED}
     if declared.get("origin") is not None:
         declared["origin"] = tuple(declared["origin"])
     return RoadFile(data, row.declaration.get("file_name", ""), AlignmentDeclaration(**declared), row.name, accuracy_m)
@@ -122,4 +194,18 @@ def alignment_document(row: AlignmentRow) -> AlignmentDocument:
     own = ("id", "name", "declaration", "source_sha256", "version", "created_at", "updated_at")
     return document_of(
         AlignmentDocument, row, **{name: value for name, value in row.summary.items() if name not in own}
+    )
+
+
+def _registered_road(row: RoadRow, lanes: RoadLanes) -> RegisteredRoad:
+    """A road of the registry as the source of an alignment."""
+    return RegisteredRoad(
+        road_id=row.id,
+        version=row.version,
+        name=row.name,
+        exact=row.localization_grade == LocalizationGrade.EXACT,
+        note=row.transform_note,
+        lanes=lanes,
+        calibration=[RoadStation(**point) for point in row.calibration],
+        parts=[[(point[0], point[1]) for point in part] for part in row.parts],
     )

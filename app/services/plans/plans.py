@@ -46,7 +46,7 @@ from app.services.staged_blobs import staged
 DRAFT, CHECKED, PROVED, APPROVED, COMMITTED = "draft", "checked", "proved", "approved", "committed"
 MAX_EXISTING = 200_000
 """Markers of the registry near a road that a plan is checked against. Source: chosen by hand, bounds the memory."""
-_MARGIN_DEG = 0.001  # [deg] around the road; source: chosen by hand, about 100 m
+_MARGIN_M = 100.0  # [m] around the road; source: chosen by hand, five times the distance of confusable codes
 _TRIES = 4  # of drawing registry numbers that nobody has; source: chosen by hand
 
 
@@ -299,10 +299,7 @@ class Plans:
     def _existing(
         self, connection: sa.Connection, caller: Caller, extent_deg: list[float]
     ) -> tuple[ExistingMarker, ...]:
-        west, south, east, north = extent_deg
-        box = Box(
-            west - _MARGIN_DEG, max(south - _MARGIN_DEG, -90.0), east + _MARGIN_DEG, min(north + _MARGIN_DEG, 90.0)
-        )
+        box = Box(*extent_deg).widened(_MARGIN_M)
         found = list_existing(connection, caller.agency_id, box, limit=MAX_EXISTING)
         return tuple(ExistingMarker(m.id, m.family, m.digits or "", m.lon_deg, m.lat_deg, m.status) for m in found)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.plan_checks import ExistingMarker
+from app.registry.marker_rows import MarkerRow
 from app.services.decoder_processes import Task
 
 
@@ -26,6 +27,31 @@ class SummarizeRoadTask(Task[dict[str, Any]]):
     """A road to read: its lanes, events, warnings and extent."""
 
     road: RoadFile
+
+
+MapForm = Literal["osm", "xodr"]
+"""Formats of HD maps by the ends of their files' names."""
+
+
+@dataclass(frozen=True, slots=True)
+class WriteMapTask(Task[bytes]):
+    """An HD map to write: a road, and the markers near it.
+
+    Attributes
+    ----------
+    road : RoadFile
+    form : str
+        ``osm`` for lanelet2, ``xodr`` for OpenDRIVE.
+    markers : tuple of MarkerRow
+        Of the registry; those that are farther from the road are left out.
+    within_m : float
+        Greatest distance of a marker from the centre line of a lane. [m]
+    """
+
+    road: RoadFile
+    form: MapForm
+    markers: tuple[MarkerRow, ...]
+    within_m: float
 
 
 @dataclass(frozen=True, slots=True)

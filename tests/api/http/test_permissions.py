@@ -39,7 +39,7 @@ CALIBRATED: dict[str, Any] = {
 NOBODY_ID = "019cb624-0000-7000-8000-00000000ffff"
 UPLOAD = "POST /v1/decodes"
 # what a parameter of a path may be where it names no row
-FORMS = {"artwork": "svg", "board": "svg", "layout": "csv", "payload": "json"}
+FORMS = {"artwork": "svg", "board": "svg", "layout": "csv", "map": "osm", "payload": "json"}
 VALUES = {
     "version": ("1",),
     "kind": ("geojson",),

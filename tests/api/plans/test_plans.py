@@ -104,7 +104,8 @@ def test_a_road_is_stored_with_its_lanes(client: httpx.Client, alignment: dict[s
 def test_bad_roads_are_refused_and_nothing_is_stored(client: httpx.Client) -> None:
     refused(send_road(client, b"{}", name="nothing"), 422, field="file")
     refused(send_road(client, road(5.0, 47.0), name="two", crs="EPSG:4326", origin=[5.0, 47.0]), 422)
-    refused(client.post("/v1/alignments", json={}), 415)
+    refused(client.post("/v1/alignments", json={}), 422)
+    refused(client.post("/v1/alignments", content=b"{}", headers={"Content-Type": "text/plain"}), 415)
     assert client.get("/v1/alignments").json()["items"] == []
 
 

@@ -261,6 +261,28 @@ def test_a_map_without_lanes_and_a_marker_beside_none_are_refused() -> None:
         write_opendrive(HdMap("behind", (straight(100),), (behind,)))
 
 
+def test_a_marker_beyond_the_end_of_the_nearest_lane_is_beside_the_next_one(schema: Any) -> None:
+    first = straight(100, heading_deg=80.0)
+    end = (float(first.lon_deg[-1]), float(first.lat_deg[-1]))
+    second = replace(straight(100, heading_deg=120.0, start_deg=end), name="2")
+    lon, lat = second.position_at([0.2], 6.0)  # 6 m to the left, where the first lane is nearer
+    marker = MapMarker("m", "cerpm", "12", float(lon[0]), float(lat[0]))
+    root = etree.fromstring(write_opendrive(HdMap("two", (first, second), (marker,))))
+    schema.assertValid(root)
+    assert [len(element.findall("objects/object")) for element in root.findall("road")] == [0, 1]
+    assert float(root.find("road/objects/object").get("t")) == pytest.approx(6.0, abs=1e-3)
+
+
+def test_markers_beside_no_lane_can_be_left_out_and_the_file_names_them(schema: Any) -> None:
+    near = MapMarker("m-1", "cerpm", "12", *START_DEG)
+    far = replace(near, id="m-2", lat_deg=START_DEG[1] + 0.01)
+    root = etree.fromstring(write_opendrive(HdMap("some", (straight(100),), (near, far)), leave_out=True))
+    schema.assertValid(root)
+    assert [element.get("name") for element in root.iter("signal")] == ["m-1"]
+    said = {element.get("code"): element.get("value") for element in root.findall("header/userData")}
+    assert said["left_out"] == "m-2"
+
+
 @pytest.mark.parametrize("radius_m", [62.5, 250.0])
 def test_our_own_reader_gets_the_lane_back_within_a_centimetre(radius_m: float) -> None:
     lane = replace(hilly(bend(radius_m, straight_m=200)), width_m=bend(radius_m, straight_m=200).width_m)
