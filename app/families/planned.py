@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, ClassVar, NamedTuple
 
 from app.families.rules import MarkerRules
 from app.planning.alignment import Alignment
 from app.planning.plan import PlannedMarker
+from app.radio.settings import RadioSettings
 from app.registry.marker_rows import CodeRow
 
 PLAN_METHOD = "placed by a plan"
@@ -37,6 +38,8 @@ class Commitment:
     now : datetime
     codebook_id : str or None
         Of the tags.
+    radio : RadioSettings
+        Of the CERPMs.
     """
 
     plan_id: str
@@ -44,6 +47,7 @@ class Commitment:
     rules: MarkerRules
     now: datetime
     codebook_id: str | None = None
+    radio: RadioSettings = field(default_factory=RadioSettings)
 
     def original(self, marker: PlannedMarker) -> dict[str, Any]:
         """Where a planned marker's position comes from."""

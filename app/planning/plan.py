@@ -14,6 +14,7 @@ from app.markers.magnet_codebook import Codebook, Meaning
 from app.markers.plate import PlateCode, PlateGeometry
 from app.planning.alignment import Alignment, RoadEvent
 from app.planning.rules import PlanRules
+from app.radio.settings import RadioSettings
 
 
 class Purpose(StrEnum):
@@ -166,6 +167,8 @@ class Plan:
         Empty until `check_plan` ran.
     codebook : Codebook or None
         Of the tags.
+    radio : RadioSettings or None
+        Of the CERPMs; None until `check_plan` ran, and without CERPMs.
     """
 
     name: str
@@ -175,6 +178,7 @@ class Plan:
     left_out: tuple[LeftOut, ...] = ()
     findings: tuple[PlanFinding, ...] = ()
     codebook: Codebook | None = None
+    radio: RadioSettings | None = None
 
     @property
     def counts(self) -> dict[str, int]:

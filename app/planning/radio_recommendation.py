@@ -68,7 +68,7 @@ def recommend_settings(plan: RadioPlan, *, more_channels: bool = True) -> Recomm
     Notes
     -----
     Tried are spreading factors 6 (without a header) or 7 to 12, the three bandwidths, 16 intervals and 5 powers. On a
-    road with its own markers, 8 of them are approached.
+    road with its own markers, 8 of them are approached: 4 along the road, and 4 that have most others in reach.
     """
     best = _best(plan)
     if best.reaches or not more_channels or plan.settings.hopping:
@@ -143,8 +143,15 @@ def _intervals(first: RadioSettings, plan: RadioPlan) -> Iterator[RadioSettings]
 
 def _approaches(plan: RadioPlan) -> list[Approach]:
     markers, wanted = markers_of(plan)
-    chosen = wanted[:: max(1, len(wanted) // _WANTED)]
-    return [approach(markers, index, plan.preview_m, plan.air) for index in chosen]
+    air, at_m = plan.air, markers.chainage_m
+    if len(wanted) > _WANTED:
+        ordered = np.sort(at_m)
+        first, last = at_m[wanted] - air.reach_m - air.harm_m, at_m[wanted] + air.harm_m - plan.preview_m
+        others = np.searchsorted(ordered, last, "right") - np.searchsorted(ordered, first)
+        crowded = np.argsort(-others, kind="stable")[: _WANTED // 2]  # they lose most packets
+        spread = np.linspace(0, len(wanted) - 1, _WANTED - len(crowded)).astype(int)
+        wanted = [wanted[k] for k in np.unique(np.concatenate([crowded, spread]))]
+    return [approach(markers, index, plan.preview_m, air) for index in wanted]
 
 
 def _recommendation(plan: RadioPlan, settings: RadioSettings | None, probability: float) -> Recommendation:

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from app.families.cerpm.message import speed_limit_document
 from app.families.planned import Commitment, PlannedMarkers, PlannedRow
 from app.planning.plan import PlannedCerpm, PlannedMarker
-from app.radio.settings import RadioSettings
 from app.registry.marker_rows import CodeRow
 
 
@@ -21,7 +20,7 @@ class PlannedCerpms(PlannedMarkers):
 
     def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
         """One row for each CERPM."""
-        radio = asdict(RadioSettings())
+        radio = asdict(commitment.radio)
         for marker in markers:
             detail = marker.detail
             assert isinstance(detail, PlannedCerpm)

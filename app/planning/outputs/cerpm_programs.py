@@ -11,7 +11,8 @@ from app.encoders.cerpm.program import MAX_PROGRAMS, MarkerProgram, write_progra
 from app.errors import InvalidParameter
 from app.markers.cerpm import HEIGHT_M, KEY_BYTES, CerpmMessage
 from app.planning.plan import Plan, PlannedCerpm, PlannedMarker
-from app.planning.plan_checks.cerpms import radio_plan
+from app.planning.plan_checks.cerpms import radio_settings
+from app.radio.settings import RadioSettings
 
 _NO_KEY = bytes(KEY_BYTES)  # stands for the marker's own, which is never written here
 PROGRAMS_FORMAT = "waymark-cerpm-programs/1"
@@ -35,7 +36,7 @@ def plan_programs(plan: Plan) -> tuple[MarkerProgram, ...]:
             limit=f"{MAX_PROGRAMS} in one list",
             cure="plan the road in sections",
         )
-    radio = radio_plan(plan, cerpms, plan.rules.cerpm).settings
+    radio = plan.radio or radio_settings(plan) or RadioSettings()
     datum = plan.alignment.vertical_datum
     return tuple(MarkerProgram(_message(marker, datum), _NO_KEY, radio) for marker in cerpms)
 

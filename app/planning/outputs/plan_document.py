@@ -14,6 +14,7 @@ from app.markers.magnet_codebook import Codebook
 from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent
 from app.planning.plan import LeftOut, Plan, PlanFinding, PlannedMarker
 from app.planning.rules import PlanRules
+from app.radio.settings import RadioSettings
 
 PLAN_FORMAT = "waymark-plan/1"
 MAX_PLAN_BYTES = 500_000_000
@@ -150,6 +151,7 @@ class PlanDocument(_Part):
     left_out: tuple[LeftOut, ...]
     findings: tuple[PlanFinding, ...]
     codebook: dict[str, Any] | None
+    radio: RadioSettings | None
 
 
 def write_plan(plan: Plan) -> bytes:
@@ -164,6 +166,7 @@ def write_plan(plan: Plan) -> bytes:
         left_out=plan.left_out,
         findings=plan.findings,
         codebook=None if plan.codebook is None else plan.codebook.to_document(),
+        radio=plan.radio,
     )
     return document.model_dump_json(by_alias=True).encode()
 
@@ -180,16 +183,19 @@ def read_plan(data: bytes) -> Plan:
         raise _unreadable(f"the plan has {len(data)} bytes", "plan", f"{MAX_PLAN_BYTES} bytes")
     try:
         document = PlanDocument.model_validate_json(data)
-        codebook = None if document.codebook is None else Codebook.from_document(document.codebook)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "plan"
         raise _unreadable(f"this is no document of a plan: {first['msg']}", place, PLAN_FORMAT) from None
     except InvalidParameter as error:
+        raise _unreadable(f"the radio of the plan is damaged: {error.message}", "radio", PLAN_FORMAT) from error
+    try:
+        codebook = None if document.codebook is None else Codebook.from_document(document.codebook)
+    except InvalidParameter as error:
         raise _unreadable(f"the codebook of the plan is damaged: {error.message}", "codebook", PLAN_FORMAT) from error
     return Plan(
         document.name, document.alignment.alignment(), document.rules, document.markers, document.left_out,
-        document.findings, codebook,
+        document.findings, codebook, document.radio,
     )  # fmt: skip
 
 

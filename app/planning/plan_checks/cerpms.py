@@ -53,7 +53,7 @@ def _path_error(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> I
 
 def _radio(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterator[PlanFinding]:
     """The radio checks where most markers are in reach of each other, with the real markers of the plan."""
-    radio = radio_plan(plan, cerpms, rules)
+    radio = _radio_plan(plan, cerpms, rules, plan.radio or RadioSettings())
     markers, busiest = _busiest(cerpms, radio.air.reach_m + radio.air.harm_m)
     check = check_radio(replace(radio, markers=markers))
     settings = radio.settings
@@ -68,28 +68,46 @@ def _radio(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterat
     yield _collisions(check, rules, busiest)
 
 
-def radio_plan(plan: Plan, cerpms: Sequence[PlannedMarker], rules: CerpmRules) -> RadioPlan:
-    """The radio of a plan's CERPMs: the settings of the rules, or recommended ones for the mean spacing of a lane."""
-    speed_mps = max(float(lane.design_speed_mps.max()) for lane in plan.alignment.lanes)
-    preview = PreviewRule(distance_m=rules.preview_m)
-    lanes = {marker.lane for marker in cerpms}
-    length_m = sum(plan.alignment.lane(name).length_m for name in lanes)
-    spacing_m = min(max(2 * length_m / len(cerpms), SPACINGS_M[0]), SPACINGS_M[1])
+def radio_settings(plan: Plan) -> RadioSettings | None:
+    """Settings of the plan's CERPMs: those of the rules, or recommended ones; None without CERPMs.
+
+    They are recommended for the mean spacing of all lanes side by side, and for the real markers of the busiest place
+    if they would not be read in time there.
+    """
+    rules = plan.rules.cerpm
+    cerpms = [marker for marker in plan.markers if isinstance(marker.detail, PlannedCerpm)]
+    if rules is None or not cerpms:
+        return None
     if rules.spreading_factor is not None and rules.interval_s is not None:
-        settings = RadioSettings(
+        return RadioSettings(
             spreading_factor=rules.spreading_factor, interval_s=rules.interval_s, bandwidth_hz=rules.bandwidth_hz
         )
-        return RadioPlan(settings, rules.region, spacing_m=spacing_m, design_speed_mps=speed_mps, preview=preview)
-    # as many markers in reach as all lanes side by side have
-    dense = RadioPlan(
-        RadioSettings(), rules.region, spacing_m=max(spacing_m / len(lanes), SPACINGS_M[0]),
-        design_speed_mps=speed_mps, preview=preview,
+    mean = _radio_plan(plan, cerpms, rules, RadioSettings())
+    found = _recommended(mean)
+    markers, _marker = _busiest(cerpms, found.air.reach_m + found.air.harm_m)
+    real = replace(found, markers=markers)
+    if check_radio(real).read_probability < real.min_probability:
+        found = _recommended(replace(mean, markers=markers))
+    return found.settings
+
+
+def _radio_plan(plan: Plan, cerpms: Sequence[PlannedMarker], rules: CerpmRules, settings: RadioSettings) -> RadioPlan:
+    lanes = {marker.lane for marker in cerpms}
+    length_m = sum(plan.alignment.lane(name).length_m for name in lanes)
+    spacing_m = min(max(2 * length_m / len(cerpms) / len(lanes), SPACINGS_M[0]), SPACINGS_M[1])
+    made = RadioPlan(
+        settings, rules.region, spacing_m=spacing_m,
+        design_speed_mps=max(float(lane.design_speed_mps.max()) for lane in plan.alignment.lanes),
+        preview=PreviewRule(distance_m=rules.preview_m),
     )  # fmt: skip
-    found = recommend_settings(dense).settings
-    if found is None:
-        return dense
-    receiver = replace(dense.receiver, channels=max(found.channels, dense.receiver.channels))
-    return replace(dense, settings=found, receiver=receiver)
+    return replace(made, receiver=replace(made.receiver, channels=max(settings.channels, made.receiver.channels)))
+
+
+def _recommended(wanted: RadioPlan) -> RadioPlan:
+    """The plan with recommended settings, or as it is where none are lawful."""
+    settings = recommend_settings(wanted).settings or wanted.settings
+    receiver = replace(wanted.receiver, channels=max(settings.channels, wanted.receiver.channels))
+    return replace(wanted, settings=settings, receiver=receiver)
 
 
 def _collisions(check: RadioCheck, rules: CerpmRules, busiest: PlannedMarker) -> PlanFinding:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from app.geodesy import LocalizationGrade
 from app.markers.checks import Verdict
 from app.planning.plan import Plan, PlanFinding
-from app.planning.plan_checks.cerpms import check_cerpms
+from app.planning.plan_checks.cerpms import check_cerpms, radio_settings
 from app.planning.plan_checks.conflicts import ExistingMarker, check_conflicts
 from app.planning.plan_checks.finding import compare
 from app.planning.plan_checks.magnets import check_magnets
@@ -16,7 +16,7 @@ from app.planning.plan_checks.plates import check_plates
 
 
 def check_plan(plan: Plan, existing: Sequence[ExistingMarker] = ()) -> Plan:
-    """The plan with the findings of all checks that apply to it.
+    """The plan with the findings of all checks that apply to it, and the radio settings of its CERPMs.
 
     Parameters
     ----------
@@ -24,6 +24,7 @@ def check_plan(plan: Plan, existing: Sequence[ExistingMarker] = ()) -> Plan:
     existing : sequence of ExistingMarker
         Markers of the registry near the road.
     """
+    plan = replace(plan, radio=radio_settings(plan))
     return replace(plan, findings=tuple(_findings(plan, existing)))
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.plate import PlateCode
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
-from app.planning.plan_checks.cerpms import radio_plan
+from app.planning.plan_checks.cerpms import radio_settings
 from app.planning.plate_view import camera_of
 from app.planning.proof.cerpms import ASIDE_M, AUDIBLE_M, LanePass, drive_cerpms, simulated_radio
 from app.planning.proof.conditions import draw_drive, draw_plate
@@ -32,6 +32,7 @@ from app.planning.proof.terms import (
     drive_terms,
     parse_conditions,
 )
+from app.radio.settings import RadioSettings
 from app.simulation.conditions import Conditions
 from app.simulation.radio.link import Radio
 
@@ -228,10 +229,7 @@ class Prover:
     @cached_property
     def _radio(self) -> Radio:
         """Of the CERPMs, as the checks of the plan have it."""
-        rules = self.plan.rules.cerpm
-        assert rules is not None
-        cerpms = [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedCerpm)]
-        return simulated_radio(radio_plan(self.plan, cerpms, rules).settings)
+        return simulated_radio(self.plan.radio or radio_settings(self.plan) or RadioSettings())
 
     def _speed_m_s(self, lane: str, at_m: float) -> float:
         one = self.lanes[lane]

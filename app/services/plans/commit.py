@@ -14,6 +14,7 @@ from app.families.planned import Commitment
 from app.families.rules import PLANNED, MarkerRules
 from app.markers.magnet_codebook import Codebook
 from app.planning.plan import Plan, PlannedTag
+from app.radio.settings import RadioSettings
 from app.registry import bulk
 from app.registry.audit import recording
 from app.registry.codebooks import CODEBOOKS, book_of
@@ -42,7 +43,7 @@ def commit_markers(
         The codebook of the plan was changed since.
     """
     codebook_id = _store_codebook(connection, caller, plan, now)
-    commitment = Commitment(row.id, plan.alignment, rules, now, codebook_id)
+    commitment = Commitment(row.id, plan.alignment, rules, now, codebook_id, plan.radio or RadioSettings())
     with recording(
         connection, caller.agency_id, author_of(caller), "plan.committed", now=now, subject=row.id,
         detail={"markers": plan.counts},

@@ -15,6 +15,7 @@ from app.markers.checks import Verdict
 from app.planning.alignment import Alignment, Lane
 from app.planning.outputs.plan_document import read_plan, write_plan
 from app.planning.plan import Plan, PlanFinding
+from app.radio.settings import RadioSettings
 from tests.planning.outputs.made import full_plan
 
 
@@ -55,7 +56,7 @@ def changed_plan() -> Plan:
         warnings=("a warning",),
     )
     finding = PlanFinding("magnet-spacing", 6.0, "<=", 6.0, "m", "METRO 6.3", Verdict.OK, "fine", "1", 3.5, 8.4, 49.0)
-    return replace(plan, alignment=road, findings=(finding,))
+    return replace(plan, alignment=road, findings=(finding,), radio=RadioSettings(spreading_factor=8))
 
 
 def test_a_plan_comes_back_as_it_was() -> None:

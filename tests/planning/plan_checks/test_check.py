@@ -120,3 +120,16 @@ def test_busy_radio_fails_at_the_busiest_place() -> None:
     assert found.verdict is Verdict.WARN
     assert found.station_m is not None
     assert 500 < found.station_m < 1500
+
+
+def test_radio_settings_are_recommended_for_the_busiest_place() -> None:
+    """On the straights pairs are far apart, and settings for the mean spacing lose most packets in the bend."""
+    rules = {"max_path_error_m": 0.01}
+    plan = checked(road(bend(60.0, 1500, 150.0, speed_kmh=40.0)), cerpm=rules)
+    assert plan.radio is not None
+    assert finding(plan, "radio read-in-time").verdict is Verdict.OK
+    straight_one = checked(road(straight(3000, speed_kmh=40.0)), cerpm=rules).radio
+    assert straight_one is not None
+    assert straight_one.channels < plan.radio.channels
+    fixed = {**rules, "spreading_factor": straight_one.spreading_factor, "interval_s": straight_one.interval_s}
+    assert finding(checked(plan.alignment, cerpm=fixed), "radio read-in-time").verdict is Verdict.FAIL
