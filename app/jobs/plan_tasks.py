@@ -22,8 +22,11 @@ from app.planning.placement.codes import unused_numbers
 from app.planning.plan_checks import check_plan
 from app.planning.read_rules import check_rules
 from app.planning.rules import RoadRules
+from app.services.plans.as_built import compare_as_built
+from app.services.plans.documents import AsBuiltDocument
 from app.services.plans.summaries import plan_summary, road_summary
 from app.services.plans.tasks import (
+    CompareTask,
     MadePlan,
     MakePlanTask,
     RoadFile,
@@ -69,6 +72,12 @@ def write_map(task: WriteMapTask, _before: None) -> bytes:
         markers = [point for row in task.markers for point in get_family(row.family).map_markers(row)]
         content = map_of_road(road, markers, within_m=task.within_m)
         return write_lanelet2(content) if task.form == "osm" else write_opendrive(content, leave_out=True)
+
+
+def compare_plan(task: CompareTask, _before: None) -> AsBuiltDocument:
+    """Compare a plan with what was built."""
+    with memory_is_the_limit("plan", _CURE):
+        return compare_as_built(read_plan(zlib.decompress(task.document)), task.built, task.existing)
 
 
 def _build(file: AlignmentFile, road: RoadFile, rules: RoadRules) -> Alignment:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -109,6 +109,7 @@ class Resource(Generic[RowT]):
         beyond: str | None = None,
         limit: int,
         newest_first: bool = False,
+        where: Sequence[sa.ColumnElement[bool]] = (),
         **equal: Any,
     ) -> tuple[list[RowT], str | None]:
         """Resources in the order of their ids, which is the order they were made in, or newest first.
@@ -117,6 +118,7 @@ class Resource(Generic[RowT]):
         ----------
         beyond : str, optional
             The id to continue after.
+        where : sequence of conditions, optional
         **equal
             Values of columns; None does not narrow.
 
@@ -129,6 +131,7 @@ class Resource(Generic[RowT]):
         """
         key = self.table.c.id
         query = self._select(agency_id, {name: value for name, value in equal.items() if value is not None})
+        query = query.where(*where)
         if beyond is not None:
             query = query.where(key < beyond if newest_first else key > beyond)
         query = query.order_by(key.desc() if newest_first else key).limit(limit + 1)

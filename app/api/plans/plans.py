@@ -43,6 +43,8 @@ from app.services.plans.plans import Plans
 
 router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
 
+FOLLOWS_MARKERS = ("committed", "built", "surveyed")
+"""Statuses that change when markers do, without a new version of the plan."""
 PlanId = Annotated[Identifier, Path(description="Id of the plan.")]
 Service = Annotated[Plans, use_cases("plans")]
 
@@ -71,8 +73,11 @@ def list_plans(
 
 @router.get("/{plan_id}", responses={**NOT_MODIFIED, **document_response(PlanDocument, 404)})
 def get_plan(plan_id: PlanId, caller: Caller, plans: Service, if_none_match: IfNoneMatch = None) -> Response:
-    """One plan with its findings, with its version as ETag."""
-    return versioned_response(plans.get(caller, plan_id), if_none_match)
+    """One plan with its findings, with its version as ETag. A committed one is always sent: its status follows from its
+    markers.
+    """
+    plan = plans.get(caller, plan_id)
+    return versioned_response(plan, None if plan["status"] in FOLLOWS_MARKERS else if_none_match)
 
 
 @router.patch("/{plan_id}", responses=document_response(PlanDocument, 404, 409, 412, 428))
@@ -130,5 +135,5 @@ def commit_plan(
 
 @router.get("/{plan_id}/as-built", responses=document_response(AsBuiltDocument, 404))
 def get_as_built(plan_id: PlanId, caller: Caller, plans: Service) -> Response:
-    """A plan beside what was built and surveyed: residuals, and what is out of tolerance."""
+    """A plan beside what was built and surveyed: residuals, tolerances, and what that does to the checks."""
     return json_response(plans.as_built(caller, plan_id))

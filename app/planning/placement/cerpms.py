@@ -47,14 +47,24 @@ def place_cerpms(lane: Lane, rules: CerpmRules, cycle_m: float, curve_radius_m: 
     return chainages
 
 
-def path_error_m(lane: Lane, chainages_m: Floats) -> Floats:
+def path_error_m(lane: Lane, chainages_m: Floats, shifts_m: Floats | None = None) -> Floats:
     """Distance of a cubic spline through the lane's pairs from its centre line at the lane's samples, shape (N,). [m]
 
+    Parameters
+    ----------
+    lane : Lane
+    chainages_m : ndarray, shape (K,)
+        Of all markers. [m]
+    shifts_m : ndarray, shape (K,), optional
+        How far each is left of its boundary; the mean of a pair moves the path. [m]
+
+    Notes
+    -----
     Source: exact markers and a cubic spline, as in the CERPM paper's section 2.3; the change of curvature and the ends
     decide. Two or three pairs are joined by a straight line or a parabola.
     """
-    chainages_m = _one_of_each_pair(chainages_m)
-    knots = ecef_from_wgs84(*lane.position_at(chainages_m))
+    chainages_m, shift_m = _one_of_each_pair(chainages_m, shifts_m)
+    knots = ecef_from_wgs84(*lane.position_at(chainages_m, shift_m))
     truth = ecef_from_wgs84(lane.lon_deg, lane.lat_deg)
     origin = truth[0]
     if len(chainages_m) < 4:
@@ -83,10 +93,18 @@ def beside_magnets(lane: Lane, cerpms: Sequence[Site], magnets: Sequence[Site]) 
     return moved
 
 
-def _one_of_each_pair(chainages_m: Floats) -> Floats:
-    """Rising chainages without those that follow another one within a metre: both sides of a pair are one place."""
-    rising = np.sort(chainages_m)
-    return np.asarray(rising[np.diff(rising, prepend=-np.inf) > _ONE_PLACE_M])
+def _one_of_each_pair(chainages_m: Floats, shifts_m: Floats | None) -> tuple[Floats, Floats]:
+    """Rising chainages without those that follow another one within a metre, and the mean shift at each.
+
+    Both sides of a pair are one place.
+    """
+    order = np.argsort(chainages_m)
+    rising = chainages_m[order]
+    is_first = np.diff(rising, prepend=-np.inf) > _ONE_PLACE_M
+    if shifts_m is None:
+        return np.asarray(rising[is_first]), np.zeros(int(is_first.sum()))
+    place = np.cumsum(is_first) - 1
+    return np.asarray(rising[is_first]), np.asarray(np.bincount(place, shifts_m[order]) / np.bincount(place))
 
 
 def _by_cycle(lane: Lane, rules: CerpmRules, cycle_m: float, curve_radius_m: float) -> Floats:

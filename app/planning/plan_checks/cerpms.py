@@ -9,7 +9,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
+from app.markers.cerpm import LaneSide
 from app.markers.checks import Verdict
+from app.planning.alignment import Floats, Lane
 from app.planning.placement.cerpms import path_error_m
 from app.planning.plan import Plan, PlanFinding, PlannedCerpm, PlannedMarker
 from app.planning.plan_checks.finding import compare
@@ -18,6 +20,8 @@ from app.planning.radio_recommendation import recommend_settings
 from app.planning.rules import CerpmRules
 from app.radio.reception import MAX_MARKERS, MAX_OFFSET_M, SPACINGS_M, RoadMarkers
 from app.radio.settings import RadioSettings
+
+_SIGN = {LaneSide.LEFT: 1.0, LaneSide.RIGHT: -1.0, LaneSide.UNKNOWN: 0.0}
 
 
 def check_cerpms(plan: Plan) -> Iterator[PlanFinding]:
@@ -39,7 +43,7 @@ def _path_error(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> I
         chainages = np.array([marker.chainage_m for marker in own])
         if np.ptp(chainages) < lane.length_m / 2:
             continue
-        found = path_error_m(lane, chainages)
+        found = path_error_m(lane, chainages, _shifts_m(lane, own))
         if float(found.max()) > error:
             error = float(found.max())
             at = float(lane.chainage_m[int(found.argmax())])
@@ -49,6 +53,13 @@ def _path_error(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> I
         "path-error", error, "<=", limit, "m", "CERPM paper, section 2.3: cubic spline through the markers",
         "greatest distance of the path through exactly surveyed markers from the centre line", worst,
     )  # fmt: skip
+
+
+def _shifts_m(lane: Lane, cerpms: Sequence[PlannedMarker]) -> Floats:
+    """How far each stands left of its boundary, as surveys of built ones find, shape (K,). [m]"""
+    sides = np.array([_SIGN[marker.detail.side] for marker in cerpms if isinstance(marker.detail, PlannedCerpm)])
+    half_m = lane.value_at(lane.width_m, [marker.chainage_m for marker in cerpms]) / 2
+    return np.asarray(np.array([marker.offset_m for marker in cerpms]) - sides * half_m)
 
 
 def _radio(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterator[PlanFinding]:

@@ -1,36 +1,46 @@
-"""A committed plan beside what was built: residuals along and across the direction of travel."""
+"""A committed plan beside what was built: residuals, what is out of tolerance, and what that does to the checks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from pyproj import Geod
 
-from app.planning.plan import Plan
+from app.markers.checks import Verdict
+from app.planning.as_built import SurveyedPlace, plan_as_built, residual_of
+from app.planning.plan import Plan, PlanFinding
+from app.planning.plan_checks import ExistingMarker, check_plan
 from app.registry.plans import BuiltRow
-from app.services.plans.documents import AsBuiltDocument, BuiltMarker
+from app.services.documents import document_of
+from app.services.plans.documents import AsBuiltDocument, BuiltMarker, CheckComparison, FindingDocument
 
 MAX_LISTED = 1000
 """Markers that the comparison lists; all are counted. Source: chosen by hand."""
-_SURVEYED = ("surveyed", "active", "suspect")
-_GEOD = Geod(ellps="WGS84")
+SURVEYED = ("surveyed", "active", "suspect")
+"""Statuses of markers that were surveyed."""
 
 
-def compare_as_built(plan: Plan, built: Sequence[BuiltRow]) -> AsBuiltDocument:
-    """Residuals of the surveyed markers, and which of them are out of tolerance."""
+def compare_as_built(plan: Plan, built: Sequence[BuiltRow], existing: Sequence[ExistingMarker] = ()) -> AsBuiltDocument:
+    """Residuals of the surveyed markers, which of them are out of tolerance, and the checks with them in place.
+
+    Parameters
+    ----------
+    plan : Plan
+    built : sequence of BuiltRow
+        The markers that the plan became.
+    existing : sequence of ExistingMarker
+        Other markers of the registry near the road.
+    """
     planned = {marker.number: marker for marker in plan.markers}
     tolerances = plan.rules.tolerances
-    surveyed = [row for row in built if row.status in _SURVEYED]
+    surveyed = {
+        row.number: SurveyedPlace(row.lon_deg, row.lat_deg, row.heading_deg) for row in built if row.status in SURVEYED
+    }
     markers: list[BuiltMarker] = []
-    for row in surveyed:
-        marker = planned[row.number]
-        azimuth, _, distance = _GEOD.inv(marker.lon_deg, marker.lat_deg, row.lon_deg, row.lat_deg)
-        angle = np.radians(azimuth - marker.heading_deg)
-        along, across = float(distance * np.cos(angle)), float(-distance * np.sin(angle))
-        turned = None
-        if row.heading_deg is not None:
-            turned = (row.heading_deg - marker.heading_deg + 180.0) % 360.0 - 180.0
+    for row in built:
+        if row.number not in surveyed:
+            continue
+        along, across, turned = residual_of(planned[row.number], surveyed[row.number])
         within = (
             abs(along) <= tolerances.along_m
             and abs(across) <= tolerances.across_m
@@ -51,7 +61,33 @@ def compare_as_built(plan: Plan, built: Sequence[BuiltRow]) -> AsBuiltDocument:
         "rms_along_m": _rms([found["along_m"] for found in markers]),
         "rms_across_m": _rms([found["across_m"] for found in markers]),
         "markers": markers[:MAX_LISTED],
+        "checks": _compare_checks(plan, check_plan(plan_as_built(plan, surveyed), existing)) if surveyed else [],
     }
+
+
+def _compare_checks(plan: Plan, built: Plan) -> list[CheckComparison]:
+    """Each check of either plan, by its name, in the order of the plan as it was built."""
+    before = {finding.name: finding for finding in plan.findings}
+    after = {finding.name: finding for finding in built.findings}
+    names = list(dict.fromkeys([*after, *before]))
+    return [
+        CheckComparison(
+            name=name,
+            planned=_document(before.get(name)),
+            built=_document(after.get(name)),
+            verdict_changed=_verdict(before.get(name)) != _verdict(after.get(name)),
+        )
+        for name in names
+    ]
+
+
+def _document(finding: PlanFinding | None) -> FindingDocument | None:
+    return None if finding is None else document_of(FindingDocument, finding)
+
+
+def _verdict(finding: PlanFinding | None) -> Verdict:
+    """A check that does not apply found nothing."""
+    return Verdict.OK if finding is None else finding.verdict
 
 
 def _rms(values: Sequence[float]) -> float | None:

@@ -114,6 +114,17 @@ class PlanSummary(TypedDict):
     codebook_entries: int
 
 
+class CheckFigure(TypedDict):
+    """A check of a plan in a list."""
+
+    name: str
+    figure: float
+    relation: str
+    limit: float
+    unit: str
+    verdict: str
+
+
 class PlanOverview(TypedDict):
     """A plan in a list, so that variants stand side by side."""
 
@@ -122,7 +133,11 @@ class PlanOverview(TypedDict):
     alignment_id: str
     status: PlanStatus
     counts: dict[str, int]
+    lane_length_m: float
+    left_out_count: int
     verdict: str
+    checks: list[CheckFigure]
+    """Each at its worst place."""
     cost: float
     cost_complete: bool
     currency: str
@@ -192,6 +207,17 @@ class BuiltMarker(TypedDict):
     in_tolerance: bool
 
 
+class CheckComparison(TypedDict):
+    """A check of a plan beside the same check of what was built."""
+
+    name: str
+    planned: FindingDocument | None
+    """As the plan was approved; null if the check did not apply then."""
+    built: FindingDocument | None
+    """With surveyed positions in place of planned ones, and the other markers that are in the registry by now."""
+    verdict_changed: bool
+
+
 class AsBuiltDocument(TypedDict):
     """A plan beside what was built."""
 
@@ -203,3 +229,5 @@ class AsBuiltDocument(TypedDict):
     rms_across_m: float | None
     markers: list[BuiltMarker]
     """Those out of tolerance first, then by the size of their residuals; at most 1,000."""
+    checks: list[CheckComparison]
+    """Empty before the first marker is surveyed."""

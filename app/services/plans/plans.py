@@ -14,11 +14,11 @@ from app.errors import CodeTaken, Conflict, InvalidParameter
 from app.families import FAMILIES
 from app.families.rules import MarkerRules
 from app.planning.outputs.plan_document import read_plan
-from app.planning.plan import Plan
 from app.planning.plan_checks import ExistingMarker
 from app.registry import bulk
 from app.registry.codebooks import CODEBOOKS, book_of
 from app.registry.database import Database
+from app.registry.plan_states import find_plan_states, has_status
 from app.registry.plans import ALIGNMENTS, PLANS, PlanRow, list_built, list_existing
 from app.registry.resources import first_version
 from app.registry.spatial import Box
@@ -28,10 +28,11 @@ from app.services.decoder_processes import DecoderProcesses
 from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
 from app.services.plans.alignments import BUSY_WAIT_S, road_of
-from app.services.plans.as_built import compare_as_built
+from app.services.plans.as_built import SURVEYED
 from app.services.plans.commit import commit_markers
 from app.services.plans.documents import (
     AsBuiltDocument,
+    CheckFigure,
     CommittedPlan,
     PlanDocument,
     PlanOverview,
@@ -39,7 +40,7 @@ from app.services.plans.documents import (
     PlanVersionDocument,
     PlanVersionPage,
 )
-from app.services.plans.tasks import MadePlan, MakePlanTask, WritePlanFileTask
+from app.services.plans.tasks import CompareTask, MadePlan, MakePlanTask, WritePlanFileTask
 from app.services.ports import Blobs, Clock
 from app.services.staged_blobs import staged
 
@@ -127,8 +128,11 @@ class Plans:
         return document, False
 
     def get(self, caller: Caller, plan_id: str) -> PlanDocument:
-        """One plan."""
-        return plan_document(self._get(caller, plan_id))
+        """One plan; one that is committed is built or surveyed when its markers are."""
+        with self._database.read() as connection:
+            row = PLANS.get(connection, caller.agency_id, plan_id)
+            states = find_plan_states(connection, caller.agency_id)
+        return plan_document(row._replace(status=states.status_of(row.id, row.status)))
 
     def page(
         self,
@@ -140,11 +144,15 @@ class Plans:
         limit: int = 100,
     ) -> tuple[PlanPage, str | None]:
         """A page of plans without their findings, and the id to continue after if there are more."""
+        agency_id = caller.agency_id
         with self._database.read() as connection:
+            states = find_plan_states(connection, agency_id)
+            where = () if status is None else (has_status(status, states),)
             rows, last = PLANS.page(
-                connection, caller.agency_id, beyond=after, limit=limit, alignment_id=alignment_id, status=status
+                connection, agency_id, beyond=after, limit=limit, where=where, alignment_id=alignment_id
             )
-        return {"items": [document_of(PlanOverview, row, **_members(row, PlanOverview)) for row in rows]}, last
+        rows = [row._replace(status=states.status_of(row.id, row.status)) for row in rows]
+        return {"items": [plan_overview(row) for row in rows]}, last
 
     def history(
         self, caller: Caller, plan_id: str, *, after: int = 0, limit: int = 100
@@ -264,19 +272,24 @@ class Plans:
         ------
         NotFound
         """
-        row = self._get(caller, plan_id)
+        agency_id = caller.agency_id
+        existing: tuple[ExistingMarker, ...] = ()
         with self._database.read() as connection:
-            built = list_built(connection, caller.agency_id, plan_id)
-        return compare_as_built(self._plan(row), built)
+            row = PLANS.get(connection, agency_id, plan_id)
+            built = list_built(connection, agency_id, plan_id)
+            if any(marker.status in SURVEYED for marker in built):
+                own = {marker.marker_id for marker in built}
+                road = ALIGNMENTS.get(connection, agency_id, row.alignment_id)
+                found = self._existing(connection, caller, road.summary["extent_deg"])
+                existing = tuple(marker for marker in found if marker.marker_id not in own)
+        task = CompareTask(self._blobs.get(row.document_key), tuple(built), existing)
+        return self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
 
     # --- steps ------------------------------------------------------------------------------------------------------
 
     def _get(self, caller: Caller, plan_id: str) -> PlanRow:
         with self._database.read() as connection:
             return PLANS.get(connection, caller.agency_id, plan_id)
-
-    def _plan(self, row: PlanRow) -> Plan:
-        return read_plan(zlib.decompress(self._blobs.get(row.document_key)))
 
     def _made(self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any]) -> MadePlan:
         """The plan, with codes that no stored marker has."""
@@ -318,6 +331,12 @@ class Plans:
 def plan_document(row: PlanRow) -> PlanDocument:
     """A plan as clients see it."""
     return document_of(PlanDocument, row, **_members(row, PlanDocument))
+
+
+def plan_overview(row: PlanRow) -> PlanOverview:
+    """A plan in a list."""
+    checks = [{name: finding[name] for name in CheckFigure.__annotations__} for finding in row.summary["findings"]]
+    return document_of(PlanOverview, row, **_members(row, PlanOverview), checks=checks)
 
 
 def _members(row: PlanRow, document: Any) -> dict[str, Any]:

@@ -8,7 +8,9 @@ from typing import Any, Literal
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.plan_checks import ExistingMarker
 from app.registry.marker_rows import MarkerRow
+from app.registry.plans import BuiltRow
 from app.services.decoder_processes import Task
+from app.services.plans.documents import AsBuiltDocument
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,3 +105,20 @@ class WritePlanFileTask(Task[bytes]):
     name: str
     crs: str | None = None
     unit: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CompareTask(Task[AsBuiltDocument]):
+    """A committed plan to compare with the markers that it became.
+
+    Attributes
+    ----------
+    document : bytes
+    built : tuple of BuiltRow
+    existing : tuple of ExistingMarker
+        Other markers of the registry near the road.
+    """
+
+    document: bytes
+    built: tuple[BuiltRow, ...]
+    existing: tuple[ExistingMarker, ...]
