@@ -29,7 +29,7 @@ from app.api.http.problems import install_problem_handlers
 from app.api.http.rate_limits import RateLimit
 from app.api.markers import artwork, bulk, cerpms, codebooks, layouts, markers, observations, searches
 from app.api.ogc import mount_ogc
-from app.api.plans import alignments, plans, radio_checks
+from app.api.plans import alignments, plan_jobs, plans, proofs, radio_checks
 from app.api.roads import roads
 from app.api.surveys import exports, imports
 from app.decoders.plate import decode_plates
@@ -73,7 +73,9 @@ from app.services.markers.markers import Markers
 from app.services.markers.observations import Observations
 from app.services.markers.searches import Searches
 from app.services.plans.alignments import Alignments
+from app.services.plans.plan_jobs import PlanJobs
 from app.services.plans.plans import Plans
+from app.services.plans.proofs import Proofs
 from app.services.roads.roads import Roads
 from app.services.surveys.exports import Exports
 from app.services.surveys.import_jobs import ImportJobs
@@ -97,6 +99,8 @@ ROUTERS = (
     radio_checks.router,
     alignments.router,
     plans.router,
+    proofs.router,
+    plan_jobs.router,
     codebooks.router,
     decodes.router,
     imports.router,
@@ -117,6 +121,17 @@ class _Outside:
     blobs: Blobs
     pool: DecodePool
     queue: LocalQueue
+    plan_queue: LocalQueue
+    proof_queue: LocalQueue
+
+    @property
+    def queues(self) -> tuple[tuple[LocalQueue, tuple[JobKind, ...]], ...]:
+        """The queues with the kinds of their jobs: a proof of hours holds up no upload, nor another plan."""
+        return (
+            (self.queue, (JobKind.DECODE, JobKind.IMPORT)),
+            (self.plan_queue, (JobKind.PLAN, JobKind.PACKAGE)),
+            (self.proof_queue, (JobKind.PROOF,)),
+        )
 
 
 def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> FastAPI:
@@ -129,6 +144,8 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         Database(settings.resolved_database_url),
         Blobs(settings.resolved_blobs_url),
         _decode_pool(settings, decode),
+        LocalQueue(),
+        LocalQueue(),
         LocalQueue(),
     )
     use_cases = _use_cases(settings, outside, decode)
@@ -164,6 +181,9 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
     import_jobs = ImportJobs(database, utc_now, blobs, queue, imports=import_cases, idempotency_ttl=ttl)
     decode_cases = Decodes(database, utc_now, blobs=blobs, queue=queue, handlers=handlers, rules=rules)
     access = Access(database, utc_now, _token_check(settings))
+    proof_cases = Proofs(
+        database, utc_now, blobs, pool, outside.proof_queue, in_flight=settings.decode_workers, idempotency_ttl=ttl
+    )
     return {
         "access": access,
         "artworks": Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode)),
@@ -180,12 +200,18 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
         "features": Features(database, utc_now),
         "import_jobs": import_jobs,
         "imports": import_cases,
-        "jobs": Jobs(database, utc_now, {JobKind.DECODE: decode_cases, JobKind.IMPORT: import_jobs}),
+        "jobs": Jobs(
+            database,
+            utc_now,
+            {JobKind.DECODE: decode_cases, JobKind.IMPORT: import_jobs, JobKind.PROOF: proof_cases},
+        ),
         "keys": Keys(database, utc_now, access),
         "layouts": Layouts(database),
         "markers": marker_cases,
         "observations": Observations(database),
+        "plan_jobs": PlanJobs(database, utc_now),
         "plans": Plans(database, utc_now, blobs, pool, marker_rules(settings)),
+        "proofs": proof_cases,
         "programs": CerpmPrograms(database, utc_now, secrets),
         "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
         "searches": Searches(database),
@@ -206,12 +232,14 @@ async def _running(settings: Settings, outside: _Outside, jobs: Jobs, access: Ac
         _show_once(access.ensure_first_key(_admin_key(settings)))
         if settings.warm_decoders:
             outside.pool.warm()
-        outside.queue.open(jobs.run_job, jobs.list_unfinished())
+        for queue, kinds in outside.queues:
+            queue.open(jobs.run_job, jobs.list_unfinished(kinds))
         async with _each_minute(access.write_uses):
             yield
     finally:
         outside.pool.close()
-        outside.queue.close()
+        for queue, _kinds in outside.queues:
+            queue.close()
         outside.database.close()
 
 
@@ -327,6 +355,7 @@ def _decode_pool(settings: Settings, decode: DecodePlates) -> DecodePool:
         workers=settings.decode_workers,
         limits=ProcessLimits(settings.decode_memory_bytes, settings.decode_timeout_s, settings.trace_timeout_s),
         max_pixels=settings.max_image_pixels,
+        max_waiting=max(32, 4 * settings.decode_workers),  # proofs and packages keep every process busy
     )
 
 

@@ -10,6 +10,7 @@ from app.jobs.decoder_process import ProcessIdTask, process_id
 from app.jobs.frame_tasks import annotate_frame, find_markers, load_frame
 from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
 from app.jobs.plan_tasks import compare_plan, make_plan, summarize_road, write_file_of_plan, write_map
+from app.jobs.proof_tasks import list_proof_units, prove_unit, write_proof
 from app.jobs.survey_tasks import read_survey_file
 from app.jobs.trace_tasks import decode_recording
 from app.services.decoder_processes import Task
@@ -17,6 +18,7 @@ from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameS
 from app.services.decodes.packet_task import DriveTask, LaneTask, OverlayTask
 from app.services.decodes.trace_task import TraceTask
 from app.services.fleet.calibrations import CalibrationTask
+from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask
 from app.services.plans.tasks import CompareTask, MakePlanTask, SummarizeRoadTask, WriteMapTask, WritePlanFileTask
 from app.services.surveys.imports import SurveyTask
 
@@ -39,6 +41,9 @@ STEPS: dict[type, StepFunction] = {
     WritePlanFileTask: write_file_of_plan,
     WriteMapTask: write_map,
     CompareTask: compare_plan,
+    ListUnitsTask: list_proof_units,
+    ProveUnitTask: prove_unit,
+    WriteProofTask: write_proof,
     ProcessIdTask: process_id,
 }
 

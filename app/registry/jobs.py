@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple
@@ -24,6 +24,12 @@ class JobKind(StrEnum):
     """Decodes the upload of the row of `decodes` with the same id. The result is stored there."""
     IMPORT = "import"
     """Imports a survey. The input is its declaration, the result its report."""
+    PLAN = "plan"
+    """Makes a plan of a long road."""
+    PROOF = "proof"
+    """Proves a plan by simulated drives; finished units are in `proof_units`."""
+    PACKAGE = "package"
+    """Writes all files of a plan into one ZIP."""
 
 
 class JobRow(NamedTuple):
@@ -41,6 +47,10 @@ class JobRow(NamedTuple):
         Key of the blob that the job reads.
     result, error : dict or None
         What the job returned, or why it failed.
+    subject_id : str or None
+        Of the row that it is about, e.g. a plan.
+    steps_done, steps_total : int or None
+        Of jobs that are divided into steps, once they are known.
     """
 
     id: str
@@ -57,16 +67,19 @@ class JobRow(NamedTuple):
     error: dict[str, str] | None
     created_at: datetime
     finished_at: datetime | None
+    subject_id: str | None = None
+    steps_done: int | None = None
+    steps_total: int | None = None
 
 
 def new_job(
     kind: JobKind, job_id: str, agency_id: str, holder_id: str, now: datetime,
-    *, job_input: Mapping[str, Any] | None = None, upload_key: str | None = None,
+    *, job_input: Mapping[str, Any] | None = None, upload_key: str | None = None, subject_id: str | None = None,
 ) -> JobRow:  # fmt: skip
     """A job that waits to be started."""
     return JobRow(
         job_id, agency_id, holder_id, kind, "queued", 0, 0.0, False, dict(job_input or {}), upload_key, None, None, now,
-        None,
+        None, subject_id,
     )  # fmt: skip
 
 
@@ -75,27 +88,31 @@ def add_job(connection: sa.Connection, job: JobRow) -> None:
     connection.execute(sa.insert(jobs), job._asdict())
 
 
-def get_job(connection: sa.Connection, agency_id: str, kind: JobKind, job_id: str) -> JobRow:
-    """One job of the agency.
+def get_job(connection: sa.Connection, agency_id: str, kind: JobKind | Sequence[JobKind], job_id: str) -> JobRow:
+    """One job of the agency, of one kind or of several.
 
     Raises
     ------
     NotFound
         There is none of this kind with this id, or it belongs to another agency.
     """
-    query = select_rows(JobRow, jobs).where(jobs.c.id == job_id, jobs.c.agency_id == agency_id, jobs.c.kind == kind)
+    query = select_rows(JobRow, jobs).where(jobs.c.id == job_id, jobs.c.agency_id == agency_id, _of_kind(kind))
     row = find_one(connection, query, JobRow)
     if row is None:
-        raise NotFound(f"there is no {kind} {job_id}", field=f"{kind}_id")
+        name = kind if isinstance(kind, JobKind) else "job"
+        raise NotFound(f"there is no {name} {job_id}", field=f"{name}_id")
     return row
 
 
 def list_jobs(
-    connection: sa.Connection, agency_id: str, kind: JobKind, *, state: str | None, before: str | None, limit: int
-) -> list[JobRow]:
-    """Jobs of one kind without their results, newest first."""
+    connection: sa.Connection, agency_id: str, kind: JobKind | Sequence[JobKind],
+    *, state: str | None, before: str | None, limit: int, subject_id: str | None = None,
+) -> list[JobRow]:  # fmt: skip
+    """Jobs of one kind or of several without their results, newest first."""
     columns = [sa.null().label("result") if name == "result" else jobs.c[name] for name in JobRow._fields]
-    query = sa.select(*columns).where(jobs.c.agency_id == agency_id, jobs.c.kind == kind)
+    query = sa.select(*columns).where(jobs.c.agency_id == agency_id, _of_kind(kind))
+    if subject_id is not None:
+        query = query.where(jobs.c.subject_id == subject_id)
     if state is not None:
         query = query.where(jobs.c.state == state)
     if before is not None:
@@ -103,9 +120,19 @@ def list_jobs(
     return fetch_all(connection, query.order_by(jobs.c.id.desc()).limit(limit), JobRow)
 
 
-def list_unfinished(connection: sa.Connection) -> list[str]:
-    """Ids of the jobs of all agencies that are still to be done, oldest first."""
-    query = sa.select(jobs.c.id).where(jobs.c.state.in_(UNFINISHED)).order_by(jobs.c.id)
+def find_job_about(
+    connection: sa.Connection, agency_id: str, kind: JobKind, subject_id: str, states: Sequence[str]
+) -> JobRow | None:
+    """The newest job of a kind about a row, in one of some states."""
+    query = select_rows(JobRow, jobs).where(
+        jobs.c.subject_id == subject_id, jobs.c.agency_id == agency_id, jobs.c.kind == kind, jobs.c.state.in_(states)
+    )
+    return find_one(connection, query.order_by(jobs.c.id.desc()).limit(1), JobRow)
+
+
+def list_unfinished(connection: sa.Connection, kinds: Sequence[JobKind] = tuple(JobKind)) -> list[str]:
+    """Ids of the jobs of some kinds and all agencies that are still to be done, oldest first."""
+    query = sa.select(jobs.c.id).where(jobs.c.state.in_(UNFINISHED), _of_kind(kinds)).order_by(jobs.c.id)
     return list(connection.execute(query).scalars())
 
 
@@ -121,12 +148,28 @@ def start_job(connection: sa.Connection, job_id: str) -> JobRow | None:
     return find_one(connection, select_rows(JobRow, jobs).where(jobs.c.id == job_id), JobRow)
 
 
-def record_progress(connection: sa.Connection, job_id: str, progress: float) -> bool:
-    """Record how far a running job is. Returns False if it was cancelled or is gone, so that it has to stop."""
+def record_progress(
+    connection: sa.Connection, job_id: str, progress: float,
+    *, steps: tuple[int, int] | None = None, kept: bool = False,
+) -> bool:  # fmt: skip
+    """Record how far a running job is. Returns False if it was cancelled or is gone, so that it has to stop.
+
+    Parameters
+    ----------
+    steps : (int, int), optional
+        Steps that are done, and all.
+    kept : bool, optional
+        A part of the result was stored, which the next attempt need not compute: attempts are counted anew.
+    """
+    values: dict[str, Any] = {"progress": progress}
+    if steps is not None:
+        values["steps_done"], values["steps_total"] = steps
+    if kept:
+        values["attempts"] = 1
     statement = sa.update(jobs).where(
         jobs.c.id == job_id, jobs.c.state == "running", jobs.c.cancel_requested.is_(False)
     )
-    return connection.execute(statement.values(progress=progress)).rowcount == 1
+    return connection.execute(statement.values(**values)).rowcount == 1
 
 
 def request_cancel(
@@ -156,3 +199,7 @@ def finish_job(
         values["progress"] = 1.0
     statement = sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state.in_(UNFINISHED)).values(**values)
     return connection.execute(statement).rowcount == 1
+
+
+def _of_kind(kind: JobKind | Sequence[JobKind]) -> sa.ColumnElement[bool]:
+    return jobs.c.kind == kind if isinstance(kind, JobKind) else jobs.c.kind.in_(kind)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import sqlalchemy as sa
@@ -38,17 +38,32 @@ class RunningJob:
         self._database, self._clock = database, clock
         self.row = row
 
-    def report_progress(self, progress: float) -> None:
+    def report_progress(
+        self, progress: float, *, steps: tuple[int, int] | None = None,
+        keep: Callable[[sa.Connection], None] | None = None,
+    ) -> None:  # fmt: skip
         """Record how far the job is.
+
+        Parameters
+        ----------
+        progress : float
+            From 0 to 1.
+        steps : (int, int), optional
+            Steps that are done, and all.
+        keep : callable, optional
+            Stores a part of the result in the same transaction, so that the next attempt goes on from there. A job
+            that gets on is never given up for its number of attempts.
 
         Raises
         ------
         JobCancelled
-            Somebody asked the job to stop.
+            Somebody asked the job to stop; nothing was kept.
         """
         with self._database.write() as connection:
-            if not store.record_progress(connection, self.row.id, progress):
+            if not store.record_progress(connection, self.row.id, progress, steps=steps, kept=keep is not None):
                 raise JobCancelled
+            if keep is not None:
+                keep(connection)
 
     def finish(self, connection: sa.Connection, result: Mapping[str, object] | None = None) -> bool:
         """Record that the job is done, in the transaction that stores its result.
@@ -111,10 +126,10 @@ class Jobs:
             with acting_for(row.agency_id):
                 self._run(RunningJob(self._database, self._clock, row))
 
-    def list_unfinished(self) -> list[str]:
-        """Jobs that an earlier process left unfinished."""
+    def list_unfinished(self, kinds: Sequence[JobKind] = tuple(JobKind)) -> list[str]:
+        """Jobs of some kinds that an earlier process left unfinished."""
         with across_agencies(), self._database.read() as connection:
-            return store.list_unfinished(connection)
+            return store.list_unfinished(connection, kinds)
 
     def _run(self, job: RunningJob) -> None:
         if job.row.attempts > self._max_attempts:

@@ -81,6 +81,11 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/plans/{plan_id}/approve": PLANNERS,
     "POST /v1/plans/{plan_id}/commit": PLANNERS,
     "GET /v1/plans/{plan_id}/as-built": READERS,
+    "GET /v1/plans/{plan_id}/proof": READERS,
+    "POST /v1/plans/{plan_id}/proof": PLANNERS,
+    "GET /v1/plan-jobs": READERS,
+    "GET /v1/plan-jobs/{job_id}": READERS,
+    "POST /v1/plan-jobs/{job_id}/cancel": PLANNERS,
     # --- roads
     "GET /v1/roads": READERS,
     "POST /v1/roads": PLANNERS,

@@ -40,6 +40,7 @@ from app.services.plans.documents import (
     PlanVersionPage,
 )
 from app.services.plans.plans import Plans
+from app.services.plans.proofs import PROOF_FILES, Proofs
 
 router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
 
@@ -104,11 +105,19 @@ def get_plan_file(
     name: Annotated[Text, Path(max_length=60, examples=["bill.csv"])],
     caller: Caller,
     plans: Service,
+    proofs: Annotated[Proofs, use_cases("proofs")],
     crs: Annotated[Text | None, Query(max_length=64, description="CRS of the stakeout.")] = None,
     unit: Annotated[Literal["m", "ft-us", "ft-intl"] | None, Query(description="Unit of the stakeout.")] = None,
 ) -> Response:
-    """A file of a plan: its document, bill, stakeout, drawings or map. A wrong name is answered with the right ones."""
-    data, version = plans.file(caller, plan_id, name, crs=crs, unit=unit)
+    """A file of a plan: its document, bill, stakeout, drawings, map, or the table of its proof.
+
+    A wrong name is answered with the right ones.
+    """
+    if name in PROOF_FILES:
+        data, row = proofs.file(caller, plan_id, name)
+        version = row.version
+    else:
+        data, version = plans.file(caller, plan_id, name, crs=crs, unit=unit)
     media_type = MEDIA_TYPES.get(name.rpartition(".")[2], "application/octet-stream")
     headers = {"ETag": f'"{version}-{name}"', "Content-Disposition": f'attachment; filename="{name}"'}
     return Response(data, media_type=media_type, headers=headers)

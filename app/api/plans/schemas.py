@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from app.families.inputs import Identifier, Number, Text
 from app.formats.alignments.registered_road import RoadLanes
 from app.planning.alignment_declaration import AlignmentDeclaration
+from app.planning.proof import ProofTerms
 from app.services.plans.plans import PlanChange
 
 Name = Annotated[Text, Field(min_length=1, max_length=80)]
@@ -106,3 +107,11 @@ class PlanPatch(_Body):
         named = self.model_fields_set - {"reason"}
         values = {name: value for name, value in self.model_dump(include=named).items() if value is not None}
         return PlanChange(values, self.reason)
+
+
+class ProofIn(ProofTerms):
+    """What is driven, and how; every member has a default."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"drives": 20, "seed": 7, "conditions": ["day", "night+rain"]}, {}]}
+    )

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from app.errors import InvalidParameter
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.plate import PlateCode
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
@@ -44,6 +45,8 @@ TAGS_NEAR_M = 500.0
 """[m] within which tags are looked for. Source: chosen by hand, a road with one codebook."""
 NEAR_M = 200.0
 """[m] within which plates are in the codebook of a frame. Source: ten times the 20 m of a coarse position."""
+MAX_UNITS = 10_000
+"""Units of one proof at most. Source: chosen by hand, some hours of work on two cores."""
 _MIN_MARKERS = 4  # in a stretch that is driven; source: chosen by hand, two pairs
 _BESIDE_M = 0.8  # [m] beyond a boundary, where its markers still are; source: twice `CerpmRules` and paint, by hand
 _LINE_OFFSET_SD_M = 0.25  # [m] of the bar's middle over a line; source: chosen by hand, a quarter of the bar
@@ -70,6 +73,32 @@ class Prover:
     def list_units(self) -> list[ProofUnit]:
         """All units, drive by drive."""
         return [unit for drive in range(self.terms.drives) for unit in self._drive_units(drive)]
+
+    def check_size(self) -> None:
+        """Check that there is something to prove, and not too much: all drives have about as many units as the first.
+
+        Raises
+        ------
+        InvalidParameter
+            The plan has nothing that a vehicle reads, there are more than `MAX_UNITS` units, or a camera is unknown.
+        """
+        for k in range(len(self.terms.cameras or ())):
+            drive_terms(self.plan, self.terms, k * len(self.terms.conditions))
+        count = len(self._drive_units(0))
+        if not count:
+            raise InvalidParameter(
+                "the plan has nothing that a vehicle could read",
+                field="plan",
+                limit=f"a plate or a tag, or {_MIN_MARKERS} line magnets or CERPMs on a stretch of lane",
+                cure="choose rules that place markers on this road",
+            )
+        if count * self.terms.drives > MAX_UNITS:
+            raise InvalidParameter(
+                f"{self.terms.drives} drives of about {count} units each are too many",
+                field="drives",
+                limit=f"{MAX_UNITS} units, here {MAX_UNITS // count} drives",
+                cure="ask for fewer drives, or lower max_markers_per_drive and max_sections_per_drive",
+            )
 
     def _drive_units(self, drive: int) -> list[ProofUnit]:
         most = self.terms.max_markers_per_drive

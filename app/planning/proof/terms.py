@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from app.errors import InvalidParameter
 from app.planning.plan import Plan
 from app.planning.rules import CameraRules
+
+Whole = Annotated[int, Field(strict=True)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 
 class Condition(StrEnum):
@@ -41,21 +45,25 @@ class ProofTerms(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
-    drives: int = Field(default=6, ge=1, le=10_000)
-    seed: int = Field(default=1, ge=0, le=2**31 - 1)
-    conditions: tuple[str, ...] = Field(default=("day",), min_length=1, max_length=20)
-    cameras: tuple[str, ...] | None = Field(default=None, description="Names in the rules; without, all of them.")
-    speed_share: float = Field(default=1.0, ge=0.1, le=1.5, description="Of the design speed.")
-    lost_share: float = Field(default=0.0, ge=0.0, le=0.9)
-    clearance_m: float = Field(default=0.16, ge=0.05, le=0.6, description="Of the magnetometers above the road.")
-    survey_rmse_m: float = Field(default=0.03, ge=0.0, le=2.0, description="Of the registered positions, horizontal.")
-    max_markers_per_drive: int = Field(
+    drives: Whole = Field(default=6, ge=1, le=10_000)
+    seed: Whole = Field(default=1, ge=0, le=2**31 - 1)
+    conditions: tuple[str, ...] = Field(
+        default=("day",), min_length=1, max_length=20, description="Of the drives in turn; `night+rain` is both."
+    )
+    cameras: tuple[str, ...] | None = Field(
+        default=None, min_length=1, max_length=10, description="Names in the rules; without, all of them."
+    )
+    speed_share: Number = Field(default=1.0, ge=0.1, le=1.5, description="Of the design speed.")
+    lost_share: Number = Field(default=0.0, ge=0.0, le=0.9, description="Of the markers, missing in a drive.")
+    clearance_m: Number = Field(default=0.16, ge=0.05, le=0.6, description="Of the magnetometers above the road.")
+    survey_rmse_m: Number = Field(default=0.03, ge=0.0, le=2.0, description="Of the registered positions, horizontal.")
+    max_markers_per_drive: Whole = Field(
         default=40, ge=1, le=1_000_000, description="Plates and tags each; more are sampled by strata."
     )
-    max_sections_per_drive: int = Field(
+    max_sections_per_drive: Whole = Field(
         default=6, ge=1, le=100_000, description="Stretches of line magnets and of lanes with CERPMs each."
     )
-    weak_below: float = Field(default=0.9, gt=0.0, le=1.0, description="Read rate below which a marker is weak.")
+    weak_below: Number = Field(default=0.9, gt=0.0, le=1.0, description="Read rate below which a marker is weak.")
 
     @field_validator("conditions")
     @classmethod
@@ -70,10 +78,19 @@ def parse_conditions(text: str) -> frozenset[Condition]:
 
     Raises
     ------
-    ValueError
+    InvalidParameter
         A name is unknown.
     """
-    return frozenset(Condition(part.strip()) for part in text.split("+"))
+    names = [part.strip() for part in text.split("+")]
+    unknown = [name for name in names if name not in list(Condition)]
+    if unknown:
+        raise InvalidParameter(
+            f"{unknown[0][:40]!r} is no condition",
+            field="conditions",
+            limit=", ".join(Condition),
+            cure="name one of these, or join several with +",
+        )
+    return frozenset(Condition(name) for name in names)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,8 @@ from typing import Any, Literal
 
 from typing_extensions import TypedDict
 
+from app.services.plans.proof_documents import ProofSummary
+
 PlanStatus = Literal["draft", "checked", "proved", "approved", "committed", "built", "surveyed"]
 
 
@@ -154,6 +156,8 @@ class PlanDocument(PlanSummary):
     alignment_id: str
     status: PlanStatus
     rules: dict[str, Any]
+    proof: ProofSummary | None
+    """Null if it was not proved since its markers were placed."""
     author: str
     approver: str | None
     version: int

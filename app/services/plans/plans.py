@@ -40,11 +40,12 @@ from app.services.plans.documents import (
     PlanVersionDocument,
     PlanVersionPage,
 )
+from app.services.plans.proof_documents import ProofSummary
+from app.services.plans.statuses import APPROVED, CHECKED, COMMITTED, DRAFT, PROVED
 from app.services.plans.tasks import CompareTask, MadePlan, MakePlanTask, WritePlanFileTask
 from app.services.ports import Blobs, Clock
 from app.services.staged_blobs import staged
 
-DRAFT, CHECKED, PROVED, APPROVED, COMMITTED = "draft", "checked", "proved", "approved", "committed"
 MAX_EXISTING = 200_000
 """Markers of the registry near a road that a plan is checked against. Source: chosen by hand, bounds the memory."""
 _MARGIN_M = 100.0  # [m] around the road; source: chosen by hand, five times the distance of confusable codes
@@ -330,7 +331,10 @@ class Plans:
 
 def plan_document(row: PlanRow) -> PlanDocument:
     """A plan as clients see it."""
-    return document_of(PlanDocument, row, **_members(row, PlanDocument))
+    proof = None
+    if row.proof is not None:
+        proof = {name: value for name, value in row.proof.items() if name in ProofSummary.__annotations__}
+    return document_of(PlanDocument, row, proof=proof, **_members(row, PlanDocument))
 
 
 def plan_overview(row: PlanRow) -> PlanOverview:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from app.markers.checks import Verdict
 from app.planning.alignment import Alignment, Lane
 from app.planning.outputs.bill import plan_bill
 from app.planning.plan import Plan, PlanFinding
+from app.planning.proof import ProofReport, UnitResult
 from app.services.documents import document_of
 from app.services.plans.documents import (
     EventSummary,
@@ -19,9 +21,12 @@ from app.services.plans.documents import (
     PlanSummary,
     RoadSummary,
 )
+from app.services.plans.proof_documents import ProofFigures, ProofTermsDocument, ReadRateDocument, WeakMarker
 
 MAX_LISTED = 1000
 """Events, warnings and places left out that a summary lists; all are counted. Source: chosen by hand."""
+MAX_WEAK = 100
+"""Weak markers that the document of a plan lists; its report has all. Source: chosen by hand."""
 _STRAIGHT_PER_M = 1e-5  # [1/m] below it a lane is straight; source: chosen by hand, a radius of 100 km
 
 
@@ -58,6 +63,21 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
         "codebook_entries": len(plan.codebook.entries) if plan.codebook is not None else 0,
     }
     return dict(summary)
+
+
+def proof_figures(report: ProofReport, results: Sequence[UnitResult]) -> dict[str, Any]:
+    """What the plan's document shows of a proof, as `ProofFigures`."""
+    figures: ProofFigures = {
+        "passed": not report.wrong,
+        "units": len(results),
+        "rates": [document_of(ReadRateDocument, rate) for rate in report.rates],
+        "markers": len(report.markers),
+        "weak": len(report.weak),
+        "wrong": len(report.wrong),
+        "weak_markers": [document_of(WeakMarker, marker) for marker in report.weak[:MAX_WEAK]],
+        "terms": cast("ProofTermsDocument", report.terms.model_dump(mode="json")),
+    }
+    return dict(figures)
 
 
 def worst_verdict(findings: tuple[PlanFinding, ...]) -> str:

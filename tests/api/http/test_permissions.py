@@ -74,7 +74,7 @@ QUERIES = {
     "GET /v1/roads/{road_id}/position": "?measure_m=10",
 }
 # what the things made below do not have
-NOT_MADE = ("/artwork.{form}", "/plot.svg", "/lane.geojson", "/overlay.{suffix}")
+NOT_MADE = ("/artwork.{form}", "/proof", "/plot.svg", "/lane.geojson", "/overlay.{suffix}")
 
 
 @pytest.fixture(scope="module")
@@ -254,6 +254,8 @@ def things(server: LiveServer) -> dict[str, list[str]]:
         alignment = _made(owner.post("/v1/alignments", files=road_file))["id"]
         rules = {"version": 1, "plates": {}}
         plan = _made(owner.post("/v1/plans", json={"name": "p", "alignment_id": alignment, "rules": rules}))["id"]
+        job = owner.post(f"/v1/plans/{plan}/proof", json={}, headers={"If-Match": "*"}).json()["id"]
+        owner.post(f"/v1/plan-jobs/{job}/cancel")
     access = server.app.state.access
     caller = access.authenticate(owner.headers["authorization"].split()[1])
     calibration = {"id": "019cb624-0000-7000-8000-00000000cccc", "who": "w", "result": CALIBRATED}
@@ -273,6 +275,7 @@ def things(server: LiveServer) -> dict[str, list[str]]:
         "import_id": [queued],
         "alignment_id": [alignment],
         "plan_id": [plan],
+        "job_id": [job],
     }
 
 
