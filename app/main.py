@@ -73,6 +73,7 @@ from app.services.markers.markers import Markers
 from app.services.markers.observations import Observations
 from app.services.markers.searches import Searches
 from app.services.plans.alignments import Alignments
+from app.services.plans.making import PlanMaking
 from app.services.plans.plan_jobs import PlanJobs
 from app.services.plans.plans import Plans
 from app.services.plans.proofs import Proofs
@@ -181,6 +182,8 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
     import_jobs = ImportJobs(database, utc_now, blobs, queue, imports=import_cases, idempotency_ttl=ttl)
     decode_cases = Decodes(database, utc_now, blobs=blobs, queue=queue, handlers=handlers, rules=rules)
     access = Access(database, utc_now, _token_check(settings))
+    plan_cases = Plans(database, utc_now, blobs, pool, marker_rules(settings))
+    plan_making = PlanMaking(database, utc_now, outside.plan_queue, plans=plan_cases, idempotency_ttl=ttl)
     proof_cases = Proofs(
         database, utc_now, blobs, pool, outside.proof_queue, in_flight=settings.decode_workers, idempotency_ttl=ttl
     )
@@ -203,14 +206,20 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
         "jobs": Jobs(
             database,
             utc_now,
-            {JobKind.DECODE: decode_cases, JobKind.IMPORT: import_jobs, JobKind.PROOF: proof_cases},
+            {
+                JobKind.DECODE: decode_cases,
+                JobKind.IMPORT: import_jobs,
+                JobKind.PLAN: plan_making,
+                JobKind.PROOF: proof_cases,
+            },
         ),
         "keys": Keys(database, utc_now, access),
         "layouts": Layouts(database),
         "markers": marker_cases,
         "observations": Observations(database),
         "plan_jobs": PlanJobs(database, utc_now),
-        "plans": Plans(database, utc_now, blobs, pool, marker_rules(settings)),
+        "plan_making": plan_making,
+        "plans": plan_cases,
         "proofs": proof_cases,
         "programs": CerpmPrograms(database, utc_now, secrets),
         "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),

@@ -192,9 +192,12 @@ def request_cancel(
 def finish_job(
     connection: sa.Connection, job_id: str, state: JobState, now: datetime,
     *, result: Mapping[str, Any] | None = None, error: Mapping[str, object] | None = None,
+    subject_id: str | None = None,
 ) -> bool:  # fmt: skip
     """Record how a job ended, unless it has ended before. Returns whether it did now."""
     values: dict[str, Any] = {"state": state, "finished_at": now, "result": result, "error": error}
+    if subject_id is not None:
+        values["subject_id"] = subject_id
     if state == "done":
         values["progress"] = 1.0
     statement = sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state.in_(UNFINISHED)).values(**values)

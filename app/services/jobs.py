@@ -65,13 +65,15 @@ class RunningJob:
             if keep is not None:
                 keep(connection)
 
-    def finish(self, connection: sa.Connection, result: Mapping[str, object] | None = None) -> bool:
-        """Record that the job is done, in the transaction that stores its result.
+    def finish(
+        self, connection: sa.Connection, result: Mapping[str, object] | None = None, *, subject_id: str | None = None
+    ) -> bool:
+        """Record that the job is done, in the transaction that stores its result, and the row that it has made.
 
         Returns whether this was the first time: if not, another worker has finished the job, and nothing more may be
         stored.
         """
-        return store.finish_job(connection, self.row.id, "done", self._clock(), result=result)
+        return store.finish_job(connection, self.row.id, "done", self._clock(), result=result, subject_id=subject_id)
 
     def end(self, state: JobState, error: WaymarkError | None = None) -> None:
         """Record that the job ended without a result."""

@@ -50,6 +50,11 @@ Prefer = Annotated[
 ]
 
 
+def wants_job(prefer: str | None) -> bool:
+    """Whether a request is to be run as a job, by its Prefer header."""
+    return "respond-async" in (prefer or "").lower()
+
+
 def file_response(media_types: Iterable[str], description: str = "The file", status: int = 200) -> Described:
     """A response that is a file of one of some media types: binary, or GeoJSON."""
     content = {media_type: {"schema": _SCHEMAS.get(media_type, BINARY)} for media_type in media_types}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 from fastapi import APIRouter, Path, Query, Request, Response
 
@@ -21,14 +21,17 @@ from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     NOT_MODIFIED,
     IfNoneMatch,
+    Prefer,
     created_response,
     document_response,
     file_response,
     json_response,
     page_response,
     versioned_response,
+    wants_job,
 )
 from app.api.http.strict_json import StrictRoute
+from app.api.plans.plan_jobs import queued_response
 from app.api.plans.schemas import PlanIn, PlanPatch
 from app.planning.outputs.files import MEDIA_TYPES
 from app.services.plans.documents import (
@@ -39,6 +42,8 @@ from app.services.plans.documents import (
     PlanStatus,
     PlanVersionPage,
 )
+from app.services.plans.making import PlanMaking
+from app.services.plans.plan_jobs import PlanJobDocument
 from app.services.plans.plans import Plans
 from app.services.plans.proofs import PROOF_FILES, Proofs
 
@@ -50,10 +55,33 @@ PlanId = Annotated[Identifier, Path(description="Id of the plan.")]
 Service = Annotated[Plans, use_cases("plans")]
 
 
-@router.post("", status_code=201, responses=document_response(PlanDocument, 404, 409, status=201, description="Made"))
-def post_plan(wanted: PlanIn, caller: Caller, plans: Service, idempotency: Idempotency) -> Response:
-    """Place the markers that rules ask for on an alignment, and check them. Nothing is in the registry yet."""
-    document, replayed = plans.make(caller, wanted.name, wanted.alignment_id, wanted.rules, idempotency)
+@router.post(
+    "",
+    status_code=201,
+    responses={
+        201: {"model": PlanDocument, "description": "Made"},
+        202: {"model": PlanJobDocument, "description": "Queued; Location leads to its progress and to the plan"},
+        **problem_responses(404, 409),
+    },
+)
+def post_plan(
+    wanted: PlanIn,
+    caller: Caller,
+    plans: Service,
+    making: Annotated[PlanMaking, use_cases("plan_making")],
+    idempotency: Idempotency,
+    prefer: Prefer = None,
+) -> Response:
+    """Place the markers that rules ask for on an alignment, and check them. Nothing is in the registry yet.
+
+    A plan on more than 20 km of lanes is made by a job, and so is one that is asked for with `Prefer: respond-async`.
+    """
+    asked = (caller, wanted.name, wanted.alignment_id, wanted.rules, idempotency)
+    as_job = wants_job(prefer) or making.is_long(caller, wanted.alignment_id)
+    document: PlanDocument | PlanJobDocument
+    document, replayed = making.request(*asked) if as_job else plans.make(*asked)
+    if "attempts" in document:  # a repeated request gets the first response, whichever it was
+        return queued_response(cast("PlanJobDocument", document), replayed)
     return created_response(document, replayed, path="/v1/plans")
 
 

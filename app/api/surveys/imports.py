@@ -19,6 +19,7 @@ from app.api.http.responses import (
     document_response,
     json_response,
     page_response,
+    wants_job,
 )
 from app.api.surveys.schemas import DECLARATION_EXAMPLE, DeclarationIn
 from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, UnsupportedUpload
@@ -89,7 +90,7 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
     if len(text) > MAX_DECLARATION_BYTES:
         raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
     declared = read_declaration(DeclarationIn, text, "body", "declaration").declared()
-    as_job = len(data) > IMMEDIATE_BYTES or "respond-async" in (prefer or "").lower()
+    as_job = len(data) > IMMEDIATE_BYTES or wants_job(prefer)
     return _Asked(import_input(declared, data), declared, idempotency_of(request, idempotency_key, text, data), as_job)
 
 

@@ -66,7 +66,7 @@ def _metres(line: GroundLine) -> Floats:
 
 
 def check_length(lines: Sequence[Sequence[GroundLine]]) -> None:
-    """Raises InvalidParameter if all lanes together are longer than 1,000 km."""
+    """Raises InvalidParameter if all lanes together are longer than 500 km."""
     total = sum(max(line.length_m for line in one) for one in lines)
     if total > MAX_LANES_M:
         raise InvalidParameter(

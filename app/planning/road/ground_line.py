@@ -14,8 +14,9 @@ from app.geodesy.ellipsoid import metres_per_radian
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
-MAX_LANES_M = 1_000_000.0
-"""Length of all lanes of a plan at most. [m] Source: issue 13, "1,000 km in one request"."""
+MAX_LANES_M = 500_000.0
+"""Length of all lanes of a plan at most. [m] Source: chosen by hand; 100 km of four lanes fit, a road of 1,000 km does
+not."""
 PIECE_M = 50.0
 """Longest piece between vertices: at 60 degrees of latitude straight lines in degrees, in a projection and on the
 ellipsoid differ by less than 0.1 mm on it. [m] Source: L^2 tan(lat) / (8 R)."""
@@ -48,7 +49,7 @@ def densify(vertices: Floats, *, geographic: bool, unit_m: float, name: str) -> 
     Raises
     ------
     InvalidParameter
-        A coordinate is not finite, or the line is longer than 1,000 km.
+        A coordinate is not finite, or the line is longer than 500 km.
     """
     _check_vertices(vertices, geographic, name)
     if geographic:

@@ -27,6 +27,7 @@ from app.services.access.audit import log_change
 from app.services.decoder_processes import DecoderProcesses
 from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
+from app.services.jobs import RunningJob
 from app.services.plans.alignments import BUSY_WAIT_S, road_of
 from app.services.plans.as_built import SURVEYED
 from app.services.plans.commit import commit_markers
@@ -49,6 +50,8 @@ from app.services.staged_blobs import staged
 MAX_EXISTING = 200_000
 """Markers of the registry near a road that a plan is checked against. Source: chosen by hand, bounds the memory."""
 _MARGIN_M = 100.0  # [m] around the road; source: chosen by hand, five times the distance of confusable codes
+PLACED = 0.9
+"""Progress of a job whose plan is placed and checked, and is stored next."""
 _TRIES = 4  # of drawing registry numbers that nobody has; source: chosen by hand
 
 
@@ -81,9 +84,19 @@ class Plans:
         return self._rules.idempotency_ttl
 
     def make(
-        self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any], key: IdempotencyKey | None = None
-    ) -> tuple[PlanDocument, bool]:
+        self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any], key: IdempotencyKey | None = None,
+        *, job: RunningJob | None = None,
+    ) -> tuple[PlanDocument, bool]:  # fmt: skip
         """Place and check the markers of a new plan, and store it.
+
+        Parameters
+        ----------
+        caller : Caller
+        name, alignment_id : str
+        rules : dict
+        key : IdempotencyKey, optional
+        job : RunningJob, optional
+            That makes it; it is finished in the same transaction.
 
         Returns
         -------
@@ -107,6 +120,8 @@ class Plans:
         with self._database.read() as connection:
             PLANS.check_name(connection, agency_id, name)
         made = self._made(caller, name, alignment_id, rules)
+        if job is not None:
+            job.report_progress(PLACED)
         with staged(self._blobs) as stage:
             document_key = stage.put("plans", made.document, durable=True)
             with (
@@ -123,6 +138,8 @@ class Plans:
                     **_made_columns(caller, made, rules, document_key),
                 }
                 row = PLANS.add(connection, agency_id, values, who=caller.label)
+                if job is not None and not job.finish(connection, {"plan_version": 1}, subject_id=row.id):
+                    raise Conflict("another worker has made this plan")
                 document = answer.store(plan_document(row))
                 log_change(connection, caller, "plan.made", now=now, subject=row.id, document=rules)
             stage.keep()
