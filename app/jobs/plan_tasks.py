@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any
 
 from app.families import get_family
 from app.formats.alignments.geometry import AlignmentFile
@@ -24,12 +23,14 @@ from app.planning.read_rules import check_rules
 from app.planning.rules import RoadRules
 from app.services.plans.as_built import compare_as_built
 from app.services.plans.documents import AsBuiltDocument
+from app.services.plans.features import lane_features, planned_columns
 from app.services.plans.summaries import plan_summary, road_summary
 from app.services.plans.tasks import (
     CompareTask,
     MadePlan,
     MakePlanTask,
     RoadFile,
+    SummarizedRoad,
     SummarizeRoadTask,
     WriteMapTask,
     WritePlanFileTask,
@@ -38,11 +39,12 @@ from app.services.plans.tasks import (
 _CURE = "cut the road into sections"
 
 
-def summarize_road(task: SummarizeRoadTask, _before: None) -> dict[str, Any]:
+def summarize_road(task: SummarizeRoadTask, _before: None) -> SummarizedRoad:
     """Read a road and describe it."""
     with memory_is_the_limit("road", _CURE):
         file = read_alignment(task.road.data, task.road.file_name)
-        return dict(road_summary(_build(file, task.road, RoadRules()), file.format))
+        road = _build(file, task.road, RoadRules())
+        return SummarizedRoad(dict(road_summary(road, file.format)), lane_features(road))
 
 
 def make_plan(task: MakePlanTask, _before: None) -> MadePlan:
@@ -56,7 +58,7 @@ def make_plan(task: MakePlanTask, _before: None) -> MadePlan:
         plan = place_plan(alignment, rules, name=task.name, codebook=book, numbers=numbers)
         plan = check_plan(plan, task.existing)
         codes = tuple((marker.family, marker.code) for marker in plan.markers if marker.family != "magnet")
-        return MadePlan(zlib.compress(write_plan(plan), 6), plan_summary(plan), codes)
+        return MadePlan(zlib.compress(write_plan(plan), 6), plan_summary(plan), codes, planned_columns(plan))
 
 
 def write_file_of_plan(task: WritePlanFileTask, _before: None) -> bytes:

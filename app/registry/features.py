@@ -1,4 +1,4 @@
-"""Markers as features: pages, counts and extents for GIS clients.
+"""Points as features: pages, counts and extents for GIS clients. A `FeatureTable` says which rows, and of which table.
 
 A page is asked for thousands of times a second, and building a statement costs more than running it. So a statement is
 built once for each shape of a question, and every value in it is a bound parameter.
@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
 from app.registry.conditions import Condition, condition_sql
+from app.registry.plan_states import find_plan_states
 from app.registry.spatial import Box, proposed_by_index
 from app.registry.tables import markers
 
@@ -58,17 +59,84 @@ FIELDS = (
     Field("updated_at", "date-time", _C.updated_at, "When it was last changed"),
 )
 FIELDS_BY_NAME = {field.name: field for field in FIELDS}
-_COLUMNS = {field.name: field.column for field in FIELDS}
+_RETIRED: sa.BindParameter[str] = sa.bindparam("retired", "retired", sa.String())
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureTable:
+    """Rows that are the features of a collection of points.
+
+    Attributes
+    ----------
+    table : Table
+        With the columns row, id, agency_id, lon_deg, lat_deg and height_m, and a spatial index.
+    fields : tuple of Field
+    owned : condition
+        Which rows of the table they are.
+    text : column
+        The feature as GeoJSON, in one line.
+    changed : column
+        Time of the last change.
+    tiled : tuple of str
+        Fields that points in tiles have.
+    cheap_to_count : frozenset of str
+        Fields by which rows are counted in little time.
+    epoch : column, optional
+        Coordinate epoch of a row. [decimal year]
+    plans : Table, optional
+        What the columns refer to besides: the plan of each row.
+    """
+
+    table: sa.Table
+    fields: tuple[Field, ...]
+    owned: sa.ColumnElement[bool]
+    text: sa.ColumnElement[Any]
+    changed: sa.ColumnElement[Any]
+    tiled: tuple[str, ...]
+    cheap_to_count: frozenset[str]
+    epoch: sa.ColumnElement[Any] | None = None
+    plans: sa.Table | None = None
+
+    @property
+    def source(self) -> sa.FromClause:
+        """What is selected from."""
+        if self.plans is None:
+            return self.table
+        return self.table.join(self.plans, self.plans.c.id == self.table.c.plan_id)
+
+    @cached_property
+    def columns(self) -> dict[str, sa.ColumnElement[Any]]:
+        """Columns by the names of their properties."""
+        return {field.name: field.column for field in self.fields}
+
+    @property
+    def conditions(self) -> list[sa.ColumnElement[bool]]:
+        """An agency's rows, by the parameter `agency`."""
+        return [self.table.c.agency_id == sa.bindparam("agency"), self.owned]
+
+    def values(self, connection: sa.Connection, agency_id: str) -> dict[str, Any]:
+        """Values of the parameters that all statements have."""
+        values: dict[str, Any] = {"agency": agency_id}
+        if self.plans is not None:
+            states = find_plan_states(connection, agency_id)
+            values |= {name: sorted(getattr(states, name)) for name in states._fields}
+        return values
+
+
+TILE_FIELDS = ("family", "status", "code", "heading_deg", "road")
+_MARKERS = (_C.feature, _C.updated_at, TILE_FIELDS, frozenset({"family", "code"}), _C.epoch)
+ON_ROAD = FeatureTable(markers, FIELDS, _C.status != _RETIRED, *_MARKERS)
+RETIRED = FeatureTable(markers, FIELDS, _C.status == _RETIRED, *_MARKERS)
 
 
 @dataclass(frozen=True, slots=True)
 class FeatureFilter:
-    """Which markers are asked for; None does not narrow.
+    """Which features are asked for; None does not narrow.
 
     Attributes
     ----------
-    retired : bool
-        Markers that are out of use, instead of all others.
+    table : FeatureTable
+        Of which collection.
     box : Box or None
     heights_m : tuple of float or None
         Lowest and highest height; markers without a height are included. [m]
@@ -80,7 +148,7 @@ class FeatureFilter:
         Anything else that is asked of the properties.
     """
 
-    retired: bool = False
+    table: FeatureTable = ON_ROAD
     box: Box | None = None
     heights_m: tuple[float, float] | None = None
     since: datetime | None = None
@@ -92,7 +160,7 @@ class FeatureFilter:
 class _Shape(NamedTuple):
     """What a statement depends on; all else is bound."""
 
-    retired: bool
+    table: FeatureTable
     wide: tuple[bool, ...]
     heights: bool
     since: bool
@@ -126,7 +194,7 @@ def list_features(
     counted: bool = False,
 ) -> tuple[list[str], int | None]:
     """Features as `feature_text` writes them, in the order of their ids, and how many match if they are counted."""
-    values = _values(agency_id, filtered)
+    values = _values(connection, agency_id, filtered)
     if after is not None:
         values["after"] = after
     statement = _page(_shape(filtered, after is not None), counted)
@@ -135,18 +203,21 @@ def list_features(
 
 
 def count_features(connection: sa.Connection, agency_id: str, filtered: FeatureFilter) -> int:
-    """How many markers a filter leaves."""
-    return int(connection.execute(_count(_shape(filtered, False)), _values(agency_id, filtered)).scalar_one())
+    """How many features a filter leaves."""
+    return int(
+        connection.execute(_count(_shape(filtered, False)), _values(connection, agency_id, filtered)).scalar_one()
+    )
 
 
-def find_feature(connection: sa.Connection, agency_id: str, marker_id: str, *, retired: bool) -> str | None:
+def find_feature(connection: sa.Connection, agency_id: str, feature_id: str, table: FeatureTable) -> str | None:
     """One feature as `list_features` has them."""
-    return connection.execute(_one(retired), {"agency": agency_id, "id": marker_id}).scalar_one_or_none()
+    values = {**table.values(connection, agency_id), "id": feature_id}
+    return connection.execute(_one(table), values).scalar_one_or_none()
 
 
-def find_extent(connection: sa.Connection, agency_id: str, *, retired: bool) -> Extent | None:
-    """What the agency's markers cover, and their epoch if all state the same one; None without any marker."""
-    row = connection.execute(_extent(retired), {"agency": agency_id}).one()
+def find_extent(connection: sa.Connection, agency_id: str, table: FeatureTable) -> Extent | None:
+    """What the agency's features cover, and their epoch if all state the same one; None without any feature."""
+    row = connection.execute(_extent(table), {"agency": agency_id}).one()
     if not row.total:
         return None
     same = row.epochs == row.total and row.min_epoch == row.max_epoch
@@ -158,7 +229,7 @@ def find_extent(connection: sa.Connection, agency_id: str, *, retired: bool) -> 
 def _shape(filtered: FeatureFilter, after: bool) -> _Shape:
     parts = filtered.box.parts if filtered.box is not None else ()
     return _Shape(
-        filtered.retired,
+        filtered.table,
         tuple((p.east_deg - p.west_deg) * (p.north_deg - p.south_deg) >= _WIDE_DEG2 for p in parts),
         filtered.heights_m is not None,
         filtered.since is not None,
@@ -169,8 +240,8 @@ def _shape(filtered: FeatureFilter, after: bool) -> _Shape:
     )
 
 
-def _values(agency_id: str, filtered: FeatureFilter) -> dict[str, Any]:
-    values: dict[str, Any] = {"agency": agency_id, "retired": "retired"}
+def _values(connection: sa.Connection, agency_id: str, filtered: FeatureFilter) -> dict[str, Any]:
+    values = filtered.table.values(connection, agency_id)
     for k, box in enumerate(filtered.box.parts if filtered.box is not None else ()):
         values |= {f"w{k}": box.west_deg, f"s{k}": box.south_deg, f"e{k}": box.east_deg, f"n{k}": box.north_deg}
     if filtered.heights_m is not None:
@@ -184,40 +255,35 @@ def _values(agency_id: str, filtered: FeatureFilter) -> dict[str, Any]:
     return values
 
 
-def owned(retired: bool) -> list[sa.ColumnElement[bool]]:
-    """An agency's markers, by the parameter `agency`."""
-    status: sa.BindParameter[str] = sa.bindparam("retired", "retired", sa.String())
-    return [_C.agency_id == sa.bindparam("agency"), _C.status == status if retired else _C.status != status]
-
-
-def in_box(k: int, wide: bool = False) -> sa.ColumnElement[bool]:
-    """Markers in the box of the parameters wK, sK, eK, nK: the index proposes, the exact columns decide."""
+def in_box(k: int, wide: bool = False, table: sa.Table = markers) -> sa.ColumnElement[bool]:
+    """Rows in the box of the parameters wK, sK, eK, nK: the index proposes, the exact columns decide."""
     number = partial(sa.bindparam, type_=sa.Double)
     west, south, east, north = (number(f"{side}{k}") for side in "wsen")
-    exact = sa.and_(_C.lon_deg.between(west, east), _C.lat_deg.between(south, north))
+    exact = sa.and_(table.c.lon_deg.between(west, east), table.c.lat_deg.between(south, north))
     if wide:
         return exact
-    return sa.and_(proposed_by_index(markers, west, south, east, north), exact)
+    return sa.and_(proposed_by_index(table, west, south, east, north), exact)
 
 
 def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
-    conditions = owned(shape.retired)
+    table, c = shape.table, shape.table.table.c
+    conditions = table.conditions
     if shape.wide:
-        conditions.append(sa.or_(*(in_box(k, wide) for k, wide in enumerate(shape.wide))))
+        conditions.append(sa.or_(*(in_box(k, wide, table.table) for k, wide in enumerate(shape.wide))))
     if shape.heights:
         low, high = sa.bindparam("low", type_=sa.Double), sa.bindparam("high", type_=sa.Double)
-        conditions.append(sa.or_(_C.height_m.is_(None), _C.height_m.between(low, high)))
+        conditions.append(sa.or_(c.height_m.is_(None), c.height_m.between(low, high)))
     if shape.since:
-        conditions.append(_C.updated_at >= sa.bindparam("since", type_=_C.updated_at.type))
+        conditions.append(table.changed >= sa.bindparam("since", type_=table.changed.type))
     if shape.until:
-        conditions.append(_C.updated_at <= sa.bindparam("until", type_=_C.updated_at.type))
+        conditions.append(table.changed <= sa.bindparam("until", type_=table.changed.type))
     for k, name in enumerate(shape.equal):
-        column = FIELDS_BY_NAME[name].column
+        column = table.columns[name]
         conditions.append(column == sa.bindparam(f"v{k}", type_=column.type))
     if shape.where is not None:
-        conditions.append(condition_sql(shape.where, _COLUMNS))
+        conditions.append(condition_sql(shape.where, table.columns))
     if shape.after:
-        conditions.append(_C.id > sa.bindparam("after"))
+        conditions.append(c.id > sa.bindparam("after"))
     return conditions
 
 
@@ -228,32 +294,37 @@ def _page(shape: _Shape, counted: bool) -> sa.Select[Any]:
     matched: sa.ColumnElement[Any] = sa.null()
     if counted:  # in the same statement, so that it is the same snapshot
         matched = _count(shape._replace(after=False)).correlate(None).scalar_subquery()
-    page = sa.select(_C.feature).where(*_conditions(shape)).order_by(_C.id).limit(most).subquery()
+    table = shape.table
+    rows = sa.select(table.text.label("feature")).select_from(table.source)
+    page = rows.where(*_conditions(shape)).order_by(table.table.c.id).limit(most).subquery()
     return sa.select(sa.func.aggregate_strings(page.c.feature, "\n"), matched)
 
 
 @lru_cache(maxsize=1024)
 def _count(shape: _Shape) -> sa.Select[Any]:
-    return sa.select(sa.func.count()).select_from(markers).where(*_conditions(shape))
+    return sa.select(sa.func.count()).select_from(shape.table.source).where(*_conditions(shape))
 
 
-@lru_cache(maxsize=2)
-def _one(retired: bool) -> sa.Select[Any]:
-    return sa.select(_C.feature).where(*owned(retired), _C.id == sa.bindparam("id"))
+@lru_cache
+def _one(table: FeatureTable) -> sa.Select[Any]:
+    query = sa.select(table.text).select_from(table.source)
+    return query.where(*table.conditions, table.table.c.id == sa.bindparam("id"))
 
 
-@lru_cache(maxsize=2)
-def _extent(retired: bool) -> sa.Select[Any]:
+@lru_cache
+def _extent(table: FeatureTable) -> sa.Select[Any]:
+    c, epoch = table.table.c, sa.null() if table.epoch is None else table.epoch
     figures: Mapping[str, sa.ColumnElement[Any]] = {
         "total": sa.func.count(),
-        "west": sa.func.min(_C.lon_deg),
-        "south": sa.func.min(_C.lat_deg),
-        "east": sa.func.max(_C.lon_deg),
-        "north": sa.func.max(_C.lat_deg),
-        "first": sa.func.min(_C.updated_at),
-        "last": sa.func.max(_C.updated_at),
-        "epochs": sa.func.count(_C.epoch),
-        "min_epoch": sa.func.min(_C.epoch),
-        "max_epoch": sa.func.max(_C.epoch),
+        "west": sa.func.min(c.lon_deg),
+        "south": sa.func.min(c.lat_deg),
+        "east": sa.func.max(c.lon_deg),
+        "north": sa.func.max(c.lat_deg),
+        "first": sa.func.min(table.changed),
+        "last": sa.func.max(table.changed),
+        "epochs": sa.func.count(epoch),
+        "min_epoch": sa.func.min(epoch),
+        "max_epoch": sa.func.max(epoch),
     }
-    return sa.select(*(figure.label(name) for name, figure in figures.items())).where(*owned(retired))
+    columns = (figure.label(name) for name, figure in figures.items())
+    return sa.select(*columns).select_from(table.source).where(*table.conditions)

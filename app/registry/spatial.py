@@ -34,7 +34,7 @@ def _rtree(table: str) -> sa.TableClause:
     return sa.table(f"{table}_rtree", *(sa.column(name, sa.Double) for name in names))
 
 
-_RTREES = {table: _rtree(table) for table in ("markers", "magnets")}
+_RTREES = {table: _rtree(table) for table in ("markers", "magnets", "planned_markers")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ def proposed_by_index(
     east_deg: sa.ColumnElement[float],
     north_deg: sa.ColumnElement[float],
 ) -> sa.ColumnElement[bool]:
-    """Rows of `markers` or `magnets` whose position may be inside a box that does not span the antimeridian."""
+    """Rows of a table with a spatial index whose position may be inside a box that does not span the antimeridian."""
     return _Proposed(table.c.row, west_deg, south_deg, east_deg, north_deg)
 
 

@@ -8,6 +8,8 @@ from app.markers.status import STATUSES
 from app.registry import column_types
 from app.registry.column_types import ID, UtcTime, agency_column, one_of
 from app.registry.metadata import metadata as metadata
+from app.registry.plan_feature_tables import alignment_lanes as alignment_lanes
+from app.registry.plan_feature_tables import planned_markers as planned_markers
 from app.registry.plan_tables import alignments as alignments
 from app.registry.plan_tables import plan_markers as plan_markers
 from app.registry.plan_tables import plan_versions as plan_versions

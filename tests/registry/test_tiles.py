@@ -13,9 +13,10 @@ import sqlalchemy as sa
 
 from app.registry import agencies
 from app.registry.database import Database
+from app.registry.features import ON_ROAD, RETIRED, TILE_FIELDS
 from app.registry.mvt import EXTENT, write_layer
 from app.registry.tables import markers
-from app.registry.tiles import MAX_FEATURES, TILE_FIELDS, Tile, marker_tile
+from app.registry.tiles import MAX_FEATURES, Tile, feature_tile
 from tests.databases import PostgresServer
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
@@ -158,7 +159,7 @@ def _row(k: int, lon_deg: float, lat_deg: float) -> dict[str, Any]:
 def _tile(database: Database, tile: Tile, *, retired: bool = False) -> bytes:
     def ask(connection: sa.Connection) -> bytes:
         agency_id = connection.execute(sa.select(sa.column("id")).select_from(sa.table("agencies"))).scalar_one()
-        return marker_tile(connection, agency_id, tile, retired=retired, layer="markers")
+        return feature_tile(connection, agency_id, tile, RETIRED if retired else ON_ROAD, layer="markers")
 
     with database.read() as connection:
         return ask(connection)

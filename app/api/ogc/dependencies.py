@@ -16,7 +16,7 @@ from app.services.markers.feature_crs import FeatureCrs
 from app.services.markers.features import Collection, Features, get_collection, no_feature
 
 _GEOJSON_NAMES = ("json", "geojson")
-_FEATURE_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", re.ASCII)
+_FEATURE_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}(\.[0-9]{5,7})?", re.ASCII)
 
 
 async def get_named_collection(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from functools import partial
 from typing import cast
 
 from starlette.responses import Response
@@ -12,18 +13,21 @@ from app.api.ogc.dependencies import BaseUrl, CollectionOf, FeatureId, FeaturesS
 from app.api.ogc.query import ItemsQuery
 from app.api.ogc.responses import GEOJSON, JSON, answer, link, with_query
 from app.api.ogc.shapes import Feature, FeaturePage, Link
-from app.services.markers.features import LINES
 
 
 def list_items(
     collection: CollectionOf, query: ItemsQueryOf, base: BaseUrl, caller: Caller, features: FeaturesService
 ) -> Response:
     """A page of features, or how many there are."""
+    count, read = features.count, features.page
+    if collection.lines is not None:
+        count = partial(features.count_lines, lines=collection.lines)
+        read = partial(features.lines, lines=collection.lines)
     if query.hits:
-        count = features.count_lines if collection is LINES else features.count
-        return answer(_hits(count(caller, query.filtered)), GEOJSON)
-    read = features.lines if collection is LINES else features.page
-    page = read(caller, query.filtered, after=query.after, limit=query.limit, crs=query.crs, counted=query.counted)
+        return answer(_hits(count(caller, filtered=query.filtered)), GEOJSON)
+    page = read(
+        caller, filtered=query.filtered, after=query.after, limit=query.limit, crs=query.crs, counted=query.counted
+    )
     document: FeaturePage = {
         "type": "FeatureCollection",
         "timeStamp": datetime.now(UTC),
@@ -45,8 +49,8 @@ def get_item(
     features: FeaturesService,
 ) -> Response:
     """One feature."""
-    if collection is LINES:
-        feature = features.get_line(caller, feature_id, crs)
+    if collection.lines is not None:
+        feature = features.get_line(caller, collection, collection.lines, feature_id, crs)
     else:
         feature = features.get(caller, collection, feature_id, crs)
     url = f"{base}/collections/{collection.id}"

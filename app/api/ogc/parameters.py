@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from app.api.ogc.cql2 import LANGUAGES
-from app.registry.features import FIELDS_BY_NAME
 from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.markers.features import COLLECTIONS, Collection
 
@@ -41,10 +40,14 @@ _COMMON = {
     "filter-lang": Parameter({"type": "string", "enum": LANGUAGES, "default": LANGUAGES[0]}, "Language of filter"),
     "filter-crs": Parameter(_CRS, "CRS of positions in filter; expressions have none"),
 }
-_FILTERS = sorted({name for collection in COLLECTIONS.values() for name in collection.filters} & FIELDS_BY_NAME.keys())
+_FIELDS = {
+    field.name: field
+    for collection in reversed(COLLECTIONS.values())  # of equal names the first collection's description is kept
+    for field in collection.fields
+    if field.name in collection.filters
+}
 PARAMETERS = _COMMON | {
-    name: Parameter({"type": FIELDS_BY_NAME[name].kind}, f"{FIELDS_BY_NAME[name].text}: equal to this")
-    for name in _FILTERS
+    name: Parameter({"type": field.kind}, f"{field.text}: equal to this") for name, field in sorted(_FIELDS.items())
 }
 ONLY_FORMAT = ("f",)
 OF_ITEM = ("f", "crs")

@@ -16,7 +16,7 @@ from app.api.ogc.cql2 import LANGUAGES, Reader
 from app.api.ogc.parameters import DEFAULT_LIMIT, MAX_LIMIT, list_parameters
 from app.errors import MalformedRequest
 from app.registry.conditions import Condition
-from app.registry.features import FIELDS_BY_NAME, FeatureFilter
+from app.registry.features import FeatureFilter
 from app.registry.spatial import Box
 from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.markers.features import Collection
@@ -112,14 +112,17 @@ def items_query(request: Request, collection: Collection) -> ItemsQuery:
     after = found.get("after")
     if after is not None and not _ID.fullmatch(after):
         refuse("after", "after is the id of a feature", "take it from a next link")
+    kinds = {field.name: field.kind for field in collection.fields}
     filtered = FeatureFilter(
-        retired=collection.retired,
+        table=collection.table,
         box=box,
         heights_m=heights_m,
         since=since,
         until=until,
-        equal=tuple((name, _value(name, text)) for name, text in found.items() if name in collection.filters),
-        where=_where(found, collection),
+        equal=tuple(
+            (name, _value(name, text, kinds[name])) for name, text in found.items() if name in collection.filters
+        ),
+        where=_where(found, kinds),
     )
     return ItemsQuery(
         pairs=pairs,
@@ -179,8 +182,7 @@ def _flag(found: dict[str, str], name: str) -> bool:
     return text == "true"
 
 
-def _value(name: str, text: str) -> str | float:
-    kind = FIELDS_BY_NAME[name].kind
+def _value(name: str, text: str, kind: str) -> str | float:
     if kind == "string":
         return text
     value = number(name, text)
@@ -191,14 +193,13 @@ def _value(name: str, text: str) -> str | float:
     return int(value)
 
 
-def _where(found: dict[str, str], collection: Collection) -> Condition | None:
+def _where(found: dict[str, str], kinds: dict[str, str]) -> Condition | None:
     language = found.get("filter-lang", LANGUAGES[0])
     if language not in LANGUAGES:
         refuse("filter-lang", "filters are not read in this language", ", ".join(LANGUAGES))
     crs_parameter(found, "filter-crs")  # there are no places in filters: none makes a difference
     if "filter" not in found:
         return None
-    kinds = {field.name: field.kind for field in collection.fields}
     reader = Reader(kinds, lambda text: _moment(text, last=False, name="filter"), lambda text: number("filter", text))
     return reader.read(found["filter"], language)
 

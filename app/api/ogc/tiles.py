@@ -1,4 +1,4 @@
-"""OGC API Tiles: markers as Mapbox Vector Tiles in WebMercatorQuad."""
+"""OGC API Tiles: points as Mapbox Vector Tiles in WebMercatorQuad."""
 
 from __future__ import annotations
 

@@ -81,7 +81,11 @@ def _point(lon_deg: float, lat_deg: float, height_m: float | None = None) -> dic
 
 
 def _line(lane: Lane) -> dict[str, Any]:
-    """The centre line with the points that it needs to be drawn within 2 cm."""
+    return {"type": "LineString", "coordinates": lane_points_deg(lane)}
+
+
+def lane_points_deg(lane: Lane) -> list[list[float]]:
+    """The centre line as [lon, lat], with the points that it needs to be drawn within 2 cm."""
     line = LineString(np.column_stack([lane.lon_deg, lane.lat_deg]))
     points = get_coordinates(simplify(line, _LANE_TOLERANCE_M / _M_PER_DEG, preserve_topology=False))
-    return {"type": "LineString", "coordinates": np.round(points, _DECIMALS).tolist()}
+    return [[lon, lat] for lon, lat in np.round(points, _DECIMALS).tolist()]

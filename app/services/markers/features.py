@@ -1,14 +1,14 @@
-"""Markers as GIS clients read them: collections of GeoJSON features. Built from rows by hand: every map view asks."""
+"""What GIS clients read: collections of GeoJSON features. Built from rows by hand: every map view asks."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import islice
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import orjson
 import shapely
@@ -19,36 +19,78 @@ from app.families import FAMILIES
 from app.registry import features as store
 from app.registry.conditions import holds, pinned_values
 from app.registry.database import Database
-from app.registry.features import FIELDS, Extent, FeatureFilter, Field
+from app.registry.features import FIELDS, ON_ROAD, RETIRED, Extent, FeatureFilter, FeatureTable, Field
 from app.registry.lines import LINE_FIELDS, Line, find_line, read_lines
+from app.registry.plan_features import LANE_FIELDS, PLAN_FIELDS, PLANNED, AlignmentLanes
 from app.registry.spatial import Box
-from app.registry.tiles import Tile, marker_tile
+from app.registry.tiles import Tile, feature_tile
 from app.services.access.access import Caller
 from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.ports import Clock
 
 _EXTENT_AGE = timedelta(seconds=60)
 _MAX_EXTENTS = 4096
-_CHEAP_TO_COUNT = frozenset({"family", "code"})
+Answer = TypeVar("Answer")
+
+
+class LineReader(Protocol):
+    """Where the features of a collection of lines come from."""
+
+    def read(
+        self, connection: sa.Connection, agency_id: str, filtered: FeatureFilter, after: str | None
+    ) -> Generator[Line]:
+        """The agency's lines after one, in a fixed order; those that the filter does not leave may be among them.
+
+        Raises
+        ------
+        MalformedRequest
+            There is no line to go on after.
+        """
+
+    def find(self, connection: sa.Connection, agency_id: str, line_id: str) -> Line | None:
+        """The line with an id."""
+
+    def extent(self, connection: sa.Connection, agency_id: str) -> Extent | None:
+        """What the lines cover."""
+
+
+class MarkerLines:
+    """Lines that markers make along a road."""
+
+    def read(
+        self, connection: sa.Connection, agency_id: str, filtered: FeatureFilter, after: str | None
+    ) -> Generator[Line]:
+        """Family by family; the times of a filter are left out."""
+        pinned = {**pinned_values(filtered.where), **dict(filtered.equal)}
+        return read_lines(connection, agency_id, LINE_SOURCES, box=filtered.box, pinned=pinned, after=after)
+
+    def find(self, connection: sa.Connection, agency_id: str, line_id: str) -> Line | None:
+        """By the id of its first marker."""
+        return find_line(connection, agency_id, LINE_SOURCES, line_id)
+
+    def extent(self, connection: sa.Connection, agency_id: str) -> Extent | None:
+        """That of all markers."""
+        return store.find_extent(connection, agency_id, ON_ROAD)
 
 
 @dataclass(frozen=True, slots=True)
 class Collection:
-    """A set of features that clients list as a layer."""
+    """A set of features that clients list as a layer: points of a table, or lines of a reader."""
 
     id: str
     title: str
     text: str
     geometry: str
     editable: bool = False
-    retired: bool = False
     fields: tuple[Field, ...] = FIELDS
     filters: tuple[str, ...] = tuple(field.name for field in FIELDS if field.kind != "date-time")
+    table: FeatureTable = ON_ROAD
+    lines: LineReader | None = None
 
     @property
     def has_tiles(self) -> bool:
         """Whether there are vector tiles of it."""
-        return self.geometry == "Point"
+        return self.lines is None
 
 
 MARKERS = Collection(
@@ -58,8 +100,8 @@ MARKERS = Collection(
     "Point",
     editable=True,
 )
-RETIRED = Collection(
-    "retired_markers", "Retired markers", "Markers that are out of use: one point each.", "Point", retired=True
+RETIRED_MARKERS = Collection(
+    "retired_markers", "Retired markers", "Markers that are out of use: one point each.", "Point", table=RETIRED
 )
 LINES = Collection(
     "marker_lines",
@@ -68,9 +110,28 @@ LINES = Collection(
     "LineString",
     fields=LINE_FIELDS,
     filters=("family", "side", "road", "status"),
+    lines=MarkerLines(),
+)
+ALIGNMENTS = Collection(
+    "alignments",
+    "Roads for plans",
+    "Lanes of the alignments that plans are made for: the centre line of each, with width, speed and curvature.",
+    "LineString",
+    fields=LANE_FIELDS,
+    filters=("alignment_id", "alignment", "lane", "road"),
+    lines=AlignmentLanes(),
+)
+PLANS = Collection(
+    "plans",
+    "Plans",
+    "Markers as they are placed in plans, one point each: those of plans that are not committed are in no registry.",
+    "Point",
+    fields=PLAN_FIELDS,
+    filters=tuple(field.name for field in PLAN_FIELDS),
+    table=PLANNED,
 )
 LINE_SOURCES = {family.name: family.lines for family in FAMILIES if family.lines is not None}
-COLLECTIONS = {collection.id: collection for collection in (MARKERS, RETIRED, LINES)}
+COLLECTIONS = {collection.id: collection for collection in (MARKERS, RETIRED_MARKERS, LINES, ALIGNMENTS, PLANS)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +181,9 @@ class Features:
     ) -> Page:
         """A page of features in the order of their ids, counted if that is asked for or costs little."""
         counted = counted or (after is None and _is_cheap(filtered))
-        texts, matched = self._database.ask(
-            lambda c: store.list_features(c, caller.agency_id, filtered, after=after, limit=limit + 1, counted=counted)
+        texts, matched = self._ask(
+            filtered.table,
+            lambda c: store.list_features(c, caller.agency_id, filtered, after=after, limit=limit + 1, counted=counted),
         )
         more = len(texts) > limit
         if after is None and not more:
@@ -134,7 +196,7 @@ class Features:
 
     def count(self, caller: Caller, filtered: FeatureFilter) -> int:
         """How many features a filter leaves."""
-        return self._database.ask(lambda connection: store.count_features(connection, caller.agency_id, filtered))
+        return self._ask(filtered.table, lambda c: store.count_features(c, caller.agency_id, filtered))
 
     def get(
         self, caller: Caller, collection: Collection, feature_id: str, crs: FeatureCrs = STORAGE_CRS
@@ -146,9 +208,8 @@ class Features:
         NotFound
             There is none with this id in the collection, or it belongs to another agency.
         """
-        text = self._database.ask(
-            lambda c: store.find_feature(c, caller.agency_id, feature_id, retired=collection.retired)
-        )
+        table = collection.table
+        text = self._ask(table, lambda c: store.find_feature(c, caller.agency_id, feature_id, table))
         if text is None:
             raise no_feature(collection)
         return _in_crs(orjson.loads(text), crs)
@@ -156,6 +217,7 @@ class Features:
     def lines(
         self,
         caller: Caller,
+        lines: LineReader,
         filtered: FeatureFilter,
         *,
         after: str | None = None,
@@ -163,7 +225,7 @@ class Features:
         crs: FeatureCrs = STORAGE_CRS,
         counted: bool = False,
     ) -> Page:
-        """A page of lines, those of magnets before runs of CERPMs, counted if that is asked for or costs nothing.
+        """A page of lines, counted if that is asked for or costs nothing.
 
         Raises
         ------
@@ -171,23 +233,31 @@ class Features:
             There is no line to go on after.
         """
         matched: int | None = None
-        with self._database.read() as connection, closing(_matching(connection, caller, filtered, after)) as lines:
-            page = list(islice(lines, limit + 1))
+        with (
+            self._database.read() as connection,
+            closing(_matching(connection, caller, lines, filtered, after)) as found,
+        ):
+            page = list(islice(found, limit + 1))
             more = len(page) > limit
             if after is None and (counted or not more):
-                matched = len(page) + sum(1 for _ in lines)
+                matched = len(page) + sum(1 for _ in found)
         if after is not None and counted:
-            matched = self.count_lines(caller, filtered)
+            matched = self.count_lines(caller, lines, filtered)
         del page[limit:]
         texts = [orjson.dumps(_line(line, crs)).decode() for line in page]
         return Page(_joined(texts), len(page), page[-1].id if more else None, matched)
 
-    def count_lines(self, caller: Caller, filtered: FeatureFilter) -> int:
+    def count_lines(self, caller: Caller, lines: LineReader, filtered: FeatureFilter) -> int:
         """How many lines a filter leaves."""
-        with self._database.read() as connection, closing(_matching(connection, caller, filtered, None)) as lines:
-            return sum(1 for _ in lines)
+        with (
+            self._database.read() as connection,
+            closing(_matching(connection, caller, lines, filtered, None)) as found,
+        ):
+            return sum(1 for _ in found)
 
-    def get_line(self, caller: Caller, line_id: str, crs: FeatureCrs = STORAGE_CRS) -> dict[str, Any]:
+    def get_line(
+        self, caller: Caller, collection: Collection, lines: LineReader, line_id: str, crs: FeatureCrs = STORAGE_CRS
+    ) -> dict[str, Any]:
         """One line.
 
         Raises
@@ -196,16 +266,15 @@ class Features:
             There is none with this id, or it belongs to another agency.
         """
         with self._database.read() as connection:
-            line = find_line(connection, caller.agency_id, LINE_SOURCES, line_id)
+            line = lines.find(connection, caller.agency_id, line_id)
         if line is None:
-            raise no_feature(LINES)
+            raise no_feature(collection)
         return _line(line, crs)
 
     def tile(self, caller: Caller, collection: Collection, tile: Tile) -> bytes:
         """A vector tile of a collection; empty without features."""
-        return self._database.ask(
-            lambda c: marker_tile(c, caller.agency_id, tile, retired=collection.retired, layer=collection.id)
-        )
+        table = collection.table
+        return self._ask(table, lambda c: feature_tile(c, caller.agency_id, tile, table, layer=collection.id))
 
     def extent(self, caller: Caller, collection: Collection) -> Extent | None:
         """What the agency's features cover, as it was within the last minute."""
@@ -215,12 +284,22 @@ class Features:
         if known is not None and timedelta() <= now - known[0] < _EXTENT_AGE:
             return known[1]
         with self._database.read() as connection:
-            extent = store.find_extent(connection, caller.agency_id, retired=collection.retired)
+            if collection.lines is not None:
+                extent = collection.lines.extent(connection, caller.agency_id)
+            else:
+                extent = store.find_extent(connection, caller.agency_id, collection.table)
         with self._lock:
             if len(self._extents) >= _MAX_EXTENTS:
                 self._extents.clear()
             self._extents[key] = (now, extent)
         return extent
+
+    def _ask(self, table: FeatureTable, question: Callable[[sa.Connection], Answer]) -> Answer:
+        """The result of a question; one about plans takes two statements, which see the same snapshot."""
+        if table.plans is None:
+            return self._database.ask(question)
+        with self._database.read() as connection:
+            return question(connection)
 
 
 def no_feature(collection: Collection) -> NotFound:
@@ -228,12 +307,12 @@ def no_feature(collection: Collection) -> NotFound:
     return NotFound(f"there is no such feature in {collection.id}", field="featureId")
 
 
-def _matching(connection: sa.Connection, caller: Caller, filtered: FeatureFilter, after: str | None) -> Generator[Line]:
+def _matching(
+    connection: sa.Connection, caller: Caller, lines: LineReader, filtered: FeatureFilter, after: str | None
+) -> Generator[Line]:
     wanted, box = dict(filtered.equal), filtered.box
-    pinned = {**pinned_values(filtered.where), **wanted}
-    lines = read_lines(connection, caller.agency_id, LINE_SOURCES, box=box, pinned=pinned, after=after)
-    with closing(lines):
-        for line in lines:
+    with closing(lines.read(connection, caller.agency_id, filtered, after)) as found:
+        for line in found:
             if (
                 all(line.properties[name] == value for name, value in wanted.items())
                 and (filtered.where is None or holds(filtered.where, line.properties))
@@ -261,7 +340,7 @@ def _line(line: Line, crs: FeatureCrs) -> dict[str, Any]:
 
 def _is_cheap(filtered: FeatureFilter) -> bool:
     rest = (filtered.box, filtered.heights_m, filtered.since, filtered.until, filtered.where)
-    return rest == (None,) * 5 and {name for name, _ in filtered.equal} <= _CHEAP_TO_COUNT
+    return rest == (None,) * 5 and {name for name, _ in filtered.equal} <= filtered.table.cheap_to_count
 
 
 def _joined(features: list[str]) -> orjson.Fragment:

@@ -18,6 +18,7 @@ from app.geodesy import LocalizationGrade
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter
+from app.registry.plan_features import add_lanes
 from app.registry.plans import ALIGNMENTS, AlignmentRow, list_for_map
 from app.registry.resources import first_version
 from app.registry.roads import ROADS, RoadRow
@@ -110,7 +111,7 @@ class Alignments:
         now, agency_id, name = self._clock(), caller.agency_id, road.name
         with self._database.read() as connection:
             ALIGNMENTS.check_name(connection, agency_id, name)
-        summary = self._processes.submit(SummarizeRoadTask(road), wait_s=BUSY_WAIT_S).result()
+        read = self._processes.submit(SummarizeRoadTask(road), wait_s=BUSY_WAIT_S).result()
         with staged(self._blobs) as stage:
             source_key = stage.put("alignments", road.data, durable=True)
             with (
@@ -126,9 +127,10 @@ class Alignments:
                     "source_key": source_key,
                     "source_sha256": hashlib.sha256(road.data).hexdigest(),
                     "declaration": {member: value for member, value in declared.items() if value is not None},
-                    "summary": summary,
+                    "summary": read.summary,
                 }
                 document = answer.store(alignment_document(ALIGNMENTS.add(connection, agency_id, values)))
+                add_lanes(connection, agency_id, document["id"], read.lanes)
                 log_change(connection, caller, "alignment.added", now=now, subject=document["id"], document=document)
             stage.keep()
         return document, False

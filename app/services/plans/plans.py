@@ -18,6 +18,7 @@ from app.planning.plan_checks import ExistingMarker
 from app.registry import bulk
 from app.registry.codebooks import CODEBOOKS, book_of
 from app.registry.database import Database
+from app.registry.plan_features import replace_planned
 from app.registry.plan_states import find_plan_states, has_status
 from app.registry.plans import ALIGNMENTS, PLANS, PlanRow, list_built, list_existing
 from app.registry.resources import first_version
@@ -125,7 +126,7 @@ class Plans:
         with staged(self._blobs) as stage:
             document_key = stage.put("plans", made.document, durable=True)
             with (
-                self._database.write() as connection,
+                self._database.write(long=True) as connection,
                 idempotent(connection, agency_id, key, now, self._ttl) as answer,
             ):
                 if answer.replayed:
@@ -140,6 +141,7 @@ class Plans:
                 row = PLANS.add(connection, agency_id, values, who=caller.label)
                 if job is not None and not job.finish(connection, {"plan_version": 1}, subject_id=row.id):
                     raise Conflict("another worker has made this plan")
+                replace_planned(connection, agency_id, row.id, made.features)
                 document = answer.store(plan_document(row))
                 log_change(connection, caller, "plan.made", now=now, subject=row.id, document=rules)
             stage.keep()
@@ -198,12 +200,14 @@ class Plans:
             changes: dict[str, Any] = {"name": name}
             if made is not None:
                 changes |= _made_columns(caller, made, rules, stage.put("plans", made.document, durable=True))
-            with self._database.write() as connection:
+            with self._database.write(long=made is not None) as connection:
                 row = PLANS.get_at(connection, agency_id, plan_id, version)
                 _check_status(row, (DRAFT, CHECKED, PROVED, APPROVED), "changed", "make another plan")
                 if name != row.name:
                     PLANS.check_name(connection, agency_id, name)
                 document = _changed(connection, caller, row, changes, now, "plan.changed", change.reason)
+                if made is not None:
+                    replace_planned(connection, agency_id, plan_id, made.features)
             stage.keep()
         return document
 

@@ -7,10 +7,12 @@ from typing import Any, Literal
 
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.plan_checks import ExistingMarker
+from app.registry.columns import Columns
 from app.registry.marker_rows import MarkerRow
 from app.registry.plans import BuiltRow
 from app.services.decoder_processes import Task
 from app.services.plans.documents import AsBuiltDocument
+from app.services.plans.features import LaneFeature
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +27,15 @@ class RoadFile:
 
 
 @dataclass(frozen=True, slots=True)
-class SummarizeRoadTask(Task[dict[str, Any]]):
+class SummarizedRoad:
+    """A road that was read: its document, and its lanes for GIS clients."""
+
+    summary: dict[str, Any]
+    lanes: list[LaneFeature]
+
+
+@dataclass(frozen=True, slots=True)
+class SummarizeRoadTask(Task[SummarizedRoad]):
     """A road to read: its lanes, events, warnings and extent."""
 
     road: RoadFile
@@ -68,11 +78,14 @@ class MadePlan:
         What lists and the plan's page show.
     numbers : tuple of (family, code)
         Codes that no other marker may have.
+    features : Columns
+        The markers for GIS clients.
     """
 
     document: bytes
     summary: dict[str, Any]
     numbers: tuple[tuple[str, str], ...]
+    features: Columns
 
 
 @dataclass(frozen=True, slots=True)
