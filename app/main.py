@@ -29,7 +29,7 @@ from app.api.http.problems import install_problem_handlers
 from app.api.http.rate_limits import RateLimit
 from app.api.markers import artwork, bulk, cerpms, codebooks, layouts, markers, observations, searches
 from app.api.ogc import mount_ogc
-from app.api.plans import alignments, plan_jobs, plans, proofs, radio_checks
+from app.api.plans import alignments, packages, plan_jobs, plans, proofs, radio_checks
 from app.api.roads import roads
 from app.api.surveys import exports, imports
 from app.decoders.plate import decode_plates
@@ -74,6 +74,7 @@ from app.services.markers.observations import Observations
 from app.services.markers.searches import Searches
 from app.services.plans.alignments import Alignments
 from app.services.plans.making import PlanMaking
+from app.services.plans.packages import Packages
 from app.services.plans.plan_jobs import PlanJobs
 from app.services.plans.plans import Plans
 from app.services.plans.proofs import Proofs
@@ -101,6 +102,7 @@ ROUTERS = (
     alignments.router,
     plans.router,
     proofs.router,
+    packages.router,
     plan_jobs.router,
     codebooks.router,
     decodes.router,
@@ -184,6 +186,9 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
     access = Access(database, utc_now, _token_check(settings))
     plan_cases = Plans(database, utc_now, blobs, pool, marker_rules(settings))
     plan_making = PlanMaking(database, utc_now, outside.plan_queue, plans=plan_cases, idempotency_ttl=ttl)
+    package_cases = Packages(
+        database, utc_now, blobs, pool, outside.plan_queue, in_flight=settings.decode_workers, idempotency_ttl=ttl
+    )
     proof_cases = Proofs(
         database, utc_now, blobs, pool, outside.proof_queue, in_flight=settings.decode_workers, idempotency_ttl=ttl
     )
@@ -211,12 +216,14 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
                 JobKind.IMPORT: import_jobs,
                 JobKind.PLAN: plan_making,
                 JobKind.PROOF: proof_cases,
+                JobKind.PACKAGE: package_cases,
             },
         ),
         "keys": Keys(database, utc_now, access),
         "layouts": Layouts(database),
         "markers": marker_cases,
         "observations": Observations(database),
+        "packages": package_cases,
         "plan_jobs": PlanJobs(database, utc_now),
         "plan_making": plan_making,
         "plans": plan_cases,

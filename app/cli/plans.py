@@ -13,8 +13,14 @@ from app.cli.errors import bad_input
 from app.errors import InvalidParameter
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    import numpy.typing as npt
     from rich.console import Console
 
+    from app.markers.plate import PlateGeometry
+    from app.markers.reading import PlateReading
     from app.planning.outputs.files import OutputOptions
     from app.planning.plan import Plan
 
@@ -52,6 +58,9 @@ def plan(
     date: Annotated[str, typer.Option(help="Date of issue, for the title block.")] = "",
     creator: Annotated[str, typer.Option(help="Creator, for the title block.")] = "",
     approver: Annotated[str, typer.Option(help="Approval person, for the title block.")] = "",
+    artwork: Annotated[
+        bool, typer.Option("--artwork", help="Also write drilling sheets and artwork, and manifest.json with SHA-256.")
+    ] = False,
 ) -> None:
     """Place markers on a road by rules, check them, and write bill, drawings, stakeout and schedule.
 
@@ -72,7 +81,8 @@ def plan(
         )
         made = _make(console, road, rules, declaration, name or road.stem)
         block = TitleBlock(owner, number, date, creator, approver)
-        _write(console, made, out, OutputOptions(stakeout_crs, stakeout_unit, DrawingOptions(block, scale)))
+        options = OutputOptions(stakeout_crs, stakeout_unit, DrawingOptions(block, scale))
+        _write(console, made, out, options, artwork=artwork)
     _print(made, out)
 
 
@@ -128,28 +138,46 @@ def _make(console: Console, road: Path, rules_file: Path, declaration: object, n
         return check_plan(placed)
 
 
-def _write(console: Console, made: Plan, out: Path, options: OutputOptions) -> None:
+def _write(console: Console, made: Plan, out: Path, options: OutputOptions, *, artwork: bool) -> None:
     """All files, or none: they are moved into the folder when the last one is complete."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from app.planning.outputs.files import plan_files
+    from app.encoders.packer import file_entry
+    from app.planning.outputs.package import MANIFEST, Package, PackageOptions, PartKind
 
+    package = Package(made, PackageOptions(options))
     out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder:
-        files = list(plan_files(made, options))
+        parts = [part for part in package.parts() if artwork or part.kind is PartKind.FILE]
+        entries = []
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         with Progress(*columns, console=console, transient=True) as progress:
-            task = progress.add_task("Writing", total=len(files))
-            for file in files:
-                progress.update(task, description=f"Writing {file.name}")
-                path = Path(folder) / file.name
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(file.write())
+            task = progress.add_task("Writing", total=len(parts))
+            for part in parts:
+                progress.update(task, description=f"Writing {part.name or part.kind}")
+                for name, content in package.write(part, _read_face):
+                    _put(Path(folder) / name, content)
+                    entries.append(file_entry(name, content))
                 progress.advance(task)
-        for file in files:
-            target = out / file.name
+        if artwork:
+            _put(Path(folder) / MANIFEST, package.manifest(entries))
+        names: list[str] = [entry["name"] for entry in entries]
+        for name in [*names, MANIFEST] if artwork else names:
+            target = out / name
             target.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(Path(folder) / file.name, target)
+            os.replace(Path(folder) / name, target)
+
+
+def _read_face(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> Sequence[PlateReading]:
+    """The plate decoder, imported with the first plate: it takes seconds."""
+    from app.jobs.package_tasks import read_face
+
+    return read_face(image, geometry)
+
+
+def _put(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
 
 
 def _print(made: Plan, out: Path) -> None:

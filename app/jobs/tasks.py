@@ -8,6 +8,7 @@ from typing import Any, Generic, TypeVar
 from app.jobs.calibration_tasks import calibrate_photos
 from app.jobs.decoder_process import ProcessIdTask, process_id
 from app.jobs.frame_tasks import annotate_frame, find_markers, load_frame
+from app.jobs.package_tasks import list_package_parts, write_package_manifest, write_package_part
 from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
 from app.jobs.plan_tasks import compare_plan, make_plan, summarize_road, write_file_of_plan, write_map
 from app.jobs.proof_tasks import list_proof_units, prove_unit, write_proof
@@ -18,6 +19,7 @@ from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameS
 from app.services.decodes.packet_task import DriveTask, LaneTask, OverlayTask
 from app.services.decodes.trace_task import TraceTask
 from app.services.fleet.calibrations import CalibrationTask
+from app.services.plans.package_tasks import ListPartsTask, WriteManifestTask, WritePartTask
 from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask
 from app.services.plans.tasks import CompareTask, MakePlanTask, SummarizeRoadTask, WriteMapTask, WritePlanFileTask
 from app.services.surveys.imports import SurveyTask
@@ -44,6 +46,9 @@ STEPS: dict[type, StepFunction] = {
     ListUnitsTask: list_proof_units,
     ProveUnitTask: prove_unit,
     WriteProofTask: write_proof,
+    ListPartsTask: list_package_parts,
+    WritePartTask: write_package_part,
+    WriteManifestTask: write_package_manifest,
     ProcessIdTask: process_id,
 }
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import datetime
+from pathlib import Path
 from typing import Protocol
 
 
@@ -19,8 +21,14 @@ class Blobs(Protocol):
     def put(self, key: str, data: bytes, *, durable: bool = False) -> None:
         """Write a blob once."""
 
+    def put_file(self, key: str, path: Path) -> None:
+        """Write a blob from a file."""
+
     def get(self, key: str) -> bytes:
         """Content of a blob."""
+
+    def stream(self, key: str) -> Iterator[bytes]:
+        """Content of a blob, part by part."""
 
     def delete(self, key: str) -> None:
         """Remove a blob."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import structlog
 
@@ -26,6 +27,13 @@ class StagedBlobs:
         key = new_blob_key(folder)
         self._keys.append(key)
         self._blobs.put(key, data, durable=durable)
+        return key
+
+    def put_file(self, folder: str, path: Path) -> str:
+        """Write a blob from a file. Returns its key."""
+        key = new_blob_key(folder)
+        self._keys.append(key)
+        self._blobs.put_file(key, path)
         return key
 
     def keep(self) -> None:

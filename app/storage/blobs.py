@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -14,6 +15,7 @@ from obstore.store import LocalStore, ObjectStore, from_url
 
 from app.errors import Conflict, InvalidParameter, NotFound, Unavailable
 
+_CHUNK_BYTES = 5 * 1024**2  # source: S3's smallest part of an upload
 _KEY = re.compile(r"[a-z]+/[0-9a-f]{2}/[0-9a-f]{32}")
 _URL = "file:///FOLDER or s3://BUCKET/PREFIX"
 
@@ -85,7 +87,44 @@ class Blobs:
             raise Conflict(f"blob {key} exists") from error
         except (BaseError, OSError) as error:
             raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
-        if durable and self._folder is not None:
+        if durable:
+            self._make_durable(key)
+
+    def put_file(self, key: str, path: Path) -> None:
+        """Write a blob from a file, a few megabytes at a time; it survives a power failure.
+
+        Parameters
+        ----------
+        key : str
+            From `new_blob_key`, and not used before: unlike `put`, this cannot refuse a taken one.
+        path : Path
+        """
+        _check_key(key)
+        try:
+            obstore.put(self._store, key, path, chunk_size=_CHUNK_BYTES, max_concurrency=2)
+        except (BaseError, OSError) as error:
+            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
+        self._make_durable(key)
+
+    def stream(self, key: str) -> Iterator[bytes]:
+        """Content of a blob, a few megabytes at a time.
+
+        Raises
+        ------
+        NotFound
+            There is none.
+        """
+        _check_key(key)
+        try:
+            found = obstore.get(self._store, key)
+        except FileNotFoundError as error:
+            raise NotFound(f"blob {key} is gone") from error
+        except (BaseError, OSError) as error:
+            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
+        return (bytes(chunk) for chunk in found.stream(min_chunk_size=_CHUNK_BYTES))
+
+    def _make_durable(self, key: str) -> None:
+        if self._folder is not None:
             path = self._folder / key
             for place in (path, path.parent, path.parent.parent):
                 _sync(place)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 from pathlib import Path
 
@@ -65,6 +66,21 @@ def test_a_road_becomes_a_folder_with_all_files(tmp_path: Path, rules: Path) -> 
     again = run("plan", road, "--rules", rules, "--out", out, "--name", "second")
     assert again.exit_code == 0, again.output
     assert read_plan((out / "plan.json").read_bytes()).name == "second"
+
+
+def test_artwork_and_sheets_are_written_on_request(tmp_path: Path) -> None:
+    rules = tmp_path / "rules.yaml"
+    rules.write_text("version: 1\nplates: {}\nlines: {}\n")
+    out = tmp_path / "plan"
+    result = run("plan", write_road(tmp_path / "b10.geojson"), "--rules", rules, "--out", out, "--artwork")
+    assert result.exit_code == 0, result.output
+    manifest = json.loads((out / "manifest.json").read_bytes())
+    written = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+    assert written == {entry["name"] for entry in manifest["files"]} | {"manifest.json"}
+    for entry in manifest["files"]:
+        assert hashlib.sha256((out / entry["name"]).read_bytes()).hexdigest() == entry["sha256"]
+    assert len(list(out.glob("artwork/plate-*.pdf"))) == read_plan((out / "plan.json").read_bytes()).counts["plate"]
+    assert list(out.glob("drilling/line-*.pdf"))
 
 
 @pytest.mark.parametrize("name", ["rural-plates", "city-magnets", "work-zone-cerpms"])

@@ -31,6 +31,20 @@ def test_what_is_put_is_got(blobs: Blobs, durable: bool) -> None:
     assert blobs.get(key) == b"\x00frame\xff"
 
 
+def test_files_are_put_and_streamed_part_by_part(blobs: Blobs, tmp_path: Path) -> None:
+    key, content = new_blob_key("packages"), bytes(range(256)) * 60_000
+    (tmp_path / "file").write_bytes(content)
+    blobs.put_file(key, tmp_path / "file")
+    assert blobs.get(key) == content
+    chunks = list(blobs.stream(key))
+    assert len(chunks) > 1
+    assert b"".join(chunks) == content
+    with pytest.raises(NotFound):
+        blobs.stream(new_blob_key("packages"))
+    with pytest.raises(InvalidParameter):
+        blobs.put_file("../x", tmp_path / "file")
+
+
 def test_a_blob_is_written_once(blobs: Blobs) -> None:
     key = new_blob_key("uploads")
     blobs.put(key, b"first")

@@ -83,6 +83,8 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/plans/{plan_id}/as-built": READERS,
     "GET /v1/plans/{plan_id}/proof": READERS,
     "POST /v1/plans/{plan_id}/proof": PLANNERS,
+    "GET /v1/plans/{plan_id}/package": READERS,
+    "POST /v1/plans/{plan_id}/package": PLANNERS,
     "GET /v1/plan-jobs": READERS,
     "GET /v1/plan-jobs/{job_id}": READERS,
     "POST /v1/plan-jobs/{job_id}/cancel": PLANNERS,

@@ -6,7 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.families.inputs import Identifier, Number, Text
+from app.encoders.plate import ArtworkFormat
+from app.families.inputs import Flag, Identifier, Number, Text
 from app.formats.alignments.registered_road import RoadLanes
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.proof import ProofTerms
@@ -115,3 +116,49 @@ class ProofIn(ProofTerms):
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"drives": 20, "seed": 7, "conditions": ["day", "night+rain"]}, {}]}
     )
+
+
+class TitleBlockIn(_Body):
+    """What the title block of the drawings states; empty fields are left to be filled in by hand."""
+
+    owner: Annotated[Text, Field(max_length=80)] = ""
+    number: Annotated[Text, Field(max_length=80, description="Identification number of the set.")] = ""
+    date: Annotated[Text, Field(max_length=80, description="Date of issue.")] = ""
+    creator: Annotated[Text, Field(max_length=80)] = ""
+    approver: Annotated[Text, Field(max_length=80)] = ""
+    title: Annotated[Text, Field(max_length=80, description="Without, the name of the plan.")] = ""
+
+
+class PackageIn(_Body):
+    """How a plan is handed out; every member may be left out."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "crs": "EPSG:25832",
+                    "scale": 500,
+                    "title_block": {"owner": "Example Road Agency", "date": "2026-11-22"},
+                    "formats": ["pdf", "dxf"],
+                },
+                {},
+            ]
+        },
+    )
+
+    crs: Annotated[Text | None, Field(max_length=64, description="Projected CRS of the stakeout.")] = None
+    unit: Literal["m", "ft-us", "ft-intl"] | None = None
+    scale: Annotated[
+        int | None, Field(strict=True, ge=1, le=100_000, description="Of the drawings: 250, 500, 1000, 2000 or 5000.")
+    ] = None
+    title_block: TitleBlockIn = TitleBlockIn()
+    formats: Annotated[list[ArtworkFormat], Field(min_length=1, max_length=4, description="Of each plate.")] = [
+        ArtworkFormat.PDF, ArtworkFormat.SVG,
+    ]  # fmt: skip
+    heaters: Annotated[Flag, Field(description="Heating tracks under dark units.")] = False
+    leds: Annotated[Flag, Field(description="Light sources under light units.")] = False
+
+    def options(self) -> dict[str, Any]:
+        """The options as JSON."""
+        return self.model_dump(mode="json")

@@ -25,11 +25,12 @@ class SheetFormat(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrillingSheet:
-    """What the crew, the planner and the buyer need of one layout."""
+    """What the crew, the planner and the buyer need of one layout; `holes` is what the agency states of the holes."""
 
     layout: MagnetLayout
     checks: tuple[Check, ...]
     bill: Bill
+    holes: str = ""
 
     @property
     def passed(self) -> bool:

@@ -134,7 +134,8 @@ class _Paper:
         self.text(_RIGHT_MM, 196, verdict, 10, bold=True, anchor="end", colour=_BLACK if passed else _RED)
         meaning = f": {layout.meaning.text}" if layout.meaning else ""
         kind = "information tag" if isinstance(layout.tag, InformationTag) else f"{layout.tag.style} line"
-        code = f"{kind} {layout.tag.text}  {layout.tag.tuple_text}{meaning}"
+        holes = f"; holes: {self._sheet.holes}" if self._sheet.holes else ""
+        code = f"{kind} {layout.tag.text}  {layout.tag.tuple_text}{meaning}{holes}"
         self.text(_LEFT_MM, 190, code, 9, width=180)
         lon_deg, lat_deg, height_m = layout.lane.origin
         origin = f"east, north from {fixed(lon_deg, 9)}, {fixed(lat_deg, 9)}, height {height_m:g} m"

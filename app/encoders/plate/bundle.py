@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 import unicodedata
 import zipfile
@@ -12,6 +11,7 @@ from typing import Any, BinaryIO
 
 import orjson
 
+from app.encoders.packer import Packer
 from app.encoders.plate.artwork import encode_plate, encode_sheets
 from app.encoders.plate.colours import COLOURS
 from app.encoders.plate.formats import DEFAULT_DPI, ArtworkFormat, write_artwork
@@ -24,7 +24,6 @@ from app.errors import InvalidParameter
 MANIFEST_FORMAT = "waymark-artwork/1"
 ARTWORK_VERSION = "1"
 MAX_PLATES = 10_000
-_LEVEL = 1
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 _RESERVED = re.compile(r"(?i)^(con|prn|aux|nul|com\d|lpt\d)(\.|$)")
 _LONGEST_STEM = 60
@@ -98,7 +97,7 @@ def write_bundle(
         raise InvalidParameter("no format was requested", field="formats", limit="at least one of svg, pdf, dxf, png")
     names = safe_names([f"{order.plate_id}-r{order.revision}" for order in orders])
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
-        packer = _Packer(archive)
+        packer = Packer(archive)
         plates = []
         for done, (order, name) in enumerate(zip(orders, names, strict=True), start=1):
             plates.append(_add_plate(packer, order, name, options, read))
@@ -134,26 +133,8 @@ def safe_names(names: Sequence[str]) -> list[str]:
     return safe
 
 
-class _Packer:
-    """Writes files into an archive and keeps their name, size and hash.
-
-    In the caller's thread: a second one waits for the interpreter longer than the compression takes (measured).
-    """
-
-    def __init__(self, archive: zipfile.ZipFile) -> None:
-        self._archive = archive
-        self.entries: list[dict[str, Any]] = []
-
-    def add(self, name: str, content: bytes) -> None:
-        info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
-        info.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
-        info.external_attr = 0o644 << 16
-        self._archive.writestr(info, content, compresslevel=_LEVEL)
-        self.entries.append({"name": name, "size": len(content), "sha256": hashlib.sha256(content).hexdigest()})
-
-
 def _add_plate(
-    packer: _Packer, order: PlateOrder, name: str, options: BundleOptions, read: PlateReader | None
+    packer: Packer, order: PlateOrder, name: str, options: BundleOptions, read: PlateReader | None
 ) -> dict[str, Any]:
     drawing = encode_plate(order, options.artwork)
     proof = prove_plate(drawing, order.code, order.geometry, read) if read else None
@@ -166,7 +147,7 @@ def _add_plate(
 
 
 def _add_sheets(
-    packer: _Packer, orders: Sequence[PlateOrder], options: BundleOptions, sheet_mm: tuple[float, float]
+    packer: Packer, orders: Sequence[PlateOrder], options: BundleOptions, sheet_mm: tuple[float, float]
 ) -> None:
     width, height = sheet_mm
     sheets = encode_sheets(orders, width_mm=width, height_mm=height, options=options.artwork)

@@ -97,6 +97,14 @@ def _check_text(name: str, text: str, shortest: int, longest: int) -> None:
         )
 
 
+def reference_text(realization: str | None, epoch: float | None, warning: str | None = None) -> str:
+    """Reference system for the margin: frame and epoch of the position, and a warning if it is only approximate."""
+    text = " ".join(str(realization or "WGS 84").split()) + (f" @ {epoch:.2f}" if epoch is not None else "")
+    if warning is not None:
+        text = f"{text[: MAX_NOTE_LENGTH - len(warning) - 3]} ({warning})"
+    return "".join(c if c.isprintable() and c.isascii() else "?" for c in text)[:MAX_NOTE_LENGTH].strip()
+
+
 @dataclass(frozen=True, slots=True)
 class ArtworkOptions:
     """What else a drawing shows.

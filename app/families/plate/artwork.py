@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from app.encoders.plate import ArtworkOptions, Drawing, PlateOrder, PlateReader, encode_plate, prove_plate
 from app.encoders.plate.bundle import ARTWORK_VERSION
-from app.encoders.plate.order import MAX_NOTE_LENGTH
+from app.encoders.plate.order import reference_text
 from app.families.files import ArtworkProof, MarkerArtwork
 from app.families.plate.rows import plate_code, plate_geometry
 from app.geodesy import LocalizationGrade
@@ -41,13 +41,9 @@ def plate_order(row: MarkerRow, record_url: str) -> PlateOrder:
 
 
 def reference_system(row: MarkerRow) -> str:
-    """Reference system for the margin: frame and epoch of the position, and a warning if it is only approximate."""
-    frame = " ".join(str(row.realization or "WGS 84").split())
-    text = frame + (f" @ {row.epoch:.2f}" if row.epoch is not None else "")
-    if is_approximate(row):
-        warning = str(LocalizationGrade.APPROXIMATE)
-        text = f"{text[: MAX_NOTE_LENGTH - len(warning) - 3]} ({warning})"
-    return "".join(c if c.isprintable() and c.isascii() else "?" for c in text)[:MAX_NOTE_LENGTH].strip()
+    """Reference system for the margin, with a warning if the position is only approximate."""
+    warning = str(LocalizationGrade.APPROXIMATE) if is_approximate(row) else None
+    return reference_text(row.realization, row.epoch, warning)
 
 
 def is_approximate(row: MarkerRow) -> bool:

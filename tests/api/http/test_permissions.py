@@ -74,7 +74,7 @@ QUERIES = {
     "GET /v1/roads/{road_id}/position": "?measure_m=10",
 }
 # what the things made below do not have
-NOT_MADE = ("/artwork.{form}", "/proof", "/plot.svg", "/lane.geojson", "/overlay.{suffix}")
+NOT_MADE = ("/artwork.{form}", "/proof", "/package", "/plot.svg", "/lane.geojson", "/overlay.{suffix}")
 
 
 @pytest.fixture(scope="module")

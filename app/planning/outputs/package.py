@@ -1,0 +1,243 @@
+"""All files of a plan, the sheets of its magnets and the artwork of its plates, in parts that are written one by one.
+
+The same plan and options give the same files in the same order, whichever process writes which part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
+from functools import cached_property
+from typing import Any
+
+import orjson
+
+from app.encoders.magnet import MagnetLayout, SheetFormat, place_line, place_tag, write_sheet
+from app.encoders.plate import (
+    ArtworkFormat,
+    ArtworkOptions,
+    PlateOrder,
+    PlateReader,
+    encode_plate,
+    prove_plate,
+    quality_sheets,
+    write_artwork,
+    write_pdf,
+)
+from app.encoders.plate.order import reference_text
+from app.encoders.plate.quality import quality_csv
+from app.errors import InvalidParameter
+from app.geodesy import LocalizationGrade
+from app.markers.magnet import LineStyle
+from app.planning.drilling_sheet import drilling_sheet
+from app.planning.magnet_checks import Site
+from app.planning.magnet_stretches import even_stretches, lane_around, spacing_of
+from app.planning.outputs.files import OutputFile, OutputOptions, plan_files
+from app.planning.outputs.stakeout_points import plan_stakeout
+from app.planning.outputs.strip_map import Drawings
+from app.planning.plan import Plan, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
+from app.roads.lane_line import LaneLine
+
+PACKAGE_FORMAT = "waymark-package/1"
+MANIFEST = "manifest.json"
+PLATES_A_PART, SHEETS_A_PART, QUALITY_A_PART = 20, 20, 300
+"""Plates, drilling sheets and rows of a quality sheet that are written at a time. Source: chosen by hand, a second or
+two of work and some megabytes; a quality sheet of 101 pages."""
+MAX_SHEET_MAGNETS = 1000
+"""Magnets of a line on one drilling sheet. Source: those of one marker, `app.families.magnet.layouts.MAX_MAGNETS`."""
+
+
+class PartKind(StrEnum):
+    """What a part has."""
+
+    FILE = "file"
+    PLATES = "plates"
+    QUALITY = "quality"
+    TAGS = "tags"
+    LINES = "lines"
+
+
+@dataclass(frozen=True, slots=True)
+class PackagePart:
+    """Some files: one of `plan_files` by its name, or those of the markers from `start` until `stop` of their kind."""
+
+    kind: PartKind
+    name: str = ""
+    start: int = 0
+    stop: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PackageOptions:
+    """How a plan is handed out.
+
+    Attributes
+    ----------
+    outputs : OutputOptions
+    formats : tuple of ArtworkFormat
+        Files of each plate.
+    artwork : ArtworkOptions
+    """
+
+    outputs: OutputOptions = field(default_factory=OutputOptions)
+    formats: tuple[ArtworkFormat, ...] = (ArtworkFormat.PDF, ArtworkFormat.SVG)
+    artwork: ArtworkOptions = field(default_factory=ArtworkOptions)
+
+
+class Package:
+    """A plan and options, with what parts share; one a process."""
+
+    def __init__(self, plan: Plan, options: PackageOptions) -> None:
+        self.plan, self.options = plan, options
+
+    def check(self) -> None:
+        """Check the options without writing a file.
+
+        Raises
+        ------
+        InvalidParameter, ReferenceSystemError
+            They do not fit the plan.
+        """
+        if self.plan.markers:
+            outputs = self.options.outputs
+            try:
+                plan_stakeout(replace(self.plan, markers=self.plan.markers[:1]), outputs.crs, outputs.unit)
+            except InvalidParameter as error:
+                error.field = (error.field or "crs").removeprefix("position.")
+                raise
+            Drawings(self.plan, outputs.drawings)
+
+    def parts(self) -> list[PackagePart]:
+        """All parts in the order of their files; the manifest comes last and is none of them."""
+        parts = [PackagePart(PartKind.FILE, file.name) for file in self._files]
+        for kind, count, size in (
+            (PartKind.TAGS, len(self._tags), SHEETS_A_PART),
+            (PartKind.LINES, len(self._lines), SHEETS_A_PART),
+            (PartKind.PLATES, len(self._plates), PLATES_A_PART),
+            (PartKind.QUALITY, len(self._plates), QUALITY_A_PART),
+        ):
+            parts += [PackagePart(kind, start=start, stop=min(start + size, count)) for start in range(0, count, size)]
+        return parts
+
+    def write(self, part: PackagePart, read: PlateReader) -> list[tuple[str, bytes]]:
+        """Names and contents of a part's files; every plate is read back first.
+
+        Raises
+        ------
+        ProofFailed
+            A plate did not read back as its own code.
+        """
+        chosen = slice(part.start, part.stop)
+        match part.kind:
+            case PartKind.FILE:
+                return [(file.name, file.write()) for file in self._files if file.name == part.name]
+            case PartKind.TAGS:
+                return [file for marker in self._tags[chosen] for file in self._tag_sheets(marker)]
+            case PartKind.LINES:
+                return [file for stretch in self._lines[chosen] for file in self._line_sheets(stretch)]
+            case PartKind.PLATES:
+                return [file for marker in self._plates[chosen] for file in self._artwork(marker, read)]
+            case PartKind.QUALITY:
+                return self._quality(part)
+
+    def manifest(self, entries: list[dict[str, Any]]) -> bytes:
+        """The manifest: what was packed, with the name, size and SHA-256 of each file."""
+        document = {
+            "format": PACKAGE_FORMAT,
+            "plan": self.plan.name,
+            "counts": self.plan.counts,
+            "read_back": len(self._plates),
+            "options": {
+                "crs": self.options.outputs.crs,
+                "unit": self.options.outputs.unit,
+                "drawings": asdict(self.options.outputs.drawings),
+                "formats": [str(form) for form in self.options.formats],
+                **asdict(self.options.artwork),
+            },
+            "files": entries,
+        }
+        return orjson.dumps(document, option=orjson.OPT_INDENT_2)
+
+    # --- what there is ----------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _files(self) -> list[OutputFile]:
+        return list(plan_files(self.plan, self.options.outputs))
+
+    @cached_property
+    def _plates(self) -> list[PlannedMarker]:
+        return [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedPlate)]
+
+    @cached_property
+    def _tags(self) -> list[PlannedMarker]:
+        return [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedTag)]
+
+    @cached_property
+    def _lines(self) -> list[list[PlannedMarker]]:
+        return sorted(even_stretches(self.plan.markers, MAX_SHEET_MAGNETS), key=lambda stretch: stretch[0].number)
+
+    # --- plates -----------------------------------------------------------------------------------------------------
+
+    def _order(self, marker: PlannedMarker) -> PlateOrder:
+        """A plate as the workshop is asked to make it; it has a record to point to when the plan is committed."""
+        assert isinstance(marker.detail, PlannedPlate)
+        road = self.plan.alignment
+        warning = None if road.grade is LocalizationGrade.EXACT else str(road.grade)
+        return PlateOrder(
+            plate_id=f"plate-{marker.number:05d}",
+            code=marker.detail.code,
+            geometry=marker.detail.geometry,
+            lon_deg=marker.lon_deg,
+            lat_deg=marker.lat_deg,
+            crs=reference_text(road.realization, road.epoch, warning),
+        )
+
+    def _artwork(self, marker: PlannedMarker, read: PlateReader) -> Iterator[tuple[str, bytes]]:
+        order = self._order(marker)
+        drawing = encode_plate(order, self.options.artwork)
+        prove_plate(drawing, order.code, order.geometry, read)
+        for form in self.options.formats:
+            yield f"artwork/{order.plate_id}.{form}", write_artwork(drawing, form, compress=False).content
+
+    def _quality(self, part: PackagePart) -> list[tuple[str, bytes]]:
+        orders = [self._order(marker) for marker in self._plates[part.start : part.stop]]
+        name = "quality"
+        if len(self._plates) > QUALITY_A_PART:
+            name += f"-{part.start // QUALITY_A_PART + 1}"
+        pages = write_pdf(quality_sheets(orders), compress=False)
+        return [(f"artwork/{name}.pdf", pages), (f"artwork/{name}.csv", quality_csv(orders))]
+
+    # --- magnets ----------------------------------------------------------------------------------------------------
+
+    def _tag_sheets(self, marker: PlannedMarker) -> Iterator[tuple[str, bytes]]:
+        detail = marker.detail
+        assert isinstance(detail, PlannedTag)
+        lon, lat, along_m = lane_around(self.plan.alignment.lane(marker.lane), marker)
+        line = LaneLine.from_lon_lat(list(zip(lon.tolist(), lat.tolist(), strict=True)), marker.height_m or 0.0)
+        name = f"tag-{marker.number:05d}"
+        layout = place_tag(line, detail.tag, along_m, name=name, offset_m=marker.offset_m, meaning=detail.meaning)
+        return self._sheets(layout, marker)
+
+    def _line_sheets(self, stretch: Sequence[PlannedMarker]) -> Iterator[tuple[str, bytes]]:
+        first = stretch[0]
+        assert isinstance(first.detail, PlannedLineMagnet)
+        points = [(marker.lon_deg, marker.lat_deg) for marker in stretch]
+        line = LaneLine.from_lon_lat(points, first.height_m or 0.0)
+        style = LineStyle.SOLID if first.detail.tag.style is LineStyle.SOLID else LineStyle.DASHED
+        layout = place_line(line, style, name=f"line-{first.number:05d}", spacing_m=spacing_of(line))
+        return self._sheets(layout, first)
+
+    def _sheets(self, layout: MagnetLayout, marker: PlannedMarker) -> Iterator[tuple[str, bytes]]:
+        lane = self.plan.alignment.lane(marker.lane)
+        site = Site(design_speed_mps=float(lane.value_at(lane.design_speed_mps, marker.chainage_m)))
+        sheet = replace(drilling_sheet(layout, site), holes=self._holes)
+        for form in (SheetFormat.PDF, SheetFormat.CSV):
+            yield f"drilling/{layout.name}.{form}", write_sheet(sheet, form)
+
+    @property
+    def _holes(self) -> str:
+        """Diameter and depth of the holes, as far as the rules have them."""
+        rules = self.plan.rules.installation
+        sizes = (("diameter", rules.hole_diameter_mm), ("depth", rules.hole_depth_mm))
+        return ", ".join(f"{name} {size:g} mm" for name, size in sizes if size is not None)
