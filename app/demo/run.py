@@ -18,6 +18,7 @@ import numpy as np
 from app.demo.cerpms import INTERVAL_S, build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import FPS, MIN_ROWS, SPEED_KMH, DemoFrame, DemoPlate, drive_over, list_plates, registered_code
 from app.demo.magnets import BOOK, LENGTH_M, build, list_drives
+from app.demo.road_plan import FILES, PlanResult, describe_plan, describe_proof, draw_plan_table, plan_road, prove_road
 from app.demo.server import LocalServer, checked
 from app.demo.table import LaneResult, Pass, TraceResult, draw_lane_table, draw_table, draw_trace_table
 from app.demo.traces import drive_and_judge
@@ -44,6 +45,10 @@ _LANE_NOTES = (
     "Accepted: authentic packets with a new sequence. Path, own track: RMS distance from the lane's true centre line.",
     "Steering: RMS distance of the front axle of a simulated car that follows the path, from the true centre line.",
     "Radio, drives and attacks are simulated; the paper drove on roads.",
+)
+_PLAN_NOTES = (
+    "Read: markers that were read of those that were passed; intervals are Wilson's of 95 %. Drives are simulated,",
+    "with the encoders, simulations and decoders of the product.",
 )
 
 
@@ -77,7 +82,8 @@ def run_demo(out: Path, *, say: Say, keep_serving: bool = False) -> bool:
     -------
     bool
         Whether every plate and every tag was decoded, matched and gave a position, the wrong way was reported, no
-        reading was wrong, no forged packet was accepted, and the paths follow the lane.
+        reading was wrong, no forged packet was accepted, the paths follow the lane, and the plan passed its checks
+        and its proof.
 
     Raises
     ------
@@ -106,13 +112,17 @@ def run_demo(out: Path, *, say: Say, keep_serving: bool = False) -> bool:
             say("")
             say(draw_lane_table(lanes))
             say("")
-            for line in (*_LANE_NOTES, "", *(f"- {line}" for line in written + more + most), ""):
+            for line in (*_LANE_NOTES, ""):
                 say(line)
-            say(f"{_verdict(passes, drives, lanes)} {time.monotonic() - began:.0f} s.")
+            made, last = _demonstrate_plan(client, out, say)
+            for line in ("", *_PLAN_NOTES, "", *(f"- {line}" for line in written + more + most + last), ""):
+                say(line)
+            say(f"{_verdict(passes, drives, lanes, made)} {time.monotonic() - began:.0f} s.")
             if keep_serving:
                 say(f"\nThe server keeps running at {server.url}/ until you press Ctrl-C. Key: {server.key}")
                 server.wait()
-    return all(p.is_good for p in passes) and all(d.is_good for d in drives) and all(lane.is_good for lane in lanes)
+    plates_and_magnets = all(p.is_good for p in passes) and all(d.is_good for d in drives)
+    return plates_and_magnets and all(lane.is_good for lane in lanes) and made.is_good
 
 
 def _demonstrate(client: httpx.Client, out: Path, say: Say) -> tuple[list[Pass], list[str]]:
@@ -269,10 +279,27 @@ def _demonstrate_cerpms(client: httpx.Client, out: Path, say: Say) -> tuple[list
     ]
 
 
-def _verdict(passes: list[Pass], drives: list[TraceResult], lanes: list[LaneResult]) -> str:
+def _demonstrate_plan(client: httpx.Client, out: Path, say: Say) -> tuple[PlanResult, list[str]]:
+    """Plan a road, and prove the plan."""
+    folder = out / "plan"
+    made = plan_road(client, folder)
+    for line in describe_plan(made.plan):
+        say(line)
+    say("Proving it: simulated vehicles drive over the plan, a sample of its markers in each drive ...")
+    prove_road(client, made, folder)
+    for line in ("", draw_plan_table(made), "", *describe_proof(made)):
+        say(line)
+    names = ", ".join(FILES)
+    return made, [f"the plan of the road: {names} and proof.json in {folder}/"]
+
+
+def _verdict(passes: list[Pass], drives: list[TraceResult], lanes: list[LaneResult], made: PlanResult) -> str:
     failed = [f"plate {p.name}" for p in passes if not p.is_good]
     failed += [f"drive {drive.name}" for drive in drives if not drive.is_good]
     failed += [f"drive {lane.name}" for lane in lanes if not lane.is_good]
+    failed += [] if made.is_good else ["plan"]
     if failed:
         return f"FAILED: {', '.join(failed)}."
-    return "All plates and tags were decoded, matched and gave a position; the paths follow the lane."
+    return (
+        "All plates and tags were decoded, matched and gave a position; the paths follow the lane; the plan is proved."
+    )

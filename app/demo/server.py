@@ -40,7 +40,7 @@ class LocalServer:
         environment = inherited | {
             "WAYMARK_DATA_DIR": str(self._folder),
             "WAYMARK_ADMIN_KEY": self.key,
-            "WAYMARK_DECODE_WORKERS": "1",  # frames come one at a time
+            "WAYMARK_DECODE_WORKERS": "2",  # frames come one at a time, and a proof drives in both
         }
         command = [sys.executable, "-c", "from app.cli import main; main()", "serve", "--port", str(self._port)]
         self._log_path = self._folder / "server.log"

@@ -162,13 +162,13 @@ def draw_table(passes: Sequence[Pass]) -> str:
     rows.append(
         ("paper, figure 10", "position", "023792168411", f"{PAPER_IN_VIEW}", f"{PAPER_DECODED}", "-", "-", "-", "-")
     )
-    return _draw(_HEAD, rows[:count], rows[count:], left=3)
+    return draw_rows(_HEAD, rows[:count], rows[count:], left=3)
 
 
 def draw_trace_table(results: Sequence[TraceResult]) -> str:
     """Table of drives over magnets, with the paper's field trials below."""
     blank = ("",) * len(_TRACE_HEAD)
-    return _draw(
+    return draw_rows(
         _TRACE_HEAD,
         [_trace_row(result) for result in results],
         [(row + blank)[: len(blank)] for row in _METRO],
@@ -194,7 +194,7 @@ def draw_lane_table(results: Sequence[LaneResult]) -> str:
         )
         for r in results
     ]
-    return _draw(_LANE_HEAD, rows, _KADAV, left=1)
+    return draw_rows(_LANE_HEAD, rows, _KADAV, left=1)
 
 
 def _trace_row(r: TraceResult) -> tuple[str, ...]:
@@ -224,12 +224,15 @@ def _rms(errors_m: Sequence[float]) -> str:
     return f"{100 * math.sqrt(statistics.fmean(e * e for e in errors_m)):.1f}" if errors_m else "-"
 
 
-def _draw(head: Sequence[str], rows: Sequence[Sequence[str]], below: Sequence[Sequence[str]], *, left: int) -> str:
+def draw_rows(
+    head: Sequence[str], rows: Sequence[Sequence[str]], below: Sequence[Sequence[str]] = (), *, left: int
+) -> str:
     """Rows, and below a rule those to compare them with; the first columns are texts, the others numbers."""
     widths = [max(len(row[k]) for row in (head, *rows, *below)) for k in range(len(head))]
     rule = "  ".join("-" * width for width in widths)
     lines = [_line(head, widths, left), rule, *(_line(row, widths, left) for row in rows)]
-    return "\n".join([*lines, rule, *(_line(row, widths, left) for row in below)])
+    compared = [rule, *(_line(row, widths, left) for row in below)] if below else []
+    return "\n".join([*lines, *compared])
 
 
 def _row(p: Pass) -> tuple[str, ...]:
