@@ -72,6 +72,14 @@ def test_the_demo_reads_every_plate_and_tag(tmp_path: Path) -> None:
         assert float(rms_cm) < 5
         assert float(coverage) > 99.5
         assert float(steering_cm) < 8
+    assert re.search(
+        r"Placed 30 plates, 735 line magnets, \d+ CERPMs on 2\.93 km .* EUR at\nthe .* Checks: .*, 0 failed\.",
+        done.stdout,
+    )
+    proofs = re.findall(r"^(?:day|wear) +(plates|line magnets) +(\d+) +(\d+) +\d+ %", done.stdout, re.MULTILINE)
+    assert [kind for kind, _passes, _read in proofs] == ["line magnets", "line magnets", "plates", "plates"]
+    assert all(int(read) >= 0.7 * int(passes) > 0 for _kind, passes, read in proofs)
+    assert "Wrong readings: 0. The plan is proved." in done.stdout
     assert re.search(r"METRO, curvy road .* 0\.965 ± 0\.044", done.stdout)
     out = tmp_path / "out"
     assert len(list((out / "layouts").glob("*.pdf"))) == 7
@@ -80,6 +88,9 @@ def test_the_demo_reads_every_plate_and_tag(tmp_path: Path) -> None:
     assert {path.suffix for path in (out / "artwork").iterdir()} == {".svg", ".pdf", ".dxf", ".png"}
     assert "023792168411.pdf" in {path.name for path in (out / "artwork").iterdir()}
     assert len(json.loads(zipfile.ZipFile(out / "artwork.zip").read("manifest.json"))["plates"]) == 6
+    assert (out / "plan/drawings.pdf").read_bytes()[:5] == b"%PDF-"
+    with (out / "plan/bill.csv").open() as file:
+        assert [row["cost"] for row in csv.DictReader(file) if row["section"] == "total"] != [""]
     assert (out / "annotated.jpg").read_bytes()[:2] == b"\xff\xd8"
     with (out / "frames.csv").open() as file:
         assert sum(row["decoded"] == "True" for row in csv.DictReader(file)) == sum(int(row[1]) for row in rows)

@@ -43,7 +43,7 @@ def summarize_road(task: SummarizeRoadTask, _before: None) -> SummarizedRoad:
     """Read a road and describe it."""
     with memory_is_the_limit("road", _CURE):
         file = read_alignment(task.road.data, task.road.file_name)
-        road = _build(file, task.road, RoadRules())
+        road = _build(file, task.road, None)
         return SummarizedRoad(dict(road_summary(road, file.format)), lane_features(road))
 
 
@@ -70,7 +70,7 @@ def write_file_of_plan(task: WritePlanFileTask, _before: None) -> bytes:
 def write_map(task: WriteMapTask, _before: None) -> bytes:
     """Write a road and the markers near it as an HD map."""
     with memory_is_the_limit("road", _CURE):
-        road = _build(read_alignment(task.road.data, task.road.file_name), task.road, RoadRules())
+        road = _build(read_alignment(task.road.data, task.road.file_name), task.road, None)
         markers = [point for row in task.markers for point in get_family(row.family).map_markers(row)]
         content = map_of_road(road, markers, within_m=task.within_m)
         return write_lanelet2(content) if task.form == "osm" else write_opendrive(content, leave_out=True)
@@ -82,5 +82,8 @@ def compare_plan(task: CompareTask, _before: None) -> AsBuiltDocument:
         return compare_as_built(read_plan(zlib.decompress(task.document)), task.built, task.existing)
 
 
-def _build(file: AlignmentFile, road: RoadFile, rules: RoadRules) -> Alignment:
-    return build_alignment(file, rules, road.declaration, name=road.name, accuracy_m=road.accuracy_m)
+def _build(file: AlignmentFile, road: RoadFile, rules: RoadRules | None) -> Alignment:
+    """Without the rules of a plan, lanes whose speed the file does not state have none."""
+    return build_alignment(
+        file, rules, road.declaration, name=road.name, accuracy_m=road.accuracy_m, needs_speed=rules is not None
+    )

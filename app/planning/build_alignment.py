@@ -15,11 +15,12 @@ from app.geodesy import LocalizationGrade
 from app.planning.alignment import Alignment, AvoidedArea, Lane
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.road.checks import (
-    check_lane,
+    check_curvature,
     check_length,
     check_line,
     check_radii,
     check_simple,
+    check_speed,
     clear_width,
     lane_errors,
 )
@@ -53,6 +54,7 @@ def build_alignment(
     *,
     name: str = "road",
     accuracy_m: float = 0.1,
+    needs_speed: bool = True,
 ) -> Alignment:
     """Lanes of a file in WGS 84, sampled at even steps of at most 1 m.
 
@@ -67,6 +69,8 @@ def build_alignment(
         Of the alignment, and of a road without a name.
     accuracy_m : float
         Worst stated accuracy of a transformation whose result still counts as exact. [m]
+    needs_speed : bool
+        Refuse lanes without a speed, as plans must; without, such speeds are NaN.
 
     Raises
     ------
@@ -93,7 +97,7 @@ def build_alignment(
     lanes: list[Lane] = []
     for geometry, lines in zip(geometries, placed.lines, strict=True):
         with lane_errors(geometry.name, lines):
-            lane = _lane(geometry, lines, rules, name, warnings)
+            lane = _lane(geometry, lines, rules, name, warnings, needs_speed)
         if lane is not None:
             lanes.append(lane)
     if not lanes:
@@ -220,7 +224,12 @@ def _place(
 
 
 def _lane(
-    geometry: LaneGeometry, lines: tuple[GroundLine, ...], rules: RoadRules, road: str, warnings: list[str]
+    geometry: LaneGeometry,
+    lines: tuple[GroundLine, ...],
+    rules: RoadRules,
+    road: str,
+    warnings: list[str],
+    needs_speed: bool,
 ) -> Lane | None:
     """The lane; None, with a warning, if it is too short."""
     length_m = min(line.length_m for line in lines)
@@ -242,5 +251,7 @@ def _lane(
         check_simple(geometry.name, line)
     lane = make_lane(geometry, lines, rules, road)
     lane = clear_width(lane, warnings)
-    check_lane(lane, geometry)
+    check_curvature(lane, geometry)
+    if needs_speed:
+        check_speed(lane)
     return lane

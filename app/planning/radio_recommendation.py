@@ -146,7 +146,7 @@ def _approaches(plan: RadioPlan) -> list[Approach]:
     air, at_m = plan.air, markers.chainage_m
     if len(wanted) > _WANTED:
         ordered = np.sort(at_m)
-        first, last = at_m[wanted] - air.reach_m - air.harm_m, at_m[wanted] + air.harm_m - plan.preview_m
+        first, last = at_m[wanted] - 2 * air.range_m, at_m[wanted] + air.range_m - plan.preview_m
         others = np.searchsorted(ordered, last, "right") - np.searchsorted(ordered, first)
         crowded = np.argsort(-others, kind="stable")[: _WANTED // 2]  # they lose most packets
         spread = np.linspace(0, len(wanted) - 1, _WANTED - len(crowded)).astype(int)

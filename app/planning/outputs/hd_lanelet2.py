@@ -229,6 +229,7 @@ def _add_lanelets(
             for side, style in ((0, lane.left_style), (1, lane.right_style))
         ]
         first_m, last_m = piece.chainage_m[piece.cuts[k]], piece.chainage_m[piece.cuts[k + 1]]
+        limit = speed_kmh(lane, first_m, last_m)
         last = k == len(piece.cuts) - 2
         stops = [s for s in stops_m if first_m <= s < last_m or (last and s >= last_m)]
         rules = [_add_stop_line(writer, lane, min(stop, lane.length_m)) for stop in stops]
@@ -241,7 +242,7 @@ def _add_lanelets(
             ],
             {
                 "type": "lanelet", "subtype": "road", "location": location, "one_way": "yes",
-                "speed_limit": f"{speed_kmh(lane, first_m, last_m):g}", "lane": lane.name, "road": lane.road,
+                "lane": lane.name, "road": lane.road, **({} if limit is None else {"speed_limit": f"{limit:g}"}),
             },
         )  # fmt: skip
 

@@ -9,19 +9,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
-from app.markers.cerpm import LaneSide
 from app.markers.checks import Verdict
 from app.planning.alignment import Floats, Lane
 from app.planning.placement.cerpms import path_error_m
 from app.planning.plan import Plan, PlanFinding, PlannedCerpm, PlannedMarker
 from app.planning.plan_checks.finding import compare
 from app.planning.radio_checks import PreviewRule, RadioCheck, RadioPlan, check_radio
-from app.planning.radio_recommendation import recommend_settings
+from app.planning.radio_recommendation import INTERVALS_S, recommend_settings
 from app.planning.rules import CerpmRules
-from app.radio.reception import MAX_MARKERS, MAX_OFFSET_M, SPACINGS_M, RoadMarkers
+from app.radio.airtime import SPREADING_FACTORS
+from app.radio.reception import MAX_MARKERS, SPACINGS_M, Air, RoadMarkers
 from app.radio.settings import RadioSettings
 
-_SIGN = {LaneSide.LEFT: 1.0, LaneSide.RIGHT: -1.0, LaneSide.UNKNOWN: 0.0}
+_CARRIAGEWAY_M = 30.0  # [m] across; markers farther aside are farther along a bend; source: by hand, a motorway
 
 
 def check_cerpms(plan: Plan) -> Iterator[PlanFinding]:
@@ -56,16 +56,19 @@ def _path_error(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> I
 
 
 def _shifts_m(lane: Lane, cerpms: Sequence[PlannedMarker]) -> Floats:
-    """How far each stands left of its boundary, as surveys of built ones find, shape (K,). [m]"""
-    sides = np.array([_SIGN[marker.detail.side] for marker in cerpms if isinstance(marker.detail, PlannedCerpm)])
+    """How far each stands left of its boundary, as surveys of built ones find, shape (K,). [m]
+
+    The boundary is the nearer one: markers that two lanes share name no side.
+    """
+    offset_m = np.array([marker.offset_m for marker in cerpms])
     half_m = lane.value_at(lane.width_m, [marker.chainage_m for marker in cerpms]) / 2
-    return np.asarray(np.array([marker.offset_m for marker in cerpms]) - sides * half_m)
+    return np.asarray(offset_m - np.sign(offset_m) * half_m)
 
 
 def _radio(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterator[PlanFinding]:
     """The radio checks where most markers are in reach of each other, with the real markers of the plan."""
     radio = _radio_plan(plan, cerpms, rules, plan.radio or RadioSettings())
-    markers, busiest = _busiest(cerpms, radio.air.reach_m + radio.air.harm_m)
+    markers, busiest = _busiest(cerpms, radio.air)
     check = check_radio(replace(radio, markers=markers))
     settings = radio.settings
     setting = f"SF{settings.spreading_factor}, {settings.bandwidth_hz / 1000:g} kHz, every {settings.interval_s:g} s, "
@@ -95,11 +98,13 @@ def radio_settings(plan: Plan) -> RadioSettings | None:
         )
     mean = _radio_plan(plan, cerpms, rules, RadioSettings())
     found = _recommended(mean)
-    markers, _marker = _busiest(cerpms, found.air.reach_m + found.air.harm_m)
+    markers, _marker = _busiest(cerpms, found.air)
     real = replace(found, markers=markers)
-    if check_radio(real).read_probability < real.min_probability:
-        found = _recommended(replace(mean, markers=markers))
-    return found.settings
+    if check_radio(real).read_probability >= real.min_probability:
+        return found.settings
+    farthest = replace(mean.settings, spreading_factor=SPREADING_FACTORS[-1], interval_s=INTERVALS_S[-1])
+    markers, _marker = _busiest(cerpms, replace(mean, settings=farthest).air)
+    return _recommended(replace(mean, markers=markers)).settings
 
 
 def _radio_plan(plan: Plan, cerpms: Sequence[PlannedMarker], rules: CerpmRules, settings: RadioSettings) -> RadioPlan:
@@ -132,16 +137,20 @@ def _collisions(check: RadioCheck, rules: CerpmRules, busiest: PlannedMarker) ->
     )  # fmt: skip
 
 
-def _busiest(cerpms: list[PlannedMarker], reach_m: float) -> tuple[RoadMarkers, PlannedMarker]:
-    """The marker with most others in reach, and those around it along and across its direction of travel."""
+def _busiest(cerpms: Sequence[PlannedMarker], air: Air) -> tuple[RoadMarkers, PlannedMarker]:
+    """The marker with most others in range, and those around it that can be heard beside it.
+
+    Their distances from it are the true ones, so that a bend does not bring them closer.
+    """
     lon, lat = np.array([m.lon_deg for m in cerpms]), np.array([m.lat_deg for m in cerpms])
     tree = cKDTree(ecef_from_wgs84(lon, lat))
-    counts = tree.query_ball_point(tree.data, reach_m, return_length=True)
+    counts = tree.query_ball_point(tree.data, air.range_m, return_length=True)
     centre = int(np.argmax(counts))
-    near = np.array(tree.query_ball_point(tree.data[centre], reach_m)[:MAX_MARKERS])
+    near = np.array(tree.query_ball_point(tree.data[centre], air.reach_m + air.harm_m)[:MAX_MARKERS])
     east = np.radians((lon[near] - lon[centre] + 180.0) % 360.0 - 180.0) * np.cos(np.radians(lat[centre])) * 6_371_000.0
     north = np.radians(lat[near] - lat[centre]) * 6_371_000.0
     heading = np.radians(cerpms[centre].heading_deg)
     along = east * np.sin(heading) + north * np.cos(heading)
-    across = np.clip(north * np.sin(heading) - east * np.cos(heading), -MAX_OFFSET_M, MAX_OFFSET_M)
-    return RoadMarkers(along, across), cerpms[centre]
+    across = np.clip(north * np.sin(heading) - east * np.cos(heading), -_CARRIAGEWAY_M, _CARRIAGEWAY_M)
+    away = np.sqrt(np.maximum(east**2 + north**2 - across**2, 0.0))
+    return RoadMarkers(np.copysign(away, along), across), cerpms[centre]

@@ -126,13 +126,13 @@ def clear_width(lane: Lane, warnings: list[str]) -> Lane:
     return replace(lane, chainage_m=lane.chainage_m[kept] - lane.chainage_m[first], **cut)
 
 
-def check_lane(lane: Lane, geometry: LaneGeometry) -> None:
-    """Check speed and curvature of a lane.
+def check_speed(lane: Lane) -> None:
+    """Check that a lane has a speed everywhere.
 
     Raises
     ------
     InvalidParameter
-        A speed is missing, or the curvature is larger than a car can turn.
+        Neither the file nor the rules state one.
     """
     missing = np.flatnonzero(~np.isfinite(lane.design_speed_mps))
     if len(missing):
@@ -142,6 +142,16 @@ def check_lane(lane: Lane, geometry: LaneGeometry) -> None:
             limit="a speed for every lane",
             cure="give road.design_speed_kmh in the rules, or speed_limit_kmh in the file",
         )
+
+
+def check_curvature(lane: Lane, geometry: LaneGeometry) -> None:
+    """Check the curvature of a lane.
+
+    Raises
+    ------
+    InvalidParameter
+        It is larger than a car can turn.
+    """
     k = int(np.argmax(np.abs(lane.curvature_per_m)))
     if abs(lane.curvature_per_m[k]) > 1 / MIN_RADIUS_M:
         raise InvalidParameter(
@@ -198,13 +208,13 @@ def _crossing_m(line: GroundLine, points: Floats, pieces: Any, own: int, other: 
 
 
 def check_radii(lanes: Sequence[Lane]) -> list[str]:
-    """Warnings where bends are sharper than the design speed allows."""
+    """Warnings where bends are sharper than the design speed allows; none where it is unknown."""
     warnings = []
     speeds, radii = np.array(_RADII).T
     for lane in lanes:
         speed_kmh = lane.design_speed_mps * 3.6
         least = np.interp(speed_kmh, speeds, radii) * np.minimum(speed_kmh / speeds[0], 1.0) ** 2
-        excess = np.abs(lane.curvature_per_m) * least
+        excess = np.nan_to_num(np.abs(lane.curvature_per_m) * least)
         k = int(np.argmax(excess))
         if excess[k] > 1.0:
             warnings.append(

@@ -98,7 +98,7 @@ def find_curves(lane: Lane, radius_m: float, turn_deg: float) -> list[RoadEvent]
 
 
 def _speed_changes(lane: Lane) -> list[RoadEvent]:
-    changes = np.flatnonzero(np.abs(np.diff(lane.design_speed_mps)) > 0.01) + 1
+    changes = np.flatnonzero(np.abs(np.diff(lane.design_speed_mps)) > 0.01) + 1  # never where a speed is unknown
     return [
         RoadEvent(
             EventKind.SPEED_LIMIT, lane.name, float(lane.chainage_m[k]), round(float(lane.design_speed_mps[k]) * 3.6, 3)

@@ -20,8 +20,8 @@ class LaneSummary(TypedDict):
     length_m: float
     width_m: list[float]
     """Least and greatest. [m]"""
-    design_speed_kmh: list[float]
-    """Least and greatest. [km/h]"""
+    design_speed_kmh: list[float] | None
+    """Least and greatest; null if the file states none, then the rules of a plan must. [km/h]"""
     min_radius_m: float | None
     """Of its sharpest bend; null on a straight. [m]"""
     max_grade: float

@@ -103,7 +103,7 @@ def _lane_summary(lane: Lane) -> LaneSummary:
         "road": lane.road,
         "length_m": lane.length_m,
         "width_m": [float(lane.width_m.min()), float(lane.width_m.max())],
-        "design_speed_kmh": [float(speed.min()), float(speed.max())],
+        "design_speed_kmh": [float(speed.min()), float(speed.max())] if np.isfinite(speed).all() else None,
         "min_radius_m": 1 / sharpest if sharpest > _STRAIGHT_PER_M else None,
         "max_grade": float(np.abs(lane.grade).max()),
         "left_style": str(lane.left_style),

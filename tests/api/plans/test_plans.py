@@ -49,6 +49,14 @@ def road(lon_deg: float, lat_deg: float, length_m: float = 800.0) -> bytes:
     return json.dumps({"type": "FeatureCollection", "features": [lane, stop]}).encode()
 
 
+def without_speed(data: bytes) -> bytes:
+    """The road with no speed limit."""
+    document = json.loads(data)
+    for feature in document["features"]:
+        feature["properties"].pop("speed_limit_kmh", None)
+    return json.dumps(document).encode()
+
+
 def send_road(client: httpx.Client, data: bytes, **declared: Any) -> httpx.Response:
     declared.setdefault("name", f"road {next(PLACES)}")
     parts = {"file": ("road.geojson", data, "application/geo+json"), "declaration": (None, json.dumps(declared))}
@@ -231,3 +239,17 @@ def test_plans_of_another_agency_are_not_found(
         refused(stranger.get(f"/v1/alignments/{alignment['id']}"), 404)
         body = {"name": "mine", "alignment_id": alignment["id"], "rules": RULES}
         refused(stranger.post("/v1/plans", json=body), 404)
+
+
+def test_a_road_without_speeds_is_stored_and_the_rules_of_a_plan_give_them(client: httpx.Client) -> None:
+    alignment = send_road(client, without_speed(road(9.0, 47.0 + next(PLACES) * 0.02))).json()
+    assert alignment["lanes"][0]["design_speed_kmh"] is None
+    for name in ("map.osm", "map.xodr"):
+        drawn = client.get(f"/v1/alignments/{alignment['id']}/{name}")
+        assert drawn.status_code == 200, drawn.text
+        assert "nan" not in drawn.text
+    wanted = {"name": f"plan {next(PLACES)}", "alignment_id": alignment["id"], "rules": {"version": 1, "plates": {}}}
+    problem = refused(client.post("/v1/plans", json=wanted), 422)
+    assert problem["field"] == "road.design_speed_kmh"
+    wanted["rules"] = {"version": 1, "plates": {}, "road": {"design_speed_kmh": 60}}
+    assert created(client, "/v1/plans", **wanted)["counts"]["plate"] > 0

@@ -133,3 +133,11 @@ def test_radio_settings_are_recommended_for_the_busiest_place() -> None:
     assert straight_one.channels < plan.radio.channels
     fixed = {**rules, "spreading_factor": straight_one.spreading_factor, "interval_s": straight_one.interval_s}
     assert finding(checked(plan.alignment, cerpm=fixed), "radio read-in-time").verdict is Verdict.FAIL
+
+
+def test_the_path_beside_a_shared_line_is_that_of_the_lane() -> None:
+    """Markers on the line between two lanes name no side."""
+    lane = straight(500)
+    lon, lat = lane.position_at(lane.chainage_m, 3.5)
+    plan = checked(road(lane, replace(lane, name="2", lon_deg=lon, lat_deg=lat)), cerpm={})
+    assert finding(plan, "path-error").figure < 0.001
