@@ -144,8 +144,10 @@ def _busiest(cerpms: Sequence[PlannedMarker], air: Air) -> tuple[RoadMarkers, Pl
     """
     lon, lat = np.array([m.lon_deg for m in cerpms]), np.array([m.lat_deg for m in cerpms])
     tree = cKDTree(ecef_from_wgs84(lon, lat))
-    counts = tree.query_ball_point(tree.data, air.range_m, return_length=True)
-    centre = int(np.argmax(counts))
+    in_range, heard = (
+        tree.query_ball_point(tree.data, away, return_length=True) for away in (air.range_m, air.reach_m + air.harm_m)
+    )
+    centre = int(np.lexsort((heard, in_range))[-1])
     near = np.array(tree.query_ball_point(tree.data[centre], air.reach_m + air.harm_m)[:MAX_MARKERS])
     east = np.radians((lon[near] - lon[centre] + 180.0) % 360.0 - 180.0) * np.cos(np.radians(lat[centre])) * 6_371_000.0
     north = np.radians(lat[near] - lat[centre]) * 6_371_000.0
