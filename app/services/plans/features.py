@@ -24,14 +24,15 @@ def lane_features(road: Alignment) -> list[LaneFeature]:
     found: list[LaneFeature] = []
     for lane, summary in zip(road.lanes, road_summary(road)["lanes"], strict=True):
         sharpest = summary["min_radius_m"]
+        slowest, fastest = summary["design_speed_kmh"] or (None, None)
         properties = {
             "lane": summary["name"],
             "road": summary["road"],
             "length_m": round(summary["length_m"], 3),
             "min_width_m": round(summary["width_m"][0], 3),
             "max_width_m": round(summary["width_m"][1], 3),
-            "min_speed_kmh": round(summary["design_speed_kmh"][0], 3),
-            "max_speed_kmh": round(summary["design_speed_kmh"][1], 3),
+            "min_speed_kmh": None if slowest is None else round(slowest, 3),
+            "max_speed_kmh": None if fastest is None else round(fastest, 3),
             "min_radius_m": None if sharpest is None else round(sharpest, 3),
             "max_curvature_per_m": 0.0 if sharpest is None else round(1 / sharpest, 9),
             "max_grade": round(summary["max_grade"], 6),
