@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
@@ -114,8 +115,7 @@ def _make(console: Console, road: Path, rules_file: Path, declaration: object, n
     from app.formats.alignments.read import read_alignment
     from app.planning.alignment_declaration import AlignmentDeclaration
     from app.planning.build_alignment import build_alignment
-    from app.planning.placement import place_plan
-    from app.planning.plan_checks import check_plan
+    from app.planning.planner import make_plan
     from app.planning.read_rules import read_rules
 
     assert isinstance(declaration, AlignmentDeclaration)
@@ -125,17 +125,15 @@ def _make(console: Console, road: Path, rules_file: Path, declaration: object, n
         file = read_alignment(road.read_bytes(), road.name)
         status.update("Placing the road")
         alignment = build_alignment(file, rules.road, declaration, name=road.stem)
-        status.update("Placing the markers")
-        placed = place_plan(alignment, rules, name=name)
-        if not placed.markers:
-            raise InvalidParameter(
-                "the rules place no marker on this road",
-                field="rules",
-                limit="at least one marker",
-                cure="; ".join(left.reason for left in placed.left_out[:3]) or "check lanes, spacing and line styles",
-            )
-        status.update(f"Checking {len(placed.markers)} markers")
-        return check_plan(placed)
+        made = make_plan(alignment, rules, name=name, report=status.update)
+    if not made.markers:
+        raise InvalidParameter(
+            "the rules place no marker on this road",
+            field="rules",
+            limit="at least one marker",
+            cure="; ".join(left.reason for left in made.left_out[:3]) or "check lanes, spacing and line styles",
+        )
+    return made
 
 
 def _write(console: Console, made: Plan, out: Path, options: OutputOptions, *, artwork: bool) -> None:
@@ -144,8 +142,9 @@ def _write(console: Console, made: Plan, out: Path, options: OutputOptions, *, a
 
     from app.encoders.packer import file_entry
     from app.planning.outputs.package import MANIFEST, Package, PackageOptions, PartKind
+    from app.plots.trade_off import draw_trade_off
 
-    package = Package(made, PackageOptions(options))
+    package = Package(made, PackageOptions(replace(options, draw_trade_off=draw_trade_off)))
     out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder:
         parts = [part for part in package.parts() if artwork or part.kind is PartKind.FILE]
@@ -188,12 +187,15 @@ def _print(made: Plan, out: Path) -> None:
     from app.markers.checks import Verdict
     from app.planning.outputs.bill import plan_bill
     from app.planning.outputs.report import counts_sentence, finding_figures, finding_place, verdict_counts
+    from app.planning.outputs.trade_off import optimum_sentence
 
     console = Console()
     road = made.alignment
     console.print(f"[bold]{escape(made.name)}[/]: {len(road.lanes)} lanes, {road.lane_length_m / 1000:.3f} km of lane")
     console.print(f"  {counts_sentence(made)}")
     console.print(f"  cost: {escape(plan_bill(made).sentence)}")
+    if made.optimum is not None:
+        console.print(f"  {escape(optimum_sentence(made.optimum, made.rules.costs.currency))}")
     if not road.surveyed:
         console.print("  [yellow]PLANNED - positions not surveyed[/]: the road was placed by an origin")
     for warning in road.warnings[:5]:

@@ -9,6 +9,7 @@ from app.formats.alignments.geometry import AlignmentFile
 from app.formats.alignments.read import read_alignment
 from app.jobs.memory_limit import memory_is_the_limit
 from app.markers.magnet_codebook import Codebook
+from app.planning import planner
 from app.planning.alignment import Alignment
 from app.planning.build_alignment import build_alignment
 from app.planning.outputs.files import OutputOptions, write_plan_file
@@ -16,11 +17,10 @@ from app.planning.outputs.hd_lanelet2 import write_lanelet2
 from app.planning.outputs.hd_map import map_of_road
 from app.planning.outputs.hd_opendrive import write_opendrive
 from app.planning.outputs.plan_document import read_plan, write_plan
-from app.planning.placement import place_plan
 from app.planning.placement.codes import unused_numbers
-from app.planning.plan_checks import check_plan
 from app.planning.read_rules import check_rules
 from app.planning.rules import RoadRules
+from app.plots.trade_off import draw_trade_off
 from app.services.plans.as_built import compare_as_built
 from app.services.plans.documents import AsBuiltDocument
 from app.services.plans.features import lane_features, planned_columns
@@ -55,8 +55,9 @@ def make_plan(task: MakePlanTask, _before: None) -> MadePlan:
         alignment = _build(file, task.road, rules.road)
         numbers = unused_numbers(task.taken, zlib.crc32(task.name.encode()))
         book = Codebook.from_document(task.codebook) if task.codebook is not None else None
-        plan = place_plan(alignment, rules, name=task.name, codebook=book, numbers=numbers)
-        plan = check_plan(plan, task.existing)
+        plan = planner.make_plan(
+            alignment, rules, name=task.name, codebook=book, numbers=numbers, existing=task.existing
+        )
         codes = tuple((marker.family, marker.code) for marker in plan.markers if marker.family != "magnet")
         return MadePlan(zlib.compress(write_plan(plan), 6), plan_summary(plan), codes, planned_columns(plan))
 
@@ -64,7 +65,11 @@ def make_plan(task: MakePlanTask, _before: None) -> MadePlan:
 def write_file_of_plan(task: WritePlanFileTask, _before: None) -> bytes:
     """Write a file of a plan."""
     with memory_is_the_limit("plan", _CURE):
-        return write_plan_file(read_plan(zlib.decompress(task.document)), task.name, OutputOptions(task.crs, task.unit))
+        return write_plan_file(
+            read_plan(zlib.decompress(task.document)),
+            task.name,
+            OutputOptions(task.crs, task.unit, draw_trade_off=draw_trade_off),
+        )
 
 
 def write_map(task: WriteMapTask, _before: None) -> bytes:

@@ -14,6 +14,7 @@ from app.markers.magnet_codebook import Codebook, Meaning
 from app.markers.plate import PlateCode, PlateGeometry
 from app.planning.alignment import Alignment, RoadEvent
 from app.planning.rules import PlanRules
+from app.planning.trade_off import Optimum
 from app.radio.settings import RadioSettings
 
 
@@ -169,6 +170,8 @@ class Plan:
         Of the tags.
     radio : RadioSettings or None
         Of the CERPMs; None until `check_plan` ran, and without CERPMs.
+    optimum : Optimum or None
+        Of rules with a `quality`.
     """
 
     name: str
@@ -179,6 +182,7 @@ class Plan:
     findings: tuple[PlanFinding, ...] = ()
     codebook: Codebook | None = None
     radio: RadioSettings | None = None
+    optimum: Optimum | None = None
 
     @property
     def counts(self) -> dict[str, int]:

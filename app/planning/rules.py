@@ -162,6 +162,22 @@ class CameraRules(_Part):
     rolling_shutter_s: float = Field(default=0.0, ge=0.0, le=0.1, description="Time from the first to the last row.")
 
 
+_CONDITION = "(day|night|rain|shade|wear|dirt)"
+
+
+class PredictionRules(_Part):
+    """Circumstances for which the checks predict read rates and path errors."""
+
+    conditions: list[Annotated[str, Field(pattern=rf"^{_CONDITION}(\+{_CONDITION})*$", max_length=60)]] = Field(
+        default=["day"], min_length=1, max_length=20, description="As in a proof; several are joined: night+rain."
+    )
+    speed_share: float = Field(default=1.0, ge=0.1, le=1.5, description="Of the design speed.")
+    lost_share: float = Field(default=0.0, ge=0.0, le=0.9, description="Share of the markers that are missing.")
+    clearance_m: float = Field(default=0.16, ge=0.05, le=0.6, description="Of the magnetometers above the road.")
+    survey_rmse_m: float = Field(default=0.03, ge=0.0, le=2.0, description="Of the registered positions, horizontal.")
+    min_read_rate: float = Field(default=0.9, ge=0.0, le=1.0, description="Lower predicted read rates are reported.")
+
+
 class Quality(_Part):
     """Required of the finished road; the optimiser finds the cheapest plan that has it."""
 
@@ -226,6 +242,7 @@ class PlanRules(_Part):
     avoid: AvoidRules = AvoidRules()
     temporary: Temporary | None = None
     cameras: list[CameraRules] = Field(default=[CameraRules()], min_length=1, max_length=10)
+    predictions: PredictionRules = PredictionRules()
     quality: Quality | None = None
     costs: Costs = Costs()
     installation: Installation = Installation()

@@ -1,6 +1,6 @@
 """``python -m benchmarks.planning [ITEM ...] [--short]``: plans of whole roads.
 
-Items: speed, commit, papers, all. The exit status is 1 where a goal was missed.
+Items: speed, predictions, commit, papers, all. The exit status is 1 where a goal was missed.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from collections.abc import Callable
 
 from benchmarks.planning.commit import measure_commit
 from benchmarks.planning.papers import measure_papers
+from benchmarks.planning.predictions import measure_predictions
 from benchmarks.planning.speed import measure_speed
 from benchmarks.planning.tables import Section
 
 RUNS: dict[str, Callable[[bool], Section]] = {
     "speed": measure_speed,
+    "predictions": measure_predictions,
     "commit": measure_commit,
     "papers": measure_papers,
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,15 @@ START_DEG = (8.4, 49.0)
 _GEOD = Geod(ellps="WGS84")
 _STEP_M = 2.0  # [m] between vertices, about; the sagitta at a radius of 60 m is 8 mm
 _WIDTH_M = 3.5  # [m] of a lane
+_MAX_STEPS = 5  # of 2 m, between vertices of digitised boundaries; by hand
 _SIGNS_EVERY_M, _JUNCTIONS_EVERY_M = 1500.0, 4000.0  # [m] as on a rural road
+
+
+class Roughness(NamedTuple):
+    """Of digitised boundaries: standard deviation of their vertices from smooth lines [m], and the seed."""
+
+    sd_m: float
+    seed: int
 
 
 def real_lane(name: str, rules: RoadRules | None = None) -> Alignment:
@@ -32,14 +41,19 @@ def real_lane(name: str, rules: RoadRules | None = None) -> Alignment:
     return build_alignment(file, rules, name=name)
 
 
-def generated_road(length_m: float, seed: int, *, radii_m: tuple[float, float], rules: RoadRules) -> Alignment:
+def generated_road(
+    length_m: float, seed: int, *, radii_m: tuple[float, float], rules: RoadRules, rough_m: float = 0.0
+) -> Alignment:
     """A generated two-lane road as an alignment."""
-    data = generated_file(length_m, seed, radii_m=radii_m, speed_kmh=rules.design_speed_kmh or 80.0)
+    speed_kmh = rules.design_speed_kmh or 80.0
+    data = generated_file(length_m, seed, radii_m=radii_m, speed_kmh=speed_kmh, rough_m=rough_m)
     return build_alignment(read_alignment(data, "road.geojson"), rules, name=f"generated-{seed}")
 
 
-def generated_file(length_m: float, seed: int, *, radii_m: tuple[float, float], speed_kmh: float = 80.0) -> bytes:
-    """A two-lane road as a GeoJSON file: centre lines of both lanes, speed limits and junctions.
+def generated_file(
+    length_m: float, seed: int, *, radii_m: tuple[float, float], speed_kmh: float = 80.0, rough_m: float = 0.0
+) -> bytes:
+    """A two-lane road as a GeoJSON file: centre lines or boundaries of both lanes, speed limits and junctions.
 
     Parameters
     ----------
@@ -50,6 +64,8 @@ def generated_file(length_m: float, seed: int, *, radii_m: tuple[float, float], 
         Least and greatest radius of the bends; arcs have clothoids of a third of their length at both ends. [m]
     speed_kmh : float
         Limit of both lanes. [km/h]
+    rough_m : float
+        Standard deviation of the boundaries from smooth lines, as digitised ones have it; 0: centre lines. [m]
     """
     step_m = length_m / round(length_m / _STEP_M)
     curvature = _curvature(length_m, step_m, np.random.default_rng((seed, 13)), radii_m)
@@ -58,6 +74,10 @@ def generated_file(length_m: float, seed: int, *, radii_m: tuple[float, float], 
     right = _beside(lon, lat, heading, -_WIDTH_M / 2)
     left = _beside(lon, lat, heading, _WIDTH_M / 2)[::-1]
     features = [_lane("1", right, speed_kmh), _lane("2", left, speed_kmh)]
+    if rough_m > 0:
+        rough = Roughness(rough_m, seed)
+        axis = (lon, lat, heading)
+        features = [feature for name in ("1", "2") for feature in _boundaries(name, axis, speed_kmh, rough)]
     for every_m, kind, value in (
         (_SIGNS_EVERY_M, "speed_limit", speed_kmh),
         (_JUNCTIONS_EVERY_M, "junction", None),
@@ -99,7 +119,7 @@ def _line(heading_deg: Floats, step_m: float) -> tuple[Floats, Floats]:
     return np.array(lon), np.array(lat)
 
 
-def _beside(lon: Floats, lat: Floats, heading_deg: Floats, left_m: float) -> list[list[float]]:
+def _beside(lon: Floats, lat: Floats, heading_deg: Floats, left_m: float | Floats) -> list[list[float]]:
     x, y, _ = _GEOD.fwd(lon, lat, heading_deg - 90.0, np.full(len(lon), left_m))
     return np.round(np.column_stack([x, y]), 9).tolist()  # type: ignore[no-any-return]
 
@@ -111,6 +131,27 @@ def _lane(name: str, line: list[list[float]], speed_kmh: float) -> dict[str, obj
     }  # fmt: skip
     geometry = {"type": "LineString", "coordinates": line}
     return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+
+def _boundaries(
+    name: str, axis: tuple[Floats, Floats, Floats], speed_kmh: float, rough: Roughness
+) -> list[dict[str, object]]:
+    """Left and right boundary of a lane, each with deviations of its own; the axis is the left one of both lanes."""
+    lon, lat, heading = axis
+    rng = np.random.default_rng((rough.seed, 14, int(name)))
+    sign = -1.0 if name == "1" else 1.0
+    features = []
+    for side, left_m in (("L", 0.0), ("R", sign * _WIDTH_M)):
+        every = int(rng.integers(1, _MAX_STEPS + 1))
+        kept = np.unique(np.append(np.arange(0, len(lon), every), len(lon) - 1))
+        off_m = left_m + rough.sd_m * rng.standard_normal(len(kept))
+        line = _beside(lon[kept], lat[kept], heading[kept], off_m)
+        lane = _lane(name, line if name == "1" else line[::-1], speed_kmh)
+        style = "dashed" if side == "L" else "solid"
+        keep = ("lane", "road", "speed_limit_kmh")
+        properties = {key: value for key, value in lane["properties"].items() if key in keep}  # type: ignore[attr-defined]
+        features.append({**lane, "properties": {**properties, "side": side, "style": style}})
+    return features
 
 
 def _point(kind: str, lane: str, place: list[float], value: float | None) -> dict[str, object]:

@@ -144,3 +144,26 @@ def test_bad_input_ends_with_status_2_and_nothing_is_written(
     assert part in result.stderr
     assert "Traceback" not in result.output
     assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
+
+
+def test_rules_with_a_quality_get_the_cheapest_places_and_their_trade_off(tmp_path: Path) -> None:
+    out = tmp_path / "plan"
+    result = run(
+        "plan", write_road(tmp_path / "road.geojson"), "--rules", DOCS / "rules-rural-plates.yaml", "--out", out
+    )
+    assert result.exit_code == 0, result.output
+    assert "cheapest plan found for a fix every 100 m" in " ".join(result.stdout.split())
+    with (out / "trade-off.csv").open(newline="") as file:
+        required, *others = csv.DictReader(file)
+    assert required["required"] == "yes"
+    assert {row["required"] for row in others} == {"no"}
+    assert float(required["cost"]) > float(required["bound"]) * 0.99 > 0
+    assert (out / "trade-off.svg").read_text().startswith("<svg")
+
+
+def test_a_quality_without_unit_costs_is_refused(tmp_path: Path, rules: Path) -> None:
+    rules.write_text(RULES + "quality: {fix_every_m: 100}\n")
+    result = run("plan", write_road(tmp_path / "road.geojson"), "--rules", rules, "--out", tmp_path / "plan")
+    assert result.exit_code == 2
+    assert "there is no unit cost for the family plate" in " ".join(result.output.split())
+    assert not (tmp_path / "plan").exists()

@@ -12,14 +12,15 @@ import numpy as np
 from app.errors import InvalidParameter
 from app.planning.alignment import Alignment, Floats, Lane, format_station
 from app.planning.marking_rules import marking_rules
+from app.planning.optimise.costs import list_prices
 from app.planning.optimise.cover import cheapest_cover, least_gain, uncovered_m
 from app.planning.optimise.path import even_pairs, fewest_pairs
-from app.planning.optimise.trade_off import TradeOffPoint
 from app.planning.placement.avoid import AvoidedAreas
-from app.planning.placement.plates import place_plates
+from app.planning.placement.plates import place_plates, plate_room_m
 from app.planning.placement.tags import place_tags
 from app.planning.plan import Purpose
 from app.planning.rules import PlanRules, Quality
+from app.planning.trade_off import TradeOffPoint
 
 FixModel = Callable[[Lane, Floats], tuple[Floats, Floats]]
 """Probability that a pass fixes the position at markers at chainages of a lane, and the standard error of the fix [m];
@@ -47,11 +48,14 @@ class FamilyModel:
     fix : FixModel or None
         None: it fixes no position, and serves the path or an event only. Where no family fixes positions, only the
         path is optimised.
+    selectable : bool
+        Whether places may be chosen; if not, those ahead of events count as fixes, and no others are.
     """
 
     family: str
     cost: float
     fix: FixModel | None
+    selectable: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +84,8 @@ class OptimisedPlan:
         No plan with the same pairs along the path and the same markers ahead of events is cheaper.
     table : tuple of TradeOffPoint
         Other requirements; the required one among them.
+    sought : tuple of (str, str)
+        Lanes and families whose places were sought.
     """
 
     quality: Quality
@@ -87,6 +93,7 @@ class OptimisedPlan:
     cost: float
     bound: float
     table: tuple[TradeOffPoint, ...]
+    sought: tuple[tuple[str, str], ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -97,46 +104,19 @@ class OptimisedPlan:
     def places(self) -> dict[tuple[str, str], tuple[float, ...]]:
         """Chainages by lane and family as `place_plan` takes them; it places what stands ahead of events itself. [m]
 
-        Tags that were chosen as fixes are among them, and `place_plan` refuses them: they have no event to announce.
+        Each family whose places were sought is among them, also where none was needed. Tags that were chosen as fixes
+        are too, and `place_plan` refuses them: they have no event to announce.
         """
-        found: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
+        found: defaultdict[tuple[str, str], list[float]] = defaultdict(list, {key: [] for key in self.sought})
         for site in self.sites:
             if site.purpose != "event":
                 found[site.lane, site.family].append(site.chainage_m)
         return {key: tuple(chainages) for key, chainages in found.items()}
 
 
-def site_costs(rules: PlanRules) -> dict[str, float]:
-    """Cost of one site of each family that the rules place, from the agency's unit costs: a tag with its magnets and
-    holes, a pair of CERPMs; days by the rate.
-
-    Raises
-    ------
-    InvalidParameter
-        A family has no unit cost.
-    """
-    price = _prices(rules)
-    each = price["marker"] + (price["day"] / rules.costs.markers_per_day if rules.costs.markers_per_day else 0.0)
-    costs = {}
-    if rules.plates is not None:
-        costs["plate"] = price["plate"] + each
-    if rules.tags is not None:
-        costs["magnet"] = price["tag"] + rules.tags.magnets * (price["magnet"] + price["hole"]) + each
-    if rules.cerpm is not None:
-        sides = 2 if rules.cerpm.sides == "both" else 1
-        costs["cerpm"] = sides * (price["cerpm"] + each)
-    for family, cost in costs.items():
-        if cost <= 0:
-            raise InvalidParameter(
-                f"there is no unit cost for the family {family}",
-                field="costs.items",
-                limit="a positive cost of each family that the rules place",
-                cure=f"add a price per {'magnet or tag' if family == 'magnet' else family}, or per marker",
-            )
-    return costs
-
-
-def optimise_plan(alignment: Alignment, rules: PlanRules, models: Sequence[FamilyModel]) -> OptimisedPlan:
+def optimise_plan(
+    alignment: Alignment, rules: PlanRules, models: Sequence[FamilyModel], *, other_cost: float = 0.0
+) -> OptimisedPlan:
     """The cheapest sites that have the quality of the rules, or the best ones within its budget.
 
     Parameters
@@ -146,6 +126,8 @@ def optimise_plan(alignment: Alignment, rules: PlanRules, models: Sequence[Famil
         With `quality`. Decision points and events keep their markers; their cost is included, and they count as fixes.
     models : sequence of FamilyModel
         Of the families that may be used, each at most once.
+    other_cost : float
+        Of markers that stand in any case, such as line magnets, in the currency of the rules.
 
     Returns
     -------
@@ -173,18 +155,20 @@ def optimise_plan(alignment: Alignment, rules: PlanRules, models: Sequence[Famil
             limit="needed to optimise",
             cure="add quality with fix_every_m, fix_probability and fix_error_m, or a budget",
         )
-    optimiser = _Optimiser(alignment, rules, models)
+    optimiser = _Optimiser(alignment, rules, models, other_cost)
     optimiser.prepare(quality.path_error_m)
     if quality.budget is not None:
         quality = optimiser.best_within(quality, quality.budget)
     sites, cost, bound = optimiser.solve(quality)
-    return OptimisedPlan(quality, tuple(sites), cost, bound, optimiser.table(quality))
+    return OptimisedPlan(quality, tuple(sites), cost, bound, optimiser.table(quality), optimiser.sought(quality))
 
 
 class _Optimiser:
     """Lanes with their candidates; results are kept, because the table and the budget ask for many requirements."""
 
-    def __init__(self, alignment: Alignment, rules: PlanRules, models: Sequence[FamilyModel]) -> None:
+    def __init__(
+        self, alignment: Alignment, rules: PlanRules, models: Sequence[FamilyModel], other_cost: float
+    ) -> None:
         wanted = set(rules.road.lanes or [lane.name for lane in alignment.lanes])
         self.lanes = [lane for lane in alignment.lanes if lane.name in wanted]
         self.rules = rules
@@ -193,8 +177,17 @@ class _Optimiser:
         self._areas = AvoidedAreas(alignment, rules.avoid)
         self._found: defaultdict[str, list[tuple[float, list[float]]]] = defaultdict(list)
         self._impossible: dict[tuple[str, float], InvalidParameter] = {}
-        price = _prices(rules)
-        self.fixed_cost = price["plan"] + price["metre_of_lane"] * sum(lane.length_m for lane in self.lanes)
+        price = list_prices(rules)
+        lanes_m = sum(lane.length_m for lane in self.lanes)
+        self.fixed_cost = price["plan"] + price["metre_of_lane"] * lanes_m + other_cost
+        self._fixing = [model for model in models if model.fix is not None]
+
+    def sought(self, quality: Quality) -> tuple[tuple[str, str], ...]:
+        """Lanes and families whose places are sought for a quality."""
+        families = {model.family for model in self._fixing if model.selectable}
+        if quality.path_error_m is not None:
+            families.add("cerpm")
+        return tuple((lane.name, family) for lane in self.lanes for family in sorted(families))
 
     def solve(self, quality: Quality) -> tuple[list[ChosenSite], float, float]:
         """Sites of all lanes, their cost, and its bound."""
@@ -263,19 +256,13 @@ class _Optimiser:
     def _solve_lane(self, lane: Lane, quality: Quality) -> tuple[list[ChosenSite], float]:
         """Sites of a lane by chainage, and by how much its cost is above the bound."""
         kept = self._kept(lane, quality)
-        if all(model.fix is None for model in self.models.values()):
+        if not self._fixing:
             return sorted(kept, key=lambda site: site.chainage_m), 0.0
         need = -math.log1p(-quality.fix_probability)
         chainage, cost, gain, family = self._candidates(lane, quality, need, kept)
         missing = uncovered_m(chainage, gain, need, quality.fix_every_m, lane.length_m)
         if missing is not None:
-            raise InvalidParameter(
-                f"on lane {lane.name} no markers fix the position with {quality.fix_probability:.4g} between "
-                f"{format_station(missing)} and {format_station(missing + quality.fix_every_m)}",
-                field="quality",
-                limit=f"an error of at most {quality.fix_error_m:g} m, outside of avoided areas",
-                cure="require less, or allow another family there",
-            )
+            raise self._unreachable(lane, missing, quality)
         found = cheapest_cover(
             chainage, cost, gain, need=need, window_m=quality.fix_every_m, length_m=lane.length_m
         )  # fmt: skip
@@ -283,6 +270,24 @@ class _Optimiser:
             ChosenSite(lane.name, float(chainage[k]), family[k], "fix") for k in found.chosen.tolist() if cost[k] > 0
         ]
         return sorted([*kept, *chosen], key=lambda site: site.chainage_m), found.cost - found.bound
+
+    def _unreachable(self, lane: Lane, from_m: float, quality: Quality) -> InvalidParameter:
+        """What is possible where the required quality is not."""
+        to_m = min(from_m + quality.fix_every_m, lane.length_m)
+        at = np.arange(from_m, to_m + 1e-9, _FINEST_M)
+        possible = []
+        for model in self._fixing:
+            assert model.fix is not None
+            chance, error = model.fix(lane, at)
+            possible.append(f"a {model.family} fixes it with {chance.max():.4g} and an error of {error.min():.3f} m")
+        return InvalidParameter(
+            f"on lane {lane.name} no markers fix the position with {quality.fix_probability:.4g} between "
+            f"{format_station(from_m)} and {format_station(to_m)}",
+            field="quality",
+            limit=f"an error of at most {quality.fix_error_m:g} m outside of avoided areas; there, at best "
+            + "; ".join(possible),
+            cure="require less there: a larger fix_error_m or fix_every_m, a lower fix_probability, or another family",
+        )
 
     def _kept(self, lane: Lane, quality: Quality) -> list[ChosenSite]:
         """Sites that are needed for other reasons than fixes: pairs of the path, markers ahead of events."""
@@ -344,6 +349,8 @@ class _Optimiser:
         at = _middles(lane, step)
         rows: list[tuple[float, float, float, str]] = []
         for family, gain in self._gains(lane, at, quality).items():
+            if not self.models[family].selectable:
+                continue
             usable = (gain > 0) & self._clear(lane, at, family)
             price = self.models[family].cost
             rows += [(x, price, g, family) for x, g in zip(at[usable].tolist(), gain[usable].tolist(), strict=True)]
@@ -380,8 +387,19 @@ class _Optimiser:
         for offset in (half, -half) if family == "cerpm" else (np.zeros(len(at)),):
             clear &= self._areas.find(*lane.position_at(at, offset)) < 0
         if family == "plate" and self.rules.plates is not None:
+            for first_m, last_m in self._tags_m(lane):
+                clear &= (at <= first_m) | (at >= last_m)
             clear &= np.abs(lane.value_at(lane.grade, at)) <= self.rules.plates.max_grade
         return clear
+
+    def _tags_m(self, lane: Lane) -> list[tuple[float, float]]:
+        """Where a plate would cover a magnet of a tag, which `place_plates` moves it away from. [m]"""
+        tags, plates = self.rules.tags, self.rules.plates
+        if tags is None or plates is None:
+            return []
+        room_m = plate_room_m(plates)
+        sites, _ = place_tags(self._alignment, lane, tags)
+        return [(site.chainage_m - room_m, site.chainage_m + tags.length_m + room_m) for site in sites]
 
     def _even_cost_of(self, lane: Lane, quality: Quality) -> float | None:
         kept = [site for site in self._kept(lane, quality) if site.purpose == "event"]
@@ -394,12 +412,12 @@ class _Optimiser:
             kept += [ChosenSite(lane.name, at, "cerpm", "path") for at in pairs.tolist()]
         base = sum(self.models[site.family].cost for site in kept)
         rows = self._kept_rows(lane, kept, quality)
-        if all(model.fix is None for model in self.models.values()):
+        if not self._fixing:
             return base
         costs = [
             base + count * model.cost
-            for model in self.models.values()
-            if model.fix is not None and (count := self._even_count(lane, model, quality, rows)) is not None
+            for model in self._fixing
+            if model.selectable and (count := self._even_count(lane, model, quality, rows)) is not None
         ]
         return min(costs, default=None)
 
@@ -423,14 +441,6 @@ class _Optimiser:
 def replace_every(quality: Quality, fix_every_m: float) -> Quality:
     """The quality with another distance between fixes. [m]"""
     return quality.model_copy(update={"fix_every_m": fix_every_m})
-
-
-def _prices(rules: PlanRules) -> dict[str, float]:
-    """Sum of the agency's prices by what they are per."""
-    prices: defaultdict[str, float] = defaultdict(float)
-    for item in rules.costs.items:
-        prices[item.per] += item.price
-    return prices
 
 
 def _middles(lane: Lane, step_m: float) -> Floats:

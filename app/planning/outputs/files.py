@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -19,7 +19,12 @@ from app.planning.outputs.schedule import write_schedule_csv
 from app.planning.outputs.stakeout import StakeoutFormat, write_stakeout
 from app.planning.outputs.stakeout_points import plan_stakeout
 from app.planning.outputs.strip_map import DrawingOptions, Drawings
+from app.planning.outputs.trade_off import write_trade_off_csv
 from app.planning.plan import Plan
+from app.planning.trade_off import Optimum, TradeOffPoint
+
+DrawTradeOff = Callable[[Sequence[TradeOffPoint], str], str]
+"""Points of a trade-off and the currency to an SVG picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +36,14 @@ class OutputOptions:
     crs, unit : str, optional
         Of the stakeout; see `plan_stakeout`.
     drawings : DrawingOptions
+    draw_trade_off : callable, optional
+        Draws the trade-off of an optimised plan as SVG; without, there is no picture of it.
     """
 
     crs: str | None = None
     unit: str | None = None
     drawings: DrawingOptions = field(default_factory=DrawingOptions)
+    draw_trade_off: DrawTradeOff | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +57,8 @@ class OutputFile:
 MEDIA_TYPES = {
     "csv": "text/csv", "dxf": "image/vnd.dxf", "geojson": "application/geo+json", "json": "application/json",
     "gpkg": "application/geopackage+sqlite3", "md": "text/markdown", "osm": "application/xml",
-    "pdf": "application/pdf", "txt": "text/plain", "xml": "application/xml", "xodr": "application/xml",
-    "zip": "application/zip",
+    "pdf": "application/pdf", "svg": "image/svg+xml", "txt": "text/plain", "xml": "application/xml",
+    "xodr": "application/xml", "zip": "application/zip",
 }  # fmt: skip
 """Media types of the files by the ends of their names."""
 
@@ -93,6 +101,8 @@ def plan_files(plan: Plan, options: OutputOptions | None = None) -> Iterator[Out
     opendrive = cache(lambda: _opendrive(plan))
     yield OutputFile("report.md", lambda: write_report(plan, _left_out(opendrive())))
     yield OutputFile("bill.csv", lambda: write_bill_csv(plan_bill(plan)))
+    if plan.optimum is not None:
+        yield from _trade_off_files(plan.optimum, plan.rules.costs.currency, options)
     yield OutputFile("schedule.csv", lambda: write_schedule_csv(plan))
     if drawings is not None:
         for name in drawings.names:
@@ -121,3 +131,10 @@ def _opendrive(plan: Plan) -> OpenDriveMap | InvalidParameter:
 def _left_out(road_map: OpenDriveMap | InvalidParameter) -> dict[str, str]:
     """Files that a plan does not have, with the reason."""
     return {"map.xodr": road_map.message} if isinstance(road_map, InvalidParameter) else {}
+
+
+def _trade_off_files(optimum: Optimum, currency: str, options: OutputOptions) -> Iterator[OutputFile]:
+    draw = options.draw_trade_off
+    yield OutputFile("trade-off.csv", lambda: write_trade_off_csv(optimum, currency))
+    if draw is not None:
+        yield OutputFile("trade-off.svg", lambda: draw(optimum.table, currency).encode())

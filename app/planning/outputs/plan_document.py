@@ -14,6 +14,7 @@ from app.markers.magnet_codebook import Codebook
 from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent
 from app.planning.plan import LeftOut, Plan, PlanFinding, PlannedMarker
 from app.planning.rules import PlanRules
+from app.planning.trade_off import Optimum
 from app.radio.settings import RadioSettings
 
 PLAN_FORMAT = "waymark-plan/1"
@@ -152,6 +153,7 @@ class PlanDocument(_Part):
     findings: tuple[PlanFinding, ...]
     codebook: dict[str, Any] | None
     radio: RadioSettings | None
+    optimum: Optimum | None = None
 
 
 def write_plan(plan: Plan) -> bytes:
@@ -167,6 +169,7 @@ def write_plan(plan: Plan) -> bytes:
         findings=plan.findings,
         codebook=None if plan.codebook is None else plan.codebook.to_document(),
         radio=plan.radio,
+        optimum=plan.optimum,
     )
     return document.model_dump_json(by_alias=True).encode()
 
@@ -195,7 +198,7 @@ def read_plan(data: bytes) -> Plan:
         raise _unreadable(f"the codebook of the plan is damaged: {error.message}", "codebook", PLAN_FORMAT) from error
     return Plan(
         document.name, document.alignment.alignment(), document.rules, document.markers, document.left_out,
-        document.findings, codebook, document.radio,
+        document.findings, codebook, document.radio, document.optimum,
     )  # fmt: skip
 
 

@@ -63,7 +63,7 @@ def path_error_m(lane: Lane, chainages_m: Floats, shifts_m: Floats | None = None
     Source: exact markers and a cubic spline, as in the CERPM paper's section 2.3; the change of curvature and the ends
     decide. Two or three pairs are joined by a straight line or a parabola.
     """
-    chainages_m, shift_m = _one_of_each_pair(chainages_m, shifts_m)
+    chainages_m, shift_m = one_of_each_pair(chainages_m, shifts_m)
     knots = ecef_from_wgs84(*lane.position_at(chainages_m, shift_m))
     truth = ecef_from_wgs84(lane.lon_deg, lane.lat_deg)
     origin = truth[0]
@@ -93,7 +93,7 @@ def beside_magnets(lane: Lane, cerpms: Sequence[Site], magnets: Sequence[Site]) 
     return moved
 
 
-def _one_of_each_pair(chainages_m: Floats, shifts_m: Floats | None) -> tuple[Floats, Floats]:
+def one_of_each_pair(chainages_m: Floats, shifts_m: Floats | None) -> tuple[Floats, Floats]:
     """Rising chainages without those that follow another one within a metre, and the mean shift at each.
 
     Both sides of a pair are one place.

@@ -69,8 +69,8 @@ def place_plan(
     numbers : NumberSource, optional
         Unused registry numbers; without, numbers drawn from the plan's name, the same ones every time.
     chosen : ChosenPlaces, optional
-        Chainages of the plates and of the pairs of CERPMs, instead of the spacings of the rules; plates at decision
-        points come on top. See `OptimisedPlan.places`.
+        Chainages of the plates and of the pairs of CERPMs on lanes, instead of the spacings of the rules; plates at
+        decision points come on top. See `OptimisedPlan.places`.
 
     Returns
     -------
@@ -173,7 +173,7 @@ class _Placer:
             tag_ranges = [(tag.chainage_m, tag.chainage_m + rules.tags.length_m) for tag in tags]
             self._tags.append((lane, tags))
         if rules.plates is not None:
-            chosen_m = None if self._chosen is None else self._chosen.get((lane.name, "plate"), ())
+            chosen_m = None if self._chosen is None else self._chosen.get((lane.name, "plate"))
             plates = place_plates(self.alignment, lane, rules, tag_ranges, chosen_m)
             self._add_plates(lane, self._clear(lane, "plate", *plates))
         if rules.lines is not None:
@@ -258,10 +258,11 @@ class _Placer:
         """Pairs across from each other; a boundary that another lane shares has its markers already."""
         assert rules.cerpm is not None
         cycle_m = rules.cerpm.n_m or marking_rules(rules.cerpm.marking_rules).cycle_m
-        if self._chosen is None:
+        chosen_m = None if self._chosen is None else self._chosen.get((lane.name, "cerpm"))
+        if chosen_m is None:
             chainages = place_cerpms(lane, rules.cerpm, cycle_m, rules.road.curve_radius_m)
         else:
-            chainages = np.array(self._chosen.get((lane.name, "cerpm"), ()), dtype=np.float64)
+            chainages = np.array(chosen_m, dtype=np.float64)
         sites = []
         for side in (LaneSide.LEFT, LaneSide.RIGHT):
             if rules.cerpm.sides not in ("both", side.name.lower()):

@@ -37,7 +37,7 @@ def place_plates(
         if all(abs(chainage - other) > near_m for other in taken):
             sites.append(Site(chainage, rules.plates.offset_from_centre_m, Purpose.SPACING))
     kept = []
-    clear_m = (rules.plates.n * (rules.plates.unit_mm + rules.plates.gap_mm) + rules.plates.gap_mm) / 2000 + MIN_GAP_M
+    clear_m = plate_room_m(rules.plates)
     sites = [_before_tags(site, tags_m, clear_m) for site in sites]
     for site in sorted(sites, key=lambda site: site.chainage_m):
         grade = float(lane.value_at(lane.grade, site.chainage_m))
@@ -47,6 +47,11 @@ def place_plates(
         else:
             kept.append(site)
     return kept, left_out
+
+
+def plate_room_m(plates: PlateRules) -> float:
+    """Distance of a plate's centre from the nearest magnet of a tag. [m]"""
+    return (plates.n * (plates.unit_mm + plates.gap_mm) + plates.gap_mm) / 2000 + MIN_GAP_M
 
 
 def _ahead_of_events(

@@ -48,7 +48,9 @@ def _path_error(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> I
             error = float(found.max())
             at = float(lane.chainage_m[int(found.argmax())])
             worst = min(own, key=lambda marker: abs(marker.chainage_m - at))
-    limit = rules.max_path_error_m if rules.max_path_error_m is not None else error
+    required = plan.rules.quality.path_error_m if plan.rules.quality is not None else None
+    limit = required if required is not None else rules.max_path_error_m
+    limit = limit if limit is not None else error
     yield compare(
         "path-error", error, "<=", limit, "m", "CERPM paper, section 2.3: cubic spline through the markers",
         "greatest distance of the path through exactly surveyed markers from the centre line", worst,

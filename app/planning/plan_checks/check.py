@@ -13,6 +13,8 @@ from app.planning.plan_checks.conflicts import ExistingMarker, check_conflicts
 from app.planning.plan_checks.finding import compare
 from app.planning.plan_checks.magnets import check_magnets
 from app.planning.plan_checks.plates import check_plates
+from app.planning.plan_checks.predictions import check_predictions
+from app.planning.plan_checks.quality import check_quality
 
 
 def check_plan(plan: Plan, existing: Sequence[ExistingMarker] = ()) -> Plan:
@@ -33,6 +35,8 @@ def _findings(plan: Plan, existing: Sequence[ExistingMarker]) -> Iterator[PlanFi
     yield from check_plates(plan)
     yield from check_magnets(plan)
     yield from check_cerpms(plan)
+    yield from check_predictions(plan)
+    yield from check_quality(plan)
     yield from check_conflicts(plan, existing)
 
 

@@ -19,6 +19,7 @@ from app.planning.outputs.drawing_sheet import TitleBlock
 from app.planning.outputs.files import OutputOptions
 from app.planning.outputs.package import MANIFEST, PackageOptions
 from app.planning.outputs.strip_map import DrawingOptions
+from app.plots.trade_off import draw_trade_off
 from app.registry import jobs as store
 from app.registry.database import Database
 from app.registry.ids import new_id
@@ -192,7 +193,7 @@ def package_options(given: Mapping[str, Any]) -> PackageOptions:
     drawings = DrawingOptions(TitleBlock(**(given.get("title_block") or {})), given.get("scale"))
     formats = given.get("formats") or (ArtworkFormat.PDF, ArtworkFormat.SVG)
     return PackageOptions(
-        OutputOptions(given.get("crs"), given.get("unit"), drawings),
+        OutputOptions(given.get("crs"), given.get("unit"), drawings, draw_trade_off),
         tuple(dict.fromkeys(ArtworkFormat(form) for form in formats)),
         ArtworkOptions(heaters=given.get("heaters", False), leds=given.get("leds", False)),
     )

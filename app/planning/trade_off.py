@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from app.planning.rules import Quality
+
 
 @dataclass(frozen=True, slots=True)
 class TradeOffPoint:
@@ -40,6 +42,28 @@ class TradeOffPoint:
 
     def _figures(self) -> tuple[float, float, float]:
         return self.cost, self.fix_every_m, self.path_error_m or 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Optimum:
+    """How a plan was optimised.
+
+    Attributes
+    ----------
+    quality : Quality
+        As required; `fix_every_m` is the best that the budget buys, where there is one.
+    cost : float
+        Of the whole plan, in the currency of the rules; working days are not rounded, and there is one more.
+    bound : float
+        No plan with the same pairs along the path and the same markers ahead of events is cheaper.
+    table : tuple of TradeOffPoint
+        The required quality first.
+    """
+
+    quality: Quality
+    cost: float
+    bound: float
+    table: tuple[TradeOffPoint, ...]
 
 
 def pareto_points(points: Sequence[TradeOffPoint]) -> tuple[TradeOffPoint, ...]:

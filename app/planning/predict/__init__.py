@@ -1,0 +1,1 @@
+"""Predicted read rates and path errors: models fitted to simulated drives."""

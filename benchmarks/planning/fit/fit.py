@@ -1,0 +1,133 @@
+"""Parameters of the models by maximum likelihood, with weak priors where a few hundred passes leave them open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from statistics import NormalDist
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+from scipy.special import expit, logsumexp
+
+from app.planning.predict.models import MagnetModel, PathModel, PlateModel, normal_quadrature
+from benchmarks.planning.fit.observe import LineSeen, PathSeen, PlatePassSeen, TagPassSeen
+
+Floats = npt.NDArray[np.float64]
+
+NIGHT_EXPOSURES_S = tuple(float(f"{0.002 + 0.006 * (k + 0.5) / 4:.5f}") for k in range(4))
+"""Four equally likely exposures by night. Source: `at_night` of app/simulation/conditions.py, 1/500 to 1/125 s."""
+_TINY = 1e-12  # of probabilities, so that logarithms are finite
+_ROBUST = NormalDist().inv_cdf(0.975)  # the 95th percentile of an error over its standard deviation on one axis
+
+
+def fit_plates(seen: Sequence[PlatePassSeen], exposures_s: tuple[float, ...] = ()) -> PlateModel:
+    """Maximum likelihood of all frames, with what the passes have in common integrated out.
+
+    Notes
+    -----
+    A pass can be read at all with a share that falls with the blur. If it can, its frames are read independently, with
+    log-odds that differ between passes by a normal variable.
+    """
+    passes = [
+        (one.blur_units, np.array([px for px, _ in one.frames]), np.array([read for _, read in one.frames]))
+        for one in seen
+        if one.frames
+    ]
+    nodes, weights = normal_quadrature()
+
+    def loss(t: Floats) -> float:
+        model = _plate_model(t)
+        total = 0.0
+        for blur, height, read in passes:
+            odds = model.pass_log_odds(height, blur)[:, None] + model.spread * nodes
+            each = np.where(read[:, None], -np.logaddexp(0, -odds), -np.logaddexp(0, odds)).sum(axis=0)
+            share = float(model.readable_share(blur))
+            found = math.log(share + _TINY) + float(logsumexp(each, b=weights))
+            if not read.any():
+                found = float(np.logaddexp(found, math.log(1 - share + _TINY)))
+            total -= found
+        return total + float((((t - _PRIOR_MEAN) / _PRIOR_SD) ** 2).sum()) / 2
+
+    found = minimize(loss, _PRIOR_MEAN, method="Nelder-Mead", options={"maxfev": 4000, "xatol": 1e-3, "fatol": 1e-3})
+    model = _plate_model(found.x)
+    fixes = np.array([one.fix_m for one in seen if one.fix_m is not None])
+    rms = float(np.percentile(fixes, 95)) / _ROBUST * math.sqrt(2)  # two axes
+    return _rounded_plates(model, rms, exposures_s)
+
+
+_PRIOR_MEAN = np.array([math.log(5.0), 0.0, math.log(0.25), 0.0, 6.0, 0.9])
+_PRIOR_SD = np.array([0.7, 0.4, 0.7, 0.7, 4.0, 1.0])  # source: by hand, wide: a factor of two or more either way
+
+
+def _plate_model(t: Floats) -> PlateModel:
+    slope, unit_px, blur_slope, spread, limit = (math.exp(float(t[k])) for k in (0, 1, 2, 3, 5))
+    return PlateModel(slope, unit_px, blur_slope, spread, float(t[4]), limit, 0.0)
+
+
+def _rounded_plates(model: PlateModel, fix_rms_m: float, exposures_s: tuple[float, ...]) -> PlateModel:
+    values = (model.slope, model.unit_px, model.blur_slope, model.spread, model.sharp, model.blur_limit)
+    return PlateModel(*(round(value, 4) for value in values), round(fix_rms_m, 4), exposures_s)
+
+
+def fit_tags(seen: Sequence[TagPassSeen]) -> MagnetModel:
+    """Logistic regression on clearance and curvature."""
+    clearance, bend = np.array([one.clearance_m for one in seen]), np.array([one.curvature_1pm for one in seen])
+    read = np.array([float(one.read) for one in seen])
+    values = _logistic(clearance, bend, read, np.ones(len(seen)))
+    fixes = [one.fix_m for one in seen if one.fix_m is not None]
+    rms = math.sqrt(sum(fix**2 for fix in fixes) / len(fixes))
+    return MagnetModel(*values, round(len(fixes) / float(read.sum()), 4), round(rms, 4))
+
+
+def fit_lines(seen: Sequence[LineSeen]) -> MagnetModel:
+    """Logistic regression of the magnets under the bar on clearance and curvature."""
+    passed = np.array([float(one.magnets) for one in seen])
+    return MagnetModel(
+        *_logistic(
+            np.array([one.clearance_m for one in seen]), np.array([one.curvature_1pm for one in seen]),
+            np.array([float(one.read) for one in seen]), passed,
+        )
+    )  # fmt: skip
+
+
+def _logistic(clearance: Floats, bend: Floats, read: Floats, passed: Floats) -> tuple[float, float, float]:
+    prior = np.array([3.0, 20.0, 100.0])  # source: by hand, standard deviations about 4, 0 and 0
+
+    def loss(t: Floats) -> float:
+        rate = np.clip(expit(t[0] + t[1] * (clearance - 0.16) + t[2] * bend), _TINY, 1 - _TINY)
+        seen = read * np.log(rate) + (passed - read) * np.log(1 - rate)
+        return float((((t - (4.0, 0.0, 0.0)) / prior) ** 2).sum()) / 2 - float(seen.sum())
+
+    found = minimize(loss, np.array([4.0, 0.0, 0.0]), method="Nelder-Mead", options={"maxfev": 2000})
+    at, slope, bent = (round(float(value), 4) for value in found.x)
+    return at, min(slope, 0.0), min(bent, 0.0)  # neither height nor bends help
+
+
+def fit_path(seen: Sequence[PathSeen]) -> PathModel:
+    """Power law of the squared error's mean, which the drives scatter about in proportion to it."""
+    survey, spacing, speed, exact, ends, rms = (
+        np.array([getattr(one, name) for one in seen])
+        for name in ("survey_m", "spacing_m", "speed_mps", "exact_rms_m", "ends_per_m", "rms_m")
+    )
+
+    def model(t: Floats) -> PathModel:
+        return PathModel(math.exp(t[0]), float(t[1]), float(t[2]), float(t[3]), math.exp(t[4]), math.exp(t[5]), 0.0)
+
+    def loss(t: Floats) -> float:
+        one = model(t)
+        mean = np.empty(len(seen))
+        for value in np.unique(survey):
+            own = survey == value
+            mean[own] = one.rms_of(float(value), spacing[own], speed[own], exact[own], ends[own]) ** 2
+        prior = (float(t[4]) + 3.0) ** 2 + (float(t[5]) - 3.0) ** 2  # source: by hand, wide
+        return float((np.log(mean) + rms**2 / mean).sum()) + prior / 8
+
+    start = np.array([math.log(0.015), 0.7, 0.4, -0.2, -3.0, 3.0])
+    found = minimize(loss, start, method="Nelder-Mead", options={"maxfev": 4000, "xatol": 1e-4, "fatol": 1e-4})
+    best = model(found.x)
+    worst = float(np.mean([one.worst_m / one.rms_m for one in seen]))
+    values = (best.rms_m, best.sigma_power, best.spacing_power, best.speed_power, best.exact_share)
+    values = (*values, best.end_gain_m, worst)
+    return PathModel(*(round(value, 5) for value in values))
