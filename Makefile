@@ -22,7 +22,7 @@ $(VENV)/.dev: requirements-dev.txt $(VENV)/.runtime
 	$(PIP) install --quiet --require-hashes -r requirements-dev.txt
 	@touch $@
 
-demo: $(VENV)/.runtime ## From a coordinate and a meaning to decoded drives, in two tables
+demo: $(VENV)/.runtime ## From coordinates, meanings and a road to decoded drives and a proved plan, in four tables
 	$(BIN)/waymark demo
 
 serve: $(VENV)/.runtime ## Serve on http://127.0.0.1:8000

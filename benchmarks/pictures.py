@@ -6,6 +6,8 @@ import argparse
 import io
 import json
 import shutil
+import subprocess
+import sys
 import tempfile
 import zipfile
 from datetime import UTC, datetime
@@ -15,8 +17,10 @@ import cv2
 import httpx
 import numpy as np
 
+import app.demo
 from app.demo.cerpms import build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import drive_over, list_plates, registered_code
+from app.demo.road_plan import ORIGIN_DEG, ROAD, RULES
 from app.demo.server import LocalServer
 from app.jobs.trace_tasks import decode_recording
 from app.markers.magnet import InformationTag, Polarity, parse_tag
@@ -56,6 +60,25 @@ def main() -> None:
         _write_page(server, Path(folder))
         _write_lane(client)
     _write_trace()
+    _write_strip_map()
+
+
+def _write_strip_map() -> None:
+    """The first strips of the demo's plan, as the drawings have them."""
+    poppler = shutil.which("pdftoppm")
+    if poppler is None:
+        print("there is no pdftoppm here: the picture of the strip map stays as it is")
+        return
+    data = Path(app.demo.__file__).parent / "data"
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "plan"
+        command = [
+            sys.executable, "-c", "from app.cli import main; main()", "plan", str(data / ROAD), "--rules",
+            str(data / RULES), "--origin", ",".join(map(str, ORIGIN_DEG)), "--out", str(out),
+        ]  # fmt: skip
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        page = ["-r", "100", "-f", "2", "-l", "2", "-singlefile", "-png"]
+        subprocess.run([poppler, *page, str(out / "drawings.pdf"), str(IMAGES / "strip-map")], check=True)
 
 
 def _write_lane(client: httpx.Client) -> None:

@@ -43,7 +43,8 @@ def test_the_tour_prints_what_the_readme_shows(tmp_path: Path) -> None:
     require("curl")
     require("bash")
     assert len(BLOCKS) == len(re.findall(r"^```sh$", README, re.MULTILINE)) >= 6
-    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    for folder in ("docs", "app"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
     programs = tmp_path / "bin"
     programs.mkdir()
     (programs / "waymark").write_text(f'#!/bin/sh\nexec {sys.executable} -c "from app.cli import main; main()" "$@"\n')
