@@ -102,12 +102,14 @@ def test_benchmark_blocks_are_filled_by_name_and_nothing_else_changes() -> None:
 def test_every_benchmark_has_its_block() -> None:
     from benchmarks.cerpm.__main__ import ITEMS as CERPM
     from benchmarks.magnets.__main__ import ITEMS as MAGNETS
+    from benchmarks.planning.__main__ import RUNS as PLANNING
     from benchmarks.plates.__main__ import ITEMS as PLATES
 
     magnets = [f"magnets-{item}" for item in ("run", *MAGNETS)]
     cerpm = [f"cerpm-{item}" for item in ("run", *CERPM)]
     imports = [f"imports-{item}" for item in ("faults", "clean", "speed")]
     registry = [f"registry-{item}" for item in ("boxes", "tiles", "searches", "growth")]
-    blocks = ["demo", "run", *PLATES, *magnets, *cerpm, *imports, *registry, "bundle", "http"]
+    planning = [f"planning-{item}" for item in ("run", *PLANNING)]
+    blocks = ["demo", "run", *PLATES, *magnets, *cerpm, *imports, *registry, *planning, "bundle", "http"]
     filled = [name for page in PAGES for name in re.findall(r"<!-- bench:([\w-]+) -->", page.read_text())]
     assert sorted(filled) == sorted(blocks)
