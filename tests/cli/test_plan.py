@@ -53,7 +53,7 @@ def test_a_road_becomes_a_folder_with_all_files(tmp_path: Path, rules: Path) -> 
     names = {path.name for path in out.iterdir()}
     assert names >= {
         "plan.json", "plan.geojson", "report.md", "bill.csv", "schedule.csv", "stakeout-pnezd.csv", "stakeout.xml",
-        "stakeout.dxf", "stakeout.gpkg", "drawings.pdf", "cerpm-programs.csv",
+        "stakeout.dxf", "stakeout.gpkg", "drawings.pdf", "cerpm-programs.csv", "map.osm", "map.xodr",
     }  # fmt: skip
     with (out / "bill.csv").open(newline="") as file:
         quantities = {row["item"]: row["quantity"] for row in csv.DictReader(file) if row["section"] == "material"}

@@ -168,3 +168,28 @@ def test_the_spatial_index_follows_the_table(store: tuple[Database, str, np.ndar
     with database.write() as connection:
         connection.execute(sa.delete(markers).where(markers.c.id == new["id"]))
     assert counts() == (0, 0)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        Box(8.0, 49.0, 8.1, 49.1), Box(179.99, -17.0, -179.99, -16.9), Box(-180.0, 10.0, -179.9, 10.1),
+        Box(179.9, 69.0, 180.0, 69.1), Box(20.0, 89.99, 21.0, 89.9995), Box(-180.0, -90.0, 180.0, 90.0),
+        Box(-10.0, -5.0, -10.0, -5.0),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_widened_box_has_every_place_within_the_margin(box: Box) -> None:
+    margin_m = 150.0
+    wide = box.widened(margin_m)
+    for lon in (box.west_deg, box.east_deg):
+        for lat in (box.south_deg, box.north_deg):
+            for azimuth in range(0, 360, 15):
+                away_lon, away_lat, _ = GEOD.fwd(lon, lat, azimuth, margin_m)
+                parts = wide.parts
+                assert any(
+                    p.west_deg <= away_lon <= p.east_deg and p.south_deg <= away_lat <= p.north_deg for p in parts
+                )
+    spread = (wide.east_deg - wide.west_deg) % 360.0 or 360.0
+    if abs(box.north_deg) < 80:
+        assert spread < (box.east_deg - box.west_deg) % 360.0 + 0.01

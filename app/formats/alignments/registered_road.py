@@ -23,6 +23,7 @@ from app.formats.alignments.geometry import (
     LineStyle,
     StationEquation,
 )
+from app.roads.axis import Axis
 from app.roads.measures import CalibrationPoint, Measures, calibrate
 from app.roads.parallel import cut_edges, parallel_line
 
@@ -104,7 +105,7 @@ def read_registered_road(data: bytes) -> AlignmentFile:
     UnreadableUpload
         It is no such document.
     InvalidParameter
-        It has no lanes, or more vertices than a road may have.
+        It has no lanes, its axis is none that could be registered, or there are too many vertices.
     """
     try:
         road = RegisteredRoad.model_validate_json(data)
@@ -117,14 +118,15 @@ def read_registered_road(data: bytes) -> AlignmentFile:
             limit=ROAD_FORMAT,
             cure="make the alignment from the road again",
         ) from None
+    ranges_m = Axis(road.parts).part_ranges_m
     axes = [cut_edges(np.array(part).reshape(-1, 2)) for part in road.parts]
     lanes = road.lanes
     count = (lanes.forward + lanes.backward) * sum(map(len, axes))
-    if not 0 < count <= MAX_VERTICES or min(map(len, axes), default=0) < 2:
+    if not 0 < count <= MAX_VERTICES:
         raise InvalidParameter(
             f"the lanes of the road have {count} vertices",
             field="lanes",
-            limit=f"a lane, parts of two vertices, and {MAX_VERTICES} vertices of all lanes",
+            limit=f"1 to {MAX_VERTICES} vertices of all lanes",
             cure="declare lanes, or register the sections of the road as roads of their own",
         )
     chainages, start_m = [], 0.0
@@ -133,7 +135,7 @@ def read_registered_road(data: bytes) -> AlignmentFile:
         chainages.append(start_m + np.concatenate([[0.0], np.cumsum(lengths)]))
         start_m = float(chainages[-1][-1])
     points = [CalibrationPoint(p.part, p.chainage_m, p.measure_m, p.ahead_m) for p in road.calibration]
-    measures = calibrate([(float(own[0]), float(own[-1])) for own in chainages], points)
+    measures = calibrate(ranges_m, points)
     earlier = None if road.exact and road.note is None else EarlierTransformation(road.exact, road.note)
     return AlignmentFile(
         "road",

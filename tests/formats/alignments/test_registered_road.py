@@ -118,8 +118,10 @@ def test_long_edges_follow_the_geodesic() -> None:
         ({"forward": 0, "backward": 0}, BEND, "0 vertices"),
         ({"forward": 8, "backward": 0}, TIGHT, "lane forward 1, chainage"),
         ({}, [(90.0, 3.0)], "no lane is left"),
+        ({}, [(90.0, 25_000.0)], "25"),
+        ({}, [], "vert"),
     ],
-    ids=["no lanes", "tighter than the lanes", "too short"],
+    ids=["no lanes", "tighter than the lanes", "too short", "a swapped vertex", "one vertex"],
 )
 def test_roads_without_usable_lanes_are_refused(
     lanes: dict[str, Any], steps: list[tuple[float, float]], match: str
