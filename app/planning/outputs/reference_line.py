@@ -103,9 +103,11 @@ class ReferenceLine:
         return points[0], points[-1]
 
     def speeds_kmh(self) -> list[tuple[float, float]]:
-        """s from which a design speed holds, and the speed; without stretches of unknown speed. [m, km/h]"""
+        """s from which a design speed holds, and the speed; none where a part of the lane has none. [m, km/h]"""
+        if not np.isfinite(self.lane.design_speed_mps).all():
+            return []  # a speed of OpenDRIVE holds until the next one
         speed = np.round(self.lane.design_speed_mps * 3.6)
-        first = np.flatnonzero(np.concatenate([[True], np.diff(speed) != 0]) & np.isfinite(speed))
+        first = np.flatnonzero(np.concatenate([[True], np.diff(speed) != 0]))
         return list(zip(self._s[first].tolist(), speed[first].tolist(), strict=True))
 
     def project(self, points_m: Floats, chainage_m: Floats) -> Foot:

@@ -219,6 +219,15 @@ def test_a_lane_in_a_town_without_heights_or_stations(tmp_path: Path) -> None:
     assert {point.z for point in loaded.pointLayer} == {0.0}
 
 
+def test_lanelets_whose_speed_is_unknown_have_no_limit(tmp_path: Path) -> None:
+    lane = straight(120)
+    lane = replace(lane, design_speed_mps=np.where(lane.chainage_m < 50, 25.0, np.nan))
+    loaded = load(tmp_path, write_lanelet2(HdMap("speeds", (lane,), ())))
+    tags = [lanelet.attributes for lanelet in loaded.laneletLayer]
+    assert [found["speed_limit"] for found in tags if "speed_limit" in found] == ["90"]
+    assert len(tags) == 3
+
+
 def test_our_own_reader_gets_the_lane_and_its_stop_line_back(content: HdMap) -> None:
     declaration = AlignmentDeclaration(vertical_datum="ellipsoid")
     read = build_alignment(read_alignment(write_lanelet2(content), "map.osm"), declaration=declaration)

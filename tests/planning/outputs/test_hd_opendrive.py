@@ -235,6 +235,14 @@ def test_signs_of_a_registry_without_heights(schema: Any) -> None:
     assert root.find("road/elevationProfile/elevation") is None
 
 
+def test_a_lane_whose_speed_is_not_known_everywhere_has_none(schema: Any) -> None:
+    lane = straight(100)
+    partly = replace(lane, name="2", design_speed_mps=np.where(lane.chainage_m < 50, 25.0, np.nan))
+    root = etree.fromstring(write_opendrive(HdMap("speeds", (lane, partly), ())))
+    schema.assertValid(root)
+    assert [len(list(element.iter("speed"))) for element in root.findall("road")] == [1, 0]
+
+
 def test_a_road_of_many_bends_across_the_antimeridian(schema: Any) -> None:
     curvature = 0.02 * np.sin(np.arange(1500) / 40)
     lane = lane_of_curvature(curvature, start_deg=(179.995, -17.0), heading_deg=90)
