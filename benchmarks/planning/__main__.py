@@ -1,6 +1,6 @@
 """``python -m benchmarks.planning [ITEM ...] [--short]``: plans of whole roads.
 
-Items: speed, predictions, commit, papers, all. The exit status is 1 where a goal was missed.
+Items: speed, predictions, optimiser, commit, papers, all. The exit status is 1 where a goal was missed.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 
 from benchmarks.planning.commit import measure_commit
+from benchmarks.planning.optimiser import measure_optimiser
 from benchmarks.planning.papers import measure_papers
 from benchmarks.planning.predictions import measure_predictions
 from benchmarks.planning.speed import measure_speed
@@ -18,6 +19,7 @@ from benchmarks.planning.tables import Section
 RUNS: dict[str, Callable[[bool], Section]] = {
     "speed": measure_speed,
     "predictions": measure_predictions,
+    "optimiser": measure_optimiser,
     "commit": measure_commit,
     "papers": measure_papers,
 }

@@ -147,3 +147,13 @@ def test_an_optimised_plan_is_written_with_its_trade_off_and_read_back() -> None
     plain = make_plan(plan.alignment, check_rules({"version": 1, "plates": {}}), name="plain")
     assert plain.optimum is None
     assert not any(file.name.startswith("trade-off") for file in plan_files(plain))
+
+
+def test_where_misses_add_up_even_spacing_is_never_cheaper() -> None:
+    camera = {"name": "weak", "frames_per_s": 4, "exposure_s": 0.002}
+    for length_m in (1500, 9000):  # solved in sections, and greedily
+        plan = made(road(straight(length_m, speed_kmh=80.0)), plates={}, cameras=[camera])
+        assert plan.optimum is not None
+        for point in plan.optimum.table:
+            assert point.even_cost is not None
+            assert point.bound - 1e-6 <= point.cost <= point.even_cost + 1e-6

@@ -15,8 +15,9 @@ from app.planning.marking_rules import marking_rules
 from app.planning.optimise.costs import list_prices
 from app.planning.optimise.cover import cheapest_cover, least_gain, uncovered_m
 from app.planning.optimise.path import even_pairs, fewest_pairs
+from app.planning.optimise.spacing import even_places, middles, replace_every
 from app.planning.placement.avoid import AvoidedAreas
-from app.planning.placement.plates import place_plates, plate_room_m
+from app.planning.placement.plates import covered_by_tags_m, place_plates
 from app.planning.placement.tags import place_tags
 from app.planning.plan import Purpose
 from app.planning.rules import PlanRules, Quality
@@ -263,13 +264,29 @@ class _Optimiser:
         missing = uncovered_m(chainage, gain, need, quality.fix_every_m, lane.length_m)
         if missing is not None:
             raise self._unreachable(lane, missing, quality)
-        found = cheapest_cover(
-            chainage, cost, gain, need=need, window_m=quality.fix_every_m, length_m=lane.length_m
-        )  # fmt: skip
+        found = cheapest_cover(chainage, cost, gain, need=need, window_m=quality.fix_every_m, length_m=lane.length_m)
         chosen = [
             ChosenSite(lane.name, float(chainage[k]), family[k], "fix") for k in found.chosen.tolist() if cost[k] > 0
         ]
-        return sorted([*kept, *chosen], key=lambda site: site.chainage_m), found.cost - found.bound
+        spent = found.cost
+        if not found.is_optimal and (even := self._cheaper_even(lane, quality, kept, spent)) is not None:
+            chosen, spent = even
+        return sorted([*kept, *chosen], key=lambda site: site.chainage_m), spent - found.bound
+
+    def _cheaper_even(
+        self, lane: Lane, quality: Quality, kept: Sequence[ChosenSite], below: float
+    ) -> tuple[list[ChosenSite], float] | None:
+        """Sites of one family at even distances and their cost, where they may stand and cost less than found."""
+        best, rows = None, self._kept_rows(lane, kept, quality)
+        for model in self._fixing:
+            count = self._even_count(lane, model, quality, rows) if model.selectable else None
+            if count is None or count * model.cost >= below - 1e-9:
+                continue
+            at = even_places(lane, count)
+            if self._clear(lane, at, model.family).all():
+                below = count * model.cost
+                best = [ChosenSite(lane.name, x, model.family, "fix") for x in at.tolist()], below
+        return best
 
     def _unreachable(self, lane: Lane, from_m: float, quality: Quality) -> InvalidParameter:
         """What is possible where the required quality is not."""
@@ -343,10 +360,10 @@ class _Optimiser:
     ) -> tuple[Floats, Floats, Floats, list[str]]:
         """Chainage, cost, gain and family of the candidates by chainage; kept sites cost nothing more."""
         step = max(quality.fix_every_m / _CANDIDATES_PER_WINDOW, _FINEST_M)
-        gains = self._gains(lane, _middles(lane, step), quality)
+        gains = self._gains(lane, middles(lane, step), quality)
         if not all(np.all((gain == 0) | (gain >= need)) for gain in gains.values()):
             step = max(quality.fix_every_m / _COUPLED_PER_WINDOW, _FINEST_M)
-        at = _middles(lane, step)
+        at = middles(lane, step)
         rows: list[tuple[float, float, float, str]] = []
         for family, gain in self._gains(lane, at, quality).items():
             if not self.models[family].selectable:
@@ -387,19 +404,10 @@ class _Optimiser:
         for offset in (half, -half) if family == "cerpm" else (np.zeros(len(at)),):
             clear &= self._areas.find(*lane.position_at(at, offset)) < 0
         if family == "plate" and self.rules.plates is not None:
-            for first_m, last_m in self._tags_m(lane):
+            for first_m, last_m in covered_by_tags_m(self._alignment, lane, self.rules):
                 clear &= (at <= first_m) | (at >= last_m)
             clear &= np.abs(lane.value_at(lane.grade, at)) <= self.rules.plates.max_grade
         return clear
-
-    def _tags_m(self, lane: Lane) -> list[tuple[float, float]]:
-        """Where a plate would cover a magnet of a tag, which `place_plates` moves it away from. [m]"""
-        tags, plates = self.rules.tags, self.rules.plates
-        if tags is None or plates is None:
-            return []
-        room_m = plate_room_m(plates)
-        sites, _ = place_tags(self._alignment, lane, tags)
-        return [(site.chainage_m - room_m, site.chainage_m + tags.length_m + room_m) for site in sites]
 
     def _even_cost_of(self, lane: Lane, quality: Quality) -> float | None:
         kept = [site for site in self._kept(lane, quality) if site.purpose == "event"]
@@ -428,7 +436,7 @@ class _Optimiser:
         need = -math.log1p(-quality.fix_probability)
         count, most = 0, int(lane.length_m / _FINEST_M)
         while count <= most:
-            at = (np.arange(count) + 0.5) * lane.length_m / max(count, 1)
+            at = even_places(lane, count)
             chainage = np.concatenate([at, [row[0] for row in rows]])
             gain = np.concatenate([self._gains(lane, at, quality)[model.family], [row[2] for row in rows]])
             order = np.argsort(chainage, kind="stable")
@@ -436,14 +444,3 @@ class _Optimiser:
                 return count
             count += max(1, count // 200)
         return None
-
-
-def replace_every(quality: Quality, fix_every_m: float) -> Quality:
-    """The quality with another distance between fixes. [m]"""
-    return quality.model_copy(update={"fix_every_m": fix_every_m})
-
-
-def _middles(lane: Lane, step_m: float) -> Floats:
-    """Middles of equal parts of a lane of at most a step. [m]"""
-    count = max(math.ceil(lane.length_m / step_m - 1e-9), 1)
-    return np.asarray((np.arange(count) + 0.5) * lane.length_m / count)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from app.markers.magnet import MIN_GAP_M
 from app.planning.alignment import Alignment, Lane
 from app.planning.placement.site import Site, distance_ahead_m, spread_evenly
+from app.planning.placement.tags import place_tags
 from app.planning.plan import LeftOut, Purpose
 from app.planning.rules import PlanRules, PlateRules
 
@@ -47,6 +48,15 @@ def place_plates(
         else:
             kept.append(site)
     return kept, left_out
+
+
+def covered_by_tags_m(alignment: Alignment, lane: Lane, rules: PlanRules) -> list[tuple[float, float]]:
+    """Stretches of a lane in which a plate would cover a magnet of a tag. [m]"""
+    if rules.tags is None or rules.plates is None:
+        return []
+    room_m = plate_room_m(rules.plates)
+    sites, _ = place_tags(alignment, lane, rules.tags)
+    return [(site.chainage_m - room_m, site.chainage_m + rules.tags.length_m + room_m) for site in sites]
 
 
 def plate_room_m(plates: PlateRules) -> float:
