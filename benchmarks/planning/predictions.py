@@ -28,6 +28,8 @@ GOAL = 0.10
 SEED = 91
 """Of the roads and drives; the models are fitted to seeds from 1001."""
 CONDITIONS = ("day", "night", "wear+dirt")
+_UNSURE, _UNSURE_TIMES = (0.05, 0.9), 4
+"""Predicted rates in this range are measured with so many times the passes: the interval of 240 is 0.06 to each side."""
 _CAMERAS = [
     {"name": "front"},
     {"name": "slow", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90, "frames_per_s": 10,
@@ -118,9 +120,11 @@ def compare_road(road: Alignment, passes: int) -> Iterator[Compared]:
     predicted = {found.name: found.figure for found in check_predictions(plan)}
     for camera in rules.cameras:
         for condition in CONDITIONS if camera.name == "front" else CONDITIONS[:1]:
-            read, count = _plates_read(plan, condition, camera.name, passes)
             what = f"plates {camera.name} {condition}"
-            yield Compared(road.name, what, predicted[f"predicted-read-rate {what}"], read / count, count, "share")
+            rate = predicted[f"predicted-read-rate {what}"]
+            more = _UNSURE_TIMES if _UNSURE[0] < rate < _UNSURE[1] else 1
+            read, count = _plates_read(plan, condition, camera.name, more * passes)
+            yield Compared(road.name, what, rate, read / count, count, "share")
     for what, (read, count) in (("tags", _tags_read(plan, passes)), ("line", _lines_read(plan, passes))):
         if count:
             name = f"predicted-read-rate {what}"

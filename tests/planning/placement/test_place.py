@@ -185,3 +185,15 @@ def test_rules_that_do_not_fit_the_road_are_refused(rules: dict[str, object], fi
         plan(road(straight(300)), **rules)
     assert caught.value.field == field
     assert caught.value.cure
+
+
+def test_pairs_of_cerpms_beside_line_magnets_stay_across_from_each_other() -> None:
+    made = plan(road(straight(1000)), lines={}, cerpm={"n_m": 12.0, "max_path_error_m": None})
+    places: dict[float, set[float]] = {}
+    for marker in made.markers:
+        if marker.family == "cerpm":
+            places.setdefault(marker.chainage_m, set()).add(marker.offset_m)
+    assert all(offsets == {1.75, -1.75} for offsets in places.values())
+    magnets = np.array([marker.chainage_m for marker in made.markers if marker.family == "magnet"])
+    assert min(float(np.abs(magnets - at).min()) for at in places) >= 0.4 - 1e-9
+    assert any(at not in np.linspace(0.0, 1000.0, 43) for at in places)
