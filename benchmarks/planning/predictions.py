@@ -29,7 +29,7 @@ SEED = 91
 """Of the roads and drives; the models are fitted to seeds from 1001."""
 CONDITIONS = ("day", "night", "wear+dirt")
 _UNSURE, _UNSURE_TIMES = (0.05, 0.9), 4
-"""Predicted rates in this range are measured with so many times the passes: the interval of 240 is 0.06 to each side."""
+"""Predicted rates in this range are measured with so many times the passes: the interval of 240 is +-0.06."""
 _CAMERAS = [
     {"name": "front"},
     {"name": "slow", "width_px": 1280, "height_px": 720, "horizontal_fov_deg": 90, "frames_per_s": 10,

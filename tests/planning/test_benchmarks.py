@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from app.planning.read_rules import check_rules
+from benchmarks.planning.optimiser import brute_force
 from benchmarks.planning.papers import measure_papers
 from benchmarks.planning.roads import LANES, generated_road, real_lane
 from benchmarks.planning.speed import RADII_M, RULES, SEED, measure_road
@@ -36,3 +37,7 @@ def test_real_lanes_are_read(name: str) -> None:
     (lane,) = real_lane(name).lanes
     assert lane.length_m > 200
     assert lane.design_speed_mps.max() < 14
+
+
+def test_the_optimiser_is_as_cheap_as_trying_all_choices() -> None:
+    assert brute_force(8) == (8, 8)
