@@ -249,6 +249,13 @@ class PlanRules(_Part):
     tolerances: Tolerances = Tolerances()
 
     @model_validator(mode="after")
+    def _cameras_differ(self) -> PlanRules:
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) < len(names):
+            raise ValueError("two cameras have the same name: findings and proofs name the camera")
+        return self
+
+    @model_validator(mode="after")
     def _has_markers(self) -> PlanRules:
         if self.plates is None and self.lines is None and self.tags is None and self.cerpm is None:
             raise ValueError("the rules place nothing: give at least one of plates, lines, tags, cerpm")

@@ -80,6 +80,7 @@ def test_yaml_is_version_1_2() -> None:
         (f"{BASE}quality: {{budget: 1000}}", "costs.items", "unit costs"),
         (f"{BASE}applies: {{speed_kmh: [100, 50]}}", "applies", "correct"),
         (f"{BASE}temporary: {{from: 2026-05-01, to: 2026-04-01}}", "temporary", "correct"),
+        (f"{BASE}cameras: [{{name: a}}, {{name: a}}]\n", "rules", "correct"),
         (f"{BASE}1: 2", "[1]", "correct"),
     ],
 )

@@ -132,10 +132,25 @@ class RoadFeature:
         return math.nan
 
     def style(self, *names: str) -> LineStyle:
-        """Style of the first of several properties that is there."""
-        text = next((found for name in names if (found := self.text(name)) is not None), "unknown").lower()
-        text = _STYLE_SYNONYMS.get(text, text)
-        return LineStyle(text) if text in set(LineStyle) else LineStyle.UNKNOWN
+        """Style of the first of several properties that is there.
+
+        Raises
+        ------
+        InvalidParameter
+            ``left_style`` or ``right_style`` is no style; other properties may hold anything.
+        """
+        name, text = next(((name, found) for name in names if (found := self.text(name)) is not None), ("", "unknown"))
+        style = _STYLE_SYNONYMS.get(text.lower(), text.lower())
+        if style in set(LineStyle):
+            return LineStyle(style)
+        if name in ("left_style", "right_style"):
+            raise InvalidParameter(
+                f"{self.where}: {name} is {text[:40]!r}",
+                field=f"properties.{name}",
+                limit=", ".join(LineStyle),
+                cure="name one of these, or leave the property out",
+            )
+        return LineStyle.UNKNOWN
 
 
 def normalize_kind(text: str) -> str:

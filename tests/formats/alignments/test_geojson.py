@@ -286,3 +286,10 @@ def test_a_route_of_a_published_map() -> None:
     assert lane.width_m is None
     assert file.crs == "EPSG:4326"
     assert not math.isnan(lane.left[0, 0])
+
+
+def test_a_style_that_is_none_is_refused() -> None:
+    with pytest.raises(InvalidParameter) as refused:
+        _read(_feature(LINE, lane="A", width_m=3.2, left_style="zigzag"))
+    assert refused.value.field == "properties.left_style"
+    assert _read(_feature(LINE, lane="A", width_m=3.2, style="blue")).lanes[0].left_style is LineStyle.UNKNOWN
