@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -45,10 +45,7 @@ class StagedBlobs:
         if key is None:
             return
         self._keys.remove(key)
-        try:
-            self._blobs.delete(key)
-        except Unavailable:
-            _LOG.warning("a blob that nothing refers to could not be deleted", blob_key=key)
+        delete_unused(self._blobs, [key])
 
     def delete_all(self) -> None:
         """Delete the blobs that were not kept."""
@@ -64,3 +61,12 @@ def staged(blobs: Blobs) -> Iterator[StagedBlobs]:
         yield stage
     finally:
         stage.delete_all()
+
+
+def delete_unused(blobs: Blobs, keys: Iterable[str]) -> None:
+    """Delete blobs that nothing refers to any more. One that cannot be deleted stays, and is logged."""
+    for key in keys:
+        try:
+            blobs.delete(key)
+        except Unavailable:
+            _LOG.warning("a blob that nothing refers to could not be deleted", blob_key=key)

@@ -34,7 +34,7 @@ from app.services.plans.fan_out import WAIT_S, tasks_in_order
 from app.services.plans.package_tasks import ListPartsTask, WriteManifestTask, WritePartTask
 from app.services.plans.plan_jobs import PlanJobDocument, check_only_one, plan_job_document
 from app.services.ports import Blobs, Clock, JobQueue
-from app.services.staged_blobs import staged
+from app.services.staged_blobs import delete_unused, staged
 
 _FOLDER = "packages"
 
@@ -178,7 +178,7 @@ class Packages:
                     return
             stage.keep()
         if before is not None and before.result is not None:
-            self._blobs.delete(before.result["blob_key"])
+            delete_unused(self._blobs, [before.result["blob_key"]])
 
 
 def package_options(given: Mapping[str, Any]) -> PackageOptions:

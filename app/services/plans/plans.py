@@ -43,10 +43,11 @@ from app.services.plans.documents import (
     PlanVersionPage,
 )
 from app.services.plans.proof_documents import ProofSummary
+from app.services.plans.proofs import files_of
 from app.services.plans.statuses import APPROVED, CHECKED, COMMITTED, DRAFT, PROVED
 from app.services.plans.tasks import CompareTask, MadePlan, MakePlanTask, WritePlanFileTask
 from app.services.ports import Blobs, Clock
-from app.services.staged_blobs import staged
+from app.services.staged_blobs import delete_unused, staged
 
 MAX_EXISTING = 200_000
 """Markers of the registry near a road that a plan is checked against. Source: chosen by hand, bounds the memory."""
@@ -209,6 +210,8 @@ class Plans:
                 if made is not None:
                     replace_planned(connection, agency_id, plan_id, made.features)
             stage.keep()
+        if made is not None:
+            delete_unused(self._blobs, files_of(row.proof))
         return document
 
     def approve(self, caller: Caller, plan_id: str, version: int | None) -> PlanDocument:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from contextlib import closing
 from datetime import timedelta
 from typing import Any, cast
@@ -26,7 +27,7 @@ from app.services.plans.plan_jobs import PlanJobDocument, caller_of, check_only_
 from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask, WrittenProof
 from app.services.plans.statuses import CHECKED, PROVED
 from app.services.ports import Blobs, Clock, JobQueue
-from app.services.staged_blobs import staged
+from app.services.staged_blobs import delete_unused, staged
 
 REPORT_FILE, TABLE_FILE = "proof.json", "proof.csv"
 PROOF_FILES = (REPORT_FILE, TABLE_FILE)
@@ -179,8 +180,12 @@ class Proofs:
                     status=status,
                 )  # fmt: skip
             stage.keep()
-        for key in (row.proof or {"keys": {}})["keys"].values():
-            self._blobs.delete(key)
+        delete_unused(self._blobs, files_of(row.proof))
+
+
+def files_of(proof: Mapping[str, Any] | None) -> list[str]:
+    """Keys of the blobs of a plan's proof."""
+    return list(proof["keys"].values()) if proof is not None else []
 
 
 def status_after(status: str, *, passed: bool) -> str:

@@ -19,6 +19,7 @@ from app.services.plans.proof_tasks import ProveUnitTask, WriteProofTask
 from app.settings import Settings
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
+from tests.formats.pictures import corner_frame, png
 from tests.http import created, finished, refused, wait_until
 
 pytestmark = pytest.mark.both_databases
@@ -85,9 +86,11 @@ def prove_plan(client: httpx.Client, plan: dict[str, Any], **more: str) -> httpx
 
 
 def test_a_checked_plan_is_proved_and_its_report_is_the_same_for_the_same_seed(
-    client: httpx.Client, plan: dict[str, Any]
+    server: LiveServer, client: httpx.Client, plan: dict[str, Any]
 ) -> None:
     url = f"/v1/plans/{plan['id']}"
+    folder = server.app.state.proofs._blobs._folder / "proofs"
+    before = len(list(folder.rglob("*/*")))
     assert (plan["status"], plan["proof"]) == ("checked", None)
     refused(client.get(f"{url}/proof"), 404, field="plan_id")
     refused(client.get(f"{url}/files/proof.csv"), 404)
@@ -124,9 +127,24 @@ def test_a_checked_plan_is_proved_and_its_report_is_the_same_for_the_same_seed(
     assert client.get(url).json()["status"] == "proved"
     jobs = client.get("/v1/plan-jobs", params={"plan_id": plan["id"]}).json()["items"]
     assert [one["id"] for one in jobs] == [again["id"], job["id"]]
+    assert len(list(folder.rglob("*/*"))) == before + 2, "the files of the earlier proof are gone"
     changed = client.patch(url, json={"rules": PLATES}, headers={"If-Match": '"3"'}).json()
+    assert len(list(folder.rglob("*/*"))) == before
     assert (changed["status"], changed["proof"]) == ("checked", None)
     refused(client.get(f"{url}/proof"), 404)
+
+
+def test_uploads_are_decoded_while_a_proof_runs(client: httpx.Client, plan: dict[str, Any]) -> None:
+    long = TERMS | {"drives": 200}
+    location = client.post(f"/v1/plans/{plan['id']}/proof", json=long, headers=FIRST).headers["Location"]
+    wait_until(lambda: client.get(location).json()["steps_done"], "the first unit")
+    frame = {"content": png(corner_frame()), "headers": {"Content-Type": "image/png"}}
+    for _ in range(2):
+        assert client.post("/v1/decodes", **frame).status_code == 201
+        job = client.get(location).json()
+        assert (job["state"], job["steps_total"]) == ("running", 200)
+    client.post(f"{location}/cancel")
+    assert finished(client, location)["state"] == "cancelled"
 
 
 def test_an_interrupted_proof_does_not_drive_finished_units_again(
