@@ -38,8 +38,8 @@ from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.status import STATUSES
 
 _GEOD = Geod(ellps="WGS84")
-_M_PER_DEG = 110_574.0  # least length of a degree of latitude on WGS 84
-_CLOCK_SLACK = timedelta(minutes=10)
+_M_PER_DEG = 110_574.0  # [m] least length of a degree of latitude; source: WGS 84 at the equator
+_CLOCK_SLACK = timedelta(minutes=10)  # that a vehicle's clock may be slow; source: by hand
 _KM_H = {"km/h": 1.0, "mph": 1.609344}
 _CURE = "fetch the snapshot again"
 

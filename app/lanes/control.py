@@ -27,7 +27,7 @@ _TURN_OVER_M = 1.0  # [m] source: the stations of decoded paths
 _HEADING_OVER_M = 1.0  # [m] to both sides; source: the stations of decoded paths
 _CURVATURE_OVER_M = 3.0  # [m] to both sides; source: by hand, about a wheelbase
 _SAME_POINT_M = 1e-6  # [m] source: below every accuracy, above rounding
-_MIN_SPEED_M_S = 1.0  # [m/s] the laws steer at lower speeds as at this one: equation 4 divides by the speed; by hand
+_MIN_SPEED_M_S = 1.0  # [m/s] slower is steered as at this speed, by which equation 4 divides; source: by hand
 _PIECES_BEHIND, _PIECES_AHEAD = 8, 40  # of the path that are searched: 2 m and 10 m; source: by hand
 
 

@@ -14,7 +14,7 @@ from app.sensors.pose_track import PoseTrack
 
 _JERK_M_S3 = 1.5  # [m/s^3] of a car in a bend, over a second; source: by hand, sensitivity 1.00, 0.99
 _POINT_SPACING_M = 3.0  # [m] between points of the line; source: the knots of `least_squares.KNOT_M`
-_MAX_PAUSE_S = 5.0  # [s] longer pauses are shortened to this; no effect on moving vehicles
+_MAX_PAUSE_S = 5.0  # [s] longer pauses are shortened to this; source: by hand, no effect on moving vehicles
 _BIN_S = 0.2  # [s] fixes are averaged over this; source: 2.8 m at 50 km/h, about one bin a knot
 _WILD_SIGMAS = 6.0  # fixes further off are left out; source: six sigma, never by chance in a drive
 _MAX_WILD_SHARE = 0.3  # more wild fixes are not wild but the track's usual error; source: by hand, no measurement kept

@@ -34,7 +34,7 @@ _OPPOSITE_SHARE = (
 )
 _MIN_SIDED_MARKERS = 4  # to compare sides with the track; source: by hand
 _SIDE_OFFSETS_M = (0.5, 4.0)  # [m] nearest and farthest offset at which a side is clear; source: by hand
-_PRECISE_TRACK_M = 0.06  # [m] noise of an RTK track: three times `driven_line._MIN_SIGMA_M`
+_PRECISE_TRACK_M = 0.06  # [m] noise of an RTK track; source: three times `driven_line._MIN_SIGMA_M`
 _PRECISE_WANDER, _COARSE_WANDER = 0.06, 0.2  # [m/sqrt(m)] of the centre; source: by hand, sensitivity 1.00, 1.00
 _UNKNOWN_ACCURACY_M = 3.0  # [m] assumed where a receiver reports none; source: by hand: a receiver without corrections
 _SINGLE_SIDE_DRIFTS = (0.05, 0.15, 0.4)  # [m/sqrt(m)] source: the receivers of `least_squares.OFFSET_MODELS`

@@ -20,7 +20,7 @@ _MAX_BOUNDARY_SIGMA_M = 0.4  # [m] a boundary that is less certain is not publis
 _SAME_STATION_M = (
     3.0  # [m] speed limits closer along the path must agree; source: by hand: a quarter of the paper's 12.2 m
 )
-_MIN_OTHER_ROW = 3  # so many outliers, and
+_MIN_OTHER_ROW = 3  # so many outliers, and; source: by hand, two may be chance
 _MIN_OTHER_ROW_SHARE = 0.08  # such a share of all markers may be a row that the path should follow; source: by hand
 _OTHER_ROW_SIGMA_M = 0.6  # [m] added then; source: by hand: the path's confidence falls below one half
 _MIN_SIGMA_M = 1e-6  # [m] keeps the confidence finite; source: below every survey, above rounding

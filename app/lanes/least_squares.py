@@ -35,7 +35,9 @@ from app.lanes.types import Floats, Ints
 
 KNOT_M = 3.0  # [m] between knots; source: by hand, sensitivity 0.95, 1.02
 _MIN_KNOTS = 5  # source: third differences need four
-_PROBE_KNOTS = 2  # every so many knots the standard deviation is computed, between them interpolated; exact at 1
+_PROBE_KNOTS = (
+    2  # every so many knots the standard deviation is computed, between them interpolated; source: by hand, exact at 1
+)
 _MEMORY_M = 256.0  # [m] measurements further away have no effect on a place; source: by hand, sensitivity 1.00, 1.00
 _BAND = 9  # source: a third difference spans four knots of three fields: 3 x 3
 _LENGTH_SUM_SIGMA_M = 1e-3  # [m] of one step of the summed length; source: a 30th of `even_spacing._LENGTH_SIGMA_M`

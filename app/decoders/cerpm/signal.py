@@ -42,7 +42,9 @@ _MIN_CERTAIN = 20  # such transmissions, for an estimate of collisions; source: 
 _RECEIVED_SHARES = (0.05, 0.98)  # limits of the estimate; source: by hand, keep logarithms finite
 _DEFAULT_RECEIVED_SHARE = 0.7  # of strong transmissions; source: 0.72 by ALOHA in `cerpm-radio` (docs/benchmarks.md)
 _DEFAULT_SPREAD_DB = 4.5  # [dB] source: shadows of 4 dB and fading of 2 dB, `simulation.radio.link.Radio`
-_DEFAULT_SENSITIVITY_DBM = -150.0  # [dBm] below every receiver's: no packet is too weak
+_DEFAULT_SENSITIVITY_DBM = (
+    -150.0
+)  # [dBm] no packet is too weak; source: below every receiver's, SX1276 data sheet: -148 dBm
 _DEFAULT_CORRELATION = 0.5  # of consecutive packets; source: by hand, as `radio.path_loss.residual_correlation`
 
 

@@ -27,7 +27,7 @@ from app.sensors.camera import Camera
 
 VERSION = "fiducial/1"
 SURE = 0.99
-"""Least posterior probability at which a code is returned; the same as of checked plates."""
+"""Least posterior probability at which a code is returned. Source: as of plates with check digits, chosen by hand."""
 DEFAULT_DICTIONARIES = ("apriltag-36h11", "aruco-mip-36h12", "aruco-6x6-250", "aruco-5x5-250", "apriltag-25h9")
 """Looked for besides the registered ones: dictionaries that are strong enough to be read without a registry."""
 _EXPECTED = 0.9  # [-] prior share of the registered signs near by among the signs in view; chosen by hand
@@ -35,7 +35,7 @@ _MIN_SPREAD = 0.1  # [-] of a module's darkness: blur and uneven print; chosen b
 _DAMAGED = 0.02  # [-] probability that a module shows nothing of its code: dirt, reflections; chosen by hand
 _MIN_SQUARES = 20  # [-] squares for each sign that a frame has at least, a priori; chosen by hand
 _CHANGE = 0.15  # [-] probability that neighbouring modules of a smooth pattern differ; chosen by hand
-_WORTH_NAMING = 0.5  # [-] candidates whose best code is less likely are no signs and are left out
+_WORTH_NAMING = 0.5  # [-] candidates whose best code is less likely are left out; source: more likely no sign than one
 
 
 @dataclass(frozen=True, slots=True)

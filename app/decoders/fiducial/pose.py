@@ -20,12 +20,12 @@ from app.sensors.camera import Camera
 Array = npt.NDArray[np.float64]
 
 CORNER_SIGMA_PX = 0.1
-"""Of a corner in each direction; tests/families/fiducial/test_fiducial_frames.py prints 0.035 on rendered frames, and
-the rest is left for lenses. [px]"""
+"""Of a corner in each direction. [px] Source: chosen by hand; tests/families/fiducial/test_fiducial_frames.py prints
+0.035 on rendered frames, and the rest is left for lenses."""
 TILT_SIGMA_RAD = math.radians(1.5)
 """Of a sign's mounting and the vehicle's springs together; chosen by hand, no measurement kept. [rad]"""
-_STEP = 1e-6
-_ROUNDS = 10
+_STEP = 1e-6  # [m], [rad] for differences; source: the root of double precision, rounded up, for lengths of metres
+_ROUNDS = 10  # of Gauss-Newton; source: by hand, two or three suffice
 
 # axes of a plate (x right, y travel, z up) in the frame of an upright sign (x right, y up, z to the viewer)
 _SIGN_FROM_PLATE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

@@ -11,12 +11,16 @@ import numpy.typing as npt
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
 
-_CELL_PX = 8  # [px] of a module in the rectified picture; its inner half is sampled
-_NEXT_SQUARE = 0.02  # [-] of the perimeter: a border inside the edge of its panel is a square of its own; by hand
+_CELL_PX = (
+    8  # [px] of a module in the rectified picture; its inner half is sampled; source: by hand, 16 samples a module
+)
+_NEXT_SQUARE = (
+    0.02  # [-] of the perimeter: a border inside the edge of its panel is a square of its own; source: by hand
+)
 _SAME_SQUARE = 0.1  # [-] candidates whose corners are nearer than this share of the side are one; chosen by hand
 _CLEAR_BORDER = 0.9  # [-] least share of the border's modules that are dark; chosen by hand
-_PROFILE_STEP_PX = 0.5  # [px]
-_MIN_EDGE_POINTS = 5  # [-] of an edge, to fit a line
+_PROFILE_STEP_PX = 0.5  # [px] between samples across an edge; source: by hand, half a pixel
+_MIN_EDGE_POINTS = 5  # [-] of an edge, to fit a line; source: by hand, more than the two that define it
 _MIN_CONTRAST = 20.0  # [grey levels] of 255 between border and quiet zone; chosen by hand
 
 

@@ -43,9 +43,9 @@ REGION_MARGIN_BINS = 4
 SPARE_BINS = 40
 """Bins that are kept longer than any region needs them: 2 m. Source: chosen by hand."""
 FORGET_SCORES = 400
-"""Bins after which old scores are dropped: speed only."""
+"""Bins after which old scores are dropped. Source: chosen by hand, speed only."""
 CHUNK_SAMPLES = 4096
-"""Samples of a whole trace that are decoded at a time: bounds the memory."""
+"""Samples of a whole trace that are decoded at a time. Source: chosen by hand, bounds the memory."""
 
 
 class MagnetDecoder:

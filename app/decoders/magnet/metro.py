@@ -19,7 +19,7 @@ VERSION = "metro-1"
 _SPIKE_UT = 100.0  # [uT] a sample so far off the median of three is a fault; source: by hand
 _WHEEL_REACH_M = 0.2  # [m] across, from a reference sensor to those in front of its wheel; source: by hand
 _MERGE_M = 0.125 * 10 / 3.6  # [m] detections nearer than this are one magnet, 0.125 s at 10 km/h; source: by hand
-_CONFIDENCE = 0.5  # of every reading: the paper gives none
+_CONFIDENCE = 0.5  # of every reading; source: by hand, the paper gives none
 
 
 @dataclass(frozen=True, slots=True)

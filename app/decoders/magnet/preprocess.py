@@ -49,7 +49,7 @@ NEIGHBOUR_REACH_M = 0.25
 AHEAD = 2
 """Samples that are looked at ahead: the next one may be faulty. Source: chosen by hand."""
 FORGET_BLOCKS = 400
-"""Blocks after which old ones are dropped: speed only."""
+"""Blocks after which old ones are dropped. Source: chosen by hand, speed only."""
 
 
 class Blocks:

@@ -29,7 +29,7 @@ QUIET_RATIO = 0.5
 MIN_VARIANCE = 1e-9
 """Keeps ratios of variances finite. [uT2] Source: chosen by hand, far below a chip's noise."""
 GROWTH_BINS, FORGET_BINS = 256, 400
-"""Bins by which the arrays grow, and after which old ones are dropped: speed only."""
+"""Bins by which the arrays grow, and after which old ones are dropped. Source: chosen by hand, speed only."""
 
 
 class _Bins(NamedTuple):

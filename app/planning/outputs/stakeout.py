@@ -70,7 +70,7 @@ def _delimited(stakeout: Stakeout, *, northing_first: bool) -> bytes:
     lines = []
     for point in stakeout.points:
         first, second = (point.north, point.east) if northing_first else (point.east, point.north)
-        height = "" if point.height is None else f"{point.height:.4f}"
+        height = "" if point.height is None else f"{point.height:z.4f}"
         lines.append(f"{point.name},{first:.4f},{second:.4f},{height},{point.description}\r\n")
     return "".join(lines).encode()
 
@@ -100,7 +100,7 @@ def _landxml(stakeout: Stakeout) -> bytes:
             continue
         lines.append(f'<CgPoints name="{label}">')
         for point in group:
-            height = "" if point.height is None else f" {point.height:.4f}"
+            height = "" if point.height is None else f" {point.height:z.4f}"
             attributes = f'name="{point.name}" code="{label}" desc={_attribute(point.description)} state="proposed"'
             lines.append(f"<CgPoint {attributes}>{point.north:.4f} {point.east:.4f}{height}</CgPoint>")
         lines.append("</CgPoints>")
@@ -159,7 +159,7 @@ def _entities(stakeout: Stakeout, owner: str, height: float, handle: int) -> tup
     pieces = []
     for point in stakeout.points:
         code, layer = point.code, _layer(point.code)
-        place = f" 10\n{point.east:.4f}\n 20\n{point.north:.4f}\n 30\n{point.height or 0.0:.4f}\n"
+        place = f" 10\n{point.east:.4f}\n 20\n{point.north:.4f}\n 30\n{point.height or 0.0:z.4f}\n"
         turn = 0.0 if point.bearing_deg is None else -point.bearing_deg % 360.0
         insert = handle
         pieces.append(
@@ -169,7 +169,7 @@ def _entities(stakeout: Stakeout, owner: str, height: float, handle: int) -> tup
         for row, (tag, value) in enumerate(zip(_TAGS, _values(point), strict=True)):
             handle += 1
             y = point.north - row * 1.5 * height
-            at = f" 10\n{point.east + height / 2:.4f}\n 20\n{y:.4f}\n 30\n{point.height or 0.0:.4f}\n"
+            at = f" 10\n{point.east + height / 2:.4f}\n 20\n{y:.4f}\n 30\n{point.height or 0.0:z.4f}\n"
             pieces.append(
                 f"  0\nATTRIB\n  5\n{handle:X}\n330\n{insert:X}\n100\nAcDbEntity\n  8\n{layer}\n100\nAcDbText\n{at}"
                 f" 40\n{height:.4f}\n  1\n{_dxf_text(value)}\n100\nAcDbAttribute\n  2\n{tag}\n 70\n{int(row > 0)}\n"
