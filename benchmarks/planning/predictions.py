@@ -25,7 +25,7 @@ from benchmarks.planning.tables import Section, table
 
 GOAL = 0.10
 """Greatest difference of predicted and measured, as a share of the measured. Source: issue 13."""
-SEED = 91
+SEED = 95
 """Of the roads and drives; the models are fitted to seeds from 1001."""
 CONDITIONS = ("day", "night", "wear+dirt")
 _UNSURE, _UNSURE_TIMES = (0.05, 0.9), 4
@@ -88,8 +88,9 @@ def measure_predictions(short: bool) -> Section:
         for row in rows
     ]  # fmt: skip
     text = (
-        "Predictions of the checks beside simulated drives of the proof, on four real lanes and two generated roads on "
-        "which nothing was fitted or tuned. Read rates as shares of passes; path errors as root mean squares [m].\n\n"
+        "Predictions of the checks beside simulated drives of the proof, on two generated roads to which nothing was "
+        "fitted, and on four real lanes that helped to choose the form of the models, but not their parameters. Read "
+        "rates as shares of passes; path errors as root mean squares [m].\n\n"
         f"{table(head, cells)}\n\nGoals: all within {GOAL:.0%}: {sum(abs(r.difference) <= GOAL for r in rows)} of "
         f"{len(rows)}; none better than measured by more than that: {sum(r.optimism <= GOAL for r in rows)} of "
         f"{len(rows)}. Worst: {worst.what} on {worst.road}, {worst.difference:+.1%}; most optimistic: {hopeful.what} "

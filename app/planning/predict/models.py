@@ -20,11 +20,7 @@ DAY = "day"
 PLACING_SD_M = 0.01
 """[m] of placing a marker, each axis. Source: `PLACING_SD_M` of app/planning/proof/cerpms.py."""
 _NODES, _WEIGHTS = (np.asarray(part) for part in np.polynomial.hermite_e.hermegauss(15))
-_SIGMA_UNIT_M, _SPACING_UNIT_M, _SPEED_UNIT_MPS = (
-    0.02,
-    15.0,
-    15.0,
-)  # units of the power law, near the middle of the drives
+_SPACING_UNIT_M, _SPEED_UNIT_MPS = 15.0, 15.0  # units of the powers; source: near the middle of the fitted drives
 
 
 def normal_quadrature() -> tuple[Floats, Floats]:
@@ -102,10 +98,12 @@ class PathModel:
 
     Attributes
     ----------
-    rms_m : float
-        With markers that are off by 2 cm on each axis, 15 m apart, at 15 m/s. [m]
-    sigma_power, spacing_power, speed_power : float
-        Exponents of these three.
+    exact_markers_m : float
+        With markers that are exactly surveyed, 15 m apart, at 15 m/s. [m]
+    marker_gain : float
+        What markers that are off by a distance on each axis add in square, as a share of that distance, there.
+    spacing_power, speed_power : float
+        Exponents of these two.
     exact_share : float
         Share of the squared error of the spline through exact markers that remains.
     end_gain_m : float
@@ -114,8 +112,8 @@ class PathModel:
         Mean greatest distance along 500 m, over the root mean square.
     """
 
-    rms_m: float
-    sigma_power: float
+    exact_markers_m: float
+    marker_gain: float
     spacing_power: float
     speed_power: float
     exact_share: float
@@ -128,7 +126,7 @@ class PathModel:
         """Of stretches, shape (K,); see `app.planning.predict.rates.Stretches`. [m]"""
         sigma = math.hypot(survey_rmse_m / math.sqrt(2), PLACING_SD_M)
         own = (
-            self.rms_m * (sigma / _SIGMA_UNIT_M) ** self.sigma_power
+            math.hypot(self.exact_markers_m, self.marker_gain * sigma)
             * (spacing_m / _SPACING_UNIT_M) ** self.spacing_power
             * (np.maximum(speed_mps, 1.0) / _SPEED_UNIT_MPS) ** self.speed_power
         )  # fmt: skip
