@@ -5,14 +5,24 @@ from __future__ import annotations
 import difflib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.tokens import AliasToken
+from ruamel.yaml.tokens import (
+    AliasToken,
+    BlockEndToken,
+    BlockMappingStartToken,
+    BlockSequenceStartToken,
+    FlowMappingEndToken,
+    FlowMappingStartToken,
+    FlowSequenceEndToken,
+    FlowSequenceStartToken,
+    Token,
+)
 
 from app.errors import InvalidParameter, UnreadableUpload, naming
 from app.markers.magnet_design import TagDesign
@@ -24,6 +34,9 @@ from app.radio.settings import RadioSettings
 
 MAX_RULES_BYTES = 200_000
 """Longest document. [bytes] Source: chosen by hand, a hundred times the examples."""
+_MAX_DEPTH = 20  # levels of a document; source: by hand, rules have four
+_OPENING = (BlockMappingStartToken, BlockSequenceStartToken, FlowMappingStartToken, FlowSequenceStartToken)
+_CLOSING = (BlockEndToken, FlowMappingEndToken, FlowSequenceEndToken)
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _LONG_LIST = 12  # names that an error lists; source: chosen by hand
 
@@ -105,8 +118,7 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _parse_yaml(text: str) -> object:
     try:
-        if any(isinstance(token, AliasToken) for token in YAML(typ="safe", pure=True).scan(text)):
-            raise _unreadable("the rules have an alias (*name)", "write the values out")
+        _check_tokens(YAML(typ="safe", pure=True).scan(text))
         return YAML(typ="safe", pure=True).load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -116,6 +128,20 @@ def _parse_yaml(text: str) -> object:
     except (YAMLError, ValueError, RecursionError) as error:
         reason = str(error).split("\n")[0][:200] or "nested too deeply"
         raise _unreadable(f"the rules are not YAML 1.2: {reason}", "see docs/plans for examples") from error
+
+
+def _check_tokens(tokens: Iterable[Token]) -> None:
+    """Refuse aliases and deep nesting at the first such token: ruamel.yaml takes minutes for deep ones."""
+    depth = 0
+    for token in tokens:
+        if isinstance(token, AliasToken):
+            raise _unreadable("the rules have an alias (*name)", "write the values out")
+        depth += isinstance(token, _OPENING) - isinstance(token, _CLOSING)
+        if depth > _MAX_DEPTH:
+            place = f"line {token.start_mark.line + 1}, column {token.start_mark.column + 1}"
+            raise _unreadable(
+                f"the rules are not YAML 1.2 of at most {_MAX_DEPTH} levels: {place}", "see docs/plans for examples"
+            )
 
 
 def _unreadable(message: str, cure: str) -> UnreadableUpload:

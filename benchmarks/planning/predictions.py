@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -78,7 +81,9 @@ class Compared:
 
 def measure_predictions(short: bool) -> Section:
     """The table of all roads, and the worst of it."""
-    rows = [row for road in _roads(short) for row in compare_road(road, passes=8 if short else 60)]
+    roads = list(_roads(short))
+    with ProcessPoolExecutor(min(len(roads), os.cpu_count() or 1)) as pool:
+        rows = [row for found in pool.map(compare_road, roads, repeat(8 if short else 60)) for row in found]
     worst = max(rows, key=lambda row: abs(row.difference))
     hopeful = max(rows, key=lambda row: row.optimism)
     head = ("road", "what", "predicted", "measured", "95 % of measured", "passes", "difference")
@@ -114,8 +119,12 @@ def replace_speed(rules: PlanRules, speed_kmh: float) -> PlanRules:
     return rules.model_copy(update={"road": rules.road.model_copy(update={"design_speed_kmh": speed_kmh})})
 
 
-def compare_road(road: Alignment, passes: int) -> Iterator[Compared]:
+def compare_road(road: Alignment, passes: int) -> list[Compared]:
     """All figures of a road, from about so many passes for each."""
+    return list(_compared(road, passes))
+
+
+def _compared(road: Alignment, passes: int) -> Iterator[Compared]:
     rules = PlanRules.model_validate({**RULES, "predictions": {"conditions": list(CONDITIONS)}})
     plan = place_plan(road, rules, name=road.name)
     predicted = {found.name: found.figure for found in check_predictions(plan)}
