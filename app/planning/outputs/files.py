@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 
 from app.errors import InvalidParameter, NotFound
 from app.planning.outputs.bill import plan_bill, write_bill_csv
@@ -106,10 +106,10 @@ def plan_files(plan: Plan, options: OutputOptions | None = None) -> Iterator[Out
     yield OutputFile("schedule.csv", lambda: write_schedule_csv(plan))
     if drawings is not None:
         for name in drawings.names:
-            yield OutputFile(name, lambda name=name: drawings.write(name))  # type: ignore[misc]
+            yield OutputFile(name, partial(drawings.write, name))
     if stakeout is not None:
         for form in StakeoutFormat:
-            yield OutputFile(form.value, lambda form=form: write_stakeout(stakeout, form))  # type: ignore[misc]
+            yield OutputFile(form.value, partial(write_stakeout, stakeout, form))
     if plan.counts.get("cerpm"):
         programs = cache(lambda: plan_programs(plan))  # two files need them, and the radio's settings take seconds
         yield OutputFile("cerpm-programs.csv", lambda: write_plan_programs_csv(programs()))

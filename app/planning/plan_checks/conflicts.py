@@ -66,8 +66,10 @@ def _footprints(markers: Sequence[PlannedMarker]) -> tuple[Floats, list[PlannedM
             continue
         lon.append(marker.lon_deg)
         lat.append(marker.lat_deg)
-        is_plate = isinstance(detail, PlannedPlate)
-        room.append(detail.geometry.side_mm / 2000 * math.sqrt(2) if is_plate else _ROOM_M[marker.family])  # type: ignore[union-attr]
+        if isinstance(detail, PlannedPlate):
+            room.append(detail.geometry.side_mm / 2000 * math.sqrt(2))  # half a diagonal
+        else:
+            room.append(_ROOM_M[marker.family])
         owners.append(marker)
     return ecef_from_wgs84(np.array(lon), np.array(lat)), owners, np.array(room)
 

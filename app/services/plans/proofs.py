@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Mapping
 from contextlib import closing
 from datetime import timedelta
+from functools import partial
 from typing import Any, cast
 
 from app.errors import NotFound
@@ -138,11 +139,8 @@ class Proofs:
         with closing(tasks_as_done(self._processes, tasks, self._in_flight)) as done:
             for number, result in done:
                 results[number] = result
-                job.report_progress(
-                    len(results) / total,
-                    steps=(len(results), total),
-                    keep=lambda connection, n=number, r=result: add_unit(connection, agency_id, job_id, n, r),  # type: ignore[misc]
-                )
+                keep = partial(add_unit, agency_id=agency_id, job_id=job_id, number=number, result=result)
+                job.report_progress(len(results) / total, steps=(len(results), total), keep=keep)
         return [results[number] for number in range(total)]
 
     def _store(self, job: RunningJob, written: WrittenProof) -> None:
