@@ -86,7 +86,7 @@ from app.settings import Settings
 from app.storage.blobs import Blobs
 from app.storage.jwks import read_jwks
 from app.storage.master_key import load_master_key
-from app.storage.signing_key import load_signing_key
+from app.storage.signing_key import load_signing_keys
 
 _LOG = structlog.get_logger("waymark")
 ROUTERS = (
@@ -177,7 +177,7 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
     rules = _decode_rules(settings)
     ttl = rules.idempotency_ttl
     secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
-    signing_key = lru_cache(lambda: load_signing_key(settings.resolved_signing_key_file))
+    signing_keys = partial(load_signing_keys, settings.resolved_signing_key_file)
     handlers = _handlers(database, pool, secrets, rules)
     marker_cases = Markers(database, utc_now, marker_rules(settings))
     import_cases = Imports(database, utc_now, pool, marker_rules(settings))
@@ -231,7 +231,7 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
         "programs": CerpmPrograms(database, utc_now, secrets),
         "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
         "searches": Searches(database),
-        "snapshots": Snapshots(database, utc_now, signing_key),
+        "snapshots": Snapshots(database, utc_now, signing_keys),
         "vehicles": Vehicles(database, utc_now, ttl),
     }
 

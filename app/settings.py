@@ -36,7 +36,8 @@ class Settings(BaseSettings):
         default=None, description="File with the 32 bytes that encrypt the agencies' secret keys; created if missing."
     )
     signing_key_file: Path | None = Field(
-        default=None, description="File with the 32 bytes that sign snapshots (Ed25519); created if missing."
+        default=None,
+        description="File with the one or two Ed25519 keys (32 bytes each) of snapshots; created if missing.",
     )
     admin_key: SecretStr | None = Field(
         default=None, description="Admin key of the server; without it, one is generated for an empty database."
@@ -154,7 +155,7 @@ class Settings(BaseSettings):
 
     @property
     def resolved_signing_key_file(self) -> Path:
-        """File of the key that snapshots are signed under with the default filled in."""
+        """File of the keys of snapshots with the default filled in."""
         return self.signing_key_file or self.data_dir / "signing.key"
 
     @property

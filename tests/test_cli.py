@@ -207,33 +207,71 @@ def test_a_snapshot_is_made_and_verified(
     waymark("import", str(survey), "--agency", "Roads", "--declaration", DECLARED)
     box = "8.40005,48.9,8.40045,49.1"
     status, printed, _ = waymark("snapshot", "make", str(out), "--agency", "Roads", "--bbox", box, "--hours", "2")
-    assert status == 0
-    assert printed.startswith(f"{out}: {out.stat().st_size} bytes, public key ")
-    public_key = printed.split()[-1]
-    for key in ((), ("--key", public_key)):
-        status, printed, _ = waymark("snapshot", "verify", str(out), *key)
+    assert (status, printed) == (0, f"{out}: {out.stat().st_size} bytes\n")
+    trust, memory = tmp_path / "trust.json", tmp_path / "newest.json"
+    assert waymark("snapshot", "trust", str(trust), "--agency", "Roads")[:2] == (0, f"{trust}: 1 trusted key\n")
+    for more in ((), ("--memory", str(memory))):
+        status, printed, _ = waymark("snapshot", "verify", str(out), "--trust", str(trust), *more)
         assert status == 0
         held = orjson.loads(printed)
         assert (held["markers"], held["retired_cerpms"]) == ({"cerpm": 4}, 0)
         assert held["bbox_deg"] == [8.40005, 48.9, 8.40045, 49.1]
         ends = [datetime.fromisoformat(held[name]) for name in ("made_at", "expires_at")]
-        assert ends[1] - ends[0] == timedelta(hours=2)
-    refused = {
-        ("--key", "00" * 32): "signed under another key",
-        ("--key", "00"): "--key has 1 bytes",
-        ("--key", "no"): "not hexadecimal",
-    }
-    for key, what in refused.items():
-        status, printed, said = waymark("snapshot", "verify", str(out), *key)
-        assert (status, printed) == (1, "")
-        assert what in said
+        assert ends[1] - ends[0].replace(microsecond=0) == timedelta(hours=2)
+    newer = tmp_path / "newer.waymark"
+    waymark("snapshot", "make", str(newer), "--agency", "Roads", "--bbox", box)
+    verify = ("snapshot", "verify", "--trust", str(trust), "--memory", str(memory))
+    assert waymark(*verify, str(newer))[0] == 0
+    status, printed, said = waymark(*verify, str(out))
+    assert (status, printed) == (1, "")
+    assert "before one that was already accepted" in said
     out.write_bytes(out.read_bytes()[:-1] + bytes([out.read_bytes()[-1] ^ 1]))
-    status, printed, said = waymark("snapshot", "verify", str(out))
+    status, printed, said = waymark(*verify, str(out))
     assert (status, printed) == (1, "")
     assert "changed or damaged" in said
-    (tmp_path / "signing.key").unlink()
-    assert "there is no signing key" in waymark("snapshot", "verify", str(out))[2]
-    assert not (tmp_path / "signing.key").exists()
+    trust.write_text("{}")
+    assert "not a trust file" in waymark(*verify, str(newer))[2]
+    trust.write_text("no")
+    assert "is not JSON" in waymark(*verify, str(newer))[2]
+
+
+def test_a_rotation_of_signing_keys(waymark: Run, tmp_path: Path) -> None:
+    """The drill of docs/snapshots.md, section Keys: no vehicle that follows it is without a valid snapshot."""
+    waymark("key", "Roads")
+    trusts = [tmp_path / f"trust-{step}.json" for step in range(3)]
+    files = [tmp_path / f"area-{step}.waymark" for step in range(3)]
+
+    def make(step: int) -> None:
+        assert waymark("snapshot", "make", str(files[step]), "--agency", "Roads", "--bbox", "8,48,9,50")[0] == 0
+
+    def install(step: int) -> None:
+        assert waymark("snapshot", "trust", str(trusts[step]), "--agency", "Roads")[0] == 0
+
+    def accepted(trust: int) -> list[bool]:
+        made = [file for file in files if file.exists()]
+        return [waymark("snapshot", "verify", str(file), "--trust", str(trusts[trust]))[0] == 0 for file in made]
+
+    install(0)
+    make(0)
+    assert "has only one key" in waymark("snapshot", "rotate", "switch")[2]
+    assert "has only one key" in waymark("snapshot", "rotate", "remove")[2]
+    status, keys, _ = waymark("snapshot", "rotate", "add")
+    assert (status, len(keys.split())) == (0, 2)
+    assert "two keys already" in waymark("snapshot", "rotate", "add")[2]
+    install(1)
+    make(1)
+    assert [accepted(0), accepted(1)] == [[True, True], [True, True]]
+    assert waymark("snapshot", "rotate", "switch")[1].split() == keys.split()[::-1]
+    make(2)
+    assert [accepted(0), accepted(1)] == [[True, True, False], [True, True, True]]
+    assert waymark("snapshot", "rotate", "remove")[1].split() == keys.split()[1:]
+    install(2)
+    assert [accepted(0), accepted(1), accepted(2)] == [[True, True, False], [True] * 3, [False, False, True]]
+    path = tmp_path / "signing.key"
+    assert (path.stat().st_size, path.stat().st_mode & 0o077) == (32, 0)
+    path.write_bytes(b"short")
+    assert "is not a file of signing keys" in waymark("snapshot", "rotate", "add")[2]
+    assert path.read_bytes() == b"short"
 
 
 @pytest.mark.parametrize(
@@ -243,6 +281,7 @@ def test_a_snapshot_is_made_and_verified(
         (("OUT", "--agency", "Roads", "--bbox", "1,2"), "bbox"),
         (("OUT", "--agency", "Roads", "--bbox", "8,48,9,50", "--hours", "0"), "cannot hold for 0 h"),
         (("OUT", "--agency", "Roads", "--bbox", "8,48,9,50", "--hours", "nan"), "cannot hold for nan h"),
+        (("OUT", "--agency", "Roads", "--bbox", "8,48,9,50", "--hours", "169"), "cannot hold for 169 h"),
         (("FILE", "--agency", "Roads", "--bbox", "8,48,9,50"), "already exists"),
     ],
 )

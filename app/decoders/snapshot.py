@@ -118,7 +118,7 @@ class Snapshot:
         self, header: Any, columns: dict[str, Any], kinds: list[dict[str, Any]], codes: bytes, books: list[Any]
     ) -> None:
         self.version = int(header["version"])
-        self.made_at_s = int(header["made_at_s"])
+        self.made_at_ms = int(header["made_at_ms"])
         self.expires_at_s = int(header["expires_at_s"])
         self.agency_id = str(uuid.UUID(bytes=bytes(header["agency_id"])))
         self.area_deg = tuple(float(header[name]) for name in ("west_deg", "south_deg", "east_deg", "north_deg"))
@@ -148,7 +148,7 @@ class Snapshot:
         return {
             "version": self.version,
             "agency_id": self.agency_id,
-            "made_at": datetime.fromtimestamp(self.made_at_s, UTC),
+            "made_at": datetime.fromtimestamp(self.made_at_ms / 1000, UTC),
             "expires_at": datetime.fromtimestamp(self.expires_at_s, UTC),
             "bbox_deg": self.area_deg,
             "markers": {name: int(np.count_nonzero(mine & self._stands)) for name, mine in families.items()},
@@ -238,7 +238,7 @@ class Snapshot:
         return sorted(made, key=lambda marker: (marker.distance_m, marker.marker_id))
 
     def _marker(self, row: int, distance_m: float) -> SnapshotMarker:
-        column = {name: self._columns[name][row] for name, _form in layout.COLUMNS[self.version]}
+        column = {name: self._columns[name][row] for name, _form in layout.COLUMNS}
         end, kind = int(self._ends[row]), self._kinds[int(column["kind"])]
         height, heading = int(column["height_mm"]), int(column["heading_step"])
         return SnapshotMarker(
@@ -262,31 +262,39 @@ class Snapshot:
         )
 
     def _lane_start_deg(self, column: Mapping[str, Any]) -> tuple[float, float] | None:
-        if "lane_lon_step" not in column or self._kinds[int(column["kind"])].get("scheme") != "information-tag":
+        if self._kinds[int(column["kind"])].get("scheme") != "information-tag":
             return None
         steps = int(column["lane_lon_step"]), int(column["lane_lat_step"])
         return round(steps[0] * layout.DEGREE_STEP, 9), round(steps[1] * layout.DEGREE_STEP, 9)
 
 
-def open_snapshot(data: bytes, public_key: bytes, now: datetime) -> Snapshot:
+def open_snapshot(data: bytes, trust: layout.Trust, now: datetime, *, newest_made_at_ms: int | None = None) -> Snapshot:
     """Verify a snapshot and read it.
+
+    `app.decoders.newest_snapshot` calls it with what the reader remembers.
 
     Parameters
     ----------
     data : bytes
-    public_key : bytes
-        The server's Ed25519 key, 32 bytes; it comes to the vehicle by another way than the snapshot.
+    trust : Trust
+        The agency and its server's public keys; they come to the vehicle by another way than the snapshot.
     now : datetime
         Aware; by a clock that nobody on the road can set.
+    newest_made_at_ms : int, optional
+        `made_at_ms` of the newest snapshot of this agency that the reader has accepted. [ms since 1970-01-01 UTC]
 
     Raises
     ------
-    NoSnapshot, TruncatedSnapshot, FutureSnapshot, ForeignSnapshot, ForgedSnapshot, ExpiredSnapshot
-        In this order; all are `SnapshotRefused`.
+    NoSnapshot, OldSnapshot, FutureSnapshot, TruncatedSnapshot, ForeignSnapshot, ForgedSnapshot, ExpiredSnapshot,
+    RolledBackSnapshot
+        All are `SnapshotRefused`.
     """
     header = _header(data)
-    if bytes(header["key_id"]) != layout.key_id_of(public_key):
-        raise layout.ForeignSnapshot("the snapshot was signed under another key", limit="the key given", cure=_CURE)
+    public_key = trust.find_key(bytes(header["key_id"]))
+    if public_key is None:
+        raise layout.ForeignSnapshot(
+            "the snapshot was signed under another key", limit="the trusted keys", cure="see docs/snapshots.md, Keys"
+        )
     signed, signature = data[: -layout.SIGNATURE_BYTES], data[-layout.SIGNATURE_BYTES :]
     try:
         Ed25519PublicKey.from_public_bytes(public_key).verify(signature, signed)
@@ -294,7 +302,20 @@ def open_snapshot(data: bytes, public_key: bytes, now: datetime) -> Snapshot:
         raise layout.ForgedSnapshot(
             "the signature does not fit: the snapshot was changed or damaged", limit="Ed25519", cure=_CURE
         ) from error
+    if bytes(header["agency_id"]) != uuid.UUID(trust.agency_id).bytes:
+        raise layout.ForeignSnapshot(
+            "the snapshot is of another agency",
+            limit=f"agency {trust.agency_id}",
+            cure="fetch it with the agency's key",
+        )
     _check_time(header, now)
+    if newest_made_at_ms is not None and int(header["made_at_ms"]) < newest_made_at_ms:
+        behind_s = (newest_made_at_ms - int(header["made_at_ms"])) / 1000
+        raise layout.RolledBackSnapshot(
+            f"the snapshot was made {behind_s:.3f} s before one that was already accepted",
+            limit="not older than the newest that was accepted",
+            cure=_CURE,
+        )
     return _read(header, signed[header.dtype.itemsize :])
 
 
@@ -302,13 +323,13 @@ def _header(data: bytes) -> Any:
     if data[:8] != layout.MAGIC[: len(data)] or not data:
         raise layout.NoSnapshot("this is no snapshot", limit=f"begins with {layout.MAGIC.decode()}", cure=_CURE)
     version = int.from_bytes(data[8:10], "little") if len(data) >= 10 else layout.VERSION
-    if version not in layout.HEADERS:
-        raise layout.FutureSnapshot(
-            f"the snapshot is of version {version}", limit=f"versions 1 to {layout.VERSION}", cure="update the reader"
-        )
-    form = layout.HEADERS[version]
-    least = form.itemsize + layout.SIGNATURE_BYTES
-    header = np.frombuffer(data, dtype=form, count=1)[0] if len(data) >= least else None
+    limit, message = f"version {layout.VERSION}", f"the snapshot is of version {version}"
+    if version > layout.VERSION:
+        raise layout.FutureSnapshot(message, limit=limit, cure="update the reader")
+    if version < layout.VERSION:
+        raise layout.OldSnapshot(message, limit=limit, cure="update the server, and fetch the snapshot again")
+    least = layout.HEADER.itemsize + layout.SIGNATURE_BYTES
+    header = np.frombuffer(data, dtype=layout.HEADER, count=1)[0] if len(data) >= least else None
     wanted = least + int(header["body_bytes"]) if header is not None else least
     if header is None or len(data) != wanted:
         raise layout.TruncatedSnapshot(f"the snapshot has {len(data)} bytes", limit=f"{wanted} bytes", cure=_CURE)
@@ -316,22 +337,25 @@ def _header(data: bytes) -> Any:
 
 
 def _check_time(header: Any, now: datetime) -> None:
-    now_s = now.timestamp()
-    if now_s >= int(header["expires_at_s"]):
+    now_s, expires_at_s, made_at_ms = now.timestamp(), int(header["expires_at_s"]), int(header["made_at_ms"])
+    if now_s >= expires_at_s:
         raise layout.ExpiredSnapshot(
-            f"the snapshot expired {now_s - int(header['expires_at_s']):.0f} s ago", limit="its time", cure=_CURE
+            f"the snapshot expired {now_s - expires_at_s:.0f} s ago", limit="its time", cure=_CURE
         )
-    if now_s < int(header["made_at_s"]) - _CLOCK_SLACK.total_seconds():
+    if now_s < made_at_ms / 1000 - _CLOCK_SLACK.total_seconds():
         raise layout.ExpiredSnapshot(
             "the snapshot is from the future", limit="a clock that is right", cure="set the clock"
+        )
+    if expires_at_s * 1000 - made_at_ms > layout.MAX_VALIDITY // timedelta(milliseconds=1):
+        raise layout.ExpiredSnapshot(
+            "the snapshot is valid for too long", limit=f"{layout.MAX_VALIDITY.days} days", cure=_CURE
         )
 
 
 def _read(header: Any, packed: bytes) -> Snapshot:
     count = int(header["markers"])
-    version, kinds_bytes, codes_bytes = (int(header[name]) for name in ("version", "kinds_bytes", "codes_bytes"))
-    books_bytes = int(header["books_bytes"]) if version > 1 else 0
-    size = count * layout.row_bytes(version) + kinds_bytes + codes_bytes + books_bytes
+    kinds_bytes, codes_bytes, books_bytes = (int(header[f"{name}_bytes"]) for name in ("kinds", "codes", "books"))
+    size = count * layout.ROW_BYTES + kinds_bytes + codes_bytes + books_bytes
     try:
         body = zlib.decompressobj().decompress(packed, size + 1)
     except zlib.error as error:
@@ -339,12 +363,11 @@ def _read(header: Any, packed: bytes) -> Snapshot:
     if len(body) != size or count > layout.MAX_MARKERS:
         raise layout.TruncatedSnapshot(f"the body has {len(body)} bytes", limit=f"{size} bytes", cure=_CURE)
     columns, start = {}, 0
-    for name, form in layout.COLUMNS[version]:
+    for name, form in layout.COLUMNS:
         columns[name] = np.frombuffer(body, dtype=form, count=count, offset=start)
         start += columns[name].nbytes
     codes_at, books_at = start + kinds_bytes, start + kinds_bytes + codes_bytes
-    kinds = orjson.loads(body[start:codes_at])
-    books = orjson.loads(body[books_at:]) if version > 1 else []
+    kinds, books = orjson.loads(body[start:codes_at]), orjson.loads(body[books_at:])
     return Snapshot(header, columns, kinds, body[codes_at:books_at], books)
 
 

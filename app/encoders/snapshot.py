@@ -6,7 +6,7 @@ import math
 import uuid
 import zlib
 from collections.abc import Mapping, Sequence
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from app.errors import InvalidParameter
 from app.markers import snapshot as layout
 from app.markers.status import STATUSES
 
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _HEIGHT_LIMIT_MM = 2**31 - 1
 
 
@@ -43,7 +44,8 @@ def write_snapshot(
     area_deg : tuple of float
         west, south, east, north.
     made_at, expires_at : datetime
-        Aware; kept to the second.
+        Aware; kept to the millisecond and to the second. Readers refuse a snapshot that was made before one that they
+        have already accepted.
     key : Ed25519PrivateKey
     codebooks : sequence of mapping
         As `Codebook.to_document` writes them.
@@ -51,8 +53,13 @@ def write_snapshot(
     Raises
     ------
     InvalidParameter
-        There are too many markers, or too many kinds of them.
+        There are too many markers, too many kinds of them, or the snapshot would be valid for more than
+        `app.markers.snapshot.MAX_VALIDITY`.
     """
+    if expires_at - made_at > layout.MAX_VALIDITY:
+        raise InvalidParameter(
+            "the snapshot would be valid for too long", field="expires_at", limit=f"{layout.MAX_VALIDITY.days} days"
+        )
     if len(markers) > layout.MAX_MARKERS:
         raise InvalidParameter(
             f"the area has more than {layout.MAX_MARKERS} markers",
@@ -76,7 +83,8 @@ def write_snapshot(
     )
     header = np.zeros((), dtype=layout.HEADER)
     header["magic"], header["version"], header["markers"] = layout.MAGIC, layout.VERSION, len(markers)
-    header["made_at_s"], header["expires_at_s"] = int(made_at.timestamp()), int(expires_at.timestamp())
+    header["made_at_ms"] = (made_at - _EPOCH) // timedelta(milliseconds=1)
+    header["expires_at_s"] = (expires_at - _EPOCH) // timedelta(seconds=1)
     header["key_id"] = np.void(layout.key_id_of(key.public_key().public_bytes_raw()))
     header["agency_id"] = np.void(uuid.UUID(agency_id).bytes)
     for name, value in zip(("west_deg", "south_deg", "east_deg", "north_deg"), area_deg, strict=True):
@@ -114,7 +122,7 @@ def _columns(
         "first_heard_ms": [_heard_ms(marker.get("first_heard_s")) for marker in markers],
         "last_heard_ms": [_heard_ms(marker.get("last_heard_s")) for marker in markers],
     }
-    return [np.array(values[name], dtype=form) for name, form in layout.COLUMNS[layout.VERSION]]
+    return [np.array(values[name], dtype=form) for name, form in layout.COLUMNS]
 
 
 def _height_mm(height_m: float | None) -> int:

@@ -1,29 +1,88 @@
-"""The server's Ed25519 key, under which snapshots are signed."""
+"""The server's Ed25519 keys: one signs snapshots; during a rotation vehicles trust a second one as well."""
 
 from __future__ import annotations
 
+import os
+import secrets
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from app.errors import Unavailable
-from app.storage.master_key import MASTER_KEY_BYTES, load_secret
+from app.errors import InvalidParameter, Unavailable
+from app.markers.snapshot import MAX_KEYS
+from app.storage.master_key import load_secret
+
+_SEED_BYTES = 32  # RFC 8032, section 5.1.5
 
 
-def load_signing_key(path: Path) -> Ed25519PrivateKey:
-    """The key in a file of 32 bytes that only its owner may read; created if there is none.
+def load_signing_keys(path: Path) -> tuple[Ed25519PrivateKey, ...]:
+    """The keys in a file that only its owner may read; created with one key if there is none. The first key signs.
 
     Raises
     ------
     Unavailable
-        The file is not a key. Vehicles hold the public key: a new one would make them refuse every snapshot.
+        The file does not consist of one or two keys of 32 bytes. It is not replaced by a new one: vehicles hold the
+        public keys, and would refuse every snapshot.
     """
-    seed = load_secret(path)
-    if len(seed) != MASTER_KEY_BYTES:
-        raise Unavailable(
-            f"{path} is not a signing key: it has {len(seed)} bytes",
-            field="signing_key_file",
-            limit=f"{MASTER_KEY_BYTES} bytes",
-            cure="restore the file that the vehicles' public key belongs to",
+    return tuple(Ed25519PrivateKey.from_private_bytes(seed) for seed in _seeds(path))
+
+
+def add_signing_key(path: Path) -> None:
+    """Add a new key, which does not sign yet.
+
+    Raises
+    ------
+    InvalidParameter
+        There are two keys already.
+    """
+    seeds = _seeds(path)
+    if len(seeds) == MAX_KEYS:
+        raise InvalidParameter(
+            f"{path} has two keys already", limit=f"{MAX_KEYS} keys", cure="run waymark snapshot rotate remove first"
         )
-    return Ed25519PrivateKey.from_private_bytes(seed)
+    _replace(path, [*seeds, secrets.token_bytes(_SEED_BYTES)])
+
+
+def switch_signing_keys(path: Path) -> None:
+    """Let the other of two keys sign."""
+    _replace(path, _both(path)[::-1])
+
+
+def remove_signing_key(path: Path) -> None:
+    """Remove the key that does not sign."""
+    _replace(path, _both(path)[:1])
+
+
+def _both(path: Path) -> list[bytes]:
+    seeds = _seeds(path)
+    if len(seeds) != MAX_KEYS:
+        raise InvalidParameter(f"{path} has only one key", cure="run waymark snapshot rotate add first")
+    return seeds
+
+
+def _seeds(path: Path) -> list[bytes]:
+    content = load_secret(path)
+    if len(content) not in (_SEED_BYTES, MAX_KEYS * _SEED_BYTES):
+        raise Unavailable(
+            f"{path} is not a file of signing keys: it has {len(content)} bytes",
+            field="signing_key_file",
+            limit=f"one or two keys of {_SEED_BYTES} bytes",
+            cure="restore the file that the vehicles' public keys belong to",
+        )
+    return [content[start : start + _SEED_BYTES] for start in range(0, len(content), _SEED_BYTES)]
+
+
+def _replace(path: Path, seeds: list[bytes]) -> None:
+    """Write the file so that it is either the old or the new one after a loss of power."""
+    fresh = path.with_name(path.name + ".new")
+    fresh.unlink(missing_ok=True)
+    with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(b"".join(seeds))
+        file.flush()
+        os.fsync(file.fileno())
+    fresh.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

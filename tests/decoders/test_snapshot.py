@@ -1,8 +1,8 @@
-"""Snapshots: what goes in comes out, and nothing that was tampered with, cut, aged or made later is read."""
+"""Snapshots: what goes in comes out, and nothing that was changed, cut, mixed, rolled back or kept too long is read."""
 
 from __future__ import annotations
 
-import base64
+import contextlib
 import math
 import uuid
 from datetime import UTC, datetime, timedelta
@@ -24,7 +24,8 @@ from app.markers.plate import PlateCode, PlateScheme
 
 NOW = datetime(2026, 5, 4, 8, 0, 0, tzinfo=UTC)
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
-PUBLIC = KEY.public_key().public_bytes_raw()
+AGENCY = str(uuid.UUID(int=7))
+TRUST = layout.Trust(AGENCY, (KEY.public_key().public_bytes_raw(),))
 AREA = (8.0, 48.0, 9.0, 50.0)
 
 
@@ -52,15 +53,13 @@ def _tag(text: str, lon_deg: float, lat_deg: float, **more: Any) -> dict[str, An
     return _plate(lon_deg, lat_deg, family="magnet", **{"kind": {}, **more}) | {"code": text}
 
 
-def _write(markers: list[dict[str, Any]], hours: float = 24.0, **more: Any) -> bytes:
-    return write_snapshot(
-        markers, agency_id=str(uuid.UUID(int=7)), area_deg=AREA, made_at=NOW,
-        expires_at=NOW + timedelta(hours=hours), key=KEY, **more,
-    )  # fmt: skip
+def _write(markers: list[dict[str, Any]], hours: float = 24.0, made_at: datetime = NOW, **more: Any) -> bytes:
+    stated = {"agency_id": AGENCY, "area_deg": AREA, "key": KEY, **more}
+    return write_snapshot(markers, made_at=made_at, expires_at=made_at + timedelta(hours=hours), **stated)
 
 
-def _open(data: bytes, now: datetime = NOW) -> Snapshot:
-    return open_snapshot(data, PUBLIC, now)
+def _open(data: bytes, now: datetime = NOW, newest_made_at_ms: int | None = None) -> Snapshot:
+    return open_snapshot(data, TRUST, now, newest_made_at_ms=newest_made_at_ms)
 
 
 def test_what_goes_in_comes_out() -> None:
@@ -119,13 +118,89 @@ def test_an_empty_area_is_a_snapshot() -> None:
     assert snapshot.near("plate", 8.4, 49.0, 1e6) == []
 
 
-def test_a_flipped_bit_anywhere_is_refused() -> None:
-    data = _write([_plate(8.4, 49.0), _cerpm(3, 8.4, 49.0)])
-    for place in range(len(data)):
-        broken = bytearray(data)
-        broken[place] ^= 1 << place % 8
+def test_every_change_of_one_byte_is_refused() -> None:
+    """To each of the 255 other values, in each place: header, body and signature."""
+    data = _write([])
+    broken = bytearray(data)
+    accepted = []
+    for place, kept in enumerate(data):
+        for value in range(256):
+            broken[place] = value
+            with contextlib.suppress(layout.SnapshotRefused):
+                _open(bytes(broken))
+                accepted.append((place, value))
+        broken[place] = kept
+    assert accepted == list(enumerate(data))
+
+
+def test_parts_of_two_snapshots_are_no_snapshot() -> None:
+    """Every cut at which the rest of another snapshot with the same length follows."""
+    plate = _plate(8.4, 49.0)
+    first, second = _write([plate]), _write([plate], made_at=NOW + timedelta(hours=1))
+    assert len(first) == len(second)
+    parts = {first[:cut] + second[cut:] for cut in range(len(first) + 1)}
+    refused = 0
+    for data in parts - {first, second}:
         with pytest.raises(layout.SnapshotRefused):
-            _open(bytes(broken))
+            _open(data, NOW + timedelta(hours=2))
+        refused += 1
+    assert refused > layout.SIGNATURE_BYTES
+    other = _write([_plate(8.5, 49.0), plate])
+    for data in (other[:104] + first[104:], first[:104] + other[104:], first[:-64] + other[-64:]):
+        with pytest.raises(layout.SnapshotRefused):
+            _open(data)
+
+
+def test_an_older_snapshot_than_the_newest_is_refused() -> None:
+    old, new = _write([]), _write([], made_at=NOW + timedelta(milliseconds=1))
+    newest = _open(new, NOW).made_at_ms
+    assert _open(new, NOW, newest).made_at_ms == newest
+    assert _open(old).made_at_ms == newest - 1
+    with pytest.raises(layout.RolledBackSnapshot, match=r"0\.001 s before"):
+        _open(old, NOW, newest)
+
+
+def test_no_snapshot_is_valid_for_more_than_a_week(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _open(_write([], hours=168.0, made_at=NOW + timedelta(microseconds=999_999))) is not None
+    with pytest.raises(InvalidParameter, match="too long"):
+        _write([], hours=168.001)
+    monkeypatch.setattr(layout, "MAX_VALIDITY", timedelta(days=366))
+    year = _write([], hours=24.0 * 365)
+    monkeypatch.undo()
+    with pytest.raises(layout.ExpiredSnapshot, match="too long"):
+        _open(year)
+
+
+def test_two_keys_are_trusted_and_no_third() -> None:
+    new, third = (Ed25519PrivateKey.generate() for _ in range(2))
+    both = layout.Trust(AGENCY, (*TRUST.public_keys, new.public_key().public_bytes_raw()))
+    assert open_snapshot(_write([]), both, NOW) is not None
+    assert open_snapshot(_write([], key=new), both, NOW) is not None
+    for key in (new, third):
+        with pytest.raises(layout.ForeignSnapshot, match="another key"):
+            _open(_write([], key=key))
+    with pytest.raises(layout.ForeignSnapshot, match="another key"):
+        open_snapshot(_write([], key=third), both, NOW)
+
+
+def test_a_snapshot_of_another_agency_is_refused() -> None:
+    with pytest.raises(layout.ForeignSnapshot, match="another agency"):
+        _open(_write([], agency_id=str(uuid.UUID(int=8))))
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        None, [], {}, {"agency_id": AGENCY}, {"agency_id": AGENCY, "public_keys": []},
+        {"agency_id": "roads", "public_keys": ["00" * 32]}, {"agency_id": AGENCY, "public_keys": ["00" * 31]},
+        {"agency_id": AGENCY, "public_keys": ["00" * 32] * 2}, {"agency_id": AGENCY, "public_keys": "00" * 32},
+        {"agency_id": AGENCY, "public_keys": ["no"]}, {"agency_id": AGENCY, "public_keys": [7]},
+        {"agency_id": AGENCY, "public_keys": ["00" * 32, "01" * 32, "02" * 32]},
+    ],
+)  # fmt: skip
+def test_trust_that_cannot_be(document: object) -> None:
+    with pytest.raises(InvalidParameter):
+        layout.Trust.from_document(document)
 
 
 def test_a_cut_or_longer_one_is_refused() -> None:
@@ -143,11 +218,13 @@ def test_each_refusal_has_its_name() -> None:
         _open(b"")
     with pytest.raises(layout.NoSnapshot):
         _open(b"SQLite format 3\x00" + data[16:])
-    with pytest.raises(layout.FutureSnapshot, match="version 3"):
-        _open(data[:8] + b"\x03\x00" + data[10:])
+    with pytest.raises(layout.FutureSnapshot, match="version 4"):
+        _open(data[:8] + b"\x04\x00" + data[10:])
+    for version in (0, 1, 2):
+        with pytest.raises(layout.OldSnapshot, match=f"version {version}") as refused:
+            _open(data[:8] + bytes([version, 0]) + data[10:])
+        assert refused.value.cure == "update the server, and fetch the snapshot again"
     other = Ed25519PrivateKey.generate()
-    with pytest.raises(layout.ForeignSnapshot):
-        open_snapshot(data, other.public_key().public_bytes_raw(), NOW)
     forged = data[:-64] + other.sign(data[:-64])
     with pytest.raises(layout.ForgedSnapshot):
         _open(forged)
@@ -169,41 +246,12 @@ def test_too_many_markers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_layout_is_as_documented() -> None:
     """docs/snapshots.md gives these numbers; a change of any is another version."""
-    first = [
-        ("magic", 0), ("version", 8), ("reserved", 10), ("markers", 12), ("made_at_s", 16), ("expires_at_s", 24),
+    assert [(name, layout.HEADER.fields[name][1]) for name in layout.HEADER.names] == [
+        ("magic", 0), ("version", 8), ("reserved", 10), ("markers", 12), ("made_at_ms", 16), ("expires_at_s", 24),
         ("key_id", 32), ("agency_id", 40), ("west_deg", 56), ("south_deg", 64), ("east_deg", 72), ("north_deg", 80),
-        ("kinds_bytes", 88), ("codes_bytes", 92), ("body_bytes", 96),
+        ("kinds_bytes", 88), ("codes_bytes", 92), ("body_bytes", 96), ("books_bytes", 100),
     ]  # fmt: skip
-    places = {
-        version: [(name, form.fields[name][1]) for name in form.names] for version, form in layout.HEADERS.items()
-    }
-    assert places == {1: first, 2: [*first, ("books_bytes", 100)]}
-    assert {version: form.itemsize for version, form in layout.HEADERS.items()} == {1: 100, 2: 104}
-    assert (layout.row_bytes(1), layout.row_bytes(2)) == (51, 91)
-
-
-VERSION_1 = base64.b64decode(
-    "V0FZTUFSS1MBAAAAAwAAAABS+GkAAAAAgKP5aQAAAABWR1qnVGNHTAAAAAAAAAAAAAAAAAAAAAcAAAAAAAAgQAAAAAAAAEhAAAAAAAAAIkAAAAAA"
-    "AABJQM8AAAAcAAAA8QAAAHicbY3BSgMxEIazu0cV7x7nHEtqW5Q8hJceRULYTXeHJmkwWUGWfZeeBZ/AF/ABxCfxrkmEli3OMAw/8/3/EDKpYipJ"
-    "eaIr8vn2naHT/brvzv7ZV1/FYfbvF4f5659cHyR1el6SsiyrqjovLh8GqDtVb0WDLQYP3PZaU9hIg/oFODgtgwIKrXTCGOCrGaNggd9R8NFoVGJ2"
-    "HgPubMRCh/XWKu8zfMMS3VsMWS6ieaTDMbxWT85El8cm5Wi1CUk5pRqh0WAAPmR7PBrXxduz1H1EV2ycBBnZWhVgfFyyY92u79diKdhsLubsesF+"
-    "AYV7ZlWWeBkXHJ95xXW+epzzX0c4VbrahLf/+YmDGMHbyDGydvL0NVg/iZZmUlJ2sDgeOMRvB+9FBwlW7qsWVIFENjoL"
-)
-"""What the writer of version 1 made of a plate, a tag and a CERPM, hours=24 from NOW."""
-
-
-def test_a_snapshot_of_version_1_is_read() -> None:
-    snapshot = _open(VERSION_1)
-    assert (snapshot.version, len(snapshot), snapshot.codebooks) == (1, 3, ())
-    assert snapshot.plate_codebook(8.4, 49.0, 10.0) == (PlateCode.from_position(8.4, 49.0),)
-    (tag,) = snapshot.registered_tags(8.4, 49.0, 10.0)
-    assert (tag.tag.text, tag.bearing_deg, tag.meaning) == ("SNS_4_0.1_10-30", 90.0, None)
-    known = snapshot.known_cerpms([7, 8])
-    assert known.registered[7].speed_limit_km_h == pytest.approx(80.4672)
-    assert (known.earlier_spans, known.min_interval_s) == ({}, {})
-    forged = VERSION_1[:8] + layout.VERSION.to_bytes(2, "little") + VERSION_1[10:]
-    with pytest.raises(layout.SnapshotRefused):
-        _open(forged)
+    assert (layout.HEADER.itemsize, layout.ROW_BYTES) == (104, 91)
 
 
 # --- what the decoders need besides places ----------------------------------------------------------------------

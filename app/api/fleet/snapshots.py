@@ -10,8 +10,8 @@ from app.api.http.dependencies import Caller, Text, use_cases
 from app.api.http.problems import problem_responses
 from app.api.http.responses import document_response, file_response, json_response
 from app.api.markers.filters import parse_box
-from app.markers.snapshot import MEDIA_TYPE, VERSION
-from app.services.fleet.documents import PublicKeyDocument
+from app.markers.snapshot import MEDIA_TYPE
+from app.services.fleet.documents import TrustDocument, trust_document
 from app.services.fleet.snapshots import MAX_HOURS
 from app.services.fleet.snapshots import Snapshots as SnapshotsService
 
@@ -36,14 +36,7 @@ def get_snapshot(
     return Response(snapshots.make(caller, parse_box(bbox), hours), headers=headers, media_type=MEDIA_TYPE)
 
 
-@router.get("/public-key", responses=document_response(PublicKeyDocument))
-def get_public_key(snapshots: Snapshots) -> Response:
-    """What this server's snapshots are verified with. A vehicle gets it once, over a channel that it trusts."""
-    key = snapshots.public_key()
-    document: PublicKeyDocument = {
-        "algorithm": "Ed25519",
-        "key_id": key.key_id.hex(),
-        "public_key": key.public_key.hex(),
-        "snapshot_version": VERSION,
-    }
-    return json_response(document)
+@router.get("/trust", responses=document_response(TrustDocument))
+def get_trust(caller: Caller, snapshots: Snapshots) -> Response:
+    """What the agency's snapshots are verified with. The operator installs it in a vehicle over a trusted channel."""
+    return json_response(trust_document(snapshots.trust(caller)))

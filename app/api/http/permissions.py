@@ -64,7 +64,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/imports/{import_id}/cancel": SURVEYORS,
     "GET /v1/exports/{kind}": READERS,
     "GET /v1/snapshots": EVERYBODY,  # vehicles without a connection decode with it
-    "GET /v1/snapshots/public-key": EVERYBODY,
+    "GET /v1/snapshots/trust": EVERYBODY,
     "GET /v1/audit": ADMINS,
     # --- plans
     "GET /v1/alignments": READERS,

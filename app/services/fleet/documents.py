@@ -1,4 +1,4 @@
-"""What the API returns about vehicles, calibrations and the key of snapshots."""
+"""What the API returns about vehicles, calibrations and the keys of snapshots."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue
 from typing_extensions import TypedDict
+
+from app.markers.snapshot import VERSION, Trust
 
 VehicleStatus = Literal["active", "retired"]
 
@@ -155,10 +157,23 @@ class CalibrationPage(TypedDict):
     items: list[CalibrationDocument]
 
 
-class PublicKeyDocument(TypedDict):
-    """The key that snapshots are verified with."""
+class TrustDocument(TypedDict):
+    """What vehicles verify an agency's snapshots with, as a trust file contains it."""
 
     algorithm: Literal["Ed25519"]
-    key_id: Annotated[str, Field(description="First eight bytes of its SHA-256, hexadecimal; every snapshot names it.")]
-    public_key: Annotated[str, Field(description="32 bytes, hexadecimal.")]
-    snapshot_version: int
+    agency_id: str
+    public_keys: Annotated[
+        list[str],
+        Field(description="One or two keys of 32 bytes, hexadecimal; that of the key that signs first."),
+    ]
+    snapshot_version: Annotated[int, Field(description="Version of the format.")]
+
+
+def trust_document(trust: Trust) -> TrustDocument:
+    """The trust file of an agency."""
+    return {
+        "algorithm": "Ed25519",
+        "agency_id": trust.agency_id,
+        "public_keys": [key.hex() for key in trust.public_keys],
+        "snapshot_version": VERSION,
+    }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
@@ -13,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from app.encoders.snapshot import write_snapshot
 from app.errors import InvalidParameter
 from app.families import FAMILIES
-from app.markers.snapshot import MAX_MARKERS, key_id_of
+from app.markers.snapshot import MAX_MARKERS, MAX_VALIDITY, Trust
 from app.registry import bulk
 from app.registry.codebooks import CODEBOOKS, book_of
 from app.registry.database import Database
@@ -24,19 +23,11 @@ from app.services.decodes.fixes import horizontal_rmse_m
 from app.services.markers.codebook_documents import MAX_BOOKS_SEARCHED
 from app.services.ports import Clock
 
-MAX_HOURS = 24.0 * 366
+MAX_HOURS = MAX_VALIDITY / timedelta(hours=1)
 _MEMBERS = (
     "id", "family", "status", "lon_deg", "lat_deg", "height_m", "vertical_datum", "heading_deg", "vertical_rmse_m",
     "heading_rmse_deg", "localization_grade",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class PublicKey:
-    """What vehicles verify snapshots with."""
-
-    key_id: bytes
-    public_key: bytes
 
 
 class Snapshots:
@@ -46,14 +37,16 @@ class Snapshots:
     ----------
     database : Database
     clock : Clock
-    signing_key : callable
-        The server's key; asked for at the first use.
+    signing_keys : callable
+        The server's keys, of which the first signs; called for every snapshot, so that a rotation needs no restart.
     """
 
-    def __init__(self, database: Database, clock: Clock, signing_key: Callable[[], Ed25519PrivateKey]) -> None:
+    def __init__(
+        self, database: Database, clock: Clock, signing_keys: Callable[[], tuple[Ed25519PrivateKey, ...]]
+    ) -> None:
         self._database = database
         self._clock = clock
-        self._signing_key = signing_key
+        self._signing_keys = signing_keys
 
     def make(self, caller: Caller, box: Box, hours: float) -> bytes:
         """A signed snapshot of the agency's markers in a box, all but the retired ones, and its codebooks.
@@ -79,14 +72,13 @@ class Snapshots:
             area_deg=(box.west_deg, box.south_deg, box.east_deg, box.north_deg),
             made_at=now,
             expires_at=now + timedelta(hours=hours),
-            key=self._signing_key(),
+            key=self._signing_keys()[0],
             codebooks=[book_of(row).to_document() for row in books],
         )
 
-    def public_key(self) -> PublicKey:
-        """The key that this server's snapshots are verified with."""
-        public = self._signing_key().public_key().public_bytes_raw()
-        return PublicKey(key_id_of(public), public)
+    def trust(self, caller: Caller) -> Trust:
+        """What vehicles verify the agency's snapshots with."""
+        return Trust(caller.agency_id, tuple(key.public_key().public_bytes_raw() for key in self._signing_keys()))
 
 
 def list_markers(connection: sa.Connection, agency_id: str, box: Box) -> list[dict[str, Any]]:

@@ -29,6 +29,7 @@ from app.jobs.packet_tasks import read_drive
 from app.lanes.estimate import fit_lane
 from app.lanes.types import LaneMarkers
 from app.main import create_app
+from app.markers.snapshot import Trust
 from app.services.access.access import Scope
 from app.services.decodes.packet_task import DriveTask
 from app.services.decodes.trace_task import trace_terms
@@ -68,12 +69,12 @@ def _download(client: httpx.Client, lon_deg: float, lat_deg: float) -> bytes:
     return answer.content
 
 
-def _key(client: httpx.Client) -> bytes:
-    return bytes.fromhex(client.get("/v1/snapshots/public-key").json()["public_key"])
+def _trust(client: httpx.Client) -> Trust:
+    return Trust.from_document(client.get("/v1/snapshots/trust").json())
 
 
 def _snapshot(client: httpx.Client, lon_deg: float, lat_deg: float) -> Snapshot:
-    return open_snapshot(_download(client, lon_deg, lat_deg), _key(client), datetime.now(UTC))
+    return open_snapshot(_download(client, lon_deg, lat_deg), _trust(client), datetime.now(UTC))
 
 
 def test_a_frame_matches_the_same_plate(real_client: httpx.Client, place: Callable[[], dict[str, Any]]) -> None:
@@ -116,7 +117,10 @@ def test_a_trace_gives_the_same_tags_meanings_and_fixes(real_client: httpx.Clien
         assert tag.match is not None
         assert tag.match.tag is not None
         assert tag.fix is not None
-        assert (tag.reading.tag.text, tag.reading.confidence) == (online["tag"], online["confidence"])
+        assert tag.reading.tag.text == online["tag"]
+        assert tag.reading.confidence == pytest.approx(
+            online["confidence"], rel=1e-12
+        )  # another process, other threads
         matched, meaning = tag.match.tag, tag.match.tag.meaning
         assert (matched.marker_id, matched.status) == (online["match"]["marker_id"], online["match"]["status"])
         assert meaning is not None
@@ -158,7 +162,7 @@ def test_packets_give_the_same_verdicts_markers_and_lane(real_server: LiveServer
         listed = client.get("/v1/markers", params={"family": "cerpm", "limit": 1000}).json()["items"]
         lon, lat = (float(np.median([m["position"][n] for m in listed])) for n in ("lon_deg", "lat_deg"))
         answer = _download(client, lon, lat)
-        snapshot = open_snapshot(answer, _key(client), datetime.now(UTC))
+        snapshot = open_snapshot(answer, _trust(client), datetime.now(UTC))
         later, _ = drive_past_cerpms(built, 6, hour=hour + 1)
         # some of the first drive are sent again an hour later: authentic, and stale
         again = [replace(p, received_at_s=p.received_at_s + 3600.0) for p in first.packets[:40]]

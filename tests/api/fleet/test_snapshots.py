@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 
 import httpx
 import pytest
 
 from app.decoders.snapshot import open_snapshot
-from app.markers.snapshot import ExpiredSnapshot
+from app.markers.snapshot import ExpiredSnapshot, ForeignSnapshot, Trust
 from app.services.access.access import Scope
 from app.settings import Settings
-from app.storage.signing_key import load_signing_key
+from app.storage.signing_key import add_signing_key, remove_signing_key, switch_signing_keys
 from tests.conftest import LiveServer
 
 pytestmark = pytest.mark.both_databases
@@ -21,12 +22,11 @@ pytestmark = pytest.mark.both_databases
 BOX = "8.3,48.9,8.6,49.1"
 
 
-def _public_key(server: LiveServer) -> bytes:
-    with server.client() as client:
-        answer = client.get("/v1/snapshots/public-key")
+def _trust(client: httpx.Client) -> Trust:
+    answer = client.get("/v1/snapshots/trust")
     assert answer.status_code == 200, answer.text
-    assert answer.json()["algorithm"] == "Ed25519"
-    return bytes.fromhex(answer.json()["public_key"])
+    assert (answer.json()["algorithm"], answer.json()["snapshot_version"]) == ("Ed25519", 3)
+    return Trust.from_document(answer.json())
 
 
 def test_a_vehicle_gets_its_agencys_markers_and_no_others(server: LiveServer, client: httpx.Client) -> None:
@@ -41,7 +41,7 @@ def test_a_vehicle_gets_its_agencys_markers_and_no_others(server: LiveServer, cl
     answer = client.get("/v1/snapshots", params={"bbox": BOX, "hours": 2})
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/vnd.waymark.snapshot"
-    snapshot = open_snapshot(answer.content, _public_key(server), datetime.now(UTC))
+    snapshot = open_snapshot(answer.content, _trust(client), datetime.now(UTC))
     assert len(snapshot) == 3
     plate = snapshot.near("plate", 8.4123, 49.0123, 100.0)[0]
     assert (plate.marker_id, plate.code) == (made[0]["id"], made[0]["code"]["digits"])
@@ -51,10 +51,12 @@ def test_a_vehicle_gets_its_agencys_markers_and_no_others(server: LiveServer, cl
     assert known["1"] == {**said, "side": "right", "speed_limit": limit}
     assert known["2"] == {**said, "side": "unknown", "speed_limit": None}
     with pytest.raises(ExpiredSnapshot):
-        open_snapshot(answer.content, _public_key(server), datetime.now(UTC) + timedelta(hours=2))
+        open_snapshot(answer.content, _trust(client), datetime.now(UTC) + timedelta(hours=2))
     with server.agency("snapshots of another", Scope.VEHICLE) as other:
         foreign = other.get("/v1/snapshots", params={"bbox": BOX})
-        nothing = open_snapshot(foreign.content, _public_key(server), datetime.now(UTC))
+        with pytest.raises(ForeignSnapshot, match="another agency"):
+            open_snapshot(foreign.content, _trust(client), datetime.now(UTC))
+        nothing = open_snapshot(foreign.content, _trust(other), datetime.now(UTC))
         assert (len(nothing), nothing.codebooks) == (0, ())
 
 
@@ -63,7 +65,7 @@ def test_a_survey_in_another_frame_is_as_good_as_its_transformation(server: Live
     exact = client.post("/v1/markers", json={"position": {**place, "crs": "EPSG:4258", "epoch": 2020.0}}).json()
     vague = client.post("/v1/markers", json={"position": {**place, "lon_deg": 8.42, "crs": "EPSG:4258"}}).json()
     answer = client.get("/v1/snapshots", params={"bbox": BOX})
-    snapshot = open_snapshot(answer.content, _public_key(server), datetime.now(UTC))
+    snapshot = open_snapshot(answer.content, _trust(client), datetime.now(UTC))
     for marker in (exact, vague):
         position = marker["position"]
         (found,) = snapshot.near("plate", position["lon_deg"], position["lat_deg"], 1.0)
@@ -90,6 +92,7 @@ def test_a_survey_in_another_frame_is_as_good_as_its_transformation(server: Live
         ({"bbox": BOX, "hours": "nan"}, "hours"),
         ({"bbox": BOX, "hours": "1e9"}, "hours"),
         ({"bbox": BOX, "hours": "-1"}, "hours"),
+        ({"bbox": BOX, "hours": "168.001"}, "hours"),
     ],
 )
 def test_bad_input_is_a_problem(client: httpx.Client, params: dict[str, str], field: str) -> None:
@@ -98,10 +101,19 @@ def test_bad_input_is_a_problem(client: httpx.Client, params: dict[str, str], fi
     assert field in answer.json()["field"]
 
 
-def test_the_key_stays_the_same_and_is_only_the_owners(server: LiveServer, settings: Settings) -> None:
+def test_a_rotation_needs_no_restart(serve: Callable[..., LiveServer], settings: Settings) -> None:
+    """The server reads its keys for every snapshot."""
     path = settings.resolved_signing_key_file
-    path.parent.mkdir(parents=True, exist_ok=True)
-    first, again = load_signing_key(path), load_signing_key(path)
-    assert first.private_bytes_raw() == again.private_bytes_raw()
-    assert path.stat().st_mode & 0o077 == 0
-    assert _public_key(server) != first.public_key().public_bytes_raw()
+    with serve(settings).client() as client:
+        before = _trust(client)
+        add_signing_key(path)
+        both = _trust(client)
+        assert both.public_keys[:1] == before.public_keys
+        assert len(both.public_keys) == 2
+        switch_signing_keys(path)
+        snapshot = client.get("/v1/snapshots", params={"bbox": BOX, "hours": 168}).content
+        open_snapshot(snapshot, both, datetime.now(UTC))
+        with pytest.raises(ForeignSnapshot, match="another key"):
+            open_snapshot(snapshot, before, datetime.now(UTC))
+        remove_signing_key(path)
+        assert _trust(client).public_keys == both.public_keys[1:]

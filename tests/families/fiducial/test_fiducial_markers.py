@@ -18,6 +18,7 @@ from app.decoders.fiducial import decode_fiducials
 from app.decoders.fiducial.offline import known_fiducials, match_fiducial
 from app.decoders.snapshot import open_snapshot
 from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial
+from app.markers.snapshot import Trust
 
 pytestmark = pytest.mark.both_databases
 
@@ -114,9 +115,9 @@ def test_a_sign_goes_out_to_gis_files_and_vehicles(client: httpx.Client, place: 
     assert [row["code"] for row in csv.DictReader(io.StringIO(text)) if row["id"] == made["id"]] == [
         "apriltag-36h11-17"
     ]
-    key = bytes.fromhex(client.get("/v1/snapshots/public-key").json()["public_key"])
+    trust = Trust.from_document(client.get("/v1/snapshots/trust").json())
     data = client.get("/v1/snapshots", params={"bbox": box}).content
-    snapshot = open_snapshot(data, key, datetime.now(UTC))
+    snapshot = open_snapshot(data, trust, datetime.now(UTC))
     code = FiducialCode("apriltag-36h11", 17)
     assert known_fiducials(snapshot, lon, lat, 50.0) == (KnownFiducial(code, FiducialGeometry(400.0, 50.0)),)
     match = match_fiducial(snapshot, code, lon, lat, 50.0)
