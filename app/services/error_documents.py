@@ -8,6 +8,17 @@ from typing_extensions import TypedDict
 
 from app.errors import WaymarkError
 
+_MAX_CHARACTER_BYTES = 6  # of JSON; source: RFC 8259 section 7, \u0001
+
+
+def cut_text(text: str, max_bytes: int) -> str:
+    """A text that takes no more than so many bytes of JSON: what a client sent may be in it."""
+    if len(text) * _MAX_CHARACTER_BYTES <= max_bytes:
+        return text
+    printable = "".join(letter if letter.isprintable() else "?" for letter in text[: max_bytes + 1])
+    sent = printable.encode("utf-8", "replace")
+    return printable if len(sent) <= max_bytes else f"{sent[: max_bytes - 3].decode('utf-8', 'ignore')}…"
+
 
 class ErrorCause(TypedDict):
     """The input at fault, the limit that it broke and what to do, as far as they are known."""

@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 from fastapi import Depends, Header, Request
+from pydantic import TypeAdapter
 from starlette.datastructures import FormData, UploadFile
 
 from app.api.decodes.schemas import ContextIn
-from app.api.http.forms import FORM, idempotency_of, media_type_of, read_declaration, read_text, validated
+from app.api.http.forms import FORM, idempotency_of, media_type_of, read_declaration, read_text
 from app.api.http.responses import IdempotencyKeyHeader
+from app.api.http.strict_json import validated
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
 from app.services.decodes.context import ContextInput
 from app.services.idempotency import IdempotencyKey
@@ -69,7 +71,7 @@ async def get_upload(
         )
     if len(text) > MAX_CONTEXT_BYTES:
         raise MalformedRequest("the context is too long", field="context", limit=f"{MAX_CONTEXT_BYTES} bytes")
-    context = read_declaration(ContextIn, text, "context").given(name)
+    context = (await read_declaration(ContextIn, text, "context")).given(name)
     if vehicle:
         context = _of_vehicle(context, vehicle)
         text += b"\n" + vehicle.encode()
@@ -78,7 +80,7 @@ async def get_upload(
 
 def _of_vehicle(context: ContextInput, vehicle: str) -> ContextInput:
     """The context with the vehicle that the form's part names."""
-    named = validated(ContextIn, {"vehicle": vehicle}, "form").vehicle
+    named = validated(TypeAdapter(ContextIn), {"vehicle": vehicle}, "form").vehicle
     if context.vehicle not in (None, named):
         raise MalformedRequest(
             "the form and the context name different vehicles",

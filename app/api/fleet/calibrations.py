@@ -89,7 +89,7 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
     if len(text) > MAX_DECLARATION_BYTES:
         raise MalformedRequest("the declaration is too long", field="declaration", limit="16 KiB", cure=_CURE)
     key = idempotency_of(request, idempotency_key, text, *(data for _name, data in photos))
-    return _Asked(tuple(photos), read_declaration(CalibrationIn, text, "declaration"), key)
+    return _Asked(tuple(photos), await read_declaration(CalibrationIn, text, "declaration"), key)
 
 
 Service = Annotated[Calibrations, use_cases("calibrations")]

@@ -6,13 +6,12 @@ import hashlib
 from typing import Any, TypeVar
 
 from fastapi import Request
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter
 from starlette.datastructures import FormData, UploadFile
 
 from app.api.http.components import reference
 from app.api.http.dependencies import checked_idempotency_key
-from app.api.http.strict_json import parse_json
+from app.api.http.strict_json import in_thread_if_large, parse_json, validated
 from app.services.idempotency import IdempotencyKey
 
 FORM = "multipart/form-data"
@@ -30,21 +29,7 @@ async def read_text(form: FormData, name: str) -> bytes:
     return await part.read() if isinstance(part, UploadFile) else part.encode()
 
 
-def validated(model: type[ModelT], value: Any, *where: str) -> ModelT:
-    """A value as a model.
-
-    Raises
-    ------
-    RequestValidationError
-        It is not valid; the locations begin with `where`, because the problem table expects them inside a request.
-    """
-    try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        raise RequestValidationError([{**fault, "loc": (*where, *fault["loc"])} for fault in error.errors()]) from error
-
-
-def read_declaration(model: type[ModelT], text: bytes, *where: str) -> ModelT:
+async def read_declaration(model: type[ModelT], text: bytes, *where: str) -> ModelT:
     """A model from the JSON text of the part that `where` ends with; an empty text declares nothing.
 
     Raises
@@ -54,7 +39,11 @@ def read_declaration(model: type[ModelT], text: bytes, *where: str) -> ModelT:
     RequestValidationError
         It is not valid.
     """
-    return validated(model, parse_json(text, where[-1]) if text.strip() else {}, *where)
+
+    def read() -> ModelT:
+        return validated(TypeAdapter(model), parse_json(text, where[-1]) if text.strip() else {}, *where)
+
+    return await in_thread_if_large(len(text), read)
 
 
 def idempotency_of(request: Request, header: str | None, text: bytes, *files: bytes) -> IdempotencyKey | None:

@@ -16,11 +16,15 @@ from starlette.exceptions import HTTPException
 from app import errors
 from app.api.http.components import reference
 from app.encoders.magnet import CodebookFull
-from app.services.error_documents import ErrorCause, error_cause
+from app.services.error_documents import ErrorCause, cut_text, error_cause
 
 Described = dict[int | str, dict[str, Any]]
 """What FastAPI's argument `responses` takes: status to description."""
 MEDIA_TYPE = "application/problem+json"
+MAX_ERRORS = 20
+"""Errors that a problem document lists."""
+MAX_TEXT_BYTES = 500
+"""Of a text in a problem document: with `MAX_ERRORS`, a document is smaller than 64 kB."""
 _LOG = structlog.get_logger(__name__)
 
 
@@ -50,7 +54,9 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     ),
     errors.StaleVersion: ProblemKind(412, "stale-version", "The resource was changed in the meantime"),
     errors.UploadTooLarge: ProblemKind(413, "too-large", "The request is too large"),
-    errors.UnsupportedUpload: ProblemKind(415, "unsupported-upload", "No decoder supports this file"),
+    errors.UnsupportedUpload: ProblemKind(
+        415, "unsupported-upload", "The media type or the kind of file is not supported"
+    ),
     errors.InvalidParameter: ProblemKind(422, "invalid-parameter", "A value is not allowed"),
     errors.CodeMismatch: ProblemKind(422, "code-mismatch", "The digits do not match the position or scheme"),
     errors.ReferenceSystemError: ProblemKind(422, "reference-system", "The reference system cannot be used"),
@@ -108,7 +114,10 @@ class FieldErrorDocument(ErrorCause):
     )
 )
 class Problem(ErrorCause):
-    """RFC 9457 problem document; `field`, `limit` and `cure` are those of the first error."""
+    """RFC 9457 problem document; `field`, `limit` and `cure` are those of the first error.
+
+    At most 20 errors are listed; `errors_left_out` is the number of the others.
+    """
 
     type: str
     title: str
@@ -117,6 +126,7 @@ class Problem(ErrorCause):
     instance: str
     request_id: NotRequired[str]
     errors: NotRequired[list[FieldErrorDocument]]
+    errors_left_out: NotRequired[int]
 
 
 def problem_responses(*statuses: int, refused: type[Problem] | None = None) -> Described:
@@ -129,7 +139,7 @@ def problem_responses(*statuses: int, refused: type[Problem] | None = None) -> D
         The problem document with a report that the route may return with status 422.
     """
     documented: Described = {}
-    for status in sorted({400, 401, 403, 408, 413, 422, 429, 500, 503, *statuses}):
+    for status in sorted({400, 401, 403, 408, 413, 415, 422, 429, 500, 503, *statuses}):
         kinds = [kind for kind in PROBLEMS.values() if kind.status == status]
         titles = "; ".join(f"`{kind.slug}`: {kind.title}" for kind in kinds) or HTTPStatus(status).phrase
         documented[status] = {
@@ -153,12 +163,17 @@ def problem(
     scope: Any,
     faults: list[FieldError] | None = None,
     headers: dict[str, str] | None = None,
+    left_out: int = 0,
 ) -> Response:
-    """A problem document as a response."""
+    """A problem document as a response: at most `MAX_ERRORS` faults, and texts that are cut to `MAX_TEXT_BYTES`."""
     body = _document(kind, detail, scope)
     if faults:
-        errors: list[FieldErrorDocument] = [{"detail": fault.detail, **_cause(fault)} for fault in faults]
+        errors: list[FieldErrorDocument] = [
+            {"detail": _cut(fault.detail), **_cause(fault)} for fault in faults[:MAX_ERRORS]
+        ]
         body = {**body, **_cause(faults[0]), "errors": errors}
+        if (left_out := left_out + len(faults[MAX_ERRORS:])) > 0:
+            body["errors_left_out"] = left_out
     content = orjson.dumps(body, default=str)
     return Response(content, kind.status, _challenge(kind.status, headers), media_type=MEDIA_TYPE)
 
@@ -174,8 +189,8 @@ def _document(kind: ProblemKind, detail: str, scope: Any) -> Problem:
         "type": kind.type,
         "title": kind.title,
         "status": kind.status,
-        "detail": detail,
-        "instance": scope.get("path", ""),
+        "detail": _cut(detail),
+        "instance": _cut(scope.get("path", "")),
     }
     if (request_id := scope.get("state", {}).get("request_id")) is not None:
         document["request_id"] = request_id
@@ -183,7 +198,11 @@ def _document(kind: ProblemKind, detail: str, scope: Any) -> Problem:
 
 
 def _cause(fault: FieldError) -> ErrorCause:
-    return error_cause(fault.field, fault.limit, fault.cure)
+    return error_cause(*(None if text is None else _cut(text) for text in (fault.field, fault.limit, fault.cure)))
+
+
+def _cut(text: str) -> str:
+    return cut_text(text, MAX_TEXT_BYTES)
 
 
 def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
@@ -214,8 +233,9 @@ def install_problem_handlers(app: FastAPI) -> None:
 
     async def on_validation_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
-        faults = [validation_fault(item) for item in error.errors()]
-        return problem(VALIDATION, faults[0].detail, request.scope, faults)
+        found = error.errors()
+        faults = [validation_fault(item) for item in found[:MAX_ERRORS]]
+        return problem(VALIDATION, faults[0].detail, request.scope, faults, left_out=len(found) - len(faults))
 
     async def on_http_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)

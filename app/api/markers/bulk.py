@@ -18,12 +18,14 @@ from app.api.markers.schemas_patch import MarkerPatch
 from app.errors import InvalidParameter, WaymarkError
 from app.families.inputs import StrictModel
 from app.families.plate.inputs import PLATE_EXAMPLES
+from app.services.error_documents import cut_text
 from app.services.markers.bulk import BulkInput, BulkReport, Item, ItemProblem, MarkerUpdate
 from app.services.markers.bulk import BulkMarkers as BulkMarkersService
 
 router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
 
 MAX_ITEMS = 1000
+_MAX_TEXT_BYTES = 160  # source: 1,000 problems of four texts then take less than 1 MB
 
 
 class UpdateIn(StrictModel):
@@ -121,7 +123,7 @@ def _read(item: JsonValue) -> Item:
         assert read.update is not None
         return MarkerUpdate(read.update.id, read.update.version, read.update.change.change())
     except ValidationError as error:
-        first = error.errors()[0]
+        first = error.errors(include_url=False, include_input=False)[0]
         fault = validation_fault({**first, "loc": ("body", *first["loc"])})
         return InvalidParameter(fault.detail, field=fault.field, limit=fault.limit, cure=fault.cure)
     except WaymarkError as error:
@@ -150,11 +152,15 @@ def _described(items: list[JsonValue], index: int, error: WaymarkError) -> ItemP
         "type": kind.type,
         "title": kind.title,
         "status": kind.status,
-        "detail": error.message,
-        "field": f"items.{index}.{_path(items[index], error.field)}".rstrip("."),
-        "limit": error.limit,
-        "cure": error.cure,
+        "detail": _cut(error.message),
+        "field": _cut(f"items.{index}.{_path(items[index], error.field)}".rstrip(".")),
+        "limit": None if error.limit is None else _cut(error.limit),
+        "cure": None if error.cure is None else _cut(error.cure),
     }
+
+
+def _cut(text: str) -> str:
+    return cut_text(text, _MAX_TEXT_BYTES)
 
 
 def _refused(request: Request, report: BulkReport) -> Response:

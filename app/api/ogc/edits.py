@@ -6,15 +6,17 @@ No If-Match is asked for here, because these clients send none. Deleting a marke
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import Depends, Header, Request
+from pydantic import TypeAdapter
 from starlette.responses import Response
 
 from app.api.http.dependencies import Caller, Markers
-from app.api.http.forms import media_type_of, validated
+from app.api.http.forms import media_type_of
 from app.api.http.permissions import PERMISSIONS
-from app.api.http.strict_json import parse_json
+from app.api.http.strict_json import in_thread_if_large, parse_json, validated
 from app.api.markers.markers import NewMarkerIn, patch_marker, post_marker
 from app.api.markers.schemas_patch import MarkerPatch
 from app.api.ogc.dependencies import (
@@ -43,6 +45,7 @@ _SURVEYED = (
 )
 _FIXED = ("family", "scheme", "code")
 _READ_ONLY = ("transform_accuracy_m", "localization_grade", "version", "updated_at")
+_NEW_MARKER, _MARKER_PATCH = TypeAdapter(NewMarkerIn), TypeAdapter(MarkerPatch)
 BODY_TYPES = (GEOJSON, JSON, "application/merge-patch+json")
 
 
@@ -87,7 +90,8 @@ async def get_body(request: Request) -> dict[str, Any]:
     kind = media_type_of(request)
     if kind not in BODY_TYPES:
         raise UnsupportedUpload("the body is not GeoJSON", field="Content-Type", limit=", ".join(BODY_TYPES))
-    body = parse_json(await request.body())
+    raw = await request.body()
+    body = await in_thread_if_large(len(raw), partial(parse_json, raw))
     if not isinstance(body, dict) or body.get("type", "Feature") != "Feature":
         raise InvalidParameter(
             "the body is not a feature", field="type", limit="Feature", cure="send a GeoJSON Feature"
@@ -124,7 +128,7 @@ def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
     body["position"] = _place(feature.get("geometry"), edit.crs) | {n: given[n] for n in _SURVEYED if n in given}
     family = _family(given.get("family", FAMILY_NAMES[0]))
     body |= {"family": family.name, **family.feature_members(given)}
-    made = post_marker(validated(NewMarkerIn, body, "body"), edit.caller, edit.markers, None)
+    made = post_marker(validated(_NEW_MARKER, body, "body"), edit.caller, edit.markers, None)
     marker_id = made.headers["Location"].rsplit("/", 1)[1]
     where = f"{base}/collections/{edit.collection.id}/items/{marker_id}"
     return Response(status_code=201, headers={"Location": where})
@@ -178,7 +182,7 @@ def _change(feature: dict[str, Any], edit: _Edit, feature_id: str) -> Response:
         marker = edit.markers.get(edit.caller, feature_id)
         body["position"] = {**marker["position"]["original"], **surveyed}
     if body:
-        patch_marker(feature_id, validated(MarkerPatch, body, "body"), edit.caller, edit.markers, None)
+        patch_marker(feature_id, validated(_MARKER_PATCH, body, "body"), edit.caller, edit.markers, None)
     return Response(status_code=204)
 
 

@@ -69,7 +69,7 @@ async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = N
     if media_type_of(request) == JSON:
         text = await request.body()
         _check_length(text)
-        road = read_declaration(RoadAlignmentIn, text, "body")
+        road = await read_declaration(RoadAlignmentIn, text, "body")
         return _Upload(b"", "", road, idempotency_of(request, idempotency_key, text))
     if media_type_of(request) != FORM:
         raise UnsupportedUpload(
@@ -90,7 +90,7 @@ async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = N
         data, file_name = await file.read(), (file.filename or "")[:200]
         text = await read_text(form, "declaration")
     _check_length(text)
-    declared = read_declaration(AlignmentIn, text, "body", "declaration")
+    declared = await read_declaration(AlignmentIn, text, "body", "declaration")
     return _Upload(data, file_name, declared, idempotency_of(request, idempotency_key, text, data))
 
 

@@ -89,7 +89,7 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
         raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
     if len(text) > MAX_DECLARATION_BYTES:
         raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
-    declared = read_declaration(DeclarationIn, text, "body", "declaration").declared()
+    declared = (await read_declaration(DeclarationIn, text, "body", "declaration")).declared()
     as_job = len(data) > IMMEDIATE_BYTES or wants_job(prefer)
     return _Asked(import_input(declared, data), declared, idempotency_of(request, idempotency_key, text, data), as_job)
 

@@ -11,10 +11,11 @@ from typing_extensions import TypedDict
 from app.formats.surveys.table import Fault
 from app.registry.jobs import JobRow, JobState
 from app.services.documents import document_of
-from app.services.error_documents import ErrorDocument
+from app.services.error_documents import ErrorDocument, cut_text
 from app.services.markers.accuracy import AccuracyDocument
 from app.surveys.comparison import ComparisonFigures
 
+_MAX_TEXT_BYTES, _MAX_FIELD_BYTES = 320, 120  # source: a report of a thousand faults then takes less than 1 MB
 Outcome = Literal["checked", "stored", "refused"]
 
 
@@ -116,4 +117,11 @@ def import_job_summary(job: JobRow) -> ImportJobSummary:
 
 def fault_document(fault: Fault) -> FaultDocument:
     """A fault as reports of imports have it."""
-    return document_of(FaultDocument, fault, severity=fault.severity.value)
+    return document_of(
+        FaultDocument,
+        fault,
+        field=cut_text(fault.field, _MAX_FIELD_BYTES),
+        message=cut_text(fault.message, _MAX_TEXT_BYTES),
+        proposal=None if fault.proposal is None else cut_text(fault.proposal, _MAX_TEXT_BYTES),
+        severity=fault.severity.value,
+    )

@@ -63,7 +63,7 @@ def test_malformed_json(client: httpx.Client, name: str) -> None:
 @pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", None])
 def test_json_of_another_content_type(client: httpx.Client, kind: str | None) -> None:
     headers = {"Content-Type": kind} if kind else {}
-    _problem(client.post("/v1/markers", content=GOOD, headers=headers), 422)
+    _problem(client.post("/v1/markers", content=GOOD, headers=headers), 415)
 
 
 # --- values -------------------------------------------------------------------------------------------------------
