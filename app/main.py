@@ -287,6 +287,7 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
         },
         permissions=Permissions(),
         body_timeout_s=settings.body_timeout_s,
+        min_bytes_per_s=settings.min_bytes_per_s,
     )
 
 

@@ -49,8 +49,22 @@ class Settings(BaseSettings):
         default=256 * 1024**2, ge=1024, description="Maximum size of a survey to import. [byte]"
     )
     max_image_pixels: int = Field(default=50_000_000, ge=1, description="Maximum size of a picture. [px]")
+    header_timeout_s: float = Field(
+        default=10.0, gt=0, description="Maximum time from the first byte of a request to the end of its headers. [s]"
+    )
     body_timeout_s: float = Field(
         default=30.0, gt=0, description="Maximum time to wait for the next part of a body. [s]"
+    )
+    min_bytes_per_s: float = Field(
+        default=8000.0,
+        gt=0,
+        description="Minimum rate at which bodies arrive and responses are read, after the first `body_timeout_s`. "
+        "[byte/s]",
+    )
+    keep_alive_s: int = Field(default=20, ge=1, description="Maximum time between two requests on one connection. [s]")
+    max_connections: int = Field(default=1000, ge=1, description="Maximum number of connections at a time.")
+    max_connections_per_address: int = Field(
+        default=200, ge=1, description="Maximum number of connections at a time from one address."
     )
     max_archive_frames: int = Field(
         default=500, ge=1, le=10_000, description="Maximum number of frames in one archive."

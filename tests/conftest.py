@@ -19,6 +19,7 @@ import structlog
 import uvicorn
 from fastapi import FastAPI
 
+from app.api.http.connections import ConnectionLimits, limited_connections
 from app.main import create_app
 from app.registry.feature_text import feature_text
 from app.registry.marker_rows import MarkerRow
@@ -42,8 +43,9 @@ class LiveServer:
     def __init__(self, app: FastAPI) -> None:
         self.app = app
         config = uvicorn.Config(
-            CheckedResponses(app), host="127.0.0.1", port=0, log_config=None, access_log=False, lifespan="on"
-        )
+            CheckedResponses(app), host="127.0.0.1", port=0, http=limited_connections(ConnectionLimits()), ws="none",
+            log_config=None, access_log=False, lifespan="on",
+        )  # fmt: skip
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
 

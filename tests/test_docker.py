@@ -16,6 +16,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import httpx
+import pytest
+
+from app.api.http.connections import MAX_HEADER_BYTES
+from app.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 NOT_IN_A_CLONE = {".git", ".venv", "var", "demo-out", "bench-out", "build", "dist", ".hypothesis"}
@@ -124,3 +128,24 @@ def test_what_the_build_does_not_need_stays_outside() -> None:
     assert Path("static/index.html") in files
     for path in ("tests/test_docker.py", "docs/ogc.md", "Makefile", ".gitignore"):
         assert Path(path) not in files
+
+
+def test_the_proxy_has_the_limits_of_the_server(tmp_path: Path) -> None:
+    text = (ROOT / "docker/nginx.conf").read_text()
+    settings = Settings()
+    for directive, expected in (
+        ("client_header_timeout", f"{settings.header_timeout_s:.0f}s"),
+        ("client_body_timeout", f"{settings.body_timeout_s:.0f}s"),
+        ("send_timeout", f"{settings.body_timeout_s:.0f}s"),
+        ("limit_conn addresses", f"{settings.max_connections_per_address}"),
+        ("limit_conn all", f"{settings.max_connections}"),
+        ("client_max_body_size", f"{settings.max_import_bytes // 1024**2 + 1}m"),
+        ("large_client_header_buffers", f"4 {MAX_HEADER_BYTES // 4 // 1024}k"),
+    ):
+        assert re.search(rf"^ *{directive} {expected};", text, re.MULTILINE), directive
+    (tmp_path / "nginx.conf").write_text(text.replace("server waymark:8000", "server 127.0.0.1:8000"))
+    if (nginx := shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin")) is None:
+        pytest.skip("nginx is not installed")
+    command = [nginx, "-t", "-p", str(tmp_path), "-c", "nginx.conf"]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr

@@ -15,24 +15,14 @@ PortOption = Annotated[int | None, typer.Option(help="Port to listen on. Default
 
 def serve(host: HostOption = None, port: PortOption = None) -> None:
     """Start the server. On an empty database it prints the first admin key."""
-    import uvicorn
-
+    from app.cli.serving import serve_until_stopped
     from app.logs import configure_logs
-    from app.main import create_app
 
     settings = read_settings(host=host, port=port)
     configure_logs(settings.log_format, settings.log_level)
     with owned_database(settings):
         pass  # a database that another process owns is reported in one line here, not in a traceback of the server
-    uvicorn.run(
-        create_app(settings),
-        host=settings.host,
-        port=settings.port,
-        log_config=None,
-        access_log=False,
-        server_header=False,
-        timeout_graceful_shutdown=30,
-    )
+    serve_until_stopped(settings)
 
 
 def demo(

@@ -110,6 +110,8 @@ class Guarded:
         Who may make which request.
     body_timeout_s : float
         Longest wait for the next part of a body. [s]
+    min_bytes_per_s : float
+        Lowest rate at which a body may arrive after `body_timeout_s` of waiting for it. [byte/s]
     """
 
     def __init__(
@@ -124,6 +126,7 @@ class Guarded:
         body_limits: Mapping[str, int],
         permissions: Permissions,
         body_timeout_s: float,
+        min_bytes_per_s: float,
     ) -> None:
         self._app = app
         self._authenticate = authenticate
@@ -134,6 +137,7 @@ class Guarded:
         self._body_limits = body_limits
         self._permissions = permissions
         self._body_timeout_s = body_timeout_s
+        self._min_bytes_per_s = min_bytes_per_s
         self._threads = anyio.CapacityLimiter(_AUTH_THREADS)  # its own, or slow requests would keep new ones waiting
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -153,7 +157,38 @@ class Guarded:
             await response(scope, receive, send)
             return
         with acting_for(scope.get("state", {}).get("agency_id", "")):
-            await self._app(scope, _limited(receive, limit, self._body_timeout_s), send)
+            await self._app(scope, self._limited(receive, limit), send)
+
+    def _limited(self, receive: Receive, limit: int) -> Receive:
+        """A `receive` that stops a body that is too large or too slow. Only the time spent waiting for it counts."""
+        seen, waited_s, complete = 0, 0.0, False
+
+        async def receive_within_limit() -> Message:
+            nonlocal seen, waited_s, complete
+            if complete:
+                return await receive()
+            started = time.perf_counter()
+            allowed_s = self._body_timeout_s + seen / self._min_bytes_per_s - waited_s
+            try:
+                with anyio.fail_after(min(self._body_timeout_s, allowed_s)):
+                    message = await receive()
+            except TimeoutError as error:
+                raise self._too_slow(seen) from error
+            waited_s += time.perf_counter() - started
+            if message["type"] == "http.request":
+                seen += len(message.get("body", b""))
+                complete = not message.get("more_body", False)
+                if seen > limit:
+                    raise BodyRefused(_too_large(limit))
+            return message
+
+        return receive_within_limit
+
+    def _too_slow(self, seen: int) -> HTTPException:
+        limit = (
+            f"no part for {self._body_timeout_s:g} s, or fewer than {self._min_bytes_per_s:g} bytes/s in the long run"
+        )
+        return HTTPException(408, f"the body arrived too slowly: {limit} ({seen} bytes came)", {"Connection": "close"})
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
         key = _key_in(headers)
@@ -216,26 +251,3 @@ def _too_large(limit: int) -> UploadTooLarge:
     return UploadTooLarge(
         f"the body is larger than {limit} bytes", field="body", limit=f"{limit} bytes", cure="split the request"
     )
-
-
-def _limited(receive: Receive, limit: int, timeout_s: float) -> Receive:
-    """A `receive` that stops a body that is too large or too slow."""
-    seen, complete = 0, False
-
-    async def receive_within_limit() -> Message:
-        nonlocal seen, complete
-        if complete:
-            return await receive()
-        try:
-            with anyio.fail_after(timeout_s):
-                message = await receive()
-        except TimeoutError as error:
-            raise HTTPException(408, f"no part of the body arrived for {timeout_s:g} s") from error
-        if message["type"] == "http.request":
-            seen += len(message.get("body", b""))
-            complete = not message.get("more_body", False)
-            if seen > limit:
-                raise BodyRefused(_too_large(limit))
-        return message
-
-    return receive_within_limit

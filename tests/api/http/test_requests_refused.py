@@ -289,6 +289,25 @@ def test_a_body_that_does_not_come_is_given_up(serve: Callable[[Settings], LiveS
     assert time.monotonic() - started > 0.25
 
 
+def test_a_body_that_comes_byte_by_byte_is_given_up(
+    serve: Callable[[Settings], LiveServer], settings: Settings
+) -> None:
+    server = serve(settings.model_copy(update={"body_timeout_s": 0.5, "min_bytes_per_s": 1e6}))
+    sent = 0
+
+    def slowly() -> Iterator[bytes]:
+        nonlocal sent
+        while sent < 1000:
+            sent += 1
+            yield b" "
+            time.sleep(0.01)  # the sender's slowness is what is tested
+
+    with server.client() as client:
+        problem = _problem(client.post("/v1/markers", content=slowly(), headers=JSON), 408)
+    assert sent < 1000
+    assert "bytes/s" in problem["detail"]
+
+
 # --- bugs ---------------------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,84 @@
+"""The server's process: its sockets, its limits, and its end within seconds."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import threading
+from contextlib import suppress
+from types import FrameType
+
+import structlog
+import uvicorn
+
+from app.api.http.connections import ConnectionLimits, limited_connections
+from app.settings import Settings
+
+_GRACE_S = 2
+"""How long running requests may go on after SIGTERM; then the decoder processes are stopped. [s]"""
+_END_S = 4.0
+"""When the process ends after SIGTERM, whatever still runs. [s] Nothing is lost: a transaction is committed as a whole
+or not at all, and the next start goes on with unfinished jobs."""
+_FILES_PER_CONNECTION = 2
+"""A connection and its upload. Databases, decoder processes and logs take fewer than `_OTHER_FILES`."""
+_OTHER_FILES = 512
+_NOT_STARTED = 3
+"""Exit status; source: STARTUP_FAILURE of uvicorn."""
+_LOG = structlog.get_logger(__name__)
+
+
+class StoppingServer(uvicorn.Server):
+    """A server that ends within `_END_S` after SIGTERM or Ctrl-C."""
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to stop; the next SIGTERM ends the process at once."""
+        super().handle_exit(sig, frame)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        end = threading.Timer(_END_S, _end)
+        end.daemon = True
+        end.start()
+
+
+def serve_until_stopped(settings: Settings) -> None:
+    """Serve until SIGTERM or Ctrl-C."""
+    from app.main import create_app
+
+    _raise_file_limit(_FILES_PER_CONNECTION * settings.max_connections + _OTHER_FILES)
+    limits = ConnectionLimits(
+        header_s=settings.header_timeout_s,
+        stall_s=settings.body_timeout_s,
+        min_bytes_per_s=settings.min_bytes_per_s,
+        total=settings.max_connections,
+        per_address=settings.max_connections_per_address,
+    )
+    config = uvicorn.Config(
+        create_app(settings),
+        host=settings.host,
+        port=settings.port,
+        http=limited_connections(limits),
+        ws="none",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_keep_alive=settings.keep_alive_s,
+        timeout_graceful_shutdown=_GRACE_S,
+    )
+    server = StoppingServer(config)
+    with suppress(KeyboardInterrupt):  # raised again by uvicorn after it has stopped
+        server.run()
+    if not server.started:
+        raise SystemExit(_NOT_STARTED)
+
+
+def _raise_file_limit(files: int) -> None:
+    """Let this process open enough files: many systems start with 1,024."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = files if hard == resource.RLIM_INFINITY else min(files, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+def _end() -> None:
+    _LOG.warning("requests or jobs that did not end in time are interrupted")
+    os.kill(os.getpid(), signal.SIGTERM)
