@@ -18,10 +18,13 @@ class ResponseRow(NamedTuple):
     response: Any
 
 
-def find_response(connection: sa.Connection, agency_id: str, key: str, now: datetime) -> ResponseRow | None:
-    """The answer that was given under this key, unless it has expired."""
+def find_response(
+    connection: sa.Connection, agency_id: str, holder_id: str, key: str, now: datetime
+) -> ResponseRow | None:
+    """The answer that this holder was given under this key, unless it has expired."""
     query = select_rows(ResponseRow, idempotency_keys).where(
         idempotency_keys.c.agency_id == agency_id,
+        idempotency_keys.c.holder_id == holder_id,
         idempotency_keys.c.key == key,
         idempotency_keys.c.expires_at > now,
     )
@@ -31,6 +34,7 @@ def find_response(connection: sa.Connection, agency_id: str, key: str, now: date
 def add_response(
     connection: sa.Connection,
     agency_id: str,
+    holder_id: str,
     key: str,
     *,
     request_sha256: str,
@@ -43,6 +47,7 @@ def add_response(
     connection.execute(
         sa.insert(idempotency_keys).values(
             agency_id=agency_id,
+            holder_id=holder_id,
             key=key,
             request_sha256=request_sha256,
             response=response,

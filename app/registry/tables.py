@@ -280,6 +280,7 @@ idempotency_keys = sa.Table(
     "idempotency_keys",
     metadata,
     sa.Column("agency_id", ID, sa.ForeignKey("agencies.id"), primary_key=True),
+    sa.Column("holder_id", sa.String(200), primary_key=True, server_default=""),  # whose request; empty: a job's own
     sa.Column("key", sa.String(200), primary_key=True),
     sa.Column("request_sha256", sa.String(64), nullable=False),
     sa.Column("response", sa.JSON, nullable=False),

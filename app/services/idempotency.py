@@ -19,10 +19,19 @@ ResponseT = TypeVar("ResponseT")
 
 @dataclass(frozen=True, slots=True)
 class IdempotencyKey:
-    """A client's key, and the hash of the request that it came with."""
+    """A client's key, the hash of the request that it came with, and whose request it is.
+
+    Attributes
+    ----------
+    key, request_sha256 : str
+    holder_id : str
+        `Caller.key_id`. Other callers of the agency have other scopes, and may not see the response. Empty for the
+        server's own jobs.
+    """
 
     key: str
     request_sha256: str
+    holder_id: str
 
 
 class Answer:
@@ -67,6 +76,7 @@ def idempotent(
         idempotency.add_response(
             connection,
             agency_id,
+            key.holder_id,
             key.key,
             request_sha256=key.request_sha256,
             response=answer.response,
@@ -108,7 +118,7 @@ def find_response(connection: sa.Connection, agency_id: str, key: IdempotencyKey
     """As `find_earlier`, in a transaction that does more."""
     if key is None:
         return None
-    answer = idempotency.find_response(connection, agency_id, key.key, now)
+    answer = idempotency.find_response(connection, agency_id, key.holder_id, key.key, now)
     if answer is None:
         return None
     if answer.request_sha256 != key.request_sha256:

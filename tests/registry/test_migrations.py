@@ -115,7 +115,9 @@ def _made(count: int) -> Made:
             {"decode_id": DECODE, "marker_id": m["id"], "frame": 1, "agency_id": AGENCY, "at": NOW, "what": "seen"}
             for m in made[:300]
         ],
-        "idempotency_keys": [{"key": "k", "request_sha256": "s", "response": {"b": 1}, "expires_at": NOW, **owned}],
+        "idempotency_keys": [
+            {"holder_id": "", "key": "k", "request_sha256": "s", "response": {"b": 1}, "expires_at": NOW, **owned}
+        ],
         "magnets": [
             {"row": k + 1, "marker_id": m["id"], "number": 1, "agency_id": AGENCY, "polarity": "N", "phi_deg": 90}
             | {"lon_deg": m["lon_deg"], "lat_deg": m["lat_deg"]}
@@ -195,6 +197,18 @@ def _compare_indexes(connection: sa.Connection, made: list[dict[str, Any]]) -> N
     magnets = {m["id"] for m in made if m["family"] == "magnet" and m["status"] != "retired"}
     assert {row.marker_id for row in list_magnets_in(connection, box)} == inside & magnets
     assert inside
+
+
+def test_responses_of_a_holder_are_given_to_nobody_else_by_an_older_release(database: Database) -> None:
+    """Two holders used one key; the older schema knows only the agency."""
+    made = _made(40)
+    row = made["idempotency_keys"][0]
+    made["idempotency_keys"] += [{**row, "holder_id": "one"}, {**row, "holder_id": "two"}]
+    _fill(database, made)
+    database.migrate("0014")
+    database.migrate()
+    with database.read() as connection:
+        assert connection.exec_driver_sql("SELECT holder_id, key FROM idempotency_keys").all() == [("", "k")]
 
 
 def test_to_nothing_and_back(database: Database) -> None:

@@ -36,12 +36,17 @@ def use_cases(name: str) -> Any:
     return Depends(get)
 
 
-async def get_caller(request: Request) -> CallerValue:
+def caller_of(request: Request) -> CallerValue:
     """The caller that the middleware authenticated."""
     caller = request.scope.get("state", {}).get("caller")
     if not isinstance(caller, CallerValue):
         raise NotAuthenticated("this resource needs a key", field="Authorization")
     return caller
+
+
+async def get_caller(request: Request) -> CallerValue:
+    """As `caller_of`; async, because a plain function would cost a hop to a thread."""
+    return caller_of(request)
 
 
 def checked_idempotency_key(key: str | None) -> str | None:
@@ -62,7 +67,7 @@ async def get_idempotency_key(request: Request, header: IdempotencyKeyHeader = N
     if key is None:
         return None
     digest = hashlib.sha256(f"{request.method} {request.url.path}\n".encode() + await request.body())
-    return IdempotencyKey(key, digest.hexdigest())
+    return IdempotencyKey(key, digest.hexdigest(), caller_of(request).key_id)
 
 
 async def get_version(if_match: IfMatch = None) -> int | None:
@@ -96,6 +101,11 @@ async def get_version(if_match: IfMatch = None) -> int | None:
     return int(digits)
 
 
+async def find_version(if_match: IfMatch = None) -> int | None:
+    """As `get_version`, for clients that may leave If-Match out: they change any version."""
+    return await get_version(if_match) if (if_match or "").strip() else None
+
+
 async def refuse_unknown_parameters(request: Request) -> None:
     """Refuse query parameters that the route does not know: a filter with a slip in its name would let all through.
 
@@ -126,3 +136,4 @@ Caller = Annotated[CallerValue, Depends(get_caller)]
 Markers = Annotated[MarkersService, use_cases("markers")]
 Idempotency = Annotated[IdempotencyKey | None, Depends(get_idempotency_key)]
 Version = Annotated[int | None, Depends(get_version)]
+SentVersion = Annotated[int | None, Depends(find_version)]

@@ -10,7 +10,7 @@ from pydantic import BaseModel, TypeAdapter
 from starlette.datastructures import FormData, UploadFile
 
 from app.api.http.components import reference
-from app.api.http.dependencies import checked_idempotency_key
+from app.api.http.dependencies import caller_of, checked_idempotency_key
 from app.api.http.strict_json import in_thread_if_large, parse_json, validated
 from app.services.idempotency import IdempotencyKey
 
@@ -55,7 +55,7 @@ def idempotency_of(request: Request, header: str | None, text: bytes, *files: by
     digest = hashlib.sha256(f"{request.url.path} {lengths}\n".encode())
     for part in (text, *files):
         digest.update(part)
-    return IdempotencyKey(key, digest.hexdigest())
+    return IdempotencyKey(key, digest.hexdigest(), caller_of(request).key_id)
 
 
 def form_body(

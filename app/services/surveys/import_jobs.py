@@ -143,7 +143,7 @@ class ImportJobs:
 
         step(_STARTED)
         given = import_input(row.input["declaration"], self._blobs.get(row.upload_key))
-        report, _ = self._imports.run(caller, given, IdempotencyKey(f"import {row.id}", row.id), step)
+        report, _ = self._imports.run(caller, given, IdempotencyKey(f"import {row.id}", row.id, ""), step)
         with self._database.write() as connection:
             job.finish(connection, report)
 

@@ -278,6 +278,17 @@ def test_an_idempotency_key_decodes_once(client: httpx.Client, plate: dict[str, 
     assert stored.counts() == counts
 
 
+def test_a_vehicle_that_repeats_another_upload_gets_a_decode_of_its_own(server: LiveServer) -> None:
+    key, name = {"Idempotency-Key": "frame-0001"}, "agency of a vehicle"
+    with server.agency(name, Scope.ADMIN) as admin, server.agency(name, Scope.VEHICLE) as vehicle:
+        first = post_frame(admin, GOOD, **key).json()["id"]
+        mine = post_frame(vehicle, GOOD, **key)
+        assert mine.status_code == 201
+        assert "idempotency-replayed" not in mine.headers
+        assert mine.json()["id"] != first
+        assert vehicle.get(f"/v1/decodes/{first}").status_code == 404
+
+
 # --- reading back -------------------------------------------------------------------------------------------------
 
 

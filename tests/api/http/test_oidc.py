@@ -334,6 +334,11 @@ def test_a_token_works_as_a_key_does(live: LiveServer) -> None:
             assert viewer.post("/v1/markers", json={"position": position}).status_code == 403
             assert planner.get("/v1/keys").status_code == 403
             assert planner.get(f"{path}/versions").json()["items"][0]["who"] == "ada"
+            once = {"json": {"position": position, "code": {"scheme": "id"}}, "headers": {"Idempotency-Key": "once"}}
+            mine = planner.post("/v1/markers", **once).json()
+            with live.client(token(jti="renewed")) as renewed, live.client(token(sub="another")) as another:
+                assert renewed.post("/v1/markers", **once).json() == mine
+                assert another.post("/v1/markers", **once).json()["id"] != mine["id"]
         with live.client(token(waymark_agency="Nobody")) as stranger:
             refused = stranger.get("/v1/markers")
             assert refused.status_code == 403

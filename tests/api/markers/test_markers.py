@@ -210,6 +210,24 @@ def test_an_idempotent_request_is_stored_once(client: httpx.Client, server: Live
         assert stranger.post("/v1/markers", json=body, headers=headers).json()["id"] != first.json()["id"]
 
 
+def test_an_idempotency_key_belongs_to_the_holder_of_the_key(server: LiveServer, place: Place) -> None:
+    name, body = "agency of several holders", {"position": place(), "code": {"scheme": "id"}}
+    headers = {"Idempotency-Key": "the same"}
+    with server.agency(name, Scope.ADMIN) as admin, server.agency(name, Scope.PLANNER) as planner:
+        first = admin.post("/v1/markers", json=body, headers=headers)
+        other = planner.post("/v1/markers", json=body, headers=headers)
+        assert (first.status_code, other.status_code) == (201, 201)
+        assert other.json()["id"] != first.json()["id"]
+        assert planner.post("/v1/markers", json={**body, "road": "B"}, headers=headers).status_code == 409
+        mine = next(key for key in admin.get("/v1/keys").json()["items"] if key["scope"] == "admin")
+        rotated = admin.post(f"/v1/keys/{mine['id']}/rotate", json={})
+        with server.client(rotated.json()["key"]) as successor:
+            again = successor.post("/v1/markers", json=body, headers=headers)
+        assert again.headers["idempotency-replayed"] == "true"
+        assert again.content == first.content
+        assert len(admin.get("/v1/markers").json()["items"]) == 2
+
+
 def test_a_refused_request_may_be_corrected_under_the_same_key(client: httpx.Client, place: Place) -> None:
     headers = {"Idempotency-Key": "k1"}
     assert client.post("/v1/markers", json={"position": {}}, headers=headers).status_code == 422
