@@ -57,10 +57,10 @@ def _require_keys(document: dict[str, Any]) -> None:
 
 
 def _describe_headers(document: dict[str, Any]) -> None:
-    """Headers are absent or texts, never null; a route without If-Match returns 428, so clients must send it."""
+    """Headers are absent or texts, never null; clients must send If-Match where a route returns 428 without it."""
     for operations in document["paths"].values():
         for operation in operations.values():
             for parameter in operation.get("parameters", ()):
                 if parameter["in"] == "header":
                     parameter["schema"] = {"type": "string"}
-                    parameter["required"] = parameter["name"] == "If-Match"
+                    parameter["required"] = parameter["name"] == "If-Match" and "428" in operation["responses"]

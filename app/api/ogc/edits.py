@@ -1,6 +1,7 @@
 """OGC API Features part 4, as QGIS edits: a point and flat properties become what /v1/markers takes.
 
-No If-Match is asked for here, because these clients send none. Deleting a marker retires it: nothing is lost.
+If-Match is not required here, because these clients send none; one that is sent is compared. Deleting a marker retires
+it: nothing is lost.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from fastapi import Depends, Header, Request
 from pydantic import TypeAdapter
 from starlette.responses import Response
 
-from app.api.http.dependencies import Caller, Markers
+from app.api.http.dependencies import Caller, Markers, SentVersion
 from app.api.http.forms import media_type_of
 from app.api.http.permissions import PERMISSIONS
 from app.api.http.strict_json import in_thread_if_large, parse_json, validated
@@ -28,7 +29,7 @@ from app.api.ogc.dependencies import (
     refuse_parameters,
 )
 from app.api.ogc.responses import GEOJSON, JSON
-from app.errors import InvalidParameter, UnsupportedUpload
+from app.errors import InvalidParameter, StaleVersion, UnsupportedUpload
 from app.families import FAMILIES, FAMILY_NAMES, get_family
 from app.families.family import Family
 from app.services.access.access import Caller as CallerValue
@@ -134,7 +135,7 @@ def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
     return Response(status_code=201, headers={"Location": where})
 
 
-def put_feature(feature: Body, edit: Edit, feature_id: FeatureId) -> Response:
+def put_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
     """Replace a marker: what is left out is cleared, but for what a marker always has."""
     stored = edit.features.get(edit.caller, edit.collection, feature_id)
     given = {**dict.fromkeys((*_CLEARED, *_SURVEYED)), **_properties(feature)}
@@ -143,25 +144,27 @@ def put_feature(feature: Body, edit: Edit, feature_id: FeatureId) -> Response:
     if tuple(place.values()) == tuple(before) and all(given[name] == properties[name] for name in _SURVEYED):
         for name in _SURVEYED:  # the position is as it was, and stays as it was sent
             del given[name]
-        return _change({"properties": given}, edit, feature_id)
-    return _change({"properties": given, "geometry": feature["geometry"]}, edit, feature_id)
+        return _change({"properties": given}, edit, feature_id, version)
+    return _change({"properties": given, "geometry": feature["geometry"]}, edit, feature_id, version)
 
 
-def patch_feature(feature: Body, edit: Edit, feature_id: FeatureId) -> Response:
+def patch_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
     """Change properties or the position of a marker."""
-    return _change(feature, edit, feature_id)
+    return _change(feature, edit, feature_id, version)
 
 
-def delete_feature(edit: Edit, feature_id: FeatureId) -> Response:
+def delete_feature(edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
     """Retire a marker."""
     edit.features.get(edit.caller, edit.collection, feature_id)
     patch = MarkerPatch(status="retired", reason="deleted through OGC API Features")
-    patch_marker(feature_id, patch, edit.caller, edit.markers, None)
+    patch_marker(feature_id, patch, edit.caller, edit.markers, version)
     return Response(status_code=204)
 
 
-def _change(feature: dict[str, Any], edit: _Edit, feature_id: str) -> Response:
+def _change(feature: dict[str, Any], edit: _Edit, feature_id: str, version: int | None) -> Response:
     stored = edit.features.get(edit.caller, edit.collection, feature_id)
+    if version not in (None, stored["properties"]["version"]):  # also where there is nothing to change
+        raise StaleVersion(f"marker {feature_id} is no longer at version {version}", field="If-Match")
     given = _properties(feature)
     for name in _FIXED:
         if name in given and given[name] != stored["properties"][name]:
@@ -182,7 +185,7 @@ def _change(feature: dict[str, Any], edit: _Edit, feature_id: str) -> Response:
         marker = edit.markers.get(edit.caller, feature_id)
         body["position"] = {**marker["position"]["original"], **surveyed}
     if body:
-        patch_marker(feature_id, validated(_MARKER_PATCH, body, "body"), edit.caller, edit.markers, None)
+        patch_marker(feature_id, validated(_MARKER_PATCH, body, "body"), edit.caller, edit.markers, version)
     return Response(status_code=204)
 
 

@@ -89,7 +89,7 @@ def _add_edit(router: APIRouter, path: str, endpoint: Endpoint, method: str, sta
         endpoint,
         methods=[method],
         status_code=status,
-        responses=problem_responses(404, 409, 415),
+        responses=problem_responses(404, 409, *(() if method == "POST" else (412,)), 415),
         openapi_extra={} if method == "DELETE" else {"requestBody": body},
     )
 

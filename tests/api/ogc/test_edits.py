@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -54,6 +55,32 @@ def test_a_marker_is_registered_changed_moved_and_deleted(client: httpx.Client) 
     assert client.get(f"{ITEMS}/{marker}").status_code == 404
     assert marker in ids(get(client, "/ogc/collections/retired_markers/items"))
     assert len(client.get(f"/v1/markers/{marker}/versions").json()["items"]) == 4
+
+
+@pytest.mark.parametrize("method", ["PUT", "PATCH", "DELETE"])
+def test_an_outdated_if_match_is_refused(
+    client: httpx.Client, method: str, place: Callable[[], dict[str, Any]]
+) -> None:
+    """Without If-Match these routes change any version, because GIS clients send none (docs/ogc.md)."""
+    at = place()
+    marker = _post_feature(client, _feature(at["lon_deg"], at["lat_deg"], road="A7"))
+    url = f"{ITEMS}/{marker}"
+    first = client.get(url)
+    etag = first.headers["etag"]
+    assert client.patch(url, json={"properties": {"road": "B9"}}, headers=SEND).status_code == 204
+    after = client.get(url)
+
+    def edit(if_match: str, **properties: Any) -> httpx.Response:
+        body = None if method == "DELETE" else {**first.json(), "properties": properties}
+        return client.request(method, url, json=body, headers={**SEND, "If-Match": if_match})
+
+    for properties in ({}, {"road": "C1"}):
+        refused = edit(etag, **properties)
+        assert (refused.status_code, refused.json()["field"]) == (412, "If-Match")
+        assert client.get(url).json() == after.json()
+    assert edit("yesterday").status_code == 422
+    assert edit(after.headers["etag"], road="C1").status_code == 204
+    assert edit("*", road="C2").status_code == (404 if method == "DELETE" else 204)
 
 
 def test_a_put_replaces_what_a_marker_need_not_have(client: httpx.Client) -> None:
