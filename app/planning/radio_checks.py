@@ -25,7 +25,7 @@ from app.radio.reception import (
     read_probability,
     road_reception,
 )
-from app.radio.regulation import check_legal
+from app.radio.regulation import check_legal, check_transmitter
 from app.radio.settings import RadioSettings
 
 CAMERA_PREVIEW_M = 31.0  # [m] of lane that a camera sees, beacons must give more; source: CERPM paper, section 5
@@ -188,6 +188,7 @@ def check_radio(plan: RadioPlan) -> RadioCheck:
     days = battery_life_days(plan.settings, plan.battery)
     checks = (
         *check_legal(plan.settings, plan.region),
+        *check_transmitter(plan.settings),
         *_lorawan_room(plan),
         _level(plan),
         _channels(plan),

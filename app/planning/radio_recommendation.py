@@ -14,7 +14,7 @@ from app.radio.airtime import BANDWIDTHS_HZ, SPREADING_FACTORS
 from app.radio.battery import battery_life_days
 from app.radio.lorawan import DATA_RATES
 from app.radio.reception import Air, Approach, approach, read_probability
-from app.radio.regulation import is_legal
+from app.radio.regulation import is_permitted
 from app.radio.settings import RadioSettings
 
 INTERVALS_S = tuple(float(f"{v:.2g}") for v in np.geomspace(0.1, 20.0, 16))  # [s] source: by hand, ratio of 1.42
@@ -126,7 +126,7 @@ def _modulations(plan: RadioPlan) -> Iterator[RadioSettings]:
                     interval_s=INTERVALS_S[-1],
                 )
                 reaches = Air(settings, plan.link, plan.receiver).reach_m > plan.preview_m
-                if reaches and is_legal(replace(settings, interval_s=3600.0), plan.region):
+                if reaches and is_permitted(replace(settings, interval_s=3600.0), plan.region):
                     yield settings
 
 
@@ -137,7 +137,7 @@ def _intervals(first: RadioSettings, plan: RadioPlan) -> Iterator[RadioSettings]
             settings = replace(first, interval_s=interval_s)
         except InvalidParameter:
             continue
-        if is_legal(settings, plan.region):
+        if is_permitted(settings, plan.region):
             yield settings
 
 

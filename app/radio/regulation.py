@@ -1,4 +1,4 @@
-"""Radio regulation of a region: checks of a marker's radio settings.
+"""Checks of a marker's radio settings: the regulation of a region, and the duty cycle of the transmitter itself.
 
 Sources: 47 CFR 15.247 and 15.249 (United States, 902-928 MHz); ERC Recommendation 70-03 annex 1 and ETSI EN 300 220-2
 V3.2.1 table B.1 (Europe, 863-870 MHz, without listen before talk). Figures here are calculated from settings; for
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from app.markers.checks import RadioFinding, Verdict, at_least, at_most
 from app.radio.lorawan import Region
-from app.radio.settings import RadioSettings
+from app.radio.settings import CONTINUOUS_POWER_DBM, FULL_POWER_DUTY_CYCLE, RadioSettings
 
 US_BAND_HZ = (902_000_000, 928_000_000)  # [Hz] source: 47 CFR 15.247(a)
 DWELL_S = 0.4  # [s] source: 47 CFR 15.247(a)(1)(i)
@@ -31,23 +31,25 @@ _20_DB_BANDWIDTH = 1.1  # LoRa's 20 dB bandwidth over its nominal one; source: b
 
 @dataclass(frozen=True, slots=True)
 class SubBand:
-    """A part of the European band with its limits: [Hz], share of an hour, [dBm]."""
+    """A part of the European band with its limits: [Hz], share of an hour, [dBm], [dBm in any 100 kHz]."""
 
     low_hz: int
     high_hz: int
     duty_cycle: float
     erp_dbm: float
+    density_dbm: float = math.inf
 
 
 EU_SUB_BANDS = (
     SubBand(863_000_000, 865_000_000, 0.001, 14.0),
-    SubBand(865_000_000, 868_000_000, 0.01, 14.0),
+    SubBand(865_000_000, 868_000_000, 0.01, 14.0, density_dbm=6.2),
     SubBand(868_000_000, 868_600_000, 0.01, 14.0),
     SubBand(868_700_000, 869_200_000, 0.001, 14.0),
     SubBand(869_400_000, 869_650_000, 0.1, 27.0),
     SubBand(869_700_000, 870_000_000, 0.01, 14.0),
 )
 """Source: EN 300 220-2 V3.2.1, table B.1, bands K, L, M, N, P and Q."""
+_EU_DENSITY_HZ = 100_000  # [Hz] source: EN 300 220-2 V3.2.1, table B.1, band L
 
 
 def check_legal(settings: RadioSettings, region: Region) -> tuple[RadioFinding, ...]:
@@ -66,9 +68,35 @@ def check_legal(settings: RadioSettings, region: Region) -> tuple[RadioFinding, 
     return _check_us(settings) if region is Region.US915 else _check_eu(settings)
 
 
-def is_legal(settings: RadioSettings, region: Region) -> bool:
-    """Whether every rule is met."""
-    return all(finding.passed for finding in check_legal(settings, region))
+def check_transmitter(settings: RadioSettings) -> tuple[RadioFinding, ...]:
+    """Check the duty cycle of the chip above 17 dBm, where its data sheet limits it.
+
+    Parameters
+    ----------
+    settings : RadioSettings
+
+    Returns
+    -------
+    tuple of RadioFinding
+        Empty at 17 dBm and less.
+    """
+    if settings.power_dbm <= CONTINUOUS_POWER_DBM:
+        return ()
+    return (
+        at_most(
+            "transmitter-duty-cycle",
+            settings.time_on_air_s / settings.interval_s,
+            FULL_POWER_DUTY_CYCLE,
+            "of the time",
+            "SX1276 data sheet, section 5.4.3",
+            f"of the power amplifier above {CONTINUOUS_POWER_DBM:g} dBm",
+        ),
+    )
+
+
+def is_permitted(settings: RadioSettings, region: Region) -> bool:
+    """Whether every rule of the region is met, and the transmitter's own limit."""
+    return all(finding.passed for finding in (*check_legal(settings, region), *check_transmitter(settings)))
 
 
 def _within(settings: RadioSettings, low_hz: float, high_hz: float, source: str) -> RadioFinding:
@@ -226,6 +254,7 @@ def _check_eu(settings: RadioSettings) -> tuple[RadioFinding, ...]:
         )
         return (RadioFinding("band", off_hz / 1e6, "<=", 0.0, "MHz", source, Verdict.FAIL, sentence),)
     name = f"{band.low_hz / 1e6:g} to {band.high_hz / 1e6:g} MHz"
+    density = (_eu_density(settings, band, name),) if math.isfinite(band.density_dbm) else ()
     return (
         _within(settings, band.low_hz, band.high_hz, source),
         at_most(
@@ -237,4 +266,19 @@ def _check_eu(settings: RadioSettings) -> tuple[RadioFinding, ...]:
             f"of one marker in {name}, however many channels it uses there",
         ),
         at_most("power", settings.eirp_dbm - _ERP_DB, band.erp_dbm, "dBm ERP", source, f"radiated in {name}"),
+        *density,
+    )
+
+
+def _eu_density(settings: RadioSettings, band: SubBand, name: str) -> RadioFinding:
+    """Density of the radiated power. A warning, because Decision (EU) 2019/1345, band 47, has no such limit."""
+    return at_most(
+        "power-density",
+        settings.eirp_dbm - _ERP_DB - 10 * math.log10(settings.bandwidth_hz / _EU_DENSITY_HZ),
+        band.density_dbm,
+        "dBm ERP/100 kHz",
+        "EN 300 220-2 V3.2.1, table B.1, band L",
+        f"power spread evenly over the channel, in {name}; Decision (EU) 2019/1345, band 47, sets no limit, but a "
+        "device above this one cannot rely on the harmonised standard",
+        worst=Verdict.WARN,
     )

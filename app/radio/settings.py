@@ -18,6 +18,8 @@ from app.radio.lorawan import LORAWAN_BYTES
 
 FREQUENCIES_HZ = (779_000_000, 1_020_000_000)  # [Hz] source: SX1276 data sheet, its highest band
 POWER_DBM = (-4.0, 20.0)  # [dBm] source: SX1276 data sheet, section 5.4, both outputs
+CONTINUOUS_POWER_DBM = 17.0  # [dBm] at any duty cycle; source: SX1276 data sheet, section 5.4.3
+FULL_POWER_DUTY_CYCLE = 0.01  # above 17 dBm; source: SX1276 data sheet, section 5.4.3, operation at +20 dBm
 INTERVALS_S = (0.05, 86_400.0)  # [s] source: by hand, 20 a second to one a day
 MAX_CHANNELS = 128  # source: by hand, twice the 64 channels of US915
 CHANNEL_STEP = 1.6  # bandwidths between channels; source: LoRaWAN Regional Parameters, 200 kHz for 125 kHz
@@ -41,7 +43,7 @@ class RadioSettings:
         Each interval is drawn evenly from interval (1 - share) to interval (1 + share), 0 to 0.9: without it two
         markers that collide once collide every time.
     power_dbm : float
-        At the antenna's connector, -4 to 20. [dBm]
+        At the antenna's connector, -4 to 20; above 17 the transmitter may send 1 % of the time. [dBm]
     antenna_gain_dbi : float
         -10 to 6. [dBi]
     channels : int
@@ -62,7 +64,7 @@ class RadioSettings:
     frequency_hz: int = 915_000_000
     spreading_factor: int = 7
     bandwidth_hz: int = 500_000
-    interval_s: float = 1.0
+    interval_s: float = 1.6
     jitter_share: float = 0.2
     power_dbm: float = 20.0
     antenna_gain_dbi: float = 2.15

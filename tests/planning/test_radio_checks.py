@@ -16,7 +16,7 @@ from app.radio.collisions import Receiver
 from app.radio.link import LinkModel
 from app.radio.lorawan import Region
 from app.radio.reception import RoadMarkers
-from app.radio.regulation import is_legal
+from app.radio.regulation import is_permitted
 from app.radio.settings import RadioSettings
 
 TEN_A_SIDE = RoadMarkers(np.repeat(np.arange(10) * 12.192, 2), np.tile([1.8, -1.8], 10))
@@ -181,7 +181,7 @@ def test_recommended_settings_pass_the_checks(plan: RadioPlan) -> None:
     found = recommend_settings(plan)
     assert found.reaches
     assert found.settings is not None
-    assert is_legal(found.settings, plan.region)
+    assert is_permitted(found.settings, plan.region)
     receiver = replace(plan.receiver, channels=found.receiver_channels)
     check = check_radio(replace(plan, settings=found.settings, receiver=receiver))
     assert named(check, "read-in-time").passed
@@ -221,7 +221,7 @@ def test_what_cannot_be_reached_lawfully_is_said() -> None:
     found = recommend_settings(RadioPlan(EUROPE, region=Region.EU868))
     assert not found.reaches
     assert found.settings is not None
-    assert is_legal(found.settings, Region.EU868)
+    assert is_permitted(found.settings, Region.EU868)
     assert found.read_probability < 0.99
     nowhere = recommend_settings(RadioPlan(RadioSettings(), region=Region.EU868))
     assert nowhere.settings is None

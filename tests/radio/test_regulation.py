@@ -9,12 +9,13 @@ import pytest
 from app.errors import InvalidParameter
 from app.markers.checks import RadioFinding, Verdict
 from app.radio.lorawan import Region
-from app.radio.regulation import FIELD_EIRP_DBM, check_legal, is_legal
+from app.radio.regulation import FIELD_EIRP_DBM, check_legal, check_transmitter, is_permitted
 from app.radio.settings import RadioSettings
 
 HOPPING = RadioSettings(
-    frequency_hz=902_300_000, bandwidth_hz=125_000, spreading_factor=10, interval_s=2.0, channels=64, hopping=True
-)
+    frequency_hz=902_300_000, bandwidth_hz=125_000, spreading_factor=10, interval_s=2.0, power_dbm=17.0, channels=64,
+    hopping=True,
+)  # fmt: skip
 EUROPE = RadioSettings(
     frequency_hz=868_100_000, bandwidth_hz=125_000, spreading_factor=7, interval_s=10.0, power_dbm=14.0
 )
@@ -43,19 +44,19 @@ def test_a_fixed_beacon_in_a_narrow_channel_fits_neither_rule(bandwidth_hz: int,
     assert "15.247(a)(1)(i), (a)(2)" in finding.source
     assert "no hopping system" in finding.sentence
     assert "no digital modulation" in finding.sentence
-    assert not is_legal(settings, Region.US915)
+    assert not is_permitted(settings, Region.US915)
 
 
 def test_a_whisper_in_a_narrow_channel_is_allowed_by_field_strength() -> None:
     assert pytest.approx(-1.249, abs=1e-3) == FIELD_EIRP_DBM
     settings = RadioSettings(bandwidth_hz=125_000, interval_s=5.0, power_dbm=-4.0, antenna_gain_dbi=2.15)
-    assert is_legal(settings, Region.US915)
-    assert not is_legal(replace(settings, power_dbm=-3.0), Region.US915)
+    assert is_permitted(settings, Region.US915)
+    assert not is_permitted(replace(settings, power_dbm=-3.0), Region.US915)
 
 
 def test_hopping_over_50_narrow_channels_is_allowed_up_to_400_ms() -> None:
     assert 0.37 < HOPPING.time_on_air_s < 0.4
-    assert is_legal(HOPPING, Region.US915)
+    assert is_permitted(HOPPING, Region.US915)
     slow = replace(HOPPING, spreading_factor=11, interval_s=20.0)
     found = findings(slow)
     assert found["dwell-time"].verdict is Verdict.FAIL
@@ -66,7 +67,7 @@ def test_dwell_counts_all_packets_on_one_channel_in_20_s() -> None:
     # 64 channels, a packet each 0.2 s: 1.56 packets on a channel in 20 s, 2 at worst.
     fast = replace(HOPPING, spreading_factor=9, interval_s=0.25, jitter_share=0.1)
     assert findings(fast)["dwell-time"].figure == pytest.approx(2 * fast.time_on_air_s)
-    assert is_legal(replace(fast, interval_s=0.32), Region.US915)
+    assert is_permitted(replace(fast, interval_s=0.32), Region.US915)
 
 
 def test_too_few_channels_are_a_hybrid_at_best() -> None:
@@ -82,8 +83,8 @@ def test_wide_hopping_channels_need_25_and_less_power_below_50() -> None:
     found = findings(settings)
     assert found["hopping-channels"].limit == 25
     assert found["power"].limit == 24.0
-    assert is_legal(settings, Region.US915)
-    assert not is_legal(replace(settings, channels=24), Region.US915)
+    assert is_permitted(settings, Region.US915)
+    assert not is_permitted(replace(settings, channels=24), Region.US915)
 
 
 def test_500_khz_does_not_hop() -> None:
@@ -93,13 +94,13 @@ def test_500_khz_does_not_hop() -> None:
 
 @pytest.mark.parametrize(("frequency_hz", "legal"), [(902_250_000, True), (902_200_000, False), (927_800_000, False)])
 def test_channels_lie_within_the_band(frequency_hz: int, legal: bool) -> None:
-    assert is_legal(RadioSettings(frequency_hz=frequency_hz), Region.US915) is legal
+    assert is_permitted(RadioSettings(frequency_hz=frequency_hz), Region.US915) is legal
 
 
 def test_all_channels_lie_within_the_band() -> None:
     settings = RadioSettings(frequency_hz=915_000_000)
-    assert is_legal(replace(settings, channels=16), Region.US915)
-    assert not is_legal(replace(settings, channels=17), Region.US915)
+    assert is_permitted(replace(settings, channels=16), Region.US915)
+    assert not is_permitted(replace(settings, channels=17), Region.US915)
 
 
 @pytest.mark.parametrize(
@@ -160,3 +161,30 @@ def test_settings_that_no_radio_has_are_refused(values: dict[str, object], field
         RadioSettings(**values)  # type: ignore[arg-type]
     assert caught.value.field == field
     assert caught.value.limit
+
+
+@pytest.mark.parametrize(
+    ("bandwidth_hz", "max_dbm"),
+    [(125_000, 7.169), (250_000, 10.179), (500_000, 13.190)],  # 6.2 dBm + 10 log10(bandwidth / 100 kHz)
+)
+def test_865_to_868_mhz_limits_the_power_in_any_100_khz(bandwidth_hz: int, max_dbm: float) -> None:
+    settings = replace(EUROPE, frequency_hz=867_000_000, bandwidth_hz=bandwidth_hz, power_dbm=max_dbm - 0.01)
+    assert findings(settings, Region.EU868)["power-density"].verdict is Verdict.OK
+    dense = replace(settings, power_dbm=max_dbm + 0.01)
+    assert findings(dense, Region.EU868)["power-density"].verdict is Verdict.WARN
+    assert not is_permitted(dense, Region.EU868)
+    assert "power-density" not in findings(replace(dense, frequency_hz=868_300_000), Region.EU868)
+
+
+def test_the_transmitter_sends_one_percent_of_the_time_above_17_dbm() -> None:
+    often = RadioSettings(interval_s=1.0)
+    assert check_transmitter(replace(often, power_dbm=17.0)) == ()
+    (finding,) = check_transmitter(often)
+    assert finding.verdict is Verdict.FAIL
+    assert finding.figure == pytest.approx(0.0154, abs=1e-4)  # a packet of 15.4 ms every second
+    assert not is_permitted(often, Region.US915)
+    assert is_permitted(replace(often, interval_s=1.6), Region.US915)
+
+
+def test_the_default_settings_are_permitted_where_their_frequency_is() -> None:
+    assert is_permitted(RadioSettings(), Region.US915)

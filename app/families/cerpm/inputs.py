@@ -30,9 +30,11 @@ class RadioIn(StrictModel):
     frequency_hz: Whole = Field(915_000_000, description="Carrier, or the first of several. [Hz]")
     spreading_factor: Whole = Field(7, description="7 to 12, or 6 without a header.")
     bandwidth_hz: Whole = Field(500_000, description="125000, 250000 or 500000. [Hz]")
-    interval_s: Number = Field(1.0, description="From one transmission to the next on average. [s]")
+    interval_s: Number = Field(1.6, description="From one transmission to the next on average. [s]")
     jitter_share: Number = Field(0.2, description="Each interval is drawn evenly around that, this share to each side.")
-    power_dbm: Number = Field(20.0, description="At the antenna's connector, -4 to 20. [dBm]")
+    power_dbm: Number = Field(
+        20.0, description="At the antenna's connector, -4 to 20; above 17 it may send 1 % of the time. [dBm]"
+    )
     antenna_gain_dbi: Number = Field(2.15, description="-10 to 6. [dBi]")
     channels: Whole = Field(1, description="Over which packets are spread, 1 to 128.")
     hopping: Flag = Field(False, description="Every marker uses all channels in turn; else each has one.")
