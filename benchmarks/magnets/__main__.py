@@ -199,14 +199,14 @@ def run_ratio(seed: int, short: bool) -> Result:
 def run_wheel(seed: int, short: bool) -> Result:
     """Table 1."""
     rows: list[Sequence[object]] = []
-    for moment in (0.5, 1.0, 2.0):
+    for moment in (0.5, 1.0, 2.0, 4.0):
         ours, with_amn, without = Tally(), Tally(), Tally()
         for k in range(1 if short else 3):
             drive = scenes.wheel_drive(np.random.default_rng([seed, 31, k]), passes=10 if short else 30, wheel=moment)
             ours.add(score_magnets(drive, decode_trace(drive.trace, BAR)))
-            with_amn.add(score_magnets(drive, _metro(drive), Orientation.UP))
-            off = MetroSettings(amplitude_ut=5.0, cancel_wheels=False)
-            without.add(score_magnets(drive, decode_trace_metro(drive.trace, BAR, off), Orientation.UP))
+            for tally, cancel in ((with_amn, True), (without, False)):
+                one_axis = MetroSettings(amplitude_ut=5.0, cancel_wheels=cancel, only=Orientation.UP)
+                tally.add(score_magnets(drive, decode_trace_metro(drive.trace, BAR, one_axis), Orientation.UP))
         accuracy = [t.found / max(t.true + t.extra + t.wrong, 1) for t in (ours, with_amn, without)]
         rows.append(
             (
@@ -218,7 +218,8 @@ def run_wheel(seed: int, short: bool) -> Result:
     head = ("wheels", "magnets", "accuracy", "precision", "recall", "goal", "met", "metro", "without AMN", "paper")
     return (
         "Upright magnets in front of the left wheel, 30 mph. Accuracy: correct readings over the sum of actual, wrong "
-        "and false ones.",
+        "and false ones. metro searches the z axis, as in the paper, but the strongest of twelve sensors counts, where "
+        "the paper used the one in front of the wheel: without AMN the two are not comparable.",
         head,
         rows,
     )

@@ -19,6 +19,9 @@ VERSION = "metro-1"
 _SPIKE_UT = 100.0  # [uT] a sample so far off the median of three is a fault; source: by hand
 _WHEEL_REACH_M = 0.2  # [m] across, from a reference sensor to those in front of its wheel; source: by hand
 _MERGE_M = 0.125 * 10 / 3.6  # [m] detections nearer than this are one magnet, 0.125 s at 10 km/h; source: by hand
+# Extrema of a dipole's field in units of mu0 m / (4 pi z^3): a forward one has 1 in x and 0.86 in z, an upright one 2 in z
+# and 0.86 in x. The weight is the middle of 1.16 and 0.43. Source: by calculation; METRO section 5.2.2 names the axes
+_AXIS_WEIGHT = {Orientation.FORWARD: 2**0.5, Orientation.UP: 1.0}
 _CONFIDENCE = 0.5  # of every reading; source: by hand, the paper gives none
 
 
@@ -42,6 +45,7 @@ class MetroSettings:
     cancel_wheels: bool = True
     tag_magnets: int = 3
     tag_gap_m: float = 5.0
+    only: Orientation | None = None
 
 
 def decode_trace_metro(
@@ -73,6 +77,8 @@ def decode_trace_metro(
     for j, sensor in enumerate(bar.array):
         lateral_cm = 100 * float(bar.positions_m[sensor, 1])
         for axis, orientation in enumerate((Orientation.FORWARD, Orientation.UP)):
+            if settings.only not in (None, orientation):
+                continue
             at, slope = steps.find_zero_crossings(derivative[:, j, axis])
             limit = steps.slope_threshold(slope)
             amplitude = steps.amplitude_steps(smooth[:, j, axis], at, trace.rate_hz)
@@ -84,7 +90,7 @@ def decode_trace_metro(
                 reading = MagnetReading(
                     float(trace.t_s[i]), float(odometer[i]), lateral_cm, polarity, orientation, _CONFIDENCE
                 )
-                found.append((float(amplitude[k]), reading))
+                found.append((float(amplitude[k]) * _AXIS_WEIGHT[orientation], reading))
     magnets = steps.merge_detections(found, _MERGE_M)
     return [*magnets, *_lines(magnets), *_tags(magnets, trace.t_s, speed, heading, settings)]
 
