@@ -14,7 +14,7 @@ from app.markers.cerpm import LaneSide
 
 Floats = npt.NDArray[np.float64]
 
-SPACING_M = 12.192  # [m] 40 ft; source: the cycle N of a broken line, MUTCD 3B.11, and the CERPM paper
+SPACING_M = 12.192  # [m] 40 ft; source: the cycle N of a broken line, MUTCD 2009 section 3B.11, and the CERPM paper
 MIN_SPACING_M = 1.0  # [m] source: by hand
 SAGITTA_M = 0.15  # [m] of a chord between neighbours, above which they are closer; source: by hand, no measurement kept
 MAX_PER_SIDE = 100_000  # source: by hand, 1,200 km at 40 ft
@@ -56,8 +56,9 @@ def place_markers(
 
     Notes
     -----
-    The spacing follows the US practice for raised markers: N = 40 ft, the cycle of a broken line; along edge lines and
-    in sharp curves half of what the straight has (FHWA, Roadway Delineation Practices Handbook; MUTCD 3B.11 to 3B.14).
+    The spacing follows the US practice for raised markers: N = 40 ft, the cycle of a broken line, and in sharp curves
+    half of what the straight has (MUTCD 2009, sections 3B.11 to 3B.14, 3B.14 to 3B.17 in the edition of 2023).
+    Only plans of whole roads (`app.planning.placement.cerpms`) are closer on transitions too.
     Pairs stand across from each other as in the paper's section 3.2 (Kadav et al., Sensors 2024, 24, 2327).
     """
     lane = cut_lane(left_m, right_m)

@@ -23,6 +23,10 @@ _ROOM_M = 0.4  # [m] between a CERPM and a line magnet; source: half of a CERPM 
 _CLEAR_REACH_M = 2.0  # [m] within which another place is sought; source: chosen by hand, a third of the magnets' 6 m
 _ONE_PLACE_M = 1.0  # [m] between markers of a pair along the lane; source: half of `MIN_SPACING_M`
 _BEND_REACH_M = 6.0  # [m] before and after a bend; source: half of N, as in app/planning/cerpm_placement.py
+_TAPER = (
+    0.01  # change of width over length from which it is a transition; source: a taper of W S feet at mph, MUTCD 2009
+)
+# (3B.09, 6C.08), is 1 in 75 at 75 mph
 
 
 def place_cerpms(lane: Lane, rules: CerpmRules, cycle_m: float, curve_radius_m: float) -> Floats:
@@ -30,8 +34,12 @@ def place_cerpms(lane: Lane, rules: CerpmRules, cycle_m: float, curve_radius_m: 
 
     Notes
     -----
-    Straights have `straight` cycles between pairs and bends `curve` cycles. Then pairs are added in the middle of every
-    gap in which a cubic spline through the pairs leaves the lane by more than `max_path_error_m`.
+    Straights have `straight` cycles between pairs; bends, and transitions where the lane's width changes, `curve`
+    cycles. Then pairs are added in the middle of every gap in which a cubic spline through the pairs leaves the lane by
+    more than `max_path_error_m`.
+
+    Positioning guides are 2 N apart, and N or less on sharp curves and on transitions that reduce lanes or shift
+    traffic: MUTCD 2009, sections 3B.11 and 3B.12 (2023: 3B.14 and 3B.15).
     """
     chainages = _by_cycle(lane, rules, cycle_m, curve_radius_m)
     if rules.max_path_error_m is None:
@@ -125,8 +133,11 @@ def _by_cycle(lane: Lane, rules: CerpmRules, cycle_m: float, curve_radius_m: flo
     """Chainages between which the integral of the density is one; stretched so that both ends have a pair."""
     straight_m, curve_m = rules.straight * cycle_m, rules.curve * cycle_m
     reach = max(round(_BEND_REACH_M / lane.step_m), 1)
-    bent = np.convolve(np.abs(lane.curvature_per_m) > 1 / curve_radius_m, np.ones(2 * reach + 1), mode="same") > 0.5
-    density = np.where(bent, 1 / min(curve_m, straight_m), 1 / straight_m)
+    taper = np.abs(np.gradient(lane.width_m, lane.chainage_m)) > _TAPER
+    close = (
+        np.convolve((np.abs(lane.curvature_per_m) > 1 / curve_radius_m) | taper, np.ones(2 * reach + 1), "same") > 0.5
+    )
+    density = np.where(close, 1 / min(curve_m, straight_m), 1 / straight_m)
     steps = np.diff(lane.chainage_m) * (density[1:] + density[:-1]) / 2
     count = np.concatenate([[0.0], np.cumsum(steps)])
     pairs = max(math.ceil(count[-1] - 1e-6), 1) + 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -143,6 +144,16 @@ def test_cerpms_are_closer_where_the_curvature_changes() -> None:
     added = np.setdiff1d(pairs[fine].round(3), pairs[coarse].round(3))
     assert 0 < len(added) < 12
     assert np.minimum(np.abs(added - 195), np.abs(added - 293)).max() < 15
+
+
+def test_cerpms_are_closer_where_a_lane_is_added() -> None:
+    lane = straight(1000)
+    taper = replace(lane, width_m=3.5 + 3.5 * np.clip((lane.chainage_m - 400) / 200, 0, 1))
+    spacing = {"n_m": 12.0, "straight": 2.0, "curve": 1.0, "max_path_error_m": None}
+    at = np.array([m.chainage_m for m in plan(road(taper), cerpm=spacing).markers if m.detail.side is LaneSide.LEFT])
+    inside = (at[:-1] > 400) & (at[1:] < 600)
+    assert np.diff(at)[inside] == pytest.approx(12.0, abs=0.3)
+    assert np.diff(at)[at[1:] < 380] == pytest.approx(24.0, abs=0.6)
 
 
 def test_cerpms_of_a_shared_boundary_stand_once_and_name_no_side_where_lanes_differ() -> None:
