@@ -129,10 +129,11 @@ def _refuse_damaged(read: DecodedSymbols, evidence: UnitEvidence, max_damage: fl
 def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> DecodedSymbols | None:
     """The registered plate that differs from what was read only where the plate is damaged.
 
-    An id plate may differ within its correction capacity, in two wrong cells or four uncertain ones: a word that is not
-    this plate's comes so near with probability 5e-11 (8 x 8). A position plate's neighbours share most of its digits:
-    it may differ in three cells, each of which is uncertain or shows what no digit looks like, and no other registered
-    plate may be nearly as near.
+    An id plate may differ within its correction capacity, in two wrong cells or four uncertain ones. On 8 x 8, with 12
+    cells of 16 values, a random word comes so near to one plate with probability 5.3e-11 by two cells, 2.3e-10 by four
+    given cells that are uncertain, and 9.2e-8 by any four; among K id plates near by with K times that. A position
+    plate's neighbours share most of its digits: it may differ in three cells, each of which is uncertain or shows what
+    no digit looks like, and no other registered plate may be nearly as near.
     """
     cells = _softmax_confidence(evidence.cell_costs, evidence.best.tolist())
     uncertain = (cells < UNCERTAIN_CELL) | (evidence.level_residual > MAX_LEVEL_RESIDUAL) | evidence.disputed
