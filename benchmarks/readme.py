@@ -1,7 +1,7 @@
 """``python -m benchmarks.readme FILE``: put what the benchmarks printed into the README and docs/benchmarks.md.
 
 A section ``### NAME`` of the file replaces what stands between ``<!-- bench:NAME -->`` and ``<!-- /bench -->``; blocks
-without a section stay as they are.
+without a section stay as they are. Where the file comes from a short mode, each of its blocks says so.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md")
+SHORT_MARK = "*Short mode: a sample of the scenes.*"
 _BLOCK = re.compile(r"(<!-- bench:(?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
 
 
 def read_sections(text: str) -> dict[str, str]:
-    """Sections of a benchmark's output by name."""
+    """Sections of a benchmark's output by name, marked where a run in short mode printed them."""
     parts = re.split(r"^### ([\w-]+)\n", text, flags=re.MULTILINE)
-    return {name: _without_lists(body) for name, body in zip(parts[1::2], parts[2::2], strict=True)}
+    mark = f"{SHORT_MARK}\n\n" if re.search(r"\bshort mode\b", text, flags=re.IGNORECASE) else ""
+    return {name: mark + _without_lists(body) for name, body in zip(parts[1::2], parts[2::2], strict=True)}
 
 
 def fill_blocks(page: str, sections: dict[str, str]) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.readme import PAGES, fill_blocks, read_sections
+from benchmarks.readme import PAGES, SHORT_MARK, fill_blocks, read_sections
 from tests.http import WITHIN_S
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -97,6 +97,13 @@ def test_benchmark_blocks_are_filled_by_name_and_nothing_else_changes() -> None:
     filled = fill_blocks(readme, read_sections(output))
     assert filled == readme.replace("\nold\n", "\n\nnote\n\n| x |\n|---|\n| 1 |\n\n")
     assert fill_blocks(filled, read_sections(output)) == filled
+
+
+def test_blocks_from_a_short_mode_are_marked() -> None:
+    page = "<!-- bench:one -->\nold\n<!-- /bench -->\n"
+    output = "### one\n\nnote\n\n### one-run\n\nSeed 1, short mode; 2 s.\n"
+    assert SHORT_MARK in fill_blocks(page, read_sections(output))
+    assert SHORT_MARK not in fill_blocks(page, read_sections(output.replace("short", "long")))
 
 
 def test_every_benchmark_has_its_block() -> None:

@@ -27,6 +27,7 @@ def main() -> int:
     if arguments.rows:
         return 0 if print_speed(arguments.rows) else 1
     faults, clean, rows = (60, 20, 20_000) if arguments.short else (200, 120, 1_000_000)
+    print(f"{'Short' if arguments.short else 'Long'} mode.\n")
     with open_judge() as judge:
         met = _print_faults(judge, arguments.seed, faults)
         met &= _print_clean(judge, arguments.seed + 1_000_000, clean)
