@@ -19,8 +19,8 @@ VERSION = "metro-1"
 _SPIKE_UT = 100.0  # [uT] a sample so far off the median of three is a fault; source: by hand
 _WHEEL_REACH_M = 0.2  # [m] across, from a reference sensor to those in front of its wheel; source: by hand
 _MERGE_M = 0.125 * 10 / 3.6  # [m] detections nearer than this are one magnet, 0.125 s at 10 km/h; source: by hand
-# Extrema of a dipole's field in units of mu0 m / (4 pi z^3): a forward one has 1 in x and 0.86 in z, an upright one 2 in z
-# and 0.86 in x. The weight is the middle of 1.16 and 0.43. Source: by calculation; METRO section 5.2.2 names the axes
+# Extrema of a dipole's field over mu0 m / (4 pi z^3): forward, 1 in x and 0.86 in z; upright, 2 in z and 0.86 in x.
+# The weight is the middle of 1.16 and 0.43. Source: calculation; METRO section 5.2.2 has no rule
 _AXIS_WEIGHT = {Orientation.FORWARD: 2**0.5, Orientation.UP: 1.0}
 _CONFIDENCE = 0.5  # of every reading; source: by hand, the paper gives none
 
