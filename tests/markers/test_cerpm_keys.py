@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
 from app.errors import InvalidParameter
-from app.markers.cerpm_keys import aes_cmac, derive_marker_key, message_tag
+from app.markers.cerpm import MESSAGE_BYTES
+from app.markers.cerpm_keys import (
+    MAX_INVALID_TAGS_PER_DAY,
+    MAX_INVALID_TAGS_PER_LOG,
+    aes_cmac,
+    derive_marker_key,
+    forgery_probability,
+    message_tag,
+)
+from app.radio.airtime import time_on_air_s
 
 RFC4493_KEY = bytes.fromhex("2b7e151628aed2a6abf7158809cf4f3c")
 RFC4493_MESSAGE = bytes.fromhex(
@@ -89,3 +100,24 @@ def test_tags_are_made_with_a_key_over_a_body_only(key: int, body: int, field: s
     with pytest.raises(InvalidParameter) as caught:
         message_tag(bytes(key), bytes(body))
     assert caught.value.field == field
+
+
+# --- guesses ------------------------------------------------------------------------------------------------------
+
+
+def test_the_forgery_budget_of_the_docs() -> None:
+    """docs/cerpm-message.md and decision 0020 state these figures; 1 - exp(-n / 2^32) by hand."""
+    year = 365
+    assert forgery_probability(2**32) == pytest.approx(1 - math.exp(-1), rel=1e-9)
+    assert forgery_probability(year * MAX_INVALID_TAGS_PER_DAY) == pytest.approx(8.495e-4, rel=1e-3)
+    assert forgery_probability(year * 4 * MAX_INVALID_TAGS_PER_LOG) == pytest.approx(3.399e-4, rel=1e-3)
+    assert forgery_probability(year * 4 * MAX_INVALID_TAGS_PER_LOG, 8) == pytest.approx(7.915e-14, rel=1e-3)
+    assert forgery_probability(0) == 0.0
+
+
+def test_a_longer_tag_does_not_fit_the_time_on_air() -> None:
+    """47 CFR 15.247(a)(1)(i): 400 ms on one channel. The symbols of SF10 take 24 bytes, and no 25th."""
+    at_sf10_s = [time_on_air_s(size, 10, 125_000) for size in (24, 25, 28)]
+    assert at_sf10_s == pytest.approx([0.370688, 0.411648, 0.411648])
+    assert MESSAGE_BYTES == 24
+    assert int(60 / time_on_air_s(MESSAGE_BYTES, 7, 125_000)) == 972 <= MAX_INVALID_TAGS_PER_LOG

@@ -18,6 +18,7 @@ from app.decoders.cerpm.verify import Verification, verify_packets
 from app.errors import WaymarkError
 from app.geodesy import LocalizationGrade
 from app.markers.cerpm import MESSAGE_BYTES
+from app.markers.cerpm_keys import MAX_INVALID_TAGS_PER_LOG
 from app.sensors.pose_track import PoseTrack
 from app.sensors.receiver import ReceivedPacket
 
@@ -68,6 +69,8 @@ def match_known_markers(
     track: PoseTrack | None = None,
     freshness: FreshnessRules | None = None,
     rules: MergeRules | None = None,
+    *,
+    max_invalid_tags: int = MAX_INVALID_TAGS_PER_LOG,
 ) -> tuple[Verification, MergedMarkers]:
     """Verify packets, and merge them to one position a marker.
 
@@ -82,11 +85,13 @@ def match_known_markers(
         Its `min_interval_s` is replaced by half of the shortest programmed interval of these markers, if known: their
         clocks may be inaccurate.
     rules : MergeRules, optional
+    max_invalid_tags : int
+        As of `verify_packets`.
     """
     numbers = list_numbers(packets)
     intervals_s = [known.min_interval_s[n] / 2 for n in numbers if n in known.min_interval_s]
     freshness = replace(freshness or FreshnessRules(), min_interval_s=min(intervals_s, default=None))
-    verification = verify_packets(packets, keys, known.earlier_spans, freshness)
+    verification = verify_packets(packets, keys, known.earlier_spans, freshness, max_invalid_tags=max_invalid_tags)
     merged = merge_markers(verification.packets, known.registered, track, rules)
     return verification, _without_retired(merged, known.retired)
 

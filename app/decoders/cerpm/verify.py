@@ -24,6 +24,7 @@ from app.decoders.cerpm.freshness import (
 from app.decoders.cerpm.payload import UndecodablePayload, decode_message, has_valid_tag
 from app.errors import InvalidParameter
 from app.markers.cerpm import CerpmMessage
+from app.markers.cerpm_keys import MAX_INVALID_TAGS_PER_LOG
 from app.sensors.receiver import ReceivedPacket
 
 Floats = npt.NDArray[np.float64]
@@ -38,6 +39,7 @@ _MIN_WRONG_KEY_PACKETS = 3  # source: by hand, no measurement kept
 _CLEAR = "sent in clear, without a tag: anyone can have sent it"
 _NO_KEY = "no marker of this number is registered, so there is no key to check it with"
 _FORGED = "the tag is not the marker's: forged, or damaged on the way"
+_UNCHECKED = "not checked: too many tags of this log had failed before"
 _WRONG_KEY = "every packet of this number has a tag of another key: programmed with a wrong key, or forged throughout"
 _DAMAGED = "the tag does not fit, and the packet differs from an authentic one in a few bits: damaged on the way"
 
@@ -50,6 +52,7 @@ class Verdict(StrEnum):
     UNKNOWN_MARKER = "unknown-marker"
     WRONG_KEY = "wrong-key"
     FORGED = "forged"
+    UNCHECKED = "unchecked"
     CORRUPT = "corrupt"
     REPLAYED = "replayed"
     OUT_OF_ORDER = "out-of-order"
@@ -109,11 +112,14 @@ class Verification:
     spans : dict of int to tuple of SequenceSpan
         Accepted sequences of each marker, to be stored and passed as `earlier_spans` next time.
     warnings : list of str
+    invalid_tags : int
+        Different payloads whose tag was checked and failed: guesses, if they were no accidents.
     """
 
     packets: list[VerifiedPacket]
     spans: dict[int, tuple[SequenceSpan, ...]]
     warnings: list[str]
+    invalid_tags: int
 
     def counts(self) -> dict[Verdict, int]:
         """Number of packets of each verdict."""
@@ -128,6 +134,8 @@ def verify_packets(
     keys: Keys,
     earlier_spans: Mapping[int, Sequence[SequenceSpan]] | None = None,
     rules: FreshnessRules | None = None,
+    *,
+    max_invalid_tags: int = MAX_INVALID_TAGS_PER_LOG,
 ) -> Verification:
     """Verify the tags and the freshness of packets.
 
@@ -140,6 +148,9 @@ def verify_packets(
     earlier_spans : mapping of int to sequence of SequenceSpan, optional
         Spans of earlier logs, by number; logs may be uploaded in any order.
     rules : FreshnessRules, optional
+    max_invalid_tags : int
+        Payloads after this many different ones with an invalid tag are not checked: tags of 32 bits can be guessed if
+        somebody may guess often enough.
 
     Returns
     -------
@@ -157,7 +168,7 @@ def verify_packets(
     distinguished from a fresh one by its bytes; only the vehicle's position can show it (see `merge_markers`).
     """
     rules = rules or FreshnessRules()
-    checked = _check_tags(packets, keys)
+    checked, invalid_tags = _check_tags(packets, keys, max_invalid_tags)
     _name_failures(checked)
     by_number: dict[int, list[int]] = defaultdict(list)
     for index, packet in enumerate(checked):
@@ -174,27 +185,32 @@ def verify_packets(
         accepted = [checked[i] for i in indices if checked[i].accepted]
         if accepted:
             spans[number] = _spans_of(accepted)
-    return Verification(checked, spans, _warnings(checked))
+    return Verification(checked, spans, _warnings(checked), invalid_tags)
 
 
 # --- tags ---------------------------------------------------------------------------------------------------------
 
 
-def _check_tags(packets: Iterable[ReceivedPacket], keys: Keys) -> list[VerifiedPacket]:
-    """Verdicts by tags alone; equal payloads are checked once."""
+def _check_tags(
+    packets: Iterable[ReceivedPacket], keys: Keys, max_invalid_tags: int
+) -> tuple[list[VerifiedPacket], int]:
+    """Verdicts by tags alone, and the number of invalid tags; equal payloads are checked once."""
     find_key = keys.get if isinstance(keys, Mapping) else keys
     known_keys: dict[int, bytes | None] = {}
     seen: dict[bytes, tuple[Verdict, int | None, CerpmMessage | None, str]] = {}
     checked = []
+    invalid_tags = 0
     for packet in packets:
         if packet.payload is None:
             checked.append(_in_clear(packet))
             continue
         found = seen.get(packet.payload)
         if found is None:
-            found = seen[packet.payload] = _check_tag(packet.payload, find_key, known_keys)
+            found = _check_tag(packet.payload, find_key, known_keys, may_guess=invalid_tags < max_invalid_tags)
+            seen[packet.payload] = found
+            invalid_tags += found[0] is Verdict.FORGED
         checked.append(VerifiedPacket(packet, *found))
-    return checked
+    return checked, invalid_tags
 
 
 def _in_clear(packet: ReceivedPacket) -> VerifiedPacket:
@@ -204,7 +220,7 @@ def _in_clear(packet: ReceivedPacket) -> VerifiedPacket:
 
 
 def _check_tag(
-    payload: bytes, find_key: Callable[[int], bytes | None], known_keys: dict[int, bytes | None]
+    payload: bytes, find_key: Callable[[int], bytes | None], known_keys: dict[int, bytes | None], *, may_guess: bool
 ) -> tuple[Verdict, int | None, CerpmMessage | None, str]:
     try:
         message, _tag = decode_message(payload)
@@ -218,6 +234,8 @@ def _check_tag(
     key = known_keys[number]
     if key is None:
         return Verdict.UNKNOWN_MARKER, number, message, _NO_KEY
+    if not may_guess:
+        return Verdict.UNCHECKED, number, message, _UNCHECKED
     if has_valid_tag(payload, key):
         return Verdict.AUTHENTIC, number, message, ""
     return Verdict.FORGED, number, message, _FORGED
@@ -383,8 +401,14 @@ def _spans_of(accepted: Sequence[VerifiedPacket]) -> tuple[SequenceSpan, ...]:
     return tuple(spans)
 
 
-def _warnings(checked: Iterable[VerifiedPacket]) -> list[str]:
+def _warnings(checked: Sequence[VerifiedPacket]) -> list[str]:
+    warnings = []
+    if unchecked := sum(1 for p in checked if p.verdict is Verdict.UNCHECKED):
+        warnings.append(f"{unchecked} packets were not checked, because too many tags before them had failed")
     untimed = sum(1 for p in checked if p.accepted and not math.isfinite(p.packet.received_at_s))
     if not untimed:
-        return []
-    return [f"freshness unknown: {untimed} packets have no time; they are accepted by the order of sequences alone"]
+        return warnings
+    return [
+        *warnings,
+        f"freshness unknown: {untimed} packets have no time; they are accepted by the order of sequences alone",
+    ]

@@ -7,9 +7,11 @@ from typing import Any
 
 from app.registry import decodes as store
 from app.registry import jobs
+from app.registry.audit import Author
 from app.registry.database import Database
 from app.registry.jobs import JobKind, new_job
 from app.services.access.access import Caller
+from app.services.access.audit import author_of
 from app.services.decodes.context import ContextInput, context_from_document
 from app.services.decodes.documents import DecodeDocument, DecodeHead, decode_document, decode_head
 from app.services.decodes.rules import DecodeRules
@@ -93,7 +95,7 @@ class Decodes:
                 return earlier, True
             context = resolve_context(connection, caller, given, data)
         handler = next(handler for handler in self._handlers if handler.accepts(context, data))
-        upload = Upload(caller.agency_id, data, context, now)
+        upload = Upload(caller.agency_id, author_of(caller), data, context, now)
         if handler.is_job(data):
             return self._put_in_queue(caller, upload, handler, key)
         record = NewRecord(caller, handler, upload, self._clock, key=key, ttl=self._rules.idempotency_ttl)
@@ -110,7 +112,10 @@ class Decodes:
                 if answer.replayed:
                     return answer.response, True
                 store.add_decode(connection, agency_id, caller.key_id, row)
-                jobs.add_job(connection, new_job(JobKind.DECODE, row.id, agency_id, caller.key_id, now))
+                jobs.add_job(
+                    connection,
+                    new_job(JobKind.DECODE, row.id, agency_id, caller.key_id, now, job_input={"label": caller.label}),
+                )
                 count_upload(connection, agency_id, row.id, upload.context, now)
                 document = answer.store(decode_document(row))
             stage.keep()
@@ -123,7 +128,8 @@ class Decodes:
             row = store.get_decode(connection, job.row.agency_id, job.row.id)
         assert row.upload_key is not None
         upload = Upload(
-            job.row.agency_id, self._blobs.get(row.upload_key), context_from_document(row.context), row.created_at,
+            job.row.agency_id, Author(job.row.input.get("label", ""), job.row.holder_id),
+            self._blobs.get(row.upload_key), context_from_document(row.context), row.created_at,
             wait_s=_WAIT_S, report_progress=job.report_progress,
         )  # fmt: skip
         handler = next(handler for handler in self._handlers if handler.kind == row.kind)

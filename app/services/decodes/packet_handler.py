@@ -15,6 +15,7 @@ from app.sensors.camera import Camera
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.decoder_processes import DecoderProcesses, Pending
 from app.services.decodes.context import DecodeContext
+from app.services.decodes.invalid_tags import InvalidTagLimit, forgery_detail
 from app.services.decodes.kinds import DecodeKind
 from app.services.decodes.packet_documents import claimed_place, packet_observations, packets_document
 from app.services.decodes.packet_matching import ReadPackets, find_known, lane_markers, read_packets_of, spans_of
@@ -46,6 +47,7 @@ class PacketHandler(UploadHandler[DriveSignal]):
     ) -> None:
         self._database, self._processes = database, processes
         self._secrets, self._rules = secrets, rules
+        self._invalid_tags = InvalidTagLimit()
 
     def accepts(self, context: DecodeContext, data: bytes) -> bool:
         """Uploads whose context declares packets."""
@@ -58,11 +60,12 @@ class PacketHandler(UploadHandler[DriveSignal]):
 
     def start(self, upload: Upload) -> StartedDrive:
         """Have the files of the drive read."""
+        self._invalid_tags.left(_holder(upload), upload.received_at)
         declared = upload.context.packets or {}
         name = str(declared.get("file_name") or "packets")
         task = DriveTask(name, upload.data, declared, self._rules.packets, self._rules.images)
         files = self._processes.submit(task, wait_s=upload.wait_s)
-        return StartedDrive(upload, files, self._database, self._processes, self._secrets)
+        return StartedDrive(upload, files, self._database, self._processes, self._secrets, self._invalid_tags)
 
     def plot(self, signal: DriveSignal) -> bytes:
         """The lane and the radio signals."""
@@ -77,14 +80,17 @@ class PacketHandler(UploadHandler[DriveSignal]):
             Another upload about these markers was stored since, so that these packets may be repetitions of its own.
         """
         verification = signal.read.verification
+        forged = forgery_detail(verification)
         spans = cerpms.list_spans(connection, upload.agency_id, verification.spans)
         newest = cerpms.newest_row(spans)
         if newest > signal.read.known.last_span:
             raise OutdatedMatch
+        self._invalid_tags.add(_holder(upload), verification.invalid_tags, upload.received_at)
         return Decoded(
             packets_document(signal.files, signal.read, signal.result),
             packet_observations(signal.read, signal.result.lane, upload.observed_at),
             spans_of(verification),
+            {} if forged is None else {"packets.forged": forged},
         )
 
 
@@ -97,6 +103,7 @@ class StartedDrive:
     database: Database
     processes: DecoderProcesses
     secrets: AgencySecrets
+    invalid_tags: InvalidTagLimit
 
     def result(self) -> DriveSignal:
         """Verify the packets against the registry as it is now, and estimate the lane."""
@@ -105,13 +112,18 @@ class StartedDrive:
         camera, pose = _view(files, upload.context)
         with self.database.read() as connection:
             known = find_known(connection, upload.agency_id, self.secrets, list_numbers(files.packets))
-        read = read_packets_of(files, known, terms, upload.received_at.timestamp())
+        max_invalid_tags = self.invalid_tags.left(_holder(upload), upload.received_at)
+        read = read_packets_of(files, known, terms, upload.received_at.timestamp(), max_invalid_tags)
         task = _lane_task(files, read, terms, camera, pose)
         return DriveSignal(files, read, self.processes.submit(task, wait_s=upload.wait_s).result())
 
     def cancel(self) -> None:
         """Stop the process."""
         self.files.cancel()
+
+
+def _holder(upload: Upload) -> str:
+    return upload.author.key_id or upload.agency_id
 
 
 def _lane_task(

@@ -84,7 +84,9 @@ def find_known(connection: sa.Connection, agency_id: str, secrets: AgencySecrets
     )
 
 
-def read_packets_of(files: DriveFiles, known: KnownMarkers, terms: PacketTerms, uploaded_at_s: float) -> ReadPackets:
+def read_packets_of(
+    files: DriveFiles, known: KnownMarkers, terms: PacketTerms, uploaded_at_s: float, max_invalid_tags: int
+) -> ReadPackets:
     """Verify packets and merge them to one place a marker."""
     began = time.perf_counter()
 
@@ -95,7 +97,9 @@ def read_packets_of(files: DriveFiles, known: KnownMarkers, terms: PacketTerms, 
 
     freshness = replace(terms.freshness, uploaded_at_s=uploaded_at_s)
     rules = MergeRules(accept_clear=terms.accept_clear)
-    verification, merged = match_known_markers(files.packets, key_of, known.cerpms, files.track, freshness, rules)
+    verification, merged = match_known_markers(
+        files.packets, key_of, known.cerpms, files.track, freshness, rules, max_invalid_tags=max_invalid_tags
+    )
     places = {
         int(number): (float(lon), float(lat))
         for number, lon, lat in zip(merged.number, merged.lon_deg, merged.lat_deg, strict=True)

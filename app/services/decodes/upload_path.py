@@ -6,17 +6,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import sqlalchemy as sa
 
 from app.errors import Unavailable
-from app.registry import cerpms
+from app.registry import audit, cerpms
 from app.registry import decodes as store
+from app.registry.audit import Author
 from app.registry.database import Database
 from app.registry.decodes import DecodeRow, NewObservation
 from app.registry.ids import new_id
@@ -48,6 +49,8 @@ class Upload:
     Attributes
     ----------
     agency_id : str
+    author : Author
+        Who uploaded it.
     data : bytes
     context : DecodeContext
     received_at : datetime
@@ -58,6 +61,7 @@ class Upload:
     """
 
     agency_id: str
+    author: Author
     data: bytes
     context: DecodeContext
     received_at: datetime
@@ -81,11 +85,14 @@ class Decoded:
     observations : sequence of NewObservation
     spans : sequence of dict
         Transmissions of CERPMs that were received.
+    incidents : mapping of str to mapping
+        What the audit log records about the upload: details by action.
     """
 
     document: FramesResult | TraceResultDocument | PacketsResult
     observations: Sequence[NewObservation] = ()
     spans: Sequence[dict[str, Any]] = ()
+    incidents: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
 
 class OutdatedMatch(Exception):
@@ -247,7 +254,7 @@ class NewRecord:
                 )  # fmt: skip
                 store.add_decode(connection, agency_id, self._caller.key_id, row)
                 count_upload(connection, agency_id, row.id, self._upload.context, now)
-                _store_decoded(connection, self._upload, row.id, decoded)
+                _store_decoded(connection, self._upload, row.id, decoded, self._clock())
                 answer.store(decode_document(row))
         self.response, self.replayed = answer.response, answer.replayed
         return not answer.replayed
@@ -271,7 +278,7 @@ class QueuedRecord:
             connection, self._upload.agency_id, decode_id,
             result=decoded.document, picture_key=picture_key, now=self._clock(),
         )  # fmt: skip
-        _store_decoded(connection, self._upload, decode_id, decoded)
+        _store_decoded(connection, self._upload, decode_id, decoded, self._clock())
         return True
 
 
@@ -280,7 +287,9 @@ def new_decode(handler: UploadHandler[Any], upload: Upload) -> DecodeRow:
     return DecodeRow(new_id(upload.received_at), handler.kind, upload.context.document(), upload.received_at)
 
 
-def _store_decoded(connection: sa.Connection, upload: Upload, decode_id: str, decoded: Decoded) -> None:
+def _store_decoded(connection: sa.Connection, upload: Upload, decode_id: str, decoded: Decoded, now: datetime) -> None:
     cerpms.add_spans(connection, upload.agency_id, decode_id, decoded.spans)
     store.add_observations(connection, upload.agency_id, decode_id, decoded.observations)
     count_driven(connection, upload.agency_id, decode_id, upload.context, decoded.document)
+    for action, detail in decoded.incidents.items():
+        audit.record(connection, upload.agency_id, upload.author, action, now=now, subject=decode_id, detail=detail)

@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,13 @@ import sqlalchemy as sa
 
 from app.demo.cerpms import BuiltLane, build_lane, draw_frame, path_errors_m, write_packets, write_poses
 from app.encoders.cerpm.payload import encode_message
+from app.errors import TooManyRequests
 from app.main import create_app
 from app.markers.cerpm import CerpmMessage
 from app.registry.tables import decodes, observations
 from app.sensors.receiver import ReceivedPacket
 from app.services.access.access import Scope
+from app.services.decodes.invalid_tags import InvalidTagLimit
 from app.settings import Settings
 from app.simulation.radio.attacks import forge_packets, move_claim, number_entries, replay_packets
 from app.simulation.radio.drive import SimulatedDrive, drive_past
@@ -273,6 +275,56 @@ def test_forged_and_replayed_packets_are_refused_and_move_nothing(road: tuple[ht
     assert refused
     assert all(entry["reason"] for entry in refused)
     assert path_rms_m(built, found) < 0.05
+
+
+def test_forged_tags_are_limited_and_in_the_audit_log(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One entry for an upload, whatever it contains; the limit is of the key, not of its agency."""
+    handler = next(handler for handler in server.app.state.decodes._handlers if handler.kind == "packets")
+    monkeypatch.setattr(handler, "_invalid_tags", InvalidTagLimit(10))
+    name = f"guessed roads {next(_AGENCIES)}"
+    with server.agency(name, Scope.ADMIN) as admin, server.agency(name, Scope.VEHICLE) as vehicle:
+        built = build_lane(admin, np.random.default_rng(1901))
+        heard, _hour = drive(built, 1930)
+        packets = heard.packets[:20]
+        forged = [replace(p, payload=p.payload[:-4] + bytes(4)) for p in packets if p.payload is not None]
+
+        def sent(chosen: Sequence[ReceivedPacket]) -> httpx.Response:
+            answer = post(vehicle, write_packets(number_entries(chosen)).encode(), name="packets.jsonl")
+            assert isinstance(answer, httpx.Response)
+            return answer
+
+        before = len(admin.get("/v1/audit").json()["items"])
+        assert sent(packets).json()["report"]["verdicts"]["authentic"] == 20
+        assert len(admin.get("/v1/audit").json()["items"]) == before
+        first = sent(forged[:6]).json()
+        second = sent(forged[6:]).json()["report"]["verdicts"]
+        assert (second["forged"] + second["wrong-key"], second["unchecked"]) == (4, 10)
+        entries = admin.get("/v1/audit").json()["items"][before:]
+        assert [(entry["action"], entry["detail"]["invalid_tags"]) for entry in entries] == [
+            ("packets.forged", 6), ("packets.forged", 4)
+        ]  # fmt: skip
+        assert entries[0]["subject"] == first["id"]
+        assert entries[0]["who"] == f"{name} vehicle"
+        assert entries[1]["detail"]["unchecked"] == 10
+        refused = sent(forged[:6])
+        assert (refused.status_code, refused.json()["limit"]) == (429, "10 invalid tags in a day (UTC)")
+        assert 1 <= int(refused.headers["retry-after"]) <= 86_400
+        other = post(admin, write_packets(number_entries(packets)).encode(), name="packets.jsonl")
+        assert other.status_code == 201
+
+
+@pytest.mark.parametrize("hour", [0, 23])
+def test_the_limit_of_invalid_tags_begins_anew_at_midnight(hour: int) -> None:
+    limit, now = InvalidTagLimit(1500), datetime(2026, 5, 4, hour, 59, 59, 500_000, tzinfo=UTC)
+    assert limit.left("one", now) == 1000
+    limit.add("one", 1000, now)
+    assert (limit.left("one", now), limit.left("two", now)) == (500, 1000)
+    limit.add("one", 500, now)
+    with pytest.raises(TooManyRequests) as refused:
+        limit.left("one", now)
+    assert refused.value.retry_after_s == (23 - hour) * 3600 + 1
+    limit.add("one", 0, now + timedelta(seconds=refused.value.retry_after_s))
+    assert limit.left("one", now + timedelta(seconds=refused.value.retry_after_s)) == 1000
 
 
 def test_what_was_heard_is_known_after_a_restart(tmp_path: Path) -> None:

@@ -69,6 +69,24 @@ def test_a_marker_with_another_key_is_named_as_that() -> None:
     assert verdicts(packets[:2]) == [Verdict.FORGED] * 2
 
 
+def test_nothing_is_checked_after_too_many_invalid_tags() -> None:
+    """Otherwise one log could try all 2^32 tags. Equal payloads are one guess; other verdicts are none."""
+    guesses = [ReceivedPacket(i, START_S + i, body(4, sequence=i) + b"\0\0\0\1") for i in range(4)]
+    unknown = ReceivedPacket(9, START_S + 9, signed(body(4000)))
+    honest = drive(20, 100, count=2)
+    found = verify_packets([guesses[0], *guesses[:3], unknown, *honest, guesses[3]], KEYS, max_invalid_tags=3)
+    expected = [*[Verdict.FORGED] * 4, Verdict.UNKNOWN_MARKER, *[Verdict.UNCHECKED] * 3]
+    assert [p.verdict for p in found.packets] == [
+        Verdict.WRONG_KEY if verdict is Verdict.FORGED else verdict for verdict in expected
+    ]
+    assert (found.invalid_tags, found.spans) == (3, {})
+    assert found.warnings == ["3 packets were not checked, because too many tags before them had failed"]
+    assert not any(p.accepted or p.signed for p in found.packets)
+    found = verify_packets([*guesses, *honest], KEYS, max_invalid_tags=5)
+    assert (found.invalid_tags, found.counts()[Verdict.AUTHENTIC]) == (4, 2)
+    assert verify_packets(honest, KEYS, max_invalid_tags=1).invalid_tags == 0
+
+
 def test_disorder_and_echoes_cost_nothing() -> None:
     packets = drive(0, 100)
     echoes = [replace(p, received_at_s=p.received_at_s + 1.5, entry=50 + p.entry) for p in packets[::4]]
@@ -221,7 +239,7 @@ def test_ten_thousand_forged_and_replayed_packets_are_all_refused_and_no_honest_
         attack += [_replay(rng, recorded or log, clock_s, day > 0) for _ in range(1000)]
         mixed = [replace(p, entry=i) for i, p in enumerate(log + attack)]
         rng.shuffle(mixed)  # type: ignore[arg-type]
-        found = verify_packets(mixed, KEYS, spans)
+        found = verify_packets(mixed, KEYS, spans, max_invalid_tags=10_000)
         refused += sum(1 for p in found.packets if p.entry >= len(log) and not p.accepted)
         honest += sum(1 for p in found.packets if p.entry < len(log) and not p.accepted)
         for number, kept in found.spans.items():
@@ -258,4 +276,4 @@ def test_rules_are_checked(name: str) -> None:
 
 
 def test_an_empty_log_is_a_result() -> None:
-    assert verify_packets([], lambda number: None) == Verification([], {}, [])
+    assert verify_packets([], lambda number: None) == Verification([], {}, [], 0)
