@@ -78,6 +78,15 @@ def test_keys_have_a_form_that_scanners_find() -> None:
     assert len(firsts) > 50  # of 62: the bits are spread over all characters
 
 
+def test_the_form_of_keys_is_as_documented() -> None:
+    text = (Path(__file__).resolve().parents[3] / "docs" / "access.md").read_text()
+    stated = re.search(r"check digits: (\d+) characters in all", text)
+    assert stated is not None
+    assert int(stated[1]) == len(new_key())
+    (example,) = re.findall(r"^    (wm_\w+)$", text, re.MULTILINE)
+    check_key(example)
+
+
 def test_every_wrong_character_and_every_swap_is_noticed() -> None:
     key = new_key()
     alphabet = string.ascii_letters + string.digits
