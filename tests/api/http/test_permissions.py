@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -324,6 +324,8 @@ def test_a_row_of_another_agency_is_as_if_it_were_not_there(
             assert {answer.status_code for answer in answers} == {200}
             continue
         assert [a.status_code for a in answers] == [404, 404], f"{route}: {answers[0].text} {answers[1].text}"
+        if route.startswith("GET"):  # not even that it has not changed
+            assert stranger.get(theirs + QUERIES.get(route, ""), headers={"If-None-Match": '"1"'}).status_code == 404
         assert _same_for(answers[0], theirs) == _same_for(answers[1], nobodys)
 
 
@@ -336,15 +338,107 @@ def test_and_its_owner_finds_it(server: LiveServer, things: dict[str, list[str]]
     assert any(answer.status_code == 200 for answer in answers), [answer.text for answer in answers]
 
 
-@pytest.mark.parametrize("path", ["/v1/artwork", "/v1/programs"])
-def test_ids_in_bodies_are_as_if_they_were_not_there(
-    stranger: httpx.Client, things: dict[str, list[str]], path: str
+# requests whose bodies or queries name rows: the kind of row, and the request about a row with an id
+WAY = {"type": "LineString", "coordinates": [[34.5, 44.5], [34.503, 44.5]]}
+MENTIONS: dict[str, tuple[str, Callable[[str], dict[str, Any]]]] = {
+    "POST /v1/artwork": ("marker_id", lambda row: {"json": {"marker_ids": [row]}}),
+    "POST /v1/programs": ("marker_id", lambda row: {"json": {"marker_ids": [row]}}),
+    "POST /v1/markers/bulk": (
+        "marker_id",
+        lambda row: {"json": {"items": [{"update": {"id": row, "version": 1, "change": {"status": "active"}}}]}},
+    ),
+    "POST /v1/markers": (
+        "codebook_id",
+        lambda row: {
+            "json": {
+                "family": "magnet",
+                "lane": {"geometry": WAY},
+                "tag": {"codebook_id": row, "chainage_m": 50, "meaning": MEANINGS[0]},
+            }
+        },
+    ),
+    "POST /v1/alignments": (
+        "road_id",
+        lambda row: {"json": {"name": "x", "road_id": row, "lanes": {"forward": 1, "width_m": 3.5}}},
+    ),
+    "POST /v1/plans": (
+        "alignment_id",
+        lambda row: {"json": {"name": "x", "alignment_id": row, "rules": {"version": 1, "plates": {}}}},
+    ),
+    "POST /v1/vehicles": ("calibration_id", lambda row: {"json": {"name": f"v {row}", "profile": _camera(row)}}),
+    "PATCH /v1/vehicles/{vehicle_id}": ("calibration_id", lambda row: {"json": {"profile": _camera(row)}}),
+    "PUT /v1/vehicles/{vehicle_id}/calibration": ("calibration_id", lambda row: {"json": {"calibration_id": row}}),
+    "PUT /v1/vehicles/{vehicle_id}/keys/{key_id}": ("key_id", lambda _row: {}),
+    "POST /v1/decodes": (
+        "vehicle_id",
+        lambda row: {
+            "content": png(corner_frame()),
+            "headers": {"Content-Type": "image/png", "Waymark-Context": json.dumps({"vehicle": row})},
+        },
+    ),
+    "GET /v1/plans": ("alignment_id", lambda row: {"params": {"alignment_id": row}}),
+    "GET /v1/plan-jobs": ("plan_id", lambda row: {"params": {"plan_id": row}}),
+    "GET /ogc/collections/plans/items": ("plan_id", lambda row: {"params": {"plan_id": row}}),
+    "GET /ogc/collections/alignments/items": ("alignment_id", lambda row: {"params": {"alignment_id": row}}),
+}
+NOT_ROWS = {"arbitration_id", "id"}  # of CAN frames; of a GeoJSON feature, whose path names it
+
+
+def _camera(calibration_id: str) -> dict[str, Any]:
+    return {"camera": {**CALIBRATED["camera"], "calibration_id": calibration_id}}
+
+
+@pytest.mark.parametrize("route", MENTIONS)
+def test_ids_in_bodies_and_queries_are_as_if_they_were_not_there(
+    stranger: httpx.Client, things: dict[str, list[str]], route: str
 ) -> None:
-    for theirs in things["marker_id"]:
-        answers = [stranger.post(path, json={"marker_ids": [marker]}) for marker in (theirs, NOBODY_ID)]
-        assert [answer.status_code for answer in answers] == [404, 404]
-        bodies = [re.sub(r'"request_id":"\w+"', "", answer.text) for answer in answers]
+    method, _, path = route.partition(" ")
+    kind, request = MENTIONS[route]
+    if "{vehicle_id}" in path:
+        made = _made(stranger.post("/v1/vehicles", json={"name": route, "profile": {}}))
+        path, etag = path.replace("{vehicle_id}", made["id"]), {"If-Match": '"1"'}
+    else:
+        etag = {}
+    for theirs in things[kind]:
+        answers = []
+        for row in (theirs, NOBODY_ID):
+            asked = request(row)
+            asked["headers"] = {**etag, **asked.get("headers", {})}
+            answers.append(stranger.request(method, path.replace("{key_id}", row), **asked))
+        assert answers[0].status_code == answers[1].status_code, [answer.text for answer in answers]
+        bodies = [re.sub(r'"request_id":"\w+"|"(href|timeStamp)":\s*"[^"]*"', "", answer.text) for answer in answers]
         assert bodies[0].replace(theirs, NOBODY_ID) == bodies[1]
+        if method != "GET":
+            assert answers[0].status_code in (404, 422), answers[0].text
+        else:
+            assert '"items":[]' in bodies[0] or '"features":[]' in bodies[0]
+
+
+def test_every_id_in_a_body_or_a_query_is_asked_about(server: LiveServer) -> None:
+    document = server.app.openapi()
+    schemas = document["components"]["schemas"]
+
+    def named(schema: dict[str, Any], seen: frozenset[str]) -> Iterator[str]:
+        reference = schema.get("$ref", "").rpartition("/")[2]
+        if reference in seen:
+            return
+        schema = schemas[reference] if reference else schema
+        yield from schema.get("properties", {})
+        inner = [*schema.get("properties", {}).values(), schema.get("items", {})]
+        for part in (*inner, *(one for how in ("anyOf", "oneOf", "allOf") for one in schema.get(how, ()))):
+            if isinstance(part, dict) and part:
+                yield from named(part, seen | {reference} if reference else seen)
+
+    missing = set()
+    for path, ways in document["paths"].items():
+        for method, way in ways.items():
+            content = way.get("requestBody", {}).get("content", {}).values()
+            names = {name for kind in content for name in named(kind["schema"], frozenset())}
+            names |= {parameter["name"] for parameter in way.get("parameters", ()) if parameter["in"] == "query"}
+            if any(re.search(r"(^|_)ids?$", name) and name not in NOT_ROWS for name in names):
+                missing.add(f"{method.upper()} {path}")
+    missing.discard("GET /ogc/collections/{collection}/items")  # two collections above
+    assert missing <= set(MENTIONS), "say in MENTIONS how a request names a row of another agency"
 
 
 def test_vehicles_see_their_own_decodes_only(server: LiveServer) -> None:
