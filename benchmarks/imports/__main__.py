@@ -53,7 +53,8 @@ def _print_faults(judge: Judge, seed: int, count: int) -> bool:
     detected = 1 - total["missed"] / count
     named = (total["refused"] + total["warned"]) / count
     print(
-        f"\nDetected (warned or refused): {detected:.1%} (goal {GOAL:.0%}); identified by its own check: {named:.1%}.\n"
+        f"\nIdentified by a check of its own, refused or warned: {named:.1%}. With those that got only a standing "
+        f"caution, which clean surveys get too (next table): {detected:.1%} (goal {GOAL:.0%}).\n"
     )
     return detected >= GOAL and not far["missed"]
 
