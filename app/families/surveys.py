@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from app.families.rules import MarkerRules
 from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Texts
 from app.markers.plate_digits import Digits
 from app.registry.columns import Columns
@@ -108,6 +109,10 @@ class SurveyImport(ABC, Generic[DefaultsT]):
     ) -> Iterator[Fault]:
         """Faults of the wanted rows that no marker of this family can have."""
         yield from ()
+
+    @abstractmethod
+    def code_form(self, defaults: DefaultsT, *, compare: bool) -> CodeForm:
+        """What the codes of a survey's column look like; with `compare` those of any marker of the family."""
 
     @abstractmethod
     def read_codes(self, survey: GeoreferencedSurvey, rows: Rows, defaults: DefaultsT) -> tuple[RowCodes, list[Fault]]:

@@ -190,8 +190,14 @@ class DelimitedLog:
 # --- RFC 4180 -----------------------------------------------------------------------------------------------------
 
 
-def split_rows(text: io.TextIOWrapper, delimiter: str) -> Iterator[list[str]]:
+def split_rows(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
     """Cells of each row that is not empty; quoted cells may span lines.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        With their line ends.
+    delimiter : str
 
     Raises
     ------
@@ -199,11 +205,10 @@ def split_rows(text: io.TextIOWrapper, delimiter: str) -> Iterator[list[str]]:
         A quote is not closed, or a cell is too long.
     """
     if delimiter == SPACES:
-        text.reconfigure(newline=None)
-        yield from (line.split() for line in text if line.strip())
+        yield from (cells for line in lines if (cells := line.split()))
         return
     csv.field_size_limit(MAX_CELL)
-    reader = csv.reader(text, delimiter=delimiter, strict=True)
+    reader = csv.reader(lines, delimiter=delimiter, strict=True)
     try:
         for row in reader:
             if row and any(row):

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import codecs
-import io
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 from app.errors import UnreadableUpload
 
@@ -15,6 +13,7 @@ MAX_LINE = 1 << 18
 MAX_NAME = 120
 """Longest name of a file or a column that is shown. [character] Chosen by hand."""
 _SAMPLE_BYTES = 4096  # [byte] by which text is recognized; chosen by hand
+_DECODED_BYTES = 1 << 20  # [byte] checked at a time, to bound memory
 _MAX_CONTROL_SHARE = 0.02  # [1] of the sample; chosen by hand: a damaged line or two, far below random bytes (0.11)
 _BOMS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
@@ -70,39 +69,65 @@ def decode_text(name: str, data: bytes) -> tuple[str, str | None]:
     return data.decode("utf-8", "replace"), warning
 
 
-def open_utf8(data: bytes) -> io.TextIOWrapper:
-    """A stream of the text of a file in UTF-8, decoded while it is read; use it inside `refuse_other_encodings`.
+def as_utf8(data: bytes, encoding: str | None = None) -> tuple[bytes, str]:
+    """Text of a file as UTF-8 without a byte order mark, and the encoding it was in.
+
+    Parameters
+    ----------
+    data : bytes
+    encoding : str, optional
+        Where it is declared: a byte order mark counts more. Without it text that is not UTF-8 is UTF-16 if every
+        other byte of its beginning is NUL, or else Windows-1252.
 
     Raises
     ------
     UnreadableUpload
-        The file holds NUL.
+        The file is not text in this encoding, or holds NUL.
     """
+    mark, of_mark = next(((bom, name) for bom, name in _BOMS if data.startswith(bom)), (b"", None))
+    name = of_mark or encoding or guess_encoding(data)
+    name = "utf-8" if name == "utf-8-sig" else name
+    try:
+        if name == "utf-8":
+            data = data[len(mark) :]
+            _check_utf8(data)
+        else:
+            data = data.decode(name).encode()
+    except UnicodeDecodeError as error:
+        raise UnreadableUpload(
+            f"the file is not text in {name}: {error.reason}",
+            field="file",
+            limit="UTF-8, UTF-16 or Windows-1252, or the declared encoding",
+            cure="save the file as UTF-8, or declare its encoding",
+        ) from error
     if b"\x00" in data:
         raise UnreadableUpload("the file holds NUL", field="file", limit="text", cure="save the file as UTF-8 text")
-    return io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", newline="")
+    return data, name
 
 
-@contextmanager
-def refuse_other_encodings(data: bytes) -> Iterator[None]:
-    """Turn a decoding error inside the block into a refusal that names the byte.
-
-    Raises
-    ------
-    UnreadableUpload
-        The file is not UTF-8.
-    """
+def guess_encoding(data: bytes) -> str:
+    """Encoding of text by its byte order mark, or by which bytes occur."""
+    for bom, name in _BOMS:
+        if data.startswith(bom):
+            return name
+    sample = data[:_SAMPLE_BYTES]
+    for name, first in (("utf-16-le", 1), ("utf-16-be", 0)):
+        nul, text = sample[first::2], sample[1 - first :: 2]
+        if nul and nul.count(0) > 0.9 * len(nul) and not text.count(0):
+            return name
     try:
-        yield
-    except UnicodeDecodeError as error:
-        start = 0
-        try:
-            data.decode("utf-8-sig")
-        except UnicodeDecodeError as whole:  # its position counts from the start of the file, not of the last block
-            start = whole.start
-        raise UnreadableUpload(
-            f"byte {start} of the file is not UTF-8", field="file", limit="UTF-8", cure="save the file as UTF-8"
-        ) from error
+        _check_utf8(data)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8"
+
+
+def _check_utf8(data: bytes) -> None:
+    """Decode without keeping the result; raises UnicodeDecodeError."""
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    for start in range(0, len(data), _DECODED_BYTES):
+        decoder.decode(data[start : start + _DECODED_BYTES])
+    decoder.decode(b"", final=True)
 
 
 def clean_text(value: object, length: int = MAX_NAME) -> str | None:

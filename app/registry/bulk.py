@@ -23,19 +23,23 @@ _CHUNK = 500
 
 
 class PlaceRow(NamedTuple):
-    """Where a marker is."""
+    """Where a marker is, and the row of the survey that it comes from."""
 
     lon_deg: float
     lat_deg: float
     height_m: float | None
     vertical_datum: str | None
+    id: str
+    family: str
+    survey_file_sha256: str | None
+    point: str | None
 
 
 def list_places_in(connection: sa.Connection, agency_id: str, box: Box, *, limit: int) -> list[PlaceRow]:
     """Places and heights of the agency's markers in a box that may be on the road."""
-    query = select_rows(PlaceRow, markers).where(
-        markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box)
-    )
+    own = {"point": markers.c.original["point"].as_string().label("point")}
+    columns = [own[name] if name in own else markers.c[name] for name in PlaceRow._fields]
+    query = sa.select(*columns).where(markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box))
     return fetch_all(connection, query.limit(limit), PlaceRow)
 
 

@@ -10,8 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from typing_extensions import TypedDict
 
-from app.formats.surveys.read import warn
-from app.formats.surveys.table import Fault, Floats
+from app.formats.surveys.table import Fault, Floats, warn
 from app.surveys.georeference import GeoreferencedSurvey, east_north_m
 
 REACH_M = 30.0

@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from app.formats.surveys.read import warn
-from app.formats.surveys.table import Fault, Floats, Severity
+from app.formats.surveys.table import Fault, Floats, Severity, warn
 from app.surveys.georeference import GeoreferencedSurvey
 
 Flags = npt.NDArray[np.bool_]

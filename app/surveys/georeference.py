@@ -9,7 +9,7 @@ import numpy as np
 
 from app.errors import WaymarkError
 from app.formats.surveys.declaration import METRES, ImportDeclaration
-from app.formats.surveys.read import crs_unit
+from app.formats.surveys.grids import unit_factor
 from app.formats.surveys.table import Floats, SurveyTable
 from app.geodesy import PlacedPositions, place_positions, reference_system
 
@@ -71,7 +71,7 @@ def georeference_survey(table: SurveyTable, declaration: ImportDeclaration, accu
         The CRS or its transformation cannot be used.
     """
     height = np.full(table.rows, np.nan) if table.height is None else table.height * METRES[table.height_unit]
-    factor = _factor(table.unit, table.crs)
+    factor = unit_factor(table.unit, reference_system(table.crs))
     placed = place_positions(
         table.first * factor,
         table.second * factor,
@@ -119,7 +119,7 @@ def list_alternatives(table: SurveyTable, declaration: ImportDeclaration) -> lis
 def _readings(table: SurveyTable, first: Floats, second: Floats) -> Iterator[tuple[str, str, Floats, Floats, str]]:
     """Code, proposal, and the coordinates with the CRS of each other reading."""
     crs = table.crs
-    factor = _factor(table.unit, crs)
+    factor = unit_factor(table.unit, reference_system(crs))
     first, second = first * factor, second * factor
     names = ("easting", "northing") if table.projected else ("lon_deg", "lat_deg")
     yield "swapped_axes", f"swap the columns of {names[0]} and {names[1]}", second, first, crs
@@ -153,11 +153,6 @@ def _sibling_zones(crs: str) -> Iterator[tuple[str, str, str]]:
             if first in (32601, 32701):
                 other = code + (100 if first == 32601 else -100)
                 yield "wrong_zone", f"declare crs EPSG:{other} (the other hemisphere)", f"EPSG:{other}"
-
-
-def _factor(unit: str, crs: str) -> float:
-    own = crs_unit(reference_system(crs))
-    return 1.0 if unit == own or unit == "deg" else METRES[unit] / METRES[own]
 
 
 def _from_dm(value: Floats) -> Floats:

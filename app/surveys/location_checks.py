@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.formats.surveys.declaration import ImportDeclaration
-from app.formats.surveys.read import warn
-from app.formats.surveys.table import Fault, Floats
+from app.formats.surveys.table import Fault, Floats, warn
 from app.surveys.consistency_checks import nearest_of
 from app.surveys.georeference import Alternative, GeoreferencedSurvey, east_north_m, list_alternatives
 

@@ -111,7 +111,7 @@ Jobs = Annotated[ImportJobs, use_cases("import_jobs")]
     },
 )
 def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports, jobs: Jobs) -> Response:
-    """Import a survey: CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, LandXML or DXF.
+    """Import a survey: CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, KMZ, GPX, LandXML, JobXML, GSI or DXF.
 
     With `dry_run` the report says what would be stored. A refused import answers 422 with the report in the problem;
     nothing of it is stored. A file of more than 8 MiB becomes a job, and so does one that is sent with

@@ -56,14 +56,23 @@ class DeclarationIn(_FamilyMembers):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [DECLARATION_EXAMPLE]})
 
-    format: Literal["csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"] | None = Field(
-        None, description="Told by the content without."
+    format: (
+        Literal["csv", "geojson", "gpkg", "shapefile", "kml", "kmz", "gpx", "landxml", "jobxml", "dxf", "gsi"] | None
+    ) = Field(None, description="Detected without.")
+    layout: Literal["named", "pnezd", "penzd", "nezd", "enzd"] | None = Field(
+        None, description="Columns of CSV; detected without."
     )
-    layout: Literal["named", "pnezd", "penzd"] = Field("named", description="Columns of CSV.")
-    columns: dict[Name, Name] = Field(default_factory=dict, max_length=20, description="Role to column.")
+    columns: dict[Name, Annotated[Text, Field(max_length=200)] | None] = Field(
+        default_factory=dict,
+        max_length=20,
+        description="Role to column; null or an empty text where no column has the role.",
+    )
     layer: Name | None = Field(None, description="Of a GeoPackage or a DXF.")
-    decimal: Literal[".", ","] = "."
-    delimiter: Literal[",", ";", "\t", "space"] | None = None
+    decimal: Literal[".", ","] | None = Field(None, description="Of CSV; detected without.")
+    delimiter: Literal[",", ";", "\t", "|", "space"] | None = Field(None, description="Of CSV; detected without.")
+    encoding: (
+        Literal["utf-8", "utf-16", "windows-1252", "iso-8859-1", "iso-8859-2", "windows-1250", "cp437", "cp850"] | None
+    ) = Field(None, description="Of CSV and GSI; detected without: UTF-8, UTF-16 or Windows-1252.")
     crs: Annotated[Text, Field(max_length=100)] | None = Field(None, description="EPSG code or URN.")
     realization: Annotated[Text, Field(min_length=1, max_length=64)] | None = None
     epoch: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1900, le=2200)] | None = None
@@ -84,6 +93,9 @@ class DeclarationIn(_FamilyMembers):
     road: Name | None = None
     compare: Annotated[bool, Field(strict=True)] = Field(
         False, description="The survey measures registered markers: residuals, and a new version of each."
+    )
+    duplicates: Literal["refuse", "store"] = Field(
+        "refuse", description="Whether rows that are already registered, and a file that was imported, are refused."
     )
     match: Literal["code", "nearest"] = "code"
     tolerance_m: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=100)] = 0.1

@@ -17,6 +17,7 @@ from app.families.cerpm.message import speed_limit_document
 from app.families.rules import MarkerRules
 from app.families.surveys import Flags, RowCodes, Rows, SurveyImport, listed_codes, texts_of, unknown_texts
 from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.markers.cerpm import HEIGHT_M, MAX_NUMBER, LaneSide, SpeedLimit, SpeedUnit
 from app.radio.settings import RadioSettings
@@ -68,6 +69,10 @@ class CerpmSurvey(SurveyImport[CerpmDefaults]):
         for row in np.flatnonzero(wanted & ((height < HEIGHT_M[0]) | (height > HEIGHT_M[1]))):
             message = f"height_m is {height[row]:g}, a message holds {HEIGHT_M[0]:g} to {HEIGHT_M[1]:g} m"
             yield Fault(int(row) + 1, "position.height_m", "not_a_marker", message, cure)
+
+    def code_form(self, defaults: CerpmDefaults, *, compare: bool) -> CodeForm:
+        """Numbers."""
+        return CodeForm("[1-9][0-9]{0,9}", True, "numbers of CERPMs")
 
     def read_codes(
         self, survey: GeoreferencedSurvey, rows: Rows, defaults: CerpmDefaults

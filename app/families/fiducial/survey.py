@@ -14,6 +14,7 @@ from app.families.fiducial.inputs import FiducialGeometryIn
 from app.families.inputs import StrictModel, Text
 from app.families.rules import RETIRED, MarkerRules
 from app.families.surveys import RowCodes, Rows, SurveyImport, listed_codes
+from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.markers.fiducial import FiducialCode, KnownFiducial
 from app.registry.columns import Columns
@@ -48,6 +49,10 @@ class FiducialSurvey(SurveyImport[KnownFiducial | None]):
         with naming("sign"):
             code = FiducialCode(sign.dictionary, 0)
             return KnownFiducial(code, sign.geometry.geometry(code))
+
+    def code_form(self, defaults: KnownFiducial | None, *, compare: bool) -> CodeForm:
+        """Numbers, with or without the series of the dictionary."""
+        return CodeForm("(?:[^ ]+-)?[0-9]{1,5}", False, "numbers of signs")
 
     def read_codes(
         self, survey: GeoreferencedSurvey, rows: Rows, defaults: KnownFiducial | None

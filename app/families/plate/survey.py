@@ -14,8 +14,9 @@ from app.errors import InvalidParameter, WaymarkError
 from app.families.plate.inputs import GeometryIn
 from app.families.rules import RETIRED, MarkerRules
 from app.families.surveys import Flags, RowCodes, Rows, SurveyImport, listed_codes
+from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, code_cells
 from app.markers.plate_digits import id_digits, position_digits, registry_number_bits
 from app.registry.columns import Columns
 from app.registry.marker_rows import CodeRow
@@ -62,6 +63,16 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
                 "check_digits means nothing in this scheme", field="check_digits", limit="position-check"
             )
         return PlateDefaults(PlateScheme(scheme), checks, PlateGeometry(**declared.get("geometry", {})))
+
+    def code_form(self, defaults: PlateDefaults, *, compare: bool) -> CodeForm:
+        """Digits of the declared size and scheme, or registry numbers; digits of any plate in comparisons."""
+        cells = len(code_cells(defaults.geometry.n))
+        if compare:
+            return CodeForm("[0-9A-F]{5,}", True, "digits of plates")
+        if defaults.scheme is PlateScheme.ID:
+            pattern = f"[0-9A-F]{{{cells}}}|[0-9]{{1,{cells - 1}}}"
+            return CodeForm(pattern, True, f"{cells} digits of an id plate, or its registry number")
+        return CodeForm(f"[0-9]{{{cells}}}", True, f"{cells} digits of a plate")
 
     def read_codes(
         self, survey: GeoreferencedSurvey, rows: Rows, defaults: PlateDefaults

@@ -30,7 +30,7 @@ from app.formats.alignments.features import (
     normalize_kind,
 )
 from app.formats.alignments.geometry import CHORD_ERROR_M, MAX_VERTICES, AlignmentFile
-from app.formats.surveys.declaration import METRES
+from app.formats.surveys.declaration import FEET, METRES
 from app.formats.surveys.dxf_reader import open_dxf, reading_dxf
 
 Floats = npt.NDArray[np.float64]
@@ -75,7 +75,7 @@ def read_dxf(data: bytes) -> AlignmentFile:
     """
     with reading_dxf():
         document, unit = open_dxf(data)
-        unit_m = METRES[unit] if unit is not None else None
+        unit_m = None if unit is None else METRES["ft-intl" if unit[0] == FEET else unit[0]] * unit[1]
         space = document.modelspace()
         paths = [path for entity in space.query(_LINES) for path in _paths(entity, unit_m or 1.0)]
         for path in paths:

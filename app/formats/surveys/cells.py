@@ -1,10 +1,15 @@
-"""Numbers as people type them: read strictly; a cell that is no number gets a fault that names the likely mistake."""
+"""Numbers as people type them: a cell that is no number gets a fault that names the likely mistake.
+
+How numbers are written is the same in the whole file: it is declared, or most cells show it. A cell that is written in
+another way is a fault.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,11 +25,74 @@ _SEXAGESIMAL = re.compile(
     r"(?:['′’m: ]\s*([0-9]{1,2}(?:\.[0-9]*)?)?\s*(?:\"|″|”|''|s)?)?\s*([NSEWO])?\s*",
     re.IGNORECASE,
 )
+_SPACES = " \u00a0\u2009\u202f"  # blank, no-break, thin and narrow no-break space separate groups (SI Brochure, 5.4.4)
+_GROUPS = f",.'\u2019{_SPACES}"
+_IN_GROUPS = re.compile(
+    rf"[+-]?[0-9]{{1,3}}(?P<mark>[{_GROUPS}])[0-9]{{3}}(?:(?P=mark)[0-9]{{3}})*(?P<rest>[.,][0-9]*)?"
+)
+_WITH_COMMA = re.compile(r"[+-]?([0-9]+),([0-9]+)")
+_WITH_POINT = re.compile(r"[+-]?[0-9]+\.[0-9]+")
+_MIN_SHARE = 0.5  # [1] of the numbers above 999 that must be in groups; chosen by hand
 _HEMISPHERE = re.compile(r"\s*(?:([NSEWO])\s*([0-9.]+)|([0-9.]+)\s*°?\s*([NSEWO]))\s*", re.IGNORECASE)
 _WITH_UNIT = re.compile(r"\s*([+-]?[0-9.]+)\s*(m|ft|us-?ft|sft|feet|'|cm|mm|km)\.?\s*", re.IGNORECASE)
 
 
-def read_numbers(cells: Any, field: str, *, decimal: str = ".", required: bool) -> tuple[Floats, list[Fault]]:
+class NumberForm(NamedTuple):
+    """How numbers are written: the decimal sign, and the sign between groups of three digits, or none."""
+
+    decimal: str = "."
+    group: str = ""
+
+
+PLAIN = NumberForm()
+
+
+def detect_number_form(cells: Iterable[str], decimal: str | None) -> tuple[NumberForm, str]:
+    """How the majority of cells is written, and the cells that show it.
+
+    Parameters
+    ----------
+    cells : iterable of str
+        A sample of the cells of coordinates.
+    decimal : str or None
+        If it is declared.
+
+    Notes
+    -----
+    A comma before three digits may separate decimals or thousands (``432,345``); such a cell shows nothing.
+    """
+    decimals, groups, large = Counter[str](), Counter[str](), 0
+    shown: dict[str, str] = {}
+    for text in map(str.strip, cells):
+        mark = sign = ""
+        if found := _IN_GROUPS.fullmatch(text):
+            rest = found["rest"] or ""
+            if rest or found["mark"] not in ",." or text.count(found["mark"]) > 1:
+                mark, sign = found["mark"], rest[:1] or (_other(found["mark"]) if found["mark"] in ",." else "")
+            elif found["mark"] == ".":
+                sign = "."  # 432.345 is a number with a decimal point, as programs write it
+            if mark == sign:
+                mark = ""
+        elif found := _WITH_COMMA.fullmatch(text):
+            sign = ","  # four digits before it, or not three after it
+        elif _WITH_POINT.fullmatch(text):
+            sign = "."
+        large += len(re.sub(r"[.,][0-9]*$", "", text) if not mark else text) > 3
+        decimals.update([sign] if sign else [])
+        groups.update([mark] if mark else [])
+        shown.setdefault(mark or sign, text[:30])
+    sign = decimal or (decimals.most_common(1)[0][0] if decimals else ".")
+    mark, count = groups.most_common(1)[0] if groups else ("", 0)
+    if mark == sign or count < _MIN_SHARE * large:
+        mark = ""
+    return NumberForm(sign, mark), shown.get(mark or sign, "")
+
+
+def _other(mark: str) -> str:
+    return "." if mark == "," else ","
+
+
+def read_numbers(cells: Any, field: str, *, form: NumberForm = PLAIN, required: bool) -> tuple[Floats, list[Fault]]:
     """Numbers of a column, shape (N,); NaN and a fault where a cell holds none.
 
     Parameters
@@ -32,8 +100,7 @@ def read_numbers(cells: Any, field: str, *, decimal: str = ".", required: bool) 
     cells : sequence of str, float or None, Texts, or ndarray
     field : str
         Name of the column in faults.
-    decimal : str
-        ``.`` or ``,``.
+    form : NumberForm
     required : bool
         An empty cell is a fault.
     """
@@ -43,12 +110,12 @@ def read_numbers(cells: Any, field: str, *, decimal: str = ".", required: bool) 
     faults: list[Fault] = []
     start = 0
     for part in _parts(cells):
-        fast = _read_fast(part) if decimal == "." else None
+        fast = _read_fast(part) if form == PLAIN else None
         if fast is not None:
             values[start : start + len(part)] = fast
         else:
             for index, cell in enumerate(part, start):
-                value = _read_one(cell, field, index + 1, decimal, required)
+                value = _read_one(cell, field, index + 1, form, required)
                 if isinstance(value, Fault):
                     faults.append(value)
                 else:
@@ -74,7 +141,7 @@ def _read_fast(cells: Sequence[Any]) -> Floats | None:
     return values if np.isfinite(values).all() else None
 
 
-def _read_one(cell: Any, field: str, row: int, decimal: str, required: bool) -> float | Fault:
+def _read_one(cell: Any, field: str, row: int, form: NumberForm, required: bool) -> float | Fault:
     if cell is None or (isinstance(cell, str) and not cell.strip()) or (isinstance(cell, float) and np.isnan(cell)):
         if required:
             return Fault(row, field, "missing", f"{field} is empty", "fill it in, or leave the row out")
@@ -82,12 +149,16 @@ def _read_one(cell: Any, field: str, row: int, decimal: str, required: bool) -> 
     if isinstance(cell, bool) or not isinstance(cell, str | int | float | np.number):
         return Fault(row, field, "not_a_number", f"{field} holds a {type(cell).__name__}, not a number")
     text = str(cell)
-    plain = text.replace(",", ".") if decimal == "," and "." not in text else text
+    plain = text
+    if form.group and (found := _IN_GROUPS.fullmatch(text.strip())) and found["mark"] == form.group:
+        plain = text.replace(form.group, "") if found["rest"] is None or found["rest"][0] == form.decimal else text
+    if form.decimal == "," and "." not in plain:
+        plain = plain.replace(",", ".")
     if _PLAIN.fullmatch(plain):
         value = float(plain)
         if np.isfinite(value):
             return value
-    return _fault_of(text, field, row, decimal)
+    return _fault_of(text, field, row, form.decimal)
 
 
 def _fault_of(text: str, field: str, row: int, decimal: str) -> Fault:

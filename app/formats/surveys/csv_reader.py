@@ -1,24 +1,50 @@
-"""Surveys as delimited text: a header with names, or the fixed columns of PNEZD and PENZD."""
+"""Surveys as delimited text: with a header somewhere in the first lines, or with columns by position."""
 
 from __future__ import annotations
 
+import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain, islice
 
 from app.errors import UnreadableUpload
 from app.formats.columns import repeated_names
-from app.formats.delimited import detect_delimiter, split_rows
+from app.formats.delimited import SPACES, detect_delimiter, split_rows
 from app.formats.surveys.declaration import ImportDeclaration
-from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable, Texts
-from app.formats.text import open_utf8, refuse_other_encodings
+from app.formats.surveys.header import Header, find_header
+from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Detected, Fault, SourceTable, Texts
+from app.formats.text import as_utf8
 
-PNEZD = ("point", "northing", "easting", "height", "description")
-PENZD = ("point", "easting", "northing", "height", "description")
-_DELIMITERS = (";", "\t", ",")
-_NUMERIC = re.compile(r"\s*[+-]?[0-9][0-9.,]*\s*")
-_SAMPLE_LINES = 50  # lines that the delimiter is detected by; chosen by hand
+_DELIMITERS = (";", "\t", "|", ",")
+_DELIMITER_NAMES = {"\t": "tab", SPACES: "blanks"}
+_COMMENTS = ("#", "//")
+_COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|//)", re.MULTILINE)
+_SAMPLE_LINES = 50  # lines by which the delimiter and the header are detected; chosen by hand
 _BATCH = 10_000  # rows at a time; chosen by hand
+_DECIMAL_COMMAS = re.compile(r"(?:\S+[ \t]+)?[+-]?[0-9]+,[0-9]+[ \t]+[+-]?[0-9]+,[0-9]+(?:[ \t].*)?\s*")
+
+
+class _Lines:
+    """Lines of a file without its comments; counts the lines that were read."""
+
+    def __init__(self, data: bytes, *, keep_ends: bool) -> None:
+        self._text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", newline="" if keep_ends else None)
+        self._has_comments = _COMMENT_LINE.search(data) is not None
+        self.number = 0
+        self.comments = 0
+        self.first_comments: list[str] = []
+
+    def __iter__(self) -> Iterator[str]:
+        quoted = False
+        for number, line in enumerate(self._text, 1):
+            self.number = number
+            if self._has_comments and not quoted and line.lstrip().startswith(_COMMENTS):
+                self.comments += 1
+                if self.comments <= _SAMPLE_LINES:
+                    self.first_comments.append(line.strip())
+                continue
+            quoted ^= self._has_comments and line.count('"') % 2 == 1
+            yield line
 
 
 def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
@@ -27,33 +53,49 @@ def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
     Raises
     ------
     UnreadableUpload
-        It is not UTF-8, holds NUL or fields without end, names no columns or one twice, or has too many.
+        It is no text, holds NUL or fields without end, names one column twice, or has too many.
+    InvalidParameter
+        It has no header, and its columns cannot be identified by position.
     """
-    with refuse_other_encodings(data):
-        return _read(data, declaration)
-
-
-def _read(data: bytes, declaration: ImportDeclaration) -> SourceTable:
-    rows = split_rows(open_utf8(data), _delimiter(data, declaration))
-    first = next(rows, None)
-    if first is None:
+    utf8, encoding = as_utf8(data, declaration.encoding)
+    detected: list[Detected] = []
+    if declaration.encoding is None:
+        detected.append(Detected("encoding", encoding, "byte order mark, or which bytes occur"))
+    delimiter = declaration.delimiter or _detect_delimiter(utf8, declaration)
+    if declaration.delimiter is None:
+        evidence = f"splits most of the first {_SAMPLE_LINES} lines into equally many cells"
+        detected.append(Detected("delimiter", _DELIMITER_NAMES.get(delimiter, delimiter), evidence))
+    lines = _Lines(utf8, keep_ends=delimiter != SPACES)
+    rows = split_rows(lines, delimiter)
+    head: list[list[str]] = []
+    numbers: list[int] = []
+    for row in islice(rows, _SAMPLE_LINES):
+        head.append(row)
+        numbers.append(lines.number)
+    comments = [next(split_rows([line.lstrip("#/ \t")], delimiter), []) for line in lines.first_comments]
+    if not head:
         raise UnreadableUpload("the file has no rows", field="file", limit="at least one row", cure="send the survey")
-    fixed = {"pnezd": PNEZD, "penzd": PENZD}.get(declaration.layout)
-    if fixed is not None:
-        has_header = len(first) > 1 and not any(_NUMERIC.fullmatch(cell) for cell in first[1:4])
-        body = rows if has_header else chain([first], rows)
-        return _columns(fixed, body, last_takes_rest=True)
-    names = tuple(name.strip() for name in first)
-    _check_names(names)
-    return _columns(names, rows, last_takes_rest=False)
+    header = find_header(head, comments, declaration)
+    _check_names(header.names)
+    detected += header.detected
+    if header.start < len(numbers) and numbers[header.start] > 2:
+        detected.append(Detected("first row", f"line {numbers[header.start]}", "the lines before it are not rows"))
+    table = _columns(header, chain(head[header.start :], rows), delimiter)
+    if lines.comments:
+        value = f"{lines.comments} lines left out"
+        detected.append(Detected("comments", value, f"they begin with {' or '.join(_COMMENTS)}"))
+    return SourceTable("csv", header.names, table, faults=header.faults, detected=tuple(detected))
 
 
-def _delimiter(data: bytes, declaration: ImportDeclaration) -> str:
-    """The declared delimiter, or the one that the first lines show."""
-    if declaration.delimiter is not None:
-        return declaration.delimiter
-    candidates = [mark for mark in _DELIMITERS if not (mark == "," and declaration.decimal == ",")]
-    return detect_delimiter(islice(open_utf8(data), _SAMPLE_LINES), candidates)
+def _detect_delimiter(utf8: bytes, declaration: ImportDeclaration) -> str:
+    """The delimiter that the first lines show."""
+    sample = list(islice(_Lines(utf8, keep_ends=False), _SAMPLE_LINES))
+    found = detect_delimiter(sample, _DELIMITERS)
+    if found == "," and declaration.decimal != ".":
+        spaced = sum(1 for line in sample if _DECIMAL_COMMAS.fullmatch(line))
+        if 2 * spaced > len(sample):
+            return SPACES
+    return found
 
 
 def _check_names(names: tuple[str, ...]) -> None:
@@ -69,32 +111,27 @@ def _check_names(names: tuple[str, ...]) -> None:
         raise UnreadableUpload(
             f"the file has {len(names)} columns", field="file", limit=f"{MAX_COLUMNS} columns", cure="leave some out"
         )
-    if any(_NUMERIC.fullmatch(name) for name in names):
-        raise UnreadableUpload(
-            "the first row holds numbers where the columns' names belong",
-            field="file",
-            limit="a header",
-            cure="add a header, or declare the layout pnezd or penzd",
-        )
 
 
-def _columns(names: tuple[str, ...], rows: Iterator[list[str]], *, last_takes_rest: bool) -> SourceTable:
-    columns = tuple(Texts() for _ in names)
-    faults = Faults()
-    width = len(names)
-    for start, batch in _batches(rows):
+def _columns(header: Header, rows: Iterable[list[str]], delimiter: str) -> tuple[Texts, ...]:
+    columns = tuple(Texts() for _ in header.names)
+    width, glue = len(header.names), " " if delimiter == SPACES else delimiter
+    for start, batch in _batches(iter(rows)):
         for k, row in enumerate(batch):
-            if len(row) != width:
-                if last_takes_rest and len(row) > width:
-                    batch[k] = [*row[: width - 1], ",".join(row[width - 1 :])]
-                elif last_takes_rest and len(row) >= width - 2:
-                    batch[k] = row + [""] * (width - len(row))
-                else:
-                    faults.add([_ragged(start + k + 1, len(row), width)])
-                    batch[k] = [""] * width
+            if len(row) == width:
+                continue
+            if len(row) > width and not any(row[width:]):
+                batch[k] = row[:width]  # delimiters at the end of the line
+            elif header.last_takes_rest and len(row) > width:
+                batch[k] = [*row[: width - 1], glue.join(row[width - 1 :])]
+            elif header.last_takes_rest and len(row) >= header.min_width:
+                batch[k] = row + [""] * (width - len(row))
+            else:
+                header.faults.add([_ragged(start + k + 1, len(row), width)])
+                batch[k] = [""] * width
         for column, cells in zip(columns, zip(*batch, strict=True), strict=True):
             column.extend(cells)
-    return SourceTable("csv", names, columns, faults=faults)
+    return columns
 
 
 def _batches(rows: Iterator[list[str]]) -> Iterator[tuple[int, list[list[str]]]]:

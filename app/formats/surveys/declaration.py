@@ -9,10 +9,21 @@ from typing import Any
 
 from app.errors import InvalidParameter
 
-FORMATS = ("csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf")
-LAYOUTS = ("pnezd", "penzd", "named")
+FORMATS = ("csv", "geojson", "gpkg", "shapefile", "kml", "kmz", "gpx", "landxml", "jobxml", "dxf", "gsi")
+FIXED_LAYOUTS = {
+    "pnezd": ("point", "northing", "easting", "height", "description"),
+    "penzd": ("point", "easting", "northing", "height", "description"),
+    "nezd": ("northing", "easting", "height", "description"),
+    "enzd": ("easting", "northing", "height", "description"),
+}
+"""Columns by position, by the name that survey software has for them."""
+LAYOUTS = (*FIXED_LAYOUTS, "named")
+ENCODINGS = ("utf-8", "utf-16", "windows-1252", "iso-8859-1", "iso-8859-2", "windows-1250", "cp437", "cp850")
+DUPLICATES = ("refuse", "store")
 METRES = {"m": 1.0, "ft-us": 1200.0 / 3937.0, "ft-intl": 0.3048}
 """Metres to a unit of length: US survey foot and international foot (NIST SP 811)."""
+FEET = "ft"
+"""Unit of a file that does not state which foot."""
 TEXT_ROLES = ("point", "code", "description", "road", "side", "status")
 NUMBER_ROLES = ("heading_deg", "measure_m", "offset_m", "horizontal_rmse_m", "vertical_rmse_m")
 COORDINATE_ROLES = ("lon_deg", "lat_deg", "easting", "northing", "height")
@@ -30,14 +41,15 @@ class ImportDeclaration:
     ----------
     format : str, optional
         One of `FORMATS`; detected by the content if it is left out.
-    layout : str
-        Of CSV: ``pnezd``, ``penzd`` (no header needed), or ``named`` columns.
+    layout : str, optional
+        Of CSV: one of `FIXED_LAYOUTS` (no header needed), or ``named`` columns; detected without.
     columns : mapping
-        Role to the column's name; common names are found without. Roles are `ROLES`.
+        Role to the column's name, or None where the file has no column of this role; common names are found without.
+        Roles are `ROLES`.
     layer : str, optional
         Of a GeoPackage or a DXF.
-    decimal, delimiter : str, optional
-        Of CSV.
+    decimal, delimiter, encoding : str, optional
+        Of CSV; detected without.
     crs, realization, epoch, vertical_datum
         Frame of the coordinates. [epoch: decimal year]
     unit, height_unit : str, optional
@@ -52,6 +64,8 @@ class ImportDeclaration:
         Of the markers.
     compare : bool
         The survey finds registered markers as built: rows are matched, and moved markers get a new version.
+    duplicates : str
+        ``refuse`` what is already registered, or ``store`` it once more.
     match : str
         ``code`` or ``nearest``.
     tolerance_m : float
@@ -61,11 +75,12 @@ class ImportDeclaration:
     """
 
     format: str | None = None
-    layout: str = "named"
-    columns: Mapping[str, str] = field(default_factory=dict)
+    layout: str | None = None
+    columns: Mapping[str, str | None] = field(default_factory=dict)
     layer: str | None = None
-    decimal: str = "."
+    decimal: str | None = None
     delimiter: str | None = None
+    encoding: str | None = None
     crs: str | None = None
     realization: str | None = None
     epoch: float | None = None
@@ -79,6 +94,7 @@ class ImportDeclaration:
     status: str | None = None
     road: str | None = None
     compare: bool = False
+    duplicates: str = "refuse"
     match: str = "code"
     tolerance_m: float = 0.1
     survey: Mapping[str, Any] = field(default_factory=dict)
@@ -86,9 +102,11 @@ class ImportDeclaration:
     def __post_init__(self) -> None:
         for name, value, allowed in (
             ("format", self.format, (None, *FORMATS)),
-            ("layout", self.layout, LAYOUTS),
-            ("decimal", self.decimal, (".", ",")),
-            ("delimiter", self.delimiter, (None, ",", ";", "\t", "space")),
+            ("layout", self.layout, (None, *LAYOUTS)),
+            ("decimal", self.decimal, (None, ".", ",")),
+            ("delimiter", self.delimiter, (None, ",", ";", "\t", "|", "space")),
+            ("encoding", self.encoding, (None, *ENCODINGS)),
+            ("duplicates", self.duplicates, DUPLICATES),
             ("unit", self.unit, (None, *METRES)),
             ("height_unit", self.height_unit, (None, *METRES)),
             ("match", self.match, MATCHES),
@@ -100,10 +118,6 @@ class ImportDeclaration:
         if unknown is not None:
             raise InvalidParameter(
                 f"there is no role {unknown[:40]!r}", field="columns", limit=", ".join(ROLES), cure=_CURE
-            )
-        if self.decimal == "," and self.delimiter == ",":
-            raise InvalidParameter(
-                "a comma cannot separate columns and decimals", field="delimiter", limit="two characters", cure=_CURE
             )
         _check_area(self.area_deg)
         if self.height_range_m is not None and not self.height_range_m[0] < self.height_range_m[1]:

@@ -12,14 +12,35 @@ from ezdxf.filemanagement import read
 from ezdxf.lldxf.const import DXFError
 
 from app.errors import UnreadableUpload, WaymarkError
-from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable
+from app.formats.surveys.declaration import FEET
+from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Detected, Fault, Faults, SourceTable
 
-_UNITS = {2: "ft-intl", 6: "m", 21: "ft-us"}
-_UNITLESS = 0  # codes of $INSUNITS; Autodesk DXF reference, "HEADER section group codes"
+_UNITS = {
+    1: (FEET, 1 / 12),
+    2: (FEET, 1.0),
+    4: ("m", 0.001),
+    5: ("m", 0.01),
+    6: ("m", 1.0),
+    7: ("m", 1000.0),
+    14: ("m", 0.1),
+    21: ("ft-us", 1.0),
+}
+"""Unit of length of each code of $INSUNITS, and how many of it one unit of the drawing is: inches, feet, mm, cm, m, km,
+dm, US survey feet. Source: Autodesk DXF reference, "HEADER section group codes"."""
+_UNITLESS = 0
+_HEAD_BYTES = 4096  # [byte] in which a binary file shows itself; chosen by hand
 
 
-def read_dxf(data: bytes, layer: str | None) -> SourceTable:
+def read_dxf(data: bytes, layer: str | None, unit: str | None = None) -> SourceTable:
     """Points and block references of the model space; their layer, block and attributes are columns.
+
+    Parameters
+    ----------
+    data : bytes
+    layer : str, optional
+        Only entities on it.
+    unit : str, optional
+        That of the coordinates where it is declared: many drawings have the $INSUNITS of a template.
 
     Raises
     ------
@@ -27,7 +48,7 @@ def read_dxf(data: bytes, layer: str | None) -> SourceTable:
         It is no ASCII DXF, has units that no survey has, or too many entities.
     """
     with reading_dxf():
-        document, unit = open_dxf(data)
+        document, found = open_dxf(data)
         entities = list(document.modelspace().query("POINT INSERT"))
     rows: list[dict[str, Any]] = []
     points: list[tuple[float, float, float]] = []
@@ -45,8 +66,16 @@ def read_dxf(data: bytes, layer: str | None) -> SourceTable:
             raise _damaged("it has too many entities")
     names = tuple(dict.fromkeys(name for row in rows for name in row))[:MAX_COLUMNS]
     xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
+    detected: tuple[Detected, ...] = ()
+    if found is not None and unit is None:
+        unit, count = found
+        xyz *= count
+        value = unit if count == 1 else f"{count:g} {unit}"
+        detected = (Detected("unit of the drawing", value, f"$INSUNITS {document.header['$INSUNITS']}"),)
     columns = tuple([row.get(name) for row in rows] for name in names)
-    return SourceTable("dxf", names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), unit=unit, faults=Faults(faults))
+    return SourceTable(
+        "dxf", names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), unit=unit, faults=Faults(faults), detected=detected
+    )
 
 
 @contextmanager
@@ -69,28 +98,27 @@ def reading_dxf() -> Iterator[None]:
         raise _damaged(f"it cannot be read: {str(error)[:200]}") from error
 
 
-def open_dxf(data: bytes) -> tuple[Any, str | None]:
-    """Document of ezdxf, and its unit; None if it states none.
+def open_dxf(data: bytes) -> tuple[Any, tuple[str, float] | None]:
+    """Document of ezdxf, and the unit of length with how many of it a drawing unit is; None if it states none.
 
     Raises
     ------
     UnreadableUpload
-        It is no ASCII DXF in UTF-8, or has units that no survey has.
+        It is no ASCII DXF, or has units that no survey has.
     """
     try:
         text = data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise _damaged("it is no ASCII DXF in UTF-8") from error
+    except UnicodeDecodeError:
+        if b"\x00" in data[:_HEAD_BYTES]:
+            raise _damaged("it is no ASCII DXF") from None
+        text = data.decode("cp1252", "replace")  # before R2007 in the code page of the system; numbers are ASCII
     document = read(io.StringIO(text, newline=None))
-    return document, _unit(document.header.get("$INSUNITS", _UNITLESS))
-
-
-def _unit(code: Any) -> str | None:
+    code = document.header.get("$INSUNITS", _UNITLESS)
     if code == _UNITLESS:
-        return None
+        return document, None
     if code not in _UNITS:
         raise _damaged(f"its $INSUNITS is {str(code)[:10]}")
-    return _UNITS[code]
+    return document, _UNITS[code]
 
 
 def _values(entity: Any) -> dict[str, Any]:
@@ -105,6 +133,6 @@ def _damaged(message: str) -> UnreadableUpload:
     return UnreadableUpload(
         f"the DXF cannot be used: {message}",
         field="file",
-        limit=f"ASCII DXF in m or ft, at most {MAX_ROWS} points",
+        limit=f"ASCII DXF in metres, millimetres or feet, at most {MAX_ROWS} points",
         cure="export the points as DXF R2010",
     )

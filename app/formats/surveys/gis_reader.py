@@ -16,7 +16,8 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable, Texts
+from app.formats.surveys.coordinates import points_of
+from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Faults, SourceTable, Texts
 
 _SQLITE = b"SQLite format 3\x00"
 _SHAPEFILE_CODE = 9994  # ESRI Shapefile Technical Description (1998), file header
@@ -24,7 +25,6 @@ _PARTS = (".shp", ".shx", ".dbf", ".prj", ".cpg")
 _MAX_MEMBERS = 50  # files of an archive; chosen by hand
 MAX_INFLATED = 512 * 1024**2
 """Largest Shapefile, inflated. [byte] Chosen by hand."""
-_POINT = 0  # geometry type of GEOS
 _PART = 100_000  # features read at a time, to bound memory
 
 
@@ -175,7 +175,7 @@ def _read(kind: str, data: bytes, layer: str | None) -> SourceTable:
                 )
                 if geometry is None:
                     raise _damaged("the layer has no geometry")
-                xyz, wrong = _points(shapely.from_wkb(geometry, on_invalid="ignore"), start)
+                xyz, wrong = points_of(shapely.from_wkb(geometry, on_invalid="ignore"), start)
                 points.append(xyz)
                 columns.append([plain_values(column) for column in fields])
                 faults.add(wrong)
@@ -198,22 +198,6 @@ def _joined(parts: list[Any]) -> Any:
                 whole.extend(cells)
         return whole
     return [value for part in parts for value in part]
-
-
-def _points(shapes: Any, start: int) -> tuple[tuple[Any, Any, Any], list[Fault]]:
-    """Coordinates; a multipoint of one point counts as the point."""
-    kinds = shapely.get_type_id(shapes)
-    single = (kinds == 4) & (shapely.get_num_geometries(shapes) == 1)
-    shapes = np.where(single, shapely.get_geometry(shapes, 0), shapes)
-    usable = (shapely.get_type_id(shapes) == _POINT) & ~shapely.is_empty(shapes)
-    points = np.where(usable, shapes, shapely.Point(np.nan, np.nan))
-    x, y, z = shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)
-    usable &= np.isfinite(x) & np.isfinite(y)
-    faults = [
-        Fault(start + int(row) + 1, "geometry", "no_point", "the feature is no point with finite numbers")
-        for row in np.flatnonzero(~usable)
-    ]
-    return (x, y, z), faults
 
 
 def plain_values(column: Any) -> Any:

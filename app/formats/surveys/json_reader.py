@@ -28,8 +28,9 @@ def read_geojson(data: bytes) -> SourceTable:
     features = document.get("features") if isinstance(document, dict) else None
     if not isinstance(features, list) or document.get("type") != "FeatureCollection":
         raise UnreadableUpload("no FeatureCollection", field="file", limit="RFC 7946", cure=_CURE)
+    features = [single for feature in features for single in _single_points(feature)]
     if len(features) > MAX_ROWS:
-        raise UnreadableUpload("too many features", field="file", limit=f"{MAX_ROWS} features", cure="cut the file")
+        raise UnreadableUpload("too many points", field="file", limit=f"{MAX_ROWS} points", cure="cut the file")
     faults: list[Fault] = []
     points = np.full((3, len(features)), np.nan)
     names: dict[str, None] = {}
@@ -61,6 +62,17 @@ def _coordinates(feature: Any) -> list[float] | None:
     if any(isinstance(v, bool) or not isinstance(v, int | float) or abs(v) > 1e12 for v in found):
         return None
     return found
+
+
+def _single_points(feature: Any) -> list[Any]:
+    """One feature for each point of a multipoint, with the properties of all."""
+    geometry = feature.get("geometry") if isinstance(feature, dict) else None
+    if not isinstance(geometry, dict) or geometry.get("type") != "MultiPoint":
+        return [feature]
+    places = geometry.get("coordinates")
+    if not isinstance(places, list):
+        return [feature]
+    return [{**feature, "geometry": {"type": "Point", "coordinates": place}} for place in places]
 
 
 def _properties(feature: Any) -> dict[str, Any]:

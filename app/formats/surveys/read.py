@@ -2,44 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
-import numpy as np
 from pyproj import CRS
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload
 from app.formats.format import Format, Sample, detect_format, list_accepted
 from app.formats.surveys.cells import read_numbers
-from app.formats.surveys.declaration import METRES, NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
+from app.formats.surveys.coordinates import check_second_pair, read_coordinates
+from app.formats.surveys.declaration import FEET, METRES, NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
 from app.formats.surveys.formats import SURVEY_FORMATS, SurveyReader
-from app.formats.surveys.table import (
-    MAX_TEXT,
-    Fault,
-    Faults,
-    Flags,
-    Floats,
-    Severity,
-    SourceTable,
-    SurveyTable,
-    Texts,
-)
+from app.formats.surveys.grids import crs_unit, unit_factor, without_zone
+from app.formats.surveys.roles import CodeForm, cell_text, find_roles
+from app.formats.surveys.table import MAX_TEXT, Detected, Fault, Floats, SourceTable, SurveyTable, Texts, warn
 from app.geodesy import normalize_crs, reference_system
 
-_NAMES = {
-    "lon_deg": ("lon_deg", "lon", "longitude", "long", "lng"),
-    "lat_deg": ("lat_deg", "lat", "latitude"),
-    "easting": ("easting", "easting_m", "east", "e", "x"),
-    "northing": ("northing", "northing_m", "north", "n", "y"),
-    "height": ("height", "height_m", "elevation", "elev", "z", "h", "altitude"),
-    "point": ("point", "point_id", "pt", "p", "name", "no"),
-    "code": ("code", "digits", "number", "registry_number"),
-    "description": ("description", "desc", "d"),
-}
+_FEET = ("ft-us", "ft-intl")
 _UNIT_ENDINGS = (("_usft", "ft-us"), ("_ftus", "ft-us"), ("_ft", "ft-intl or ft-us"), ("(ft)", "ft-intl or ft-us"))
 
 
-def read_survey(data: bytes, declaration: ImportDeclaration) -> SurveyTable:
+def read_survey(data: bytes, declaration: ImportDeclaration, code_form: CodeForm | None = None) -> SurveyTable:
     """Read a file of any format.
+
+    Parameters
+    ----------
+    data : bytes
+    declaration : ImportDeclaration
+    code_form : CodeForm, optional
+        What codes of the family look like: a column that is only named like one has to show it.
 
     Raises
     ------
@@ -48,7 +38,7 @@ def read_survey(data: bytes, declaration: ImportDeclaration) -> SurveyTable:
     InvalidParameter, ReferenceSystemError
         The declaration does not fit the file: columns, layer, CRS, units or heights.
     """
-    return _with_roles(_find_format(data, declaration).read(data, declaration), declaration)
+    return _with_roles(_find_format(data, declaration).read(data, declaration), declaration, code_form)
 
 
 def _find_format(data: bytes, declaration: ImportDeclaration) -> Format[SurveyReader]:
@@ -66,91 +56,41 @@ def _find_format(data: bytes, declaration: ImportDeclaration) -> Format[SurveyRe
     return found
 
 
-def _with_roles(source: SourceTable, declaration: ImportDeclaration) -> SurveyTable:
+def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: CodeForm | None) -> SurveyTable:
     if not source.rows:
         raise UnreadableUpload("the file has no points", field="file", limit="at least one row", cure="send the survey")
-    places = {role: _find_column(source, role, declaration) for role in (*_NAMES, *TEXT_ROLES, *NUMBER_ROLES)}
-    faults = source.faults
-    broken = source.faults.flags(source.rows, Severity.REFUSED)
-    height: Floats | None
-    if source.points is not None:
-        first, second, z = source.points
-        height = None if np.isnan(z).all() or declaration.ignore_heights else z
-        projected = None
-        height_name = "height"
-    else:
-        first, second, height, projected, height_name = _coordinates(source, declaration, places, faults, broken)
-    crs, system = _crs(source, declaration, projected)
-    unit, height_unit = _units(source, declaration, system, has_height=height is not None)
-    _check_datum(declaration, has_height=height is not None)
-    faults.add(_unit_names(source, places, unit, height_unit, height_name))
+    places, faults, detected = find_roles(source, declaration, code_form)
+    read = read_coordinates(source, declaration, places)
+    crs, system = _crs(source.crs or read.crs, source.format, declaration, read.projected)
+    has_height = read.height is not None
+    unit, height_unit, feet = _units(source, declaration, system, has_height=has_height)
+    _check_datum(declaration, has_height=has_height)
+    first, zone = without_zone(read.first, system) if unit == "m" else (read.first, None)
+    faults += [*read.faults, *feet, *_unit_names(source, places, unit, height_unit, has_height=has_height)]
+    faults += check_second_pair(replace(read, first=first), crs, unit_factor(unit, system))
+    if zone is not None:
+        evidence = f"the eastings begin with {zone}, the zone of {crs}"
+        read.detected.append(Detected("zone in the eastings", str(zone), evidence))
     texts = {role: _texts(source, places[role]) for role in TEXT_ROLES if places[role] is not None}
     numbers: dict[str, Floats] = {}
     for role in NUMBER_ROLES:
         if (column := places[role]) is not None:
-            numbers[role], wrong = read_numbers(
-                source.columns[column], role, decimal=declaration.decimal, required=False
-            )
-            faults.add(wrong)
+            numbers[role], wrong = read_numbers(source.columns[column], role, form=read.form, required=False)
+            faults += wrong
+    source.faults.add(faults)
+    told = (Detected("format", source.format, "its first bytes"),) if declaration.format is None else ()
     return SurveyTable(
-        source.format, first, second, height, bool(system.is_projected), crs, unit, height_unit, texts, numbers,
-        faults,
+        source.format, first, read.second, read.height, bool(system.is_projected), crs, unit, height_unit, texts,
+        numbers, source.faults, (*told, *source.detected, *detected, *read.detected),
+        written=None if zone is None else (read.first, read.second),
     )  # fmt: skip
 
 
-def _find_column(source: SourceTable, role: str, declaration: ImportDeclaration) -> int | None:
-    wanted = declaration.columns.get(role)
-    if wanted is not None:
-        if wanted not in source.names:
-            raise InvalidParameter(
-                f"there is no column {wanted[:60]!r}",
-                field=f"columns.{role}",
-                limit=", ".join(source.names)[:300],
-                cure="declare a column of the file",
-            )
-        return source.names.index(wanted)
-    taken = set(declaration.columns.values())
-    names = [name.lower() if name not in taken else "" for name in source.names]
-    return next((names.index(name) for name in _NAMES.get(role, (role,)) if name in names), None)
-
-
-def _coordinates(
-    source: SourceTable,
-    declaration: ImportDeclaration,
-    places: dict[str, int | None],
-    faults: Faults,
-    broken: Flags,
-) -> tuple[Floats, Floats, Floats | None, bool, str]:
-    pairs = (("lon_deg", "lat_deg"), ("easting", "northing"))
-    declared = [pair for pair in pairs if pair[0] in declaration.columns or pair[1] in declaration.columns]
-    there = declared or [pair for pair in pairs if places[pair[0]] is not None and places[pair[1]] is not None]
-    if len(there) != 1 or None in (places[there[0][0]], places[there[0][1]]):
-        raise InvalidParameter(
-            "the columns of the coordinates cannot be identified",
-            field="columns",
-            limit="lon_deg and lat_deg, or easting and northing",
-            cure=f"declare two of the columns {', '.join(source.names)[:200]}",
-        )
-    values = []
-    for role in there[0]:
-        column = places[role]
-        assert column is not None
-        read, wrong = read_numbers(source.columns[column], role, decimal=declaration.decimal, required=True)
-        faults.add(fault for fault in wrong if not broken[(fault.row or 1) - 1])
-        values.append(read)
-    height, name = None, "height"
-    if (column := places["height"]) is not None and not declaration.ignore_heights:
-        height, wrong = read_numbers(source.columns[column], "height", decimal=declaration.decimal, required=False)
-        faults.add(fault for fault in wrong if not broken[(fault.row or 1) - 1])
-        name = source.names[column]
-        if np.isnan(height).all():
-            height = None
-    return values[0], values[1], height, there[0] == pairs[1], name
-
-
-def _crs(source: SourceTable, declaration: ImportDeclaration, projected: bool | None) -> tuple[str, CRS]:
-    in_file = normalize_crs(source.crs) if source.crs is not None else None
-    if source.format == "geojson" and in_file is None:
+def _crs(
+    of_file: str | None, file_format: str, declaration: ImportDeclaration, projected: bool | None
+) -> tuple[str, CRS]:
+    in_file = normalize_crs(of_file) if of_file is not None else None
+    if file_format == "geojson" and in_file is None:
         in_file = None if declaration.crs is not None else "OGC:CRS84"
     declared = normalize_crs(declaration.crs) if declaration.crs is not None else None
     if (
@@ -185,17 +125,27 @@ def _crs(source: SourceTable, declaration: ImportDeclaration, projected: bool | 
     return name, system
 
 
-def _units(source: SourceTable, declaration: ImportDeclaration, system: CRS, *, has_height: bool) -> tuple[str, str]:
-    if source.unit is not None and declaration.unit is not None and source.unit != declaration.unit:
+def _units(
+    source: SourceTable, declaration: ImportDeclaration, system: CRS, *, has_height: bool
+) -> tuple[str, str, list[Fault]]:
+    """Units of the coordinates and of the heights; a warning where the file does not state which foot."""
+    own = crs_unit(system)
+    of_file, faults = source.unit, list[Fault]()
+    if of_file == FEET:
+        of_file = declaration.unit if declaration.unit in _FEET else own if own in _FEET else "ft-intl"
+        if own in _FEET and declaration.unit is None:
+            message = f"the file is in feet without stating which; they were read as {own}, the unit of {system.name}"
+            cure = "declare unit: ft-us or ft-intl; they differ by 2 ppm, a metre in 500 km"
+            faults.append(warn(None, "unit", "which_foot", message, cure))
+    if of_file is not None and declaration.unit is not None and of_file != declaration.unit:
         raise InvalidParameter(
-            f"the file is in {source.unit}, the declaration has {declaration.unit}",
+            f"the file is in {of_file}, the declaration has {declaration.unit}",
             field="unit",
-            limit=source.unit,
+            limit=of_file,
             cure="leave unit out, or export the file again in the unit that it is in",
         )
-    own = crs_unit(system)
-    unit = (declaration.unit or source.unit or own) if system.is_projected else "deg"
-    height_unit = declaration.height_unit or source.unit or declaration.unit
+    unit = (declaration.unit or of_file or own) if system.is_projected else "deg"
+    height_unit = declaration.height_unit or of_file or declaration.unit
     if height_unit is None and has_height and own in METRES and own != "m":
         raise InvalidParameter(
             "the unit of the heights is not declared",
@@ -203,29 +153,7 @@ def _units(source: SourceTable, declaration: ImportDeclaration, system: CRS, *, 
             limit=", ".join(METRES),
             cure=f"declare height_unit: the CRS is in {own}, heights need not be",
         )
-    return unit, height_unit or "m"
-
-
-def crs_unit(system: CRS) -> str:
-    """Unit of the axes of a CRS: one of `METRES`, or ``deg``.
-
-    Raises
-    ------
-    InvalidParameter
-        The CRS has another unit.
-    """
-    if not system.is_projected:
-        return "deg"
-    factor = system.axis_info[0].unit_conversion_factor
-    for name, metres in METRES.items():
-        if abs(factor / metres - 1) < 1e-9:
-            return name
-    raise InvalidParameter(
-        f"{system.name} is in {system.axis_info[0].unit_name}",
-        field="crs",
-        limit=", ".join(METRES),
-        cure="transform it",
-    )
+    return unit, height_unit or "m", faults
 
 
 def _check_datum(declaration: ImportDeclaration, *, has_height: bool) -> None:
@@ -239,12 +167,12 @@ def _check_datum(declaration: ImportDeclaration, *, has_height: bool) -> None:
 
 
 def _unit_names(
-    source: SourceTable, places: dict[str, int | None], unit: str, height_unit: str, height_name: str
+    source: SourceTable, places: dict[str, int | None], unit: str, height_unit: str, *, has_height: bool
 ) -> list[Fault]:
     """Columns whose names end with another unit than the one that is used."""
     faults = []
     for role, unit_used in (("easting", unit), ("northing", unit), ("height", height_unit)):
-        column = places[role]
+        column = places[role] if unit_used != "deg" and (has_height or role != "height") else None
         name = source.names[column].lower().replace(" ", "_") if column is not None else ""
         named = next((feet for ending, feet in _UNIT_ENDINGS if name.endswith(ending)), None)
         if named is None and name.endswith(("_m", "(m)")):
@@ -260,18 +188,5 @@ def _texts(source: SourceTable, column: int | None) -> Texts:
     cells = source.columns[column]
     texts = Texts()
     for part in cells.parts() if isinstance(cells, Texts) else (cells,):
-        texts.extend([_text(value) for value in part])
+        texts.extend([cell_text(value)[:MAX_TEXT].replace("\x00", "") for value in part])
     return texts
-
-
-def _text(value: Any) -> str:
-    if value is None or (isinstance(value, float) and value != value):
-        return ""
-    if isinstance(value, float | np.floating) and float(value).is_integer():
-        value = int(value)
-    return str(value).strip()[:MAX_TEXT].replace("\x00", "")
-
-
-def warn(row: int | None, field: str, code: str, message: str, proposal: str | None = None) -> Fault:
-    """A fault that only warns."""
-    return Fault(row, field, code, message, proposal, Severity.WARNING)

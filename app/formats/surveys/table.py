@@ -54,6 +54,26 @@ class Fault(NamedTuple):
     severity: Severity = Severity.REFUSED
 
 
+def warn(row: int | None, field: str, code: str, message: str, proposal: str | None = None) -> Fault:
+    """A fault that only warns."""
+    return Fault(row, field, code, message, proposal, Severity.WARNING)
+
+
+class Detected(NamedTuple):
+    """A property of a file that was not declared, with the evidence for it.
+
+    Attributes
+    ----------
+    what : str
+        The property, such as ``encoding`` or ``column of code``.
+    value, evidence : str
+    """
+
+    what: str
+    value: str
+    evidence: str
+
+
 class Faults:
     """Faults of a survey: counted by kind, flagged for every row, and kept with their texts up to a limit."""
 
@@ -165,8 +185,9 @@ class SourceTable:
     crs : str or None
         As the file declares it, in the form ``EPSG:code``.
     unit : str or None
-        Unit of length of the coordinates, as the file declares it.
+        Unit of length of the coordinates, as the file declares it; ``ft`` where it does not state which foot.
     faults : Faults
+    detected : tuple of Detected
     """
 
     format: str
@@ -176,6 +197,7 @@ class SourceTable:
     crs: str | None = None
     unit: str | None = None
     faults: Faults = field(default_factory=Faults)
+    detected: tuple[Detected, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -203,6 +225,10 @@ class SurveyTable:
     numbers : dict of arrays
         By role: heading_deg, measure_m, offset_m, horizontal_rmse_m, vertical_rmse_m.
     faults : Faults
+    detected : tuple of Detected
+        What was not declared.
+    written : tuple of two arrays, or None
+        Coordinates as the file has them, where `first` and `second` are others.
     """
 
     format: str
@@ -216,6 +242,8 @@ class SurveyTable:
     texts: dict[str, Texts] = field(default_factory=dict)
     numbers: dict[str, Floats] = field(default_factory=dict)
     faults: Faults = field(default_factory=Faults)
+    detected: tuple[Detected, ...] = ()
+    written: tuple[Floats, Floats] | None = None
 
     @property
     def rows(self) -> int:

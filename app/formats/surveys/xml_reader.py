@@ -1,4 +1,4 @@
-"""Surveys as XML: the placemarks of KML and the CgPoints of LandXML. No document type, so no entity expands."""
+"""Surveys as XML: placemarks of KML, waypoints of GPX, CgPoints of LandXML. No document type, so no entity expands."""
 
 from __future__ import annotations
 
@@ -6,17 +6,24 @@ import io
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from app.errors import UnreadableUpload
-from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Fault, Faults, SourceTable
-from app.formats.xml_tree import check_xml, local_name
+from app.formats.archives import ArchiveLimits, read_members
+from app.formats.surveys.declaration import FEET
+from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Detected, Fault, Faults, SourceTable
+from app.formats.xml_tree import MAX_BYTES, check_xml, local_name
 
 MAX_ELEMENTS = 20 * MAX_ROWS
 """Elements of a document. Chosen by hand."""
-_LANDXML_UNITS = {"meter": "m", "foot": "ft-intl", "ussurveyfoot": "ft-us"}
+_GPX_NAMES = {"name": "point", "desc": "description", "cmt": "comment", "sym": "symbol", "type": "type"}
+_KMZ_LIMITS = ArchiveLimits(members=1000, member_bytes=MAX_BYTES, total_bytes=MAX_BYTES, ratio=200.0)
+"""Of a KMZ with its pictures. Ratio: KML of many points is about 20 times smaller in a ZIP; measured with 8 to 100,000
+placemarks by `tests/formats/surveys/test_formats.py`."""
+_LANDXML_UNITS = {"meter": "m", "foot": FEET, "ussurveyfoot": "ft-us"}
 
 
 def read_kml(data: bytes) -> SourceTable:
@@ -30,7 +37,7 @@ def read_kml(data: bytes) -> SourceTable:
     rows: list[dict[str, Any]] = []
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
-    for placemark in _elements(data, "Placemark"):
+    for placemark in elements(data, "Placemark"):
         text = next((e.text or "" for e in _below(placemark, "Point") for e in _below(e, "coordinates")), "")
         point = _numbers(text.split(","))
         rows.append(_kml_values(placemark))
@@ -39,6 +46,61 @@ def read_kml(data: bytes) -> SourceTable:
             point = [math.nan, math.nan]
         points.append((point[0], point[1], point[2] if len(point) == 3 else math.nan))
     return _table("kml", rows, points, faults, crs="EPSG:4326")
+
+
+def read_kmz(data: bytes) -> SourceTable:
+    """The one KML of a KMZ archive.
+
+    Raises
+    ------
+    UnreadableUpload, UploadTooLarge, UnsupportedUpload
+        The archive is damaged or encrypted, holds no KML or several, or is too large when inflated.
+    """
+    members = [member for member in read_members(data, _KMZ_LIMITS) if member.name.lower().endswith(".kml")]
+    main = [member for member in members if member.name.lower() == "doc.kml"] or members
+    if len(main) != 1:
+        raise UnreadableUpload(
+            f"the archive holds {len(members)} KML files", field="file", limit="one KML", cure="save it as one KML"
+        )
+    if main[0].error is not None:
+        raise main[0].error
+    return replace(read_kml(main[0].data), format="kmz")
+
+
+def read_gpx(data: bytes) -> SourceTable:
+    """Waypoints; points of tracks and routes are no surveyed points.
+
+    Raises
+    ------
+    UnreadableUpload
+        It is no XML, has a document type, or too many elements.
+    """
+    rows: list[dict[str, Any]] = []
+    points: list[tuple[float, float, float]] = []
+    faults: list[Fault] = []
+    tracked = 0
+    for element in elements(data, "wpt", "trkpt", "rtept"):
+        if local_name(element.tag) != "wpt":
+            tracked += 1
+            continue
+        values = {local_name(child.tag): (child.text or "").strip() for child in element}
+        rows.append({name: values.get(tag) for tag, name in _GPX_NAMES.items()})
+        place = _numbers([element.get("lon", "-"), element.get("lat", "-")])
+        height = _numbers([values.get("ele", "")])
+        if place is None or height is None:
+            faults.append(Fault(len(rows), "geometry", "no_point", "the waypoint has no finite lon, lat and ele"))
+        lon, lat = place or (math.nan, math.nan)
+        points.append((lon, lat, height[0] if height else math.nan))
+    if tracked and not rows:
+        raise UnreadableUpload(
+            f"the GPX has no waypoints, but {tracked} points of tracks and routes",
+            field="file",
+            limit="waypoints (wpt)",
+            cure="export the surveyed points as waypoints",
+        )
+    table = _table("gpx", rows, points, faults, crs="EPSG:4326")
+    skipped = (Detected("tracks", f"{tracked} points left out", "only waypoints are markers"),) if tracked else ()
+    return replace(table, detected=skipped)
 
 
 def read_landxml(data: bytes) -> SourceTable:
@@ -53,7 +115,7 @@ def read_landxml(data: bytes) -> SourceTable:
     points: list[tuple[float, float, float]] = []
     faults: list[Fault] = []
     crs = unit = None
-    for element in _elements(data, "CgPoint", "CoordinateSystem", "Metric", "Imperial"):
+    for element in elements(data, "CgPoint", "CoordinateSystem", "Metric", "Imperial"):
         kind = local_name(element.tag)
         if kind == "CoordinateSystem":
             code = element.get("epsgCode")
@@ -82,7 +144,24 @@ def _linear_unit(name: str) -> str:
     return unit
 
 
-def _elements(data: bytes, *names: str) -> Iterator[ET.Element]:
+def check_size(rows: int, names: int) -> None:
+    """Check the number of points and of their columns.
+
+    Raises
+    ------
+    UnreadableUpload
+        There are too many.
+    """
+    if names > MAX_COLUMNS or rows > MAX_ROWS:
+        raise UnreadableUpload(
+            "the file has too many points or names",
+            field="file",
+            limit=f"{MAX_ROWS} points, {MAX_COLUMNS} names",
+            cure="cut the file",
+        )
+
+
+def elements(data: bytes, *names: str) -> Iterator[ET.Element]:
     """Elements of these names; each is forgotten after its turn."""
     check_xml(data, max_elements=MAX_ELEMENTS, cure="send the points alone")
     parents: list[ET.Element] = []
@@ -134,13 +213,7 @@ def _table(
     unit: str | None = None,
 ) -> SourceTable:
     names = tuple(dict.fromkeys(name for row in rows for name in row))
-    if len(names) > MAX_COLUMNS or len(rows) > MAX_ROWS:
-        raise UnreadableUpload(
-            "the file has too many points or names",
-            field="file",
-            limit=f"{MAX_ROWS} points, {MAX_COLUMNS} names",
-            cure="cut the file",
-        )
+    check_size(len(rows), len(names))
     columns = tuple([row.get(name) for row in rows] for name in names)
     xyz = np.array(points, dtype=np.float64).reshape(-1, 3)
     return SourceTable(kind, names, columns, (xyz[:, 0], xyz[:, 1], xyz[:, 2]), crs, unit, Faults(faults))

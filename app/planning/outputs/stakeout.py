@@ -18,7 +18,7 @@ from ezdxf.filemanagement import new
 from pyogrio import raw
 
 from app.formats.surveys.declaration import METRES
-from app.formats.surveys.read import crs_unit
+from app.formats.surveys.grids import crs_unit
 from app.geodesy import reference_system
 from app.planning.outputs.plan_geojson import marker_feature
 from app.planning.outputs.stakeout_points import CODES, Stakeout, StakePoint

@@ -10,7 +10,7 @@ from pyproj import Geod
 
 from app.errors import InvalidParameter
 from app.formats.surveys.declaration import METRES
-from app.formats.surveys.read import crs_unit
+from app.formats.surveys.grids import crs_unit
 from app.geodesy import normalize_crs, reference_system
 from app.geodesy.from_wgs84 import Floats, Origin, SystemPositions, positions_in_system
 from app.planning.alignment import format_station

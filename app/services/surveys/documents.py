@@ -8,7 +8,7 @@ from typing import Annotated, Literal, cast
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from app.formats.surveys.table import Fault
+from app.formats.surveys.table import Detected, Fault
 from app.registry.jobs import JobRow, JobState
 from app.services.documents import document_of
 from app.services.error_documents import ErrorDocument, cut_text
@@ -28,6 +28,14 @@ class FaultDocument(TypedDict):
     message: str
     proposal: str | None
     severity: Literal["refused", "warning"]
+
+
+class DetectedDocument(TypedDict):
+    """A property of the file that was not declared, and the evidence for it."""
+
+    what: str
+    value: str
+    evidence: str
 
 
 class Residual(TypedDict):
@@ -60,6 +68,7 @@ class ImportReport(TypedDict):
     crs: str
     localization_grade: str
     transform_note: str | None
+    detected: Annotated[list[DetectedDocument], Field(description="What was not declared, with its evidence.")]
     accuracy: Annotated[AccuracyDocument, Field(description="Of the RMSE that was declared for the whole survey.")]
     rows: int
     good_rows: int
@@ -113,6 +122,11 @@ def import_job_document(job: JobRow) -> ImportJobDocument:
 def import_job_summary(job: JobRow) -> ImportJobSummary:
     """An import without its report."""
     return document_of(ImportJobSummary, job, links={"self": f"/v1/imports/{job.id}"})
+
+
+def detected_document(detected: Detected) -> DetectedDocument:
+    """A detected property as reports of imports have it."""
+    return document_of(DetectedDocument, detected)
 
 
 def fault_document(fault: Fault) -> FaultDocument:

@@ -108,6 +108,7 @@ def common_columns(
 def _originals(survey: GeoreferencedSurvey, rows: Rows, declaration: ImportDeclaration, sha256: str) -> JsonTexts:
     """The rows exactly as they were given, and the survey they belong to."""
     table = survey.table
+    written = table.written or (table.first, table.second)
     names = ("easting", "northing") if table.projected else ("lon_deg", "lat_deg")
     if table.projected and table.unit == "m":
         names = ("easting_m", "northing_m")
@@ -120,8 +121,8 @@ def _originals(survey: GeoreferencedSurvey, rows: Rows, declaration: ImportDecla
     )
     of_survey = {**_known(**declaration.survey), "file_sha256": sha256, "format": table.format}
     own: dict[str, Sequence[Any]] = {
-        names[0]: table.first[rows].tolist(),
-        names[1]: table.second[rows].tolist(),
+        names[0]: written[0][rows].tolist(),
+        names[1]: written[1][rows].tolist(),
         "survey": json_objects(Columns(len(rows), of_survey, {"row": (rows + 1).tolist()})),
     }
     if table.height is not None:

@@ -18,6 +18,7 @@ from app.families.family import Family, Registration
 from app.families.rules import PLANNED, MarkerRules
 from app.families.surveys import RowCodes, Rows
 from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Floats, Severity, SurveyTable
 from app.plots.residual_map import draw_residuals
 from app.registry import bulk
@@ -42,6 +43,7 @@ from app.services.surveys.documents import (
     ImportReport,
     Outcome,
     Residual,
+    detected_document,
     fault_document,
 )
 from app.services.surveys.import_codes import assign_codes
@@ -49,6 +51,7 @@ from app.services.surveys.import_rows import check_values, common_columns, marke
 from app.services.version_kinds import kind_of_change, kind_of_new
 from app.surveys.comparison import Comparison, check_residuals, compare_survey
 from app.surveys.consistency_checks import check_consistency
+from app.surveys.duplicates import RegisteredPoints, find_duplicates
 from app.surveys.georeference import GeoreferencedSurvey, georeference_survey
 from app.surveys.location_checks import NEAR_M, Neighbours, check_location
 
@@ -74,6 +77,7 @@ class SurveyTask(Task[SurveyTable]):
 
     data: bytes
     declaration: ImportDeclaration
+    code_form: CodeForm
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +135,9 @@ class Imports:
         now = self._clock()
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
-        pending = self._processes.submit(SurveyTask(given.data, given.declaration), wait_s=_BUSY_WAIT_S)
+        pending = self._processes.submit(
+            SurveyTask(given.data, given.declaration, _code_form(given)), wait_s=_BUSY_WAIT_S
+        )
         survey = georeference_survey(pending.result(), given.declaration, self._rules.crs_accuracy_m)
         step(READ)
         registration = Registration(caller.agency_id, now, self._rules, self._database)
@@ -174,9 +180,10 @@ class _Running:
 
     def check(self, connection: sa.Connection) -> None:
         """Hold the survey against the registry's places."""
-        neighbours = self._neighbours(connection)
+        neighbours, registered = self._neighbours(connection)
         is_known = partial(self._is_known, connection)
         self._faults.add(check_location(self._survey, self._given.declaration, neighbours, is_known))
+        self._faults.add(find_duplicates(self._survey, self._given.declaration, self._sha256, registered))
 
     def prepare(self, connection: sa.Connection) -> None:
         """What would be stored."""
@@ -245,6 +252,7 @@ class _Running:
             "crs": table.crs,
             "localization_grade": str(placed.grade),
             "transform_note": placed.note,
+            "detected": [detected_document(detected) for detected in table.detected],
             "accuracy": accuracy_document(*(self._given.declaration.survey.get(name) for name in _ACCURACY)),
             "rows": table.rows,
             "good_rows": good,
@@ -290,14 +298,20 @@ class _Running:
         clipped = np.clip([west - wide, east + wide], -180.0, 180.0), np.clip([south - high, north + high], -90.0, 90.0)
         return Box(float(clipped[0][0]), float(clipped[1][0]), float(clipped[0][1]), float(clipped[1][1]))
 
-    def _neighbours(self, connection: sa.Connection) -> Neighbours:
+    def _neighbours(self, connection: sa.Connection) -> tuple[Neighbours, RegisteredPoints]:
         box = self._box()
         agency_id = self._caller.agency_id
         found = bulk.list_places_in(connection, agency_id, box, limit=_NEIGHBOURS) if box is not None else []
-        return Neighbours(
-            *_places(found),
-            tuple(row.vertical_datum for row in found),
+        lon, lat, height = _places(found)
+        registered = RegisteredPoints(
+            lon,
+            lat,
+            tuple(row.id for row in found),
+            tuple(row.family for row in found),
+            tuple(row.point for row in found),
+            tuple(row.survey_file_sha256 for row in found),
         )
+        return Neighbours(lon, lat, height, tuple(row.vertical_datum for row in found)), registered
 
     def _compare(self, connection: sa.Connection, good: Rows) -> None:
         declaration = self._given.declaration
@@ -433,6 +447,12 @@ def _defaults(given: ImportInput) -> Any:
     """What the survey's markers have in common; the family's own defaults where nothing is declared."""
     survey = get_family(given.declaration.family).survey
     return survey.defaults({}) if given.defaults is None and survey is not None else given.defaults
+
+
+def _code_form(given: ImportInput) -> CodeForm:
+    survey = get_family(given.declaration.family).survey
+    assert survey is not None  # `_check_family` refuses the others
+    return survey.code_form(_defaults(given), compare=given.declaration.compare)
 
 
 def _check_family(declaration: ImportDeclaration) -> None:

@@ -173,7 +173,7 @@ def test_what_cannot_be_read() -> None:
     with pytest.raises(UnreadableUpload, match="DXF cannot be used"):
         read_alignment(b"0\nSECTION\n2\nENTITIES\n0\nLINE\n10\nabc\n0\nENDSEC\n0\nEOF\n")
     with pytest.raises(UnreadableUpload, match="INSUNITS"):
-        _read(_drawing(1)[0])
+        _read(_drawing(3)[0])
 
 
 def test_damaged_drawings_raise_nothing_else() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.formats.surveys.cells import read_numbers
+from app.formats.surveys.cells import NumberForm, detect_number_form, read_numbers
 
 
 def test_plain_numbers_are_read_at_once_and_one_by_one() -> None:
@@ -45,6 +45,42 @@ def test_what_is_no_number_is_named(cell: str, code: str, proposal: str) -> None
 
 
 def test_declared_decimal_commas_are_read() -> None:
-    values, faults = read_numbers(["8,5", "-7,25"], "lon_deg", decimal=",", required=True)
+    values, faults = read_numbers(["8,5", "-7,25"], "lon_deg", form=NumberForm(","), required=True)
     assert values.tolist() == [8.5, -7.25]
     assert not faults
+
+
+@pytest.mark.parametrize(
+    ("cells", "form", "values"),
+    [
+        (["456789.12", "5427345.001"], NumberForm(".", ""), [456789.12, 5427345.001]),
+        (["456789,12", "5427345,001"], NumberForm(",", ""), [456789.12, 5427345.001]),
+        (["456,789.12", "5,427,345.001", "112.3"], NumberForm(".", ","), [456789.12, 5427345.001, 112.3]),
+        (["456.789,12", "5.427.345,001", "112,3"], NumberForm(",", "."), [456789.12, 5427345.001, 112.3]),
+        (["456 789,12", "5 427 345,001"], NumberForm(",", " "), [456789.12, 5427345.001]),
+        (["456\u00a0789.12", "5\u00a0427\u00a0345.001"], NumberForm(".", "\u00a0"), [456789.12, 5427345.001]),
+        (["2'683'141.5", "1'247'945.2"], NumberForm(".", "'"), [2683141.5, 1247945.2]),
+        (["8.416", "49.005"], NumberForm(".", ""), [8.416, 49.005]),
+        (["4,312,345", "1,247,945"], NumberForm(".", ","), [4312345.0, 1247945.0]),
+    ],
+)
+def test_the_form_of_numbers_is_detected(cells: list[str], form: NumberForm, values: list[float]) -> None:
+    found, shown = detect_number_form(cells, None)
+    assert found == form
+    assert shown in cells
+    read, faults = read_numbers(cells, "easting", form=found, required=True)
+    assert read.tolist() == values
+    assert not faults
+
+
+def test_a_comma_before_three_digits_shows_nothing() -> None:
+    assert detect_number_form(["432,345", "5,427"], None) == (NumberForm(), "")
+    assert detect_number_form(["432,345", "5,427.5"], None)[0] == NumberForm(".", ",")
+    assert detect_number_form(["432,345", "5,4275"], None)[0] == NumberForm(",", "")
+
+
+def test_a_cell_in_another_form_than_the_majority_is_a_fault() -> None:
+    cells = ["456789.12", "456,790.12", "456791.12", "456792,12"]
+    form, _shown = detect_number_form(cells, None)
+    _values, faults = read_numbers(cells, "easting", form=form, required=True)
+    assert [(fault.row, fault.code) for fault in faults] == [(2, "grouped_digits"), (4, "decimal_comma")]

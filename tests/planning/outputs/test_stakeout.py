@@ -17,7 +17,8 @@ from pyproj import Transformer
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.surveys.declaration import METRES, ImportDeclaration
-from app.formats.surveys.read import crs_unit, read_survey
+from app.formats.surveys.grids import crs_unit
+from app.formats.surveys.read import read_survey
 from app.geodesy import LocalizationGrade, place_positions, reference_system
 from app.planning.alignment import Alignment
 from app.planning.outputs.stakeout import StakeoutFormat, write_stakeout

@@ -1,0 +1,228 @@
+"""Coordinates of a table: its geometry, a column of WKT, or two columns of numbers, checked against a second pair."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.errors import InvalidParameter
+from app.formats.surveys.cells import PLAIN, NumberForm, detect_number_form, read_numbers
+from app.formats.surveys.declaration import NUMBER_ROLES, ImportDeclaration
+from app.formats.surveys.roles import WKT_NAMES, cell_text, plain_name
+from app.formats.surveys.table import Detected, Fault, Floats, Severity, SourceTable, Texts, warn
+from app.geodesy import reference_system
+from app.geodesy.systems import best_effort
+
+PAIRS = (("lon_deg", "lat_deg"), ("easting", "northing"))
+_SAMPLE = 1000  # cells of a column by which the form of its numbers is detected; chosen by hand
+_WKT = re.compile(r"\s*(?:SRID=[0-9]+;)?\s*(?:MULTI)?POINT\b.*|0[01][0-9A-Fa-f]{40,}", re.IGNORECASE | re.DOTALL)
+_SRID = re.compile(r"SRID=([0-9]{4,6});", re.IGNORECASE)
+_AGREE_M = 5.0
+"""Difference between two pairs of coordinates of a row that the datums of a continent explain. [m] Chosen by hand:
+above NAD83 - WGS 84 (1 to 2 m) and the rounding of five decimals of a degree, below NAD27 or ED50 (30 to 200 m)."""
+_M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
+
+
+@dataclass(slots=True)
+class Coordinates:
+    """Coordinates of the rows as the file has them.
+
+    Attributes
+    ----------
+    first, second : ndarray, shape (N,)
+        Longitude and latitude, or easting and northing; NaN where there is none.
+    height : ndarray, shape (N,), or None
+    projected : bool or None
+        None where the columns do not show it.
+    form : NumberForm
+        Of the file's numbers.
+    check_deg : tuple of two arrays, or None
+        Longitudes and latitudes beside eastings and northings.
+    crs : str or None
+        Of the geometry.
+    """
+
+    first: Floats
+    second: Floats
+    height: Floats | None
+    projected: bool | None
+    form: NumberForm = PLAIN
+    check_deg: tuple[Floats, Floats] | None = None
+    crs: str | None = None
+    faults: list[Fault] = field(default_factory=list)
+    detected: list[Detected] = field(default_factory=list)
+
+
+def read_coordinates(source: SourceTable, declaration: ImportDeclaration, places: dict[str, int | None]) -> Coordinates:
+    """Coordinates of all rows; faults of cells that are no numbers.
+
+    Raises
+    ------
+    InvalidParameter
+        No two columns hold coordinates.
+    """
+    if source.points is not None:
+        return _with_plausible_heights(Coordinates(*source.points, None), declaration)
+    pair = _choose_pair(source, declaration, places)
+    if pair is None:
+        wkt = _wkt_column(source)
+        if wkt is None:
+            raise _not_identified(source)
+        return _with_plausible_heights(_from_wkt(source, wkt), declaration)
+    form, shown = _form(source, declaration, places)
+    values = [_numbers(source, places, role, form) for role in (*pair, "height")]
+    faults = [fault for _values, wrong in values for fault in wrong]
+    first, second, height = (found for found, _wrong in values)
+    assert first is not None
+    assert second is not None
+    read = Coordinates(first, second, height, pair == PAIRS[1], form, faults=faults)
+    if shown:
+        value = form.decimal + (f", groups of three digits separated by {form.group!r}" if form.group else "")
+        read.detected.append(Detected("decimal sign", value, f"most numbers are written like {shown!r}"))
+    if pair == PAIRS[1] and None not in (places["lon_deg"], places["lat_deg"]):
+        lon, lat = (_numbers(source, places, role, form)[0] for role in PAIRS[0])
+        assert lon is not None
+        assert lat is not None
+        read.check_deg = lon, lat
+    return _with_plausible_heights(read, declaration)
+
+
+def check_second_pair(read: Coordinates, crs: str, factor: float) -> Iterator[Fault]:
+    """Rows whose longitude and latitude are not where their easting and northing are; one fault if most are not.
+
+    Parameters
+    ----------
+    read : Coordinates
+    crs : str
+        Of the eastings and northings.
+    factor : float
+        Units of the CRS in one unit of the coordinates.
+    """
+    if read.check_deg is None:
+        return
+    with np.errstate(invalid="ignore"):
+        lon, lat = (np.asarray(v) for v in best_effort(crs).transform(read.first * factor, read.second * factor))
+        east = (read.check_deg[0] - lon) * np.cos(np.radians(lat)) * _M_PER_DEG
+        apart_m = np.hypot(east, (read.check_deg[1] - lat) * _M_PER_DEG)
+    known = np.isfinite(apart_m)
+    if not known.any():
+        return
+    usual_m = float(np.median(apart_m[known]))
+    cure = "check crs; declare columns.easting null if longitude and latitude are right, and their CRS"
+    if usual_m > _AGREE_M:
+        message = f"longitude and latitude lie {usual_m:.0f} m from easting and northing in {crs} (median)"
+        yield warn(None, "position", "coordinates_disagree", message, cure)
+        return
+    for row in np.flatnonzero(known & (apart_m > _AGREE_M + usual_m)):
+        message = f"longitude and latitude lie {apart_m[row]:.0f} m from easting and northing in {crs}"
+        yield warn(int(row) + 1, "position", "coordinates_disagree", message, "compare the digits of both pairs")
+
+
+def _choose_pair(
+    source: SourceTable, declaration: ImportDeclaration, places: dict[str, int | None]
+) -> tuple[str, str] | None:
+    """The pair that is declared, or that the declared CRS has; None if there is none."""
+    declared = [pair for pair in PAIRS if any(declaration.columns.get(role) for role in pair)]
+    there = declared or [pair for pair in PAIRS if None not in (places[pair[0]], places[pair[1]])]
+    if len(there) == 2 and declaration.crs is not None:
+        there = [PAIRS[bool(reference_system(declaration.crs).is_projected)]]
+    if len(there) > 1 or (there and None in (places[there[0][0]], places[there[0][1]])):
+        raise _not_identified(source)
+    return there[0] if there else None
+
+
+def _not_identified(source: SourceTable) -> InvalidParameter:
+    return InvalidParameter(
+        "the columns of the coordinates cannot be identified",
+        field="columns",
+        limit="lon_deg and lat_deg, or easting and northing",
+        cure=f"declare two of the columns {', '.join(source.names)[:200]}, and crs",
+    )
+
+
+def _numbers(
+    source: SourceTable, places: dict[str, int | None], role: str, form: NumberForm
+) -> tuple[Floats | None, list[Fault]]:
+    column = places[role]
+    if column is None:
+        return None, []
+    found, wrong = read_numbers(source.columns[column], role, form=form, required=role != "height")
+    broken = source.faults.flags(source.rows, Severity.REFUSED)
+    return found, [fault for fault in wrong if not broken[(fault.row or 1) - 1]]
+
+
+def _form(source: SourceTable, declaration: ImportDeclaration, places: dict[str, int | None]) -> tuple[NumberForm, str]:
+    """How the numbers of the coordinates, heights and other measures are written."""
+    columns = [source.columns[k] for role, k in places.items() if k is not None and _holds_numbers(role)]
+    texts = [column for column in columns if isinstance(column, Texts)]
+    if not texts:
+        return NumberForm(declaration.decimal or "."), ""
+    sample = (column[k] for column in texts for k in range(0, len(column), max(len(column) // _SAMPLE, 1)))
+    form, shown = detect_number_form(islice(sample, _SAMPLE * len(texts)), declaration.decimal)
+    return form, shown if declaration.decimal is None or form.group else ""
+
+
+def _holds_numbers(role: str) -> bool:
+    return role in NUMBER_ROLES or role == "height" or any(role in pair for pair in PAIRS)
+
+
+# --- geometry -------------------------------------------------------------------------------------------------------
+
+
+def _wkt_column(source: SourceTable) -> int | None:
+    for column, name in enumerate(source.names):
+        if plain_name(name) in WKT_NAMES:
+            texts = (cell_text(value) for value in source.columns[column])
+            if _WKT.fullmatch(next((text for text in texts if text), "")):
+                return column
+    return None
+
+
+def _from_wkt(source: SourceTable, column: int) -> Coordinates:
+    texts = [cell_text(value) for value in source.columns[column]]
+    first = next(text for text in texts if text)
+    is_hex = first[0] == "0"
+    read: Any = shapely.from_wkb if is_hex else shapely.from_wkt
+    shapes = read([text if is_hex else _SRID.sub("", text) for text in texts], on_invalid="ignore")
+    srid = int(shapely.get_srid(read(first))) if is_hex else int(found[1]) if (found := _SRID.match(first)) else 0
+    (x, y, z), faults = points_of(shapes)
+    evidence = f"the column {source.names[column][:60]!r} holds {'WKB' if is_hex else 'WKT'} such as {first[:40]!r}"
+    detected = [Detected("coordinates", "geometry", evidence)]
+    crs = f"EPSG:{srid}" if srid else None
+    return Coordinates(x, y, z, None, crs=crs, faults=faults, detected=detected)
+
+
+def points_of(shapes: Any, start: int = 0) -> tuple[tuple[Floats, Floats, Floats], list[Fault]]:
+    """Coordinates of shapes, NaN and a fault where one is no point; a multipoint of one point counts as the point."""
+    kinds = shapely.get_type_id(shapes)
+    single = (kinds == shapely.GeometryType.MULTIPOINT) & (shapely.get_num_geometries(shapes) == 1)
+    shapes = np.where(single, shapely.get_geometry(shapes, 0), shapes)
+    usable = (shapely.get_type_id(shapes) == shapely.GeometryType.POINT) & ~shapely.is_empty(shapes)
+    points = np.where(usable, shapes, shapely.Point(np.nan, np.nan))
+    x, y, z = shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)
+    usable &= np.isfinite(x) & np.isfinite(y)
+    faults = [
+        Fault(start + int(row) + 1, "geometry", "no_point", "the feature is no point with finite numbers")
+        for row in np.flatnonzero(~usable)
+    ]
+    return (x, y, z), faults
+
+
+def _with_plausible_heights(read: Coordinates, declaration: ImportDeclaration) -> Coordinates:
+    """Without heights that are none: not declared, missing everywhere, or zero everywhere."""
+    if read.height is None or declaration.ignore_heights or np.isnan(read.height).all():
+        read.height = None
+        return read
+    known = read.height[np.isfinite(read.height)]
+    if len(known) > 1 and not known.any():
+        message = f"all {len(known)} heights are 0, as software writes unknown ones; they were left out"
+        cure = "measure the heights, or declare ignore_heights"
+        read.faults.append(warn(None, "height", "zero_heights", message, cure))
+        read.height = None
+    return read

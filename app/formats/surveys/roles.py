@@ -1,0 +1,210 @@
+"""Roles of a table's columns: by declaration, or by the columns' names together with their values."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from app.errors import InvalidParameter
+from app.formats.columns import normal_name
+from app.formats.surveys.declaration import NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
+from app.formats.surveys.table import Detected, Fault, SourceTable, warn
+from app.markers.status import STATUSES
+
+_NAMES = {
+    "lon_deg": ("lon", "longitude", "long", "lng", "laenge", "lange", "longitud"),
+    "lat_deg": ("lat", "latitude", "breite", "latitud"),
+    "easting": (
+        "easting", "east", "e", "x", "rechtswert", "rw", "rechts", "ostwert", "ost", "este", "grid_easting", "x_coord",
+        "xcoord", "x_coordinate",
+    ),
+    "northing": (
+        "northing", "north", "n", "y", "hochwert", "hw", "hoch", "nordwert", "nord", "norte", "grid_northing",
+        "y_coord", "ycoord", "y_coordinate",
+    ),
+    "height": (
+        "height", "elevation", "elev", "z", "h", "altitude", "alt", "ele", "hohe", "hoehe", "cota", "ortho_height",
+        "orthometric_height", "grid_elevation", "rl", "z_coord", "zcoord",
+    ),
+    "point": (
+        "point", "point_id", "pointid", "point_name", "point_number", "point_no", "pt", "pt_id", "ptid", "p", "name",
+        "no", "nr", "punkt", "punktnummer", "punktnr", "pnr", "pkt", "pktnr", "station", "punto", "id",
+    ),
+    "code": ("code", "digits", "number", "registry_number"),
+    "description": ("description", "desc", "d", "descr", "beschreibung", "bemerkung", "remark", "remarks", "notes"),
+}  # fmt: skip
+"""Names of columns as survey software writes them, in English, German and Spanish; the first that is there is taken."""
+_ELLIPSOIDAL = ("ellipsoidal_height", "ellipsoid_height", "ell_height", "ellips_height", "h_ell", "ellh")
+WKT_NAMES = ("wkt", "wkt_geom", "geom", "geometry", "the_geom", "geom_wkt")
+_UNIT = re.compile(r"_(?:m|metres?|meters?|u?s?_?s?ft|ft_?us|ft_?intl|i?ft|feet|deg|degrees|dd|gon)$")
+_SAMPLE = 2000  # values by which a column is recognised; chosen by hand
+_MIN_SHARE = 0.5  # [1] of the values that must fit a role; the others are faults of their rows. Chosen by hand
+_SIDES = ("left", "right", "unknown")
+
+
+class CodeForm(NamedTuple):
+    """What the codes of a family's markers look like in a survey.
+
+    Attributes
+    ----------
+    pattern : str
+        Regular expression of a code.
+    differ : bool
+        Whether two markers never have the same code.
+    name : str
+        For people.
+    """
+
+    pattern: str
+    differ: bool
+    name: str
+
+
+class Roles(NamedTuple):
+    """Columns by role, and how the ones that were not declared were recognised."""
+
+    places: dict[str, int | None]
+    faults: list[Fault]
+    detected: list[Detected]
+
+
+def plain_name(name: str) -> str:
+    """A column's name without accents, case and unit: ``Höhe [m]`` is ``hohe``."""
+    letters = unicodedata.normalize("NFKD", name)
+    return _UNIT.sub("", normal_name("".join(c for c in letters if not unicodedata.combining(c))))
+
+
+def names_coordinates(names: Sequence[str]) -> bool:
+    """Whether columns of these names hold coordinates."""
+    plain = {plain_name(name) for name in names}
+    pairs = (("easting", "northing"), ("lon_deg", "lat_deg"))
+    return any(all(plain.intersection(_NAMES[role]) for role in pair) for pair in pairs) or not plain.isdisjoint(
+        WKT_NAMES
+    )
+
+
+def find_roles(source: SourceTable, declaration: ImportDeclaration, code_form: CodeForm | None) -> Roles:
+    """Columns of all roles; a role that is declared null has none.
+
+    Parameters
+    ----------
+    source : SourceTable
+    declaration : ImportDeclaration
+    code_form : CodeForm, optional
+        Without it any text is a code.
+
+    Raises
+    ------
+    InvalidParameter
+        A declared column is not in the file.
+    """
+    roles = Roles({}, [], [])
+    taken = {name for name in declaration.columns.values() if name}
+    for role in (*_NAMES, *TEXT_ROLES, *NUMBER_ROLES):
+        if role in roles.places:
+            continue
+        if role in declaration.columns:
+            roles.places[role] = _declared(source, role, declaration.columns[role])
+        else:
+            roles.places[role] = _detected(source, role, declaration, taken, code_form, roles)
+    return roles
+
+
+def _declared(source: SourceTable, role: str, wanted: str | None) -> int | None:
+    if not wanted:
+        return None
+    if wanted not in source.names:
+        raise InvalidParameter(
+            f"there is no column {wanted[:60]!r}",
+            field=f"columns.{role}",
+            limit=", ".join(source.names)[:300],
+            cure="declare a column of the file, or null if there is none for this role",
+        )
+    return source.names.index(wanted)
+
+
+def _detected(
+    source: SourceTable,
+    role: str,
+    declaration: ImportDeclaration,
+    taken: set[str],
+    code_form: CodeForm | None,
+    roles: Roles,
+) -> int | None:
+    used = {place for place in roles.places.values() if place is not None}
+    refuted: Fault | None = None
+    for column in _named(source, role, declaration):
+        name = source.names[column]
+        if name in taken or column in used:
+            continue
+        evidence, fits = _evidence(source.columns[column], role, code_form)
+        shown = f"{name.strip()[:60]!r}"
+        if fits:
+            roles.detected.append(
+                Detected(f"column of {role}", name.strip()[:60], f"its name{evidence and '; '}{evidence}")
+            )
+            return column
+        if refuted is None and evidence:
+            refuted = warn(
+                None, role, "role_without_evidence", f"the column {shown} was not read as {role}: {evidence}",
+                f"declare columns {{{role!r}: {shown}}} if it is, or {{{role!r}: null}} if it is not".replace("'", '"'),
+            )  # fmt: skip
+    if refuted is not None:
+        roles.faults.append(refuted)
+    return None
+
+
+def _named(source: SourceTable, role: str, declaration: ImportDeclaration) -> Iterator[int]:
+    """Columns with a usual name of the role, the most usual name first."""
+    if role in NUMBER_ROLES:  # names of ours, with their units
+        yield from (k for k, name in enumerate(source.names) if name.strip().lower() == role)
+        return
+    wanted = _NAMES.get(role, (role,))
+    if role == "height":
+        ellipsoidal_first = declaration.vertical_datum == "ellipsoid"
+        wanted = (*_ELLIPSOIDAL, *wanted) if ellipsoidal_first else (*wanted, *_ELLIPSOIDAL)
+    names = [plain_name(name) for name in source.names]
+    for name in wanted:
+        yield from (k for k, other in enumerate(names) if other == name)
+
+
+def _evidence(cells: Sequence[Any], role: str, code_form: CodeForm | None) -> tuple[str, bool]:
+    """What the values show about a role, and whether they fit it."""
+    fits: Callable[[str], object]
+    if role == "code" and code_form is not None:
+        fits, form = re.compile(code_form.pattern).fullmatch, code_form.name
+    elif role in ("status", "side"):
+        known = STATUSES if role == "status" else _SIDES
+        fits, form = lambda text: text.lower() in known, f"one of {', '.join(known)}"
+    elif role in NUMBER_ROLES:
+        fits, form = re.compile(r"[+-]?[0-9.,]+(?:[eE][+-]?[0-9]+)?").fullmatch, "a number"
+    else:
+        return "", True
+    values = list(_sample(cells))
+    good = sum(1 for text in values if fits(text))
+    if not values or good < _MIN_SHARE * len(values):
+        other = next((text for text in values if not fits(text)), None)
+        return (f"{good} of {len(values)} values are {form}, {other[:40]!r} is not" if other else ""), False
+    if role == "code" and code_form is not None and code_form.differ and len(set(values)) < _MIN_SHARE * len(values):
+        return f"{len(values)} values are only {len(set(values))} different ones, and each marker has its own", False
+    return f"{good} of {len(values)} values are {form}", True
+
+
+def _sample(cells: Sequence[Any]) -> Iterator[str]:
+    """Texts of values throughout a column, without empty ones."""
+    for k in range(0, len(cells), max(len(cells) // _SAMPLE, 1)):
+        if text := cell_text(cells[k]):
+            yield text
+
+
+def cell_text(value: Any) -> str:
+    """A value as text; whole numbers without decimals, empty where there is none."""
+    if value is None or (isinstance(value, float) and value != value):
+        return ""
+    if isinstance(value, float | np.floating) and float(value).is_integer():
+        value = int(value)
+    return str(value).strip()

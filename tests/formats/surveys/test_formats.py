@@ -1,0 +1,248 @@
+"""Files of survey instruments and programs: GSI, JobXML, GPX, KMZ, LandXML, DXF and GeoJSON."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from typing import Any
+
+import ezdxf
+import numpy as np
+import pytest
+from pyproj import Geod, Transformer
+
+from app.errors import UnreadableUpload, WaymarkError
+from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.read import read_survey
+from app.formats.surveys.table import SurveyTable
+from app.geodesy import place_positions
+
+UTM = {"crs": "EPSG:25832", "vertical_datum": "EPSG:7837"}
+
+
+def _read(data: str | bytes, **declared: Any) -> SurveyTable:
+    content = data if isinstance(data, bytes) else data.encode()
+    return read_survey(content, ImportDeclaration(**{**UTM, **declared}))
+
+
+def _detected(read: SurveyTable) -> dict[str, str]:
+    return {one.what: one.value for one in read.detected}
+
+
+# --- GSI --------------------------------------------------------------------------------------------------------------
+
+GSI_8 = (
+    "110001+0000STN1 84..10+00012345 85..10+00067890 86..10+00001234 \r\n"
+    "410002+0000CODE 42....+00000001 \r\n"
+    "110003+00000P-7 81..00+00456789 82..00-00012345 83..00+00112500 71....+000KERB1 \r\n"
+    "110004+0000P-8A 81..00+00456790 82..00-00012346 83..00+00000000 \r\n"
+)
+GSI_16 = (
+    "*110001+00000000000000A1 81..10+0000000456789123 82..10+0000005427345678 83..10+0000000000112500 \n"
+    "*110002+00000000000000A2 81..10+0000000456799123 82..10+0000005427346678 83..10+0000000000112600 \n"
+)
+
+
+def test_gsi_8() -> None:
+    read = _read(GSI_8)
+    assert read.format == "gsi"
+    assert list(read.texts["point"]) == ["P-7", "P-8A"]
+    assert list(read.texts["description"]) == ["KERB1", ""]
+    assert (read.first.tolist(), read.second.tolist()) == ([456.789, 456.79], [-12.345, -12.346])
+    assert read.height is not None
+    assert read.height.tolist() == [112.5, 0.0]
+    found = _detected(read)
+    assert found["words"] == "GSI-8"
+    assert (found["stations"], found["other lines"]) == ("1 lines left out", "1 left out")
+
+
+@pytest.mark.parametrize(
+    ("unit", "digits", "metres", "name"),
+    [
+        ("0", 456789123, 456789.123, "m"), ("6", 4567891234, 456789.1234, "m"), ("8", 45678912345, 456789.12345, "m"),
+        ("1", 456789123, 456789.123, "ft-intl"), ("7", 4567891234, 456789.1234, "ft-intl"),
+    ],
+)  # fmt: skip
+def test_units_of_gsi_16(unit: str, digits: int, metres: float, name: str) -> None:
+    line = f"*110001+00000000000000A1 81..0{unit}+{digits:016d} 82..0{unit}+{digits:016d} 83..0{unit}+{digits:016d} \n"
+    read = _read(line * 2)
+    assert (read.first[0], read.unit, read.height_unit) == (metres, name, name)
+    assert _detected(read)["words"] == "GSI-16"
+
+
+def test_stations_are_read_where_there_are_no_other_points() -> None:
+    read = _read("110001+0000STN1 84..10+00012345 85..10+00067890 86..10+00001234 \n")
+    assert (list(read.texts["point"]), read.first.tolist(), read.second.tolist()) == (["STN1"], [12.345], [67.89])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("110001+0000STN1 21.102+00012345 \n", "no coordinates"),
+        (GSI_8 + "some text\n", "line 5 is no line of GSI"),
+        (GSI_16.replace("82..10", "82..11"), "several units"),
+        (GSI_16.replace("81..10", "81..12").replace("82..10", "82..12"), "several units"),
+    ],
+)
+def test_bad_gsi(text: str, message: str) -> None:
+    with pytest.raises(UnreadableUpload, match=message):
+        _read(text)
+
+
+# --- XML --------------------------------------------------------------------------------------------------------------
+
+
+def _jobxml(points: str) -> str:
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?><JOBFile jobName="B10" version="5.74" product="Trimble Access">'
+        "<Environment><DisplaySettings><DistanceUnits>USSurveyFeet</DistanceUnits></DisplaySettings></Environment>"
+        '<FieldBook><PointRecord ID="1"><Name>raw</Name><Grid><North>1</North></Grid></PointRecord></FieldBook>'
+        f"<Reductions>{points}</Reductions></JOBFile>"
+    )
+
+
+JOBXML = _jobxml(
+    "<Point><ID>1</ID><Name>101</Name><Code>IP</Code><SurveyMethod>NetworkRTK</SurveyMethod>"
+    "<Grid><North>5427345.678</North><East>456789.123</East><Elevation>112.5</Elevation></Grid>"
+    "<WGS84><Latitude>48.99763</Latitude><Longitude>8.40921</Longitude><Height>160.5</Height></WGS84></Point>"
+    "<Point><ID>2</ID><Name>102</Name><Code>IP</Code><Grid><North>5427346.678</North><East>456799.123</East>"
+    "<Elevation>112.6</Elevation></Grid><WGS84><Latitude>48.99764</Latitude><Longitude>8.40935</Longitude>"
+    "<Height>160.6</Height></WGS84></Point><Point><Name>azimuth</Name><Grid/></Point>"
+)
+
+
+def test_jobxml_has_grid_and_wgs84_coordinates() -> None:
+    read = _read(JOBXML)
+    assert (read.format, read.unit, read.first.tolist()) == ("jobxml", "m", [456789.123, 456799.123])
+    assert read.second.tolist() == [5427345.678, 5427346.678]
+    assert read.height is not None
+    assert read.height.tolist() == [112.5, 112.6]
+    assert list(read.texts["point"]) == ["101", "102"]
+    assert _detected(read)["other points"] == "1 left out"
+    degrees = _read(JOBXML, crs="EPSG:4326", vertical_datum="ellipsoid")
+    assert (degrees.first.tolist(), degrees.second.tolist()) == ([8.40921, 8.40935], [48.99763, 48.99764])
+    assert degrees.height is not None
+    assert degrees.height.tolist() == [160.5, 160.6]
+
+
+GPX = (
+    '<gpx xmlns="http://www.topografix.com/GPX/1/1" version="1.1" creator="a receiver">'
+    '<wpt lat="49.0051" lon="8.4164"><ele>112.5</ele><name>A1</name><desc>nail</desc><sym>Flag</sym></wpt>'
+    '<wpt lat="49.0052" lon="8.4165"><ele>112.6</ele><name>A2</name></wpt>'
+    '<trk><trkseg><trkpt lat="1" lon="1"/></trkseg></trk></gpx>'
+)
+
+
+def test_gpx_waypoints_but_no_tracks() -> None:
+    read = _read(GPX, crs=None)
+    assert (read.format, read.crs) == ("gpx", "EPSG:4326")
+    assert (read.first.tolist(), read.second.tolist()) == ([8.4164, 8.4165], [49.0051, 49.0052])
+    assert (list(read.texts["point"]), list(read.texts["description"])) == (["A1", "A2"], ["nail", ""])
+    assert read.height is not None
+    assert read.height.tolist() == [112.5, 112.6]
+    assert _detected(read)["tracks"] == "1 points left out"
+    with pytest.raises(UnreadableUpload, match="no waypoints, but 1 points of tracks"):
+        _read(GPX[: GPX.index("<wpt")] + GPX[GPX.index("<trk>") :], crs=None)
+
+
+def _kml(count: int) -> bytes:
+    marks = "".join(
+        f"<Placemark><name>A{k}</name><Point><coordinates>8.4{k:06d},49.0,0</coordinates></Point></Placemark>"
+        for k in range(count)
+    )
+    return f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{marks}</Document></kml>'.encode()
+
+
+def _zip(**members: bytes) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name.replace("_", "."), content)
+    return packed.getvalue()
+
+
+@pytest.mark.parametrize("count", [8, 20_000])
+def test_kmz(count: int) -> None:
+    read = _read(_zip(doc_kml=_kml(count), icon_png=b"\x89PNG"), crs=None)
+    assert (read.format, read.rows, read.texts["point"][count - 1]) == ("kmz", count, f"A{count - 1}")
+    assert read.height is None
+    assert read.faults.counts == {"zero_heights": 1}
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (_zip(doc_kml=b"<kml>" + b" " * 2**26 + b"</kml>"), "expands beyond its limit"),
+        (_zip(a_kml=_kml(1), b_kml=_kml(1)), "holds 2 KML files"),
+        (_zip(doc_kml=b'<!DOCTYPE k [<!ENTITY a "aa">]><kml>&a;</kml>'), "document type"),
+        (_zip(doc_kml=_kml(8))[:-30], "damaged"),
+    ],
+)
+def test_bad_kmz(data: bytes, message: str) -> None:
+    with pytest.raises(WaymarkError, match=message):
+        _read(data, crs=None)
+
+
+@pytest.mark.parametrize("root", ["gpx", "JOBFile", "LandXML", "kml"])
+def test_no_xml_may_declare_a_document_type(root: str) -> None:
+    with pytest.raises(UnreadableUpload, match="document type"):
+        _read(f'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaa">]><{root}>&a;</{root}>')
+
+
+# --- units ------------------------------------------------------------------------------------------------------------
+
+
+def test_feet_of_a_crs_in_us_survey_feet() -> None:
+    points = (
+        '<CgPoint name="1">1900000.0 1176000.0 600.0</CgPoint><CgPoint name="2">1900010.0 1176000.0 601.0</CgPoint>'
+    )
+    text = (
+        '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2"><Units><Imperial linearUnit="foot"/></Units>'
+        f'<CoordinateSystem epsgCode="3435"/><CgPoints>{points}</CgPoints></LandXML>'
+    )
+    plain = _read(text, crs=None)
+    assert (plain.unit, plain.height_unit) == ("ft-us", "ft-us")
+    assert plain.faults.counts == {"which_foot": 1}
+    declared = _read(text, crs=None, unit="ft-intl")
+    assert (declared.unit, declared.faults.counts) == ("ft-intl", {})
+    assert plain.first.tolist() == declared.first.tolist()  # the same numbers; only the unit differs
+    metric = _read(text.replace('"3435"', '"26916"'), crs=None)
+    assert (metric.unit, metric.faults.counts) == ("ft-intl", {})
+
+
+def test_a_drawing_in_millimetres() -> None:
+    document = ezdxf.new("R2010", units=4)
+    document.modelspace().add_point((456_789_123.0, 5_427_345_678.0, 112_500.0))
+    document.modelspace().add_point((456_799_123.0, 5_427_345_678.0, 112_600.0))
+    text = io.StringIO()
+    document.write(text)
+    read = _read(text.getvalue())
+    assert (read.first[0], read.second[0]) == pytest.approx((456789.123, 5427345.678), abs=1e-6)
+    assert read.height == pytest.approx([112.5, 112.6])
+    assert _detected(read)["unit of the drawing"] == "0.001 m"
+    kept = _read(text.getvalue(), unit="m")  # the unit of a template, not of the coordinates
+    assert kept.first[0] == 456_789_123.0
+
+
+def test_multipoints_of_geojson() -> None:
+    many = {"type": "MultiPoint", "coordinates": [[8.4164, 49.0051], [8.4165, 49.0052], [8.4166, "x"]]}
+    one = {"type": "Point", "coordinates": [8.4167, 49.0053]}
+    features = [
+        {"type": "Feature", "properties": {"name": name}, "geometry": shape}
+        for name, shape in (("a", many), ("b", one))
+    ]
+    read = _read(json.dumps({"type": "FeatureCollection", "features": features}), crs=None)
+    assert list(read.texts["point"]) == ["a", "a", "a", "b"]
+    assert read.first[[0, 1, 3]].tolist() == [8.4164, 8.4165, 8.4167]
+    assert [(fault.row, fault.code) for fault in read.faults.shown(9)] == [(3, "no_point")]
+
+
+def test_positions_of_feet_differ_by_2_ppm() -> None:
+    """EPSG:3435: read in the unit of the CRS, the point is where PROJ places it; as international feet 1.36 m away."""
+    x, y = 1176000.0, 1900000.0
+    true = Transformer.from_crs("EPSG:3435", "EPSG:4269", always_xy=True).transform(x, y)
+    off = Transformer.from_crs("EPSG:3435", "EPSG:4269", always_xy=True).transform(x * 0.999998, y * 0.999998)
+    assert Geod(ellps="GRS80").inv(*true, *off)[2] == pytest.approx(1.362, abs=0.005)
+    placed = place_positions(np.array([x]), np.array([y]), np.array([np.nan]), crs="EPSG:3435")
+    assert (placed.lon_deg[0], placed.lat_deg[0]) == pytest.approx(true, abs=2e-5)

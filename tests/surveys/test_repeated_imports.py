@@ -1,0 +1,121 @@
+"""Surveys that are imported once more, and the report on what was not declared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from app.api.surveys.schemas import DeclarationIn
+from app.families.rules import MarkerRules
+from app.jobs.tasks import SameProcess
+from app.main import utc_now
+from app.registry.database import Database
+from app.services.access.access import Access, Scope
+from app.services.surveys.declarations import import_input
+from app.services.surveys.documents import ImportReport
+from app.services.surveys.imports import Imports
+
+DECLARED = {"crs": "EPSG:25832", "family": "cerpm", "area_deg": [8.3, 48.9, 8.6, 49.1], "ignore_heights": True}
+EAST, NORTH = 457000.0, 5428000.0
+Send = Callable[..., ImportReport]
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
+    """A registry that the tests of this module share, each with an agency of its own."""
+    opened = Database(f"sqlite:///{tmp_path_factory.mktemp('registry') / 'registry.sqlite3'}")
+    opened.open()
+    opened.migrate()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def send(database: Database, request: pytest.FixtureRequest) -> Send:
+    """Imports a file with a declaration as the API takes it."""
+    access = Access(database, utc_now)
+    caller = access.authenticate(access.create_key(request.node.name, Scope.PLANNER, "surveys"))
+    imports = Imports(database, utc_now, SameProcess(), MarkerRules())
+
+    def run(data: bytes, **declared: Any) -> ImportReport:
+        declaration = DeclarationIn.model_validate({**DECLARED, **declared})
+        return imports.run(caller, import_input(declaration.declared(), data))[0]
+
+    return run
+
+
+def _csv(*, moved_m: float = 0.0, prefix: str = "A") -> bytes:
+    rows = [f"{prefix}{k},{EAST + 10 * k + moved_m:.3f},{NORTH:.3f}" for k in range(8)]
+    return "\n".join(["point,easting,northing", *rows]).encode()
+
+
+def test_the_same_file_is_refused_and_a_comparison_is_proposed(send: Send) -> None:
+    assert send(_csv())["stored"] == 8
+    report = send(_csv())
+    assert (report["outcome"], report["stored"]) == ("refused", 0)
+    fault = report["faults"][0]
+    assert (fault["row"], fault["code"]) == (None, "file_already_imported")
+    assert "8 registered markers come from it" in fault["message"]
+    assert "compare" in str(fault["proposal"])
+    assert "duplicates" in str(fault["proposal"])
+
+
+def test_the_same_points_in_another_file_are_refused_row_by_row(send: Send) -> None:
+    assert send(_csv())["stored"] == 8
+    again = _csv(moved_m=0.04) + b"\nB1,457200.000,5428000.000\n"
+    report = send(again)
+    assert (report["outcome"], report["counts"]["already_registered"]) == ("refused", 8)
+    assert "is registered from point A0, 0.04 m from this row" in report["faults"][0]["message"]
+    assert send(again, mode="good")["stored"] == 1
+
+
+def test_a_point_number_or_a_poor_accuracy_widen_what_is_the_same_point(send: Send) -> None:
+    assert send(_csv())["stored"] == 8
+    assert send(_csv(moved_m=0.3), dry_run=True)["counts"]["already_registered"] == 8
+    renamed = send(_csv(moved_m=0.3, prefix="B"), dry_run=True)["counts"]
+    assert "already_registered" not in renamed
+    assert renamed["marker_already_there"] == 8
+    poor = send(_csv(moved_m=0.3, prefix="B"), dry_run=True, survey={"horizontal_rmse_m": 0.2})
+    assert poor["counts"]["already_registered"] == 8
+
+
+def test_a_marker_of_another_family_may_stand_at_the_same_place(send: Send) -> None:
+    assert send(_csv())["stored"] == 8
+    assert send(_csv(prefix="B"), dry_run=True)["counts"]["already_registered"] == 8
+    assert "already_registered" not in send(_csv(prefix="B"), dry_run=True, family="plate")["counts"]
+
+
+def test_duplicates_can_be_declared(send: Send) -> None:
+    assert send(_csv())["stored"] == 8
+    report = send(_csv(), duplicates="store")
+    assert (report["stored"], report["counts"]["marker_already_there"]) == (8, 8)
+
+
+def test_the_same_file_may_be_compared(send: Send) -> None:
+    assert send(_csv())["stored"] == 8
+    report = send(_csv(), compare=True, match="nearest", dry_run=True)
+    assert report["comparison"] is not None
+    assert report["comparison"]["matched"] == 8
+    assert not {"file_already_imported", "already_registered"} & report["counts"].keys()
+
+
+def test_the_report_states_everything_that_was_not_declared(send: Send) -> None:
+    rows = "\n".join(f"{k};{EAST + 10 * k:.3f};{NORTH:.3f};EOP".replace(".", ",") for k in range(8))
+    text = f"# Büro Müller\nAuftrag 7\nPunkt;Rechtswert;Hochwert;Code\n{rows}\n".encode("cp1252")
+    report = send(text, dry_run=True)
+    assert report["good_rows"] == 8
+    assert {one["what"]: one["value"] for one in report["detected"]} == {
+        "format": "csv", "encoding": "cp1252", "delimiter": ";", "first row": "line 4", "comments": "1 lines left out",
+        "column of point": "Punkt", "column of easting": "Rechtswert", "column of northing": "Hochwert",
+        "decimal sign": ",",
+    }  # fmt: skip
+    assert all(one["evidence"] for one in report["detected"])
+    assert report["counts"]["role_without_evidence"] == 1
+    columns = {"point": "Punkt", "easting": "Rechtswert", "northing": "Hochwert", "code": None}
+    declared = {"format": "csv", "encoding": "windows-1252", "delimiter": ";", "decimal": ",", "columns": columns}
+    report = send(text, dry_run=True, **declared)
+    assert {one["what"] for one in report["detected"]} == {"first row", "comments"}
+    assert "role_without_evidence" not in report["counts"]
+    assert send(text, dry_run=True, columns={"code": "", "status": None})["good_rows"] == 8
