@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -117,8 +118,24 @@ class Unavailable(WaymarkError):
     """A part the request needs is busy or down; trying again later can work."""
 
 
+class StorageFull(Unavailable):
+    """There is no room for what the request wants to store; nothing of it was stored."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__(f"there is no room in {where}", cure="try again when the operator has made room")
+
+
+class CommitUnknown(Unavailable):
+    """The database failed while it committed: whether the change was stored shows only when it works again."""
+
+
 class ProofFailed(WaymarkError):
     """An artwork was rendered and did not read back as its own code."""
+
+
+def is_disk_full(error: BaseException) -> bool:
+    """Whether an error of the operating system says that a disk or a quota is full."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -82,10 +83,12 @@ from app.services.roads.roads import Roads
 from app.services.surveys.exports import Exports
 from app.services.surveys.import_jobs import ImportJobs
 from app.services.surveys.imports import Imports
+from app.services.unused_blobs import UnusedBlobs
 from app.settings import Settings
 from app.storage.blobs import Blobs
 from app.storage.jwks import read_jwks
 from app.storage.master_key import load_master_key
+from app.storage.probe import FolderProbe
 from app.storage.signing_key import load_signing_keys
 
 _LOG = structlog.get_logger("waymark")
@@ -155,7 +158,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app = FastAPI(
         title="Waymark",
         version=__version__,
-        lifespan=lambda _app: _running(settings, outside, use_cases["jobs"], use_cases["access"]),
+        lifespan=lambda _app: _running(settings, outside, use_cases),
         default_response_class=Response,
         generate_unique_id_function=operation_id,
     )
@@ -163,12 +166,22 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         setattr(app.state, name, use_case)
     app.state.database = outside.database
     app.state.public_url = settings.public_url.rstrip("/")
-    app.state.readiness = {"database": outside.database.is_ready, "decoders": outside.pool.is_ready}
+    app.state.readiness = {
+        "database": outside.database.is_ready,
+        "decoders": outside.pool.is_ready,
+        "storage": FolderProbe(_folders(outside)).is_writable,
+    }
     app.state.metrics = CollectorRegistry()
     _add_routes(app)
     _add_guard(app, settings, app.state.access)
     app.add_middleware(Observed, registry=app.state.metrics)
     return app
+
+
+def _folders(outside: _Outside) -> set[Path]:
+    """Folders of this machine in which data are stored."""
+    database = outside.database.path
+    return {folder for folder in (outside.blobs.folder, database.parent if database else None) if folder is not None}
 
 
 def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> dict[str, Any]:
@@ -232,13 +245,15 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
         "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
         "searches": Searches(database),
         "snapshots": Snapshots(database, utc_now, signing_keys),
+        "unused_blobs": UnusedBlobs(database, utc_now, blobs),
         "vehicles": Vehicles(database, utc_now, ttl),
     }
 
 
 @asynccontextmanager
-async def _running(settings: Settings, outside: _Outside, jobs: Jobs, access: Access) -> AsyncIterator[None]:
+async def _running(settings: Settings, outside: _Outside, use_cases: Mapping[str, Any]) -> AsyncIterator[None]:
     """The time between the server's start and its end."""
+    jobs, access, unused_blobs = use_cases["jobs"], use_cases["access"], use_cases["unused_blobs"]
     outside.database.open()
     try:
         outside.database.migrate()
@@ -250,7 +265,7 @@ async def _running(settings: Settings, outside: _Outside, jobs: Jobs, access: Ac
             outside.pool.warm()
         for queue, kinds in outside.queues:
             queue.open(jobs.run_job, jobs.list_unfinished(kinds))
-        async with _each_minute(access.write_uses):
+        async with _each_minute(access.write_uses), _each_day(unused_blobs.try_to_delete, stop=unused_blobs.stop):
             yield
     finally:
         outside.pool.close()
@@ -306,6 +321,23 @@ async def _each_minute(work: Callable[[], None]) -> AsyncIterator[None]:
     finally:
         task.cancel()
         await asyncio.to_thread(work)
+
+
+@asynccontextmanager
+async def _each_day(work: Callable[[], None], *, stop: Callable[[], None]) -> AsyncIterator[None]:
+    """Call `work` in a thread now and once a day; `stop` ends a call."""
+
+    async def repeat() -> None:
+        while True:
+            await asyncio.to_thread(work)
+            await asyncio.sleep(24 * 3600)
+
+    task = asyncio.create_task(repeat())
+    try:
+        yield
+    finally:
+        stop()
+        task.cancel()
 
 
 def utc_now() -> datetime:

@@ -25,6 +25,7 @@ from app.registry.engines import (
     BUSY_TIMEOUT_S,
     LONG,
     busy_is_unavailable,
+    cut_commit_is_unknown,
     isolation,
     postgres_asking_engine,
     postgres_engine,
@@ -143,7 +144,7 @@ class Database:
 
     @contextmanager
     def write(self, *, long: bool = False) -> Iterator[sa.Connection]:
-        """A write transaction, committed when the block ends without an error.
+        """A write transaction, committed when the block ends without an error. Then it survives a power failure.
 
         Parameters
         ----------
@@ -155,8 +156,14 @@ class Database:
         try:
             with busy_is_unavailable(), self.engine.connect() as connection:
                 connection = connection.execution_options(**isolation(self.url, write=True), **{LONG: long})
-                with connection.begin():
+                transaction = connection.begin()
+                try:
                     yield connection
+                except BaseException:
+                    transaction.rollback()
+                    raise
+                with cut_commit_is_unknown():
+                    transaction.commit()
         finally:
             self.writes += 1
             self._one_writer.release()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,7 +12,7 @@ import psycopg
 import sqlalchemy as sa
 from sqlalchemy import event
 
-from app.errors import Unavailable
+from app.errors import CommitUnknown, StorageFull, Unavailable
 from app.registry.spatial import register_functions
 from app.registry.tenancy import set_whose, whose_rows
 
@@ -32,6 +33,16 @@ _PAGE_BYTES = 16_384
 """Page size of a new SQLite file. [byte] Rows have 2 kB, and finding a page takes longer the more pages the log holds,
 which contains the whole of an import. No figure was kept; `python -m benchmarks.imports` measures it."""
 _CANNOT_BE_REACHED = "the database cannot be reached"
+_BUSY, _DISK_FAILED = "the database is busy", "the disk of the database failed"
+_SQLITE_TEMPORARY = {
+    sqlite3.SQLITE_BUSY: _BUSY,
+    sqlite3.SQLITE_LOCKED: _BUSY,
+    sqlite3.SQLITE_IOERR: _DISK_FAILED,
+    sqlite3.SQLITE_CANTOPEN: _DISK_FAILED,
+}
+"""Result codes that say nothing about the request. Source: https://www.sqlite.org/rescode.html"""
+_OPERATIONAL = (sa.exc.OperationalError, sqlite3.OperationalError, psycopg.OperationalError)
+"""As SQLAlchemy raises them, and as the drivers do where they are used without it."""
 
 
 def sqlite_engine(url: sa.URL) -> sa.Engine:
@@ -153,22 +164,48 @@ def busy_is_unavailable() -> Iterator[None]:
         yield
     except sa.exc.TimeoutError as error:
         raise Unavailable("every database connection is in use", cure="try again in a few seconds") from error
-    except sa.exc.OperationalError as error:
-        message = _temporary(error)
-        if message is None:
+    except _OPERATIONAL as error:
+        failure = _temporary(error)
+        if failure is None:
             raise
-        raise Unavailable(message, cure="try again in a few seconds") from error
+        raise failure from error
 
 
-def _temporary(error: sa.exc.OperationalError) -> str | None:
-    cause = error.orig
-    if not isinstance(cause, psycopg.Error):
-        return "the database is busy" if "locked" in str(cause) or "busy" in str(cause) else None
-    if cause.sqlstate == "57014":
-        return f"the database needed more than {STATEMENT_TIMEOUT_S:.0f} s for one statement"
-    if cause.sqlstate in ("55P03", "40001", "40P01"):
-        return "the database is busy"
-    return _CANNOT_BE_REACHED
+@contextmanager
+def cut_commit_is_unknown() -> Iterator[None]:
+    """Raise a failure in the middle of a commit as `CommitUnknown`: it may be durable although nothing confirmed it."""
+    try:
+        yield
+    except _OPERATIONAL as error:
+        if isinstance(_temporary(error), StorageFull):
+            raise  # the end of the transaction was not written
+        raise CommitUnknown(
+            "the database failed while it stored the change, which may be stored or not",
+            cure="read it again, or repeat the request with the same Idempotency-Key",
+        ) from error
+
+
+def _temporary(error: Exception) -> Unavailable | None:
+    """A failure that has nothing to do with the request; None if it may have."""
+    cause = error.orig if isinstance(error, sa.exc.OperationalError) else error
+    message = _CANNOT_BE_REACHED
+    if isinstance(cause, sqlite3.OperationalError):
+        code = cause.sqlite_errorcode & 0xFF  # without what the extended code adds
+        if code == sqlite3.SQLITE_FULL:
+            return StorageFull("the database")
+        if code not in _SQLITE_TEMPORARY:
+            return None
+        message = _SQLITE_TEMPORARY[code]
+    elif isinstance(cause, psycopg.Error):
+        if cause.sqlstate == "53100":
+            return StorageFull("the database")
+        if cause.sqlstate == "57014":
+            message = f"the database needed more than {STATEMENT_TIMEOUT_S:.0f} s for one statement"
+        elif cause.sqlstate in ("55P03", "40001", "40P01"):
+            message = _BUSY
+        elif cause.sqlstate == "58030":
+            message = _DISK_FAILED
+    return Unavailable(message, cure="try again in a few seconds")
 
 
 def _json(value: Any) -> str:

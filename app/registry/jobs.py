@@ -148,6 +148,12 @@ def start_job(connection: sa.Connection, job_id: str) -> JobRow | None:
     return find_one(connection, select_rows(JobRow, jobs).where(jobs.c.id == job_id), JobRow)
 
 
+def return_attempt(connection: sa.Connection, job_id: str) -> None:
+    """Do not count the start of a job that stopped through no fault of its own."""
+    statement = sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state == "running", jobs.c.attempts > 0)
+    connection.execute(statement.values(attempts=jobs.c.attempts - 1))
+
+
 def record_progress(
     connection: sa.Connection, job_id: str, progress: float,
     *, steps: tuple[int, int] | None = None, kept: bool = False,

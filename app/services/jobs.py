@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Protocol
 
 import sqlalchemy as sa
 import structlog
 
-from app.errors import Unavailable, UnreadableUpload, WaymarkError
+from app.errors import StorageFull, Unavailable, UnreadableUpload, WaymarkError, is_disk_full
 from app.registry import jobs as store
 from app.registry.database import Database
 from app.registry.jobs import JobKind, JobRow, JobState
@@ -17,7 +18,8 @@ from app.services.error_documents import error_document
 from app.services.ports import Clock
 
 MAX_ATTEMPTS = 3
-"""How often a job is started; one that never ends then fails."""
+"""How often a job is started; one that never ends then fails. Starts that ended because the server was stopped, or a
+store was full or did not answer, are not counted: such a job waits."""
 _LOG = structlog.get_logger(__name__)
 
 
@@ -142,12 +144,21 @@ class Jobs:
         except JobCancelled:
             job.end("cancelled")
         except Unavailable:
+            self._return_attempt(job)
             raise
         except WaymarkError as error:
             job.end("failed", error)
-        except Exception:  # noqa: BLE001 - a defect must not leave a job that runs for ever
+        except Exception as error:
+            if is_disk_full(error):
+                self._return_attempt(job)
+                raise StorageFull("the folder for temporary files") from error
+            # a defect must not leave a job that runs for ever
             _LOG.exception("a job failed on a defect", job_id=job.row.id, kind=job.row.kind)
             job.end("failed", WaymarkError("the job failed on a defect of the server; its log has the details"))
+
+    def _return_attempt(self, job: RunningJob) -> None:
+        with suppress(Unavailable), self._database.write() as connection:
+            store.return_attempt(connection, job.row.id)
 
 
 def _too_many_attempts(attempts: int) -> WaymarkError:

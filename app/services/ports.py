@@ -18,8 +18,8 @@ class Clock(Protocol):
 class Blobs(Protocol):
     """Store of uploads."""
 
-    def put(self, key: str, data: bytes, *, durable: bool = False) -> None:
-        """Write a blob once."""
+    def put(self, key: str, data: bytes) -> None:
+        """Write a blob once, durably."""
 
     def put_file(self, key: str, path: Path) -> None:
         """Write a blob from a file."""
@@ -32,6 +32,12 @@ class Blobs(Protocol):
 
     def delete(self, key: str) -> None:
         """Remove a blob."""
+
+    def list_keys(self, before: datetime | None = None) -> Iterator[str]:
+        """Keys of all blobs, or of those that were written before a time."""
+
+    def delete_partial(self, before: datetime) -> None:
+        """Remove what writes that were cut off before a time have left."""
 
 
 class JobQueue(Protocol):

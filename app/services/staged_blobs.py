@@ -8,7 +8,7 @@ from pathlib import Path
 
 import structlog
 
-from app.errors import Unavailable
+from app.errors import CommitUnknown, Unavailable
 from app.services.ports import Blobs
 from app.storage.blobs import new_blob_key
 
@@ -22,11 +22,11 @@ class StagedBlobs:
         self._blobs = blobs
         self._keys: list[str] = []
 
-    def put(self, folder: str, data: bytes, *, durable: bool = False) -> str:
+    def put(self, folder: str, data: bytes) -> str:
         """Write a blob. Returns its key."""
         key = new_blob_key(folder)
         self._keys.append(key)
-        self._blobs.put(key, data, durable=durable)
+        self._blobs.put(key, data)
         return key
 
     def put_file(self, folder: str, path: Path) -> str:
@@ -55,10 +55,16 @@ class StagedBlobs:
 
 @contextmanager
 def staged(blobs: Blobs) -> Iterator[StagedBlobs]:
-    """Write blobs inside the block; when it ends, those that were not kept are deleted."""
+    """Write blobs inside the block; when it ends, those that were not kept are deleted.
+
+    If the rows that refer to them may have been committed, they stay: `app.services.unused_blobs` decides later.
+    """
     stage = StagedBlobs(blobs)
     try:
         yield stage
+    except CommitUnknown:
+        stage.keep()
+        raise
     finally:
         stage.delete_all()
 

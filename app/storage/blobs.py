@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import uuid
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -13,10 +16,13 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 
-from app.errors import Conflict, InvalidParameter, NotFound, Unavailable
+from app.errors import Conflict, InvalidParameter, NotFound, StorageFull, Unavailable, is_disk_full
 
 _CHUNK_BYTES = 5 * 1024**2  # source: S3's smallest part of an upload
 _KEY = re.compile(r"[a-z]+/[0-9a-f]{2}/[0-9a-f]{32}")
+_DISK_FULL = re.compile(rf"\(os error ({errno.ENOSPC}|{errno.EDQUOT})\)")
+_PARTIAL = re.compile(_KEY.pattern + "#[0-9]+")
+"""Name under which obstore writes a file before it is whole. Source: `staged_upload_path` of the crate object_store."""
 _URL = "file:///FOLDER or s3://BUCKET/PREFIX"
 
 
@@ -45,15 +51,24 @@ class Blobs:
         self._url = url
         self._folder: Path | None = None
         self._opened: ObjectStore | None = None
+        self._durable_folders: set[Path] = set()
         if parts.scheme == "file" and not parts.netloc and parts.path:
             self._folder = Path(unquote(parts.path))
         elif parts.scheme != "s3" or not parts.netloc:
             raise InvalidParameter(f"no blob store at {url!r}", field="blobs_url", limit=_URL)
 
+    @property
+    def folder(self) -> Path | None:
+        """The folder, unless the blobs are in S3."""
+        return self._folder
+
     def open(self) -> None:
         """Create the folder, or prepare the client."""
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            for folder in list(self._folder.parents)[:2]:  # the data folder may be new, too
+                with suppress(PermissionError):
+                    _sync(folder)
             self._opened = LocalStore(self._folder)
         else:
             self._opened = from_url(self._url)
@@ -64,31 +79,27 @@ class Blobs:
             raise Unavailable("the blob store is not open")
         return self._opened
 
-    def put(self, key: str, data: bytes, *, durable: bool = False) -> None:
-        """Write a blob that does not exist yet.
+    def put(self, key: str, data: bytes) -> None:
+        """Write a blob that does not exist yet. When this returns, it survives a power failure.
 
         Parameters
         ----------
         key : str
             From `new_blob_key`.
         data : bytes
-        durable : bool
-            On a local folder, return only when the bytes would survive a power failure. S3 always does.
 
         Raises
         ------
         Conflict
             The key is taken.
+        StorageFull
+            There is no room.
+        Unavailable
+            The store does not answer, or its disk failed.
         """
         _check_key(key)
-        try:
+        with self._written(key):
             obstore.put(self._store, key, data, mode="create", use_multipart=False)
-        except AlreadyExistsError as error:
-            raise Conflict(f"blob {key} exists") from error
-        except (BaseError, OSError) as error:
-            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
-        if durable:
-            self._make_durable(key)
 
     def put_file(self, key: str, path: Path) -> None:
         """Write a blob from a file, a few megabytes at a time; it survives a power failure.
@@ -98,13 +109,15 @@ class Blobs:
         key : str
             From `new_blob_key`, and not used before: unlike `put`, this cannot refuse a taken one.
         path : Path
+
+        Raises
+        ------
+        StorageFull, Unavailable
+            As `put`.
         """
         _check_key(key)
-        try:
+        with self._written(key):
             obstore.put(self._store, key, path, chunk_size=_CHUNK_BYTES, max_concurrency=2)
-        except (BaseError, OSError) as error:
-            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
-        self._make_durable(key)
 
     def stream(self, key: str) -> Iterator[bytes]:
         """Content of a blob, a few megabytes at a time.
@@ -120,14 +133,33 @@ class Blobs:
         except FileNotFoundError as error:
             raise NotFound(f"blob {key} is gone") from error
         except (BaseError, OSError) as error:
-            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
+            raise _failure(error) from error
         return (bytes(chunk) for chunk in found.stream(min_chunk_size=_CHUNK_BYTES))
 
+    @contextmanager
+    def _written(self, key: str) -> Iterator[None]:
+        """Make the blob durable that the block writes. One that failed is deleted: after a failed fsync the kernel may
+        have dropped its pages, and a second fsync would succeed."""
+        try:
+            yield
+            self._make_durable(key)
+        except AlreadyExistsError as error:
+            raise Conflict(f"blob {key} exists") from error
+        except (BaseError, OSError) as error:
+            with suppress(BaseError, OSError):
+                obstore.delete(self._store, key)
+            raise _failure(error) from error
+
     def _make_durable(self, key: str) -> None:
-        if self._folder is not None:
-            path = self._folder / key
-            for place in (path, path.parent, path.parent.parent):
-                _sync(place)
+        if self._folder is None:
+            return  # S3 answers when the object is durable
+        path = self._folder / key
+        _sync(path)
+        _sync(path.parent)
+        if path.parent not in self._durable_folders:
+            _sync(path.parent.parent)
+            _sync(self._folder)
+            self._durable_folders.add(path.parent)
 
     def get(self, key: str) -> bytes:
         """Content of a blob.
@@ -143,7 +175,7 @@ class Blobs:
         except FileNotFoundError as error:
             raise NotFound(f"blob {key} is gone") from error
         except (BaseError, OSError) as error:
-            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
+            raise _failure(error) from error
 
     def delete(self, key: str) -> None:
         """Remove a blob; one that is gone already is no error."""
@@ -153,7 +185,48 @@ class Blobs:
         except FileNotFoundError:
             return
         except (BaseError, OSError) as error:
-            raise Unavailable("the blob store does not answer", cure="try again in a few seconds") from error
+            raise _failure(error) from error
+
+    def list_keys(self, before: datetime | None = None) -> Iterator[str]:
+        """Keys of all blobs, or of those that were written before a time."""
+        try:
+            for name, written_at in self._list_all():
+                if _KEY.fullmatch(name) and (before is None or written_at < before):
+                    yield name
+        except (BaseError, OSError) as error:
+            raise _failure(error) from error
+
+    def delete_partial(self, before: datetime) -> None:
+        """Remove what writes into a folder that were cut off before a time have left.
+
+        In S3 a rule of the bucket does so ("AbortIncompleteMultipartUpload").
+        """
+        try:
+            for name, written_at in self._list_all():
+                if self._folder is not None and _PARTIAL.fullmatch(name) and written_at < before:
+                    (self._folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise _failure(error) from error
+
+    def _list_all(self) -> Iterator[tuple[str, datetime]]:
+        """Name and time of every object; obstore does not list the partial files of a folder."""
+        if self._folder is None:
+            for chunk in obstore.list(self._store):
+                yield from ((found["path"], found["last_modified"]) for found in chunk)
+            return
+        for place, _folders, names in os.walk(self._folder):
+            for name in names:
+                path = Path(place, name)
+                with suppress(FileNotFoundError):  # deleted in the meantime
+                    modified = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+                    yield str(path.relative_to(self._folder)), modified
+
+
+def _failure(error: BaseException) -> Unavailable:
+    """What an error of the store means. obstore has one class for most, with the operating system's number as text."""
+    if is_disk_full(error) or _DISK_FULL.search(str(error)):
+        return StorageFull("the blob store")
+    return Unavailable("the blob store failed or does not answer", cure="try again in a few seconds")
 
 
 def _check_key(key: str) -> None:

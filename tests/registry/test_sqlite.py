@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import subprocess
 import sys
 from datetime import UTC, datetime
@@ -10,12 +11,15 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
+from app.errors import CommitUnknown, StorageFull, Unavailable
 from app.families.inputs import PositionIn
 from app.families.plate.registration import NewPlate
 from app.registry import agencies
 from app.registry.database import Database
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
+from app.services.staged_blobs import staged
+from app.storage.blobs import Blobs
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 
@@ -41,6 +45,50 @@ def test_the_connection_is_durable(database: Database) -> None:
 def test_a_new_file_has_large_pages(database: Database) -> None:
     with database.read() as connection:
         assert connection.exec_driver_sql("PRAGMA page_size").scalar() == 16_384
+
+
+def test_a_full_disk_is_no_defect_and_stores_nothing(database: Database) -> None:
+    with database.write() as connection:
+        connection.exec_driver_sql("CREATE TABLE filler (content BLOB)")
+        pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
+        connection.exec_driver_sql(f"PRAGMA max_page_count = {pages + 1}")  # SQLite's own limit fails as a disk does
+    with pytest.raises(StorageFull, match="no room in the database"), database.write() as connection:
+        connection.exec_driver_sql("INSERT INTO filler VALUES (zeroblob(1000000))")
+    with database.write() as connection:
+        assert connection.exec_driver_sql("SELECT count(*) FROM filler").scalar() == 0
+
+
+class Failing(sqlite3.Connection):
+    """A connection whose commits end as on a disk whose fsync fails."""
+
+    code = sqlite3.SQLITE_IOERR | 4 << 8
+    """SQLITE_IOERR_FSYNC"""
+
+    def commit(self) -> None:
+        error = sqlite3.OperationalError("disk I/O error")
+        error.sqlite_errorcode = self.code
+        raise error
+
+
+def test_a_commit_whose_fsync_fails_is_unknown_and_its_blobs_stay(tmp_path: Path) -> None:
+    engine_url = f"sqlite:///{tmp_path / 'db'}"
+    database, blobs = Database(engine_url), Blobs((tmp_path / "blobs").as_uri())
+    database.engine = sa.create_engine(engine_url, connect_args={"factory": Failing})
+    blobs.open()
+    keys: list[str] = []
+
+    def store() -> None:
+        with staged(blobs) as stage:
+            keys.append(stage.put("uploads", b"x"))
+            with database.write() as connection:
+                connection.exec_driver_sql("CREATE TABLE t (a)")
+
+    with pytest.raises(CommitUnknown):
+        store()
+    assert blobs.get(keys[0]) == b"x"
+    with pytest.raises(Unavailable, match="disk of the database"), database.write():
+        Failing.commit(Failing(":memory:"))
+    database.close()
 
 
 def test_a_write_takes_the_lock_at_its_start(database: Database) -> None:

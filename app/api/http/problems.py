@@ -67,6 +67,7 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     errors.VersionRequired: ProblemKind(428, "version-required", "The change must state the version it is based on"),
     errors.TooManyRequests: ProblemKind(429, "too-many-requests", "Too many requests in a short time"),
     errors.ProofFailed: ProblemKind(500, "proof-failed", "The artwork could not be read back"),
+    errors.StorageFull: ProblemKind(507, "storage-full", "There is no room to store this"),
     errors.Unavailable: ProblemKind(503, "unavailable", "The service is temporarily unavailable"),
 }
 UNION_TAG = "one-of:"
@@ -139,7 +140,7 @@ def problem_responses(*statuses: int, refused: type[Problem] | None = None) -> D
         The problem document with a report that the route may return with status 422.
     """
     documented: Described = {}
-    for status in sorted({400, 401, 403, 408, 413, 415, 422, 429, 500, 503, *statuses}):
+    for status in sorted({400, 401, 403, 408, 413, 415, 422, 429, 500, 503, 507, *statuses}):
         kinds = [kind for kind in PROBLEMS.values() if kind.status == status]
         titles = "; ".join(f"`{kind.slug}`: {kind.title}" for kind in kinds) or HTTPStatus(status).phrase
         documented[status] = {
@@ -218,7 +219,12 @@ def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
 
 
 def unexpected(error: Exception, scope: Any) -> Response:
-    """The response to a bug: the details are in the log, the client gets only the request's id."""
+    """The response to a bug: the details are in the log, the client gets only the request's id.
+
+    A full disk is no bug: requests and responses pass through temporary files at many places.
+    """
+    if errors.is_disk_full(error):
+        return problem_from(errors.StorageFull("the folder for temporary files"), scope)
     _LOG.error("unexpected error", exc_info=error, path=scope.get("path"))
     kind = ProblemKind(500, "internal-error", "The server failed")
     return problem(kind, "an unexpected error; its details are in the server's log under this request_id", scope)
@@ -294,6 +300,6 @@ def _challenge(status: int, headers: dict[str, str] | None) -> dict[str, str]:
     extra = dict(headers or {})
     if status == 401:
         extra["WWW-Authenticate"] = 'Bearer realm="waymark"'
-    if status == 503:
+    if status in (503, 507):
         extra["Retry-After"] = "5"
     return extra

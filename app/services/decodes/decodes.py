@@ -107,7 +107,7 @@ class Decodes:
     ) -> tuple[DecodeDocument, bool]:
         agency_id, now, ttl = caller.agency_id, upload.received_at, self._rules.idempotency_ttl
         with staged(self._blobs) as stage:
-            row = new_decode(handler, upload)._replace(upload_key=stage.put(UPLOADS, upload.data, durable=True))
+            row = new_decode(handler, upload)._replace(upload_key=stage.put(UPLOADS, upload.data))
             with write_once(self._database, agency_id, key, now, ttl) as (connection, answer):
                 if answer.replayed:
                     return answer.response, True

@@ -113,7 +113,7 @@ class Alignments:
             ALIGNMENTS.check_name(connection, agency_id, name)
         read = self._processes.submit(SummarizeRoadTask(road), wait_s=BUSY_WAIT_S).result()
         with staged(self._blobs) as stage:
-            source_key = stage.put("alignments", road.data, durable=True)
+            source_key = stage.put("alignments", road.data)
             with (
                 self._database.write() as connection,
                 idempotent(connection, agency_id, key, now, self._ttl) as answer,

@@ -125,7 +125,7 @@ class Plans:
         if job is not None:
             job.report_progress(PLACED)
         with staged(self._blobs) as stage:
-            document_key = stage.put("plans", made.document, durable=True)
+            document_key = stage.put("plans", made.document)
             with (
                 self._database.write(long=True) as connection,
                 idempotent(connection, agency_id, key, now, self._ttl) as answer,
@@ -200,7 +200,7 @@ class Plans:
         with staged(self._blobs) as stage:
             changes: dict[str, Any] = {"name": name}
             if made is not None:
-                changes |= _made_columns(caller, made, rules, stage.put("plans", made.document, durable=True))
+                changes |= _made_columns(caller, made, rules, stage.put("plans", made.document))
             with self._database.write(long=made is not None) as connection:
                 row = PLANS.get_at(connection, agency_id, plan_id, version)
                 _check_status(row, (DRAFT, CHECKED, PROVED, APPROVED), "changed", "make another plan")

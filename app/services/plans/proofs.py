@@ -150,8 +150,8 @@ class Proofs:
         assert plan_id is not None
         with staged(self._blobs) as stage:
             keys = {
-                REPORT_FILE: stage.put(_FOLDER, written.report, durable=True),
-                TABLE_FILE: stage.put(_FOLDER, written.table, durable=True),
+                REPORT_FILE: stage.put(_FOLDER, written.report),
+                TABLE_FILE: stage.put(_FOLDER, written.table),
             }
             with self._database.write() as connection:
                 row = PLANS.get(connection, agency_id, plan_id)

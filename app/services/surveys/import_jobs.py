@@ -79,7 +79,7 @@ class ImportJobs:
             job = new_job(
                 JobKind.IMPORT, new_id(now), agency_id, caller.key_id, now,
                 job_input={"declaration": dict(declared), "label": caller.label},
-                upload_key=stage.put("uploads", data, durable=True),
+                upload_key=stage.put("uploads", data),
             )  # fmt: skip
             with write_once(self._database, agency_id, key, now, self._ttl) as (connection, answer):
                 if answer.replayed:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import re
 from collections.abc import Callable
 from typing import Any
@@ -16,10 +18,12 @@ from fastapi.routing import APIRoute
 
 from app.api.http.middleware import PROTECTED
 from app.api.http.problems import MEDIA_TYPE, PROBLEMS, kind_of
-from app.errors import WaymarkError
+from app.errors import StorageFull, WaymarkError
 from app.logs import configure_logs
 from app.settings import Settings
+from app.storage import probe
 from tests.conftest import LiveServer
+from tests.http import refused
 
 OPEN = {"/", "/healthz", "/readyz", "/metrics", "/docs", "/docs/oauth2-redirect", "/redoc", "/openapi.json"}
 
@@ -32,6 +36,36 @@ def test_every_error_of_the_domain_is_in_the_table() -> None:
     missing = {kind for kind in _descendants(WaymarkError) if kind_of(kind("x")) is None}
     assert missing == {WaymarkError}
     assert len({kind.slug for kind in PROBLEMS.values()}) == len(PROBLEMS)
+
+
+def test_not_ready_while_nothing_can_be_written(
+    fresh_server: LiveServer, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(probe, "_VALID_S", 0.0)
+
+    def fail(_descriptor: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with fresh_server.client(None) as anyone:
+        assert anyone.get("/readyz").json()["parts"]["storage"] is True
+        for module, name, fault in ((os, "fsync", fail), (probe, "MIN_FREE_BYTES", 2**62)):
+            with monkeypatch.context() as broken:
+                broken.setattr(module, name, fault)
+                late = anyone.get("/readyz")
+                assert (late.status_code, late.json()["parts"]["storage"]) == (503, False)
+            assert anyone.get("/readyz").status_code == 200
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "no space left"), StorageFull("the database")])
+def test_a_full_disk_is_507_with_a_time_to_try_again(fresh_server: LiveServer, error: Exception) -> None:
+    def fail() -> None:
+        raise error
+
+    fresh_server.app.add_api_route("/full", fail)
+    with fresh_server.client() as client:
+        response = client.get("/full")
+    assert "room" in refused(response, 507, "storage-full")["detail"]
+    assert int(response.headers["retry-after"]) > 0
 
 
 def test_ready_only_while_the_database_is_migrated(fresh_server: LiveServer, settings: Settings) -> None:

@@ -1,0 +1,43 @@
+"""Which blobs the rows refer to."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import sqlalchemy as sa
+
+from app.registry.jobs import JobKind
+from app.registry.plan_tables import alignments, plans
+from app.registry.tables import decodes, jobs
+
+COLUMNS = (
+    decodes.c.upload_key,
+    decodes.c.picture_key,
+    jobs.c.upload_key,
+    alignments.c.source_key,
+    plans.c.document_key,
+)
+"""Columns that are the key of a blob."""
+_DOCUMENTS = (plans.c.proof, jobs.c.input, jobs.c.result)
+"""JSON in which keys of blobs stand."""
+_KEY = re.compile(r"[a-z]+/[0-9a-f]{2}/[0-9a-f]{32}")
+_ROWS = 10_000
+
+
+def blob_references(connection: sa.Connection) -> Iterator[str]:
+    """Keys of all blobs that rows of any agency refer to; some of them more than once."""
+    for column in COLUMNS:
+        yield from _stream(connection, sa.select(column).where(column.is_not(None)))
+    for column in _DOCUMENTS:
+        query = sa.select(sa.cast(column, sa.Text)).where(column.is_not(None))
+        if column.table is jobs:
+            query = query.where(jobs.c.kind != JobKind.IMPORT)  # their reports are large and have no keys
+        for text in _stream(connection, query):
+            yield from _KEY.findall(text)
+
+
+def _stream(connection: sa.Connection, query: sa.Select[Any]) -> Iterator[str]:
+    with connection.execute(query.execution_options(yield_per=_ROWS)) as rows:
+        yield from rows.scalars()
