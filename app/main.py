@@ -22,6 +22,7 @@ from app.api.access import audit, keys
 from app.api.decodes import decodes
 from app.api.fleet import calibrations, snapshots, vehicles
 from app.api.http import system, ui
+from app.api.http.costs import Budget, Slots
 from app.api.http.dependencies import refuse_unknown_parameters
 from app.api.http.middleware import Guarded, Observed
 from app.api.http.openapi import describe, operation_id
@@ -79,6 +80,7 @@ from app.services.plans.packages import Packages
 from app.services.plans.plan_jobs import PlanJobs
 from app.services.plans.plans import Plans
 from app.services.plans.proofs import Proofs
+from app.services.request_work import check_deadline
 from app.services.roads.roads import Roads
 from app.services.surveys.exports import Exports
 from app.services.surveys.import_jobs import ImportJobs
@@ -303,6 +305,9 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
         permissions=Permissions(),
         body_timeout_s=settings.body_timeout_s,
         min_bytes_per_s=settings.min_bytes_per_s,
+        budget=Budget(settings.key_processor_s_per_min, settings.agency_processor_s_per_min),
+        slots=Slots(settings.expensive_at_once, settings.expensive_per_agency),
+        request_timeout_s=settings.request_timeout_s,
     )
 
 
@@ -393,6 +398,7 @@ def _face_reader(decode: DecodePlates) -> PlateReader:
     """The decoder as the self-proof wants it: our own drawing is no stranger's upload, so it needs no child process."""
 
     def read(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> list[PlateReading]:
+        check_deadline()  # once a plate: a bundle has thousands
         return decode(image, geometries=(geometry,))
 
     return read

@@ -111,6 +111,29 @@ class Settings(BaseSettings):
         default=30.0, ge=0, le=1e6, description="Maximum rate of wrong keys from one address; 0: unlimited. [1/min]"
     )
 
+    key_processor_s_per_min: float = Field(
+        default=120.0,
+        ge=0,
+        le=1e6,
+        description="Processor time for requests with one key in the long run; ten minutes' worth at once; 0: "
+        "unlimited. [s/min]",
+    )
+    agency_processor_s_per_min: float = Field(
+        default=240.0,
+        ge=0,
+        le=1e6,
+        description="Processor time for requests of one agency, in the same way. [s/min]",
+    )
+    expensive_at_once: int = Field(
+        default=4, ge=1, le=1000, description="Maximum number of expensive requests at once; others wait."
+    )
+    expensive_per_agency: int = Field(
+        default=2, ge=1, le=1000, description="Maximum number of expensive requests of one agency at once."
+    )
+    request_timeout_s: float = Field(
+        default=300.0, gt=0, description="Maximum time for the work on a request that is not a job. [s]"
+    )
+
     oidc_issuer: str = Field(default="", description="OpenID Connect issuer whose tokens are accepted; empty: none.")
     oidc_audience: str = Field(default="", description="Audience that its tokens must contain.")
     oidc_jwks: str = Field(default="", description="Its public keys (JWKS): https://..., or a file.")

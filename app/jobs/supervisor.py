@@ -7,7 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError, Future, wait
 from concurrent.futures import TimeoutError as FutureTimeout
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -19,6 +19,7 @@ from app.errors import Unavailable, UnreadableUpload
 from app.jobs.decoder_process import READY, ProcessLimits, serve_tasks
 from app.jobs.frame_tasks import DecodePlates
 from app.jobs.tasks import STEPS
+from app.services.request_work import add_processor_time, check_deadline
 
 T = TypeVar("T")
 _START_S = 300.0
@@ -42,6 +43,11 @@ class Pending(Generic[T]):
         Stops the process that works on this, if one does.
     timeout_s : float
         Longest time in the process. [s]
+
+    Attributes
+    ----------
+    used_s : float
+        Time in the process so far, which works on nothing else. [s]
     """
 
     def __init__(self, steps: tuple[object, ...], interrupt: Callable[[Pending[Any]], None], timeout_s: float) -> None:
@@ -49,19 +55,27 @@ class Pending(Generic[T]):
         self.future: Future[T] = Future()
         self.timeout_s = timeout_s
         self.stopped = False
+        self.used_s = 0.0
         self._interrupt = interrupt
 
     def result(self) -> T:
-        """Wait for the result; an error in the process is raised here."""
+        """Wait for the result; an error in the process is raised here. The request is charged the process's time."""
+        last_s = time.monotonic() + self.timeout_s + _PATIENCE_S
         try:
-            return self.future.result(self.timeout_s + _PATIENCE_S)
+            while time.monotonic() < last_s:
+                wait([self.future], _CHECK_S)
+                if self.future.done():
+                    return self.future.result()
+                check_deadline()
         except CancelledError as error:
             raise _was_stopped() from error
-        except FutureTimeout as error:
-            if self.future.done():
-                raise
+        except Unavailable:
             self.cancel()
-            raise Unavailable("no decoder process is free", cure="try again later") from error
+            raise
+        finally:
+            add_processor_time(self.used_s)
+        self.cancel()
+        raise Unavailable("no decoder process is free", cure="try again later")
 
     def cancel(self) -> None:
         """Stop it, also when it runs already."""
@@ -167,6 +181,7 @@ class WorkerSupervisor(threading.Thread):
             if self._closing or pending.stopped:
                 raise _was_stopped()
             self._current = pending
+        started_s = time.monotonic()
         try:
             for number, step in enumerate(pending.steps, 1):
                 argument = self._wait_for(step) if isinstance(step, Future) else step
@@ -175,6 +190,7 @@ class WorkerSupervisor(threading.Thread):
                 answer: tuple[bool, Any] = connection.recv()
                 return answer
         finally:
+            pending.used_s += time.monotonic() - started_s
             with self._lock:
                 self._current = None
         self._drop()

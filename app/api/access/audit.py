@@ -8,10 +8,11 @@ from fastapi import APIRouter, Query, Request, Response
 
 from app.api.http.dependencies import Caller, PageSize, use_cases
 from app.api.http.responses import document_response, page_response
+from app.api.http.strict_json import StrictRoute
 from app.services.access.audit import AuditLog
 from app.services.access.documents import AuditPage
 
-router = APIRouter(prefix="/v1/audit", tags=["audit"])
+router = APIRouter(prefix="/v1/audit", tags=["audit"], route_class=StrictRoute)
 
 
 @router.get("", responses=document_response(AuditPage))

@@ -21,12 +21,13 @@ from app.api.http.responses import (
     json_response,
     page_response,
 )
+from app.api.http.strict_json import StrictRoute
 from app.registry.jobs import JobState
 from app.services.decodes.decodes import Decodes as DecodesService
 from app.services.decodes.documents import DecodeDocument, DecodePage
 from app.services.decodes.outputs import DecodeOutputs
 
-router = APIRouter(prefix="/v1/decodes", tags=["decodes"])
+router = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
 
 DecodeId = Annotated[Identifier, Path(description="Id of the decode.")]
 _MEDIA_TYPES = {"png": "image/png", "jpg": "image/jpeg"}

@@ -21,6 +21,7 @@ from app.api.http.responses import (
     json_response,
     page_response,
 )
+from app.api.http.strict_json import StrictRoute
 from app.encoders.calibration_board import encode_board
 from app.encoders.plate import ArtworkFormat, write_artwork
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
@@ -29,7 +30,7 @@ from app.services.fleet.calibrations import MAX_PHOTOS, Calibrations
 from app.services.fleet.documents import CalibrationDocument, CalibrationPage
 from app.services.idempotency import IdempotencyKey
 
-router = APIRouter(prefix="/v1", tags=["fleet"])
+router = APIRouter(prefix="/v1", tags=["fleet"], route_class=StrictRoute)
 
 MAX_DECLARATION_BYTES = 16 * 1024
 _CURE = "send multipart/form-data with several parts photos, or one ZIP of them, and a part declaration"

@@ -15,6 +15,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.api.http.costs import Budget, Slots, admitted
 from app.api.http.permissions import Permissions
 from app.api.http.problems import BodyRefused, problem_from, unexpected
 from app.api.http.rate_limits import RateLimit, address_of
@@ -112,6 +113,12 @@ class Guarded:
         Longest wait for the next part of a body. [s]
     min_bytes_per_s : float
         Lowest rate at which a body may arrive after `body_timeout_s` of waiting for it. [byte/s]
+    budget : Budget
+        Processor time of keys and agencies.
+    slots : Slots
+        Places for expensive requests.
+    request_timeout_s : float
+        Longest time of a request once its body was read, where its work checks that. [s]
     """
 
     def __init__(
@@ -127,6 +134,9 @@ class Guarded:
         permissions: Permissions,
         body_timeout_s: float,
         min_bytes_per_s: float,
+        budget: Budget,
+        slots: Slots,
+        request_timeout_s: float,
     ) -> None:
         self._app = app
         self._authenticate = authenticate
@@ -138,6 +148,9 @@ class Guarded:
         self._permissions = permissions
         self._body_timeout_s = body_timeout_s
         self._min_bytes_per_s = min_bytes_per_s
+        self._budget = budget
+        self._slots = slots
+        self._request_timeout_s = request_timeout_s
         self._threads = anyio.CapacityLimiter(_AUTH_THREADS)  # its own, or slow requests would keep new ones waiting
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -156,8 +169,7 @@ class Guarded:
             response.headers["Connection"] = "close"
             await response(scope, receive, send)
             return
-        with acting_for(scope.get("state", {}).get("agency_id", "")):
-            await self._app(scope, self._limited(receive, limit), send)
+        await self._answer(scope, self._limited(receive, limit), send)
 
     def _limited(self, receive: Receive, limit: int) -> Receive:
         """A `receive` that stops a body that is too large or too slow. Only the time spent waiting for it counts."""
@@ -190,6 +202,18 @@ class Guarded:
         )
         return HTTPException(408, f"the body arrived too slowly: {limit} ({seen} bytes came)", {"Connection": "close"})
 
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let the app answer a request, and charge what that costs."""
+        state = scope.get("state", {})
+        agency_id: str = state.get("agency_id", "")
+        caller: Caller | None = state.get("caller")
+        with acting_for(agency_id), admitted(self._slots, agency_id, self._request_timeout_s, receive) as work:
+            try:
+                await self._app(scope, receive, send)
+            finally:
+                if caller is not None:
+                    self._budget.charge(caller, work.used_s)
+
     async def _admit(self, scope: Scope, headers: Headers) -> None:
         key = _key_in(headers)
         caller = self._recall(key)
@@ -200,6 +224,7 @@ class Guarded:
         if self._requests is not None:
             left = self._requests.take(caller.key_id)
             state["rate_limit"] = ((b"ratelimit-policy", self._requests.policy), (b"ratelimit", left))
+        self._budget.check(caller)
         allowed = self._permissions.find(scope["method"], scope["path"])
         if allowed is None:
             return  # nothing there: 404 or 405. Should there be a route after all, it finds no caller and refuses

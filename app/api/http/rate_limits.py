@@ -70,9 +70,7 @@ class RateLimit:
         left_s = self._bucket_s - (full_at_s - now_s)
         if left_s < -1e-9:
             raise self._refusal(-left_s)
-        if owner not in self._full_at_s and len(self._full_at_s) >= _MAX_BUCKETS:
-            self._forget(now_s)
-        self._full_at_s[owner] = full_at_s
+        self._keep(owner, full_at_s, now_s)
         left = int(left_s / self._token_s + 1e-6)
         return f'"{self._name}";r={left};t={math.ceil(full_at_s - now_s)}'.encode()
 
@@ -87,6 +85,16 @@ class RateLimit:
         wait_s = self._full_at_s.get(owner, 0.0) - self._now_s() + self._token_s - self._bucket_s
         if wait_s > 1e-9:
             raise self._refusal(wait_s)
+
+    def charge(self, owner: str, tokens: float) -> None:
+        """Take tokens that were used already; the bucket may be overdrawn, and `check` then refuses."""
+        now_s = self._now_s()
+        self._keep(owner, max(self._full_at_s.get(owner, 0.0), now_s) + tokens * self._token_s, now_s)
+
+    def _keep(self, owner: str, full_at_s: float, now_s: float) -> None:
+        if owner not in self._full_at_s and len(self._full_at_s) >= _MAX_BUCKETS:
+            self._forget(now_s)
+        self._full_at_s[owner] = full_at_s
 
     def _refusal(self, wait_s: float) -> TooManyRequests:
         return TooManyRequests(

@@ -18,8 +18,9 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import TypeAdapter, ValidationError
 
+from app.api.http.costs import EXPENSIVE, bounded
 from app.errors import MalformedRequest, UnsupportedUpload
-from app.services.processor_time import counted
+from app.services.request_work import counted
 
 T = TypeVar("T")
 MAX_DEPTH = 32
@@ -40,7 +41,11 @@ _TEXT = re.compile(rb'"(?:[^"\\]|\\.)*+(?:"|\Z)', re.DOTALL)
 
 
 class StrictRoute(APIRoute):
-    """A route whose JSON body goes through `parse_json` and is validated, in a thread if it is large."""
+    """A route whose endpoint is `bounded`, and whose JSON body goes through `parse_json`: a large one in a thread."""
+
+    def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
+        expensive = any(f"{method} {path}" in EXPENSIVE for method in options.get("methods") or ())
+        super().__init__(path, bounded(endpoint, expensive=expensive), **options)
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """Handle the request with a strict reader of its body."""

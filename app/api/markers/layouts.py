@@ -9,10 +9,11 @@ from fastapi import APIRouter, Response
 from app.api.http.dependencies import Caller, MarkerId, use_cases
 from app.api.http.problems import problem_responses
 from app.api.http.responses import NOT_MODIFIED, IfNoneMatch, file_response
+from app.api.http.strict_json import StrictRoute
 from app.encoders.magnet import SheetFormat
 from app.services.markers.layouts import Layouts
 
-router = APIRouter(prefix="/v1/markers", tags=["layouts"])
+router = APIRouter(prefix="/v1/markers", tags=["layouts"], route_class=StrictRoute)
 
 
 @router.get(

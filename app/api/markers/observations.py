@@ -10,11 +10,12 @@ from pydantic import AfterValidator, AwareDatetime
 
 from app.api.http.dependencies import Caller, MarkerId, PageSize, Text, use_cases
 from app.api.http.responses import document_response, json_response, page_response
+from app.api.http.strict_json import StrictRoute
 from app.errors import InvalidParameter
 from app.services.markers.observations import ObservationPage, ObservationSummary, place_of
 from app.services.markers.observations import Observations as ObservationsService
 
-router = APIRouter(prefix="/v1/markers/{marker_id}/observations", tags=["markers"])
+router = APIRouter(prefix="/v1/markers/{marker_id}/observations", tags=["markers"], route_class=StrictRoute)
 
 
 def _storable(time: datetime) -> datetime:

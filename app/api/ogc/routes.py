@@ -18,6 +18,7 @@ from app.api.http.components import reference
 from app.api.http.openapi import operation_id
 from app.api.http.problems import Described, problem_responses
 from app.api.http.responses import file_response
+from app.api.http.strict_json import StrictRoute
 from app.api.ogc import documents, edits, items, tiles
 from app.api.ogc.parameters import OF_ITEM, OF_ITEMS, ONLY_FORMAT, PARAMETERS, described
 from app.api.ogc.responses import GEOJSON, JSON, MVT, OPENAPI, SCHEMA
@@ -35,6 +36,7 @@ from app.api.ogc.shapes import (
     TileSet,
     TileSets,
 )
+from app.services.request_work import counted
 
 _ITEMS = "/ogc/collections/{collection}/items"
 _ITEM = f"{_ITEMS}/{{feature}}"
@@ -50,7 +52,7 @@ def _in_own_threads(answer: Callable[..., Response]) -> Callable[..., Awaitable[
     @wraps(answer)
     async def endpoint(request: Request, **values: Any) -> Response:
         threads: ThreadPoolExecutor = request.app.state.ogc_threads
-        run = partial(copy_context().run, answer, **values)
+        run = partial(copy_context().run, partial(counted, answer, **values))
         return await asyncio.get_running_loop().run_in_executor(threads, run)
 
     own = signature(answer, eval_str=True)
@@ -102,7 +104,9 @@ def _add_heads(router: APIRouter) -> None:
 
 
 def _router() -> APIRouter:
-    router = APIRouter(tags=["ogc"], default_response_class=Response, generate_unique_id_function=operation_id)
+    router = APIRouter(
+        route_class=StrictRoute, tags=["ogc"], default_response_class=Response, generate_unique_id_function=operation_id
+    )
     read, edit = partial(_add_read, router), partial(_add_edit, router)
     read(_ITEMS, _in_own_threads(items.list_items), _json(FeaturePage, GEOJSON), (*OF_ITEMS, *_filters()))
     read(

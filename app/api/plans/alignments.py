@@ -23,6 +23,7 @@ from app.api.http.responses import (
     page_response,
     versioned_response,
 )
+from app.api.http.strict_json import StrictRoute
 from app.api.markers.filters import Filtered
 from app.api.plans.schemas import AlignmentIn, RoadAlignmentIn
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
@@ -31,7 +32,7 @@ from app.services.plans.alignments import Alignments
 from app.services.plans.documents import AlignmentDocument, AlignmentPage
 from app.services.plans.tasks import MapForm
 
-router = APIRouter(prefix="/v1/alignments", tags=["plans"])
+router = APIRouter(prefix="/v1/alignments", tags=["plans"], route_class=StrictRoute)
 
 MAX_DECLARATION_BYTES = 64 * 1024
 MAX_WITHIN_M = 100.0

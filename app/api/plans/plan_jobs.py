@@ -8,10 +8,11 @@ from fastapi import APIRouter, Path, Query, Request, Response
 
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
 from app.api.http.responses import created_response, document_response, json_response, page_response
+from app.api.http.strict_json import StrictRoute
 from app.registry.jobs import JobState
 from app.services.plans.plan_jobs import PlanJobDocument, PlanJobPage, PlanJobs
 
-router = APIRouter(prefix="/v1/plan-jobs", tags=["plans"])
+router = APIRouter(prefix="/v1/plan-jobs", tags=["plans"], route_class=StrictRoute)
 
 JobId = Annotated[Identifier, Path(description="Id of the job.")]
 Service = Annotated[PlanJobs, use_cases("plan_jobs")]

@@ -10,11 +10,13 @@ from fastapi.responses import StreamingResponse
 from app.api.http.dependencies import Caller, use_cases
 from app.api.http.problems import problem_responses
 from app.api.http.responses import file_response
+from app.api.http.strict_json import StrictRoute
 from app.api.markers.filters import Filtered
+from app.services.request_work import counted_steps
 from app.services.surveys.exports import STREAMED, WHOLE
 from app.services.surveys.exports import Exports as ExportsService
 
-router = APIRouter(prefix="/v1/exports", tags=["exports"])
+router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=StrictRoute)
 
 _SUFFIXES = {"shapefile": "shp.zip", "landxml": "xml"}
 Exports = Annotated[ExportsService, use_cases("exports")]
@@ -41,5 +43,7 @@ def get_export(
     """
     headers = {"Content-Disposition": f'attachment; filename="markers.{_SUFFIXES.get(kind, kind)}"'}
     if kind in STREAMED:
-        return StreamingResponse(exports.stream(caller, kind, filtered), headers=headers, media_type=STREAMED[kind])
-    return StreamingResponse(exports.whole(caller, kind, filtered), headers=headers, media_type=WHOLE[kind])
+        chunks, media_type = exports.stream(caller, kind, filtered), STREAMED[kind]
+    else:
+        chunks, media_type = exports.whole(caller, kind, filtered), WHOLE[kind]
+    return StreamingResponse(counted_steps(chunks), headers=headers, media_type=media_type)

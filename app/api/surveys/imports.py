@@ -21,6 +21,7 @@ from app.api.http.responses import (
     page_response,
     wants_job,
 )
+from app.api.http.strict_json import StrictRoute
 from app.api.surveys.schemas import DECLARATION_EXAMPLE, DeclarationIn
 from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, UnsupportedUpload
 from app.registry.jobs import JobState
@@ -31,7 +32,7 @@ from app.services.surveys.import_jobs import IMMEDIATE_BYTES, ImportJobs
 from app.services.surveys.imports import ImportInput
 from app.services.surveys.imports import Imports as ImportsService
 
-router = APIRouter(prefix="/v1/imports", tags=["imports"])
+router = APIRouter(prefix="/v1/imports", tags=["imports"], route_class=StrictRoute)
 
 MAX_DECLARATION_BYTES = 64 * 1024
 _CURE = "send multipart/form-data with the parts file and declaration"

@@ -17,6 +17,7 @@ from app.services.access.access import Caller
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.markers.markers import MarkerChange, Markers, Step
 from app.services.ports import Clock
+from app.services.request_work import check_deadline
 
 Mode: TypeAlias = Literal["all", "good"]
 ALL: Mode = "all"
@@ -137,6 +138,7 @@ class BulkMarkers:
         return report, False
 
     def _prepared(self, caller: Caller, item: Item, now: datetime) -> tuple[int, Step | WaymarkError]:
+        check_deadline()
         if isinstance(item, WaymarkError):
             return 0, item
         try:
@@ -153,6 +155,7 @@ def _result(
     connection: sa.Connection, index: int, prepared: tuple[int, Step | WaymarkError], describe: DescribeError
 ) -> ItemResult:
     status, step = prepared
+    check_deadline()
     try:
         if isinstance(step, WaymarkError):
             raise step

@@ -1,0 +1,197 @@
+"""Budgets of processor time, slots for expensive requests, and work that stops when nobody waits for it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
+
+import pytest
+from fastapi.routing import APIRoute
+from starlette.types import Message
+
+from app.api.http.costs import EXPENSIVE, MAX_WAITING, Budget, Slots, admitted, bounded
+from app.api.http.permissions import PERMISSIONS
+from app.api.http.rate_limits import RateLimit
+from app.api.http.strict_json import StrictRoute
+from app.errors import TooManyRequests, Unavailable
+from app.jobs.supervisor import Pending
+from app.main import ROUTERS
+from app.services.access.access import Caller, Scope
+from app.services.request_work import RequestWork, check_deadline, counted_steps, working
+from app.settings import Settings
+from tests.conftest import LiveServer
+from tests.http import refused
+
+CALLER = Caller("agency", "key", "label", Scope.ADMIN)
+
+
+async def _nothing() -> Message:
+    await asyncio.Event().wait()
+    raise AssertionError
+
+
+async def _leaves() -> Message:
+    return {"type": "http.disconnect"}
+
+
+def _spin(processor_s: float = 0.02) -> None:
+    end_s = time.thread_time() + processor_s
+    while time.thread_time() < end_s:
+        pass
+
+
+# --- slots --------------------------------------------------------------------------------------------------------
+
+
+def test_every_route_is_bounded_and_every_expensive_one_exists() -> None:
+    routes = [route for router in ROUTERS for route in router.routes]
+    assert all(isinstance(route, StrictRoute) for route in routes)
+    names = {f"{method} {r.path}" for r in routes if isinstance(r, APIRoute) for method in r.methods}
+    assert names >= EXPENSIVE
+    assert PERMISSIONS.keys() >= EXPENSIVE
+
+
+def test_an_agency_waits_for_its_own_requests_only() -> None:
+    async def run() -> None:
+        slots = Slots(3, 2)
+        order: list[str] = []
+
+        async def request(agency: str, name: str, finished: asyncio.Event) -> None:
+            async with slots.slot(agency):
+                order.append(name)
+                await finished.wait()
+
+        ends = {name: asyncio.Event() for name in ("a1", "a2", "a3", "b1", "c1")}
+        async with asyncio.TaskGroup() as tasks:
+            for name, end in ends.items():
+                tasks.create_task(request(name[0], name, end))
+                await asyncio.sleep(0)
+            assert order == ["a1", "a2", "b1"]
+            ends["a1"].set()
+            while len(order) < 4:
+                await asyncio.sleep(0)
+            for end in ends.values():
+                end.set()
+        assert sorted(order) == sorted(ends)
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(("wait_s", "waiting"), [(0.001, 1), (60.0, MAX_WAITING + 1)])
+def test_too_many_or_too_long_waiting_requests_are_refused(wait_s: float, waiting: int) -> None:
+    async def run() -> None:
+        slots = Slots(4, 1, wait_s)
+
+        async def wait() -> None:
+            async with slots.slot("a"):
+                raise AssertionError
+
+        async with slots.slot("a"):
+            tasks = [asyncio.create_task(wait()) for _ in range(waiting)]
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            error = done.pop().exception()
+            assert isinstance(error, Unavailable)
+            assert error.limit == "1 at once for one agency, 4 in all"
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        async with slots.slot("a"):  # what was cancelled holds nothing
+            pass
+
+    asyncio.run(run())
+
+
+# --- endpoints ----------------------------------------------------------------------------------------------------
+
+
+def _run(endpoint: Callable[[], object], receive: Callable[[], Awaitable[Message]], timeout_s: float = 300.0) -> Any:
+    async def run() -> Any:
+        with admitted(Slots(1, 1), "agency", timeout_s, receive) as work:
+            try:
+                await bounded(endpoint, expensive=True)()
+            except Unavailable as error:
+                return error
+            return work
+
+    return asyncio.run(run())
+
+
+def _work_without_end() -> None:
+    while True:
+        check_deadline()
+        time.sleep(0.001)
+
+
+def test_work_stops_when_the_client_leaves() -> None:
+    assert _run(_work_without_end, _leaves).message == "the client has left"
+
+
+def test_work_stops_at_its_deadline() -> None:
+    assert "too long" in _run(_work_without_end, _nothing, timeout_s=0.01).message
+
+
+def test_the_processor_time_of_threads_and_streams_is_counted() -> None:
+    work = _run(_spin, _nothing)
+    assert isinstance(work, RequestWork)
+    assert work.used_s >= 0.02
+
+    def chunks() -> Iterator[int]:
+        for number in range(3):
+            _spin()
+            yield number
+
+    with working(60.0) as work:
+        assert list(counted_steps(chunks())) == [0, 1, 2]
+    assert work.used_s >= 0.06
+
+
+def test_a_task_of_a_client_that_left_is_cancelled() -> None:
+    interrupted: list[object] = []
+    pending: Pending[int] = Pending((), interrupted.append, 60.0)
+    assert pending.future.set_running_or_notify_cancel()
+    pending.used_s = 1.5
+    with working(60.0) as work:
+        work.abandoned = True
+        with pytest.raises(Unavailable):
+            pending.result()
+    assert interrupted == [pending]
+    assert work.used_s == 1.5
+
+
+# --- budgets ------------------------------------------------------------------------------------------------------
+
+
+def test_a_budget_is_charged_afterwards_and_may_be_overdrawn() -> None:
+    now_s = [1000.0]
+    limit = RateLimit(2.0, 10, name="x", message="x", cure="x", now_s=lambda: now_s[0])
+    limit.charge("a", 9.0)
+    limit.check("a")
+    limit.charge("a", 21.0)
+    with pytest.raises(TooManyRequests) as error:
+        limit.check("a")
+    assert error.value.retry_after_s == 11
+    limit.check("b")
+    now_s[0] += 10.5
+    limit.check("a")
+
+
+def test_keys_share_the_budget_of_their_agency() -> None:
+    budget = Budget(0.0, 1.0)
+    budget.charge(CALLER, 100.0)
+    with pytest.raises(TooManyRequests, match="this agency used too much"):
+        budget.check(Caller("agency", "another key", "label", Scope.ADMIN))
+    budget.check(Caller("another agency", "another key", "label", Scope.ADMIN))
+    Budget(0.0, 0.0).charge(CALLER, 1e9)
+
+
+def test_a_key_that_used_up_its_time_is_refused(serve: Callable[[Settings], LiveServer], settings: Settings) -> None:
+    server = serve(settings.model_copy(update={"key_processor_s_per_min": 1e-3}))
+    with server.client() as client:
+        assert client.get("/v1/markers").status_code == 200
+        refusal = client.get("/v1/markers")
+        problem = refused(refusal, 429, "too-many-requests")
+        assert int(refusal.headers["Retry-After"]) >= 1
+        assert "processor time" in problem["detail"]
+        assert client.get("/healthz").status_code == 200
