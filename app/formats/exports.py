@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import warnings
 import zipfile
@@ -19,6 +18,7 @@ from pyogrio import raw  # type: ignore[import-untyped]
 from pyproj import Transformer
 
 from app.errors import InvalidParameter
+from app.formats.spreadsheet import TableWriter
 
 Record = Mapping[str, Any]
 
@@ -41,7 +41,6 @@ SHAPEFILE_NAMES = {
     "transform_note": "trans_note", "check_points": "check_pts", "transform_accuracy_m": "trans_acc",
 }  # fmt: skip
 """Ten characters a name, the same in every file."""
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 
 def write_csv(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
@@ -49,15 +48,14 @@ def write_csv(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
     yield (",".join(FIELDS) + "\r\n").encode()
     for page in pages:
         text = io.StringIO(newline="")
-        writer = csv.writer(text)
+        writer = TableWriter(text)
         for record in page:
-            writer.writerow([*(_harmless(record[n]) for n in TEXTS), *(_number(record[n]) for n in NUMBERS)])
+            writer.write_row([*(_text(record[n]) for n in TEXTS), *(_number(record[n]) for n in NUMBERS)])
         yield text.getvalue().encode()
 
 
-def _harmless(value: Any) -> str:
-    text = "" if value is None else str(value)
-    return "'" + text if text.startswith(_FORMULA) else text
+def _text(value: Any) -> str:
+    return "" if value is None else str(value)
 
 
 def _number(value: Any) -> str:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from app.encoders.cerpm.payload import encode_body
 from app.errors import InvalidParameter
+from app.formats.spreadsheet import TableWriter
 from app.markers.cerpm import KEY_BYTES, CerpmMessage, LaneSide, SpeedUnit
 from app.radio.settings import RadioSettings
 
@@ -90,11 +90,11 @@ def write_programs_csv(programs: Sequence[MarkerProgram], *, with_keys: bool = F
             )
         seen.add(program.message.number)
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\r\n")
-    writer.writerow([*COLUMNS, KEY_COLUMN] if with_keys else COLUMNS)
+    writer = TableWriter(stream)
+    writer.write_row([*COLUMNS, KEY_COLUMN] if with_keys else COLUMNS)
     for program in programs:
         row = _row(program)
-        writer.writerow([*row, program.key.hex()] if with_keys else row)
+        writer.write_row([*row, program.key.hex()] if with_keys else row)
     return stream.getvalue()
 
 

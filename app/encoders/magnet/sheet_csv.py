@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import io
 
 from app.encoders.magnet.sheet import DrillingSheet
+from app.formats.spreadsheet import TableWriter
 
 COLUMNS = (
     "layout", "code", "meaning", "hole", "chainage_m", "offset_m", "from_first_m", "from_previous_m", "lon_deg",
     "lat_deg", "east_m", "north_m", "polarity", "phi_deg", "north_pole", "north_pole_bearing_deg",
 )  # fmt: skip
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 
 
 def write_sheet_csv(sheet: DrillingSheet) -> bytes:
@@ -23,13 +22,13 @@ def write_sheet_csv(sheet: DrillingSheet) -> bytes:
     layout = sheet.layout
     meaning = layout.meaning.text if layout.meaning else ""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\r\n")
-    writer.writerow(COLUMNS)
+    writer = TableWriter(stream)
+    writer.write_row(COLUMNS)
     for hole, gap_m in zip(layout.holes, [0.0, *layout.gaps_m], strict=True):
         bearing = hole.north_pole_bearing_deg
-        writer.writerow(
+        writer.write_row(
             [
-                *(plain_text(text) for text in (layout.name, layout.tag.text, meaning)),
+                *(layout.name, layout.tag.text, meaning),
                 hole.number,
                 *(fixed(v, 4) for v in (hole.chainage_m, hole.offset_m, hole.along_m, gap_m)),
                 *(fixed(v, 9) for v in (hole.lon_deg, hole.lat_deg)),
@@ -41,11 +40,6 @@ def write_sheet_csv(sheet: DrillingSheet) -> bytes:
             ]
         )
     return stream.getvalue().encode()
-
-
-def plain_text(text: str) -> str:
-    """Text that no spreadsheet takes for a formula."""
-    return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 def fixed(value: float, decimals: int) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Sequence
 from functools import lru_cache
@@ -16,6 +15,7 @@ from app.encoders.plate.face import code_face, fixed_face
 from app.encoders.plate.lettering import fitted_height_mm
 from app.encoders.plate.margin import SIDE_TOLERANCE_MM, UNIT_TOLERANCE_MM
 from app.encoders.plate.order import PlateOrder
+from app.formats.spreadsheet import TableWriter
 from app.markers.plate import PlateGeometry
 
 PAGE_MM = (210.0, 297.0)
@@ -71,16 +71,16 @@ def quality_sheets(orders: Sequence[PlateOrder]) -> list[Drawing]:
 def quality_csv(orders: Sequence[PlateOrder]) -> bytes:
     """The same as rows in UTF-8, with empty columns for what is measured."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\r\n")
-    writer.writerow(_CSV_HEADER.split(","))
+    writer = TableWriter(stream)
+    writer.write_row(_CSV_HEADER.split(","))
     for order in orders:
         limits = dimension_limits_mm(order.geometry)
         nominal = {name: value for name, value, _ in limits}
         tolerance = {name: value for name, _, value in limits}
         geometry = order.geometry
-        writer.writerow(
+        writer.write_row(
             [
-                _cell(order.plate_id),
+                order.plate_id,
                 order.revision,
                 order.code.digits,
                 order.code.scheme.value,
@@ -90,17 +90,12 @@ def quality_csv(orders: Sequence[PlateOrder]) -> bytes:
                 *(tolerance[k] for k in ("outer edge", "unit", "gap", "thickness", "diagonals differ")),
                 "" if order.lon_deg is None else f"{order.lon_deg:.9f}",
                 "" if order.lat_deg is None else f"{order.lat_deg:.9f}",
-                _cell(order.crs),
-                _cell(order.record_url),
+                order.crs,
+                order.record_url,
                 *[""] * _BLANK_COLUMNS,
             ]
         )
     return stream.getvalue().encode()
-
-
-def _cell(text: str) -> str:
-    """Text that no spreadsheet takes for a formula."""
-    return f"'{text}" if text[:1] in ("=", "+", "-", "@") else text
 
 
 def _page(number: int, total: int, parts: Sequence[Part]) -> Drawing:

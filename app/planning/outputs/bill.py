@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections import Counter, defaultdict
@@ -11,7 +10,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from app.encoders.magnet.bill import PAINT, CostRow
-from app.encoders.magnet.sheet_csv import fixed, plain_text
+from app.encoders.magnet.sheet_csv import fixed
+from app.formats.spreadsheet import TableWriter
 from app.markers.cerpm import LaneSide
 from app.planning.costs import unit_costs
 from app.planning.plan import Plan, PlannedLineMagnet, PlannedPlate, PlannedTag
@@ -223,26 +223,26 @@ def bill_document(bill: PlanBill) -> dict[str, object]:
 def write_bill_csv(bill: PlanBill) -> bytes:
     """The bill as CSV in UTF-8: materials, the agency's unit costs, the total, and published figures."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\r\n")
-    writer.writerow(COLUMNS)
+    writer = TableWriter(stream)
+    writer.write_row(COLUMNS)
     for material in bill.materials:
         note = "" if material.priced else NO_UNIT_COST
-        writer.writerow(["material", material.family, material.item, material.quantity, "each", "", "", "", "", note])
+        writer.write_row(["material", material.family, material.item, material.quantity, "each", "", "", "", "", note])
     for row in bill.rows:
         item = row.item
         cost = "" if row.cost is None else fixed(row.cost, 2)
-        texts = [plain_text(text) for text in (item.item, item.pay_item or "", item.source)]
-        writer.writerow(
+        texts = [item.item, item.pay_item or "", item.source]
+        writer.write_row(
             ["cost", "", texts[0], _plain(row.quantity), item.per.replace("_", " "), _plain(item.price), cost,
              bill.currency, texts[1], texts[2] if cost else "the quantity is unknown"]
         )  # fmt: skip
     note = "" if bill.complete else f"incomplete: {NO_UNIT_COST} for {'; '.join(bill.missing)}"
-    writer.writerow(["total", "", "total of the costs", "", "", "", fixed(bill.total, 2), bill.currency, "", note])
+    writer.write_row(["total", "", "total of the costs", "", "", "", fixed(bill.total, 2), bill.currency, "", note])
     for compared in bill.comparisons:
         unit = compared.cost
         costs = [_range(unit.low_usd, unit.high_usd), _range(compared.low_usd, compared.high_usd)]
         note = f"{unit.source}; {METRO_LABEL}"
-        writer.writerow(["comparison", "", unit.item, _plain(compared.quantity), unit.unit, *costs, "USD", "", note])
+        writer.write_row(["comparison", "", unit.item, _plain(compared.quantity), unit.unit, *costs, "USD", "", note])
     return stream.getvalue().encode()
 
 

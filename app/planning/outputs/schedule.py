@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from app.encoders.magnet.sheet_csv import fixed, plain_text
+from app.encoders.magnet.sheet_csv import fixed
+from app.formats.spreadsheet import TableWriter
 from app.planning.alignment import format_station
 from app.planning.plan import Plan, PlannedLineMagnet, PlannedMarker, PlannedTag
 
@@ -102,14 +102,14 @@ def _end_of_kilometre(markers: Sequence[PlannedMarker], start: int) -> int:
 def write_schedule_csv(plan: Plan) -> bytes:
     """The schedule as CSV in UTF-8, one row a section; stations are displayed ones."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\r\n")
-    writer.writerow(COLUMNS)
+    writer = TableWriter(stream)
+    writer.write_row(COLUMNS)
     for section in plan_schedule(plan):
         first, last = section.markers[0], section.markers[-1]
         stations = [format_station(plan.alignment.displayed_station_m(m.station_m)) for m in (first, last)]
-        writer.writerow(
+        writer.write_row(
             [
-                section.order, section.day or "", plain_text(section.lane), *stations,
+                section.order, section.day or "", section.lane, *stations,
                 fixed(first.chainage_m, 2), fixed(last.chainage_m, 2), first.number, last.number,
                 len(section.markers), section.count("plate"), section.line_magnets, len(section.tags), section.holes,
                 section.count("cerpm"),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import io
 
+from app.formats.spreadsheet import TableWriter
 from app.planning.trade_off import Optimum
 
 COLUMNS = (
@@ -15,13 +15,13 @@ COLUMNS = (
 def write_trade_off_csv(optimum: Optimum, currency: str) -> bytes:
     """Requirements with the cheapest cost found, its bound, and the cost of even spacing, as CSV in UTF-8."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\r\n")
-    writer.writerow(COLUMNS)
+    writer = TableWriter(stream)
+    writer.write_row(COLUMNS)
     required = optimum.quality
     for point in optimum.table:
         even = point.even_cost
         is_required = (point.fix_every_m, point.path_error_m) == (required.fix_every_m, required.path_error_m)
-        writer.writerow(
+        writer.write_row(
             [
                 f"{point.fix_every_m:.10g}", "" if point.path_error_m is None else f"{point.path_error_m:.10g}",
                 f"{point.cost:.2f}", f"{point.bound:.2f}", "" if even is None else f"{even:.2f}",

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from dataclasses import asdict, fields
 from typing import Any
 
+from app.formats.spreadsheet import TableWriter
 from app.planning.proof.report import MarkerProof, ProofReport
 
 PROOF_FORMAT = "waymark-proof/1"
@@ -37,8 +37,9 @@ def report_document(report: ProofReport) -> dict[str, Any]:
 def markers_csv(report: ProofReport) -> str:
     """One row a marker that was driven over; empty where a figure is unknown."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
+    writer = TableWriter(stream, "\n")
     names = [field.name for field in fields(MarkerProof)]
-    writer.writerow(names)
-    writer.writerows([getattr(marker, name) for name in names] for marker in report.markers)
+    writer.write_row(names)
+    for marker in report.markers:
+        writer.write_row(getattr(marker, name) for name in names)
     return stream.getvalue()

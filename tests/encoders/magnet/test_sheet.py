@@ -31,7 +31,7 @@ TAG = InformationTag.from_gaps("SNS", 0.1, [10, 30])
 SEVEN = InformationTag.from_gaps("NSNSNSN", 0.5, [1, 2, 1, 4, 1, 3])
 LONG = InformationTag.from_gaps("NNS", 0.5, [1, 59])
 MM_PER_POINT = 25.4 / 72
-FORMULAS = ["=1+1", "+1", "-1", "@SUM(A1)", "＝1+1"]
+FORMULAS = ["=1+1", "+1+1", "-1-1", "@SUM(A1)", "＝1+1"]
 
 
 def tag_sheet(
