@@ -32,6 +32,7 @@ CAMERA_PREVIEW_M = 31.0  # [m] of lane that a camera sees, beacons must give mor
 SPACING_M = 12.192  # [m] 40 ft; source: CERPM paper, section 3.2
 _SAMPLES = 60  # markers that are checked; source: by hand, bounds the time of a check
 _STATIONS = 200  # points of the road that are checked; source: by hand, bounds the time of a check
+_STATION_MARKERS = 2_000_000  # stations times markers; source: by hand, bounds the time of a check to seconds
 _STATION_STEP_M = 5.0  # [m] source: by hand, no measurement kept
 
 
@@ -211,11 +212,12 @@ def markers_of(plan: RadioPlan) -> tuple[RoadMarkers, list[int]]:
 
 
 def _stations(plan: RadioPlan, markers: RoadMarkers) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Stations to check: within one spacing of an even road, otherwise every 5 m or 200 in all."""
+    """Stations to check: within one spacing of an even road, otherwise every 5 m, and 200 in all at most."""
     if plan.markers is None:
         return np.linspace(0.0, plan.spacing_m, 5)
     low, high = float(markers.chainage_m.min()), float(markers.chainage_m.max())
-    return np.linspace(low, high, min(_STATIONS, 1 + math.ceil((high - low) / _STATION_STEP_M)))
+    most = min(_STATIONS, _STATION_MARKERS // len(markers.chainage_m))
+    return np.linspace(low, high, min(most, 1 + math.ceil((high - low) / _STATION_STEP_M)))
 
 
 def _success_at_preview(reception: Approach, air: Air) -> float:

@@ -70,7 +70,8 @@ def recommend_settings(plan: RadioPlan, *, more_channels: bool = True) -> Recomm
     Tried are spreading factors 6 (without a header) or 7 to 12, the three bandwidths, 16 intervals and 5 powers. On a
     road with its own markers, 8 of them are approached: 4 along the road, and 4 that have most others in reach.
     """
-    best = _best(plan)
+    approaches = _ApproachesByLink(plan)
+    best = _best(plan, approaches)
     if best.reaches or not more_channels or plan.settings.hopping:
         return best
     for channels in MORE_CHANNELS:
@@ -81,22 +82,19 @@ def recommend_settings(plan: RadioPlan, *, more_channels: bool = True) -> Recomm
             settings=replace(plan.settings, channels=channels),
             receiver=replace(plan.receiver, channels=max(channels, plan.receiver.channels)),
         )
-        found = _best(wider)
+        found = _best(wider, approaches)
         if found.reaches:
             return found
         best = max(best, found, key=lambda one: one.read_probability)
     return best
 
 
-def _best(plan: RadioPlan) -> Recommendation:
+def _best(plan: RadioPlan, approaches_by_link: _ApproachesByLink) -> Recommendation:
     reaching: tuple[float, RadioSettings, float] | None = None
     likeliest: tuple[float, RadioSettings] | None = None
     for first in _modulations(plan):
-        try:
-            approaches = _approaches(replace(plan, settings=first))
-        except InvalidParameter:  # more markers in range than a check allows
-            continue
-        for settings in _intervals(first, plan):
+        approaches = approaches_by_link.find(first)
+        for settings in _intervals(first, plan) if approaches else ():
             air = Air(settings, plan.link, plan.receiver)
             probability = min(read_probability(one, plan.design_speed_mps, air) for one in approaches)
             if likeliest is None or probability > likeliest[0]:
@@ -139,6 +137,25 @@ def _intervals(first: RadioSettings, plan: RadioPlan) -> Iterator[RadioSettings]
             continue
         if is_permitted(settings, plan.region):
             yield settings
+
+
+class _ApproachesByLink:
+    """Approaches of a plan's markers, each computed once: they depend on sensitivity and power, not on channels."""
+
+    def __init__(self, plan: RadioPlan) -> None:
+        self._plan = plan
+        self._found: dict[tuple[float, float], list[Approach]] = {}
+
+    def find(self, settings: RadioSettings) -> list[Approach]:
+        """Approaches with these settings; none where more markers are in range than a check allows."""
+        plan = replace(self._plan, settings=settings)
+        key = plan.air.threshold_dbm, settings.power_dbm
+        if key not in self._found:
+            try:
+                self._found[key] = _approaches(plan)
+            except InvalidParameter:
+                self._found[key] = []
+        return self._found[key]
 
 
 def _approaches(plan: RadioPlan) -> list[Approach]:

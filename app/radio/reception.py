@@ -23,6 +23,7 @@ SPACINGS_M = (1.0, 1000.0)  # [m] shortest and longest; source: by hand
 LANE_WIDTH_M = 3.6  # [m] source: 12 ft, AASHTO Green Book, 4.3
 _FADES = 2.5  # standard deviations of fading; source: normal distribution, beyond them one packet in 160
 _APPROACH_STEPS = 40  # from the reach to the preview distance; source: by hand, no measurement kept
+_TRANSMISSIONS = 1_000  # on an approach, each by itself; source: 25 between two of its steps, where success is linear
 _PHASES = 32  # of the transmissions on the approach; source: by hand, no measurement kept
 
 
@@ -89,7 +90,7 @@ class RoadMarkers:
     def distances_m(self, station_m: npt.ArrayLike) -> Floats:
         """From stations on the road, shape (...) to (..., M). [m]"""
         away = np.asarray(station_m, float)[..., None] - self.chainage_m
-        return np.asarray(np.hypot(away, self.offset_m))
+        return np.asarray(np.sqrt(away**2 + self.offset_m**2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,8 +271,10 @@ def read_probability(reception: Approach, speed_mps: float, air: Air) -> float:
         return 0.0
     success = packet_success(reception.level_dbm, reception.harmful, air.settings, air.link, air.receiver)
     stride_m = speed_mps * air.settings.interval_s
-    count = math.ceil((reception.ahead_m[-1] - reception.ahead_m[0]) / stride_m)
+    stretch_m = reception.ahead_m[-1] - reception.ahead_m[0]
+    each = math.ceil(stretch_m / stride_m / _TRANSMISSIONS)  # transmissions that are taken as sent from one place
+    count = math.ceil(stretch_m / (each * stride_m))
     phases = (np.arange(_PHASES) + 0.5) / _PHASES
-    sent_m = reception.ahead_m[0] + stride_m * (phases[:, None] + np.arange(count))
+    sent_m = reception.ahead_m[0] + each * stride_m * (phases[:, None] + np.arange(count))
     missed = 1 - np.interp(sent_m, reception.ahead_m, success, right=0.0)
-    return float(1 - missed.prod(axis=1).mean())
+    return float(1 - (missed**each).prod(axis=1).mean())

@@ -9,13 +9,14 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.markers.checks import RadioFinding, Verdict
+from app.planning import radio_recommendation
 from app.planning.radio_checks import PreviewRule, RadioCheck, RadioPlan, check_radio
 from app.planning.radio_recommendation import recommend_settings
 from app.radio.battery import Battery, battery_life_days, mean_current_ma, transmit_current_ma
 from app.radio.collisions import Receiver
 from app.radio.link import LinkModel
 from app.radio.lorawan import Region
-from app.radio.reception import RoadMarkers
+from app.radio.reception import Air, Approach, RoadMarkers, approach
 from app.radio.regulation import is_permitted
 from app.radio.settings import RadioSettings
 
@@ -226,3 +227,25 @@ def test_what_cannot_be_reached_lawfully_is_said() -> None:
     nowhere = recommend_settings(RadioPlan(RadioSettings(), region=Region.EU868))
     assert nowhere.settings is None
     assert "no settings are lawful" in nowhere.sentence
+
+
+def test_an_approach_is_computed_once_for_all_channels(monkeypatch: pytest.MonkeyPatch) -> None:
+    approached: list[tuple[float, float]] = []
+
+    def count(markers: RoadMarkers, index: int, nearest_m: float, air: Air) -> Approach:
+        approached.append((air.threshold_dbm, air.settings.power_dbm))
+        return approach(markers, index, nearest_m, air)
+
+    monkeypatch.setattr(radio_recommendation, "approach", count)
+    crowded = RoadMarkers(np.linspace(0.0, 500.0, 500), np.tile([1.8, -1.8], 250))
+    found = recommend_settings(RadioPlan(RadioSettings(), markers=crowded))
+    assert not found.reaches
+    assert len(approached) <= 8 * len(set(approached))
+
+
+def test_reception_among_twenty_thousand_is_computed_at_fewer_stations() -> None:
+    def stations(count: int) -> int:
+        markers = RoadMarkers(np.linspace(0.0, 2000.0, count), np.tile([1.8, -1.8], count // 2))
+        return len(check_radio(RadioPlan(RadioSettings(), markers=markers)).road.station_m)
+
+    assert (stations(1000), stations(20_000)) == (200, 100)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 from scipy.stats import truncnorm
 
 from app.errors import InvalidParameter
@@ -251,3 +253,28 @@ def test_more_capture_helps_less_than_fewer_markers() -> None:
     sparse = reception_at(RoadMarkers.evenly(24.384, 300.0), 0.0, air)
     relocking = reception_at(RoadMarkers.evenly(12.192, 300.0), 0.0, replace(air, receiver=Receiver(relocks=True)))
     assert near.success.mean() < relocking.success.mean() < sparse.success.mean()
+
+
+@pytest.mark.parametrize(
+    "receiver", [Receiver(), Receiver(relocks=True), DEAF_TO_CAPTURE], ids=["locks", "relocks", "no capture"]
+)
+def test_thousands_of_others_counted_by_level_come_to_the_sum_over_each(receiver: Receiver) -> None:
+    link, wanted = LinkModel(), np.array([-80.0, -108.0, -115.0])
+    others = np.stack([link.level_dbm(np.linspace(first_m, 900.0, 6000)) for first_m in (1.0, 30.0, 300.0)])
+    found = harmful_others(wanted, others, -116.0, link, receiver)
+    each = np.array([harmful_others(wanted, others[:, k : k + 1], -116.0, link, receiver) for k in range(6000)])
+    assert found == pytest.approx(each.sum(axis=0), abs=6000 * 2e-5)
+
+
+def test_frequent_transmissions_over_a_long_approach_need_little_memory() -> None:
+    air = Air(RadioSettings(interval_s=0.05), LinkModel(), Receiver(sensitivity_dbm=-150.0))
+    reception = approach(RoadMarkers([0.0], [1.8]), 0, 31.0, air)
+    faint = replace(reception, level_dbm=np.full_like(reception.level_dbm, -150.0 - 4.0 * 4.0))
+    tracemalloc.start()
+    probability = read_probability(faint, 0.5, air)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    sent = (reception.ahead_m[-1] - reception.ahead_m[0]) / (0.5 * 0.05)
+    assert sent > 500_000
+    assert probability == pytest.approx(1 - (1 - ndtr(-4.0)) ** sent, rel=1e-3)
+    assert peak_bytes < 5_000_000
