@@ -32,7 +32,10 @@ IntArray = npt.NDArray[np.intp]
 MAX_VERTICES = 100_000  # source: by hand, bounds the memory of an axis
 MAX_EDGE_M = 20_000.0  # [m] source: by hand; longer edges are swapped or missing vertices
 MAX_LENGTH_M = 5_000_000.0  # [m] source: by hand, bounds the memory of an axis
+MAX_PARTS = 2_000  # source: by hand, bounds the time to make an axis to half a second
 MAX_OFFSET_M = 10_000.0  # [m] source: by hand, bounds the time of a search
+MAX_FEET = 20  # of a place; source: by hand, bounds an answer; roads that cross themselves have two
+MAX_PAIRS = 10_000_000  # of places and pieces of an axis in one search; source: by hand, bounds its time to 3 s
 _GEOD = Geod(ellps="WGS84")
 _PIECE_M = 250.0  # [m] edges are cut into pieces on which a plane is accurate to 0.1 mm (`_plane`); source: by hand
 _BEND_M = 25.0  # [m] farther from a vertex, offsets are square to the edge; source: docs/roads.md
@@ -40,7 +43,7 @@ _SAME_PLACE_M = 1e-4  # [m] shorter edges are dropped; source: a tenth of a mill
 _CORNER_RAD = np.radians(90.0)  # [rad] sharper kinks are corners; source: docs/roads.md
 _ON_BISECTOR = 1e-9  # share of a piece by which two strips overlap, so that there is no gap; source: above rounding
 _SAME_FOOT_M = 1e-4  # [m] source: `_SAME_PLACE_M`
-_PAIRS = 1_000_000  # of places and pieces in memory at the same time; source: by hand, about 100 MB
+_PAIRS = 300_000  # of places and pieces in memory at the same time; source: by hand, about 50 MB
 _REFINEMENTS = 3  # of a foot on a geodesic; source: to the nanometre (`_exact`)
 _MAX_DETOUR = 1.01  # of a strip's foot against the nearest place on the axis; source: by hand, no measurement kept
 
@@ -83,32 +86,30 @@ class Axis:
     ----------
     parts : sequence of sequences of (lon_deg, lat_deg)
         Vertices of each line in the direction of increasing chainage; further coordinates are left out. [deg]
+    max_length_m : float
+        Of all parts together. [m]
 
     Raises
     ------
     InvalidParameter
-        A part with fewer than two different vertices, an edge above 20 km, more than 100 000 vertices or 5 000 km.
+        A part with fewer than two different vertices, an edge above 20 km, more than 100 000 vertices, 2 000 parts or
+        `max_length_m`.
     """
 
-    def __init__(self, parts: Sequence[Sequence[Sequence[float]]]) -> None:
+    def __init__(self, parts: Sequence[Sequence[Sequence[float]]], max_length_m: float = MAX_LENGTH_M) -> None:
         _check_count(parts)
+        edges = [_edges(np.array([p[:2] for p in part], dtype=np.float64), number) for number, part in enumerate(parts)]
+        _check_length(sum(float(lengths_m.sum()) for _, _, lengths_m in edges), max_length_m)
         pieces = []
         self.vertex_chainages_m: list[FloatArray] = []
         chainage_m = 0.0
-        for number, part in enumerate(parts):
-            made, vertices_m = _pieces(np.array([p[:2] for p in part], dtype=np.float64), number)
+        for number, part_edges in enumerate(edges):
+            made, vertices_m = _pieces(*part_edges)
             made["chainage"] += chainage_m
             made["part"] = np.full(len(made["length"]), number, dtype=np.intp)
             self.vertex_chainages_m.append(vertices_m + chainage_m)
             chainage_m = float(self.vertex_chainages_m[-1][-1])
             pieces.append(made)
-        if chainage_m > MAX_LENGTH_M:
-            raise InvalidParameter(
-                f"the line is {chainage_m / 1000:.0f} km long",
-                field="geometry",
-                limit=f"{MAX_LENGTH_M / 1000:.0f} km",
-                cure="register the sections of the road as roads of their own",
-            )
         joined = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
         self._lon, self._lat, self._azimuth = joined["lon"], joined["lat"], joined["azimuth"]
         self._length, self._chainage, self._part = joined["length"], joined["chainage"], joined["part"].astype(np.intp)
@@ -129,7 +130,9 @@ class Axis:
         """Chainages of each part's start and end. [m]"""
         return [(float(v[0]), float(v[-1])) for v in self.vertex_chainages_m]
 
-    def locate(self, lon_deg: FloatArray, lat_deg: FloatArray, max_offset_m: float) -> list[list[Foot]]:
+    def locate(
+        self, lon_deg: FloatArray, lat_deg: FloatArray, max_offset_m: float, *, max_feet: int = MAX_FEET
+    ) -> list[list[Foot]]:
         """Feet of places on the axis, for each place the nearest first; none where it is farther than `max_offset_m`.
 
         Parameters
@@ -137,11 +140,18 @@ class Axis:
         lon_deg, lat_deg : ndarray, shape (N,)
         max_offset_m : float
             Up to 10 000. [m]
+        max_feet : int
+            Nearest feet of each place that are computed.
 
         Returns
         -------
         list of list of Foot
             More than one foot: a loop, a hairpin, a road that crosses itself, or parts side by side.
+
+        Raises
+        ------
+        InvalidParameter
+            More than 10 million pairs of a place and a piece of the axis near it.
         """
         lon, lat = np.atleast_1d(lon_deg).astype(np.float64), np.atleast_1d(lat_deg).astype(np.float64)
         feet: list[list[Foot]] = [[] for _ in range(len(lon))]
@@ -149,6 +159,7 @@ class Axis:
             x, y, share = self._plane(places, pieces, lon, lat)
             length = self._length[pieces]
             inside = (share >= -_ON_BISECTOR) & (share <= 1 + _ON_BISECTOR) & (np.abs(y) <= max_offset_m * _MAX_DETOUR)
+            inside[inside] = _is_among_nearest(places[inside], np.abs(y[inside]), max_feet)
             self._add_strips(feet, places[inside], pieces[inside], lon, lat)
             away = np.hypot(x - np.clip(x, 0.0, length), y)
             self._add_nearest(feet, places, pieces, away, lon, lat)
@@ -210,13 +221,13 @@ class Axis:
         radius = self._reach + 2 * max_offset_m + 1.0
         places = ecef_from_wgs84(lon, lat)
         counts = np.asarray(self._tree.query_ball_point(places, radius, return_length=True), dtype=np.intp)
+        _check_pairs(int(counts.sum()), len(places))
         start = 0
         while start < len(places):
             end = start + max(1, int(np.searchsorted(np.cumsum(counts[start:]), _PAIRS, side="right")))
-            found = list(self._tree.query_ball_point(places[start:end], radius))
-            number = np.repeat(np.arange(start, min(end, len(places))), counts[start:end])
-            if len(number):
-                yield number, np.concatenate([np.asarray(pieces, dtype=np.intp) for pieces in found])
+            near = cKDTree(places[start:end]).sparse_distance_matrix(self._tree, radius, output_type="ndarray")
+            if len(near):
+                yield near["i"] + start, near["j"]
             start = end
 
     def _plane(
@@ -291,6 +302,16 @@ class Axis:
             feet[place].append(Foot(int(self._part[pieces[k]]), chainage, float(offset[k]), float(beyond[k]), False))
 
 
+def _is_among_nearest(places: IntArray, distance_m: FloatArray, count: int) -> npt.NDArray[np.bool_]:
+    """Which of these candidates are among the `count` nearest ones of their place, shape (N,)."""
+    order = np.lexsort((distance_m, places))
+    ordered = places[order]
+    rank = np.arange(len(order)) - np.searchsorted(ordered, ordered)
+    nearest = np.empty(len(order), dtype=np.bool_)
+    nearest[order] = rank < count
+    return nearest
+
+
 def _sorted(feet: list[Foot], max_offset_m: float) -> list[Foot]:
     """Nearest first, each once."""
     kept: list[Foot] = []
@@ -302,25 +323,44 @@ def _sorted(feet: list[Foot], max_offset_m: float) -> list[Foot]:
     return kept
 
 
-def _check_count(parts: Sequence[Sequence[Sequence[float]]]) -> None:
-    total = sum(len(part) for part in parts)
-    if not parts or total > MAX_VERTICES:
+def _check_pairs(pairs: int, places: int) -> None:
+    if pairs > MAX_PAIRS:
         raise InvalidParameter(
-            f"the line has {total} vertices",
+            f"{places} positions have {pairs} edges of the line near them",
             field="geometry",
-            limit=f"2 to {MAX_VERTICES} vertices",
-            cure="leave out vertices that lie on straight lines",
+            limit=f"{MAX_PAIRS} pairs of a position and an edge",
+            cure="ask for fewer positions or a smaller offset, or leave out vertices of the line",
         )
 
 
-def _pieces(points: FloatArray, number: int) -> tuple[dict[str, npt.NDArray[np.float64]], FloatArray]:
-    """Pieces of a part, and the chainages of its vertices."""
+def _check_length(length_m: float, limit_m: float) -> None:
+    if length_m > limit_m:
+        raise InvalidParameter(
+            f"the line is {length_m / 1000:.0f} km long",
+            field="geometry",
+            limit=f"{limit_m / 1000:.0f} km",
+            cure="divide it into sections, each a line of its own",
+        )
+
+
+def _check_count(parts: Sequence[Sequence[Sequence[float]]]) -> None:
+    total = sum(len(part) for part in parts)
+    if not parts or total > MAX_VERTICES or len(parts) > MAX_PARTS:
+        raise InvalidParameter(
+            f"the line has {total} vertices in {len(parts)} parts",
+            field="geometry",
+            limit=f"2 to {MAX_VERTICES} vertices in at most {MAX_PARTS} parts",
+            cure="leave out vertices that lie on straight lines, and join parts end to end",
+        )
+
+
+def _edges(points: FloatArray, number: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Vertices of a part, and azimuth [deg] and length [m] of the edge from each to the next."""
     if len(points) > 1:
         azimuth, _, length = _GEOD.inv(points[:-1, 0], points[:-1, 1], points[1:, 0], points[1:, 1])
     else:
         azimuth = length = np.zeros(0)
-    kept = np.flatnonzero(length > _SAME_PLACE_M)
-    if not len(kept):
+    if not (length > _SAME_PLACE_M).any():
         raise InvalidParameter(
             f"line {number} has fewer than two different vertices",
             field=f"geometry.coordinates[{number}]",
@@ -335,6 +375,14 @@ def _pieces(points: FloatArray, number: int) -> tuple[dict[str, npt.NDArray[np.f
             limit=f"{MAX_EDGE_M / 1000:.0f} km",
             cure="give vertices along the road; check the coordinates for swapped axes",
         )
+    return points, azimuth, length
+
+
+def _pieces(
+    points: FloatArray, azimuth: FloatArray, length: FloatArray
+) -> tuple[dict[str, npt.NDArray[np.float64]], FloatArray]:
+    """Pieces of a part, and the chainages of its vertices."""
+    kept = np.flatnonzero(length > _SAME_PLACE_M)
     vertices_m = np.concatenate([[0.0], np.cumsum(np.where(length > _SAME_PLACE_M, length, 0.0))])
     starts, azimuth, length = points[:-1][kept], azimuth[kept], length[kept]
     turns = _turns(starts, azimuth, length, points)

@@ -8,8 +8,9 @@ Within a section, between jumps and ends of parts, measures are unique.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from app.errors import InvalidParameter
 
 FloatArray = npt.NDArray[np.float64]
+MAX_PLACES = 20  # of a measure; source: by hand, bounds an answer; measures of a road occur twice
 SCALES = (0.5, 2.0)  # lowest and highest metres of measure to a metre of road; source: by hand
 _SAME_M = 1e-6  # [m] source: a micrometre, above rounding
 _ON_END_M = 1e-6  # [m] source: `_SAME_M`
@@ -60,29 +62,33 @@ class Measures:
     """Measures of a whole axis, by sections in the order of their chainages."""
 
     sections: tuple[Section, ...]
+    _starts: list[tuple[int, float]] = field(init=False, repr=False, compare=False)  # part and chainage of each section
+    _ends_m: FloatArray = field(init=False, repr=False, compare=False)  # lowest and highest measure, shape (2, S)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_starts", [(s.part, float(s.chainages_m[0])) for s in self.sections])
+        ends_m = [(s.measures_m[0], s.measures_m[-1]) for s in self.sections]
+        object.__setattr__(self, "_ends_m", np.array(ends_m, float).reshape(-1, 2).T)
 
     def measure_at(self, part: int, chainage_m: float) -> float:
         """Measure of a place on the axis; at an equation of stationing the one after it. [m]"""
-        found = self._section_at(part, chainage_m)
+        found = self.sections[self.section_at(part, chainage_m)]
         return float(np.interp(chainage_m, found.chainages_m, found.measures_m))
 
     def section_at(self, part: int, chainage_m: float) -> int:
         """Number of the section of a place on the axis."""
-        return self.sections.index(self._section_at(part, chainage_m))
+        number = bisect_right(self._starts, (part, chainage_m)) - 1
+        return number if number >= 0 and self.sections[number].part == part else number + 1
 
     def places_of(self, measure_m: float) -> list[tuple[int, int, float]]:
-        """Section, part and chainage of each place with a measure; none if it is not on the road."""
+        """Section, part and chainage of each place with a measure, the first 20; none if it is not on the road."""
+        low_m, high_m = self._ends_m
         places = []
-        for number, section in enumerate(self.sections):
-            if section.measures_m[0] - _ON_END_M <= measure_m <= section.measures_m[-1] + _ON_END_M:
-                chainage_m = float(np.interp(measure_m, section.measures_m, section.chainages_m))
-                places.append((number, section.part, chainage_m))
+        for number in np.flatnonzero((low_m - _ON_END_M <= measure_m) & (measure_m <= high_m + _ON_END_M))[:MAX_PLACES]:
+            section = self.sections[number]
+            chainage_m = float(np.interp(measure_m, section.measures_m, section.chainages_m))
+            places.append((int(number), section.part, chainage_m))
         return places
-
-    def _section_at(self, part: int, chainage_m: float) -> Section:
-        own = [section for section in self.sections if section.part == part]
-        after = [section for section in own if section.chainages_m[0] <= chainage_m]
-        return after[-1] if after else own[0]
 
 
 def calibrate(part_ranges_m: Sequence[tuple[float, float]], points: Sequence[CalibrationPoint]) -> Measures:
@@ -101,8 +107,11 @@ def calibrate(part_ranges_m: Sequence[tuple[float, float]], points: Sequence[Cal
         Two points at one place, measures that do not rise, or metres of measure beyond 0.5 to 2 metres of road.
     """
     sections: list[Section] = []
+    by_part: dict[int, list[CalibrationPoint]] = {}
+    for point in sorted(points, key=lambda p: p.chainage_m):
+        by_part.setdefault(point.part, []).append(point)
     for part, (start_m, end_m) in enumerate(part_ranges_m):
-        own = sorted((p for p in points if p.part == part), key=lambda p: p.chainage_m)
+        own = by_part.get(part, [])
         _check_places(own)
         if not own:
             ahead_m = float(sections[-1].measures_m[-1]) if sections else 0.0

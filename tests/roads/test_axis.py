@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from pyproj import Geod
 
 from app.errors import InvalidParameter
-from app.roads.axis import Axis
+from app.roads.axis import Axis, FloatArray, IntArray
 
 GEOD = Geod(ellps="WGS84")
 LANES = sorted((Path(__file__).parents[2] / "benchmarks/cerpm/routes").glob("*.geojson"))
@@ -156,3 +157,54 @@ def test_lines_that_are_none_are_refused(parts: list[list[tuple[float, float]]],
     with pytest.raises(InvalidParameter) as caught:
         Axis(parts)
     assert limit in str(caught.value.limit)
+
+
+# --- lines that are made to take long -----------------------------------------------------------------------------
+
+
+def _zigzag(vertices: int, width_deg: float, step_deg: float) -> list[list[float]]:
+    i = np.arange(vertices)
+    points: list[list[float]] = np.column_stack([8.0 + width_deg * (i % 2), 49.0 + step_deg * i]).tolist()
+    return points
+
+
+def test_a_place_beside_thousands_of_edges_has_the_nearest_twenty_feet(monkeypatch: pytest.MonkeyPatch) -> None:
+    exact: list[int] = []
+    compute = Axis._exact
+
+    def count(self: Axis, places: IntArray, *rest: Any) -> tuple[FloatArray, FloatArray]:
+        exact.append(len(places))
+        return compute(self, places, *rest)
+
+    monkeypatch.setattr(Axis, "_exact", count)
+    axis = Axis([_zigzag(4000, 1e-4, 1e-7)])
+    lon, lat = np.full(3, 8.00005), np.array([49.0001, 49.0002, 49.0003])
+    found = axis.locate(lon, lat, 100.0)
+    assert [len(feet) for feet in found] == [20, 20, 20]
+    assert sum(exact) <= 3 * (20 + 1)
+    edges_m = 1e-7 * math.radians(1) * 6_371_000
+    for feet in found:
+        assert feet == sorted(feet, key=lambda foot: foot.distance_m)
+        assert feet[-1].distance_m < 12 * edges_m
+        assert len({round(foot.chainage_m, 4) for foot in feet}) == 20
+
+
+def test_more_pairs_of_places_and_edges_than_a_search_takes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.roads.axis.MAX_PAIRS", 10_000)
+    axis = Axis([_zigzag(1000, 1e-5, 1e-7)])
+    with pytest.raises(InvalidParameter, match="20 positions have 19980 edges") as caught:
+        axis.locate(np.full(20, 8.0), np.full(20, 49.0), 100.0)
+    assert caught.value.limit is not None
+    assert "10000 pairs" in caught.value.limit
+    assert len(axis.locate(np.full(5, 8.0), np.full(5, 49.0), 100.0)) == 5
+
+
+def test_a_line_that_is_too_long_is_refused_before_it_is_cut_into_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.roads.axis._cuts", lambda length: pytest.fail("it was cut"))
+    with pytest.raises(InvalidParameter, match="km long"):
+        Axis([_zigzag(70_000, 0.25, 1e-7)])
+    with pytest.raises(InvalidParameter, match="km long") as caught:
+        Axis([_zigzag(100, 0.25, 1e-7)], 1_000_000.0)
+    assert caught.value.limit == "1000 km"
+    with pytest.raises(InvalidParameter, match="2001 parts"):
+        Axis([[[8.0, 49.0], [8.1, 49.0]]] * 2001)

@@ -77,3 +77,13 @@ def test_what_does_not_rise_with_the_road_is_refused(points: list[CalibrationPoi
     with pytest.raises(InvalidParameter) as caught:
         calibrate(ONE, points)
     assert caught.value.field == "calibration"
+
+
+def test_a_measure_that_hundreds_of_parts_have_is_at_its_first_twenty_places() -> None:
+    ranges_m = [(100.0 * k, 100.0 * k + 100.0) for k in range(300)]
+    measures = calibrate(ranges_m, [CalibrationPoint(k, start_m, 0.0) for k, (start_m, _) in enumerate(ranges_m)])
+    assert measures.places_of(50.0) == [(k, k, 100.0 * k + 50.0) for k in range(20)]
+    for part in (0, 17, 299):
+        assert measures.section_at(part, ranges_m[part][0] + 50.0) == part
+        assert measures.section_at(part, ranges_m[part][0] - 1.0) == part
+        assert measures.measure_at(part, ranges_m[part][1]) == 100.0

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from typing_extensions import Unpack
 
-from app.errors import InvalidParameter
+from app.errors import InvalidParameter, naming
 from app.families import get_family
 from app.families.documents import MarkerDocument
 from app.registry import markers as store
@@ -29,6 +29,7 @@ MAX_ALONG = 20_000
 MAX_LINE_M = 1_000_000.0
 _STEP_M = 2_000.0
 _ON_END_M = 1e-3
+_FEET = 4  # of a marker beside a line: the nearest two, each perhaps as the end of one piece and the start of the next
 
 Place = tuple[float, float]
 Page = tuple[list[FoundMarker], str | None]
@@ -147,18 +148,10 @@ def circle(filtered: MarkerFilter, place: Place, radius_m: float) -> MarkerFilte
 
 def _axis(line: Sequence[Sequence[float]]) -> Axis:
     try:
-        axis = Axis([line])
+        return Axis([line], MAX_LINE_M)
     except InvalidParameter as error:
         error.field = "along.geometry"
         raise
-    if axis.length_m > MAX_LINE_M:
-        raise InvalidParameter(
-            f"the line is {axis.length_m / 1000:.0f} km long",
-            field="along.geometry",
-            limit=f"{MAX_LINE_M / 1000:.0f} km",
-            cure="search along its parts",
-        )
-    return axis
 
 
 def _order(
@@ -166,8 +159,10 @@ def _order(
 ) -> list[tuple[float, str, Foot, bool]]:
     """Distance along, id, foot and ambiguity of the places in the corridor, in the order of the line."""
     lon, lat = np.array([p[1] for p in places]), np.array([p[2] for p in places])
+    with naming("along"):
+        located = axis.locate(lon, lat, half_m, max_feet=_FEET)
     found = []
-    for place, feet in zip(places, axis.locate(lon, lat, half_m), strict=True):
+    for place, feet in zip(places, located, strict=True):
         if feet and abs(feet[0].beyond_m) <= _ON_END_M:
             ambiguous = len(feet) > 1 and feet[1].distance_m - feet[0].distance_m < 1.0
             found.append((feet[0].chainage_m, place[0], feet[0], ambiguous))

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from app.errors import InvalidParameter
 from app.geodesy import PlacedPositions, place_positions
-from app.roads.axis import Axis
+from app.roads.axis import Axis, Foot
 from app.roads.measures import CalibrationPoint
 
 _REACH_M = 50.0
@@ -71,7 +71,7 @@ def place_lines(lines: LinesInput, accuracy_m: float) -> PlacedLines:
         The CRS is unknown, or a vertex is out of its range.
     """
     flat = np.array([point for part in lines.parts for point in part], dtype=np.float64)
-    placed = _placed(flat, lines, accuracy_m, "geometry.coordinates")
+    placed = _placed(flat, lines, accuracy_m, ["geometry.coordinates"] * len(flat))
     points = np.stack([placed.lon_deg, placed.lat_deg], axis=1).tolist()
     ends = np.cumsum([len(part) for part in lines.parts]).tolist()
     parts = [points[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
@@ -88,11 +88,24 @@ def resolve_calibration(
     InvalidParameter
         A vertex or a part that is not there, or a position that is too far from the axis or beside it twice.
     """
-    settled = [_settled(axis, lines, point, f"calibration.{k}", accuracy_m) for k, point in enumerate(points)]
+    feet = _feet(axis, lines, points, accuracy_m)
+    settled = [_settled(axis, point, feet.get(k, []), f"calibration.{k}") for k, point in enumerate(points)]
     return sorted(settled, key=lambda point: (point.part, point.chainage_m))
 
 
-def _settled(axis: Axis, lines: LinesInput, point: CalibrationInput, field: str, accuracy_m: float) -> CalibrationPoint:
+def _feet(
+    axis: Axis, lines: LinesInput, points: Sequence[CalibrationInput], accuracy_m: float
+) -> dict[int, list[Foot]]:
+    """Feet of the calibration points that are positions, by the number of the point."""
+    positions = {k: point.position for k, point in enumerate(points) if point.position is not None}
+    if not positions:
+        return {}
+    fields = [f"calibration.{k}.position" for k in positions]
+    placed = _placed(np.array(list(positions.values()), dtype=np.float64), lines, accuracy_m, fields)
+    return dict(zip(positions, axis.locate(placed.lon_deg, placed.lat_deg, _REACH_M), strict=True))
+
+
+def _settled(axis: Axis, point: CalibrationInput, feet: list[Foot], field: str) -> CalibrationPoint:
     if (point.vertex is None) == (point.position is None):
         raise InvalidParameter(
             "a calibration point is a vertex or a position",
@@ -111,8 +124,6 @@ def _settled(axis: Axis, lines: LinesInput, point: CalibrationInput, field: str,
             )
         chainage_m = float(vertices_m[point.part][point.vertex])
         return CalibrationPoint(point.part, chainage_m, point.measure_m, point.ahead_m)
-    placed = _placed(np.array([point.position], dtype=np.float64), lines, accuracy_m, f"{field}.position")
-    feet = axis.locate(placed.lon_deg, placed.lat_deg, _REACH_M)[0]
     if not feet:
         raise InvalidParameter(
             f"the position of measure {point.measure_m:g} m is not at the road",
@@ -130,7 +141,9 @@ def _settled(axis: Axis, lines: LinesInput, point: CalibrationInput, field: str,
     return CalibrationPoint(feet[0].part, feet[0].chainage_m, point.measure_m, point.ahead_m)
 
 
-def _placed(points: npt.NDArray[np.float64], lines: LinesInput, accuracy_m: float, field: str) -> PlacedPositions:
+def _placed(
+    points: npt.NDArray[np.float64], lines: LinesInput, accuracy_m: float, fields: Sequence[str]
+) -> PlacedPositions:
     try:
         placed = place_positions(
             points[:, 0],
@@ -142,13 +155,13 @@ def _placed(points: npt.NDArray[np.float64], lines: LinesInput, accuracy_m: floa
             accuracy_m=accuracy_m,
         )
     except InvalidParameter as error:
-        error.field = "crs" if error.field == "position.crs" else field
+        error.field = "crs" if error.field == "position.crs" else fields[0]
         raise
     if not placed.placed.all():
         k = int(np.argmin(placed.placed))
         raise InvalidParameter(
             f"vertex {k}, {points[k, 0]:g} {points[k, 1]:g}, is not in the area of {placed.crs}",
-            field=field,
+            field=fields[k],
             limit=f"coordinates of {placed.crs}, longitude or easting first",
             cure="check the CRS and the order of the axes",
         )

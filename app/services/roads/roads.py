@@ -206,12 +206,22 @@ class Roads:
         reach_m: float,
         version: int | None = None,
     ) -> RoadLocatedMany:
-        """Measures and offsets of positions (lon_deg, lat_deg); several feet where the road passes more than once."""
+        """Measures and offsets of positions (lon_deg, lat_deg); several feet where the road passes more than once.
+
+        Raises
+        ------
+        InvalidParameter
+            A position out of range, or too many edges of the road near the positions.
+        """
         for position in positions:
             check_lon_lat(*position)
         head, route = self._route(caller, road_id, version)
-        items = [located_position(route, feet) for feet in route.feet(positions, reach_m)]
-        return {**head, "items": items}
+        try:
+            feet = route.feet(positions, reach_m)
+        except InvalidParameter as error:
+            error.field = "positions"
+            raise
+        return {**head, "items": [located_position(route, found) for found in feet]}
 
     def place(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ MARKER_REACH_M = 100.0
 AMBIGUOUS_M = 1.0
 """Feet whose distances differ by less than this cannot be distinguished by the position alone. [m]"""
 _ON_END_M = 0.01
+_AT_ONCE = 1_000  # markers that are located at the same time; source: as `locate` of a road, bounds its pairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,10 @@ def references_of(
         What those measures were on, if that was another.
     """
     found = []
-    for feet, measure_m in zip(route.feet(positions, MARKER_REACH_M), before_m, strict=True):
+    located = chain.from_iterable(
+        route.feet(positions[start : start + _AT_ONCE], MARKER_REACH_M) for start in range(0, len(positions), _AT_ONCE)
+    )
+    for feet, measure_m in zip(located, before_m, strict=True):
         if not feet:
             found.append(Reference(None, None, f"farther than {MARKER_REACH_M:g} m from the road"))
             continue
