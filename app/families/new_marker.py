@@ -32,3 +32,8 @@ class NewMarker:
     offset_m: float | None = None
     kind: str | None = None
     reason: str | None = None
+
+    @property
+    def part_count(self) -> int:
+        """Things in the road that the marker has at most, e.g. magnets: what its registration costs."""
+        return 1

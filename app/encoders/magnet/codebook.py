@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,6 @@ from app.markers.magnet_error import (
     ReadingConditions,
     covariance_of,
     placements_of,
-    separation,
     separation_for,
 )
 
@@ -143,6 +143,13 @@ def _full(book: Codebook, asked: int, fit: int, rules: CodebookRules) -> Codeboo
     )
 
 
+class _Placements(NamedTuple):
+    """Placements of a design's magnets, and how they are read."""
+
+    u: FloatArray  # (K, M - 2), middle magnets' places over the tag's length
+    inverse: FloatArray  # (K, M - 2, M - 2), of the covariance of u
+
+
 class _CodeSpace:
     """The codes of a design, and which of them are still free.
 
@@ -154,13 +161,13 @@ class _CodeSpace:
         self._design, self._rules = design, rules
         self._limit = separation_for(rules.confusion)
         self._steps = placements_of(design, MAX_PLACEMENTS)
-        self._gaps_m = self._steps.astype(np.float64) * design.segment_m
-        self._inverse = self._inverses(self._gaps_m)
+        gaps_m = self._steps.astype(np.float64) * design.segment_m
+        self._all = self._placements(gaps_m)
         self._blocked: dict[_Pattern, npt.NDArray[np.bool_]] = {}
         self._near_rows: dict[tuple[int, ...], npt.NDArray[np.bool_]] = {}
         self._lost_rows: dict[tuple[int, ...], list[npt.NDArray[np.bool_]]] = {}
-        self._lost = [_without(self._gaps_m, i) for i in range(design.magnets)] if rules.survive_missing else []
-        self._lost_inverses = [self._inverses(gaps_m) for gaps_m in self._lost]
+        missed = range(design.magnets) if rules.survive_missing else ()
+        self._lost = [self._placements(_without(gaps_m, i)) for i in missed]
 
     def take(self, tag: InformationTag) -> None:
         """Block what is too near to a tag and, on a wrong-way-safe book, to its reverse."""
@@ -194,7 +201,7 @@ class _CodeSpace:
                 for way, seen in enumerate(self._seen_as(tag)):
                     for pattern, gaps_m in views(seen):
                         rivals = by_pattern.get(pattern, [])
-                        near = self._near(gaps_m, np.array([g for _, g in rivals])) if rivals else ()
+                        near = self._near(gaps_m, self._placements(np.array([g for _, g in rivals]))) if rivals else ()
                         pairs |= {
                             (max(i, k), min(i, k))
                             for (k, _), hit in zip(rivals, near, strict=True)
@@ -213,28 +220,25 @@ class _CodeSpace:
     def _near_placements(self, tag: InformationTag) -> npt.NDArray[np.bool_]:
         """Which placements are too near to a tag's, shape (K,); the same for all polarities, so kept."""
         if tag.gap_steps not in self._near_rows:
-            near = self._near(np.array(tag.gaps_m), self._gaps_m, self._inverse)
-            self._near_rows[tag.gap_steps] = near
+            self._near_rows[tag.gap_steps] = self._near(np.array(tag.gaps_m), self._all)
         return self._near_rows[tag.gap_steps]
 
-    def _near(
-        self, gaps_m: FloatArray, others_m: FloatArray, others_inverse: FloatArray | None = None
-    ) -> npt.NDArray[np.bool_]:
-        """Whether gaps of shape (K, M - 1) are nearer to a code's than the rules allow, as seen from either side."""
+    def _near(self, gaps_m: FloatArray, others: _Placements) -> npt.NDArray[np.bool_]:
+        """Which of K placements are nearer to a code's than the rules allow, as seen from either side."""
         if len(gaps_m) < 2:  # two magnets have no ratio
-            return np.ones(len(others_m), dtype=bool)
-        if others_inverse is None:
-            others_inverse = self._inverses(others_m)
-        own = covariance_of(gaps_m[None], self._rules.conditions)[0]
-        u, others_u = _places(gaps_m[None])[0], _places(others_m)
-        delta = others_u - u
-        seen_from_there = np.sqrt((delta[:, None, :] @ others_inverse @ delta[:, :, None])[:, 0, 0])
-        near: npt.NDArray[np.bool_] = np.minimum(separation(u, own, others_u), seen_from_there) < self._limit
+            return np.ones(len(others.u), dtype=bool)
+        own = self._placements(gaps_m[None])
+        delta = others.u - own.u
+        from_here = np.einsum("kj,kj->k", delta @ own.inverse[0], delta)  # squared separations
+        from_there = np.einsum("kj,kj->k", np.einsum("ki,kij->kj", delta, others.inverse), delta)
+        near: npt.NDArray[np.bool_] = np.minimum(from_here, from_there) < self._limit**2
         return near
 
-    def _inverses(self, gaps_m: FloatArray) -> FloatArray:
-        """Inverse covariances of codes, shape (K, M - 2, M - 2)."""
-        return np.asarray(np.linalg.inv(covariance_of(gaps_m, self._rules.conditions)), dtype=np.float64)
+    def _placements(self, gaps_m: FloatArray) -> _Placements:
+        """Placements of gaps of shape (K, M - 1)."""
+        if gaps_m.shape[1] < 2:
+            return _Placements(np.empty((len(gaps_m), 0)), np.empty((len(gaps_m), 0, 0)))
+        return _Placements(_places(gaps_m), np.linalg.inv(covariance_of(gaps_m, self._rules.conditions)))
 
     def _remains(self, tag: InformationTag) -> Iterator[tuple[_Pattern, FloatArray]]:
         """What is left of a tag when one magnet is missed: polarities and gaps, for each of its magnets."""
@@ -248,8 +252,7 @@ class _CodeSpace:
         """Block every code that, one magnet missed, is too near to what is left of a code."""
         key = tuple(np.round(gaps_m / self._design.segment_m).astype(int).tolist())
         if key not in self._lost_rows:
-            pairs = zip(self._lost, self._lost_inverses, strict=True)
-            self._lost_rows[key] = [self._near(gaps_m, lost_m, inverse) for lost_m, inverse in pairs]
+            self._lost_rows[key] = [self._near(gaps_m, lost) for lost in self._lost]
         for i, near in enumerate(self._lost_rows[key]):
             for polarity in Polarity:
                 row = self._row((*pattern[:i], polarity, *pattern[i:]))

@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
-from app.errors import Unavailable, WaymarkError
+from app.errors import InvalidParameter, Unavailable, WaymarkError
 from app.families.new_marker import NewMarker
 from app.registry.database import Database
 from app.services.access.access import Caller
@@ -22,6 +22,7 @@ from app.services.request_work import check_deadline
 Mode: TypeAlias = Literal["all", "good"]
 ALL: Mode = "all"
 GOOD: Mode = "good"
+MAX_PARTS = 10_000  # magnets and other markers of the items; source: by hand, one to three seconds of a processor
 _CREATED, _UPDATED = 201, 200
 
 
@@ -117,12 +118,15 @@ class BulkMarkers:
 
         Raises
         ------
+        InvalidParameter
+            The new markers have too many magnets together.
         Unavailable
             The database is busy; nothing is stored.
         """
         now = self._clock()
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
+        _check_parts(given.items)
         steps = [self._prepared(caller, item, now) for item in given.items]
         try:
             with write_once(self._database, caller.agency_id, key, now, self._ttl, long=True) as (connection, answer):
@@ -149,6 +153,17 @@ class BulkMarkers:
             raise
         except WaymarkError as error:
             return 0, error
+
+
+def _check_parts(items: Sequence[Item]) -> None:
+    count = sum(item.part_count for item in items if isinstance(item, NewMarker))
+    if count > MAX_PARTS:
+        raise InvalidParameter(
+            f"the items have about {count} magnets and other markers",
+            field="items",
+            limit=f"{MAX_PARTS} in one request",
+            cure="send them in several requests",
+        )
 
 
 def _result(

@@ -10,7 +10,9 @@ import httpx
 import pytest
 
 from app.services.access.access import Scope
+from app.services.markers.markers import Markers, Step
 from tests.conftest import LiveServer
+from tests.http import refused
 
 pytestmark = pytest.mark.both_databases
 
@@ -175,3 +177,19 @@ def test_surveyors_change_but_do_not_register(server: LiveServer, place: Place) 
         with server.agency("a stranger to bulk") as stranger:
             result = _bulk(stranger, update, mode="good").json()["report"]["results"][0]
             assert result["status"] == 404
+
+
+def test_more_magnets_than_a_request_takes_are_refused_before_any_is_placed(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def place(self: Markers, *_: object) -> Step:
+        pytest.fail("a line was placed")
+
+    monkeypatch.setattr(Markers, "prepare_new", place)
+    lane = {"geometry": {"type": "LineString", "coordinates": [[8.0, 40.0], [8.05, 40.0]]}}
+    line = {"family": "magnet", "lane": lane, "line": {"style": "solid", "spacing_m": 6.0}}
+    projected = {**line, "lane": {"crs": "EPSG:25832", "points_m": [[456000, 5427000], [456000, 5431500]]}}
+    problem = refused(_bulk(client, *[{"create": line}] * 7, *[{"create": projected}] * 7), 422, field="items")
+    assert problem["limit"] == "10000 in one request"
+    counted = int(problem["detail"].split()[4])
+    assert counted == pytest.approx(7 * 4270 / 6 + 7 * 4500 / 6, rel=0.01)
