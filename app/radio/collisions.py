@@ -132,7 +132,7 @@ class _Others(NamedTuple):
     """Other markers by their mean levels: how many have each of them."""
 
     levels_dbm: Floats  # (..., B)
-    count: Floats  # (..., B)
+    number: Floats  # (..., B)
 
 
 def _binned(others_dbm: Floats, link: LinkModel) -> _Others:
@@ -161,12 +161,12 @@ def _harmful_at(
     levels_dbm: Floats, others: _Others, threshold_dbm: float, link: LinkModel, receiver: Receiver
 ) -> Floats:
     """Harmful others of packets with given levels, shape (..., Q), among others of shape (..., M)."""
-    readable = (link.share_above(others.levels_dbm, threshold_dbm) * others.count).sum(-1)[..., None]
+    readable = (link.share_above(others.levels_dbm, threshold_dbm) * others.number).sum(-1)[..., None]
     if receiver.capture_db is None:
         return np.asarray(np.broadcast_to(readable, levels_dbm.shape))
     limits_dbm = levels_dbm - receiver.capture_db
     share = link.share_above(others.levels_dbm[..., None, :], limits_dbm[..., None])
-    strong = np.einsum("...qm,...m->...q", share, others.count)
+    strong = np.einsum("...qm,...m->...q", share, others.number)
     if receiver.relocks:
         return np.asarray(strong)
     return np.asarray(strong + 0.5 * np.maximum(readable - strong, 0.0))

@@ -238,7 +238,8 @@ class _CodeSpace:
         """Placements of gaps of shape (K, M - 1)."""
         if gaps_m.shape[1] < 2:
             return _Placements(np.empty((len(gaps_m), 0)), np.empty((len(gaps_m), 0, 0)))
-        return _Placements(_places(gaps_m), np.linalg.inv(covariance_of(gaps_m, self._rules.conditions)))
+        inverse = np.linalg.inv(covariance_of(gaps_m, self._rules.conditions))
+        return _Placements(_places(gaps_m), np.asarray(inverse, dtype=np.float64))
 
     def _remains(self, tag: InformationTag) -> Iterator[tuple[_Pattern, FloatArray]]:
         """What is left of a tag when one magnet is missed: polarities and gaps, for each of its magnets."""
