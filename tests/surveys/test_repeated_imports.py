@@ -1,4 +1,4 @@
-"""Surveys that are imported once more, and the report on what was not declared."""
+"""Imports of surveys: once more, in a local grid, and the report on what was not declared."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+import sqlalchemy as sa
+from pyproj import Transformer
 
 from app.api.surveys.schemas import DeclarationIn
+from app.errors import InvalidParameter
 from app.families.rules import MarkerRules
 from app.jobs.tasks import SameProcess
 from app.main import utc_now
 from app.registry.database import Database
+from app.registry.tables import markers
+from app.registry.tenancy import seeing_every_agency
 from app.services.access.access import Access, Scope
 from app.services.surveys.declarations import import_input
 from app.services.surveys.documents import ImportReport
@@ -119,3 +124,26 @@ def test_the_report_states_everything_that_was_not_declared(send: Send) -> None:
     assert {one["what"] for one in report["detected"]} == {"first row", "comments"}
     assert "role_without_evidence" not in report["counts"]
     assert send(text, dry_run=True, columns={"code": "", "status": None})["good_rows"] == 8
+
+
+def test_a_local_grid_is_declared_and_reported(send: Send, database: Database) -> None:
+    places = ((457000.0, 5428000.0, 0.0, 0.0), (457300.0, 5428400.0, 500.0, 0.0))  # turned by atan2(400, 300)
+    names = ("easting", "northing", "local_easting", "local_northing")
+    points = [{"point": f"C{k}", **dict(zip(names, place, strict=True))} for k, place in enumerate(places)]
+    text = b"point,easting,northing\nM1,5.000,0.000\nM2,10.000,0.000\n"
+    report = send(text, local_grid={"control_points": points})
+    assert report["stored"] == 2
+    assert report["local_grid"] is not None
+    assert report["local_grid"]["rotation_deg"] == pytest.approx(53.1301024, abs=1e-6)
+    assert report["local_grid"]["max_m"] == 0.0
+    assert report["crs"] == "EPSG:25832"
+    query = sa.select(markers.c.original, markers.c.lon_deg).where(
+        markers.c.survey_file_sha256 == report["file_sha256"]
+    )
+    with database.read() as connection, seeing_every_agency(connection):
+        (original, lon_deg), _second = connection.execute(query.order_by(markers.c.id)).all()
+    assert (original["local_easting_m"], original["local_northing_m"]) == (5.0, 0.0)
+    to_degrees = Transformer.from_crs("EPSG:25832", "EPSG:4258", always_xy=True).transform
+    assert lon_deg == pytest.approx(to_degrees(457003.0, 5428004.0)[0], abs=2e-6)
+    with pytest.raises(InvalidParameter, match="do not fit each other"):
+        send(text, local_grid={"control_points": [{**points[0], "easting": 456999.0}, points[1]]})

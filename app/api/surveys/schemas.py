@@ -40,6 +40,26 @@ class SurveyIn(StrictModel):
     )
 
 
+class ControlPointIn(StrictModel):
+    """A point that is known in a local grid and in the declared CRS."""
+
+    point: Name = Field(description="Its point number.")
+    easting: Number = Field(description="In the CRS and its unit.")
+    northing: Number = Field(description="In the CRS and its unit.")
+    local_easting: Number | None = Field(None, description="That of the row with this point number without.")
+    local_northing: Number | None = Field(None, description="That of the row with this point number without.")
+
+
+class LocalGridIn(StrictModel):
+    """How coordinates of a local grid are transformed: a similarity transformation by least squares."""
+
+    control_points: Annotated[list[ControlPointIn], Field(min_length=2, max_length=100)]
+    scale: Literal["fixed", "free"] = Field("fixed", description="1, or estimated of at least three points.")
+    limit_m: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=10)] = Field(
+        0.05, description="Largest residual of a control point. [m]"
+    )
+
+
 if TYPE_CHECKING:
 
     class _FamilyMembers(BaseModel):
@@ -81,6 +101,7 @@ class DeclarationIn(_FamilyMembers):
     )
     unit: Unit | None = Field(None, description="Of projected coordinates; the CRS's own without.")
     height_unit: Unit | None = None
+    local_grid: LocalGridIn | None = Field(None, description="Where easting and northing are of a local grid.")
     ignore_heights: Annotated[bool, Field(strict=True)] = False
     area_deg: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
         None, description="west, south, east, north that all rows lie in. [deg]"

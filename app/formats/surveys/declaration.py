@@ -34,6 +34,62 @@ MAX_AREA_DEG = 30.0
 
 
 @dataclass(frozen=True, slots=True)
+class ControlPoint:
+    """A point that is known in a local grid and in the declared CRS.
+
+    Attributes
+    ----------
+    point : str
+        Its point number, which names it in reports and in the file.
+    easting, northing : float
+        In the CRS and its unit.
+    local_easting, local_northing : float, optional
+        In the local grid, in the unit of the file; those of the row with the same point number without.
+    """
+
+    point: str
+    easting: float
+    northing: float
+    local_easting: float | None = None
+    local_northing: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LocalGrid:
+    """How coordinates of a local grid are transformed to the declared CRS.
+
+    Attributes
+    ----------
+    control_points : tuple of ControlPoint
+    scale : str
+        ``fixed`` (1, as for distances that are reduced to the grid) or ``free`` (estimated).
+    limit_m : float
+        Largest residual of a control point. [m]
+    """
+
+    control_points: tuple[ControlPoint, ...]
+    scale: str = "fixed"
+    limit_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        needed = 2 if self.scale == "fixed" else 3
+        if len(self.control_points) < needed:
+            raise InvalidParameter(
+                f"{len(self.control_points)} control points leave no residuals to check",
+                field="local_grid.control_points",
+                limit=f"at least {needed} with scale {self.scale}",
+                cure="declare further control points",
+            )
+        names = [control.point for control in self.control_points]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise InvalidParameter(
+                f"the control point {twice[:40]!r} is declared twice", field="local_grid.control_points",
+                limit="each point once", cure="leave one of the two out",
+            )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
 class ImportDeclaration:
     """What is declared of a survey.
 
@@ -54,6 +110,8 @@ class ImportDeclaration:
         Frame of the coordinates. [epoch: decimal year]
     unit, height_unit : str, optional
         ``m``, ``ft-us`` or ``ft-intl``; that of the CRS without.
+    local_grid : LocalGrid, optional
+        Where easting and northing are those of a local grid.
     ignore_heights : bool
         Leave heights out.
     area_deg : tuple of four floats, optional
@@ -87,6 +145,7 @@ class ImportDeclaration:
     vertical_datum: str | None = None
     unit: str | None = None
     height_unit: str | None = None
+    local_grid: LocalGrid | None = None
     ignore_heights: bool = False
     area_deg: tuple[float, float, float, float] | None = None
     height_range_m: tuple[float, float] | None = None

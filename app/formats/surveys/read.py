@@ -65,9 +65,18 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: 
     has_height = read.height is not None
     unit, height_unit, feet = _units(source, declaration, system, has_height=has_height)
     _check_datum(declaration, has_height=has_height)
-    first, zone = without_zone(read.first, system) if unit == "m" else (read.first, None)
+    is_local = declaration.local_grid is not None
+    if is_local and not system.is_projected:
+        raise InvalidParameter(
+            f"a local grid is transformed to eastings and northings, {crs} has none",
+            field="crs",
+            limit="a projected CRS",
+            cure="declare the CRS of the control points",
+        )
+    first, zone = without_zone(read.first, system) if unit == "m" and not is_local else (read.first, None)
     faults += [*read.faults, *feet, *_unit_names(source, places, unit, height_unit, has_height=has_height)]
-    faults += check_second_pair(replace(read, first=first), crs, unit_factor(unit, system))
+    if not is_local:
+        faults += check_second_pair(replace(read, first=first), crs, unit_factor(unit, system))
     if zone is not None:
         evidence = f"the eastings begin with {zone}, the zone of {crs}"
         read.detected.append(Detected("zone in the eastings", str(zone), evidence))

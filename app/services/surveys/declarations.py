@@ -7,7 +7,7 @@ from typing import Any
 
 from app.errors import naming
 from app.families import FAMILIES
-from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.declaration import ControlPoint, ImportDeclaration, LocalGrid
 from app.services.surveys.imports import ImportInput
 
 _SURVEYS = {family.name: family.survey for family in FAMILIES if family.survey is not None}
@@ -35,6 +35,9 @@ def import_input(declared: Mapping[str, Any], data: bytes) -> ImportInput:
     for name in ("area_deg", "height_range_m"):
         values[name] = tuple(values[name]) if values[name] is not None else None
     with naming("declaration"):
+        if (grid := values["local_grid"]) is not None:
+            points = tuple(ControlPoint(**point) for point in grid["control_points"])
+            values["local_grid"] = LocalGrid(**{**grid, "control_points": points})
         defaults = _defaults(declared)
         declaration = ImportDeclaration(**values)
     strict = declared["warnings"] == "refuse"

@@ -14,6 +14,7 @@ from app.services.documents import document_of
 from app.services.error_documents import ErrorDocument, cut_text
 from app.services.markers.accuracy import AccuracyDocument
 from app.surveys.comparison import ComparisonFigures
+from app.surveys.local_grid import LocalGridDocument
 
 _MAX_TEXT_BYTES, _MAX_FIELD_BYTES = 320, 120  # source: a report of a thousand faults then takes less than 1 MB
 Outcome = Literal["checked", "stored", "refused"]
@@ -69,6 +70,7 @@ class ImportReport(TypedDict):
     localization_grade: str
     transform_note: str | None
     detected: Annotated[list[DetectedDocument], Field(description="What was not declared, with its evidence.")]
+    local_grid: LocalGridDocument | None
     accuracy: Annotated[AccuracyDocument, Field(description="Of the RMSE that was declared for the whole survey.")]
     rows: int
     good_rows: int

@@ -112,6 +112,8 @@ def _originals(survey: GeoreferencedSurvey, rows: Rows, declaration: ImportDecla
     names = ("easting", "northing") if table.projected else ("lon_deg", "lat_deg")
     if table.projected and table.unit == "m":
         names = ("easting_m", "northing_m")
+    if declaration.local_grid is not None:
+        names = (f"local_{names[0]}", f"local_{names[1]}")
     same = _known(
         unit=table.unit if table.projected and table.unit != "m" else None,
         crs=table.crs,

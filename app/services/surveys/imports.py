@@ -19,18 +19,16 @@ from app.families.rules import PLANNED, MarkerRules
 from app.families.surveys import RowCodes, Rows
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
-from app.formats.surveys.table import Fault, Floats, Severity, SurveyTable
+from app.formats.surveys.table import Fault, Severity, SurveyTable
 from app.plots.residual_map import draw_residuals
 from app.registry import bulk
 from app.registry import markers as store
 from app.registry.audit import AuditEntry, recording
-from app.registry.bulk import PlaceRow
 from app.registry.bulk_load import LARGE
 from app.registry.columns import Columns
 from app.registry.database import Database
 from app.registry.ids import new_ids
 from app.registry.marker_rows import MarkerRow
-from app.registry.spatial import Box
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
 from app.services.decoder_processes import DecoderProcesses, Task
@@ -47,13 +45,15 @@ from app.services.surveys.documents import (
     fault_document,
 )
 from app.services.surveys.import_codes import assign_codes
+from app.services.surveys.import_neighbours import MAX_NEIGHBOURS, list_neighbours, places_of, survey_box
 from app.services.surveys.import_rows import check_values, common_columns, marker_columns
 from app.services.version_kinds import kind_of_change, kind_of_new
 from app.surveys.comparison import Comparison, check_residuals, compare_survey
 from app.surveys.consistency_checks import check_consistency
-from app.surveys.duplicates import RegisteredPoints, find_duplicates
+from app.surveys.duplicates import find_duplicates
 from app.surveys.georeference import GeoreferencedSurvey, georeference_survey
-from app.surveys.location_checks import NEAR_M, Neighbours, check_location
+from app.surveys.local_grid import LocalGridDocument, apply_local_grid
+from app.surveys.location_checks import check_location
 
 ALL: Final = "all"
 SURVEYED = tuple(name for name, family in zip(FAMILY_NAMES, FAMILIES, strict=True) if family.survey is not None)
@@ -62,13 +62,11 @@ READ, SETTLED = 0.3, 0.5
 """How far an import is when its file was read, and when it goes to store what is good."""
 MAX_FAULTS = 1000
 _KNOWN_M = 5_000.0
-_NEIGHBOURS = 50_000
 _BUSY_WAIT_S = 10.0
 _PART = 2000
 _ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
 _STANDING = "place_by_area_only"
 """The caution that every survey of a new road gets, however well it is declared."""
-_MARGIN_DEG = NEAR_M / 90_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +136,11 @@ class Imports:
         pending = self._processes.submit(
             SurveyTask(given.data, given.declaration, _code_form(given)), wait_s=_BUSY_WAIT_S
         )
-        survey = georeference_survey(pending.result(), given.declaration, self._rules.crs_accuracy_m)
+        table, grid = apply_local_grid(pending.result(), given.declaration)
+        survey = georeference_survey(table, given.declaration, self._rules.crs_accuracy_m)
         step(READ)
         registration = Registration(caller.agency_id, now, self._rules, self._database)
-        running = _Running(caller, given, survey, registration, hashlib.sha256(given.data).hexdigest())
+        running = _Running(caller, given, survey, grid, registration, hashlib.sha256(given.data).hexdigest())
         with self._database.read() as connection:
             running.check(connection)
         step(SETTLED)
@@ -166,9 +165,16 @@ class _Running:
     """An import between its steps."""
 
     def __init__(
-        self, caller: Caller, given: ImportInput, survey: GeoreferencedSurvey, registration: Registration, sha256: str
+        self,
+        caller: Caller,
+        given: ImportInput,
+        survey: GeoreferencedSurvey,
+        grid: LocalGridDocument | None,
+        registration: Registration,
+        sha256: str,
     ) -> None:
         self._caller, self._given, self._survey, self._now = caller, given, survey, registration.now
+        self._grid = grid
         self._sha256, self._registration, self._rules = sha256, registration, registration.rules
         self._faults = survey.table.faults
         self._faults.add(check_consistency(survey))
@@ -180,7 +186,7 @@ class _Running:
 
     def check(self, connection: sa.Connection) -> None:
         """Hold the survey against the registry's places."""
-        neighbours, registered = self._neighbours(connection)
+        neighbours, registered = list_neighbours(connection, self._caller.agency_id, self._survey)
         is_known = partial(self._is_known, connection)
         self._faults.add(check_location(self._survey, self._given.declaration, neighbours, is_known))
         self._faults.add(find_duplicates(self._survey, self._given.declaration, self._sha256, registered))
@@ -253,6 +259,7 @@ class _Running:
             "localization_grade": str(placed.grade),
             "transform_note": placed.note,
             "detected": [detected_document(detected) for detected in table.detected],
+            "local_grid": self._grid,
             "accuracy": accuracy_document(*(self._given.declaration.survey.get(name) for name in _ACCURACY)),
             "rows": table.rows,
             "good_rows": good,
@@ -287,32 +294,6 @@ class _Running:
     def _is_known(self, connection: sa.Connection, lon_deg: float, lat_deg: float) -> bool:
         return bulk.is_any_near(connection, self._caller.agency_id, lon_deg, lat_deg, _KNOWN_M)
 
-    def _box(self) -> Box | None:
-        """The box of the middle nine tenths of the rows, widened: one row far away must not stretch it."""
-        placed = self._survey.placed
-        if not placed.placed.any():
-            return None
-        west, east = np.quantile(placed.lon_deg[placed.placed], [0.05, 0.95])
-        south, north = np.quantile(placed.lat_deg[placed.placed], [0.05, 0.95])
-        wide, high = _MARGIN_DEG * 2 + (east - west) / 8, _MARGIN_DEG + (north - south) / 8
-        clipped = np.clip([west - wide, east + wide], -180.0, 180.0), np.clip([south - high, north + high], -90.0, 90.0)
-        return Box(float(clipped[0][0]), float(clipped[1][0]), float(clipped[0][1]), float(clipped[1][1]))
-
-    def _neighbours(self, connection: sa.Connection) -> tuple[Neighbours, RegisteredPoints]:
-        box = self._box()
-        agency_id = self._caller.agency_id
-        found = bulk.list_places_in(connection, agency_id, box, limit=_NEIGHBOURS) if box is not None else []
-        lon, lat, height = _places(found)
-        registered = RegisteredPoints(
-            lon,
-            lat,
-            tuple(row.id for row in found),
-            tuple(row.family for row in found),
-            tuple(row.point for row in found),
-            tuple(row.survey_file_sha256 for row in found),
-        )
-        return Neighbours(lon, lat, height, tuple(row.vertical_datum for row in found)), registered
-
     def _compare(self, connection: sa.Connection, good: Rows) -> None:
         declaration = self._given.declaration
         codes = self._survey.table.texts.get("code")
@@ -327,11 +308,11 @@ class _Running:
         if declaration.match == "code":
             assert codes is not None
             matched = self._by_code(connection, codes, good)
-        elif (box := self._box()) is not None:
+        elif (box := survey_box(self._survey)) is not None:
             self._known = bulk.list_markers_in(
-                connection, self._caller.agency_id, declaration.family, box, limit=_NEIGHBOURS
+                connection, self._caller.agency_id, declaration.family, box, limit=MAX_NEIGHBOURS
             )
-        lon, lat, height = _places(self._known)
+        lon, lat, height = places_of(self._known)
         self._comparison = compare_survey(self._survey, lon, lat, height, matched)
         self._faults.add(check_residuals(self._comparison, declaration.tolerance_m))
 
@@ -431,12 +412,6 @@ class _Running:
         tolerance_m = self._given.declaration.tolerance_m
         drawn = draw_residuals(self._survey, found, tolerance_m)
         return {**found.document(tolerance_m), "residuals": residuals, "map_svg": drawn}
-
-
-def _places(rows: Sequence[MarkerRow | PlaceRow]) -> tuple[Floats, Floats, Floats]:
-    values = [(row.lon_deg, row.lat_deg, np.nan if row.height_m is None else row.height_m) for row in rows]
-    array = np.array(values, dtype=np.float64).reshape(-1, 3)
-    return array[:, 0], array[:, 1], array[:, 2]
 
 
 def _square_deg(marker: MarkerRow, lon_deg: float, lat_deg: float) -> float:
