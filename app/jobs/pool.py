@@ -1,16 +1,22 @@
-"""Decoder processes: children with limits, each behind a thread and a pipe of its own, and outlived by the pool."""
+"""Decoder processes: children with limits, each behind a thread and a pipe of its own, and outlived by the pool.
+
+Agencies share them: their tasks are taken in turn, and one agency holds at most half of the places while others
+want some.
+"""
 
 from __future__ import annotations
 
 import os
-import queue
 import threading
 from typing import Any, TypeVar
 
 from app.errors import Unavailable
 from app.jobs.decoder_process import ONE_THREAD, ProcessIdTask, ProcessLimits
+from app.jobs.fair_queue import FairQueue
 from app.jobs.frame_tasks import DecodePlates
+from app.jobs.places import Places
 from app.jobs.supervisor import Pending, WorkerSupervisor
+from app.registry.tenancy import whose_rows
 from app.services.decoder_processes import Task
 
 ResultT = TypeVar("ResultT")
@@ -28,7 +34,8 @@ class DecodePool:
     max_pixels : int
         Largest picture that OpenCV in a child decodes, in case the check of the header misses one. [px]
     max_waiting : int
-        Largest number of tasks that wait or are carried out; more are refused as busy.
+        Largest number of tasks that wait or are carried out; more are refused as busy. An agency that has fewer than
+        two is never refused.
     """
 
     def __init__(
@@ -44,9 +51,9 @@ class DecodePool:
         self._workers = workers
         self._limits = limits or ProcessLimits()
         self._max_pixels = max_pixels
-        self._places = threading.BoundedSemaphore(max_waiting)
+        self._places = Places(max_waiting)
         self._lock = threading.Lock()
-        self._tasks: queue.SimpleQueue[Pending[Any] | None] = queue.SimpleQueue()
+        self._tasks: FairQueue[Pending[Any]] = FairQueue()
         self._supervisors: list[WorkerSupervisor] = []
         self._closed = False
 
@@ -72,8 +79,7 @@ class DecodePool:
             supervisors, self._supervisors = self._supervisors, []
         for supervisor in supervisors:
             supervisor.close()
-        for _supervisor in supervisors:
-            self._tasks.put(None)
+        self._tasks.close()
         for supervisor in supervisors:
             supervisor.join()
 
@@ -86,17 +92,17 @@ class DecodePool:
 
     def submit(self, task: Task[ResultT], *, wait_s: float = 0.0) -> Pending[ResultT]:
         """As `DecoderProcesses.submit`; `Unavailable` also where the pool was closed."""
-        if not (self._places.acquire(timeout=wait_s) if wait_s else self._places.acquire(blocking=False)):
-            raise Unavailable("every decoder process is busy", cure="try again in a few seconds")
+        agency_id = whose_rows()
+        self._places.take(agency_id, wait_s)
         timeout_s = self._limits.trace_timeout_s if task.is_long else self._limits.timeout_s
         pending: Pending[ResultT] = Pending(task.steps(), self._interrupt, timeout_s)
-        pending.future.add_done_callback(lambda _future: self._places.release())
+        pending.future.add_done_callback(lambda _future: self._places.give_back(agency_id))
         with self._lock:
             if self._closed:
                 pending.future.cancel()
                 raise Unavailable("the server is stopping", cure="try again in a few seconds")
             self._start_supervisors()
-            self._tasks.put(pending)
+            self._tasks.put(agency_id, pending)
         return pending
 
     def _interrupt(self, pending: Pending[Any]) -> None:

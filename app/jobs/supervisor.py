@@ -17,6 +17,7 @@ import structlog
 
 from app.errors import Unavailable, UnreadableUpload
 from app.jobs.decoder_process import READY, ProcessLimits, serve_tasks
+from app.jobs.fair_queue import FairQueue
 from app.jobs.frame_tasks import DecodePlates
 from app.jobs.tasks import STEPS
 from app.services.request_work import add_processor_time, check_deadline
@@ -92,16 +93,14 @@ class WorkerSupervisor(threading.Thread):
 
     Parameters
     ----------
-    tasks : SimpleQueue of Pending or None
-        Shared with the other supervisors; None ends one of them.
+    tasks : FairQueue of Pending
+        Shared with the other supervisors; they end when it is closed.
     decode : callable
         `decode_plates`, imported by name in the process.
     limits : ProcessLimits
     """
 
-    def __init__(
-        self, tasks: queue.SimpleQueue[Pending[Any] | None], decode: DecodePlates, limits: ProcessLimits
-    ) -> None:
+    def __init__(self, tasks: FairQueue[Pending[Any]], decode: DecodePlates, limits: ProcessLimits) -> None:
         super().__init__(name="decoder-supervisor", daemon=True)
         self._tasks = tasks
         self._decode = decode
@@ -126,18 +125,18 @@ class WorkerSupervisor(threading.Thread):
                 self._process.kill()
 
     def close(self) -> None:
-        """Kill the process and refuse further tasks; the thread ends at the next None."""
+        """Kill the process and refuse further tasks; the thread ends with the queue."""
         with self._lock:
             self._closing = True
             if self._process is not None:
                 self._process.kill()
 
     def run(self) -> None:
-        """Serve until a None comes."""
+        """Serve until the queue is closed and empty."""
         self._start_early()
         while True:
             try:
-                pending = self._tasks.get(timeout=_CHECK_S)
+                pending = self._tasks.get(_CHECK_S)
             except queue.Empty:
                 self._start_early()
                 continue

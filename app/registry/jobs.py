@@ -130,10 +130,11 @@ def find_job_about(
     return find_one(connection, query.order_by(jobs.c.id.desc()).limit(1), JobRow)
 
 
-def list_unfinished(connection: sa.Connection, kinds: Sequence[JobKind] = tuple(JobKind)) -> list[str]:
-    """Ids of the jobs of some kinds and all agencies that are still to be done, oldest first."""
-    query = sa.select(jobs.c.id).where(jobs.c.state.in_(UNFINISHED), _of_kind(kinds)).order_by(jobs.c.id)
-    return list(connection.execute(query).scalars())
+def list_unfinished(connection: sa.Connection, kinds: Sequence[JobKind] = tuple(JobKind)) -> list[tuple[str, str]]:
+    """Ids and agencies of the jobs of some kinds and all agencies that are still to be done, oldest first."""
+    unfinished = jobs.c.state.in_(UNFINISHED)
+    query = sa.select(jobs.c.id, jobs.c.agency_id).where(unfinished, _of_kind(kinds)).order_by(jobs.c.id)
+    return [(job_id, agency_id) for job_id, agency_id in connection.execute(query)]
 
 
 def start_job(connection: sa.Connection, job_id: str) -> JobRow | None:

@@ -130,8 +130,8 @@ class Jobs:
             with acting_for(row.agency_id):
                 self._run(RunningJob(self._database, self._clock, row))
 
-    def list_unfinished(self, kinds: Sequence[JobKind] = tuple(JobKind)) -> list[str]:
-        """Jobs of some kinds that an earlier process left unfinished."""
+    def list_unfinished(self, kinds: Sequence[JobKind] = tuple(JobKind)) -> list[tuple[str, str]]:
+        """Ids and agencies of the jobs of some kinds that an earlier process left unfinished."""
         with across_agencies(), self._database.read() as connection:
             return store.list_unfinished(connection, kinds)
 

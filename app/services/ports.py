@@ -43,5 +43,5 @@ class Blobs(Protocol):
 class JobQueue(Protocol):
     """Where jobs wait for a worker."""
 
-    def submit(self, job_id: str) -> None:
-        """Have ``run_job(job_id)`` called, at least once."""
+    def submit(self, job_id: str, agency_id: str) -> None:
+        """Have ``run_job(job_id)`` called, at least once; agencies take turns."""

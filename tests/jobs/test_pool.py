@@ -22,6 +22,7 @@ from app.jobs.pool import DecodePool
 from app.jobs.supervisor import Pending, WorkerSupervisor
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
+from app.registry.tenancy import acting_for
 from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameResult, FrameSearch, FrameTask, Outline
 from tests.formats.pictures import huge_png, jpeg, lying_png, png
 from tests.http import wait_until
@@ -191,6 +192,27 @@ def test_more_frames_than_places_are_refused_as_busy(tmp_path: Path) -> None:
         for pending in waiting:
             pending.result()
         start(small, standin.OBEY).result()
+    finally:
+        small.close()
+
+
+def test_an_agency_that_takes_every_place_keeps_no_other_from_its_own(tmp_path: Path) -> None:
+    small = DecodePool(partial(standin.hold, tmp_path), workers=1, max_waiting=3)
+    small.open()
+    try:
+        with acting_for("one"):
+            waiting = [start(small, standin.OBEY) for _ in range(3)]
+            with pytest.raises(Unavailable, match="3 tasks of this agency"):
+                start(small, standin.OBEY)
+        with acting_for("two"):
+            waiting.append(start(small, standin.OBEY))
+        ended: list[int] = []
+        for number, pending in enumerate(waiting):
+            pending.future.add_done_callback(lambda _future, number=number: ended.append(number))
+        (tmp_path / "go").touch()
+        for pending in waiting:
+            pending.result()
+        assert ended == [0, 3, 1, 2]
     finally:
         small.close()
 

@@ -119,7 +119,7 @@ class Decodes:
                 count_upload(connection, agency_id, row.id, upload.context, now)
                 document = answer.store(decode_document(row))
             stage.keep()
-        self._queue.submit(row.id)
+        self._queue.submit(row.id, agency_id)
         return document, False
 
     def run(self, job: RunningJob) -> None:

@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
 from typing import Any, TypeVar
 
 from app.errors import Unavailable
@@ -35,7 +36,7 @@ def tasks_as_done(
     pool = ThreadPoolExecutor(in_flight, thread_name_prefix="plan-tasks")
     done: queue.SimpleQueue[Future[ResultT]] = queue.SimpleQueue()  # in the order in which they ended
     try:
-        futures = {pool.submit(feeder.carry_out, task): key for key, task in tasks}
+        futures = {pool.submit(copy_context().run, feeder.carry_out, task): key for key, task in tasks}
         for future in futures:
             future.add_done_callback(done.put)
         for _ in range(len(futures)):

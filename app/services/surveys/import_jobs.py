@@ -87,7 +87,7 @@ class ImportJobs:
                 store.add_job(connection, job)
                 document = answer.store(import_job_document(job))
             stage.keep()
-        self._queue.submit(job.id)
+        self._queue.submit(job.id, job.agency_id)
         return document, False
 
     def get(self, caller: Caller, import_id: str) -> ImportJobDocument:
