@@ -160,6 +160,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app = FastAPI(
         title="Waymark",
         version=__version__,
+        openapi_url=None,  # app/api/http/ui.py has the document and the pages about it
         lifespan=lambda _app: _running(settings, outside, use_cases),
         default_response_class=Response,
         generate_unique_id_function=operation_id,

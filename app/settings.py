@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from pathlib import Path
 from typing import Literal, Self
 
@@ -111,6 +112,11 @@ class Settings(BaseSettings):
         default=30.0, ge=0, le=1e6, description="Maximum rate of wrong keys from one address; 0: unlimited. [1/min]"
     )
 
+    trusted_proxies: str = Field(
+        default="",
+        description="Addresses of proxies whose X-Forwarded-For and X-Forwarded-Proto are accepted, separated by "
+        "commas; empty: none.",
+    )
     key_processor_s_per_min: float = Field(
         default=120.0,
         ge=0,
@@ -154,6 +160,14 @@ class Settings(BaseSettings):
             raise ValueError(f"an admin key has at least {MIN_ADMIN_KEY_CHARACTERS} characters")
         return key
 
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _are_addresses(cls, addresses: str) -> str:
+        for address in addresses.split(","):
+            if address.strip():
+                ipaddress.ip_address(address.strip())
+        return addresses
+
     @field_validator("proj_grids_dir")
     @classmethod
     def _is_folder(cls, folder: Path | None) -> Path | None:
@@ -174,6 +188,11 @@ class Settings(BaseSettings):
         if self.oidc_jwks.startswith("http://") and not self.oidc_jwks.startswith(_LOOPBACK):
             raise ValueError("oidc_jwks is fetched by https")
         return self
+
+    @property
+    def proxies(self) -> list[str]:
+        """The addresses of trusted proxies."""
+        return [address.strip() for address in self.trusted_proxies.split(",") if address.strip()]
 
     @property
     def resolved_database_url(self) -> str:

@@ -51,12 +51,15 @@ def serve_until_stopped(settings: Settings) -> None:
         min_bytes_per_s=settings.min_bytes_per_s,
         total=settings.max_connections,
         per_address=settings.max_connections_per_address,
+        proxies=frozenset(settings.proxies),
     )
     config = uvicorn.Config(
         create_app(settings),
         host=settings.host,
         port=settings.port,
         http=limited_connections(limits),
+        proxy_headers=bool(settings.proxies),
+        forwarded_allow_ips=settings.proxies,
         ws="none",
         log_config=None,
         access_log=False,

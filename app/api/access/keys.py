@@ -20,7 +20,7 @@ from app.services.access.keys import MAX_OVERLAP, Keys, NewKey
 router = APIRouter(prefix="/v1/keys", tags=["access"], route_class=StrictRoute)
 
 _DAY_S = 86_400
-_NO_STORE = {"Cache-Control": "no-store"}
+_NO_STORE = {"Cache-Control": "private, no-store"}
 KeyId = Annotated[Identifier, Path(description="Id of the key.")]
 
 

@@ -110,7 +110,7 @@ def cancel_decode(decode_id: DecodeId, caller: Caller, decodes: Decodes) -> Resp
 )
 def get_plot(decode_id: DecodeId, caller: Caller, outputs: Outputs, if_none_match: IfNoneMatch = None) -> Response:
     """What was found: magnets, tags and line crossings in a trace, or the lane and the radio of a packet log."""
-    headers = {"ETag": f'"{decode_id}-plot"', "Cache-Control": "private, max-age=86400"}
+    headers = {"ETag": f'"{decode_id}-plot"', "Cache-Control": "private, no-cache"}
     plot = outputs.plot(caller, decode_id)
     if if_none_match == headers["ETag"]:
         return Response(status_code=304, headers=headers)
@@ -140,7 +140,7 @@ def get_overlay(
     if_none_match: IfNoneMatch = None,
 ) -> Response:
     """The camera frame of a packet log with the lane drawn over it, drawn when it is asked for."""
-    headers = {"ETag": f'"{decode_id}-overlay-{suffix}"', "Cache-Control": "private, max-age=86400"}
+    headers = {"ETag": f'"{decode_id}-overlay-{suffix}"', "Cache-Control": "private, no-cache"}
     if if_none_match == headers["ETag"]:
         decodes.get(caller, decode_id)
         return Response(status_code=304, headers=headers)
@@ -161,7 +161,7 @@ def get_annotated(
     if_none_match: IfNoneMatch = None,
 ) -> Response:
     """The frame with outlines, digits and confidence of its readings, drawn when it is asked for."""
-    headers = {"ETag": f'"{decode_id}-{frame}-{suffix}"', "Cache-Control": "private, max-age=86400"}
+    headers = {"ETag": f'"{decode_id}-{frame}-{suffix}"', "Cache-Control": "private, no-cache"}
     if if_none_match == headers["ETag"]:
         decodes.get(caller, decode_id)
         return Response(status_code=304, headers=headers)

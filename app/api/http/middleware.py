@@ -26,6 +26,9 @@ from app.services.access.access import Caller
 PROTECTED = ("/v1", "/ogc")
 _METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 _AUTH_THREADS = 4
+_UNKNOWN_PER_S = 20.0
+"""Unknown keys from an address that sent too many wrong ones that are checked per second. Source: chosen by hand; a key
+that an operator chose has 24 characters or more, and 20/s are 600 million guesses a year."""
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _LOG = structlog.get_logger("waymark.access")
 
@@ -63,6 +66,7 @@ class Observed:
                 status = message["status"]
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = request_id
+                _protect(headers)
                 headers.raw.extend(scope["state"].get("rate_limit", ()))
             await send(message)
 
@@ -89,6 +93,13 @@ class Observed:
             ms=round(seconds * 1000, 2),
             agency=scope["state"].get("agency_id"),
         )
+
+
+def _protect(headers: MutableHeaders) -> None:
+    """No cache may give a response to another key, and no browser may guess its type (docs/access.md, "Caches")."""
+    headers.setdefault("Cache-Control", "private, no-cache" if "ETag" in headers else "private, no-store")
+    headers.setdefault("X-Content-Type-Options", "nosniff")
+    headers.add_vary_header("Authorization, X-API-Key")
 
 
 class Guarded:
@@ -148,6 +159,7 @@ class Guarded:
         self._permissions = permissions
         self._body_timeout_s = body_timeout_s
         self._min_bytes_per_s = min_bytes_per_s
+        self._unknown = RateLimit(_UNKNOWN_PER_S, 1, name="unknown-keys", message="", cure="")
         self._budget = budget
         self._slots = slots
         self._request_timeout_s = request_timeout_s
@@ -236,8 +248,9 @@ class Guarded:
             return await to_thread.run_sync(self._authenticate, key, limiter=self._threads)
         client = scope.get("client")
         address = address_of(client[0]) if client else "unknown"
-        if not self._was_valid(key):  # those who share an address with a guesser go on with what they have
-            self._failures.check(address)
+        if not self._was_valid(key) and self._failures.is_spent(address):
+            # a valid key that comes from the address of a guesser is delayed, but never refused
+            await anyio.sleep(self._unknown.reserve_s(address))
         try:
             return await to_thread.run_sync(self._authenticate, key, limiter=self._threads)
         except NotAuthenticated:

@@ -34,7 +34,6 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /": PUBLIC,
     "GET /static": PUBLIC,
     "GET /docs": PUBLIC,
-    "GET /docs/oauth2-redirect": PUBLIC,
     "GET /redoc": PUBLIC,
     "GET /openapi.json": PUBLIC,
     "GET /healthz": PUBLIC,

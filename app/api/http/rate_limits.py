@@ -82,9 +82,21 @@ class RateLimit:
         TooManyRequests
             It is.
         """
-        wait_s = self._full_at_s.get(owner, 0.0) - self._now_s() + self._token_s - self._bucket_s
-        if wait_s > 1e-9:
-            raise self._refusal(wait_s)
+        if self.is_spent(owner):
+            raise self._refusal(self._wait_s(owner))
+
+    def is_spent(self, owner: str) -> bool:
+        """Whether an owner's bucket is empty."""
+        return self._wait_s(owner) > 1e-9
+
+    def reserve_s(self, owner: str) -> float:
+        """Take a token, or the one that comes after those that others wait for; returns the time until it comes. [s]"""
+        wait_s = max(0.0, self._wait_s(owner))
+        self.charge(owner, 1.0)
+        return wait_s
+
+    def _wait_s(self, owner: str) -> float:
+        return self._full_at_s.get(owner, 0.0) - self._now_s() + self._token_s - self._bucket_s
 
     def charge(self, owner: str, tokens: float) -> None:
         """Take tokens that were used already; the bucket may be overdrawn, and `check` then refuses."""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import FileResponse
 from starlette.datastructures import MutableHeaders
 from starlette.staticfiles import StaticFiles
 from starlette.types import Message, Receive, Scope, Send
+
+from app.api.http.responses import json_response
 
 STATIC = Path(__file__).resolve().parents[3] / "static"
 _HEADERS = {
@@ -20,6 +22,10 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
 }
+_REDOC_STYLES = (
+    "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=' 'sha256-QMIg+bpjm3JdElJ388KYke01izlUW0UoNOeKjpMxdgc='"
+)
+"""Hashes of the two style elements that Redoc makes: an empty one, which its script fills, and that of its menu."""
 
 router = APIRouter()
 
@@ -28,6 +34,25 @@ router = APIRouter()
 def get_page() -> FileResponse:
     """The page; everything else that it needs is under /static."""
     return FileResponse(STATIC / "index.html", headers=_HEADERS)
+
+
+@router.get("/docs", response_class=FileResponse, include_in_schema=False)
+def get_docs() -> FileResponse:
+    """The API's documentation by Swagger UI, from static/vendor."""
+    return FileResponse(STATIC / "docs.html", headers=_HEADERS)
+
+
+@router.get("/redoc", response_class=FileResponse, include_in_schema=False)
+def get_redoc() -> FileResponse:
+    """The API's reference by Redoc, from static/vendor."""
+    policy = _HEADERS["Content-Security-Policy"].replace("style-src 'self'", f"style-src 'self' {_REDOC_STYLES}")
+    return FileResponse(STATIC / "redoc.html", headers=_HEADERS | {"Content-Security-Policy": policy})
+
+
+@router.get("/openapi.json", include_in_schema=False)
+def get_openapi_document(request: Request) -> Response:
+    """The OpenAPI document."""
+    return json_response(request.app.openapi(), headers={"Cache-Control": "no-cache"})
 
 
 def mount_static(app: FastAPI) -> None:
