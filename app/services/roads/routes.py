@@ -119,7 +119,7 @@ def references_of(
         if abs(foot.beyond_m) > _ON_END_M:
             found.append(Reference(None, None, f"{abs(foot.beyond_m):.2f} m beyond the road's end"))
             continue
-        found.append(Reference(route.measure_of(foot), foot.offset_m))
+        found.append(Reference(route.measure_of(foot), foot.offset_m + 0.0))  # SQLite stores no -0.0
     return found
 
 
