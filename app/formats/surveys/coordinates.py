@@ -26,6 +26,7 @@ _SRID = re.compile(r"SRID=([0-9]{4,6});", re.IGNORECASE)
 _AGREE_M = 5.0
 """Difference between two pairs of coordinates of a row that the datums of a continent explain. [m] Chosen by hand:
 above NAD83 - WGS 84 (1 to 2 m) and the rounding of five decimals of a degree, below NAD27 or ED50 (30 to 200 m)."""
+_FEW = 4  # rows whose heights may be equal by chance; chosen by hand
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
 
@@ -225,4 +226,7 @@ def _with_plausible_heights(read: Coordinates, declaration: ImportDeclaration) -
         cure = "measure the heights, or declare ignore_heights"
         read.faults.append(warn(None, "height", "zero_heights", message, cure))
         read.height = None
+    elif len(known) > _FEW and np.ptp(known) == 0:
+        message = f"all {len(known)} heights are {known[0]:g}, as devices without heights write them"
+        read.faults.append(warn(None, "height", "equal_heights", message, "declare ignore_heights to leave them out"))
     return read

@@ -61,7 +61,7 @@ def read_gsi(data: bytes, declaration: ImportDeclaration) -> SourceTable:
         columns["description"].append(_text(line, _REMARK))
         for index, name in indices.items():
             value = _length(line, index)
-            if value is None and index in line.words:
+            if value is None and not _is_missing(line, index):
                 message = f"line {line.number}: word {index} holds no number"
                 faults.add([Fault(row, name, "not_a_number", message, "export the points again")])
             columns[name].append(value)
@@ -91,6 +91,11 @@ def _lines(text: str) -> Iterator[_Line]:
 def _text(line: _Line, index: str) -> str:
     """Data of a word without the zeros that fill it."""
     return line.words[index][2].lstrip("0") or "0" if index in line.words else ""
+
+
+def _is_missing(line: _Line, index: str) -> bool:
+    """Whether there is no such word, or one without a value, which instruments write as dashes."""
+    return index not in line.words or (line.words[index][2].strip("0-") == "" and "-" in line.words[index][2])
 
 
 def _length(line: _Line, index: str) -> float | None:

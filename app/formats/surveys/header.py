@@ -101,6 +101,15 @@ def _is_header(row: Sequence[str], declaration: ImportDeclaration) -> bool:
 
 def _named(rows: Sequence[Sequence[str]], names: Sequence[str], index: int) -> Header:
     header = Header(tuple(name.strip() for name in names), index + 1)
+    widths = {len(row) for row in rows[header.start :]}
+    width = max(widths, default=len(names))
+    if width < len(names) and names_coordinates(header.names[:width]):
+        header.detected.append(
+            Detected(
+                "header", f"{width} names", f"the rows have {width} cells; {header.names[width][:40]!r} is no column"
+            )
+        )
+        header.names = header.names[:width]
     if header.start < len(rows) and sum(1 for cell in rows[header.start] if _UNIT.fullmatch(cell)) >= 2:
         header.start += 1
         cells = " ".join(cell.strip() for cell in rows[header.start - 1] if cell.strip())

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 
-from app.formats.surveys.table import Detected, Faults, SourceTable
+from app.formats.surveys.table import Detected, Fault, Faults, SourceTable, warn
 from app.formats.surveys.xml_reader import check_size, elements
 from app.formats.xml_tree import local_name
 
 _GRID = {"North": "northing", "East": "easting", "Elevation": "height"}
 _WGS84 = {"Latitude": "lat_deg", "Longitude": "lon_deg", "Height": "ellipsoidal_height"}
-_TEXTS = {"Name": "point", "Code": "code", "Method": "method"}
+_TEXTS = {"Name": "point", "Code": "code", "SurveyMethod": "method"}
+_POOR = ("Float", "Code", "Autonomous", "SBAS", "Differential")
+"""Ends of survey methods without fixed ambiguities: Trimble JobXML schema 5.3, SurveyMethodEnum."""
 _NAMES = (*_TEXTS.values(), *_GRID.values(), *_WGS84.values())
 
 
@@ -24,20 +26,32 @@ def read_jobxml(data: bytes) -> SourceTable:
         It is no XML, has a document type, or too many elements.
     """
     rows: list[dict[str, str | float | None]] = []
-    without = 0
+    without, faults = 0, Faults()
     for point in elements(data, "Point"):
         row = _row(point)
         if row is None:
             without += 1
         else:
             rows.append(row)
+            faults.add(_check_method(len(rows), str(row["method"] or "")))
         check_size(len(rows), len(_NAMES))
     detected = [Detected("unit", "m", "JobXML has its lengths in metres")]
     if without:
         detected.append(Detected("other points", f"{without} left out", "points without coordinates"))
     names = tuple(name for name in _NAMES if any(row[name] is not None for row in rows))
     columns = tuple([row[name] for row in rows] for name in names)
-    return SourceTable("jobxml", names, columns, unit="m", faults=Faults(), detected=tuple(detected))
+    return SourceTable("jobxml", names, columns, unit="m", faults=faults, detected=tuple(detected))
+
+
+def _check_method(row: int, method: str) -> list[Fault]:
+    """Warnings of points that were typed in, or measured without fixed ambiguities."""
+    if method == "KeyedIn":
+        message, cure = "the point was keyed in, not measured", "leave out points of the plan and of the control"
+        return [warn(row, "point", "keyed_in_point", message, cure)]
+    if method.endswith(_POOR):
+        message = f"the point was measured with {method}: decimetres to metres"
+        return [warn(row, "point", "poor_solution", message, "measure it again with fixed ambiguities")]
+    return []
 
 
 def _row(point: ET.Element) -> dict[str, str | float | None] | None:

@@ -101,6 +101,12 @@ def test_lines_before_the_rows(header: str, first: str | None) -> None:
     assert found["column of easting"]
 
 
+def test_names_beyond_the_cells_of_the_rows_are_none() -> None:
+    """Some programs write the project and the date behind the names."""
+    found = _check(_read(_text("P,E,N,H,D,PROJECT1,2020-07-21 12:00", "{k},{e},{n},{h},nail")))
+    assert found["header"] == "5 names"
+
+
 @pytest.mark.parametrize(
     ("row", "layout"),
     [

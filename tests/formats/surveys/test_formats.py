@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import ezdxf
@@ -18,6 +19,7 @@ from app.formats.surveys.read import read_survey
 from app.formats.surveys.table import SurveyTable
 from app.geodesy import place_positions
 
+DATA = Path(__file__).parents[2] / "data/surveys"
 UTM = {"crs": "EPSG:25832", "vertical_datum": "EPSG:7837"}
 
 
@@ -76,6 +78,15 @@ def test_stations_are_read_where_there_are_no_other_points() -> None:
     assert (list(read.texts["point"]), read.first.tolist(), read.second.tolist()) == (["STN1"], [12.345], [67.89])
 
 
+def test_gsi_without_heights() -> None:
+    """Dashes stand for a value that was not measured."""
+    read = _read(GSI_16.replace("0000000000112500", "00000000000-----"))
+    assert read.height is not None
+    assert np.isnan(read.height).tolist() == [True, False]
+    assert not read.faults.counts
+    assert _read(GSI_16.replace("0000000000112500", "00000000001a2500")).faults.counts == {"not_a_number": 1}
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -124,6 +135,30 @@ def test_jobxml_has_grid_and_wgs84_coordinates() -> None:
     assert (degrees.first.tolist(), degrees.second.tolist()) == ([8.40921, 8.40935], [48.99763, 48.99764])
     assert degrees.height is not None
     assert degrees.height.tolist() == [160.5, 160.6]
+
+
+def test_jobxml_of_a_receiver() -> None:
+    """The grid coordinates are where the receiver's own WGS 84 coordinates are, by PROJ within a centimetre."""
+    data = (DATA / "kierzkowo.jxl").read_bytes()
+    read = _read(data, crs="EPSG:2177", vertical_datum="EPSG:5621")  # ETRF2000-PL / CS2000/18: zone 6 in the eastings
+    assert list(read.texts["point"]) == ["413-1033", "413-1034", "101", "102", "103", "104", "105", "164"]
+    assert read.first[2] == 6492430.5665061
+    assert read.faults.counts == {"keyed_in_point": 2, "poor_solution": 1}
+    receiver = np.array([[17.882364673859, 54.775102817023], [17.88230642274, 54.77509893477]])
+    found = Transformer.from_crs("EPSG:2177", "EPSG:9702", always_xy=True).transform(read.first[2:4], read.second[2:4])
+    assert np.column_stack(found) == pytest.approx(receiver, abs=1e-7)
+    degrees = _read(data, crs="EPSG:4326", vertical_datum="ellipsoid")
+    assert np.column_stack([degrees.first[2:4], degrees.second[2:4]]) == pytest.approx(receiver, abs=1e-12)
+    wrong = _read(data, crs="EPSG:2178", vertical_datum="EPSG:5621")  # the zone of 21 degrees
+    assert wrong.faults.counts["coordinates_disagree"] == 1
+
+
+def test_gpx_of_a_receiver() -> None:
+    read = _read((DATA / "cerknicko_jezero.gpx").read_bytes(), crs=None)
+    assert read.rows == 7
+    assert (read.first[1], read.second[1], read.texts["point"][1]) == (14.294899916, 45.757933259, "BACK T TH")
+    assert read.faults.counts == {"equal_heights": 1}  # -0.11438 m in the karst of Slovenia
+    assert _detected(read)["tracks"] == "2 points left out"
 
 
 GPX = (
