@@ -9,12 +9,16 @@ import numpy as np
 
 from app.errors import WaymarkError
 from app.formats.surveys.declaration import METRES, ImportDeclaration
-from app.formats.surveys.grids import unit_factor
+from app.formats.surveys.grids import unit_factor, without_zone
 from app.formats.surveys.table import Floats, SurveyTable
 from app.geodesy import PlacedPositions, place_positions, reference_system
 
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 _SAMPLE = 40  # rows that other readings are tried on; chosen by hand
+_THOUSANDS = (
+    (1000.0, "multiply the coordinates by 1000; in a drawing whose $INSUNITS is not their unit declare unit"),
+    (0.001, "divide the coordinates by 1000: they seem to be millimetres"),
+)
 _ZONES = (  # first and last EPSG code of the zones of a grid, and its name; source: EPSG registry
     (32601, 32660, "WGS 84 / UTM north"),
     (32701, 32760, "WGS 84 / UTM south"),
@@ -122,7 +126,8 @@ def _readings(table: SurveyTable, first: Floats, second: Floats) -> Iterator[tup
     factor = unit_factor(table.unit, reference_system(crs))
     first, second = first * factor, second * factor
     names = ("easting", "northing") if table.projected else ("lon_deg", "lat_deg")
-    yield "swapped_axes", f"swap the columns of {names[0]} and {names[1]}", second, first, crs
+    swapped = _without_zone(second, crs)
+    yield "swapped_axes", f"swap the columns of {names[0]} and {names[1]}", swapped, first, crs
     yield "wrong_sign", f"give {names[0]} the other sign", -first, second, crs
     yield "wrong_sign", f"give {names[1]} the other sign", first, -second, crs
     yield "wrong_sign", "give both coordinates the other sign", -first, -second, crs
@@ -133,11 +138,21 @@ def _readings(table: SurveyTable, first: Floats, second: Floats) -> Iterator[tup
             proposal = f"divide the coordinates by 10^{power}"
             yield "wrong_unit", proposal, first / 10**power, second / 10**power, crs
         return
+    for factor, proposal in _THOUSANDS:
+        yield "wrong_unit", proposal, first * factor, second * factor, crs
     for unit in METRES:
         if unit != table.unit:
             change = METRES[unit] / METRES[table.unit]
             yield "wrong_unit", f"declare unit {unit}", first * change, second * change, crs
     yield from ((code, proposal, first, second, other) for code, proposal, other in _sibling_zones(crs))
+
+
+def _without_zone(easting: Floats, crs: str) -> Floats:
+    """Eastings without the number of the zone; as they are where it is that of another zone."""
+    try:
+        return without_zone(easting, reference_system(crs))[0]
+    except WaymarkError:
+        return easting
 
 
 def _sibling_zones(crs: str) -> Iterator[tuple[str, str, str]]:

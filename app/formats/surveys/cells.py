@@ -33,6 +33,10 @@ _IN_GROUPS = re.compile(
 _WITH_COMMA = re.compile(r"[+-]?([0-9]+),([0-9]+)")
 _WITH_POINT = re.compile(r"[+-]?[0-9]+\.[0-9]+")
 _MIN_SHARE = 0.5  # [1] of the numbers above 999 that must be in groups; chosen by hand
+_WHOLE_DEGREES = re.compile(
+    r"\s*([NSEW])?\s*([+-]?[0-9]{1,3})\s*[°d]\s*([0-9]{1,2}(?:[.,][0-9]*)?)\s*['′’m]\s*"
+    r"(?:([0-9]{1,2}(?:[.,][0-9]*)?)\s*(?:\"|″|”|''|s))?\s*([NSEW])?\s*"
+)  # with the sign of degrees, and no O, which is Ost (east) or Ouest (west)
 _HEMISPHERE = re.compile(r"\s*(?:([NSEWO])\s*([0-9.]+)|([0-9.]+)\s*°?\s*([NSEWO]))\s*", re.IGNORECASE)
 _WITH_UNIT = re.compile(r"\s*([+-]?[0-9.]+)\s*(m|ft|us-?ft|sft|feet|'|cm|mm|km)\.?\s*", re.IGNORECASE)
 
@@ -124,6 +128,36 @@ def read_numbers(cells: Any, field: str, *, form: NumberForm = PLAIN, required: 
     return values, faults
 
 
+def are_sexagesimal(cells: Iterable[str]) -> bool:
+    """Whether most of the cells are degrees, minutes and seconds with their signs."""
+    filled = [text for text in cells if text.strip()]
+    return sum(1 for text in filled if _WHOLE_DEGREES.fullmatch(text)) > _MIN_SHARE * len(filled)
+
+
+def read_sexagesimal(cells: Sequence[str], field: str) -> tuple[Floats, list[Fault]]:
+    """Decimal degrees of a column of degrees, minutes and seconds, shape (N,); NaN and a fault for any other cell."""
+    values = np.full(len(cells), np.nan)
+    faults: list[Fault] = []
+    for index, text in enumerate(cells):
+        found = _WHOLE_DEGREES.fullmatch(text)
+        letter = (found[1] or found[5] or "") if found else ""
+        if found is None or letter not in ("", *_LETTERS.get(field, "")) or not _in_range(found):
+            shown = repr(text.strip()[:40])
+            message = f"{field} is {shown}, not degrees, minutes and seconds like most of the others"
+            faults.append(Fault(index + 1, field, "not_a_number", message, "write all rows in the same form"))
+            continue
+        values[index] = _decimal_degrees(found)
+    return values, faults
+
+
+_OST_OR_OUEST = "write decimal degrees, negative in the west: O may be Ost (east) or Ouest (west)"
+_LETTERS = {"lon_deg": "EW", "lat_deg": "NS"}
+
+
+def _in_range(found: re.Match[str]) -> bool:
+    return all(float((found[k] or "0").replace(",", ".")) < 60 for k in (3, 4))
+
+
 def _parts(cells: Sequence[Any]) -> Iterator[Sequence[Any]]:
     if isinstance(cells, Texts):
         return cells.parts()
@@ -171,30 +205,26 @@ def _fault_of(text: str, field: str, row: int, decimal: str) -> Fault:
         return Fault(row, field, "grouped_digits", f"{field} is {shown}: digits in groups", cure)
     if (found := _HEMISPHERE.fullmatch(text)) is not None:
         letter, number = found[1] or found[4], found[2] or found[3]
-        sign = "-" if letter.upper() in "SWO" else ""
-        return Fault(
-            row,
-            field,
-            "hemisphere_letter",
-            f"{field} is {shown}: a letter in place of the sign",
-            f"write {sign}{number}",
-        )
+        sign = "-" if letter.upper() in "SW" else ""
+        cure = f"write {sign}{number}" if letter.upper() != "O" else _OST_OR_OUEST
+        return Fault(row, field, "hemisphere_letter", f"{field} is {shown}: a letter in place of the sign", cure)
     if (found := _WITH_UNIT.fullmatch(text)) is not None:
         return Fault(
             row, field, "unit_in_value", f"{field} is {shown}: a unit in the value",
             f"write {found[1]} and declare the unit of the column",
         )  # fmt: skip
     if (found := _SEXAGESIMAL.fullmatch(text)) is not None:
-        return Fault(
-            row, field, "degrees_minutes", f"{field} is {shown}: degrees and minutes, not decimal degrees",
-            f"write {_decimal_degrees(found):.9f}",
-        )  # fmt: skip
+        letter = (found[1] or found[5] or "").upper()
+        cure = f"write {_decimal_degrees(found):.9f}" if letter != "O" else _OST_OR_OUEST
+        message = f"{field} is {shown}: degrees and minutes, not decimal degrees"
+        return Fault(row, field, "degrees_minutes", message, cure)
     return Fault(row, field, "not_a_number", f"{field} is {shown}, not a finite number", "write plain decimal numbers")
 
 
 def _decimal_degrees(found: re.Match[str]) -> float:
-    degrees, minutes, seconds = abs(float(found[2])), float(found[3]), float(found[4] or 0)
+    degrees = abs(float(found[2]))
+    minutes, seconds = (float((found[k] or "0").replace(",", ".")) for k in (3, 4))
     letter = (found[1] or found[5] or "").upper()
-    negative = found[2].startswith("-") or letter in ("S", "W", "O")
+    negative = found[2].startswith("-") or letter in ("S", "W")
     value = degrees + minutes / 60 + seconds / 3600
     return -value if negative else value

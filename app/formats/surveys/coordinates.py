@@ -5,14 +5,21 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 import shapely
 
 from app.errors import InvalidParameter
-from app.formats.surveys.cells import PLAIN, NumberForm, detect_number_form, read_numbers
+from app.formats.surveys.cells import (
+    PLAIN,
+    NumberForm,
+    are_sexagesimal,
+    detect_number_form,
+    read_numbers,
+    read_sexagesimal,
+)
 from app.formats.surveys.declaration import NUMBER_ROLES, ImportDeclaration
 from app.formats.surveys.roles import WKT_NAMES, cell_text, plain_name
 from app.formats.surveys.table import Detected, Fault, Floats, Severity, SourceTable, Texts, warn
@@ -21,6 +28,7 @@ from app.geodesy.systems import best_effort
 
 PAIRS = (("lon_deg", "lat_deg"), ("easting", "northing"))
 _SAMPLE = 1000  # cells of a column by which the form of its numbers is detected; chosen by hand
+_BLANKS = {" ": "blanks", "\u00a0": "no-break spaces", "\u2009": "thin spaces", "\u202f": "narrow no-break spaces"}
 _WKT = re.compile(r"\s*(?:SRID=[0-9]+;)?\s*(?:MULTI)?POINT\b.*|0[01][0-9A-Fa-f]{40,}", re.IGNORECASE | re.DOTALL)
 _SRID = re.compile(r"SRID=([0-9]{4,6});", re.IGNORECASE)
 _AGREE_M = 5.0
@@ -77,17 +85,21 @@ def read_coordinates(source: SourceTable, declaration: ImportDeclaration, places
             raise _not_identified(source)
         return _with_plausible_heights(_from_wkt(source, wkt), declaration)
     form, shown = _form(source, declaration, places)
-    values = [_numbers(source, places, role, form) for role in (*pair, "height")]
+    is_sexagesimal = all(are_sexagesimal(_sample_of(source, places[role])) for role in PAIRS[0])
+    values = [_numbers(source, places, role, form, is_sexagesimal) for role in (*pair, "height")]
     faults = [fault for _values, wrong in values for fault in wrong]
     first, second, height = (found for found, _wrong in values)
     assert first is not None
     assert second is not None
     read = Coordinates(first, second, height, pair == PAIRS[1], form, faults=faults)
+    if is_sexagesimal:
+        read.detected.append(Detected("degrees", "degrees, minutes, seconds", "the signs in most of the values"))
     if shown:
-        value = form.decimal + (f", groups of three digits separated by {form.group!r}" if form.group else "")
+        group = _BLANKS.get(form.group, form.group)
+        value = form.decimal + (f", with {group} between groups of three digits" if form.group else "")
         read.detected.append(Detected("decimal sign", value, f"most numbers are written like {shown!r}"))
     if pair == PAIRS[1] and None not in (places["lon_deg"], places["lat_deg"]):
-        lon, lat = (_numbers(source, places, role, form)[0] for role in PAIRS[0])
+        lon, lat = (_numbers(source, places, role, form, is_sexagesimal)[0] for role in PAIRS[0])
         assert lon is not None
         assert lat is not None
         read.check_deg = lon, lat
@@ -147,13 +159,23 @@ def _not_identified(source: SourceTable) -> InvalidParameter:
     )
 
 
+def _sample_of(source: SourceTable, column: int | None) -> Iterator[str]:
+    """Texts throughout a column; none of a column of numbers."""
+    cells = source.columns[column] if column is not None else ()
+    if isinstance(cells, Texts):
+        yield from (cells[k] for k in range(0, len(cells), max(len(cells) // _SAMPLE, 1)))
+
+
 def _numbers(
-    source: SourceTable, places: dict[str, int | None], role: str, form: NumberForm
+    source: SourceTable, places: dict[str, int | None], role: str, form: NumberForm, is_sexagesimal: bool = False
 ) -> tuple[Floats | None, list[Fault]]:
     column = places[role]
     if column is None:
         return None, []
-    found, wrong = read_numbers(source.columns[column], role, form=form, required=role != "height")
+    if is_sexagesimal and role in PAIRS[0]:
+        found, wrong = read_sexagesimal(source.columns[column], role)
+    else:
+        found, wrong = read_numbers(source.columns[column], role, form=form, required=role != "height")
     broken = source.faults.flags(source.rows, Severity.REFUSED)
     return found, [fault for fault in wrong if not broken[(fault.row or 1) - 1]]
 
@@ -164,7 +186,7 @@ def _form(source: SourceTable, declaration: ImportDeclaration, places: dict[str,
     texts = [column for column in columns if isinstance(column, Texts)]
     if not texts:
         return NumberForm(declaration.decimal or "."), ""
-    sample = (column[k] for column in texts for k in range(0, len(column), max(len(column) // _SAMPLE, 1)))
+    sample = chain.from_iterable(_sample_of(source, k) for role, k in places.items() if _holds_numbers(role))
     form, shown = detect_number_form(islice(sample, _SAMPLE * len(texts)), declaration.decimal)
     return form, shown if declaration.decimal is None or form.group else ""
 

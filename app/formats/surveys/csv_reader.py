@@ -84,7 +84,10 @@ def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
     if lines.comments:
         value = f"{lines.comments} lines left out"
         detected.append(Detected("comments", value, f"they begin with {' or '.join(_COMMENTS)}"))
-    return SourceTable("csv", header.names, table, faults=header.faults, detected=tuple(detected))
+    return SourceTable(
+        "csv", header.names, table, faults=header.faults, detected=tuple(detected),
+        has_names=not header.last_takes_rest,
+    )  # fmt: skip
 
 
 def _detect_delimiter(utf8: bytes, declaration: ImportDeclaration) -> str:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pyproj import CRS
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload
+from app.formats.archives import ZIP_MAGIC
 from app.formats.format import Format, Sample, detect_format, list_accepted
 from app.formats.surveys.cells import read_numbers
 from app.formats.surveys.coordinates import check_second_pair, read_coordinates
@@ -17,6 +18,16 @@ from app.formats.surveys.roles import CodeForm, cell_text, find_roles
 from app.formats.surveys.table import MAX_TEXT, Detected, Fault, Floats, SourceTable, SurveyTable, Texts, warn
 from app.geodesy import normalize_crs, reference_system
 
+_DOCUMENTS = (
+    (ZIP_MAGIC, "an Excel workbook", "save the sheet as CSV UTF-8"),
+    (b"\xd0\xcf\x11\xe0", "an old Excel or Word document", "save the table as CSV UTF-8"),
+    (b"%PDF", "a PDF", "export the points as CSV"),
+    (b"AC10", "a DWG", "save the drawing as DXF"),
+    (b"JB,NM", "raw data of a data collector (RW5)", "export the coordinates as text"),
+    (b"LASF", "a point cloud", "export the points of the markers alone"),
+)
+"""First bytes of files that are sent by mistake, their kind, and how a survey is made of it."""
+_DIRECTORY_BYTES = 1 << 17  # [byte] at the end of a ZIP in which its directory is; chosen by hand
 _FEET = ("ft-us", "ft-intl")
 _UNIT_ENDINGS = (("_usft", "ft-us"), ("_ftus", "ft-us"), ("_ft", "ft-intl or ft-us"), ("(ft)", "ft-intl or ft-us"))
 
@@ -43,6 +54,7 @@ def read_survey(data: bytes, declaration: ImportDeclaration, code_form: CodeForm
 
 def _find_format(data: bytes, declaration: ImportDeclaration) -> Format[SurveyReader]:
     """The declared format, or the one that the content shows."""
+    _refuse_documents(data)
     if declaration.format is not None:
         return next(found for found in SURVEY_FORMATS if found.name == declaration.format)
     found = detect_format(Sample("", data), SURVEY_FORMATS)
@@ -54,6 +66,13 @@ def _find_format(data: bytes, declaration: ImportDeclaration) -> Format[SurveyRe
             cure="export it again in one of these formats",
         )
     return found
+
+
+def _refuse_documents(data: bytes) -> None:
+    """Refuse files of office and survey software that are no surveys, and name the way to one."""
+    for signature, name, cure in _DOCUMENTS:
+        if data.startswith(signature) and (signature != ZIP_MAGIC or b"xl/workbook.xml" in data[-_DIRECTORY_BYTES:]):
+            raise UnsupportedUpload(f"the file is {name}", field="file", limit=list_accepted(SURVEY_FORMATS), cure=cure)
 
 
 def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: CodeForm | None) -> SurveyTable:

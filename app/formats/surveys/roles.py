@@ -19,30 +19,32 @@ _NAMES = {
     "lon_deg": ("lon", "longitude", "long", "lng", "laenge", "lange", "longitud"),
     "lat_deg": ("lat", "latitude", "breite", "latitud"),
     "easting": (
-        "easting", "east", "e", "x", "rechtswert", "rw", "rechts", "ostwert", "ost", "este", "grid_easting", "x_coord",
-        "xcoord", "x_coordinate",
+        "easting", "east", "e", "x", "rechtswert", "rw", "rechts", "ostwert", "ost", "este", "grideasting", "xcoord",
+        "xcoordinate",
     ),
     "northing": (
-        "northing", "north", "n", "y", "hochwert", "hw", "hoch", "nordwert", "nord", "norte", "grid_northing",
-        "y_coord", "ycoord", "y_coordinate",
+        "northing", "north", "n", "y", "hochwert", "hw", "hoch", "nordwert", "nord", "norte", "gridnorthing",
+        "ycoord", "ycoordinate",
     ),
     "height": (
-        "height", "elevation", "elev", "z", "h", "altitude", "alt", "ele", "hohe", "hoehe", "cota", "ortho_height",
-        "orthometric_height", "grid_elevation", "rl", "z_coord", "zcoord",
+        "height", "elevation", "elev", "z", "h", "altitude", "alt", "ele", "hohe", "hoehe", "cota", "orthoheight",
+        "orthometricheight", "gridelevation", "rl", "zcoord",
     ),
     "point": (
-        "point", "point_id", "pointid", "point_name", "point_number", "point_no", "pt", "pt_id", "ptid", "p", "name",
+        "point", "pointid", "pointname", "pointnumber", "pointno", "pt", "ptid", "p", "name",
         "no", "nr", "punkt", "punktnummer", "punktnr", "pnr", "pkt", "pktnr", "station", "punto", "id",
     ),
-    "code": ("code", "digits", "number", "registry_number"),
+    "code": ("code", "digits", "number", "registrynumber"),
     "description": ("description", "desc", "d", "descr", "beschreibung", "bemerkung", "remark", "remarks", "notes"),
 }  # fmt: skip
 """Names of columns as survey software writes them, in English, German and Spanish; the first that is there is taken."""
-_ELLIPSOIDAL = ("ellipsoidal_height", "ellipsoid_height", "ell_height", "ellips_height", "h_ell", "ellh")
-WKT_NAMES = ("wkt", "wkt_geom", "geom", "geometry", "the_geom", "geom_wkt")
+_ELLIPSOIDAL = ("ellipsoidalheight", "ellipsoidheight", "ellheight", "ellipsheight", "hell", "ellh")
+WKT_NAMES = ("wkt", "wktgeom", "geom", "geometry", "thegeom", "geomwkt")
 _UNIT = re.compile(r"_(?:m|metres?|meters?|u?s?_?s?ft|ft_?us|ft_?intl|i?ft|feet|deg|degrees|dd|gon)$")
+_IN_BRACKETS = re.compile(r"\s*[\[(][^\])]*[\])]\s*$")  # a unit or a datum behind the name
 _SAMPLE = 2000  # values by which a column is recognised; chosen by hand
 _MIN_SHARE = 0.5  # [1] of the values that must fit a role; the others are faults of their rows. Chosen by hand
+_MAX_SHOWN = 20  # names in a report; chosen by hand
 _SIDES = ("left", "right", "unknown")
 
 
@@ -73,9 +75,9 @@ class Roles(NamedTuple):
 
 
 def plain_name(name: str) -> str:
-    """A column's name without accents, case and unit: ``Höhe [m]`` is ``hohe``."""
-    letters = unicodedata.normalize("NFKD", name)
-    return _UNIT.sub("", normal_name("".join(c for c in letters if not unicodedata.combining(c))))
+    """A column's name without accents, case, blanks and unit: ``Punkt-Nr.`` is ``punktnr``, ``Höhe [m]`` ``hohe``."""
+    letters = unicodedata.normalize("NFKD", _IN_BRACKETS.sub("", name) or name)
+    return _UNIT.sub("", normal_name("".join(c for c in letters if not unicodedata.combining(c)))).replace("_", "")
 
 
 def names_coordinates(names: Sequence[str]) -> bool:
@@ -111,6 +113,10 @@ def find_roles(source: SourceTable, declaration: ImportDeclaration, code_form: C
             roles.places[role] = _declared(source, role, declaration.columns[role])
         else:
             roles.places[role] = _detected(source, role, declaration, taken, code_form, roles)
+    used = set(roles.places.values())
+    if unread := [name.strip() for k, name in enumerate(source.names) if k not in used and name.strip() != ""]:
+        shown = ", ".join(unread[:_MAX_SHOWN]) + (" and others" if len(unread) > _MAX_SHOWN else "")
+        roles.detected.append(Detected("columns without a role", shown[:300], "their names, or their values"))
     return roles
 
 
@@ -144,9 +150,9 @@ def _detected(
         evidence, fits = _evidence(source.columns[column], role, code_form)
         shown = f"{name.strip()[:60]!r}"
         if fits:
-            roles.detected.append(
-                Detected(f"column of {role}", name.strip()[:60], f"its name{evidence and '; '}{evidence}")
-            )
+            if source.has_names:
+                shown_evidence = f"its name{evidence and '; '}{evidence}"
+                roles.detected.append(Detected(f"column of {role}", name.strip()[:60], shown_evidence))
             return column
         if refuted is None and evidence:
             refuted = warn(

@@ -188,6 +188,8 @@ class SourceTable:
         Unit of length of the coordinates, as the file declares it; ``ft`` where it does not state which foot.
     faults : Faults
     detected : tuple of Detected
+    has_names : bool
+        Whether the names are the file's own; those of a layout by position are not.
     """
 
     format: str
@@ -198,6 +200,7 @@ class SourceTable:
     unit: str | None = None
     faults: Faults = field(default_factory=Faults)
     detected: tuple[Detected, ...] = ()
+    has_names: bool = True
 
     @property
     def rows(self) -> int:

@@ -29,6 +29,8 @@ def test_plain_numbers_are_read_at_once_and_one_by_one() -> None:
         ("12.5 ft", "unit_in_value", "12.5"),
         ("77°08'54\"W", "degrees_minutes", "-77.148333333"),
         ("-77 8 54", "degrees_minutes", "-77.148333333"),
+        ("12.5 O", "hemisphere_letter", "Ost (east) or Ouest (west)"),
+        ("8°24'36\"O", "degrees_minutes", "Ost (east) or Ouest (west)"),
         ("1_000", "not_a_number", ""),
         ("nan", "not_a_number", ""),
         ("inf", "not_a_number", ""),

@@ -178,6 +178,31 @@ def test_a_second_pair_of_coordinates_is_a_check() -> None:
     assert degrees.first[0] == pytest.approx(lon[0][0], abs=1e-7)
 
 
+def test_degrees_minutes_and_seconds() -> None:
+    text = """Name,Latitude,Longitude
+P1,"49°00'18.00000""N","8°24'36.54000""E"
+P2,"49°00'18.36000""N","8°24'37.08000""W"
+"""
+    read = _read(text, crs="EPSG:4326")
+    assert read.first == pytest.approx([8.41015, -8.4103], abs=1e-12)  # 8 + 24/60 + 36.54/3600; 8 + 24/60 + 37.08/3600
+    assert read.second == pytest.approx([49.005, 49.0051], abs=1e-12)
+    assert {one.what: one.value for one in read.detected}["degrees"] == "degrees, minutes, seconds"
+    for wrong in ('8°24\'36""O', '8°24\'36""N', '8°64\'36""E', "8.41"):  # O: Ost or Ouest
+        found = _read(text + f'P3,"49°00\'18.0""N","{wrong}"\n', crs="EPSG:4326")
+        assert [(fault.row, fault.code) for fault in found.faults.shown(9)] == [(3, "not_a_number")]
+
+
+def test_columns_that_were_not_read_are_reported() -> None:
+    found = _check(_read(_text("Punkt-Nr.;Ost;Nord;Höhe (m ü. NN);Punktart;Datum", "{k};{e};{n};{h};Nagel;1.6.2025")))
+    assert found["columns without a role"] == "Punktart, Datum"
+    assert found["column of height"] == "Höhe (m ü. NN)"
+
+
+def test_columns_by_position_have_no_names() -> None:
+    found = _check(_read(_text("", "{k},{e},{n},{h},nail")))
+    assert not [what for what in found if what.startswith("column")]
+
+
 @pytest.mark.parametrize(
     "cell",
     [

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 
-from app.errors import UnreadableUpload, WaymarkError
+from app.errors import UnreadableUpload, UnsupportedUpload, WaymarkError
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.formats.surveys.table import SurveyTable
@@ -281,3 +281,18 @@ def test_positions_of_feet_differ_by_2_ppm() -> None:
     assert Geod(ellps="GRS80").inv(*true, *off)[2] == pytest.approx(1.362, abs=0.005)
     placed = place_positions(np.array([x]), np.array([y]), np.array([np.nan]), crs="EPSG:3435")
     assert (placed.lon_deg[0], placed.lat_deg[0]) == pytest.approx(true, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (_zip(**{"xl/workbook_xml": b"<x/>"}), "an Excel workbook"),
+        (b"%PDF-1.4\n1 0 obj\n", "a PDF"),
+        (b"AC1032\x00", "a DWG"),
+        (b"JB,NMTEST,DT06-01-2025\nMO,AD0,UN1\n", "raw data"),
+    ],
+)
+def test_documents_that_are_no_surveys_are_named(data: bytes, message: str) -> None:
+    with pytest.raises(UnsupportedUpload, match=message) as caught:
+        _read(data)
+    assert caught.value.cure
