@@ -71,7 +71,7 @@ export async function drawCerpm(box, marker) {
         make("td", {}, part.value),
       ))),
     )),
-    payload.note ? make("p", { class: "hint" }, payload.note) : null,
+    payload.note ? make("p", { class: "hint" }, payload.note) : "", // append() would write null as a word
   );
 }
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
@@ -15,15 +17,29 @@ if TYPE_CHECKING:
     from app.registry.database import Database
     from app.services.access.access import Caller
 
+_NEAR = 0.88
+"""How similar a name is to a setting's (`difflib`). Source: by hand; WAYMARK_PROT is near, WAYMARK_KEY is not."""
+
 
 def read_settings(**overrides: object) -> Settings:
     """Settings from the environment; overrides that are None are ignored."""
+    _check_names()
     try:
         return Settings.model_validate({name: value for name, value in overrides.items() if value is not None})
     except ValidationError as error:
         first = error.errors()[0]
         name = "WAYMARK_" + "_".join(str(part) for part in first["loc"]).upper()
         raise InvalidParameter(f"{name.removesuffix('_')}: {first['msg']}", cure="see docs/settings.md") from error
+
+
+def _check_names() -> None:
+    """Refuse variables whose names are nearly those of settings; others may belong to other programs."""
+    known = [f"WAYMARK_{name.upper()}" for name in Settings.model_fields]
+    for name in sorted(os.environ):
+        if name.startswith("WAYMARK_") and name not in known and (near := get_close_matches(name, known, 1, _NEAR)):
+            raise InvalidParameter(
+                f"there is no setting {name}", field=name, cure=f"did you mean {near[0]}? See docs/settings.md"
+            )
 
 
 @contextmanager

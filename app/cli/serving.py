@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import socket
 import threading
 from contextlib import suppress
 from types import FrameType
@@ -13,6 +14,7 @@ import structlog
 import uvicorn
 
 from app.api.http.connections import ConnectionLimits, limited_connections
+from app.errors import InvalidParameter
 from app.settings import Settings
 
 _GRACE_S = 2
@@ -41,9 +43,16 @@ class StoppingServer(uvicorn.Server):
 
 
 def serve_until_stopped(settings: Settings) -> None:
-    """Serve until SIGTERM or Ctrl-C."""
+    """Serve until SIGTERM or Ctrl-C.
+
+    Raises
+    ------
+    InvalidParameter
+        The address or the port cannot be used.
+    """
     from app.main import create_app
 
+    _check_port(settings.host, settings.port)
     _raise_file_limit(_FILES_PER_CONNECTION * settings.max_connections + _OTHER_FILES)
     limits = ConnectionLimits(
         header_s=settings.header_timeout_s,
@@ -72,6 +81,21 @@ def serve_until_stopped(settings: Settings) -> None:
         server.run()
     if not server.started:
         raise SystemExit(_NOT_STARTED)
+
+
+def _check_port(host: str, port: int) -> None:
+    """Refuse a port that another program uses, before the server starts with all its parts."""
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        raise InvalidParameter(
+            f"the server cannot listen on {host}, port {port}: {error.strerror}",
+            field="WAYMARK_PORT",
+            cure="stop the program that uses the port, or choose another: waymark serve --port 8001",
+        ) from error
 
 
 def _raise_file_limit(files: int) -> None:

@@ -7,10 +7,10 @@ from typing import Annotated
 
 from fastapi import Depends, Header, Request
 from pydantic import TypeAdapter
-from starlette.datastructures import FormData, UploadFile
+from starlette.datastructures import UploadFile
 
 from app.api.decodes.schemas import ContextIn
-from app.api.http.forms import FORM, idempotency_of, media_type_of, read_declaration, read_text
+from app.api.http.forms import FORM, check_parts, idempotency_of, media_type_of, read_declaration, read_text
 from app.api.http.responses import IdempotencyKeyHeader
 from app.api.http.strict_json import validated
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
@@ -93,7 +93,7 @@ def _of_vehicle(context: ContextInput, vehicle: str) -> ContextInput:
 
 async def _read_form(request: Request) -> tuple[bytes, bytes, str, str]:
     async with request.form(max_files=2, max_fields=3, max_part_size=MAX_CONTEXT_BYTES) as form:
-        _check_parts(form)
+        check_parts(form, None, "file", "context", "vehicle")
         file = form.get("file")
         if not isinstance(file, UploadFile):
             raise UnreadableUpload(
@@ -110,18 +110,6 @@ async def _read_form(request: Request) -> tuple[bytes, bytes, str, str]:
                 "the vehicle came as a file", field="vehicle", limit="a name", cure="send it as text"
             )
     return data, text, file.filename or "", vehicle
-
-
-def _check_parts(form: FormData) -> None:
-    names = [name for name, _value in form.multi_items()]
-    wrong = next((name for name in names if name not in ("file", "context", "vehicle") or names.count(name) > 1), None)
-    if wrong is not None:
-        raise MalformedRequest(
-            f"the form has an unexpected part {wrong[:80]!r}, or has it twice",
-            field="file" if wrong == "file" else "body",
-            limit="one file, one context, one vehicle",
-            cure="send several frames as a ZIP archive",
-        )
 
 
 Upload = Annotated[UploadedFile, Depends(get_upload)]

@@ -10,7 +10,7 @@ from starlette.datastructures import UploadFile
 
 from app.api.fleet.schemas_calibrations import DECLARATION_EXAMPLE, CalibrationIn
 from app.api.http.dependencies import Caller, Identifier, LastId, use_cases
-from app.api.http.forms import FORM, form_body, idempotency_of, media_type_of, read_declaration, read_text
+from app.api.http.forms import FORM, check_parts, form_body, idempotency_of, media_type_of, read_declaration, read_text
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
@@ -70,14 +70,7 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
     if media_type_of(request) != FORM:
         raise UnsupportedUpload("a calibration is a form", field="Content-Type", limit=FORM, cure=_CURE)
     async with request.form(max_files=MAX_PHOTOS + 1, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
-        names = [name for name, _value in form.multi_items()]
-        if set(names) - {"photos", "declaration"} or names.count("declaration") > 1:
-            raise MalformedRequest(
-                "the form has an unexpected part, or has declaration twice",
-                field="body",
-                limit="photos, one declaration",
-                cure=_CURE,
-            )
+        check_parts(form, "photos", "declaration")
         files = form.getlist("photos")
         if not files or not all(isinstance(file, UploadFile) for file in files):
             raise UnreadableUpload("there is no photo in the form", field="photos", limit="files", cure=_CURE)

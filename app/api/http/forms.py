@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from functools import cache
 from typing import Any, TypeVar
 
 from fastapi import Request
@@ -12,6 +13,7 @@ from starlette.datastructures import FormData, UploadFile
 from app.api.http.components import reference
 from app.api.http.dependencies import caller_of, checked_idempotency_key
 from app.api.http.strict_json import in_thread_if_large, parse_json, validated
+from app.errors import MalformedRequest
 from app.services.idempotency import IdempotencyKey
 
 FORM = "multipart/form-data"
@@ -29,6 +31,37 @@ async def read_text(form: FormData, name: str) -> bytes:
     return await part.read() if isinstance(part, UploadFile) else part.encode()
 
 
+@cache
+def _adapter(model: type[BaseModel]) -> TypeAdapter[BaseModel]:
+    return TypeAdapter(model)
+
+
+def check_parts(form: FormData, several: str | None, *known: str) -> None:
+    """Refuse parts that a form does not have, and parts that are sent twice, but for the one that may be.
+
+    Raises
+    ------
+    MalformedRequest
+        There is one.
+    """
+    names = [name for name, _value in form.multi_items()]
+    allowed = (*known, several) if several else known
+    for name in names:
+        if name not in allowed:
+            shown = name[:80]
+            file = several or known[0]
+            raise MalformedRequest(
+                f"the form has no part {shown!r}",
+                field=shown,
+                limit=", ".join(allowed),
+                cure=f"name the part with the file {file}, or leave {shown} out",
+            )
+        if name != several and names.count(name) > 1:
+            raise MalformedRequest(
+                f"the part {name!r} was sent twice", field=name, limit=f"one {name}", cure="send it once"
+            )
+
+
 async def read_declaration(model: type[ModelT], text: bytes, *where: str) -> ModelT:
     """A model from the JSON text of the part that `where` ends with; an empty text declares nothing.
 
@@ -41,7 +74,9 @@ async def read_declaration(model: type[ModelT], text: bytes, *where: str) -> Mod
     """
 
     def read() -> ModelT:
-        return validated(TypeAdapter(model), parse_json(text, where[-1]) if text.strip() else {}, *where)
+        found = validated(_adapter(model), parse_json(text, where[-1]) if text.strip() else {}, *where)
+        assert isinstance(found, model)
+        return found
 
     return await in_thread_if_large(len(text), read)
 

@@ -287,7 +287,8 @@ def validation_fault(item: Mapping[str, Any]) -> FieldError:
     cause = context.get("error")
     if isinstance(cause, errors.WaymarkError):
         return FieldError(field=cause.field or path, detail=cause.message, limit=cause.limit, cure=cause.cure)
-    cures = {"missing": f"send {path}", "extra_forbidden": f"leave {path} out"}
+    near = f"did you mean {context['near']}? If not, " if "near" in context else ""
+    cures = {"missing": f"send {path}", "extra_forbidden": f"{near}leave {path} out"}
     return FieldError(
         field=path,
         detail=f"{path}: {item['msg']}",

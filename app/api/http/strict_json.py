@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import difflib
 import json
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from functools import partial
+from functools import cache, partial
 from typing import Any, NoReturn, TypeVar
 
 from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
 from app.api.http.costs import EXPENSIVE, bounded
 from app.errors import MalformedRequest, UnsupportedUpload
@@ -30,6 +32,9 @@ MAX_MEMBERS = 1_000
 """Members of one object. Source: chosen by hand, the largest that a route takes has about 40."""
 _MAX_INT = 2**64
 _MAX_INT_DIGITS = 20
+_UNKNOWN = "extra_forbidden"
+_NEAR = 0.75
+"""How similar a name is that is proposed for an unknown one (`difflib`). Source: chosen by hand, on single slips."""
 _LARGE_BYTES = 16 * 1024
 """Larger documents are read in a thread. Source: by measurement, a smaller one takes 20 ms at most."""
 _READER = ThreadPoolExecutor(1, "json")
@@ -106,7 +111,28 @@ def validated(adapter: TypeAdapter[T], value: object, *where: str) -> T:
             fault: Any = {"type": "invalid", "loc": where, "msg": f"{error.error_count()} values are not as documented"}
             raise RequestValidationError([fault]) from None
         faults = error.errors(include_url=False, include_input=False)
-        raise RequestValidationError([{**fault, "loc": (*where, *fault["loc"])} for fault in faults]) from None
+        names = _names_in(adapter) if any(fault["type"] == _UNKNOWN for fault in faults) else ()
+        raise RequestValidationError([_located(fault, where, names) for fault in faults]) from None
+
+
+def _located(fault: ErrorDetails, where: tuple[str, ...], names: Collection[str]) -> dict[str, Any]:
+    """A fault with its place in the request, and with the known name that is nearest to an unknown one."""
+    found: dict[str, Any] = {**fault, "loc": (*where, *fault["loc"])}
+    if fault["type"] == _UNKNOWN:
+        unknown = str(fault["loc"][-1])[:80].lower()
+        longer = sorted((name for name in names if name.startswith(f"{unknown}_")), key=len)
+        if near := longer or difflib.get_close_matches(unknown, names, 1, _NEAR):
+            found["ctx"] = {"near": near[0]}
+    return found
+
+
+@cache
+def _names_in(adapter: TypeAdapter[Any]) -> tuple[str, ...]:
+    """Names of all members of a model and of the models in it."""
+    schema = adapter.json_schema()
+    return tuple(
+        sorted({name for model in (schema, *schema.get("$defs", {}).values()) for name in model.get("properties", ())})
+    )
 
 
 def parse_json(raw: bytes, field: str = "body") -> Any:

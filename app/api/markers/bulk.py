@@ -6,13 +6,14 @@ from functools import partial
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Request, Response
-from pydantic import ConfigDict, Field, JsonValue, ValidationError
+from fastapi.exceptions import RequestValidationError
+from pydantic import ConfigDict, Field, JsonValue, TypeAdapter
 
 from app.api.http.dependencies import Caller, Idempotency, Identifier, use_cases
 from app.api.http.permissions import PERMISSIONS
 from app.api.http.problems import FieldError, Problem, kind_of, problem_responses, report_problem, validation_fault
 from app.api.http.responses import created_response
-from app.api.http.strict_json import StrictRoute
+from app.api.http.strict_json import StrictRoute, validated
 from app.api.markers.markers import NewMarkerIn
 from app.api.markers.schemas_patch import MarkerPatch
 from app.errors import InvalidParameter, WaymarkError
@@ -41,6 +42,9 @@ class ItemIn(StrictModel):
 
     create: NewMarkerIn | None = None
     update: UpdateIn | None = None
+
+
+_ITEM = TypeAdapter(ItemIn)
 
 
 class BulkIn(StrictModel):
@@ -109,8 +113,15 @@ def post_bulk(body: BulkIn, request: Request, caller: Caller, bulk: Bulk, idempo
 
 
 def _read(item: JsonValue) -> Item:
+    if isinstance(item, dict) and not item.keys() & ItemIn.model_fields.keys():
+        return InvalidParameter(
+            "an item is an object with create or update",
+            field="create",
+            limit="{create: a marker} or {update: {id, version, change}}",
+            cure='put the marker into create: {"create": {"position": ...}}',
+        )
     try:
-        read = ItemIn.model_validate(item)
+        read = validated(_ITEM, item, "body")
         if (read.create is None) == (read.update is None):
             return InvalidParameter(
                 "an item registers a marker or changes one",
@@ -122,9 +133,8 @@ def _read(item: JsonValue) -> Item:
             return read.create.root.new()
         assert read.update is not None
         return MarkerUpdate(read.update.id, read.update.version, read.update.change.change())
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        fault = validation_fault({**first, "loc": ("body", *first["loc"])})
+    except RequestValidationError as error:
+        fault = validation_fault(error.errors()[0])
         return InvalidParameter(fault.detail, field=fault.field, limit=fault.limit, cure=fault.cure)
     except WaymarkError as error:
         return error

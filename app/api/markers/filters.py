@@ -16,6 +16,8 @@ from app.registry.spatial import Box
 from app.services.markers.search_areas import area_of_text
 
 _MAX_POLYGON_TEXT = 8_000
+MAX_OVER_ANTIMERIDIAN_DEG = 180.0
+"""Width of a box over the antimeridian. Source: RFC 7946 section 5.2 allows any; a wider one has its sides swapped."""
 _MetresQuery = Annotated[float | None, Query(ge=-1e8, le=1e8, allow_inf_nan=False)]
 
 
@@ -81,7 +83,8 @@ def checked_box(west_deg: float, south_deg: float, east_deg: float, north_deg: f
     Raises
     ------
     InvalidParameter
-        A side is out of range, or the south is above the north.
+        A side is out of range, the south is above the north, or the box over the antimeridian is wider than half the
+        earth: its west and east are swapped.
     """
     check_lon_lat(west_deg, south_deg, field="bbox")
     check_lon_lat(east_deg, north_deg, field="bbox")
@@ -91,6 +94,13 @@ def checked_box(west_deg: float, south_deg: float, east_deg: float, north_deg: f
             field="bbox",
             limit="south <= north",
             cure="send west,south,east,north; only the longitudes may be the other way round, over the antimeridian",
+        )
+    if west_deg > east_deg and (width_deg := 360.0 + east_deg - west_deg) > MAX_OVER_ANTIMERIDIAN_DEG:
+        raise InvalidParameter(
+            f"bbox has its west above its east, so it spans {width_deg:.6g} degrees over the antimeridian",
+            field="bbox",
+            limit=f"{MAX_OVER_ANTIMERIDIAN_DEG:g} degrees over the antimeridian",
+            cure="send west,south,east,north",
         )
     return Box(west_deg, south_deg, east_deg, north_deg)
 

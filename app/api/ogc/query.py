@@ -12,6 +12,7 @@ from urllib.parse import parse_qsl
 
 from starlette.requests import Request
 
+from app.api.markers.filters import MAX_OVER_ANTIMERIDIAN_DEG
 from app.api.ogc.cql2 import LANGUAGES, Reader
 from app.api.ogc.parameters import DEFAULT_LIMIT, MAX_LIMIT, list_parameters
 from app.errors import MalformedRequest
@@ -222,6 +223,12 @@ def _bbox(found: dict[str, str]) -> tuple[Box | None, tuple[float, float] | None
     if south > north or (heights_m is not None and heights_m[0] > heights_m[1]):
         refuse(
             "bbox", "bbox has its upper bound below its lower one", "lower corner first; west of east may be greater"
+        )
+    if 0.0 < west - east < 360.0 - MAX_OVER_ANTIMERIDIAN_DEG:
+        refuse(
+            "bbox",
+            f"bbox has its west above its east, and spans {360.0 + east - west:.6g} degrees over the antimeridian",
+            f"west,south,east,north; {MAX_OVER_ANTIMERIDIAN_DEG:g} degrees over the antimeridian",
         )
     return _on_earth(west, south, east, north), heights_m
 

@@ -10,7 +10,7 @@ from starlette.datastructures import UploadFile
 
 from app.api.http.components import reference
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
-from app.api.http.forms import FORM, form_body, idempotency_of, media_type_of, read_declaration, read_text
+from app.api.http.forms import FORM, check_parts, form_body, idempotency_of, media_type_of, read_declaration, read_text
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
@@ -77,14 +77,7 @@ async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = N
             "a road comes as a form, or is named in JSON", field="Content-Type", limit=f"{FORM}, {JSON}", cure=_CURE
         )
     async with request.form(max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
-        names = [name for name, _value in form.multi_items()]
-        if set(names) - {"file", "declaration"} or len(set(names)) != len(names):
-            raise MalformedRequest(
-                "the form has an unexpected part, or has one twice",
-                field="body",
-                limit="one file, one declaration",
-                cure=_CURE,
-            )
+        check_parts(form, None, "file", "declaration")
         file = form.get("file")
         if not isinstance(file, UploadFile):
             raise UnreadableUpload("there is no file in the form", field="file", limit="a part file", cure=_CURE)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.errors import InvalidParameter, Unavailable, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.columns import require_columns
 from app.formats.text import is_clean_text
 from app.formats.traces.declaration import ByteOrder, CanDeclaration, CanSignal, TraceLimits
@@ -57,7 +57,7 @@ def read_can_log(
 
     Raises
     ------
-    Unavailable
+    UnsupportedUpload
         python-can or cantools is not installed.
     InvalidParameter
         A signal is not in the DBC, or its frames are not in the log.
@@ -146,7 +146,7 @@ def _messages(part: Part) -> Iterator[Any]:
     try:
         import can
     except ImportError as error:
-        raise Unavailable(
+        raise UnsupportedUpload(
             "this server reads no CAN logs: python-can is not installed",
             field=part.name,
             cure="send speed as CSV, or install waymark[can]",
@@ -201,7 +201,7 @@ def _load_signals(dbc: Sequence[Part], name: str, field: str) -> dict[str, tuple
         import cantools
         from cantools.database.errors import Error as DatabaseError
     except ImportError as error:
-        raise Unavailable(
+        raise UnsupportedUpload(
             "this server reads no DBC: cantools is not installed",
             field=field,
             cure="declare identifier, bits and scaling, or install waymark[can]",

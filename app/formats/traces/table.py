@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.errors import InvalidParameter, Unavailable, UnreadableUpload, UploadTooLarge
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.columns import require_columns
 from app.formats.delimited import Dialect, NumberColumns
 from app.formats.traces.declaration import S_PER_UNIT, TimeUnit, TraceColumns, TraceDeclaration, TraceLimits
@@ -66,7 +66,7 @@ def read_parquet(part: Part, declaration: TraceDeclaration, limits: TraceLimits,
 
     Raises
     ------
-    Unavailable
+    UnsupportedUpload
         pyarrow is not installed.
     InvalidParameter
         Columns are missing or hold no numbers.
@@ -76,7 +76,7 @@ def read_parquet(part: Part, declaration: TraceDeclaration, limits: TraceLimits,
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise Unavailable(
+        raise UnsupportedUpload(
             "this server reads no Parquet: pyarrow is not installed",
             field=part.name,
             cure="send CSV, or install waymark[parquet]",

@@ -225,7 +225,7 @@ def test_requests_without_a_file(client: httpx.Client) -> None:
     two = [("file", ("a.png", GOOD)), ("file", ("b.png", GOOD))]
     check_problem(client.post("/v1/decodes", files=two), 400, "malformed-request", "file")
     stray = {"file": ("a.png", GOOD), "agency": (None, "other")}
-    check_problem(client.post("/v1/decodes", files=stray), 400, "malformed-request", "body")
+    check_problem(client.post("/v1/decodes", files=stray), 400, "malformed-request", "agency")
     assert post_frame(client, GOOD, "[" * 100_000).status_code == 400
     many = [("file", ("a.png", GOOD))] * 5
     assert client.post("/v1/decodes", files=many).status_code == 400

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.errors import InvalidParameter, Unavailable, UnreadableUpload, UploadTooLarge
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.traces.declaration import (
     ByteOrder,
     CanDeclaration,
@@ -234,6 +234,6 @@ def test_without_the_libraries(library: str, tmp_path: Path, monkeypatch: pytest
     trace = make_trace(200)
     content = log(trace, "log", tmp_path)
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(Unavailable) as error:
+    with pytest.raises(UnsupportedUpload) as error:
         read(trace, "a.log", content, declared(speed=CanSignal(name="Speed") if library == "cantools" else SPEED))
     assert "waymark[can]" in (error.value.cure or "")

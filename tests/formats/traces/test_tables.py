@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.errors import InvalidParameter, Unavailable, UnreadableUpload, UnsupportedUpload, UploadTooLarge
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.traces.declaration import (
     AxisConvention,
     FieldUnit,
@@ -319,7 +319,7 @@ def test_parquet_that_is_damaged_or_holds_text() -> None:
 def test_parquet_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
     content = _parquet(make_trace(50))
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(Unavailable) as error:
+    with pytest.raises(UnsupportedUpload) as error:
         read(content, name="drive.parquet")
     assert "waymark[parquet]" in (error.value.cure or "")
 
