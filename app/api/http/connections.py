@@ -24,6 +24,8 @@ MAX_HEADER_BYTES = 64 * 1024
 """Longest request line and headers. [byte] Source: twice what nginx takes by default (large_client_header_buffers)."""
 RETRY_AFTER_S = 5
 _CHECK_S = 1.0
+_LINGER_S = 2.0
+"""How long a client may still send after its response. [s] Source: by hand; nginx waits 5 s (lingering_timeout)."""
 _DROP_UNSENT = struct.pack("ii", 1, 0)
 """Value of SO_LINGER: on, 0 s. Source: man 7 socket."""
 _LOG = structlog.get_logger(__name__)
@@ -78,6 +80,7 @@ class LimitedConnection(HttpToolsProtocol):
         self._address = address_of(self.client[0]) if self.client else "unknown"
         self._headers_since_s: float | None = self.loop.time()
         self._header_bytes = 0
+        self._sends_body = False
         self._unread_since: tuple[float, int] | None = None
         self.open_by_address[self._address] += 1
         self._check_handle = self.loop.call_later(self.limits.check_s, self._check)
@@ -113,12 +116,25 @@ class LimitedConnection(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """The parser has seen all headers."""
         self._headers_since_s = None
+        self._sends_body = True
         super().on_headers_complete()
 
     def on_response_complete(self) -> None:
-        """End the connection if the client still sends a body that nobody reads."""
+        """Let a client that still sends a body that nobody reads see the response, and then end the connection.
+
+        Closing at once would reset the connection, and the client could lose the response (RFC 9112 section 9.6).
+        """
         super().on_response_complete()
-        if not self.pipeline and self.cycle.response_complete and self.cycle.more_body:
+        if not self.pipeline and self.cycle.response_complete and self._sends_body:
+            self.loop.call_later(_LINGER_S, self._end_unread, self.cycle)
+
+    def on_message_complete(self) -> None:
+        """The parser has seen the whole body."""
+        self._sends_body = False
+        super().on_message_complete()
+
+    def _end_unread(self, cycle: object) -> None:
+        if self.cycle is cycle and self._sends_body:
             self.transport.close()
 
     def resume_writing(self) -> None:
