@@ -141,8 +141,13 @@ def _check_directory(data: bytes, limits: ArchiveLimits) -> None:
         raise _too_many(limits)
 
 
+def is_file(info: zipfile.ZipInfo) -> bool:
+    """Whether an entry is a file with a name; `ZipInfo.is_dir` raises IndexError where there is no name."""
+    return info.filename != "" and not info.is_dir()
+
+
 def _files(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
-    return [info for info in archive.infolist() if not info.is_dir()]
+    return [info for info in archive.infolist() if is_file(info)]
 
 
 def _inflate(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limits: ArchiveLimits) -> bytes:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import replace
-from typing import Annotated, Any, NamedTuple
+from itertools import chain
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,7 @@ from typing_extensions import TypedDict
 from app.errors import InvalidParameter
 from app.formats.surveys.declaration import METRES, ControlPoint, ImportDeclaration, LocalGrid
 from app.formats.surveys.grids import crs_unit, unit_factor
-from app.formats.surveys.table import Fault, SurveyTable, warn
+from app.formats.surveys.table import Fault, SurveyTable, Texts, warn
 from app.geodesy import reference_system
 
 Complex = npt.NDArray[np.complex128]
@@ -111,7 +112,7 @@ def apply_local_grid(
         return table, None
     system = reference_system(table.crs)
     factor, unit_m = unit_factor(table.unit, system), METRES[crs_unit(system)]
-    at = {control.point: _row_of(table, control) for control in grid.control_points}
+    at = _rows_of(table, grid)
     controls = grid.control_points
     local: Complex = np.array([_local(table, control, at[control.point]) * factor for control in controls])
     known: Complex = np.array([complex(control.easting, control.northing) for control in controls])
@@ -136,16 +137,21 @@ def apply_local_grid(
     return replace(table, first=first, second=second, written=(table.first, table.second)), document
 
 
-def _row_of(table: SurveyTable, control: ControlPoint) -> int | None:
-    """Index of the row with the number of a control point; None if there is none."""
-    texts: Any = table.texts.get("point", ())
-    found = [row for row, text in enumerate(texts) if text == control.point]
-    if len(found) > 1 and control.local_easting is None:
-        raise InvalidParameter(
-            f"{len(found)} rows have the number of the control point {control.point[:40]!r}", field=_FIELD,
-            limit="one row", cure="declare local_easting and local_northing of the control point",
-        )  # fmt: skip
-    return found[0] if found else None
+def _rows_of(table: SurveyTable, grid: LocalGrid) -> dict[str, int | None]:
+    """Index of the row with the number of each control point; None if there is none."""
+    found: dict[str, list[int]] = {control.point: [] for control in grid.control_points}
+    parts = table.texts.get("point", Texts()).parts()
+    for row, text in enumerate(chain.from_iterable(parts)):
+        if text in found:
+            found[text].append(row)
+    for control in grid.control_points:
+        count = len(found[control.point])
+        if count > 1 and control.local_easting is None:
+            raise InvalidParameter(
+                f"{count} rows have the number of the control point {control.point[:40]!r}", field=_FIELD,
+                limit="one row", cure="declare local_easting and local_northing of the control point",
+            )  # fmt: skip
+    return {name: rows[0] if rows else None for name, rows in found.items()}
 
 
 def _local(table: SurveyTable, control: ControlPoint, row: int | None) -> complex:

@@ -32,6 +32,7 @@ _IN_GROUPS = re.compile(
 )
 _WITH_COMMA = re.compile(r"[+-]?([0-9]+),([0-9]+)")
 _WITH_POINT = re.compile(r"[+-]?[0-9]+\.[0-9]+")
+_MAX_SHOWN = 60  # [character] of a cell that is no plain number; none that is one in another form is longer
 _MIN_SHARE = 0.5  # [1] of the numbers above 999 that must be in groups; chosen by hand
 _WHOLE_DEGREES = re.compile(
     r"\s*([NSEW])?\s*([+-]?[0-9]{1,3})\s*[°d]\s*([0-9]{1,2}(?:[.,][0-9]*)?)\s*['′’m]\s*"
@@ -67,7 +68,7 @@ def detect_number_form(cells: Iterable[str], decimal: str | None) -> tuple[Numbe
     """
     decimals, groups, large = Counter[str](), Counter[str](), 0
     shown: dict[str, str] = {}
-    for text in map(str.strip, cells):
+    for text in (cell.strip()[:_MAX_SHOWN] for cell in cells):
         mark = sign = ""
         if found := _IN_GROUPS.fullmatch(text):
             rest = found["rest"] or ""
@@ -130,7 +131,7 @@ def read_numbers(cells: Any, field: str, *, form: NumberForm = PLAIN, required: 
 
 def are_sexagesimal(cells: Iterable[str]) -> bool:
     """Whether most of the cells are degrees, minutes and seconds with their signs."""
-    filled = [text for text in cells if text.strip()]
+    filled = [text for cell in cells if (text := cell.strip()[:_MAX_SHOWN])]
     return sum(1 for text in filled if _WHOLE_DEGREES.fullmatch(text)) > _MIN_SHARE * len(filled)
 
 
@@ -139,7 +140,7 @@ def read_sexagesimal(cells: Sequence[str], field: str) -> tuple[Floats, list[Fau
     values = np.full(len(cells), np.nan)
     faults: list[Fault] = []
     for index, text in enumerate(cells):
-        found = _WHOLE_DEGREES.fullmatch(text)
+        found = _WHOLE_DEGREES.fullmatch(text.strip()[:_MAX_SHOWN])
         letter = (found[1] or found[5] or "") if found else ""
         if found is None or letter not in ("", *_LETTERS.get(field, "")) or not _in_range(found):
             shown = repr(text.strip()[:40])
@@ -196,7 +197,8 @@ def _read_one(cell: Any, field: str, row: int, form: NumberForm, required: bool)
 
 
 def _fault_of(text: str, field: str, row: int, decimal: str) -> Fault:
-    shown = repr(text.strip()[:40])
+    text = text.strip()[:_MAX_SHOWN]  # patterns with several optional blanks take quadratic time
+    shown = repr(text[:40])
     if decimal == "." and _DECIMAL_COMMA.fullmatch(text):
         cure = f'declare decimal ",", or write {text.strip().replace(",", ".")}'
         return Fault(row, field, "decimal_comma", f"{field} is {shown}: a decimal comma", cure)

@@ -16,6 +16,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, UnreadableUpload
+from app.formats.archives import is_file
 from app.formats.surveys.coordinates import points_of
 from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Faults, SourceTable, Texts
 
@@ -113,7 +114,7 @@ def repack_shapefile(data: bytes) -> bytes:
     """The parts of the Shapefile in a new archive, under fixed names, checked and not compressed."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = [m for m in archive.infolist() if not m.is_dir() and "__MACOSX" not in m.filename]
+            members = [m for m in archive.infolist() if is_file(m) and "__MACOSX" not in m.filename]
             chosen = _parts(members)
             parts = {suffix: _inflated(archive, member) for suffix, member in chosen.items()}
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError, ValueError) as error:

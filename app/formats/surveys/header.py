@@ -17,7 +17,8 @@ from app.formats.surveys.table import Detected, Faults, Floats
 from app.geodesy import normalize_crs, reference_system
 from app.geodesy.systems import best_effort, covers
 
-_NUMERIC = re.compile(r"\s*[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*\s*")
+_NUMERIC = re.compile(r"[+-]?[0-9][0-9.,' \u00a0\u2009\u202f]*")
+_MAX_NUMBER = 40  # [character] longest cell that is a number; a float64 needs 24. Chosen by hand
 _UNIT = re.compile(r"\s*[\[(]?(?:m|metres?|meters?|ft|us-?ft|usft|sft|feet|deg|degrees|°)[\])]?\s*", re.IGNORECASE)
 _MIN_SHARE = 0.9  # [1] of the first rows that must be numbers, or lie in the area of use; chosen by hand
 _MIN_ROWS = 2  # columns cannot be identified by the position of one row alone
@@ -77,11 +78,11 @@ def find_header(
             return _named(rows, row, index)
     if declaration.layout == "named" or not _first_is_data(rows):
         first = rows[0]
-        if any(_NUMERIC.fullmatch(name) for name in first):
+        if any(_is_number(name) for name in first):
             raise _no_header("")
         return _named(rows, first, 0)
     start = _first_data(rows)
-    if start and len(rows[start - 1]) == len(rows[start]) and not any(map(_NUMERIC.fullmatch, rows[start - 1])):
+    if start and len(rows[start - 1]) == len(rows[start]) and not any(map(_is_number, rows[start - 1])):
         return _named(rows, rows[start - 1], start - 1)  # a header with other names, which the error will list
     for cells in comments:
         if _is_header(cells, declaration) and len(cells) == len(rows[start]):
@@ -91,12 +92,17 @@ def find_header(
     return _by_position(rows, declaration)
 
 
+def _is_number(cell: str) -> bool:
+    text = cell.strip()
+    return len(text) <= _MAX_NUMBER and _NUMERIC.fullmatch(text) is not None
+
+
 def _is_header(row: Sequence[str], declaration: ImportDeclaration) -> bool:
     names = [name.strip() for name in row]
     wanted = [name for role, name in declaration.columns.items() if name and role in _COORDINATES]
     if len(wanted) == 2:
         return all(name in names for name in wanted)
-    return names_coordinates(names) and not any(_NUMERIC.fullmatch(name) for name in names)
+    return names_coordinates(names) and not any(_is_number(name) for name in names)
 
 
 def _named(rows: Sequence[Sequence[str]], names: Sequence[str], index: int) -> Header:
@@ -134,19 +140,19 @@ def _first_numeric(rows: Sequence[Sequence[str]], column: int) -> int:
     """Index of the first row with numbers in this column and the next; 0 if there is none."""
     for index, row in enumerate(rows):
         pair = row[column : column + 2]
-        if len(pair) == 2 and all(map(_NUMERIC.fullmatch, pair)):
+        if len(pair) == 2 and all(map(_is_number, pair)):
             return index
     return 0
 
 
 def _first_data(rows: Sequence[Sequence[str]]) -> int:
     """Index of the first row with two numbers; there is one."""
-    return next(k for k, row in enumerate(rows) if sum(1 for cell in row if _NUMERIC.fullmatch(cell)) >= 2)
+    return next(k for k, row in enumerate(rows) if sum(1 for cell in row if _is_number(cell)) >= 2)
 
 
 def _first_is_data(rows: Sequence[Sequence[str]]) -> bool:
     """Whether the first lines are rows of numbers, after lines that are not."""
-    numeric = [sum(1 for cell in row if _NUMERIC.fullmatch(cell)) >= 2 for row in rows]
+    numeric = [sum(1 for cell in row if _is_number(cell)) >= 2 for row in rows]
     return any(numeric) and sum(numeric) >= _MIN_SHARE * len(numeric[numeric.index(True) :])
 
 
@@ -183,7 +189,7 @@ def _by_position(rows: Sequence[Sequence[str]], declaration: ImportDeclaration) 
 
 def _is_numeric(rows: Sequence[Sequence[str]], column: int) -> bool:
     filled = [row[column] for row in rows if len(row) > column and row[column].strip()]
-    return sum(1 for cell in filled if _NUMERIC.fullmatch(cell)) >= _MIN_SHARE * len(rows) > 0
+    return sum(1 for cell in filled if _is_number(cell)) >= _MIN_SHARE * len(rows) > 0
 
 
 def _fits(rows: Sequence[Sequence[str]], names: tuple[str, ...], declaration: ImportDeclaration) -> bool:

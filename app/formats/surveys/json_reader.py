@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -28,7 +30,7 @@ def read_geojson(data: bytes) -> SourceTable:
     features = document.get("features") if isinstance(document, dict) else None
     if not isinstance(features, list) or document.get("type") != "FeatureCollection":
         raise UnreadableUpload("no FeatureCollection", field="file", limit="RFC 7946", cure=_CURE)
-    features = [single for feature in features for single in _single_points(feature)]
+    features = list(islice(chain.from_iterable(map(_single_points, features)), MAX_ROWS + 1))
     if len(features) > MAX_ROWS:
         raise UnreadableUpload("too many points", field="file", limit=f"{MAX_ROWS} points", cure="cut the file")
     faults: list[Fault] = []
@@ -64,7 +66,7 @@ def _coordinates(feature: Any) -> list[float] | None:
     return found
 
 
-def _single_points(feature: Any) -> list[Any]:
+def _single_points(feature: Any) -> Iterable[Any]:
     """One feature for each point of a multipoint, with the properties of all."""
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     if not isinstance(geometry, dict) or geometry.get("type") != "MultiPoint":
@@ -72,7 +74,7 @@ def _single_points(feature: Any) -> list[Any]:
     places = geometry.get("coordinates")
     if not isinstance(places, list):
         return [feature]
-    return [{**feature, "geometry": {"type": "Point", "coordinates": place}} for place in places]
+    return ({**feature, "geometry": {"type": "Point", "coordinates": place}} for place in places)
 
 
 def _properties(feature: Any) -> dict[str, Any]:

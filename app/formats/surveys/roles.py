@@ -42,6 +42,7 @@ _ELLIPSOIDAL = ("ellipsoidalheight", "ellipsoidheight", "ellheight", "ellipsheig
 WKT_NAMES = ("wkt", "wktgeom", "geom", "geometry", "thegeom", "geomwkt")
 _UNIT = re.compile(r"_(?:m|metres?|meters?|u?s?_?s?ft|ft_?us|ft_?intl|i?ft|feet|deg|degrees|dd|gon)$")
 _IN_BRACKETS = re.compile(r"\s*[\[(][^\])]*[\])]\s*$")  # a unit or a datum behind the name
+_MAX_NAME = 100  # [character] of a name that are looked at; chosen by hand
 _SAMPLE = 2000  # values by which a column is recognised; chosen by hand
 _MIN_SHARE = 0.5  # [1] of the values that must fit a role; the others are faults of their rows. Chosen by hand
 _MAX_SHOWN = 20  # names in a report; chosen by hand
@@ -76,6 +77,7 @@ class Roles(NamedTuple):
 
 def plain_name(name: str) -> str:
     """A column's name without accents, case, blanks and unit: ``Punkt-Nr.`` is ``punktnr``, ``Höhe [m]`` ``hohe``."""
+    name = name.strip()[:_MAX_NAME]
     letters = unicodedata.normalize("NFKD", _IN_BRACKETS.sub("", name) or name)
     return _UNIT.sub("", normal_name("".join(c for c in letters if not unicodedata.combining(c)))).replace("_", "")
 

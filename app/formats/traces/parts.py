@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
-from app.formats.archives import ArchiveLimits, count_members, is_archive
+from app.formats.archives import ArchiveLimits, count_members, is_archive, is_file
 from app.formats.traces.declaration import TraceLimits
 
 BLOCK_BYTES = 4 * 1024**2
@@ -104,7 +104,7 @@ def _members(archive: Part, limits: TraceLimits) -> list[Part]:
     try:
         packed = zipfile.ZipFile(io.BytesIO(data))
         for info in packed.infolist():
-            if info.is_dir():
+            if not is_file(info):
                 continue
             if info.flag_bits & 1 or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise UnsupportedUpload(

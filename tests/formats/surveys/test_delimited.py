@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import suppress
 from typing import Any
 
 import pytest
 import shapely
 from pyproj import Transformer
 
-from app.errors import InvalidParameter, UnreadableUpload
+from app.errors import InvalidParameter, UnreadableUpload, WaymarkError
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.formats.surveys.table import SurveyTable
@@ -232,3 +234,20 @@ def test_heights_that_are_all_zero_are_unknown() -> None:
 def test_a_quoted_text_may_span_lines_that_begin_like_comments() -> None:
     read = _read('P,E,N,D\n1,456789.12,5427345.67,"nail\n# in the kerb"\n2,456799.12,5427345.67,x\n')
     assert list(read.texts["description"]) == ["nail\n# in the kerb", "x"]
+
+
+@pytest.mark.parametrize("cell", ["1" + " " * 9000 + "x", "(" * 9000, "°" + " " * 9000, "," * 9000])
+@pytest.mark.parametrize("place", ["name", "value", "header-less"])
+def test_long_cells_cost_no_more_than_their_size(cell: str, place: str) -> None:
+    """Patterns with several optional parts would take quadratic time: minutes for these files."""
+    quoted = f'"{cell}"'
+    rows = [f"{k},{e},{n},{quoted}" for k, (e, n) in enumerate(zip(E, N, strict=True))] * 20
+    text = {
+        "name": "\n".join([f"P,E,N,{quoted}", *(row.replace(quoted, "1.0") for row in rows)]),
+        "value": "\n".join(["P,E,N,H", *rows]),
+        "header-less": "\n".join([",".join([quoted] * 4)] * 40 + rows),
+    }[place]
+    start = time.process_time()
+    with suppress(WaymarkError):
+        _read(text)
+    assert time.process_time() - start < 5.0  # processor time; 0.1 s measured
