@@ -71,7 +71,8 @@ def test_an_outdated_if_match_is_refused(
     after = client.get(url)
 
     def edit(if_match: str, **properties: Any) -> httpx.Response:
-        body = None if method == "DELETE" else {**first.json(), "properties": properties}
+        whole = {} if method == "PATCH" else first.json()
+        body = None if method == "DELETE" else {**whole, "properties": properties}
         return client.request(method, url, json=body, headers={**SEND, "If-Match": if_match})
 
     for properties in ({}, {"road": "C1"}):
