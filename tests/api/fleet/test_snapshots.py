@@ -47,7 +47,9 @@ def test_a_vehicle_gets_its_agencys_markers_and_no_others(server: LiveServer, cl
     assert (plate.marker_id, plate.code) == (made[0]["id"], made[0]["code"]["digits"])
     assert (plate.lon_deg, plate.lat_deg, plate.height_m) == (8.412345678, 49.012345678, 120.5)
     known = {marker.code: marker.kind for marker in snapshot.near("cerpm", 8.4123, 49.0123, 100.0)}
-    said = {"family": "cerpm", "min_interval_s": 0.8, "transform_note": None}
+    radio = made[1]["radio"]
+    min_s = pytest.approx(radio["interval_s"] * (1 - radio["jitter_share"]))
+    said = {"family": "cerpm", "min_interval_s": min_s, "transform_note": None}
     assert known["1"] == {**said, "side": "right", "speed_limit": limit}
     assert known["2"] == {**said, "side": "unknown", "speed_limit": None}
     with pytest.raises(ExpiredSnapshot):
