@@ -137,7 +137,7 @@ def test_a_key_is_shown_once_and_stored_as_a_hash(server: LiveServer, admin: htt
     response = admin.post("/v1/keys", json={"scope": "viewer", "label": "a map"})
     made = response.json()
     assert response.headers["location"] == f"/v1/keys/{made['id']}"
-    assert response.headers["cache-control"] == "no-store"
+    assert response.headers["cache-control"] == "private, no-store"
     key = made.pop("key")
     assert FORM.fullmatch(key)
     assert made["prefix"] == key[:11]
@@ -283,7 +283,7 @@ def test_rotation_through_the_api(server: LiveServer, admin: httpx.Client) -> No
     answer = admin.post(f"/v1/keys/{old['id']}/rotate", json={"overlap_s": 3600})
     new = answer.json()
     assert answer.status_code == 201
-    assert answer.headers["cache-control"] == "no-store"
+    assert answer.headers["cache-control"] == "private, no-store"
     assert _works(server, old["key"])
     assert _works(server, new["key"])
     assert new["expires_at"] is None
