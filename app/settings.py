@@ -90,7 +90,7 @@ class Settings(BaseSettings):
         default=0.1,
         ge=0,
         le=1,
-        description="Maximum stated error of a coordinate transformation that counts as exact. [m]",
+        description="Maximum stated error of a coordinate transformation that is used; other positions are unfit. [m]",
     )
     proj_grids_dir: Path | None = Field(
         default=None, description="Folder with PROJ grids for coordinate transformations; none are downloaded."

@@ -32,7 +32,7 @@ export async function showMarkers(chosenId = null) {
     state.selected = new Set([...state.selected].filter((id) => items.some((marker) => marker.id === id)));
     $("#no-markers").hidden = items.length > 0;
     $("#map-caption").textContent = items.length
-      ? `${items.length}${more ? " and more" : ""} markers. Ticks point in the direction of travel. Amber markers have an approximate position that is not for localization.`
+      ? `${items.length}${more ? " and more" : ""} markers. Ticks point in the direction of travel. Amber markers have a position that is not for localization.`
       : "";
     const chosen = items.find((marker) => marker.id === (chosenId || state.chosen)) || null;
     state.chosen = chosen && chosen.id;
@@ -94,7 +94,7 @@ function drawPlaces() {
 function kindOf(marker) {
   if (marker.id === state.chosen) return "chosen";
   if (marker.status === "retired") return "retired";
-  return marker.position.localization_grade === "exact" ? "" : "approximate";
+  return marker.position.localization_grade === "unfit" ? "unfit" : "";
 }
 
 function choose(marker) {

@@ -12,6 +12,7 @@ import typer
 
 from app.cli.errors import bad_input
 from app.errors import InvalidParameter
+from app.geodesy.vertical import normalize_vertical_datum
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -78,7 +79,15 @@ def plan(
     with bad_input():
         _check_folder(out)
         declaration = AlignmentDeclaration(
-            crs, realization, epoch, vertical_datum, unit, None, ignore_heights, _origin(origin), bearing
+            crs,
+            realization,
+            epoch,
+            vertical_datum and normalize_vertical_datum(vertical_datum),
+            unit,
+            None,
+            ignore_heights,
+            _origin(origin),
+            bearing,
         )
         made = _make(console, road, rules, declaration, name or road.stem)
         block = TitleBlock(owner, number, date, creator, approver)

@@ -28,7 +28,7 @@ from app.decoders.cerpm.merged_markers import RegisteredMarker
 from app.decoders.magnet.identify import TagCandidates, TagFormat
 from app.decoders.magnet.match import tag_candidates
 from app.decoders.magnet.registered_tag import RegisteredTag
-from app.geodesy import LocalizationGrade
+from app.geodesy import LocalizationGrade, grade_accuracy
 from app.markers import snapshot as layout
 from app.markers.cerpm import LaneSide
 from app.markers.localization_warnings import position_warnings
@@ -58,7 +58,7 @@ class SnapshotMarker:
     ellipsoidal : bool
         The height is above the ellipsoid.
     exact : bool
-        Fit for localization by its survey's frame.
+        Fit for localization by its survey and its reference frame.
     kind : mapping
         What it has in common with others: scheme and geometry, or side and speed limit.
     distance_m : float
@@ -100,15 +100,12 @@ class SnapshotMarker:
     @property
     def grade(self) -> LocalizationGrade:
         """What its position is fit for."""
-        return LocalizationGrade.EXACT if self.exact else LocalizationGrade.APPROXIMATE
+        return grade_accuracy(self.horizontal_rmse_m if self.exact else None)
 
     def localization_warnings(self, what: str) -> tuple[str, ...]:
         """What makes its position unfit for localization; `what` is what it is called."""
         note = self.kind.get("transform_note")
-        rmse_m = self.horizontal_rmse_m
-        return tuple(
-            position_warnings(what, grade=self.grade, transform_note=note, horizontal_rmse_m=rmse_m, status=self.status)
-        )
+        return tuple(position_warnings(what, grade=self.grade, transform_note=note, status=self.status))
 
 
 class Snapshot:

@@ -112,6 +112,7 @@ def build_lane(client: httpx.Client, rng: np.random.Generator) -> BuiltLane:
                         "lat_deg": float(installed.lat_deg[k]),
                         "height_m": 0.0,
                         "realization": "ITRF2014",
+                        "epoch": 2026.4,
                         "horizontal_rmse_m": SURVEY_RMSE_M,
                         "survey_method": "GNSS RTK",
                     },

@@ -92,7 +92,7 @@ def _survey(place: LanePlace, code: dict[str, Any], rng: np.random.Generator) ->
             "lat_deg": lat,
             "height_m": height,
             "realization": "ITRF2014",
-            "epoch": 2025.4,
+            "epoch": 2026.4,
             "horizontal_rmse_m": SURVEY_RMSE_M,
             "vertical_rmse_m": SURVEY_RMSE_M,
             "survey_method": "simulated GNSS RTK",
@@ -149,6 +149,7 @@ def _with_truth(jpeg: bytes, rows: float, scene: PlateScene, place: LanePlace, r
     context = {
         "coarse_position": {"lon_deg": coarse_lon, "lat_deg": coarse_lat, "accuracy_m": 10.0},
         "heading_deg": (heading_deg + 3.0 * rng.standard_normal()) % 360.0,
+        "captured_at": "2026-06-01T08:00:00Z",
         "camera": {
             "width_px": CAMERA.width_px,
             "height_px": CAMERA.height_px,

@@ -177,7 +177,7 @@ def build(client: httpx.Client, folder: Path, rng: np.random.Generator) -> Built
 def _body(lane: Lane, left_m: float) -> dict[str, Any]:
     coordinates = [lane.lon_lat(at, left_m) for at in np.arange(0.0, LENGTH_M + 0.5)]
     geometry = {"type": "LineString", "coordinates": coordinates}
-    source = {"height_m": ORIGIN[2], "realization": "ITRF2014", "epoch": 2025.4, "horizontal_rmse_m": 0.02}
+    source = {"height_m": ORIGIN[2], "realization": "ITRF2014", "epoch": 2026.4, "horizontal_rmse_m": 0.02}
     return {"family": "magnet", "road": "Karlsruhe, magnet lane", "lane": {"geometry": geometry, **source}}
 
 
@@ -186,7 +186,7 @@ def _survey(client: httpx.Client, marker: dict[str, Any], rng: np.random.Generat
     error_m = np.array([*rng.standard_normal(2) * SURVEY_RMSE_M / np.sqrt(2), 0.0])
     lon_deg, lat_deg, _height = wgs84_from_enu(error_m, (hole["lon_deg"], hole["lat_deg"], ORIGIN[2]))
     position = {
-        "lon_deg": lon_deg, "lat_deg": lat_deg, "height_m": ORIGIN[2], "realization": "ITRF2014", "epoch": 2025.4,
+        "lon_deg": lon_deg, "lat_deg": lat_deg, "height_m": ORIGIN[2], "realization": "ITRF2014", "epoch": 2026.4,
         "horizontal_rmse_m": SURVEY_RMSE_M, "survey_method": "simulated GNSS RTK",
     }  # fmt: skip
     body = {"status": "surveyed", "position": position, "reason": "as-built survey"}

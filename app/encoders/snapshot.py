@@ -145,6 +145,6 @@ def _heard_ms(time_s: float | None) -> int:
 
 
 def _flags(marker: Mapping[str, Any]) -> int:
-    flags = layout.EXACT_FLAG if marker["localization_grade"] == "exact" else 0
+    flags = layout.EXACT_FLAG if marker["localization_grade"] != "unfit" else 0
     flags |= layout.ELLIPSOIDAL_FLAG if marker["vertical_datum"] in (None, "ellipsoid") else 0
     return flags | (layout.HEARD_FLAG if marker.get("last_sequence") is not None else 0)

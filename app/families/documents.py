@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import Any, NotRequired
 
 from typing_extensions import TypedDict
 
-from app.geodesy.place import Grade
+from app.geodesy.grades import Grade
 from app.markers.status import Status
 from app.registry.marker_rows import MarkerRow
 
@@ -35,6 +35,15 @@ class PositionDocument(TypedDict):
     original: dict[str, Any]
 
 
+class WarningDocument(TypedDict):
+    """Something in a position that is probably wrong, though it can be stored."""
+
+    field: str
+    code: str
+    message: str
+    proposal: str | None
+
+
 class MarkerHead(TypedDict):
     """Which marker it is."""
 
@@ -45,7 +54,10 @@ class MarkerHead(TypedDict):
 
 
 class MarkerPlace(TypedDict):
-    """Where a marker is, and since when."""
+    """Where a marker is, and since when.
+
+    `position_warnings` are in the response to a request that registers or moves the marker, if there are any.
+    """
 
     position: PositionDocument
     heading_deg: float | None
@@ -55,6 +67,7 @@ class MarkerPlace(TypedDict):
     offset_m: float | None
     created_at: datetime
     updated_at: datetime
+    position_warnings: NotRequired[list[WarningDocument]]
 
 
 class MarkerDocument(MarkerHead, MarkerPlace):

@@ -6,7 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
+from app.errors import ReferenceSystemError
 from app.families.new_marker import NewMarker
+from app.geodesy.vertical import normalize_vertical_datum
 from app.markers.status import Status
 
 
@@ -16,11 +18,20 @@ def _plain_text(text: str) -> str:
     return text
 
 
+def _vertical_datum(text: str) -> str:
+    try:
+        return normalize_vertical_datum(text)
+    except ReferenceSystemError as error:
+        error.field = None  # the place in the request is
+        raise
+
+
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Whole = Annotated[int, Field(strict=True)]
 Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, AfterValidator(_plain_text)]
 Identifier = Annotated[str, Field(pattern=r"^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$")]
+VerticalDatum = Annotated[Text, Field(min_length=1, max_length=64), AfterValidator(_vertical_datum)]
 VersionKind = Literal["as-planned", "as-built", "resurvey", "correction", "change"]
 Heading = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, lt=360)]
 Accuracy = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1e6)]
@@ -52,11 +63,8 @@ class ProvenanceIn(StrictModel):
     epoch: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1900, le=2200)] | None = Field(
         None, description="Coordinate epoch. [decimal year]"
     )
-    vertical_datum: Text | None = Field(
-        None,
-        min_length=1,
-        max_length=64,
-        description="`ellipsoid` (default) or the datum of the height, e.g. EPSG:5703.",
+    vertical_datum: VerticalDatum | None = Field(
+        None, description="`ellipsoid` (default) or the datum of the height, e.g. EPSG:5703."
     )
     horizontal_rmse_m: Accuracy | None = Field(None, description="Horizontal accuracy, RMSE. [m]")
     vertical_rmse_m: Accuracy | None = Field(None, description="Vertical accuracy, RMSE. [m]")

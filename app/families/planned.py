@@ -12,6 +12,7 @@ from app.families.rules import MarkerRules
 from app.planning.alignment import Alignment
 from app.planning.plan import PlannedMarker
 from app.radio.settings import RadioSettings
+from app.registry.grade_columns import grade_columns
 from app.registry.marker_rows import CodeRow
 
 PLAN_METHOD = "placed by a plan"
@@ -74,10 +75,8 @@ class Commitment:
             "realization": road.realization,
             "epoch": road.epoch,
             "survey_method": PLAN_METHOD,
-            "transform_accuracy_m": road.transform_accuracy_m,
-            "localization_grade": str(road.grade),
-            "transform_note": None,
             "original": self.original(marker),
+            **grade_columns(None, road.transform_accuracy_m, None),
         }
 
 

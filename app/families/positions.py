@@ -7,6 +7,7 @@ from typing import Any
 from app.errors import InvalidParameter
 from app.families.inputs import PositionIn
 from app.geodesy import PlacedPosition, place_position
+from app.registry.grade_columns import grade_columns
 
 
 def place_input(position: PositionIn, accuracy_m: float) -> PlacedPosition:
@@ -49,7 +50,7 @@ def position_columns(position: PositionIn, placed: PlacedPosition) -> dict[str, 
         "height_m": placed.height_m,
         "crs": placed.crs,
         "realization": placed.realization,
-        "epoch": position.epoch,
+        "epoch": placed.epoch,
         "vertical_datum": position.vertical_datum or ("ellipsoid" if position.height_m is not None else None),
         "horizontal_rmse_m": position.horizontal_rmse_m,
         "vertical_rmse_m": position.vertical_rmse_m,
@@ -58,8 +59,6 @@ def position_columns(position: PositionIn, placed: PlacedPosition) -> dict[str, 
         "surveyor": position.surveyor,
         "instrument": position.instrument,
         "survey_file_sha256": position.survey_file_sha256,
-        "transform_accuracy_m": placed.transform_accuracy_m,
         "original": position.model_dump(exclude_none=True),
-        "localization_grade": str(placed.grade),
-        "transform_note": placed.note,
+        **grade_columns(position.horizontal_rmse_m, placed.transform_accuracy_m, placed.note),
     }

@@ -10,7 +10,7 @@ from pyproj.enums import TransformDirection
 
 from app.errors import ReferenceSystemError
 from app.geodesy.operations import list_operations
-from app.geodesy.place import LocalizationGrade
+from app.geodesy.realizations import system_of_realization
 from app.geodesy.systems import best_effort, covers, geographic_from, is_global, named_system, normalize_crs
 
 Floats = npt.NDArray[np.float64]
@@ -27,18 +27,21 @@ class Origin:
     ----------
     crs : str
         System that they were submitted in.
-    grade : LocalizationGrade
-        EXACT: transformed with a stated accuracy, or global from the start.
+    stated : bool
+        Transformed with a stated accuracy, or global from the start.
     epoch : float or None
-        [decimal year]
+        Of the positions. [decimal year]
     ellipsoidal_height : bool
         Heights are above the ellipsoid.
+    realization : str or None
+        Realization of `crs` that they were submitted in, as it was stated.
     """
 
     crs: str
-    grade: LocalizationGrade
+    stated: bool
     epoch: float | None
     ellipsoidal_height: bool
+    realization: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +105,7 @@ def positions_in_system(
         first, second = _projected(name, lon_deg, lat_deg)
         return SystemPositions(first, second, height_m, 0.0, f"{name} is on a global datum: no datum transformation")
     returns = _same_datum(name, origin.crs)
-    if returns and origin.grade is not LocalizationGrade.EXACT:
+    if returns and not origin.stated:
         first, second = best_effort(name).transform(lon_deg, lat_deg, direction=_INVERSE)
         note = f"the road came in {origin.crs} without a stated accuracy, which is undone: exact in its own datum"
         return SystemPositions(np.asarray(first), np.asarray(second), height_m, 0.0, note)
@@ -116,7 +119,11 @@ def _transformed(
     three_d = origin.ellipsoidal_height and bool(np.isfinite(height_m).all())
     middle = int(np.argsort(lon_deg)[len(lon_deg) // 2])
     place = float(lon_deg[middle]), float(lat_deg[middle])
-    operations = list_operations(name, *place, three_d=three_d, epoch=origin.epoch, accuracy_m=np.inf)
+    source = (system_of_realization(name, origin.realization) if returns else None) or name
+    operations = list_operations(source, *place, three_d=three_d, accuracy_m=np.inf)
+    if not isinstance(operations, str) and origin.epoch is None:
+        known = [operation for operation in operations if not operation.needs_epoch]
+        operations = known or "the transformation depends on time, and the epoch of the positions is not known"
     if isinstance(operations, str):
         raise ReferenceSystemError(
             f"positions cannot be staked in {name}: {operations}",

@@ -17,7 +17,7 @@ from app.geodesy.systems import best_effort, covers, named_system
 
 _ITRF2014_2D, _ITRF2014_3D = "EPSG:9000", "EPSG:7912"
 _TIMELY = ("t_epoch", "defmodel")
-_MAX_NAME = 300  # characters; source: by hand
+_MAX_NAME = 200  # characters; source: by hand, a note has 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def bounded_operations(name: str, three_d: bool) -> tuple[BoundedOperation, ...]
 
 
 def list_operations(
-    name: str, lon_deg: float, lat_deg: float, *, three_d: bool, epoch: float | None, accuracy_m: float
+    name: str, lon_deg: float, lat_deg: float, *, three_d: bool, accuracy_m: float
 ) -> list[BoundedOperation] | str:
     """Operations that transform a place to ITRF2014 with the required accuracy, best first; or why there are none.
 
@@ -88,8 +88,6 @@ def list_operations(
         Approximate position. [deg]
     three_d : bool
         With an ellipsoidal height.
-    epoch : float or None
-        [decimal year]
     accuracy_m : float
         Worst stated accuracy. [m]
     """
@@ -102,8 +100,7 @@ def list_operations(
     good = [one for one in here if one.bound_m <= accuracy_m]
     if not good:
         return f"the best transformation states {here[0].bound_m:g} m, the limit is {accuracy_m:g} m"
-    timely = [one for one in good if epoch is not None or not one.needs_epoch]
-    return timely or "the transformation depends on time and no epoch was given"
+    return good
 
 
 def use_grids(folder: Path | None) -> None:

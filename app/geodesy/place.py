@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
-from enum import StrEnum
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from app.errors import InvalidParameter
+from app.errors import InvalidParameter, ReferenceSystemError
 from app.geodesy.frames import check_lon_lat
+from app.geodesy.grades import LocalizationGrade, grade_accuracy
 from app.geodesy.operations import BoundedOperation, list_operations
+from app.geodesy.plate_motion import plate_motion
+from app.geodesy.realizations import (
+    TARGET,
+    accuracy_of_global,
+    has_realizations,
+    is_stated,
+    realization_of_system,
+    system_of_realization,
+)
 from app.geodesy.systems import (
     check_area,
     geographic_from,
@@ -25,17 +32,13 @@ from app.geodesy.systems import (
     wgs84_without_bound,
 )
 
-_GLOBAL_REALIZATION = re.compile(r"(WGS ?84|ITRF|IGS|IGb)", re.IGNORECASE)
+PLATE_FIXED_EPOCH = 2020.0
+"""Epoch in the ITRF for which plate-fixed coordinates without an epoch are transformed. [decimal year]
 
-
-Grade = Literal["exact", "approximate, not for localization"]
-
-
-class LocalizationGrade(StrEnum):
-    """Whether a position may be used to localize a vehicle."""
-
-    EXACT = "exact"
-    APPROXIMATE = "approximate, not for localization"
+Any would do, because they do not change and the position is moved to the epoch of its use. Source: by hand.
+"""
+UNSTATED_YEARS = 10.0
+"""Age that coordinates without an epoch may have. [year] Source: by hand; ITRF2014 came out in 2016."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +55,12 @@ class PlacedPosition:
         The original CRS, in the form ``EPSG:code`` or ``OGC:CRS84``.
     realization : str or None
         Frame of lon_deg, lat_deg: as stated, or the one it was transformed into.
+    epoch : float or None
+        Of lon_deg, lat_deg in this frame. [decimal year]
     transform_accuracy_m : float or None
-        Stated bound of the transformation; 0 without one, None if there is no bound. [m]
-    grade : LocalizationGrade
+        Horizontal accuracy of the transformation, the realization and the epoch together; None if it is unknown. [m]
     note : str or None
-        Why it is only approximate, or which transformation was used.
+        Which transformation was used, and which declaration would make the position more accurate.
     """
 
     lon_deg: float
@@ -64,9 +68,14 @@ class PlacedPosition:
     height_m: float | None
     crs: str
     realization: str | None
+    epoch: float | None
     transform_accuracy_m: float | None
-    grade: LocalizationGrade
     note: str | None = None
+
+    @property
+    def grade(self) -> LocalizationGrade:
+        """Best grade that a survey in this frame can have."""
+        return grade_accuracy(self.transform_accuracy_m)
 
 
 def place_position(
@@ -94,13 +103,13 @@ def place_position(
     projected : bool
         The coordinates are easting and northing.
     realization : str, optional
-        Frame as stated by the surveyor, e.g. ``ITRF2014``.
+        Frame as stated by the surveyor, e.g. ``ITRF2014``, ``WGS 84 (G2139)``, or ``ETRF2000`` of ETRS89.
     epoch : float, optional
         Coordinate epoch. [decimal year]
     ellipsoidal_height : bool
         The height is above the ellipsoid and takes part in the transformation.
     accuracy_m : float
-        Worst stated accuracy of a transformation whose result still counts as exact. [m]
+        Worst stated accuracy of a transformation that is used. [m]
 
     Raises
     ------
@@ -112,8 +121,9 @@ def place_position(
     Notes
     -----
     PROJ transforms NAD83(2011) to EPSG:4326 by a null shift and assumes an epoch without a warning. So other systems
-    are transformed to ITRF2014 only by operations that state an accuracy, within their area of use and, if they depend
-    on time, with an epoch. All other positions are transformed without a bound and graded approximate.
+    are transformed to ITRF2014 only by operations that state an accuracy, within their area of use. If these depend on
+    time, a plate-fixed frame without an epoch is transformed for `PLATE_FIXED_EPOCH`. All other positions are
+    transformed without a bound: they are unfit for localization.
     """
     name = normalize_crs(crs)
     system = named_system(name)
@@ -130,23 +140,19 @@ def place_position(
     lon_deg, lat_deg = wgs84_without_bound(name, first, second)
     check_area(system, name, lon_deg, lat_deg)
     if is_global(system):
-        return _placed_globally(name, lon_deg, lat_deg, height_m, realization)
+        frame = _global_frame(name, (lon_deg, lat_deg), realization, epoch)
+        return PlacedPosition(lon_deg, lat_deg, height_m, name, *frame)
     height = height_m if ellipsoidal_height else None
-    moved = _to_itrf2014(name, (lon_deg, lat_deg), (first, second, height), epoch, accuracy_m)
+    moved = _to_itrf2014(name, (lon_deg, lat_deg), (first, second, height), realization, epoch, accuracy_m)
     if isinstance(moved, str):
-        return PlacedPosition(
-            lon_deg, lat_deg, height_m, name, None, None, LocalizationGrade.APPROXIMATE, f"from {name}: {moved}"
-        )
+        return PlacedPosition(lon_deg, lat_deg, height_m, name, None, None, None, f"from {name}: {moved}")
     operation, lon_deg, lat_deg, moved_height = moved
     return PlacedPosition(
         lon_deg,
         lat_deg,
         moved_height if height is not None else height_m,
         name,
-        "ITRF2014",
-        operation.bound_m,
-        LocalizationGrade.EXACT,
-        _note(name, operation),
+        *_transformed_frame(name, (lon_deg, lat_deg), operation, realization, epoch),
     )
 
 
@@ -164,9 +170,14 @@ class PlacedPositions:
     placed: npt.NDArray[np.bool_]
     crs: str
     realization: str | None
+    epoch: float | None
     transform_accuracy_m: float | None
-    grade: LocalizationGrade
     note: str | None
+
+    @property
+    def grade(self) -> LocalizationGrade:
+        """Best grade that a survey in this frame can have."""
+        return grade_accuracy(self.transform_accuracy_m)
 
 
 def place_positions(
@@ -202,24 +213,22 @@ def place_positions(
     known = np.isfinite(lon)
     heights = height_m if ellipsoidal_height else np.full_like(height_m, np.nan)
     if not known.any() or is_global(system):
-        one = _placed_globally(name, 0.0, 0.0, None, realization)
-        return PlacedPositions(
-            lon, lat, height_m, known, name, one.realization, one.transform_accuracy_m, one.grade, one.note
-        )
+        middle_deg = _middle(lon[known], lat[known]) if known.any() else (0.0, 0.0)
+        frame = _global_frame(name, middle_deg, realization, epoch)
+        return PlacedPositions(lon, lat, height_m, known, name, *frame)
     has_height = bool(np.isfinite(heights[known]).all())
     middle = int(np.flatnonzero(known)[np.argsort(lon[known])[known.sum() // 2]])
     original = (float(first[middle]), float(second[middle]), float(heights[middle]) if has_height else None)
-    moved = _to_itrf2014(name, (float(lon[middle]), float(lat[middle])), original, epoch, accuracy_m)
+    place_deg = (float(lon[middle]), float(lat[middle]))
+    moved = _to_itrf2014(name, place_deg, original, realization, epoch, accuracy_m)
     if isinstance(moved, str):
-        grade, note = LocalizationGrade.APPROXIMATE, f"from {name}: {moved}"
-        return PlacedPositions(lon, lat, height_m, known, name, None, None, grade, note)
+        return PlacedPositions(lon, lat, height_m, known, name, None, None, None, f"from {name}: {moved}")
     operation = moved[0]
     unproject = geographic_from(name)
     if unproject is not None:
         first, second = unproject.transform(first, second)
-    x, y, z, _ = operation.transformer.transform(
-        first, second, np.where(np.isfinite(heights), heights, 0.0), np.zeros_like(first) + (epoch or 0.0)
-    )
+    times = np.full_like(first, _epoch_of(operation, epoch))
+    x, y, z, _ = operation.transformer.transform(first, second, np.where(np.isfinite(heights), heights, 0.0), times)
     reached = known & np.isfinite(x) & np.isfinite(y) & operation.covers(lon, lat)
     return PlacedPositions(
         np.where(reached, x, np.nan),
@@ -227,43 +236,112 @@ def place_positions(
         np.where(reached, z, np.nan) if has_height else height_m,
         reached,
         name,
-        "ITRF2014",
-        operation.bound_m,
-        LocalizationGrade.EXACT,
-        _note(name, operation),
+        *_transformed_frame(name, place_deg, operation, realization, epoch),
     )
+
+
+def _middle(lon_deg: npt.NDArray[np.float64], lat_deg: npt.NDArray[np.float64]) -> tuple[float, float]:
+    k = int(np.argsort(lon_deg)[len(lon_deg) // 2])
+    return float(lon_deg[k]), float(lat_deg[k])
 
 
 def _to_itrf2014(
     name: str,
     place: tuple[float, float],
     original: tuple[float, float, float | None],
+    realization: str | None,
     epoch: float | None,
     accuracy_m: float,
 ) -> tuple[BoundedOperation, float, float, float] | str:
     """The first operation that transforms a place, with its result; or why there is none."""
     first, second, height_m = original
-    operations = list_operations(name, *place, three_d=height_m is not None, epoch=epoch, accuracy_m=accuracy_m)
+    source = system_of_realization(name, realization) or name
+    operations = list_operations(source, *place, three_d=height_m is not None, accuracy_m=accuracy_m)
     if isinstance(operations, str):
         return operations
     unproject = geographic_from(name)
     if unproject is not None:
         first, second = unproject.transform(first, second)
     for operation in operations:
-        lon, lat, height, _ = operation.transformer.transform(first, second, height_m or 0.0, epoch or 0.0)
+        at = _epoch_of(operation, epoch)
+        lon, lat, height, _ = operation.transformer.transform(first, second, height_m or 0.0, at)
         if all(math.isfinite(v) for v in (lon, lat, height)):
             return operation, float(lon), float(lat), float(height)
     return "the transformation does not reach this position"
+
+
+def _epoch_of(operation: BoundedOperation, epoch: float | None) -> float:
+    """Epoch for which an operation is run."""
+    return (epoch or PLATE_FIXED_EPOCH) if operation.needs_epoch else 0.0
+
+
+_Frame = tuple[str | None, float | None, float | None, str | None]
+"""Realization, epoch, accuracy [m] and note of a position."""
+
+
+def _transformed_frame(
+    name: str, place_deg: tuple[float, float], operation: BoundedOperation, realization: str | None, epoch: float | None
+) -> _Frame:
+    """Frame of positions that an operation brought to ITRF2014."""
+    motion = plate_motion(*place_deg)
+    parts_m, notes = [operation.bound_m], [_note(name, operation)]
+    if system_of_realization(name, realization) is None:
+        if realization is not None:
+            notes.append(f"the realization {realization} is not one of {name}, it was ignored")
+        elif has_realizations(name):
+            notes.append("state the realization, such as ETRF2000, for a better accuracy")
+    if not operation.needs_epoch:
+        parts_m.append(UNSTATED_YEARS * float((motion.speed_m + motion.accuracy_m)[0]))
+        return TARGET, None, math.hypot(*parts_m), "; ".join(notes)
+    if epoch is None:
+        parts_m.append(UNSTATED_YEARS * float(motion.accuracy_m[0]))
+        notes.append(f"no epoch is stated: motion within the plate may add {parts_m[-1]:.2g} m; state the epoch")
+    return TARGET, epoch or PLATE_FIXED_EPOCH, math.hypot(*parts_m), "; ".join(notes)
+
+
+def stored_frame(
+    crs: str, place_deg: tuple[float, float], realization: str | None, epoch: float | None, accuracy_m: float | None
+) -> tuple[float | None, str | None]:
+    """Accuracy [m] of a stored position's frame, which may be of before realization and epoch counted, and what to add
+    to its note.
+
+    Parameters
+    ----------
+    crs, realization, epoch, accuracy_m
+        As they are stored.
+    place_deg : (float, float)
+        Longitude and latitude. [deg]
+    """
+    try:
+        is_kept = is_global(named_system(normalize_crs(crs)))
+    except ReferenceSystemError:
+        is_kept = False
+    if accuracy_m is None or not is_kept:
+        return accuracy_m, None
+    return _global_frame(crs, place_deg, realization, epoch)[2:]
 
 
 def _note(name: str, operation: BoundedOperation) -> str:
     return f"transformed from {name} to ITRF2014, stated accuracy {operation.bound_m:g} m: {operation.name}"
 
 
-def _placed_globally(
-    name: str, lon_deg: float, lat_deg: float, height_m: float | None, realization: str | None
-) -> PlacedPosition:
-    if realization is not None and not _GLOBAL_REALIZATION.match(realization):
+def _global_frame(name: str, place_deg: tuple[float, float], realization: str | None, epoch: float | None) -> _Frame:
+    """Frame of positions in WGS 84 or an ITRF, which are kept as they are."""
+    stated = realization if is_stated(realization) else realization_of_system(name)
+    accuracy_m = accuracy_of_global(stated)
+    if accuracy_m is None:
         note = f"the realization {realization} is not one of {name}; no transformation was made"
-        return PlacedPosition(lon_deg, lat_deg, height_m, name, realization, None, LocalizationGrade.APPROXIMATE, note)
-    return PlacedPosition(lon_deg, lat_deg, height_m, name, realization, 0.0, LocalizationGrade.EXACT)
+        return realization, epoch, None, note
+    parts_m, notes = [accuracy_m], []
+    if stated is None:
+        notes.append(
+            f"the realization of WGS 84 is not stated, they differ by up to {accuracy_m:g} m: state the realization, "
+            "such as ITRF2020 or WGS 84 (G2296)"
+        )
+    if epoch is None:
+        motion = plate_motion(*place_deg)
+        parts_m.append(UNSTATED_YEARS * float((motion.speed_m + motion.accuracy_m)[0]))
+        notes.append(
+            f"no epoch is stated, the plate moves by {parts_m[-1]:.2f} m in {UNSTATED_YEARS:g} years: state the epoch"
+        )
+    return stated, epoch, math.hypot(*parts_m), "; ".join(notes) or None

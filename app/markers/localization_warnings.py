@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from app.geodesy import LocalizationGrade
+from app.geodesy import UNFIT_TEXT, LocalizationGrade
 
 SURVEYED = ("surveyed", "active")
 
 
-def position_warnings(
-    what: str, *, grade: str, transform_note: str | None, horizontal_rmse_m: float | None, status: str
-) -> list[str]:
+def position_warnings(what: str, *, grade: str, transform_note: str | None, status: str) -> list[str]:
     """Warnings about the position of a marker; none if it is fit for localization.
 
     Parameters
@@ -20,15 +18,11 @@ def position_warnings(
         A `LocalizationGrade`.
     transform_note : str or None
         Note on the transformation of its position.
-    horizontal_rmse_m : float or None
-        [m]
     status : str
     """
     localization_warnings = []
-    if grade != LocalizationGrade.EXACT:
-        localization_warnings.append(transform_note or f"the {what}'s position is approximate")
-    if horizontal_rmse_m is None:
-        localization_warnings.append(f"the {what}'s position has no stated accuracy")
+    if grade == LocalizationGrade.UNFIT:
+        localization_warnings.append(transform_note or f"the {what}'s position is {UNFIT_TEXT}")
     if status not in SURVEYED:
         localization_warnings.append(f"the {what} is {status}, its position is not surveyed")
     return localization_warnings

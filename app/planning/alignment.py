@@ -10,7 +10,7 @@ import numpy.typing as npt
 from pyproj import Geod
 
 from app.formats.alignments.geometry import EventKind, LineStyle, StationEquation
-from app.geodesy import LocalizationGrade
+from app.geodesy import LocalizationGrade, grade_accuracy
 
 Floats = npt.NDArray[np.float64]
 
@@ -157,13 +157,15 @@ class Alignment:
     events : tuple of RoadEvent
         By lane and chainage; curves are found by `build_alignment`, the others come with the file.
     areas : tuple of AvoidedArea
-    grade : LocalizationGrade
-        What positions computed from it are fit for; APPROXIMATE for roads that were placed by an origin.
     surveyed : bool
         Whether the file states coordinates on Earth; False where an origin placed a road of local coordinates.
-    crs, realization, epoch, vertical_datum
+    crs, vertical_datum
         As declared or stated by the file; the datum is None where heights are unknown.
+    realization, epoch
+        Of the lanes' positions.
     transform_accuracy_m : float or None
+        Horizontal accuracy of the transformation, the realization and the epoch; None if it is unknown. [m]
+    declared_realization : str or None
     start_station_m : float
         Displayed station of the start of the reference line. [m]
     station_equations : tuple of StationEquation
@@ -174,16 +176,21 @@ class Alignment:
     lanes: tuple[Lane, ...]
     events: tuple[RoadEvent, ...] = ()
     areas: tuple[AvoidedArea, ...] = ()
-    grade: LocalizationGrade = LocalizationGrade.EXACT
     surveyed: bool = True
     crs: str = "EPSG:4326"
     realization: str | None = None
     epoch: float | None = None
     vertical_datum: str | None = None
     transform_accuracy_m: float | None = 0.0
+    declared_realization: str | None = None
     start_station_m: float = 0.0
     station_equations: tuple[StationEquation, ...] = ()
     warnings: tuple[str, ...] = ()
+
+    @property
+    def grade(self) -> LocalizationGrade:
+        """Best grade that positions along it can have."""
+        return grade_accuracy(self.transform_accuracy_m)
 
     @property
     def lane_length_m(self) -> float:

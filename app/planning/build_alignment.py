@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
-from app.geodesy import LocalizationGrade
 from app.planning.alignment import Alignment, AvoidedArea, Lane
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.road.checks import (
@@ -68,7 +67,7 @@ def build_alignment(
     name : str
         Of the alignment, and of a road without a name.
     accuracy_m : float
-        Worst stated accuracy of a transformation whose result still counts as exact. [m]
+        Worst stated accuracy of a transformation that is used. [m]
     needs_speed : bool
         Refuse lanes without a speed, as plans must; without, such speeds are NaN.
 
@@ -117,13 +116,13 @@ def build_alignment(
         tuple(lanes),
         tuple(events),
         tuple(_areas(file, placed.rings)),
-        source.grade,
         source.surveyed,
         source.crs,
         source.realization,
-        declaration.epoch,
+        source.epoch,
         declaration.vertical_datum if has_heights else None,
         source.transform_accuracy_m,
+        declaration.realization,
         file.start_station_m,
         file.station_equations,
         tuple(warnings),
@@ -135,9 +134,9 @@ def _with_earlier(file: AlignmentFile, road: PlacedRoad) -> PlacedRoad:
     earlier = file.earlier
     if earlier is None:
         return road
-    if earlier.exact:
-        return replace(road, transform_accuracy_m=None)
-    return replace(road, grade=LocalizationGrade.APPROXIMATE, transform_accuracy_m=None, note=earlier.note or road.note)
+    if not earlier.exact:
+        return replace(road, transform_accuracy_m=None, note=earlier.note or road.note)
+    return road if earlier.accuracy_m is None else replace(road, transform_accuracy_m=earlier.accuracy_m)
 
 
 def _areas(file: AlignmentFile, rings: Sequence[Floats]) -> Iterator[AvoidedArea]:

@@ -14,6 +14,7 @@ import orjson
 import sqlalchemy as sa
 
 from app.registry.audit import NO_ENTRY, entry_hash, version_sha256
+from app.registry.grade_columns import is_graded, regraded
 from app.registry.marker_rows import PUBLIC
 from app.registry.tables import audit_log, marker_versions, markers
 
@@ -183,7 +184,10 @@ def _sha256_of(row: sa.RowMapping) -> str:
 
 def _differing(row: sa.RowMapping) -> list[str]:
     """Columns of the marker that its newest version has otherwise; a version knows the columns of its time."""
-    known = {name: value for name, value in row["marker"].items() if _NOW + name in row}
+    written = row["marker"]
+    if "localization_grade" in written and not is_graded(written):
+        written = {**written, **regraded(written)}  # a migration did the same
+    known = {name: value for name, value in written.items() if _NOW + name in row}
     now = orjson.loads(orjson.dumps({name: row[_NOW + name] for name in known}))
     return [] if now == known else [name for name in known if now[name] != known[name]]
 

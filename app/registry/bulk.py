@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.geodesy.vertical import ELLIPSOID
 from app.registry.audit import AuditEntry
 from app.registry.bulk_load import large_load, load_columns
 from app.registry.columns import Columns, json_objects
@@ -35,18 +36,26 @@ class PlaceRow(NamedTuple):
     point: str | None
 
 
-def list_places_in(connection: sa.Connection, agency_id: str, box: Box, *, limit: int) -> list[PlaceRow]:
-    """Places and heights of the agency's markers in a box that may be on the road."""
+def list_places_in(
+    connection: sa.Connection, agency_id: str, box: Box, *, limit: int, ignoring: str = ""
+) -> list[PlaceRow]:
+    """Places and heights of the agency's markers, but one, in a box that may be on the road."""
     own = {"point": markers.c.original["point"].as_string().label("point")}
     columns = [own[name] if name in own else markers.c[name] for name in PlaceRow._fields]
-    query = sa.select(*columns).where(markers.c.agency_id == agency_id, markers.c.status != "retired", within_box(box))
+    query = sa.select(*columns).where(
+        markers.c.agency_id == agency_id, markers.c.status != "retired", markers.c.id != ignoring, within_box(box)
+    )
     return fetch_all(connection, query.limit(limit), PlaceRow)
 
 
-def is_any_near(connection: sa.Connection, agency_id: str, lon_deg: float, lat_deg: float, radius_m: float) -> bool:
-    """Whether the agency has a marker in the box around a circle."""
+def is_any_near(
+    connection: sa.Connection, agency_id: str, lon_deg: float, lat_deg: float, radius_m: float, *, ignoring: str = ""
+) -> bool:
+    """Whether the agency has a marker, besides one, in the box around a circle."""
     query = sa.select(markers.c.row).where(
-        markers.c.agency_id == agency_id, within_box(box_around(lon_deg, lat_deg, radius_m))
+        markers.c.agency_id == agency_id,
+        markers.c.id != ignoring,
+        within_box(box_around(lon_deg, lat_deg, radius_m)),
     )
     return connection.execute(query.limit(1)).first() is not None
 
@@ -116,18 +125,17 @@ def list_records(
     return [dict(zip(fields, row, strict=True)) for row in rows]
 
 
-def has_heights(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> bool:
-    """Whether a marker of the filter has a height."""
-    query = sa.select(markers.c.row).where(
-        markers.c.agency_id == agency_id, markers.c.height_m.is_not(None), *conditions_of(filtered)
-    )
-    return connection.execute(query.limit(1)).first() is not None
+def have_ellipsoidal_heights(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> bool:
+    """Whether every marker of the filter has an ellipsoidal height."""
+    lacks = sa.or_(markers.c.height_m.is_(None), markers.c.vertical_datum != ELLIPSOID)
+    query = sa.select(markers.c.row).where(markers.c.agency_id == agency_id, lacks, *conditions_of(filtered))
+    return connection.execute(query.limit(1)).first() is None
 
 
 _SNAPSHOT = (
     "id", "family", "status", "scheme", "digits", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm", "lon_deg",
     "lat_deg", "height_m", "vertical_datum", "heading_deg", "horizontal_rmse_m", "vertical_rmse_m", "heading_rmse_deg",
-    "localization_grade", "transform_accuracy_m", "transform_note",
+    "localization_grade", "transform_accuracy_m", "transform_note", "epoch",
 )  # fmt: skip
 
 

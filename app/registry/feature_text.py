@@ -15,6 +15,7 @@ from typing import Any
 
 import orjson
 
+from app.geodesy.vertical import is_ellipsoidal
 from app.registry.columns import Columns, JsonTexts, json_objects, json_texts
 from app.registry.features import FIELDS
 from app.registry.marker_rows import MarkerRow
@@ -25,8 +26,12 @@ _pick = attrgetter(*PROPERTIES.values())
 
 
 def feature_text(marker: MarkerRow) -> str:
-    """The feature of a marker: WGS 84 longitude and latitude, height if there is one; one line."""
-    lon_deg, lat_deg, height_m = marker.lon_deg, marker.lat_deg, marker.height_m
+    """The feature of a marker: WGS 84 longitude and latitude, and its height if that is ellipsoidal; one line.
+
+    A height in a geometry is above the ellipsoid: RFC 7946 section 4. Others are in the properties, with their datum.
+    """
+    lon_deg, lat_deg = marker.lon_deg, marker.lat_deg
+    height_m = marker.height_m if is_ellipsoidal(marker.vertical_datum) else None
     properties = dict(zip(PROPERTIES, _pick(marker), strict=True))
     properties["side"] = _side(marker.spec) if marker.family == "cerpm" else None
     feature = {
@@ -52,7 +57,11 @@ def feature_texts(columns: Columns) -> list[str]:
         updated_at=list(map(_time, columns.values("updated_at"))),
     )
     places = zip(*(json_texts(columns.values(name)) for name in ("lon_deg", "lat_deg", "height_m")), strict=True)
-    coordinates = (f"{lon},{lat}" if height == "null" else f"{lon},{lat},{height}" for lon, lat, height in places)
+    flat = [not is_ellipsoidal(datum) for datum in columns.values("vertical_datum")]
+    coordinates = (
+        f"{lon},{lat}" if is_flat or height == "null" else f"{lon},{lat},{height}"
+        for (lon, lat, height), is_flat in zip(places, flat, strict=True)
+    )
     members: dict[str, Sequence[Any]] = {
         "id": columns.values("id"),
         "geometry": JsonTexts([f'{{"type":"Point","coordinates":[{place}]}}' for place in coordinates]),

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.geodesy.vertical import ELLIPSOID
 from app.registry.conditions import Condition, condition_sql
 from app.registry.plan_states import find_plan_states
 from app.registry.spatial import Box, proposed_by_index
@@ -46,6 +47,7 @@ FIELDS = (
     Field("offset_m", "number", _C.offset_m, "Offset from the road's axis, left positive [m]"),
     Field("realization", "string", _C.realization, "Reference frame of the position"),
     Field("epoch", "number", _C.epoch, "Coordinate epoch [decimal year]"),
+    Field("height_m", "number", _C.height_m, "Height above vertical_datum [m]"),
     Field("vertical_datum", "string", _C.vertical_datum, "What the height is above"),
     Field("horizontal_rmse_m", "number", _C.horizontal_rmse_m, "Horizontal accuracy [m]"),
     Field("vertical_rmse_m", "number", _C.vertical_rmse_m, "Vertical accuracy [m]"),
@@ -53,8 +55,18 @@ FIELDS = (
     Field("check_points", "integer", _C.check_points, "Independent points that the accuracy was tested at"),
     Field("surveyor", "string", _C.surveyor, "Who surveyed"),
     Field("instrument", "string", _C.instrument, "With what it was surveyed"),
-    Field("transform_accuracy_m", "number", _C.transform_accuracy_m, "Accuracy of the transformation to WGS 84 [m]"),
-    Field("localization_grade", "string", _C.localization_grade, "Whether a vehicle may be localized by it"),
+    Field(
+        "transform_accuracy_m",
+        "number",
+        _C.transform_accuracy_m,
+        "Accuracy of the reference frame: transformation, realization, epoch [m]",
+    ),
+    Field(
+        "localization_grade",
+        "string",
+        _C.localization_grade,
+        "cm, dm, m or unfit: what a vehicle may be localized by it to",
+    ),
     Field("version", "integer", _C.version, "Version of the marker"),
     Field("updated_at", "date-time", _C.updated_at, "When it was last changed"),
 )
@@ -139,7 +151,7 @@ class FeatureFilter:
         Of which collection.
     box : Box or None
     heights_m : tuple of float or None
-        Lowest and highest height; markers without a height are included. [m]
+        Lowest and highest ellipsoidal height; markers without one are included. [m]
     since, until : datetime or None
         Bounds of the last change, both inclusive.
     equal : tuple of (name, value)
@@ -272,7 +284,7 @@ def _conditions(shape: _Shape) -> list[sa.ColumnElement[bool]]:
         conditions.append(sa.or_(*(in_box(k, wide, table.table) for k, wide in enumerate(shape.wide))))
     if shape.heights:
         low, high = sa.bindparam("low", type_=sa.Double), sa.bindparam("high", type_=sa.Double)
-        conditions.append(sa.or_(c.height_m.is_(None), c.height_m.between(low, high)))
+        conditions.append(sa.or_(c.height_m.is_(None), c.vertical_datum != ELLIPSOID, c.height_m.between(low, high)))
     if shape.since:
         conditions.append(table.changed >= sa.bindparam("since", type_=table.changed.type))
     if shape.until:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import datetime
+from typing import Any, cast
 
 import sqlalchemy as sa
 
 from app.errors import NotFound
+from app.registry.grade_columns import is_graded, regraded
 from app.registry.marker_rows import MARKERS, MarkerRow, VersionRow
 from app.registry.markers import MarkerFilter, conditions_of
 from app.registry.rows import fetch_all, row_of, select_rows
@@ -28,7 +30,7 @@ def list_versions(
         v.marker_id == marker_id, v.agency_id == agency_id, v.version > after
     )
     rows = fetch_all(connection, query.order_by(v.version).limit(limit), VersionRow)
-    return [row._replace(marker=row_of(MarkerRow, row.marker)) for row in rows]
+    return [row._replace(marker=_marker_of(cast(Mapping[str, Any], row.marker))) for row in rows]
 
 
 def get_version(connection: sa.Connection, agency_id: str, marker_id: str, version: int) -> VersionRow:
@@ -116,7 +118,12 @@ def _states(connection: sa.Connection, marker_ids: list[str], at: datetime) -> I
     newest = sa.select(sa.func.max(w.c.version)).where(w.c.marker_id == v.c.marker_id, w.c.at <= at).scalar_subquery()
     query = sa.select(v.c.marker).where(v.c.marker_id.in_(marker_ids), v.c.version == newest)
     for marker in connection.execute(query).scalars():
-        yield row_of(MarkerRow, marker)
+        yield _marker_of(marker)
+
+
+def _marker_of(stored: Mapping[str, Any]) -> MarkerRow:
+    """The marker of a version; one from before there were grades gets its grade."""
+    return row_of(MarkerRow, stored if is_graded(stored) else {**stored, **regraded(stored)})
 
 
 def _matches(marker: MarkerRow, filtered: MarkerFilter) -> bool:

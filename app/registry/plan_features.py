@@ -60,12 +60,13 @@ PLAN_FIELDS = (
     Field("station_m", "number", _P.station_m, "True distance along the road's reference line [m]"),
     Field("offset_m", "number", _P.offset_m, "From the lane's centre line, left positive [m]"),
     Field("heading_deg", "number", _P.heading_deg, "Direction of travel, clockwise from true north [deg]"),
+    Field("height_m", "number", _P.height_m, "Height above vertical_datum [m]"),
     Field("vertical_datum", "string", _P.vertical_datum, "What the height is above"),
     Field("plan_id", "string", _P.plan_id, "Id of the plan"),
     Field("plan", "string", plans.c.name, "Name of the plan"),
     Field("status", "string", _STATUS, "Of the plan: draft, checked, proved, approved, committed, built or surveyed"),
 )
-OF_MARKER = tuple(field.name for field in PLAN_FIELDS[:11])
+OF_MARKER = tuple(field.name for field in PLAN_FIELDS[:12])
 """Properties that are in the stored part of a feature; the others follow from the plan."""
 _TEXT = sa.literal_column('\'{"type":"Feature","id":"\'', sa.String()).concat(_P.id).concat('",')
 _TEXT = _TEXT.concat(_P.feature).concat(',"plan_id":"').concat(_P.plan_id).concat('","plan":')
@@ -110,7 +111,7 @@ LANE_FIELDS = tuple(
         ("max_grade", "number", "Steepest rise or fall per distance"),
         ("left_style", "string", "Paint of the left boundary"),
         ("right_style", "string", "Paint of the right boundary"),
-        ("localization_grade", "string", "Whether positions along it are exact"),
+        ("localization_grade", "string", "cm, dm, m or unfit: best grade that positions along it can have"),
     )
 )
 

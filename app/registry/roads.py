@@ -20,11 +20,13 @@ _CHUNK = 1000
 
 
 class RoadFrame(TypedDict):
-    """The reference system that a road's geometry came in, and whether it came as a MultiLineString."""
+    """The reference system that a road's geometry came in, the frame that it is in now and the accuracy of that, and
+    whether it came as a MultiLineString."""
 
     crs: str
     realization: str | None
     epoch: float | None
+    transform_accuracy_m: float | None
     several: bool
 
 

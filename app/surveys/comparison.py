@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from typing_extensions import TypedDict
 
 from app.formats.surveys.table import Fault, Floats, warn
+from app.geodesy import move_to_epoch
 from app.surveys.georeference import GeoreferencedSurvey, east_north_m
 
 REACH_M = 30.0
@@ -80,8 +81,17 @@ def compare_survey(
     lat_deg: Floats,
     height_m: Floats,
     matched: npt.NDArray[np.intp] | None,
+    epoch: Floats | None = None,
 ) -> Comparison:
-    """Residuals of a survey at registered markers, shape (M,): those that its rows name, or else the mutual nearest."""
+    """Residuals of a survey at registered markers, shape (M,): those that its rows name, or else the mutual nearest.
+
+    Markers are compared where they were at the epoch of the survey, if their own epoch [decimal year] is known.
+    """
+    if epoch is not None and survey.placed.epoch is not None:
+        moved = move_to_epoch(
+            lon_deg, lat_deg, np.where(np.isfinite(epoch), epoch, survey.placed.epoch), survey.placed.epoch
+        )
+        lon_deg, lat_deg = moved.lon_deg, moved.lat_deg
     others = np.column_stack(east_north_m(lon_deg, lat_deg, survey.origin_deg)).reshape(-1, 2)
     points = np.column_stack([survey.east_m, survey.north_m])
     if matched is None:

@@ -34,6 +34,7 @@ _GRADE = 0.15  # [m/m] steepest road that is allowed for
 _ROUNDED_ROWS = 5  # rows from which on whole metres are no coincidence
 _HEIGHT_STEP_M = 2.0  # [m] step of height that is allowed besides the grade
 _PART = 100_000  # rows that are worked on at a time, to bound memory
+_COARSE_M = 1.0  # [m] an RMSE above it is graded m or unfit, and is more often one in millimetres
 _NO_DATA = (-9999.0, -99999.0, -32768.0, 9999.0, 99999.0)  # values that GIS programs write for "no data"
 
 
@@ -50,6 +51,16 @@ def check_consistency(survey: GeoreferencedSurvey) -> Iterator[Fault]:
             order = _order(points, float(np.median(distance_m)))
             yield from _check_line(points[order], rows[order])
     yield from check_heights(survey)
+
+
+def check_accuracy(horizontal_rmse_m: float | None, vertical_rmse_m: float | None) -> Iterator[Fault]:
+    """Stated accuracies that are no survey's. [m]"""
+    for field, rmse_m in (("horizontal_rmse_m", horizontal_rmse_m), ("vertical_rmse_m", vertical_rmse_m)):
+        if rmse_m is not None and rmse_m > _COARSE_M:
+            yield warn(
+                None, field, "coarse_accuracy", f"the stated accuracy is {rmse_m:g} m",
+                f"state it in metres ({rmse_m:g} mm are {rmse_m / 1000:g} m), or survey again: for vehicles",
+            )  # fmt: skip
 
 
 def _check_zeros(survey: GeoreferencedSurvey) -> Iterator[Fault]:

@@ -19,6 +19,8 @@ from app.surveys.georeference import Alternative, GeoreferencedSurvey, east_nort
 HasMarkersNear = Callable[[float, float], bool]
 """Whether markers are registered within some kilometres of a longitude and latitude."""
 
+KNOWN_M = 5_000.0
+"""Registered markers within this distance confirm that a place is the agency's. [m]"""
 NEAR_M = 300.0
 """Registered markers within this distance of a row are compared with it. [m]"""
 _MIN_NEAR_SHARE = 0.3  # [1] of rows with a registered marker near, below which the area alone is checked

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from pyproj import CRS
 
 from app.errors import WaymarkError
 from app.families.rules import MarkerRules
@@ -53,8 +54,10 @@ class Judge:
         caller = self._access.authenticate(self._access.create_key(f"agency {self._count}", Scope.PLANNER, "bench"))
         if survey.registered:
             lines = ["number,lon,lat,height", *(",".join(map(repr, map(_plain, row))) for row in survey.registered)]
+            # the survey's coordinates are made by PROJ's null shifts: what is registered is in the datum of the survey
+            crs = ":".join(CRS(survey.crs).geodetic_crs.to_2d().to_authority())
             declaration = ImportDeclaration(
-                crs="EPSG:4326", family="cerpm", vertical_datum="ellipsoid", columns={"code": "number"}, status="active"
+                crs=crs, family="cerpm", vertical_datum="ellipsoid", columns={"code": "number"}, status="active"
             )
             given = ImportInput("\n".join(lines).encode(), declaration, mode="good")
             report, _ = self._imports.run(caller, given)

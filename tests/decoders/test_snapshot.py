@@ -34,7 +34,7 @@ def _plate(lon_deg: float, lat_deg: float, code: PlateCode | None = None, **more
     return {
         "id": str(uuid.uuid4()), "family": "plate", "status": "surveyed", "code": code.digits, "lon_deg": lon_deg,
         "lat_deg": lat_deg, "height_m": 120.3456, "vertical_datum": "ellipsoid", "heading_deg": 359.99996,
-        "horizontal_rmse_m": 0.0121, "vertical_rmse_m": None, "heading_rmse_deg": 0.2, "localization_grade": "exact",
+        "horizontal_rmse_m": 0.0121, "vertical_rmse_m": None, "heading_rmse_deg": 0.2, "localization_grade": "cm",
         "kind": {
             "scheme": str(code.scheme), "n": code.n, "unit_mm": 35.0, "gap_mm": 5.0, "thickness_mm": 20.0,
             "check_digits": None,
@@ -66,7 +66,7 @@ def test_what_goes_in_comes_out() -> None:
     plate = _plate(8.4, 49.0)
     bare = _plate(
         8.4001, 49.0, height_m=None, heading_deg=None, horizontal_rmse_m=None, heading_rmse_deg=None,
-        localization_grade="approximate, not for localization", vertical_datum="EPSG:5703",
+        localization_grade="unfit", vertical_datum="EPSG:5703",
     )  # fmt: skip
     snapshot = _open(_write([plate, bare]))
     first, second = snapshot.near("plate", 8.4, 49.0, 100.0)
@@ -280,7 +280,7 @@ def test_cerpms_carry_what_was_heard_of_them() -> None:
     limit = {"value": 30, "unit": "km/h"}
     kind = {"side": "right", "speed_limit": limit, "min_interval_s": 0.8, "transform_note": "a datum's bound"}
     markers = [
-        _cerpm(4_000_000_000, 8.4, 49.0, kind=kind, localization_grade="approximate", **heard),
+        _cerpm(4_000_000_000, 8.4, 49.0, kind=kind, localization_grade="unfit", **heard),
         _cerpm(5, 8.41, 49.0), _cerpm(6, 8.41, 49.0, status="retired"),
     ]  # fmt: skip
     snapshot = _open(_write(markers))

@@ -43,7 +43,7 @@ def _rows(agency: str, count: int, lon_deg: float = 8.0) -> list[dict[str, Any]]
             "scheme": "cerpm", "digits_match_position": (None, True, False)[k % 3], "lon_deg": lon_deg + k * 1e-4,
             "lat_deg": 49.123456789012345, "height_m": None if k % 2 else 1e-9, "crs": "EPSG:4326",
             "original": {"point": TEXTS[k % 5], "row": k}, "spec": None if k % 4 else {"side": "left"},
-            "localization_grade": "exact", "road": TEXTS[k % 5], "version": 1, "created_at": NOW, "updated_at": NOW,
+            "localization_grade": "cm", "road": TEXTS[k % 5], "version": 1, "created_at": NOW, "updated_at": NOW,
         }
         for k in range(count)
     ]  # fmt: skip

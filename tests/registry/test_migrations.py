@@ -13,11 +13,13 @@ import orjson
 import pytest
 import sqlalchemy as sa
 
-from app.registry.audit import find_head
+from app.registry.audit import find_head, version_sha256
 from app.registry.audit_check import ChainReport, check_history
 from app.registry.bulk_load import load_rows
 from app.registry.database import Database
 from app.registry.feature_text import feature_text
+from app.registry.grade_columns import regraded
+from app.registry.history import list_versions
 from app.registry.magnets import list_magnets_in
 from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter, list_markers
@@ -70,6 +72,7 @@ def _marker(k: int, lon_deg: float, lat_deg: float) -> dict[str, Any]:
         "created_at": NOW,
         "updated_at": NOW + timedelta(microseconds=k),
     }
+    marker |= regraded(marker)
     return {**marker, "feature": feature_text(row_of(MarkerRow, marker))}
 
 
@@ -209,6 +212,61 @@ def test_responses_of_a_holder_are_given_to_nobody_else_by_an_older_release(data
     database.migrate()
     with database.read() as connection:
         assert connection.exec_driver_sql("SELECT holder_id, key FROM idempotency_keys").all() == [("", "k")]
+
+
+ITRF: dict[str, Any] = {"realization": "ITRF2014", "epoch": 2025.4, "transform_accuracy_m": 0.0}
+LEGACY: list[tuple[dict[str, Any], str, float | None]] = [
+    ({"transform_accuracy_m": 0.0}, "m", 2.0),
+    ({"realization": "ITRF2014", "transform_accuracy_m": 0.0}, "dm", 0.27),
+    ({"realization": "ITRF2014", "epoch": 2025.4, "transform_accuracy_m": 0.0}, "cm", 0.0),
+    (
+        {"realization": "ITRF2014", "epoch": 2025.4, "transform_accuracy_m": 0.0, "horizontal_rmse_m": 12.0},
+        "unfit",
+        0.0,
+    ),
+    (
+        {"realization": "ITRF2014", "epoch": 2025.4, "transform_accuracy_m": 0.0, "horizontal_rmse_m": None},
+        "unfit",
+        0.0,
+    ),
+    ({"crs": "EPSG:25832", "realization": "ITRF2014", "epoch": 2025.4, "transform_accuracy_m": 0.1}, "dm", 0.1),
+    ({"crs": "EPSG:25832", "transform_note": "from EPSG:25832: no epoch"}, "unfit", None),
+    ({"realization": "NAD83(2011)", "transform_note": "not one of EPSG:4326"}, "unfit", None),
+]
+"""Positions as they were stored before there were grades, with their grade and the accuracy of their frame [m]."""
+
+
+def test_older_positions_are_graded_and_their_history_verifies(database: Database) -> None:
+    made = _made(len(LEGACY))
+    datums = ("ellipsoid", "EPSG:7837")
+    for k, (marker, version, (position, _, _)) in enumerate(
+        zip(made["markers"], made["marker_versions"], LEGACY, strict=True)
+    ):
+        old = "exact" if "transform_accuracy_m" in position else "approximate, not for localization"
+        marker |= {"lon_deg": 8.4, "lat_deg": 49.0, "height_m": 120.5, "vertical_datum": datums[k % 2]}
+        unstated = dict.fromkeys(("realization", "epoch", "transform_accuracy_m", "transform_note"))
+        marker |= {"horizontal_rmse_m": 0.02, **unstated} | position
+        marker |= {"localization_grade": old, "updated_at": NOW, "created_at": NOW}
+        names = MarkerRow._fields
+        version["marker"] = orjson.loads(orjson.dumps({name: marker.get(name) for name in names if name != "original"}))
+        version["sha256"] = version_sha256(AGENCY, marker["id"], 1, NOW, "w", None, "as-built", version["marker"])
+    database.migrate("0015")
+    _fill(database, made)
+    database.migrate()
+    with database.read() as connection:
+        rows = list_markers(connection, AGENCY, MarkerFilter(), after=None, limit=20)
+        features = connection.execute(sa.select(markers.c.feature).order_by(markers.c.id)).scalars().all()
+        faults = list(check_history(connection, AGENCY, ChainReport()))
+        assert [fault for fault in faults if "entry" not in fault.where + fault.what] == []  # the log has none here
+        versions = [list_versions(connection, AGENCY, row.id)[0].marker for row in rows]
+    for row, version_row, feature, (_, grade, accuracy_m) in zip(rows, versions, features, LEGACY, strict=True):
+        assert row.localization_grade == version_row.localization_grade == grade
+        assert row.transform_accuracy_m == (None if accuracy_m is None else pytest.approx(accuracy_m, abs=0.02))
+        assert feature == feature_text(row)
+        point = orjson.loads(feature)
+        assert len(point["geometry"]["coordinates"]) == (3 if row.vertical_datum == "ellipsoid" else 2)
+        assert point["properties"]["height_m"] == 120.5
+    assert "state horizontal_rmse_m" in (rows[4].transform_note or "")
 
 
 def test_to_nothing_and_back(database: Database) -> None:

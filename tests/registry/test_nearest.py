@@ -70,7 +70,7 @@ def store(tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[
                 "digits": f"{owner} {k}",
                 "crs": "EPSG:4326",
                 "original": {},
-                "localization_grade": "exact",
+                "localization_grade": "cm",
                 "version": 1,
                 "created_at": NOW,
                 "updated_at": NOW,

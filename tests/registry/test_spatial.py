@@ -37,7 +37,7 @@ PLAIN = {
     "status": "planned",
     "crs": "EPSG:4326",
     "original": {},
-    "localization_grade": "exact",
+    "localization_grade": "cm",
     "version": 1,
     "created_at": NOW,
     "updated_at": NOW,

@@ -149,7 +149,7 @@ def _row(k: int, lon_deg: float, lat_deg: float) -> dict[str, Any]:
         "lat_deg": lat_deg,
         "crs": "EPSG:4326",
         "original": {},
-        "localization_grade": "exact",
+        "localization_grade": "cm",
         "version": 1,
         "created_at": NOW,
         "updated_at": NOW,

@@ -101,7 +101,9 @@ def post_artwork(wanted: ArtworkIn, caller: Caller, artworks: ArtworkService) ->
         "Waymark-Proof": f"read-back plates={bundle.plates} lowest-confidence={bundle.lowest_confidence:.6f}",
     }
     if bundle.approximate:
-        headers["Waymark-Note"] = f"{bundle.approximate} of {bundle.plates} plates have an approximate position"
+        headers["Waymark-Note"] = (
+            f"{bundle.approximate} of {bundle.plates} plates have a position that is not for localization"
+        )
     return StreamingResponse(_chunks(bundle), headers=headers, media_type="application/zip")
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.encoders.plate import ArtworkFormat
-from app.families.inputs import Flag, Identifier, Number, Text
+from app.families.inputs import Flag, Identifier, Number, Text, VerticalDatum
 from app.formats.alignments.registered_road import RoadLanes
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.proof import ProofTerms
@@ -27,7 +27,7 @@ class AlignmentIn(_Body):
     crs: Annotated[Text | None, Field(max_length=64, examples=["EPSG:25832"])] = None
     realization: Annotated[Text | None, Field(max_length=64, examples=["ITRF2014"])] = None
     epoch: Annotated[Number | None, Field(ge=1900, le=2100, description="Decimal year.")] = None
-    vertical_datum: Annotated[Text | None, Field(max_length=64, examples=["ellipsoid"])] = None
+    vertical_datum: Annotated[VerticalDatum | None, Field(examples=["ellipsoid"])] = None
     unit: Literal["m", "ft-us", "ft-intl"] | None = None
     height_unit: Literal["m", "ft-us", "ft-intl"] | None = None
     ignore_heights: bool = False

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from app.api.http.dependencies import Number, Text
 from app.families import FAMILIES, FamilyName
-from app.families.inputs import Accuracy, StrictModel
+from app.families.inputs import Accuracy, StrictModel, VerticalDatum
 from app.markers.status import Status
 
 Unit = Literal["m", "ft-us", "ft-intl"]
@@ -96,7 +96,7 @@ class DeclarationIn(_FamilyMembers):
     crs: Annotated[Text, Field(max_length=100)] | None = Field(None, description="EPSG code or URN.")
     realization: Annotated[Text, Field(min_length=1, max_length=64)] | None = None
     epoch: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1900, le=2200)] | None = None
-    vertical_datum: Annotated[Text, Field(min_length=1, max_length=64)] | None = Field(
+    vertical_datum: VerticalDatum | None = Field(
         None, description="`ellipsoid`, or the datum of the heights; needed where there are any."
     )
     unit: Unit | None = Field(None, description="Of projected coordinates; the CRS's own without.")

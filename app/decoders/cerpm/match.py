@@ -5,6 +5,7 @@ Used on the server with the registry, and on board with a snapshot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,7 +17,7 @@ from app.decoders.cerpm.merged_markers import MergedMarkers, MergeRules, Registe
 from app.decoders.cerpm.payload import decode_message
 from app.decoders.cerpm.verify import Verification, verify_packets
 from app.errors import WaymarkError
-from app.geodesy import LocalizationGrade
+from app.geodesy import LocalizationGrade, grade_accuracy
 from app.markers.cerpm import MESSAGE_BYTES
 from app.markers.cerpm_keys import MAX_INVALID_TAGS_PER_LOG
 from app.sensors.pose_track import PoseTrack
@@ -99,7 +100,7 @@ def match_known_markers(
 def grade_markers(
     merged: MergedMarkers, verification: Verification, known: KnownCerpms
 ) -> tuple[LocalizationGrade, tuple[str, ...]]:
-    """Whether a path through these markers may localize a vehicle, and the reasons against it."""
+    """Grade of the least accurate of these markers, and the reasons why their path may not localize a vehicle."""
     localization_warnings: dict[str, int] = {}
     authentic = {packet.number for packet in verification.packets if packet.accepted}
     for number in merged.number.tolist():
@@ -113,7 +114,9 @@ def grade_markers(
     if merged.shift_m is not None:
         localization_warnings["the markers send positions in another datum"] = len(merged.left_out)
     texts = tuple(f"{warning} ({count} of {len(merged.number)})" for warning, count in localization_warnings.items())
-    return (LocalizationGrade.APPROXIMATE if localization_warnings else LocalizationGrade.EXACT), texts
+    if texts or not len(merged.number):
+        return LocalizationGrade.UNFIT, texts
+    return grade_accuracy(float(merged.sigma_m.max()) * math.sqrt(2)), texts  # horizontal RMSE is of both axes
 
 
 def _without_retired(merged: MergedMarkers, retired: frozenset[int]) -> MergedMarkers:

@@ -127,7 +127,7 @@ def fix_from_tag(reading: TagReading, tag: RegisteredTag, bar: MagnetometerBar) 
         along_std_m=along_std_m,
         across_std_m=across_std_m,
         across_m=float((middles_m.mean(axis=0) - passage.holes_m[-1]) @ lane_left),
-        grade=LocalizationGrade.APPROXIMATE if tag.localization_warnings else LocalizationGrade.EXACT,
+        grade=LocalizationGrade.UNFIT if tag.localization_warnings else LocalizationGrade(tag.grade),
         notes=tag.localization_warnings,
     )
 

@@ -14,7 +14,7 @@ from app.encoders.magnet import DrillingSheet, MagnetLayout, place_line, place_t
 from app.errors import InvalidParameter, naming
 from app.families.inputs import PositionIn
 from app.families.magnet.spec import MagnetSpec, StoredLane, meaning_of
-from app.geodesy import LocalizationGrade, PlacedPosition, place_position
+from app.geodesy import PlacedPosition, place_position
 from app.markers.checks import Check
 from app.markers.magnet import InformationTag, LineTag, Orientation, parse_tag
 from app.planning.drilling_sheet import drilling_sheet
@@ -111,8 +111,8 @@ def lane_spec(lane: LaneInput, placed: list[PlacedPosition]) -> StoredLane:
 
 
 def worst_grade(placed: list[PlacedPosition]) -> PlacedPosition:
-    """The first vertex that is only approximate, or the first one."""
-    return next((p for p in placed if p.grade is not LocalizationGrade.EXACT), placed[0])
+    """The vertex with the least accurate frame."""
+    return max(placed, key=lambda p: math.inf if p.transform_accuracy_m is None else p.transform_accuracy_m)
 
 
 def layout_of(name: str, spec: MagnetSpec) -> MagnetLayout:

@@ -7,7 +7,7 @@ from app.encoders.plate.bundle import ARTWORK_VERSION
 from app.encoders.plate.order import reference_text
 from app.families.files import ArtworkProof, MarkerArtwork
 from app.families.plate.rows import plate_code, plate_geometry
-from app.geodesy import LocalizationGrade
+from app.geodesy import UNFIT_TEXT
 from app.registry.marker_rows import MarkerRow
 
 
@@ -41,11 +41,11 @@ def plate_order(row: MarkerRow, record_url: str) -> PlateOrder:
 
 
 def reference_system(row: MarkerRow) -> str:
-    """Reference system for the margin, with a warning if the position is only approximate."""
-    warning = str(LocalizationGrade.APPROXIMATE) if is_approximate(row) else None
+    """Reference system for the margin, with a warning if the position is not for localization."""
+    warning = UNFIT_TEXT if is_unfit(row) else None
     return reference_text(row.realization, row.epoch, warning)
 
 
-def is_approximate(row: MarkerRow) -> bool:
+def is_unfit(row: MarkerRow) -> bool:
     """Whether the position is not fit for localization."""
-    return row.localization_grade != "exact"
+    return row.localization_grade == "unfit"

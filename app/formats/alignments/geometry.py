@@ -146,13 +146,16 @@ class EarlierTransformation:
     Attributes
     ----------
     exact : bool
-        Whether a transformation with a stated accuracy did it; otherwise positions are approximate.
+        Whether a transformation with a stated accuracy did it; otherwise positions are unfit for localization.
     note : str or None
         How, for people.
+    accuracy_m : float or None
+        Its accuracy; None in documents that were written without it. [m]
     """
 
     exact: bool
     note: str | None
+    accuracy_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

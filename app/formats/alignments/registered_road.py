@@ -76,7 +76,9 @@ class RegisteredRoad(_Part):
     parts : list of lines of (lon, lat)
         In WGS 84 / ITRF. [deg]
     exact : bool
-        Whether positions are exact; otherwise they are not for localization.
+        Whether a transformation with a stated accuracy brought them there; otherwise they are not for localization.
+    accuracy_m : float or None
+        Of the positions' reference frame; None in documents that were written without it. [m]
     note : str or None
         How they were transformed before.
     """
@@ -87,6 +89,7 @@ class RegisteredRoad(_Part):
     name: str
     exact: bool
     note: str | None
+    accuracy_m: float | None = None
     lanes: RoadLanes
     calibration: list[RoadStation]
     parts: list[list[tuple[Longitude, Latitude]]]
@@ -136,7 +139,7 @@ def read_registered_road(data: bytes) -> AlignmentFile:
         start_m = float(chainages[-1][-1])
     points = [CalibrationPoint(p.part, p.chainage_m, p.measure_m, p.ahead_m) for p in road.calibration]
     measures = calibrate(ranges_m, points)
-    earlier = None if road.exact and road.note is None else EarlierTransformation(road.exact, road.note)
+    earlier = EarlierTransformation(road.exact, road.note, road.accuracy_m)
     return AlignmentFile(
         "road",
         tuple(_lanes(road, axes, chainages)),

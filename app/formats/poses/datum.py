@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 
 from app.errors import InvalidParameter, ReferenceSystemError
-from app.geodesy import LocalizationGrade, place_position
+from app.geodesy import place_position, reference_system
+from app.geodesy.systems import is_global
 
 _WGS84_NAME = re.compile(r"(WGS[ _-]?(19)?84|ITRF|IGS|W84)", re.IGNORECASE)
 _EPSG_NUMBER = re.compile(r"\d{4,6}\Z", re.ASCII)
@@ -25,8 +26,9 @@ def check_datum(crs: str, lon_deg: float = 0.0, lat_deg: float = 0.0) -> None:
     name = f"EPSG:{text}" if _EPSG_NUMBER.match(text) else text
     with_cure = f"positions are in {text[:60]!r}, which is not WGS 84 / ITRF"
     try:
-        placed = place_position(lon_deg, lat_deg, crs=name)
+        place_position(lon_deg, lat_deg, crs=name)
+        known = is_global(reference_system(name))
     except InvalidParameter as error:
         raise ReferenceSystemError(with_cure, field="poses.crs", limit="WGS 84", cure=_CURE_DATUM) from error
-    if placed.grade is not LocalizationGrade.EXACT or placed.transform_accuracy_m != 0.0:
+    if not known:
         raise ReferenceSystemError(with_cure, field="poses.crs", limit="WGS 84", cure=_CURE_DATUM)

@@ -28,7 +28,7 @@ from app.encoders.plate import (
 from app.encoders.plate.order import reference_text
 from app.encoders.plate.quality import quality_csv
 from app.errors import InvalidParameter
-from app.geodesy import LocalizationGrade
+from app.geodesy import UNFIT_TEXT, LocalizationGrade
 from app.markers.magnet import LineStyle
 from app.planning.drilling_sheet import drilling_sheet
 from app.planning.magnet_checks import Site
@@ -183,7 +183,7 @@ class Package:
         """A plate as the workshop is asked to make it; it has a record to point to when the plan is committed."""
         assert isinstance(marker.detail, PlannedPlate)
         road = self.plan.alignment
-        warning = None if road.grade is LocalizationGrade.EXACT else str(road.grade)
+        warning = UNFIT_TEXT if road.grade is LocalizationGrade.UNFIT else None
         return PlateOrder(
             plate_id=f"plate-{marker.number:05d}",
             code=marker.detail.code,

@@ -9,7 +9,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, Va
 
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import LineStyle, StationEquation
-from app.geodesy import LocalizationGrade
 from app.markers.magnet_codebook import Codebook
 from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent
 from app.planning.plan import LeftOut, Plan, PlanFinding, PlannedMarker
@@ -112,13 +111,14 @@ class AlignmentDocument(_Part):
     lanes: list[LaneDocument]
     events: tuple[RoadEvent, ...]
     areas: list[AreaDocument]
-    grade: LocalizationGrade
+    grade: str = ""  # not read back: it follows from the accuracy
     surveyed: bool
     crs: str
     realization: str | None
     epoch: float | None
     vertical_datum: str | None
     transform_accuracy_m: float | None
+    declared_realization: str | None = None
     start_station_m: float
     station_equations: tuple[StationEquation, ...]
     warnings: tuple[str, ...]
@@ -135,7 +135,8 @@ class AlignmentDocument(_Part):
 
     def alignment(self) -> Alignment:
         """The alignment of the document."""
-        same = {name: getattr(self, name) for name in type(self).model_fields if name not in ("lanes", "areas")}
+        own = ("lanes", "areas", "grade")
+        same = {name: getattr(self, name) for name in type(self).model_fields if name not in own}
         areas = tuple(AvoidedArea(area.kind, np.array(area.ring_deg).reshape(-1, 2)) for area in self.areas)
         return Alignment(lanes=tuple(lane.lane() for lane in self.lanes), areas=areas, **same)
 

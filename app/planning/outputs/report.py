@@ -67,7 +67,7 @@ def write_report(plan: Plan, missing_files: Mapping[str, str] | None = None) -> 
     length_km = road.lane_length_m / 1000
     lines += [
         f"Road {_cell(road.name)}: {len(road.lanes)} lanes, {length_km:.3f} km of lane, {len(road.events)} events, "
-        f"{len(road.areas)} areas to avoid. Positions: {road.grade}; {road.crs}.",
+        f"{len(road.areas)} areas to avoid. Positions: grade {road.grade}; {road.crs}.",
         "",
         *(f"- Warning: {_cell(warning)}" for warning in road.warnings),
         *([""] if road.warnings else []),

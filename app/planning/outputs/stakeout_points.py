@@ -141,7 +141,13 @@ def plan_stakeout(plan: Plan, crs: str | None = None, unit: str | None = None) -
     places = _places(plan)
     lon, lat, height = (np.array([place[k] for place in places], dtype=np.float64) for k in (2, 3, 4))
     road = plan.alignment
-    origin = Origin(road.crs, road.grade, road.epoch, road.vertical_datum == "ellipsoid")
+    origin = Origin(
+        road.crs,
+        road.transform_accuracy_m is not None,
+        road.epoch,
+        road.vertical_datum == "ellipsoid",
+        road.declared_realization,
+    )
     found = positions_in_system(lon, lat, height, name, origin=origin)
     scale, up = METRES[own] / METRES[unit], 1.0 / METRES[unit]
     east, north, high = (found.first * scale).tolist(), (found.second * scale).tolist(), (found.height_m * up).tolist()

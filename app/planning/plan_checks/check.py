@@ -47,11 +47,11 @@ def _places(plan: Plan) -> Iterator[PlanFinding]:
         "places that the rules ask for and that have no marker" + (f"; first: {missing[0].reason}" if missing else ""),
         missed=Verdict.WARN,
     )  # fmt: skip
-    approximate = plan.alignment.grade is LocalizationGrade.APPROXIMATE
+    unfit = plan.alignment.grade is LocalizationGrade.UNFIT
     yield compare(
-        "positions", float(approximate), "<=", 0, "roads", "docs/decisions/0002-positions.md",
+        "positions", float(unfit), "<=", 0, "roads", "docs/decisions/0002-positions.md",
         "the road is placed by an origin or without a stated accuracy: survey the markers before they localize"
-        if approximate
+        if unfit
         else "the road's reference system has a stated accuracy",
         missed=Verdict.WARN,
     )  # fmt: skip

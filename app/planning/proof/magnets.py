@@ -13,7 +13,7 @@ from app.decoders.magnet.identify import TagFormat
 from app.decoders.magnet.match import match_tags, tag_candidates
 from app.decoders.magnet.readings import MagnetReading
 from app.decoders.magnet.registered_tag import RegisteredTag
-from app.geodesy import enu_from_wgs84, wgs84_from_enu
+from app.geodesy import enu_from_wgs84, grade_accuracy, wgs84_from_enu
 from app.markers.magnet import Orientation
 from app.planning.alignment import Floats, Lane
 from app.planning.plan import PlannedLineMagnet, PlannedMarker, PlannedTag
@@ -203,7 +203,7 @@ def _registered(marker: PlannedMarker, rmse_m: float, rng: np.random.Generator) 
     bearing = _bearing_deg(marker) + float(rng.normal(0, _HEADING_STD_DEG))
     return RegisteredTag(
         str(marker.number), "surveyed", planned.tag, lon, lat, height, bearing, marker.lon_deg, marker.lat_deg,
-        rmse_m, "exact", meaning=planned.meaning,
+        rmse_m, grade_accuracy(rmse_m), meaning=planned.meaning,
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from pyproj.exceptions import CRSError
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.alignments.geometry import AlignmentFile
 from app.formats.surveys.declaration import METRES
-from app.geodesy import LocalizationGrade, normalize_crs, place_positions, reference_system
+from app.geodesy import normalize_crs, place_positions, reference_system
 from app.geodesy.systems import is_global
 from app.planning.alignment_declaration import AlignmentDeclaration
 
@@ -42,11 +42,11 @@ class PlacedRoad:
     Attributes
     ----------
     lon_deg, lat_deg, height_m : ndarray, shape (N,)
-    crs, realization, grade, transform_accuracy_m
+    crs, realization, epoch, transform_accuracy_m
         As in `app.planning.alignment.Alignment`.
     surveyed : bool
     note : str or None
-        Why positions are only approximate.
+        Why positions are unfit for localization.
     """
 
     lon_deg: Floats
@@ -54,7 +54,7 @@ class PlacedRoad:
     height_m: Floats
     crs: str
     realization: str | None
-    grade: LocalizationGrade
+    epoch: float | None
     transform_accuracy_m: float | None
     surveyed: bool
     note: str | None
@@ -107,19 +107,19 @@ class RoadReference:
             ellipsoidal_height=self.declaration.vertical_datum == "ellipsoid",
             accuracy_m=accuracy_m,
         )
-        grade, bound, note = placed.grade, placed.transform_accuracy_m, placed.note
+        bound, note = placed.transform_accuracy_m, placed.note
         if not known:
-            grade, bound, note = LocalizationGrade.APPROXIMATE, None, "the CRS of the file states no known datum"
+            bound, note = None, "the CRS of the file states no known datum"
         return PlacedRoad(
             placed.lon_deg,
             placed.lat_deg,
             placed.height_m,
             self.name,
             placed.realization,
-            grade,
+            placed.epoch,
             bound,
             True,
-            note if grade is LocalizationGrade.APPROXIMATE else None,
+            note if bound is None else None,
         )
 
     def _place_locally(self, vertices: Floats, height: Floats, origin: tuple[float, float]) -> PlacedRoad:
@@ -138,7 +138,7 @@ class RoadReference:
             x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn), direction="INVERSE"
         )
         return PlacedRoad(
-            np.asarray(lon), np.asarray(lat), height, "local", None, LocalizationGrade.APPROXIMATE, None, False,
+            np.asarray(lon), np.asarray(lat), height, "local", None, None, None, False,
             "the road is in local coordinates, placed by the declared origin",
         )  # fmt: skip
 

@@ -117,6 +117,5 @@ class StartedArchive:
             raise
         except WaymarkError as error:
             return ReadFrame(member.index, member.name, error=error)
-        upload = self._upload
         with self._database.read() as connection:
-            return read_frame(connection, upload.agency_id, member, result, upload.context, self._nearby)
+            return read_frame(connection, self._upload, member, result, self._nearby)

@@ -70,6 +70,7 @@ class FixDocument(TypedDict):
     covariance: list[list[float]]
     sigma: SigmaDocument
     localization_grade: LocalizationGrade
+    epoch: float | None
     notes: list[str]
     marker_ids: list[str]
 
@@ -178,6 +179,7 @@ def fix_document(fix: Fix | None) -> FixDocument | None:
             "heading_deg": float(np.degrees(sigma[3])),
         },
         "localization_grade": fix.grade,
+        "epoch": fix.epoch,
         "notes": list(fix.notes),
         "marker_ids": list(fix.marker_ids),
     }

@@ -12,6 +12,7 @@ import sqlalchemy as sa
 from app.families.frames import Match
 from app.formats.archives import Member
 from app.formats.images import ImageLimits, inspect_image
+from app.geodesy import decimal_year
 from app.registry.database import Database
 from app.registry.decodes import NewObservation
 from app.sensors.camera import Camera
@@ -90,7 +91,7 @@ class FrameHandler(UploadHandler[FrameSignal]):
     def match(self, connection: sa.Connection, upload: Upload, signal: FrameSignal) -> Decoded:
         """Match the frame's readings."""
         member = Member(0, "")
-        frame = read_frame(connection, upload.agency_id, member, signal.result, upload.context, signal.nearby)
+        frame = read_frame(connection, upload, member, signal.result, signal.nearby)
         return decoded_frames([frame], signal.nearby, upload.observed_at)
 
 
@@ -113,21 +114,17 @@ def start_frame(
 
 
 def read_frame(
-    connection: sa.Connection,
-    agency_id: str,
-    member: Member,
-    result: FrameResult,
-    context: DecodeContext,
-    nearby: NearbyMarkers,
+    connection: sa.Connection, upload: Upload, member: Member, result: FrameResult, nearby: NearbyMarkers
 ) -> ReadFrame:
     """Match a frame's readings and compute the vehicle's position from them."""
+    context, epoch = upload.context, decimal_year(upload.observed_at)
     camera = context.camera.camera_for(result.header) if context.camera else None
     markers = []
     for reading in result.readings:
-        match = match_reading(connection, agency_id, reading, context.coarse_position, nearby)
+        match = match_reading(connection, upload.agency_id, reading, context.coarse_position, nearby)
         fix = None
         if match is not None and camera is not None and reading.pose is not None:
-            fix = fix_from_match(reading.pose, camera, match, context.heading_deg)
+            fix = fix_from_match(reading.pose, camera, match, context.heading_deg, epoch=epoch)
         markers.append(ReadMarker(reading, match, fix))
     return ReadFrame(
         index=member.index,

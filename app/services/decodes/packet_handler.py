@@ -113,7 +113,14 @@ class StartedDrive:
         with self.database.read() as connection:
             known = find_known(connection, upload.agency_id, self.secrets, list_numbers(files.packets))
         max_invalid_tags = self.invalid_tags.left(_holder(upload), upload.received_at)
-        read = read_packets_of(files, known, terms, upload.received_at.timestamp(), max_invalid_tags)
+        read = read_packets_of(
+            files,
+            known,
+            terms,
+            max_invalid_tags,
+            received_at=upload.received_at,
+            observed_at=upload.observed_at,
+        )
         task = _lane_task(files, read, terms, camera, pose)
         return DriveSignal(files, read, self.processes.submit(task, wait_s=upload.wait_s).result())
 

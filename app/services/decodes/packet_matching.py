@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import sqlalchemy as sa
 
 from app.decoders.cerpm.freshness import SequenceSpan
@@ -17,7 +19,7 @@ from app.decoders.cerpm.signal import SignalReport, profile_signals
 from app.decoders.cerpm.verify import Verification
 from app.families.cerpm.message import radio_of, side_of, speed_limit_of
 from app.families.rules import RETIRED
-from app.geodesy import LocalizationGrade
+from app.geodesy import LocalizationGrade, decimal_year, move_to_epoch
 from app.lanes.types import LaneMarkers
 from app.markers.cerpm_keys import derive_marker_key
 from app.registry import cerpms
@@ -85,9 +87,15 @@ def find_known(connection: sa.Connection, agency_id: str, secrets: AgencySecrets
 
 
 def read_packets_of(
-    files: DriveFiles, known: KnownMarkers, terms: PacketTerms, uploaded_at_s: float, max_invalid_tags: int
+    files: DriveFiles,
+    known: KnownMarkers,
+    terms: PacketTerms,
+    max_invalid_tags: int,
+    *,
+    received_at: datetime,
+    observed_at: datetime,
 ) -> ReadPackets:
-    """Verify packets and merge them to one place a marker."""
+    """Verify packets and merge them to one place a marker, where it is when the drive was recorded."""
     began = time.perf_counter()
 
     def key_of(number: int) -> bytes | None:
@@ -95,11 +103,12 @@ def read_packets_of(
             return None
         return derive_marker_key(known.agency_key, number)
 
-    freshness = replace(terms.freshness, uploaded_at_s=uploaded_at_s)
+    freshness = replace(terms.freshness, uploaded_at_s=received_at.timestamp())
     rules = MergeRules(accept_clear=terms.accept_clear)
     verification, merged = match_known_markers(
         files.packets, key_of, known.cerpms, files.track, freshness, rules, max_invalid_tags=max_invalid_tags
     )
+    merged = _at_epoch(merged, known.rows, decimal_year(_driven_at(files) or observed_at))
     places = {
         int(number): (float(lon), float(lat))
         for number, lon, lat in zip(merged.number, merged.lon_deg, merged.lat_deg, strict=True)
@@ -140,6 +149,26 @@ def _span(row: SpanRow) -> SequenceSpan:
         row.last_sequence,
         math.nan if first is None else first,
         math.nan if last is None else last,
+    )
+
+
+def _driven_at(files: DriveFiles) -> datetime | None:
+    """Time of the drive by its packets; None if they have none."""
+    times_s = np.array([packet.received_at_s for packet in files.packets])
+    known = times_s[np.isfinite(times_s)]
+    return datetime.fromtimestamp(float(np.median(known)), UTC) if len(known) else None
+
+
+def _at_epoch(merged: MergedMarkers, rows: dict[int, MarkerRow], epoch: float) -> MergedMarkers:
+    """Registered positions moved to an epoch; before, they are compared with those in messages, of their own epoch."""
+    epochs = [row.epoch if (row := rows.get(number)) is not None else None for number in merged.number.tolist()]
+    known = np.array([stored is not None for stored in epochs], dtype=bool) & merged.registered
+    moved = move_to_epoch(merged.lon_deg, merged.lat_deg, [epoch if e is None else e for e in epochs], epoch)
+    return replace(
+        merged,
+        lon_deg=np.where(known, moved.lon_deg, merged.lon_deg),
+        lat_deg=np.where(known, moved.lat_deg, merged.lat_deg),
+        sigma_m=np.where(known, np.hypot(merged.sigma_m, moved.accuracy_m / math.sqrt(2)), merged.sigma_m),
     )
 
 

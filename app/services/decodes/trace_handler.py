@@ -10,6 +10,7 @@ import sqlalchemy as sa
 from app.decoders.magnet.identify import TagFormat
 from app.decoders.magnet.match import ReadTrace, match_tags
 from app.errors import UnreadableUpload
+from app.geodesy import decimal_year
 from app.registry.codebooks import CODEBOOKS, book_of
 from app.registry.database import Database
 from app.registry.decodes import NewObservation
@@ -70,7 +71,8 @@ class TraceHandler(UploadHandler[TraceSignal]):
         declared = upload.context.trace or {}
         position, reach_m = upload.context.coarse_position, trace_terms(declared).reach_m
         with self._database.read() as connection:
-            nearby = find_nearby_tags(connection, upload.agency_id, position, reach_m)
+            epoch = decimal_year(upload.observed_at)
+            nearby = find_nearby_tags(connection, upload.agency_id, position, reach_m, epoch)
             formats = () if nearby.texts else _book_formats(connection, upload.agency_id)
         name = str(declared.get("file_name") or "recording")
         task = TraceTask(name, upload.data, declared, nearby.texts, formats, self._rules.traces)

@@ -16,7 +16,7 @@ from app.registry import markers as store
 from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter
 from app.services.decodes.context import CoarsePosition
-from app.services.decodes.fixes import horizontal_rmse_m, position_warnings
+from app.services.decodes.fixes import horizontal_rmse_m, marker_at, position_warnings
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +33,9 @@ class NearbyTags:
 
 
 def find_nearby_tags(
-    connection: sa.Connection, agency_id: str, position: CoarsePosition | None, reach_m: float
+    connection: sa.Connection, agency_id: str, position: CoarsePosition | None, reach_m: float, epoch: float
 ) -> NearbyTags:
-    """Information tags of the agency within the coarse accuracy and the length of a drive."""
+    """Information tags within the coarse accuracy and the length of a drive, where they are at an epoch."""
     if position is None:
         return NearbyTags()
     near = (position.lon_deg, position.lat_deg, position.accuracy_m + reach_m)
@@ -44,15 +44,18 @@ def find_nearby_tags(
     )
     tags = [row for row in rows if row.scheme == INFORMATION_TAG and row.status != "retired"]
     complete = len(tags) <= MAX_TAGS and len(rows) < 4 * MAX_TAGS
-    return NearbyTags(tuple(registered_tag(row) for row in tags[:MAX_TAGS]), complete)
+    return NearbyTags(tuple(registered_tag(row, epoch) for row in tags[:MAX_TAGS]), complete)
 
 
-def registered_tag(row: MarkerRow) -> RegisteredTag:
-    """The information tag of a magnet marker's row."""
+def registered_tag(stored: MarkerRow, epoch: float) -> RegisteredTag:
+    """The information tag of a magnet marker's row, where it is at an epoch [decimal year]."""
+    row = marker_at(stored, epoch)
     tag, spec = parse_tag(row.digits), cast(MagnetSpec, row.spec)
     assert isinstance(tag, InformationTag)
     assert row.heading_deg is not None
     lane_lon_deg, lane_lat_deg = spec["lane"]["points_deg"][0][:2]
+    lane_lon_deg += row.lon_deg - stored.lon_deg
+    lane_lat_deg += row.lat_deg - stored.lat_deg
     return RegisteredTag(
         row.id, row.status, tag, row.lon_deg, row.lat_deg, row.height_m, row.heading_deg,
         lane_lon_deg, lane_lat_deg, horizontal_rmse_m(row), row.localization_grade,

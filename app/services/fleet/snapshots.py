@@ -12,6 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from app.encoders.snapshot import write_snapshot
 from app.errors import InvalidParameter
 from app.families import FAMILIES
+from app.geodesy import decimal_year
 from app.markers.snapshot import MAX_MARKERS, MAX_VALIDITY, Trust
 from app.registry import bulk
 from app.registry.codebooks import CODEBOOKS, book_of
@@ -19,7 +20,7 @@ from app.registry.database import Database
 from app.registry.marker_rows import MarkerRow
 from app.registry.spatial import Box
 from app.services.access.access import Caller
-from app.services.decodes.fixes import horizontal_rmse_m
+from app.services.decodes.fixes import horizontal_rmse_m, marker_at
 from app.services.markers.codebook_documents import MAX_BOOKS_SEARCHED
 from app.services.ports import Clock
 
@@ -64,7 +65,7 @@ class Snapshots:
             )
         now = self._clock()
         with self._database.read() as connection:
-            markers = list_markers(connection, caller.agency_id, box)
+            markers = list_markers(connection, caller.agency_id, box, decimal_year(now))
             books, _ = CODEBOOKS.page(connection, caller.agency_id, limit=MAX_BOOKS_SEARCHED)
         return write_snapshot(
             markers,
@@ -81,8 +82,8 @@ class Snapshots:
         return Trust(caller.agency_id, tuple(key.public_key().public_bytes_raw() for key in self._signing_keys()))
 
 
-def list_markers(connection: sa.Connection, agency_id: str, box: Box) -> list[dict[str, Any]]:
-    """The agency's markers in a box as a snapshot holds them, in the order of their ids.
+def list_markers(connection: sa.Connection, agency_id: str, box: Box, epoch: float) -> list[dict[str, Any]]:
+    """The agency's markers in a box as a snapshot holds them, in the order of their ids, where they are at an epoch.
 
     If there are more than fit, one more than fits is returned.
     """
@@ -102,15 +103,19 @@ def list_markers(connection: sa.Connection, agency_id: str, box: Box) -> list[di
             limit=left,
         )
         members = snapshot.members(connection, agency_id, rows) if len(rows) < left else {}
-        records += [_record(row, snapshot.kind(row), members.get(row.id, {})) for row in rows]
+        records += [_record(row, epoch, snapshot.kind(row), members.get(row.id, {})) for row in rows]
     return sorted(records, key=lambda record: str(record["id"]))
 
 
-def _record(row: MarkerRow, kind: dict[str, Any], members: dict[str, Any]) -> dict[str, Any]:
-    note = None if row.localization_grade == "exact" else row.transform_note
+def _record(stored: MarkerRow, epoch: float, kind: dict[str, Any], members: dict[str, Any]) -> dict[str, Any]:
+    row = marker_at(stored, epoch)
+    note = row.transform_note if row.localization_grade == "unfit" else None
     record = (
         {name: getattr(row, name) for name in _MEMBERS}
         | (row.spec or {})
         | {"code": row.digits, "horizontal_rmse_m": horizontal_rmse_m(row)}
     )
+    for name, shift in (("lane_lon_deg", row.lon_deg - stored.lon_deg), ("lane_lat_deg", row.lat_deg - stored.lat_deg)):
+        if record.get(name) is not None:
+            record[name] += shift
     return record | members | {"kind": kind | {"transform_note": note}}

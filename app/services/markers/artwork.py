@@ -20,7 +20,7 @@ from app.encoders.plate.formats import DEFAULT_DPI
 from app.errors import NotFound, Unavailable
 from app.families import FAMILIES, get_family
 from app.families.files import ArtworkProof, MarkerArtwork
-from app.families.plate.artwork import is_approximate, plate_order
+from app.families.plate.artwork import is_unfit, plate_order
 from app.families.plate.plates import PLATE
 from app.registry import markers as store
 from app.registry.database import Database
@@ -131,7 +131,7 @@ class Artworks:
             self._places.release()
         size = file.tell()
         file.seek(0)
-        return Bundle(file, size, len(rows), sum(is_approximate(row) for row in rows), _lowest_confidence(manifest))
+        return Bundle(file, size, len(rows), sum(is_unfit(row) for row in rows), _lowest_confidence(manifest))
 
     def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, MarkerArtwork]:
         with self._database.read() as connection:

@@ -16,7 +16,7 @@ from app.errors import InvalidParameter, NotFound
 from app.families.cerpm.cerpms import CERPM
 from app.families.cerpm.message import message_of, radio_of
 from app.families.rules import RETIRED
-from app.geodesy import LocalizationGrade
+from app.geodesy import UNFIT_TEXT
 from app.markers.cerpm import MAX_SEQUENCE
 from app.markers.cerpm_keys import derive_marker_key
 from app.radio.lorawan import F_PORT
@@ -178,9 +178,9 @@ def _next_sequences(connection: sa.Connection, agency_id: str, rows: list[Marker
 def _note(row: MarkerRow) -> str | None:
     if row.status == RETIRED:
         return "the marker is retired: packets from it are not used"
-    if row.localization_grade == "exact":
+    if row.localization_grade != "unfit":
         return None
-    return f"{LocalizationGrade.APPROXIMATE}: {row.transform_note}"
+    return f"{UNFIT_TEXT}: {row.transform_note}"
 
 
 def payload_document(payload: CerpmPayload) -> PayloadDocument:

@@ -47,7 +47,7 @@ class Alignments:
     ----------
     database, clock, blobs, processes
     accuracy_m : float
-        Worst stated accuracy of a transformation whose result still counts as exact. [m]
+        Worst stated accuracy of a transformation that is used. [m]
     idempotency_ttl : timedelta
     """
 
@@ -205,8 +205,9 @@ def _registered_road(row: RoadRow, lanes: RoadLanes) -> RegisteredRoad:
         road_id=row.id,
         version=row.version,
         name=row.name,
-        exact=row.localization_grade == LocalizationGrade.EXACT,
+        exact=row.localization_grade != LocalizationGrade.UNFIT,
         note=row.transform_note,
+        accuracy_m=row.given.get("transform_accuracy_m"),
         lanes=lanes,
         calibration=[RoadStation(**point) for point in row.calibration],
         parts=[[(point[0], point[1]) for point in part] for part in row.parts],

@@ -8,6 +8,7 @@ from typing import Any
 
 import orjson
 
+from app.geodesy.vertical import is_ellipsoidal
 from app.planning.alignment import Alignment
 from app.planning.outputs.plan_geojson import lane_points_deg
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker
@@ -80,13 +81,16 @@ def _row(marker: PlannedMarker, datum: str | None) -> dict[str, Any]:
         "station_m": round(marker.station_m, 4),
         "offset_m": round(marker.offset_m, 4),
         "heading_deg": round(marker.heading_deg, 4),
+        "height_m": height_m,
         "vertical_datum": None if height_m is None else datum,
     }
-    place = (marker.lon_deg, marker.lat_deg) if height_m is None else (marker.lon_deg, marker.lat_deg, height_m)
+    place = [marker.lon_deg, marker.lat_deg]
+    if height_m is not None and is_ellipsoidal(datum):
+        place.append(height_m)
     feature = {
         "geometry": {"type": "Point", "coordinates": place},
         "properties": {name: values[name] for name in OF_MARKER},
     }
     text = orjson.dumps(feature).decode()[1:-2]  # open at its end: what follows from the plan is added in queries
-    at = {"lon_deg": marker.lon_deg, "lat_deg": marker.lat_deg, "height_m": height_m}
+    at = {"lon_deg": marker.lon_deg, "lat_deg": marker.lat_deg}
     return {**values, **at, "feature": text}

@@ -58,6 +58,8 @@ class PlacedLines:
     parts: list[list[list[float]]]
     crs: str
     realization: str | None
+    epoch: float | None
+    transform_accuracy_m: float | None
     grade: str
     note: str | None
 
@@ -75,7 +77,8 @@ def place_lines(lines: LinesInput, accuracy_m: float) -> PlacedLines:
     points = np.stack([placed.lon_deg, placed.lat_deg], axis=1).tolist()
     ends = np.cumsum([len(part) for part in lines.parts]).tolist()
     parts = [points[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
-    return PlacedLines(parts, placed.crs, placed.realization, str(placed.grade), placed.note)
+    accuracy, grade = placed.transform_accuracy_m, str(placed.grade)
+    return PlacedLines(parts, placed.crs, placed.realization, placed.epoch, accuracy, grade, placed.note)
 
 
 def resolve_calibration(

@@ -92,7 +92,7 @@ class Roads:
     database : Database
     clock : Clock
     crs_accuracy_m : float
-        Worst stated accuracy of a transformation that counts as exact. [m]
+        Worst stated accuracy of a transformation that is used. [m]
     idempotency_ttl : timedelta
     """
 
@@ -278,7 +278,8 @@ class Roads:
             "given": {
                 "crs": placed.crs,
                 "realization": placed.realization,
-                "epoch": lines.epoch,
+                "epoch": placed.epoch,
+                "transform_accuracy_m": placed.transform_accuracy_m,
                 "several": lines.several,
             },
             "calibration": [asdict(point) for point in points],

@@ -14,6 +14,7 @@ from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.table import Fault, Floats
 from app.markers.status import STATUSES
 from app.registry.columns import Columns, JsonTexts, json_objects
+from app.registry.grade_columns import grade_columns
 from app.surveys.georeference import GeoreferencedSurvey
 
 _EMPTY: dict[str, Any] = dict.fromkeys(
@@ -63,25 +64,24 @@ def common_columns(
 ) -> Columns:
     """Columns that markers of every family have: place, provenance, road."""
     placed, said, texts, numbers = survey.placed, declaration.survey, survey.table.texts, survey.table.numbers
+    rmse_m = said.get("horizontal_rmse_m")
     same = {
         "family": declaration.family,
         "status": declaration.status or PLANNED,
         "road": declaration.road,
         "heading_deg": None,
         "heading_rmse_deg": None,
-        "horizontal_rmse_m": said.get("horizontal_rmse_m"),
+        "horizontal_rmse_m": rmse_m,
         "vertical_rmse_m": said.get("vertical_rmse_m"),
         "crs": placed.crs,
         "realization": placed.realization,
-        "epoch": declaration.epoch,
+        "epoch": placed.epoch,
         "survey_method": said.get("survey_method"),
         "check_points": said.get("check_points"),
         "surveyor": said.get("surveyor"),
         "instrument": said.get("instrument"),
         "survey_file_sha256": file_sha256,
-        "transform_accuracy_m": placed.transform_accuracy_m,
-        "localization_grade": str(placed.grade),
-        "transform_note": placed.note,
+        **grade_columns(rmse_m, placed.transform_accuracy_m, placed.note),
         "measure_m": None,
         "offset_m": None,
     }
@@ -102,6 +102,9 @@ def common_columns(
     for name in ("horizontal_rmse_m", "vertical_rmse_m"):
         if name in numbers:
             own[name] = [value or same[name] for value in _optional(numbers[name], rows)]
+    if "horizontal_rmse_m" in own:
+        grades = [grade_columns(value, placed.transform_accuracy_m, placed.note) for value in own["horizontal_rmse_m"]]
+        own |= {name: [of_row[name] for of_row in grades] for name in ("localization_grade", "transform_note")}
     return Columns(len(rows), same, {}).but(**own)
 
 

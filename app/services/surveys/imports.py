@@ -27,6 +27,7 @@ from app.registry.audit import AuditEntry, recording
 from app.registry.bulk_load import LARGE
 from app.registry.columns import Columns
 from app.registry.database import Database
+from app.registry.grade_columns import grade_columns
 from app.registry.ids import new_ids
 from app.registry.marker_rows import MarkerRow
 from app.services.access.access import Caller
@@ -49,11 +50,11 @@ from app.services.surveys.import_neighbours import MAX_NEIGHBOURS, list_neighbou
 from app.services.surveys.import_rows import check_values, common_columns, marker_columns
 from app.services.version_kinds import kind_of_change, kind_of_new
 from app.surveys.comparison import Comparison, check_residuals, compare_survey
-from app.surveys.consistency_checks import check_consistency
+from app.surveys.consistency_checks import check_accuracy, check_consistency
 from app.surveys.duplicates import find_duplicates
 from app.surveys.georeference import GeoreferencedSurvey, georeference_survey
 from app.surveys.local_grid import LocalGridDocument, apply_local_grid
-from app.surveys.location_checks import check_location
+from app.surveys.location_checks import KNOWN_M, check_location
 
 ALL: Final = "all"
 SURVEYED = tuple(name for name, family in zip(FAMILY_NAMES, FAMILIES, strict=True) if family.survey is not None)
@@ -61,7 +62,6 @@ SURVEYED = tuple(name for name, family in zip(FAMILY_NAMES, FAMILIES, strict=Tru
 READ, SETTLED = 0.3, 0.5
 """How far an import is when its file was read, and when it goes to store what is good."""
 MAX_FAULTS = 1000
-_KNOWN_M = 5_000.0
 _BUSY_WAIT_S = 10.0
 _PART = 2000
 _ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
@@ -178,6 +178,7 @@ class _Running:
         self._sha256, self._registration, self._rules = sha256, registration, registration.rules
         self._faults = survey.table.faults
         self._faults.add(check_consistency(survey))
+        self._faults.add(check_accuracy(*(given.declaration.survey.get(name) for name in _ACCURACY[:2])))
         self._codes: RowCodes | None = None
         self._defaults = _defaults(given)
         self._known: list[MarkerRow] = []
@@ -247,6 +248,8 @@ class _Running:
         warned = self._faults.flags(table.rows, Severity.WARNING)
         shown = self._faults.shown(MAX_FAULTS)
         good = len(self._good_rows())
+        rmse_m = self._given.declaration.survey.get("horizontal_rmse_m")
+        grade = grade_columns(rmse_m, placed.transform_accuracy_m, placed.note)
         lon, lat = placed.lon_deg[placed.placed], placed.lat_deg[placed.placed]
         return {
             "outcome": outcome,
@@ -256,8 +259,8 @@ class _Running:
             "format": table.format,
             "file_sha256": self._sha256,
             "crs": table.crs,
-            "localization_grade": str(placed.grade),
-            "transform_note": placed.note,
+            "localization_grade": grade["localization_grade"],
+            "transform_note": grade["transform_note"],
             "detected": [detected_document(detected) for detected in table.detected],
             "local_grid": self._grid,
             "accuracy": accuracy_document(*(self._given.declaration.survey.get(name) for name in _ACCURACY)),
@@ -292,7 +295,7 @@ class _Running:
         return np.flatnonzero(~bad & self._survey.placed.placed)
 
     def _is_known(self, connection: sa.Connection, lon_deg: float, lat_deg: float) -> bool:
-        return bulk.is_any_near(connection, self._caller.agency_id, lon_deg, lat_deg, _KNOWN_M)
+        return bulk.is_any_near(connection, self._caller.agency_id, lon_deg, lat_deg, KNOWN_M)
 
     def _compare(self, connection: sa.Connection, good: Rows) -> None:
         declaration = self._given.declaration
@@ -313,7 +316,8 @@ class _Running:
                 connection, self._caller.agency_id, declaration.family, box, limit=MAX_NEIGHBOURS
             )
         lon, lat, height = places_of(self._known)
-        self._comparison = compare_survey(self._survey, lon, lat, height, matched)
+        epoch = np.array([marker.epoch for marker in self._known], dtype=np.float64)
+        self._comparison = compare_survey(self._survey, lon, lat, height, matched, epoch)
         self._faults.add(check_residuals(self._comparison, declaration.tolerance_m))
 
     def _by_code(self, connection: sa.Connection, codes: Sequence[str], good: Rows) -> Any:

@@ -150,7 +150,8 @@ def test_a_selection_by_id(real_client: httpx.Client, place: Place) -> None:
 
 def test_a_selection_by_filter_and_approximate_positions(real_client: httpx.Client, place: Place) -> None:
     here = place()
-    inside = register(real_client, here, status="surveyed")
+    frame = {"realization": "ITRF2014", "epoch": 2026.4, "horizontal_rmse_m": 0.02}
+    inside = register(real_client, here | frame, status="surveyed")
     register(real_client, here | {"lat_deg": here["lat_deg"] + 0.001}, status="planned")
     register(real_client, place(), status="surveyed")
     bbox = [here["lon_deg"] - 0.01, here["lat_deg"] - 0.01, here["lon_deg"] + 0.01, here["lat_deg"] + 0.01]
@@ -158,12 +159,12 @@ def test_a_selection_by_filter_and_approximate_positions(real_client: httpx.Clie
     assert [entry["plate_id"] for entry in unpack(answer)[1]["plates"]] == [inside["id"]]
     assert "waymark-note" not in answer.headers
 
-    vague = register(real_client, {"lon_deg": -84.55, "lat_deg": 42.73, "crs": "EPSG:6318"})
-    assert vague["position"]["localization_grade"] != "exact"
+    vague = register(real_client, {"lon_deg": -84.55, "lat_deg": 42.73, "crs": "EPSG:4267"})
+    assert vague["position"]["localization_grade"] == "unfit"
     answer = real_client.post("/v1/artwork", json={"marker_ids": [vague["id"]], "formats": ["svg"]})
     [entry] = unpack(answer)[1]["plates"]
     assert "not for localization" in entry["crs"]
-    assert answer.headers["waymark-note"] == "1 of 1 plates have an approximate position"
+    assert answer.headers["waymark-note"] == "1 of 1 plates have a position that is not for localization"
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from app.decoders.plate import decode_plates
 from app.decoders.snapshot import Snapshot, open_snapshot
 from app.demo.cerpms import build_lane
 from app.formats.traces.read import read_trace
+from app.geodesy import decimal_year, move_to_epoch
 from app.jobs.packet_tasks import read_drive
 from app.lanes.estimate import fit_lane
 from app.lanes.types import LaneMarkers
@@ -93,7 +94,8 @@ def test_a_frame_matches_the_same_plate(real_client: httpx.Client, place: Callab
     matches = [snapshot.match_plate(r.code, lon, lat, 120.0) for r in readings if r.code is not None]
     offline = {match.marker_id: match.distance_m for match in matches if match is not None}
     assert offline.keys() == online.keys()
-    assert all(abs(offline[marker_id] - online[marker_id]) < 1e-3 for marker_id in online)
+    # the snapshot has the plates where they are today, half a year of plate motion from their survey
+    assert all(abs(offline[marker_id] - online[marker_id]) < 0.1 for marker_id in online)
 
 
 def test_a_trace_gives_the_same_tags_meanings_and_fixes(real_client: httpx.Client) -> None:
@@ -102,7 +104,8 @@ def test_a_trace_gives_the_same_tags_meanings_and_fixes(real_client: httpx.Clien
     codes = tuple(entry["code"] for entry in book["entries"])
     lane, drive = Lane(real_client, codes, book["id"]), _drive(codes=codes)
     data = _zipped(write_recorder_files(drive.trace))
-    decode = post_frame(real_client, data, lane.context, name="drive.zip").json()
+    context = lane.context | {"captured_at": datetime.now(UTC).isoformat()}  # a snapshot has today's positions
+    decode = post_frame(real_client, data, context, name="drive.zip").json()
     assert [tag["match"]["marker_id"] for tag in decode["tags"]] == lane.ids
     coarse = lane.context["coarse_position"]
     snapshot = _snapshot(real_client, coarse["lon_deg"], coarse["lat_deg"])
@@ -130,7 +133,8 @@ def test_a_trace_gives_the_same_tags_meanings_and_fixes(real_client: httpx.Clien
         assert tag.fix.lon_deg == pytest.approx(fix["lon_deg"], abs=2e-9)
         assert tag.fix.lat_deg == pytest.approx(fix["lat_deg"], abs=2e-9)
         assert tag.fix.heading_deg == pytest.approx(fix["heading_deg"], abs=1e-4)
-        assert np.allclose(tag.fix.covariance, fix["covariance"], rtol=0.01, atol=1e-7)
+        # in a snapshot an RMSE is rounded up to the millimetre, here from 10.7 mm
+        assert np.allclose(tag.fix.covariance, fix["covariance"], rtol=0.1, atol=1e-7)
 
 
 def test_where_no_tag_is_registered_the_codebooks_say_what_to_look_for(real_client: httpx.Client) -> None:
@@ -183,11 +187,14 @@ def test_packets_give_the_same_verdicts_markers_and_lane(real_server: LiveServer
     grade, localization_warnings = grade_markers(merged, verification, known)
     assert grade == online["lane"]["localization_grade"]
     assert not localization_warnings
-    used = (merged.number, merged.lon_deg, merged.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_km_h)
+    driven = datetime.fromtimestamp(float(np.median([p.received_at_s for p in packets])), UTC)
+    then = move_to_epoch(merged.lon_deg, merged.lat_deg, decimal_year(datetime.now(UTC)), decimal_year(driven))
+    used = (merged.number, then.lon_deg, then.lat_deg, merged.side, merged.sigma_m, merged.speed_limit_km_h)
     lane = fit_lane(LaneMarkers(*used), files.track)
     stations = online["lane"]["stations"]
-    assert np.allclose(lane.lon_deg, stations["lon_deg"], rtol=0, atol=2e-9)
-    assert np.allclose(lane.lat_deg, stations["lat_deg"], rtol=0, atol=2e-9)
+    # within 2 mm: the path's weights are those of accuracies rounded up to the millimetre
+    assert np.allclose(lane.lon_deg, stations["lon_deg"], rtol=0, atol=2e-8)
+    assert np.allclose(lane.lat_deg, stations["lat_deg"], rtol=0, atol=2e-8)
     assert np.allclose(lane.speed_limit_km_h, stations["speed_limit_km_h"])
 
     # the keys are the operator's to hand out: they are not in the file, and without them no packet is believed

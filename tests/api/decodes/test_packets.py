@@ -124,7 +124,7 @@ def test_a_drive_gives_the_lane_its_pictures_and_observations(road: tuple[httpx.
     assert sum(verdicts.values()) == len(heard.packets)
     assert path_rms_m(built, found) < 0.05
     lane = found["lane"]
-    assert lane["localization_grade"] == "exact", lane["localization_warnings"]
+    assert lane["localization_grade"] == "cm", lane["localization_warnings"]
     assert lane["refusal"] is None
     assert lane["speed_limits_km_h"] == [30.0]
     lengths = {name: len(column) for name, column in lane["stations"].items()}
@@ -456,7 +456,7 @@ def test_a_track_of_another_place_accuses_no_marker(road: tuple[httpx.Client, Bu
     away = replace(heard, track=replace(heard.track, lat_deg=heard.track.lat_deg + 0.1))
     found = decoded(client, packed(away))
     assert any("another drive" in warning for warning in found["report"]["warnings"])
-    assert found["lane"]["localization_grade"] != "exact"
+    assert found["lane"]["localization_grade"] == "unfit"
     database = server.app.state.database
     with database.read() as connection:
         agency_id = find_agency_of(connection, found["id"])
@@ -468,7 +468,7 @@ def test_a_path_that_is_not_sure_is_not_for_localization(road: tuple[httpx.Clien
     client, built = road
     heard, _hour = drive(built, 1925)
     paper = decoded(client, packed(heard), {"packets": {"method": "paper"}})
-    assert paper["lane"]["localization_grade"] != "exact"
+    assert paper["lane"]["localization_grade"] == "unfit"
     assert any("no standard deviation" in text for text in paper["lane"]["localization_warnings"])
 
 
@@ -491,7 +491,7 @@ def test_a_log_in_clear_is_used_only_if_that_is_said(road: tuple[httpx.Client, B
     assert refused["lane"]["refusal"]
     used = decoded(client, data, {"packets": {"accept_clear": True}}, name="log.csv")
     assert used["lane"]["refusal"] is None
-    assert used["lane"]["localization_grade"] != "exact"
+    assert used["lane"]["localization_grade"] == "unfit"
     assert any("in clear" in doubt for doubt in used["lane"]["localization_warnings"])
 
 

@@ -12,7 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
-from app.geodesy import enu_from_heading, enu_from_wgs84, wgs84_from_enu
+from app.geodesy import enu_from_heading, enu_from_wgs84, move_to_epoch, wgs84_from_enu
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
@@ -42,6 +42,9 @@ def from_vehicle_m(ahead_m: float, left_m: float) -> np.ndarray[Any, np.dtype[np
     return enu_from_heading(HEADING_DEG) @ np.array([right, forward, 0.0])
 
 
+EPOCH, CAPTURED_AT = 2026.4, "2026-05-27T00:00:00Z"
+
+
 class Road:
     """A vehicle at a place, and the plates before it: (ahead_m, left_m, rotation_deg) from below the camera."""
 
@@ -61,6 +64,8 @@ class Road:
                     "lon_deg": lon,
                     "lat_deg": lat,
                     "height_m": height,
+                    "realization": "ITRF2014",
+                    "epoch": EPOCH,
                     "horizontal_rmse_m": 0.01,
                     "vertical_rmse_m": 0.02,
                 },
@@ -92,7 +97,7 @@ class Road:
     def context(self, **more: Any) -> dict[str, Any]:
         """What the vehicle knows: its place within a few metres."""
         coarse = {"lon_deg": self.origin[0] + 3e-5, "lat_deg": self.origin[1] - 3e-5, "accuracy_m": 10.0}
-        return {"coarse_position": coarse, "camera": CAMERA_IN} | more
+        return {"coarse_position": coarse, "camera": CAMERA_IN, "captured_at": CAPTURED_AT} | more
 
     def error_m(self, fix: dict[str, Any]) -> float:
         """Distance of a fix from where the vehicle really is."""
@@ -111,9 +116,15 @@ def test_the_vehicle_is_found(real_client: httpx.Client, place: Place) -> None:
     assert reading["grade"]["letter"] in "ABCDF"
     assert reading["pose"]["reprojection_rms_px"] < 1.0
     fix = decode["fix"]
-    assert fix["localization_grade"] == "exact"
+    assert fix["localization_grade"] == "cm"
     assert road.error_m(fix) < 0.06
     assert abs((fix["heading_deg"] - HEADING_DEG + 180) % 360 - 180) < 0.6
+    # the plate moves on with its tectonic plate: the vehicle is where it is when the frame is captured
+    assert fix["epoch"] == pytest.approx(EPOCH, abs=0.002)
+    earlier = post_frame(real_client, road.frame(), road.context(captured_at="2015-01-01T00:00:00Z")).json()["fix"]
+    then = move_to_epoch(fix["lon_deg"], fix["lat_deg"], EPOCH, 2015.0)
+    assert (earlier["lon_deg"], earlier["lat_deg"]) == pytest.approx((then.lon_deg[0], then.lat_deg[0]), abs=1e-8)
+    assert earlier["sigma"]["east_m"] > fix["sigma"]["east_m"]
     covariance = np.array(fix["covariance"])
     assert covariance.shape == (4, 4)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
@@ -134,7 +145,7 @@ def test_several_plates_are_fused(real_client: httpx.Client, place: Place) -> No
 def test_a_position_that_is_not_exact_gives_no_fix_for_localization(real_client: httpx.Client, place: Place) -> None:
     road = Road(real_client, place(), (5.0, 0.0, 0.0)).register(status="planned")
     fix = post_frame(real_client, road.frame(), road.context()).json()["fix"]
-    assert fix["localization_grade"] == "approximate, not for localization"
+    assert fix["localization_grade"] == "unfit"
     assert fix["notes"] == ["the plate is planned, its position is not surveyed"]
 
 
@@ -145,9 +156,9 @@ def test_a_place_without_a_stated_bound_gives_no_fix_for_localization(real_clien
     position = marker["position"]["original"] | {"realization": "NAD83(2011)"}
     change = {"position": position, "heading_deg": marker["heading_deg"]}
     answer = real_client.patch(f"/v1/markers/{marker['id']}", json=change, headers={"If-Match": '"1"'})
-    assert answer.json()["position"]["localization_grade"] == "approximate, not for localization"
+    assert answer.json()["position"]["localization_grade"] == "unfit"
     decode = post_frame(real_client, road.frame(), road.context()).json()
-    assert decode["fix"]["localization_grade"] == "approximate, not for localization"
+    assert decode["fix"]["localization_grade"] == "unfit"
     assert "NAD83(2011)" in " ".join(decode["fix"]["notes"])
 
 
@@ -156,7 +167,7 @@ def test_a_plate_without_heading_needs_the_vehicles(real_client: httpx.Client, p
     frame = road.frame()
     assert post_frame(real_client, frame, road.context()).json()["fix"] is None
     fix = post_frame(real_client, frame, road.context(heading_deg=HEADING_DEG)).json()["fix"]
-    assert fix["localization_grade"] == "approximate, not for localization"
+    assert fix["localization_grade"] == "unfit"
     assert road.error_m(fix) < 0.3
 
 

@@ -136,7 +136,7 @@ def test_a_drive_over_registered_tags_gives_tuples_matches_and_fixes(client: htt
         assert abs(along_m) < 0.03
         assert abs(along_m) < 4 * fix["sigma"]["along_m"]
         assert abs(fix["t_s"] - last.t_s) < 0.005
-        assert fix["localization_grade"] == "exact"
+        assert fix["localization_grade"] == "cm"
         assert abs((fix["heading_deg"] - 30.0 + 180) % 360 - 180) < 1.0
     stored = client.get(f"/v1/decodes/{decode['id']}").json()
     assert stored["tags"] == decode["tags"]

@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from app.decoders.snapshot import open_snapshot
+from app.geodesy import decimal_year, move_to_epoch
 from app.markers.snapshot import ExpiredSnapshot, ForeignSnapshot, Trust
 from app.services.access.access import Scope
 from app.settings import Settings
@@ -63,24 +64,30 @@ def test_a_vehicle_gets_its_agencys_markers_and_no_others(server: LiveServer, cl
 
 
 def test_a_survey_in_another_frame_is_as_good_as_its_transformation(server: LiveServer, client: httpx.Client) -> None:
+    now = datetime.now(UTC)
     place = {"lon_deg": 8.41, "lat_deg": 49.01, "horizontal_rmse_m": 0.02}
     exact = client.post("/v1/markers", json={"position": {**place, "crs": "EPSG:4258", "epoch": 2020.0}}).json()
-    vague = client.post("/v1/markers", json={"position": {**place, "lon_deg": 8.42, "crs": "EPSG:4258"}}).json()
+    vague = client.post("/v1/markers", json={"position": {**place, "lon_deg": 8.42, "crs": "EPSG:4314"}}).json()
     answer = client.get("/v1/snapshots", params={"bbox": BOX})
     snapshot = open_snapshot(answer.content, _trust(client), datetime.now(UTC))
     for marker in (exact, vague):
         position = marker["position"]
         (found,) = snapshot.near("plate", position["lon_deg"], position["lat_deg"], 1.0)
         bound_m = position["transform_accuracy_m"] or 0.0
+        if position["epoch"] is not None:  # the snapshot has it where it is today
+            moved = move_to_epoch(position["lon_deg"], position["lat_deg"], position["epoch"], decimal_year(now))
+            assert (found.lon_deg, found.lat_deg) == pytest.approx((moved.lon_deg[0], moved.lat_deg[0]), abs=2e-9)
+            assert abs(found.lon_deg - position["lon_deg"]) > 5e-7
+            bound_m = math.hypot(bound_m, moved.accuracy_m[0])
         assert found.horizontal_rmse_m == pytest.approx(math.hypot(0.02, bound_m), abs=0.001)
         assert found.horizontal_rmse_m >= math.hypot(0.02, bound_m) - 1e-9
         assert found.grade == position["localization_grade"]
-        approximate = [] if found.grade == "exact" else [position["transform_note"]]
+        unfit = [position["transform_note"]] if found.grade == "unfit" else []
         assert found.localization_warnings("plate") == (
-            *approximate,
+            *unfit,
             "the plate is planned, its position is not surveyed",
         )
-    assert {exact["position"]["localization_grade"], vague["position"]["localization_grade"]} > {"exact"}
+    assert [marker["position"]["localization_grade"] for marker in (exact, vague)] == ["dm", "unfit"]
 
 
 @pytest.mark.parametrize(

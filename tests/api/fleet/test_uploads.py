@@ -67,8 +67,8 @@ def _grey_png(width: int = 96, height: int = 64) -> bytes:
 def test_a_frame_with_the_vehicles_name_gives_its_position(fleet: httpx.Client) -> None:
     road = Road(fleet, PLATE_AT, (5.0, 0.3, 4.0)).register()
     vehicle = _vehicle(fleet, camera=CAMERA_IN)
-    coarse = road.context()["coarse_position"]
-    answer = _send(fleet, road.frame(), {"vehicle": "BUS-7", "coarse_position": coarse})
+    known = {name: road.context()[name] for name in ("coarse_position", "captured_at")}
+    answer = _send(fleet, road.frame(), {"vehicle": "BUS-7", **known})
     assert answer.status_code == 201, answer.text
     decode = answer.json()
     assert road.error_m(decode["fix"]) < 0.15

@@ -118,9 +118,9 @@ def test_only_cerpms_have_a_payload(client: httpx.Client, place: Place) -> None:
     assert nothing.status_code == 422
 
 
-def test_an_approximate_position_is_said(client: httpx.Client) -> None:
-    body = cerpm({"lon_deg": -85.6436, "lat_deg": 42.2531, "crs": "EPSG:6318"})
+def test_an_unfit_position_is_noted(client: httpx.Client) -> None:
+    body = cerpm({"lon_deg": -85.6436, "lat_deg": 42.2531, "crs": "EPSG:4267"})
     made = client.post("/v1/markers", json=body)
     assert made.status_code == 201, made.text
     sent = client.get(f"/v1/markers/{made.json()['id']}/payload.hex")
-    assert "approximate" in sent.headers["waymark-note"]
+    assert "not for localization" in sent.headers["waymark-note"]

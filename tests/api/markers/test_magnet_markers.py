@@ -78,7 +78,7 @@ def test_a_tag_on_a_lane_becomes_magnets(client: httpx.Client, lane: Lane) -> No
     assert marker["heading_deg"] == pytest.approx(90.0, abs=0.01)
     position = marker["position"]
     assert (position["horizontal_rmse_m"], position["realization"]) == (0.02, "ITRF2014")
-    assert position["localization_grade"] == "exact"
+    assert position["localization_grade"] == "dm"
     assert (position["original"]["chainage_m"], position["original"]["survey_method"]) == (50.0, "GNSS RTK")
     assert marker["lane"]["geometry"] == given["geometry"]
     assert client.get(response.headers["location"]).json() == marker
@@ -140,17 +140,18 @@ def test_projected_lanes_follow_the_rules_of_plates(client: httpx.Client) -> Non
     assert marker["lane"]["geometry"]["coordinates"][0] == pytest.approx([lon, lat], abs=1e-9)
     assert marker["lane"]["given"] == points
     assert marker["position"]["crs"] == "EPSG:32633"
-    assert marker["position"]["localization_grade"] == "exact"
+    assert marker["position"]["transform_accuracy_m"] == pytest.approx(2.0, abs=0.05)
     # the scale of UTM on its central meridian is 0.9996: distances in the road are not those on the map
     assert marker["lane"]["length_m"] == pytest.approx(200 / 0.9996, abs=0.01)
     nad83 = {"type": "LineString", "coordinates": [[-84.5, 42.7], [-84.498, 42.7]]}
     approximate = created(client, "/v1/markers", **_tag({"geometry": nad83, "crs": "EPSG:6318"}))["position"]
-    assert approximate["localization_grade"] == "approximate, not for localization"
-    assert "epoch" in approximate["transform_note"]
+    assert approximate["epoch"] == 2020.0
+    assert "state the epoch" in approximate["transform_note"]
+    nad83["coordinates"] = [[-84.6, 42.7], [-84.598, 42.7]]
     exact = created(client, "/v1/markers", **_tag({"geometry": nad83, "crs": "EPSG:6318", "epoch": 2025.0}))
-    assert exact["position"]["localization_grade"] == "exact"
+    assert exact["position"]["transform_accuracy_m"] == 0.0
     assert exact["lane"]["given"] == nad83["coordinates"]
-    assert exact["lane"]["geometry"]["coordinates"][0][0] == pytest.approx(-84.5000110, abs=2e-6)
+    assert exact["lane"]["geometry"]["coordinates"][0][0] == pytest.approx(-84.6000110, abs=2e-6)
 
 
 def test_an_idempotent_request_is_stored_once(client: httpx.Client, lane: Lane) -> None:
@@ -480,7 +481,7 @@ def test_the_documented_examples_and_members(client: httpx.Client) -> None:
     assert [example for example in schemas["NewMarkerIn"]["examples"] if example.get("family") == "magnet"] == examples
     tag, line = (created(client, "/v1/markers", **example) for example in examples)
     for made in (tag, line):
-        assert set(made) == set(schemas["MagnetDetailDocument"]["properties"])
+        assert set(made) == set(schemas["MagnetDetailDocument"]["required"])
         for part, schema in (("lane", "LaneDocument"), ("bill", "BillDocument")):
             assert set(made[part]) == set(schemas[schema]["properties"])
         assert set(made["magnets"][0]) == set(schemas["HoleDocument"]["properties"])
@@ -489,7 +490,7 @@ def test_the_documented_examples_and_members(client: httpx.Client) -> None:
     assert set(line["code"]) == set(schemas["LineTagDocument"]["properties"])
     assert set(line["layout"]) == set(schemas["LinePlaceDocument"]["properties"])
     for item in client.get("/v1/markers").json()["items"]:
-        assert set(item) == set(schemas["MagnetDocument"]["properties"])
+        assert set(item) == set(schemas["MagnetDocument"]["required"])
 
 
 def test_the_guide_is_accepted(fresh_server: LiveServer) -> None:

@@ -33,7 +33,8 @@ def test_a_position_alone_makes_a_position_plate(client: httpx.Client, place: Pl
     assert marker["code"]["digits"] == "127500" + f"{spot['lat_deg']:.6f}".split(".")[1]
     assert marker["code"]["digits_match_position"] is True
     assert marker["geometry"] == {"n": 8, "unit_mm": 35.0, "gap_mm": 5.0, "thickness_mm": 20.0, "side_mm": 325.0}
-    assert marker["position"]["localization_grade"] == "exact"
+    assert marker["position"]["localization_grade"] == "unfit"
+    assert "state horizontal_rmse_m" in marker["position"]["transform_note"]
     assert marker["position"]["original"] == spot
     assert client.get(response.headers["location"]).json() == marker
 
@@ -237,19 +238,18 @@ def test_a_refused_request_may_be_corrected_under_the_same_key(client: httpx.Cli
 # --- positions in other systems -----------------------------------------------------------------------------------
 
 
-def test_nad83_is_flagged_and_kept_as_it_came(client: httpx.Client) -> None:
-    given = {"lon_deg": -84.5123456, "lat_deg": 42.7, "crs": "EPSG:6318"}
+def test_nad83_is_transformed_and_kept_as_it_came(client: httpx.Client) -> None:
+    given = {"lon_deg": -84.5123456, "lat_deg": 42.7, "crs": "EPSG:6318", "horizontal_rmse_m": 0.02}
     position = created(client, "/v1/markers", position=given)["position"]
-    assert position["localization_grade"] == "approximate, not for localization"
-    assert "epoch" in position["transform_note"]
+    assert (position["localization_grade"], position["epoch"]) == ("cm", 2020.0)
+    assert "state the epoch" in position["transform_note"]
     assert position["original"] == given
 
 
 def test_nad83_with_an_epoch_is_transformed(client: httpx.Client) -> None:
     given = {"lon_deg": -84.5, "lat_deg": 42.75, "crs": "urn:ogc:def:crs:EPSG::6318", "epoch": 2025.0}
     marker = created(client, "/v1/markers", position=given)
-    assert marker["position"]["localization_grade"] == "exact"
-    assert marker["position"]["realization"] == "ITRF2014"
+    assert (marker["position"]["transform_accuracy_m"], marker["position"]["realization"]) == (0.0, "ITRF2014")
     assert 84.500010 < -marker["position"]["lon_deg"] < 84.500012
     assert marker["code"]["digits"].startswith("500011")
 
@@ -257,11 +257,12 @@ def test_nad83_with_an_epoch_is_transformed(client: httpx.Client) -> None:
 def test_projected_coordinates(client: httpx.Client) -> None:
     given = {"easting_m": 836694.05, "northing_m": 819069.8, "crs": "EPSG:2326"}
     position = created(client, "/v1/markers", position=given)["position"]
-    assert position["localization_grade"] == "approximate, not for localization"
+    assert position["localization_grade"] == "unfit"
     assert position["lon_deg"] == pytest.approx(114.18, abs=0.01)
     assert position["original"] == given
-    exact = {"easting_m": 500000.0, "northing_m": 4_000_000.0, "crs": "EPSG:32633"}
-    assert created(client, "/v1/markers", position=exact)["position"]["localization_grade"] == "exact"
+    known = {"easting_m": 500000.0, "northing_m": 4_000_000.0, "crs": "EPSG:32633", "horizontal_rmse_m": 0.01}
+    frame = {"realization": "ITRF2020", "epoch": 2026.4}
+    assert created(client, "/v1/markers", position=known | frame)["position"]["localization_grade"] == "cm"
 
 
 # --- read and list ------------------------------------------------------------------------------------------------

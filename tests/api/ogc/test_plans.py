@@ -159,7 +159,7 @@ def test_lanes_are_lines_with_their_figures(client: httpx.Client, start: tuple[f
     assert (properties["min_width_m"], properties["max_speed_kmh"]) == (3.0, pytest.approx(50.0))
     assert properties["min_radius_m"] == pytest.approx(100.0, rel=0.1)
     assert properties["max_curvature_per_m"] == pytest.approx(0.01, rel=0.1)
-    assert properties["localization_grade"] == "exact"
+    assert properties["localization_grade"] == "m"
     assert GEOD.line_length(*zip(*lane["geometry"]["coordinates"], strict=True)) == pytest.approx(209.4, abs=0.5)
     schema = get(client, "/ogc/collections/alignments/schema")["properties"]
     assert list(schema["properties"]["properties"]) == list(properties)

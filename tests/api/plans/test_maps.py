@@ -60,7 +60,7 @@ def test_a_registered_road_is_the_source_of_an_alignment(client: httpx.Client, s
     for lane in alignment["lanes"]:
         assert lane["length_m"] == pytest.approx(500.0, abs=0.01)
         assert (lane["road"], lane["left_style"], lane["width_m"]) == ("B 27", "dashed", pytest.approx([3.25, 3.25]))
-    assert (alignment["format"], alignment["localization_grade"]) == ("road", "exact")
+    assert (alignment["format"], alignment["localization_grade"]) == ("road", "m")
     assert (alignment["declaration"]["road_id"], alignment["declaration"]["road_version"]) == (source["id"], 1)
     # the source can be sent as a file again, and a changed road changes no alignment
     client.patch(f"/v1/roads/{source['id']}", json={"calibration": []}, headers={"If-Match": '"1"'})

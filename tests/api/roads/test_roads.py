@@ -63,7 +63,8 @@ def test_a_road_is_kept_as_it_came(client: httpx.Client) -> None:
     assert answer.headers["etag"] == '"1"'
     assert (road["length_m"], road["from_m"], road["to_m"]) == (pytest.approx(1200), 0, pytest.approx(1200))
     assert road["geometry"] == {"type": "LineString", "coordinates": line}
-    assert road["localization_grade"] == "exact"
+    assert road["localization_grade"] == "m"
+    assert "state the realization" in road["transform_note"]
     stored = client.get(f"/v1/roads/{road['id']}")
     assert stored.json() | {"markers": road["markers"]} == road
     listed = client.get("/v1/roads?name=B 10").json()["items"]
@@ -124,9 +125,10 @@ def test_geometry_in_a_projected_system_keeps_its_lengths_and_says_how_good_it_i
     assert road["crs"] == "EPSG:32632"
     assert road["length_m"] == pytest.approx(1700, abs=1e-3)
     assert road["from_m"] == pytest.approx(-700, abs=1e-3)
-    assert road["localization_grade"] == "exact"
+    assert road["localization_grade"] == "m"
+    assert "state the realization" in road["transform_note"]
     nad83 = _road(client, "NAD83", _line((0, 500), start=(-85.0, 42.0)), crs="EPSG:4269")
-    assert nad83["localization_grade"] == "approximate, not for localization"
+    assert nad83["localization_grade"] == "unfit"
     assert nad83["transform_note"]
 
 

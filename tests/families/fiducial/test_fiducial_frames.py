@@ -65,6 +65,7 @@ def test_the_vehicle_is_found_by_a_sign(
     enu_m = enu_from_heading(HEADING_DEG) @ np.array([-in_vehicle[1], in_vehicle[0], in_vehicle[2]])
     lon, lat, height = wgs84_from_enu(enu_m, origin)
     position = {"lon_deg": lon, "lat_deg": lat, "height_m": height, "horizontal_rmse_m": 0.01, "vertical_rmse_m": 0.02}
+    position |= {"realization": "ITRF2014", "epoch": 2026.4}
     # to the left is against the clock, by which headings count; a sign that faces the vehicle has its heading
     body = sign(vehicle, number=40 + int(ahead_m)) | {
         "position": position,
@@ -80,13 +81,15 @@ def test_the_vehicle_is_found_by_a_sign(
     data = cv2.imencode(".png", picture)[1].tobytes()
     coarse = {"lon_deg": origin[0] + 3e-5, "lat_deg": origin[1] - 3e-5, "accuracy_m": 10.0}
 
-    decode = post_frame(client, data, {"coarse_position": coarse, "camera": CAMERA_IN}).json()
+    decode = post_frame(
+        client, data, {"coarse_position": coarse, "camera": CAMERA_IN, "captured_at": "2026-05-27T00:00:00Z"}
+    ).json()
 
     (reading,) = [reading for reading in decode["readings"] if reading["family"] == "fiducial"]
     assert (reading["outcome"], reading["digits"]) == ("read", marker["code"]["text"])
     assert reading["match"]["marker_id"] == marker["id"]
     fix = decode["fix"]
-    assert fix["localization_grade"] == "exact"
+    assert fix["localization_grade"] == "cm"
     error_m = np.linalg.norm(enu_from_wgs84(fix["lon_deg"], fix["lat_deg"], fix["height_m"], origin))
     assert error_m < limit_m
     assert error_m < 5 * math.sqrt(np.trace(np.array(fix["covariance"])[:3, :3]))

@@ -93,13 +93,13 @@ def test_stations_are_the_measures_of_the_road() -> None:
     assert shown == pytest.approx([1000.0, 1100.0, 1602.0, 1702.0, 5000.0, 5100.0], abs=1e-6)
 
 
-def test_an_approximate_road_is_an_approximate_alignment() -> None:
+def test_an_alignment_is_as_accurate_as_its_road() -> None:
     built = read(road(exact=False, note="from EPSG:4269: no operation states an accuracy"))
-    assert built.grade is LocalizationGrade.APPROXIMATE
+    assert built.grade is LocalizationGrade.UNFIT
     assert built.transform_accuracy_m is None
     assert any("EPSG:4269" in warning for warning in built.warnings)
-    exact = read(road())
-    assert (exact.grade, exact.transform_accuracy_m, exact.realization) == (LocalizationGrade.EXACT, 0.0, "ITRF2014")
+    known = read(road(accuracy_m=0.05))
+    assert (known.grade, known.transform_accuracy_m, known.realization) == (LocalizationGrade.CM, 0.05, "ITRF2014")
 
 
 def test_long_edges_follow_the_geodesic() -> None:

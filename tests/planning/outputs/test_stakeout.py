@@ -19,7 +19,7 @@ from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.surveys.declaration import METRES, ImportDeclaration
 from app.formats.surveys.grids import crs_unit
 from app.formats.surveys.read import read_survey
-from app.geodesy import LocalizationGrade, place_positions, reference_system
+from app.geodesy import place_positions, reference_system
 from app.planning.alignment import Alignment
 from app.planning.outputs.stakeout import StakeoutFormat, write_stakeout
 from app.planning.outputs.stakeout_points import Stakeout, plan_stakeout
@@ -32,7 +32,7 @@ SYSTEMS = [
     ("EPSG:32632", "ft-intl", {}),
     ("EPSG:32632", "ft-us", {}),
     ("EPSG:25832", "m", {"epoch": 2010.0, "realization": "ITRF2014"}),  # ETRS89
-    ("EPSG:25832", "m", {"crs": "EPSG:25832", "grade": LocalizationGrade.APPROXIMATE}),  # undoes a null shift
+    ("EPSG:31467", "m", {"crs": "EPSG:31467", "transform_accuracy_m": None}),  # undoes what has no stated accuracy
 ]
 
 

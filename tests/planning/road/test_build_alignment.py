@@ -226,7 +226,7 @@ def test_local_coordinates_need_an_origin_and_are_not_surveyed() -> None:
     )
     lane = alignment.lanes[0]
     assert not alignment.surveyed
-    assert alignment.grade is LocalizationGrade.APPROXIMATE
+    assert alignment.grade is LocalizationGrade.UNFIT
     assert alignment.transform_accuracy_m is None
     assert (lane.lon_deg[0], lane.lat_deg[0]) == pytest.approx((8.4, 49.0), abs=1e-12)
     azimuth, _, distance = GEOD.inv(8.4, 49.0, lane.lon_deg[-1], lane.lat_deg[-1])
@@ -252,20 +252,20 @@ def test_the_problem_of_a_reference_is_reported() -> None:
         "+proj=tmerc +lat_0=0 +lon_0=9 +k=0.9996 +x_0=500000 +y_0=0 +datum=WGS84 +units=m",
     ],
 )
-def test_references_in_their_usual_forms_are_exact(crs: str) -> None:
-    alignment = _declared(UTM, crs)
+def test_references_in_their_usual_forms_are_known(crs: str) -> None:
+    alignment = _declared(UTM, crs, realization="ITRF2014", epoch=2020.0)
     want = Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True).transform(456_000.0, 5_430_000.0)
     lane = alignment.lanes[0]
     assert (lane.lon_deg[0], lane.lat_deg[0]) == pytest.approx(want, abs=1e-10)
-    assert alignment.grade is LocalizationGrade.EXACT
+    assert alignment.grade is LocalizationGrade.CM
     assert alignment.surveyed
 
 
 @pytest.mark.parametrize("crs", ["+proj=tmerc +lat_0=0 +lon_0=9.1 +k=0.9996 +x_0=500000 +ellps=WGS84", "EPSG:31467"])
-def test_without_a_bound_the_grade_is_approximate(crs: str) -> None:
+def test_without_a_bound_a_road_is_unfit(crs: str) -> None:
     lane = LaneGeometry("1", UTM.centre + np.array([3e6 if crs == "EPSG:31467" else 0.0, 0, 0]))
     alignment = _declared(lane, crs)
-    assert alignment.grade is LocalizationGrade.APPROXIMATE
+    assert alignment.grade is LocalizationGrade.UNFIT
     assert alignment.surveyed
     assert alignment.warnings
 
@@ -274,11 +274,11 @@ def test_the_horizontal_part_of_a_compound_code_is_used() -> None:
     assert _declared(UTM, "EPSG:5555").crs == "EPSG:25832"
 
 
-def test_an_epoch_makes_a_dynamic_transformation_exact() -> None:
+def test_the_epoch_of_a_dynamic_transformation_is_that_of_the_positions() -> None:
     lane = LaneGeometry("1", np.array([[-77.2, 38.9, np.nan], [-77.199, 38.9, np.nan]]))
-    assert _declared(lane, "EPSG:6318").grade is LocalizationGrade.APPROXIMATE
+    assert _declared(lane, "EPSG:6318").epoch == 2020.0
     alignment = _declared(lane, "EPSG:6318", epoch=2010.0)
-    assert alignment.grade is LocalizationGrade.EXACT
+    assert alignment.grade is LocalizationGrade.CM
     assert alignment.realization == "ITRF2014"
     assert alignment.epoch == 2010.0
 
