@@ -79,5 +79,8 @@ def export_markers(
     ):
         database.migrate()
         with operator(database, agency) as caller:
-            Exports(database).write_file(caller, kind, filtered, Path(folder)).rename(out)
+            path, left_out = Exports(database).write_file(caller, kind, filtered, Path(folder))
+            path.rename(out)
+    if left_out:
+        typer.echo(f"left out, too far from the file's UTM zone: {' '.join(left_out)}", err=True)
     typer.echo(out)

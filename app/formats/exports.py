@@ -7,18 +7,19 @@ import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
+import numpy.typing as npt
 import orjson
 import shapely
 from ezdxf.filemanagement import new
 from pyogrio import raw  # type: ignore[import-untyped]
 from pyproj import Transformer
 
-from app.errors import InvalidParameter
 from app.formats.spreadsheet import TableWriter
+from app.geodesy.vertical import is_ellipsoidal
 
 Record = Mapping[str, Any]
 
@@ -41,6 +42,26 @@ SHAPEFILE_NAMES = {
     "transform_note": "trans_note", "check_points": "check_pts", "transform_accuracy_m": "trans_acc",
 }  # fmt: skip
 """Ten characters a name, the same in every file."""
+MAX_FROM_MERIDIAN_DEG = 9.0
+"""Farthest longitude from the central meridian of a zone that a marker is projected in. [deg] Source: by hand; a road
+of 6 degrees that begins in one zone lies in it whole."""
+
+
+class CadFile(NamedTuple):
+    """A file in one UTM zone, and the ids of the markers that lie too far from it."""
+
+    content: bytes
+    left_out: tuple[str, ...]
+
+
+class _Zone(NamedTuple):
+    """Markers in a UTM zone [m], and the ids of the others."""
+
+    code: int
+    records: list[Record]
+    east: npt.NDArray[np.float64]
+    north: npt.NDArray[np.float64]
+    left_out: tuple[str, ...]
 
 
 def write_csv(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
@@ -74,15 +95,19 @@ def write_geojson(pages: Iterable[Sequence[Record]]) -> Iterator[bytes]:
 
 
 def _feature(record: Record) -> dict[str, Any]:
-    place = [record["lon_deg"], record["lat_deg"]]
-    if record["height_m"] is not None and record["vertical_datum"] == "ellipsoid":  # section 3.1.1: above WGS 84
-        place.append(record["height_m"])
+    height_m = _ellipsoidal_m(record)
+    place = [record["lon_deg"], record["lat_deg"], *([] if height_m is None else [height_m])]
     properties = {name: record[name] for name in FIELDS if name not in ("id", "lon_deg", "lat_deg")}
     geometry = {"type": "Point", "coordinates": place}
     return {"type": "Feature", "id": record["id"], "geometry": geometry, "properties": properties}
 
 
-def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, has_heights: bool) -> Path:
+def _ellipsoidal_m(record: Record) -> float | None:
+    """Height of a point's geometry, of all formats: above the ellipsoid, or none (RFC 7946, section 4)."""
+    return record["height_m"] if is_ellipsoidal(record["vertical_datum"]) else None
+
+
+def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, all_heights: bool) -> Path:
     """A GeoPackage, a zipped Shapefile (names of `SHAPEFILE_NAMES`) or KML in a folder, by GDAL, a page at a time.
 
     Parameters
@@ -93,17 +118,18 @@ def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, h
         ``gpkg``, ``shapefile`` or ``kml``.
     folder : Path
         An empty one.
-    has_heights : bool
-        Whether points have a z; zero where a marker has no height. KML has none: it takes them to be above the geoid.
+    all_heights : bool
+        Whether every marker has an ellipsoidal height. The points of a Shapefile all have one or none; those of a
+        GeoPackage have it where it is known. KML has none: it takes them to be above the geoid.
     """
     name, suffix = {"gpkg": ("GPKG", "gpkg"), "shapefile": ("ESRI Shapefile", "shp"), "kml": ("KML", "kml")}[driver]
     names = [SHAPEFILE_NAMES[n] for n in FIELDS] if driver == "shapefile" else list(FIELDS)
-    kind = "Point Z" if has_heights and driver != "kml" else "Point"
+    kind = "Point Z" if all_heights and driver == "shapefile" else "Point"  # GDAL adds z to a GeoPackage's as it comes
     path = folder / f"markers.{suffix}"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # KML has a name of its own for some fields
         for number, page in enumerate(pages):
-            geometry, columns = _gis_columns(page, flat=kind == "Point")
+            geometry, columns = _gis_columns(page, flat=kind == "Point" and driver != "gpkg")
             raw.write(
                 path, geometry, columns, names, driver=name, geometry_type=kind, crs="EPSG:4326",
                 layer="markers", encoding="UTF-8", append=number > 0,
@@ -118,8 +144,11 @@ def _gis_columns(page: Sequence[Record], *, flat: bool) -> tuple[Any, list[Any]]
     columns = [np.array(of[n], dtype=object) for n in TEXTS]
     columns += [np.array([np.nan if v is None else v for v in of[n]], dtype=np.float64) for n in NUMBERS]
     lon, lat = (columns[FIELDS.index(n)] for n in ("lon_deg", "lat_deg"))
-    height = np.nan_to_num(columns[FIELDS.index("height_m")])
-    points = shapely.points(lon, lat) if flat else shapely.points(lon, lat, height)
+    points = shapely.points(lon, lat)
+    if not flat:
+        height = np.array([_ellipsoidal_m(record) for record in page], dtype=np.float64)
+        known = np.isfinite(height)
+        points[known] = shapely.points(lon[known], lat[known], height[known])
     return shapely.to_wkb(points), columns
 
 
@@ -132,58 +161,70 @@ def _zipped(folder: Path) -> Path:
     return path
 
 
-def write_landxml(records: Sequence[Record]) -> bytes:
-    """LandXML 1.2 CgPoints (north, east, elevation) in the UTM zone of WGS 84 that the markers lie in."""
-    code, east, north = _utm(records)
+def write_landxml(records: Sequence[Record]) -> CadFile:
+    """LandXML 1.2 CgPoints (north, east, ellipsoidal height) in the UTM zone of WGS 84 that most markers lie in."""
+    zone = _utm(records)
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2" version="1.2"><Units><Metric linearUnit="meter" '
         'areaUnit="squareMeter" volumeUnit="cubicMeter" temperatureUnit="celsius" pressureUnit="milliBars"/></Units>',
-        f'<CoordinateSystem epsgCode="{code}"/><CgPoints>',
+        f'<CoordinateSystem epsgCode="{zone.code}"/><CgPoints>',
     ]
-    for record, e, n in zip(records, east, north, strict=True):
-        height = f" {record['height_m']:.4f}" if record["height_m"] is not None else ""
-        name, identifier = quoteattr(_code(record)), quoteattr(str(record["id"]))
-        lines.append(f"<CgPoint name={name} desc={identifier}>{n:.4f} {e:.4f}{escape(height)}</CgPoint>")
-    return "\n".join([*lines, "</CgPoints></LandXML>", ""]).encode()
+    lines += [f"<!-- left out: {marker_id}, too far from this zone -->" for marker_id in zone.left_out]
+    for record, e, n in zip(zone.records, zone.east, zone.north, strict=True):
+        z = _ellipsoidal_m(record)
+        height = f" {z:.4f}" if z is not None else ""
+        name, description = quoteattr(_code(record)), quoteattr("; ".join([str(record["id"]), *_other_height(record)]))
+        lines.append(f"<CgPoint name={name} desc={description}>{n:.4f} {e:.4f}{escape(height)}</CgPoint>")
+    return CadFile("\n".join([*lines, "</CgPoints></LandXML>", ""]).encode(), zone.left_out)
 
 
-def write_dxf(records: Sequence[Record]) -> bytes:
-    """DXF R2010 in metres: a block reference a marker with its code and id, in the UTM zone of WGS 84."""
-    code, east, north = _utm(records)
+def write_dxf(records: Sequence[Record]) -> CadFile:
+    """DXF R2010 in metres: a block reference a marker with its code and id, in the UTM zone of WGS 84 that most lie in.
+
+    Its z is the ellipsoidal height; 0, the plane of the drawing, where that is unknown: a block always has one. Another
+    height is the attribute HEIGHT, with its datum.
+    """
+    zone = _utm(records)
+    layer = f"WAYMARK_EPSG_{zone.code}"
     document = new("R2010", units=6)
     document.header["$INSUNITS"] = 6
-    document.layers.add(f"WAYMARK_EPSG_{code}")
+    document.layers.add(layer)
+    for marker_id in zone.left_out:
+        document.header.custom_vars.append("LEFT_OUT", marker_id)
     block = document.blocks.new("WAYMARK_MARKER")
     block.add_point((0, 0))
-    for tag in ("CODE", "ID"):
+    for tag in ("CODE", "ID", "HEIGHT"):
         block.add_attdef(tag, (0, 0), dxfattribs={"height": 0.25})
     space = document.modelspace()
-    for record, e, n in zip(records, east, north, strict=True):
-        place = (float(e), float(n), record["height_m"] or 0.0)
-        reference = space.add_blockref("WAYMARK_MARKER", place, dxfattribs={"layer": f"WAYMARK_EPSG_{code}"})
-        reference.add_auto_attribs({"CODE": _code(record), "ID": str(record["id"])})
+    for record, e, n in zip(zone.records, zone.east, zone.north, strict=True):
+        place = (float(e), float(n), _ellipsoidal_m(record) or 0.0)
+        reference = space.add_blockref("WAYMARK_MARKER", place, dxfattribs={"layer": layer})
+        height = "".join(_other_height(record))
+        reference.add_auto_attribs({"CODE": _code(record), "ID": str(record["id"]), "HEIGHT": height})
     text = io.StringIO()
     document.write(text)
-    return text.getvalue().encode()
+    return CadFile(text.getvalue().encode(), zone.left_out)
 
 
 def _code(record: Record) -> str:
     return str(record["code"] if record["code"] is not None else record["id"])
 
 
-def _utm(records: Sequence[Record]) -> tuple[int, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """EPSG code of the zone, eastings and northings [m]."""
+def _other_height(record: Record) -> list[str]:
+    """A height that is not in the geometry, in words."""
+    known = record["height_m"] is not None and _ellipsoidal_m(record) is None
+    return [f"{record['height_m']:.4f} m above {record['vertical_datum']}"] if known else []
+
+
+def _utm(records: Sequence[Record]) -> _Zone:
+    """The zone that most markers lie in, with those that are not too far from it."""
     lon, lat = (np.array([r[n] for r in records], dtype=np.float64) for n in ("lon_deg", "lat_deg"))
-    middle = float(np.median(lon))
-    if len(records) and float(np.ptp(lon)) > 6.0:
-        raise InvalidParameter(
-            "the markers lie too far apart for one UTM zone",
-            field="bbox",
-            limit="6 degrees of longitude",
-            cure="export a smaller box, or a format in degrees",
-        )
-    zone = min(int((middle + 180.0) // 6.0) + 1, 60)
-    code = (32600 if float(np.median(lat)) >= 0 else 32700) + zone
-    east, north = Transformer.from_crs("EPSG:4326", f"EPSG:{code}", always_xy=True).transform(lon, lat)
-    return code, np.asarray(east), np.asarray(north)
+    number = int(np.bincount(np.minimum((lon + 180.0) // 6.0, 59.0).astype(np.intp)).argmax())
+    away_deg = np.abs((lon - (6.0 * number - 177.0) + 180.0) % 360.0 - 180.0)
+    near = away_deg <= MAX_FROM_MERIDIAN_DEG
+    code = (32601 if float(np.median(lat[near])) >= 0 else 32701) + number
+    east, north = Transformer.from_crs("EPSG:4326", f"EPSG:{code}", always_xy=True).transform(lon[near], lat[near])
+    kept = [record for record, is_near in zip(records, near, strict=True) if is_near]
+    left_out = tuple(str(record["id"]) for record, is_near in zip(records, near, strict=True) if not is_near)
+    return _Zone(code, kept, np.asarray(east), np.asarray(north), left_out)

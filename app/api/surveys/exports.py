@@ -18,6 +18,8 @@ from app.services.surveys.exports import Exports as ExportsService
 
 router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=StrictRoute)
 
+MAX_LEFT_OUT_IDS = 20
+"""Ids in the header Waymark-Left-Out. Source: chosen by hand, 1 kB."""
 _SUFFIXES = {"shapefile": "shp.zip", "landxml": "xml"}
 Exports = Annotated[ExportsService, use_cases("exports")]
 
@@ -39,11 +41,15 @@ def get_export(
 
     The filters are those of GET /v1/markers.
 
-    Positions are longitude and latitude in WGS 84 / ITRF; LandXML and DXF are in the UTM zone they lie in.
+    Positions are longitude and latitude in WGS 84 / ITRF; LandXML and DXF are in the UTM zone that most of them lie in.
+    Markers too far from it are left out: the file lists them, and the header Waymark-Left-Out has their number and the
+    first ids. Retired markers are in LandXML and DXF only with status=retired.
     """
     headers = {"Content-Disposition": f'attachment; filename="markers.{_SUFFIXES.get(kind, kind)}"'}
     if kind in STREAMED:
         chunks, media_type = exports.stream(caller, kind, filtered), STREAMED[kind]
     else:
-        chunks, media_type = exports.whole(caller, kind, filtered), WHOLE[kind]
+        (chunks, left_out), media_type = exports.whole(caller, kind, filtered), WHOLE[kind]
+        if left_out:
+            headers["Waymark-Left-Out"] = f"{len(left_out)}; {' '.join(left_out[:MAX_LEFT_OUT_IDS])}"
     return StreamingResponse(counted_steps(chunks), headers=headers, media_type=media_type)

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from app.errors import InvalidParameter
+from app.families.rules import RETIRED
 from app.formats import exports as write
 from app.registry import bulk
 from app.registry.database import Database
@@ -41,47 +42,55 @@ class Exports:
         pages = self._pages(caller, filtered)
         return write.write_csv(pages) if kind == "csv" else write.write_geojson(pages)
 
-    def whole(self, caller: Caller, kind: str, filtered: MarkerFilter) -> Iterator[bytes]:
-        """One file, written before this returns and gone when it has been read.
+    def whole(self, caller: Caller, kind: str, filtered: MarkerFilter) -> tuple[Iterator[bytes], tuple[str, ...]]:
+        """One file, written before this returns and gone when it has been read; and the ids of markers left out of it.
 
         Raises
         ------
         InvalidParameter
-            There are none, too many for one file, or too far apart for one zone.
+            There are none, or too many for one file.
         """
         folder = TemporaryDirectory(prefix="waymark-export-")
         try:
-            path = self.write_file(caller, kind, filtered, Path(folder.name))
+            path, left_out = self.write_file(caller, kind, filtered, Path(folder.name))
         except BaseException:
             folder.cleanup()
             raise
-        return _blocks(path, folder)
+        return _blocks(path, folder), left_out
 
-    def write_file(self, caller: Caller, kind: str, filtered: MarkerFilter, folder: Path) -> Path:
-        """One file of any kind, in an empty folder; raises as `whole`."""
+    def write_file(
+        self, caller: Caller, kind: str, filtered: MarkerFilter, folder: Path
+    ) -> tuple[Path, tuple[str, ...]]:
+        """One file of any kind, in an empty folder, and the ids of markers left out of it; raises as `whole`.
+
+        LandXML and DXF have one UTM zone: markers too far from it are left out. They have no status either, so retired
+        markers are in them only if the filter asks for these.
+        """
         if kind in STREAMED:
             path = folder / f"markers.{kind}"
             with path.open("wb") as file:
                 file.writelines(self.stream(caller, kind, filtered))
-            return path
-        pages = self._pages(caller, filtered, most=MAX_WHOLE[kind])
+            return path, ()
+        in_zone = kind in ("landxml", "dxf")
+        pages = self._pages(caller, filtered, most=MAX_WHOLE[kind], with_retired=not in_zone)
         first = next(pages, None)
         if first is None:
             raise InvalidParameter(
                 "no marker is in the selection", field="bbox", limit="one at least", cure="widen the filter"
             )
         records = chain.from_iterable(chain((first,), pages))
-        if kind in ("landxml", "dxf"):
+        if in_zone:
             path = folder / f"markers.{kind}"
-            path.write_bytes((write.write_landxml if kind == "landxml" else write.write_dxf)(list(records)))
-            return path
+            made = (write.write_landxml if kind == "landxml" else write.write_dxf)(list(records))
+            path.write_bytes(made.content)
+            return path, made.left_out
         with self._database.read() as connection:
-            has_heights = bulk.has_heights(connection, caller.agency_id, filtered)
+            all_heights = bulk.have_ellipsoidal_heights(connection, caller.agency_id, filtered)
         batches = _batched(records, MAX_WHOLE["kml"] if kind == "kml" else _GIS_PAGE)
-        return write.write_gis(batches, kind, folder, has_heights=has_heights)
+        return write.write_gis(batches, kind, folder, all_heights=all_heights), ()
 
     def _pages(
-        self, caller: Caller, filtered: MarkerFilter, *, most: int | None = None
+        self, caller: Caller, filtered: MarkerFilter, *, most: int | None = None, with_retired: bool = True
     ) -> Iterator[list[dict[str, Any]]]:
         after: str | None = None
         count = 0
@@ -90,6 +99,11 @@ class Exports:
                 page = bulk.list_records(connection, caller.agency_id, filtered, write.FIELDS, after=after, limit=_PAGE)
             if not page:
                 return
+            after = page[-1]["id"]
+            if not with_retired and filtered.status is None:
+                page = [record for record in page if record["status"] != RETIRED]
+                if not page:
+                    continue
             count += len(page)
             if most is not None and count > most:
                 raise InvalidParameter(
@@ -101,7 +115,6 @@ class Exports:
             for record in page:
                 record["updated_at"] = record["updated_at"].isoformat()
             yield page
-            after = page[-1]["id"]
 
 
 def _batched(records: Iterator[dict[str, Any]], count: int) -> Iterator[list[dict[str, Any]]]:

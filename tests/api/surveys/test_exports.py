@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
+import subprocess
 import tempfile
 import zipfile
 from pathlib import Path
@@ -149,10 +151,64 @@ def test_files_of_several_pages_hold_every_value(
     assert of["horizontal_rmse_m"][:3] == pytest.approx([0.01] * 3)
     points = shapely.from_wkb(geometry)
     assert shapely.get_y(points) == pytest.approx([m["lat_deg"] for m in markers] + [-1e-9], abs=1e-12)
-    assert shapely.get_z(points).tolist() == [160.25, 161.25, 162.25, 0.0]
     info = read_info(path)
     assert info["features"] == 4
-    assert info["geometry_type"] == "Point Z"
+    # a height that is unknown is none, not zero
+    assert info["geometry_type"] == ("Point" if kind == "shapefile" else "Point Z")
+    assert shapely.has_z(points).tolist() == [kind == "gpkg"] * 3 + [False]
+    if kind == "gpkg":
+        assert shapely.get_z(points[:3]).tolist() == [160.25, 161.25, 162.25]
+
+
+def test_only_ellipsoidal_heights_are_in_geometries(client: httpx.Client, tmp_path: Path) -> None:
+    """RFC 7946 section 4; heights above another datum are attributes, and GDAL's own tools show no other z."""
+    datums = ("ellipsoid", "EPSG:7837", None)
+    for k, datum in enumerate(datums):
+        height = {} if datum is None else {"height_m": 160.5, "vertical_datum": datum}
+        position = {"lon_deg": LON + k * 1e-3, "lat_deg": LAT, **height}
+        marker = {"family": "cerpm", "position": position, "side": "left", "road": datum or "none"}
+        assert client.post("/v1/markers", json=marker).status_code == 201
+    shown = {}
+    for kind, name in (("gpkg", "m.gpkg"), ("geojson", "m.geojson"), ("shapefile", "m.shp.zip")):
+        path = tmp_path / name
+        path.write_bytes(client.get(f"/v1/exports/{kind}").content)
+        source = f"/vsizip/{path}" if kind == "shapefile" else str(path)
+        found = subprocess.run(["ogrinfo", "-q", "-al", source], capture_output=True, text=True, check=True).stdout
+        shown[kind] = re.findall(r"^ +(POINT.*?) \(", found, re.MULTILINE)
+        assert found.count("160.5") == (2 if kind == "shapefile" else 3), found  # attributes of two, z of one
+    assert shown == {"gpkg": ["POINT Z", "POINT", "POINT"], "geojson": ["POINT Z", "POINT", "POINT"],
+                     "shapefile": ["POINT"] * 3}  # fmt: skip
+    items = client.get("/ogc/collections/markers/items").json()["features"]
+    assert [len(item["geometry"]["coordinates"]) for item in items] == [3, 2, 2]
+    assert [item["properties"]["height_m"] for item in items] == [160.5, 160.5, None]
+    only = client.get("/v1/exports/shapefile", params={"road": "ellipsoid"}).content
+    (tmp_path / "z.shp.zip").write_bytes(only)
+    assert read_info(f"/vsizip/{tmp_path / 'z.shp.zip'}")["geometry_type"] == "Point Z"
+    landxml = client.get("/v1/exports/landxml").text
+    assert len(re.findall(r">[0-9.]+ [0-9.]+ 160.5000<", landxml)) == 1
+    assert "; 160.5000 m above EPSG:7837" in landxml
+
+
+@pytest.mark.parametrize("kind", ["landxml", "dxf"])
+def test_a_distant_marker_is_left_out_and_named(
+    client: httpx.Client, markers: list[dict[str, float]], kind: str
+) -> None:
+    far = {"family": "cerpm", "position": {"lon_deg": -77.15, "lat_deg": 38.9}, "side": "left"}
+    marker = client.post("/v1/markers", json=far).json()
+    answer = client.get(f"/v1/exports/{kind}")
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["Waymark-Left-Out"] == f"1; {marker['id']}"
+    assert marker["id"] in answer.text
+    crs = "EPSG:32632" if kind == "dxf" else None
+    declaration = ImportDeclaration(family="cerpm", vertical_datum="ellipsoid", crs=crs)
+    assert read_survey(answer.content, declaration).rows == 3
+    etag = {"If-Match": f'"{marker["version"]}"'}
+    assert client.patch(f"/v1/markers/{marker['id']}", json={"status": "retired"}, headers=etag).status_code == 200
+    later = client.get(f"/v1/exports/{kind}")
+    assert "Waymark-Left-Out" not in later.headers
+    assert marker["id"] not in later.text
+    retired = client.get(f"/v1/exports/{kind}", params={"status": "retired"})
+    assert marker["id"] in retired.text
 
 
 def test_no_file_is_left_behind(client: httpx.Client, markers: list[dict[str, float]]) -> None:
