@@ -14,7 +14,7 @@ from app.api.http.permissions import PERMISSIONS
 from app.api.http.problems import FieldError, Problem, kind_of, problem_responses, report_problem, validation_fault
 from app.api.http.responses import created_response
 from app.api.http.strict_json import StrictRoute, validated
-from app.api.markers.markers import NewMarkerIn
+from app.api.markers.markers import WARNINGS_TEXT, NewMarkerIn
 from app.api.markers.schemas_patch import MarkerPatch
 from app.errors import InvalidParameter, WaymarkError
 from app.families.inputs import StrictModel
@@ -22,6 +22,7 @@ from app.families.plate.inputs import PLATE_EXAMPLES
 from app.services.error_documents import cut_text
 from app.services.markers.bulk import BulkInput, BulkReport, Item, ItemProblem, MarkerUpdate
 from app.services.markers.bulk import BulkMarkers as BulkMarkersService
+from app.services.markers.plausibility import WarningMode
 
 router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
 
@@ -78,6 +79,7 @@ class BulkIn(StrictModel):
     )
     mode: Literal["all", "good"] = Field("all", description="Store all items or none, or those that are good.")
     dry_run: Annotated[bool, Field(strict=True)] = Field(False, description="Say what would happen; store nothing.")
+    warnings: WarningMode = Field("store", description=WARNINGS_TEXT)
 
 
 class RefusedItems(Problem):
@@ -105,7 +107,7 @@ def post_bulk(body: BulkIn, request: Request, caller: Caller, bulk: Bulk, idempo
         caller.require(PERMISSIONS["POST /v1/markers"])
     items = [_read(item) for item in body.items]
     report, replayed = bulk.run(
-        caller, BulkInput(items, body.mode, body.dry_run), partial(_described, body.items), idempotency
+        caller, BulkInput(items, body.mode, body.dry_run, body.warnings), partial(_described, body.items), idempotency
     )
     if report["outcome"] == "refused":
         return _refused(request, report)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict, Discriminator, RootModel, Tag, model_validator
 
 from app.api.http.dependencies import AfterVersion, Caller, Idempotency, MarkerId, Markers, PageSize, Version
@@ -25,10 +25,13 @@ from app.families import FAMILIES, FAMILY_NAMES, union_of
 from app.families.inputs import MarkerIn
 from app.services.markers.accuracy import AccuracyDocument
 from app.services.markers.documents import AnyMarkerDetail, VersionDocument, VersionPage
+from app.services.markers.plausibility import WarningMode
 
 router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
 
 _DEFAULT_FAMILY = FAMILY_NAMES[0]
+WARNINGS_TEXT = "What a warning about a position means: the marker is stored, or refused with 422."
+Warnings = Annotated[WarningMode, Query(description=WARNINGS_TEXT)]
 
 
 def _family_tag(body: Any) -> str:
@@ -67,9 +70,14 @@ class NewMarkerIn(RootModel[_AnyMarkerIn]):
 @router.post(
     "", status_code=201, responses=document_response(AnyMarkerDetail, 404, 409, status=201, description="Registered")
 )
-def post_marker(marker: NewMarkerIn, caller: Caller, markers: Markers, idempotency: Idempotency) -> Response:
-    """Register a marker of any family. With an Idempotency-Key a repeated request gets the first answer again."""
-    document, replayed = markers.register(caller, marker.root.new(), idempotency)
+def post_marker(
+    marker: NewMarkerIn, caller: Caller, markers: Markers, idempotency: Idempotency, warnings: Warnings = "store"
+) -> Response:
+    """Register a marker of any family. With an Idempotency-Key a repeated request gets the first answer again.
+
+    `position_warnings` of the response name what is probably wrong with the position.
+    """
+    document, replayed = markers.register(caller, marker.root.new(), idempotency, warnings)
     return created_response(document, replayed, path="/v1/markers")
 
 
@@ -81,10 +89,15 @@ def get_marker(marker_id: MarkerId, caller: Caller, markers: Markers, if_none_ma
 
 @router.patch("/{marker_id}", responses=document_response(AnyMarkerDetail, 404, 409, 412, 428))
 def patch_marker(
-    marker_id: MarkerId, patch: MarkerPatch, caller: Caller, markers: Markers, version: Version
+    marker_id: MarkerId,
+    patch: MarkerPatch,
+    caller: Caller,
+    markers: Markers,
+    version: Version,
+    warnings: Warnings = "store",
 ) -> Response:
-    """Change a marker that is still at the version named by If-Match."""
-    return versioned_response(markers.change(caller, marker_id, patch.change(), version))
+    """Change a marker that is still at the version named by If-Match; a new position may have `position_warnings`."""
+    return versioned_response(markers.change(caller, marker_id, patch.change(), version, warnings))
 
 
 @router.get("/{marker_id}/accuracy", responses=document_response(AccuracyDocument, 404))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
+import orjson
 from fastapi import Depends, Header, Request
 from pydantic import TypeAdapter
 from starlette.responses import Response
@@ -18,7 +19,7 @@ from app.api.http.dependencies import Caller, Markers, SentVersion
 from app.api.http.forms import media_type_of
 from app.api.http.permissions import PERMISSIONS
 from app.api.http.strict_json import in_thread_if_large, parse_json, validated
-from app.api.markers.markers import NewMarkerIn, patch_marker, post_marker
+from app.api.markers.markers import WARNINGS_TEXT, NewMarkerIn, patch_marker, post_marker
 from app.api.markers.schemas_patch import MarkerPatch
 from app.api.ogc.dependencies import (
     BaseUrl,
@@ -32,16 +33,18 @@ from app.api.ogc.responses import GEOJSON, JSON
 from app.errors import InvalidParameter, StaleVersion, UnsupportedUpload
 from app.families import FAMILIES, FAMILY_NAMES, get_family
 from app.families.family import Family
+from app.geodesy.vertical import is_ellipsoidal
 from app.services.access.access import Caller as CallerValue
 from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.markers.features import Collection
 from app.services.markers.features import Features as FeaturesUseCases
 from app.services.markers.markers import Markers as MarkersUseCases
+from app.services.markers.plausibility import WarningMode
 
 _PLAIN = ("status", "heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m", "side")
 _CLEARED = ("heading_deg", "heading_rmse_deg", "road", "measure_m", "offset_m")  # by a PUT without them
 _SURVEYED = (
-    *("realization", "epoch", "vertical_datum", "horizontal_rmse_m", "vertical_rmse_m", "survey_method"),
+    *("realization", "epoch", "height_m", "vertical_datum", "horizontal_rmse_m", "vertical_rmse_m", "survey_method"),
     *("check_points", "surveyor", "instrument"),
 )
 _FIXED = ("family", "scheme", "code")
@@ -59,6 +62,7 @@ class _Edit:
     features: FeaturesUseCases
     markers: MarkersUseCases
     crs: FeatureCrs
+    warnings: WarningMode
 
 
 async def get_edit(
@@ -70,12 +74,13 @@ async def get_edit(
     content_crs: Annotated[
         str, Header(alias="Content-Crs", description="CRS of the body's geometry.")
     ] = f"<{STORAGE_CRS}>",
+    warnings: Annotated[WarningMode, Header(alias="Waymark-Warnings", description=WARNINGS_TEXT)] = "store",
 ) -> _Edit:
     """What a request that edits has besides its feature."""
     sent = content_crs.strip().strip("<>")
     if sent not in list(FeatureCrs):
         raise InvalidParameter("this CRS is not offered", field="Content-Crs", limit=", ".join(FeatureCrs))
-    return _Edit(collection, caller, features, markers, FeatureCrs(sent))
+    return _Edit(collection, caller, features, markers, FeatureCrs(sent), warnings)
 
 
 async def get_body(request: Request) -> dict[str, Any]:
@@ -126,13 +131,14 @@ def post_feature(feature: Body, edit: Edit, base: BaseUrl) -> Response:
     """Register a marker of a family whose markers are points."""
     given = {name: value for name, value in _properties(feature).items() if value is not None}
     body = {name: given[name] for name in _PLAIN if name in given}
-    body["position"] = _place(feature.get("geometry"), edit.crs) | {n: given[n] for n in _SURVEYED if n in given}
+    surveyed = {name: given[name] for name in _SURVEYED if name in given}
+    body["position"] = _position(_place(feature.get("geometry"), edit.crs), surveyed)
     family = _family(given.get("family", FAMILY_NAMES[0]))
     body |= {"family": family.name, **family.feature_members(given)}
-    made = post_marker(validated(_NEW_MARKER, body, "body"), edit.caller, edit.markers, None)
+    made = post_marker(validated(_NEW_MARKER, body, "body"), edit.caller, edit.markers, None, edit.warnings)
     marker_id = made.headers["Location"].rsplit("/", 1)[1]
     where = f"{base}/collections/{edit.collection.id}/items/{marker_id}"
-    return Response(status_code=201, headers={"Location": where})
+    return Response(status_code=201, headers={"Location": where, **_warned(made)})
 
 
 def put_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentVersion) -> Response:
@@ -141,6 +147,8 @@ def put_feature(feature: Body, edit: Edit, feature_id: FeatureId, version: SentV
     given = {**dict.fromkeys((*_CLEARED, *_SURVEYED)), **_properties(feature)}
     place = _place(feature.get("geometry"), edit.crs)
     before, properties = stored["geometry"]["coordinates"], stored["properties"]
+    if "height_m" in place:
+        given["height_m"] = _position(place, given)["height_m"]
     if tuple(place.values()) == tuple(before) and all(given[name] == properties[name] for name in _SURVEYED):
         for name in _SURVEYED:  # the position is as it was, and stays as it was sent
             del given[name]
@@ -180,13 +188,21 @@ def _change(feature: dict[str, Any], edit: _Edit, feature_id: str, version: int 
             body.pop(name, None)
     surveyed = {name: given[name] for name in _SURVEYED if name in given}
     if feature.get("geometry") is not None:
-        body["position"] = _place(feature["geometry"], edit.crs) | surveyed
+        body["position"] = _position(_place(feature["geometry"], edit.crs), surveyed)
     elif surveyed:
         marker = edit.markers.get(edit.caller, feature_id)
         body["position"] = {**marker["position"]["original"], **surveyed}
-    if body:
-        patch_marker(feature_id, validated(_MARKER_PATCH, body, "body"), edit.caller, edit.markers, version)
-    return Response(status_code=204)
+    if not body:
+        return Response(status_code=204)
+    patch = validated(_MARKER_PATCH, body, "body")
+    changed = patch_marker(feature_id, patch, edit.caller, edit.markers, version, edit.warnings)
+    return Response(status_code=204, headers=_warned(changed))
+
+
+def _warned(answer: Response) -> dict[str, str]:
+    """Codes of the warnings about a position that was stored, as a header: these responses have no body."""
+    found = orjson.loads(answer.body).get("position_warnings", ())
+    return {"Waymark-Warnings": " ".join(warning["code"] for warning in found)} if found else {}
 
 
 def _family(name: Any) -> Family[Any, Any]:
@@ -217,6 +233,20 @@ def _properties(feature: dict[str, Any]) -> dict[str, Any]:
                 cure="leave it out",
             )
     return given
+
+
+def _position(place: dict[str, Any], surveyed: dict[str, Any]) -> dict[str, Any]:
+    """A point with its properties. The height of a geometry is ellipsoidal; another is in the properties."""
+    if "height_m" not in place:
+        return place | surveyed
+    if is_ellipsoidal(surveyed.get("vertical_datum")):
+        return surveyed | place
+    raise InvalidParameter(
+        "the geometry has a height, which is ellipsoidal, and vertical_datum is another",
+        field="geometry",
+        limit="two numbers with a vertical_datum other than ellipsoid",
+        cure="send the height as the property height_m",
+    )
 
 
 def _place(geometry: Any, crs: FeatureCrs) -> dict[str, Any]:

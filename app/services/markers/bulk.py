@@ -11,11 +11,13 @@ import sqlalchemy as sa
 from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter, Unavailable, WaymarkError
+from app.families.documents import WarningDocument
 from app.families.new_marker import NewMarker
 from app.registry.database import Database
 from app.services.access.access import Caller
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.markers.markers import MarkerChange, Markers, Step
+from app.services.markers.plausibility import WarningMode
 from app.services.ports import Clock
 from app.services.request_work import check_deadline
 
@@ -46,6 +48,7 @@ class ItemResult(TypedDict):
     id: str | None
     version: int | None
     problem: ItemProblem | None
+    warnings: list[WarningDocument]
 
 
 class BulkReport(TypedDict):
@@ -84,6 +87,7 @@ class BulkInput:
     items: Sequence[Item]
     mode: Mode = ALL
     dry_run: bool = False
+    warnings: WarningMode = "store"
 
 
 class _NotStored(Exception):
@@ -127,7 +131,7 @@ class BulkMarkers:
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
         _check_parts(given.items)
-        steps = [self._prepared(caller, item, now) for item in given.items]
+        steps = [self._prepared(caller, item, now, given.warnings) for item in given.items]
         try:
             with write_once(self._database, caller.agency_id, key, now, self._ttl, long=True) as (connection, answer):
                 if answer.replayed:
@@ -141,14 +145,17 @@ class BulkMarkers:
             pass
         return report, False
 
-    def _prepared(self, caller: Caller, item: Item, now: datetime) -> tuple[int, Step | WaymarkError]:
+    def _prepared(
+        self, caller: Caller, item: Item, now: datetime, warnings: WarningMode
+    ) -> tuple[int, Step | WaymarkError]:
         check_deadline()
         if isinstance(item, WaymarkError):
             return 0, item
         try:
             if isinstance(item, MarkerUpdate):
-                return _UPDATED, self._markers.prepare_change(caller, item.marker_id, item.change, item.version, now)
-            return _CREATED, self._markers.prepare_new(caller, item, now)
+                step = self._markers.prepare_change(caller, item.marker_id, item.change, item.version, now, warnings)
+                return _UPDATED, step
+            return _CREATED, self._markers.prepare_new(caller, item, now, warnings)
         except Unavailable:
             raise
         except WaymarkError as error:
@@ -180,8 +187,22 @@ def _result(
         raise
     except WaymarkError as error:
         problem = describe(index, error)
-        return {"index": index, "status": problem["status"], "id": None, "version": None, "problem": problem}
-    return {"index": index, "status": status, "id": marker["id"], "version": marker["version"], "problem": None}
+        return {
+            "index": index,
+            "status": problem["status"],
+            "id": None,
+            "version": None,
+            "problem": problem,
+            "warnings": [],
+        }
+    return {
+        "index": index,
+        "status": status,
+        "id": marker["id"],
+        "version": marker["version"],
+        "problem": None,
+        "warnings": marker.get("position_warnings", []),
+    }
 
 
 def _report(given: BulkInput, results: list[ItemResult]) -> BulkReport:

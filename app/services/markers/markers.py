@@ -12,7 +12,7 @@ import sqlalchemy as sa
 
 from app.errors import InvalidParameter
 from app.families import get_family
-from app.families.documents import MarkerDocument
+from app.families.documents import MarkerDocument, WarningDocument
 from app.families.family import Family, Registration
 from app.families.inputs import PositionIn
 from app.families.new_marker import NewMarker
@@ -31,6 +31,7 @@ from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, write_once
 from app.services.markers.accuracy import AccuracyDocument, accuracy_document
 from app.services.markers.documents import VersionDocument
+from app.services.markers.plausibility import WarningMode, check_position
 from app.services.ports import Clock
 from app.services.roads.routes import linear_references
 from app.services.version_kinds import kind_of_change, kind_of_new
@@ -75,20 +76,21 @@ class Markers:
         self._random_bits = random_bits
 
     def register(
-        self, caller: Caller, new: NewMarker, key: IdempotencyKey | None = None
+        self, caller: Caller, new: NewMarker, key: IdempotencyKey | None = None, warnings: WarningMode = "store"
     ) -> tuple[MarkerDocument, bool]:
         """Store a new marker.
 
         Returns
         -------
         marker : MarkerDocument
+            With the warnings about its position.
         replayed : bool
             The request had been made before under the same Idempotency-Key; nothing was stored now.
 
         Raises
         ------
         InvalidParameter, CodeMismatch, ReferenceSystemError
-            The request contradicts itself or a limit.
+            The request contradicts itself or a limit, or has warnings that are to be refused.
         CodeTaken
             Another marker carries the code or the number.
         NotFound
@@ -97,14 +99,14 @@ class Markers:
             Magnets of another marker lie too near.
         """
         now = self._clock()
-        store_new = self.prepare_new(caller, new, now)
+        store_new = self.prepare_new(caller, new, now, warnings)
         ttl = self._rules.idempotency_ttl
         with write_once(self._database, caller.agency_id, key, now, ttl) as (connection, answer):
             if not answer.replayed:
                 answer.store(store_new(connection))
         return answer.response, answer.replayed
 
-    def prepare_new(self, caller: Caller, new: NewMarker, now: datetime) -> Step:
+    def prepare_new(self, caller: Caller, new: NewMarker, now: datetime, warnings: WarningMode = "store") -> Step:
         """What takes time before a new marker is stored, and the step that then stores it.
 
         Raises
@@ -128,6 +130,7 @@ class Markers:
                 "updated_at": now,
                 **family.columns(connection, registration, new, prepared),
             }
+            found = check_position(connection, caller.agency_id, values["id"], values, warnings)
             if new.measure_m is None:
                 values |= linear_references(connection, caller.agency_id, [values], [None])[0]
             kind = kind_of_new(new.status, new.kind)
@@ -137,7 +140,7 @@ class Markers:
             ) as entry:
                 row = store.add_marker(connection, entry, values, kind=kind, why=new.reason)
             family.index(connection, caller.agency_id, row)
-            return family.detail(row)
+            return _with_warnings(family.detail(row), found)
 
         return store_new
 
@@ -153,7 +156,14 @@ class Markers:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         return accuracy_document(row.horizontal_rmse_m, row.vertical_rmse_m, row.check_points)
 
-    def change(self, caller: Caller, marker_id: str, change: MarkerChange, version: int | None) -> MarkerDocument:
+    def change(
+        self,
+        caller: Caller,
+        marker_id: str,
+        change: MarkerChange,
+        version: int | None,
+        warnings: WarningMode = "store",
+    ) -> MarkerDocument:
         """Change a marker that is still at `version`; None changes whatever version is stored.
 
         Raises
@@ -161,16 +171,22 @@ class Markers:
         StaleVersion
             The marker was changed since the caller read it.
         InvalidParameter
-            Its family does not allow the change.
+            Its family does not allow the change, or its position has warnings that are to be refused.
         Conflict
             At its new place, or back in use, it collides with another marker.
         """
-        change_stored = self.prepare_change(caller, marker_id, change, version, self._clock())
+        change_stored = self.prepare_change(caller, marker_id, change, version, self._clock(), warnings)
         with self._database.write() as connection:
             return change_stored(connection)
 
     def prepare_change(
-        self, caller: Caller, marker_id: str, change: MarkerChange, version: int | None, now: datetime
+        self,
+        caller: Caller,
+        marker_id: str,
+        change: MarkerChange,
+        version: int | None,
+        now: datetime,
+        warnings: WarningMode = "store",
     ) -> Step:
         """The step that changes a marker; its place is worked out before.
 
@@ -191,6 +207,9 @@ class Markers:
             values |= _spec_changes(family, change)
             registration = self._registration(caller, now)
             values |= family.revise(connection, registration, row, values)
+            found: list[WarningDocument] = []
+            if placed is not None:
+                found = check_position(connection, caller.agency_id, marker_id, {**row._asdict(), **values}, warnings)
             if (placed is not None or "road" in values) and values.get("measure_m") is None:
                 merged = {**row._asdict(), **values}
                 values |= linear_references(connection, caller.agency_id, [merged], [row.measure_m])[0]
@@ -204,7 +223,7 @@ class Markers:
                 )
             if placed is not None:
                 family.index(connection, caller.agency_id, changed)
-            return family.detail(changed)
+            return _with_warnings(family.detail(changed), found)
 
         return change_stored
 
@@ -235,6 +254,10 @@ class Markers:
 
 def _family(row: MarkerRow) -> Family[Any, Any]:
     return get_family(row.family)
+
+
+def _with_warnings(document: MarkerDocument, found: list[WarningDocument]) -> MarkerDocument:
+    return {**document, "position_warnings": found} if found else document
 
 
 def _spec_changes(family: Family[Any, Any], change: MarkerChange) -> dict[str, Any]:
