@@ -19,6 +19,7 @@ from benchmarks.registry.fill import Network, fill, lay_roads
 from benchmarks.registry.searches import measure_growth, measure_searches
 from benchmarks.registry.servers import drop_database, make_database, settle
 from benchmarks.registry.serving import measure_boxes, measure_tiles
+from benchmarks.registry.verification import VERSIONS, measure_verification
 
 OUT = Path("bench-out/registry")
 GROWTH = (10_000, 100_000, 1_000_000, 5_000_000)
@@ -39,12 +40,15 @@ def main() -> int:
     parser.add_argument("--short", action="store_true")
     parser.add_argument("--rows", type=int, default=None)
     parser.add_argument("--growth", type=_numbers, default=None, help="rows of the growth table, e.g. 10000,5000000")
-    parser.add_argument("--only", choices=("http", "searches", "growth"), default=None)
+    parser.add_argument("--only", choices=("http", "searches", "growth", "audit"), default=None)
     arguments = parser.parse_args()
     rows = arguments.rows or (20_000 if arguments.short else 1_000_000)
     seconds = 1.0 if arguments.short else 4.0
     met, known = True, {}
-    if arguments.only != "growth":
+    if arguments.only in (None, "audit"):
+        with filled(rows // VERSIONS) as registry:
+            met &= measure_verification(registry)
+    if arguments.only not in ("growth", "audit"):
         with filled(rows) as registry:
             if arguments.only != "searches":
                 met &= measure_boxes(registry, OUT / "tipg", seconds)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -12,8 +14,8 @@ import sqlalchemy as sa
 from app.errors import InvalidParameter, NotFound
 from app.families.inputs import PositionIn
 from app.families.plate.registration import NewPlate
-from app.registry import agencies
-from app.registry.audit import Author, find_head, list_entries, record, recording
+from app.registry import agencies, audit_check
+from app.registry.audit import Author, find_head, list_entries, record, recording, version_sha256
 from app.registry.database import Database
 from app.services.access.access import Caller, Scope
 from app.services.access.audit import AuditLog, parse_head
@@ -82,6 +84,53 @@ def test_a_history_that_nobody_touched_has_no_fault(registry: Registry) -> None:
         first, *_, last = list_entries(connection, registry.agency_ids[0])
     assert first.previous_hash == "0" * 64
     assert (last.who, last.action, last.detail) == ("an admin", "key.created", {"a": "ü", "b": 1})
+
+
+def test_versions_are_parsed_only_where_their_texts_differ(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed: list[str] = []
+
+    def count(agency_id: str, marker_id: str, *rest: Any) -> str:
+        parsed.append(marker_id)
+        return version_sha256(agency_id, marker_id, *rest)
+
+    monkeypatch.setattr(audit_check, "version_sha256", count)
+    assert registry.faults() == []
+    assert parsed == []
+    with registry.database.write() as connection:
+        where = {"marker": registry.marker_ids[0][0], "version": 1}
+        query = "SELECT CAST(marker AS TEXT) FROM marker_versions WHERE marker_id = :marker AND version = :version"
+        text = json.dumps(json.loads(connection.execute(sa.text(query), where).scalar_one()), indent=1)
+        kind = "JSON" if connection.dialect.name == "postgresql" else "TEXT"
+        update = f"UPDATE marker_versions SET marker = CAST(:text AS {kind}) WHERE marker_id = :marker"
+        connection.execute(sa.text(f"{update} AND version = :version"), {**where, "text": text})
+    assert registry.faults() == []
+    assert parsed == [where["marker"]]
+
+
+def test_a_check_since_a_verified_head_covers_what_follows_it(registry: Registry) -> None:
+    with registry.database.read() as connection:
+        entries = list_entries(connection, registry.agency_ids[0])
+    second, marker_id = entries[1], registry.marker_ids[0][0]
+
+    def faults(number: int = second.number, sha256: str = second.hash) -> list[str]:
+        ((_, report, found),) = (
+            (name, report, [f"{fault.where}: {fault.what}" for fault in found])
+            for name, report, found in AuditLog(registry.database).verify("one", None, {"one": (number, sha256)})
+        )
+        if not found:
+            assert (report.since, report.entries, report.versions, report.head) == (2, 3, 2, registry.head())
+        return found
+
+    assert faults() == []
+    assert faults(second.number, "0" * 64) != []
+    assert faults(77, "0" * 64)[0] == "entry 77: missing, and an earlier check ended with it"
+    registry.run("UPDATE audit_log SET who = 'me' WHERE agency_id = :agency AND number = 1", agency=second.agency_id)
+    assert faults() == []  # as docs/history.md says
+    assert registry.faults() != []
+    registry.run("UPDATE marker_versions SET who = 'me' WHERE marker_id = :id AND version = 2", id=marker_id)
+    assert faults() == [f"version 2 of marker {marker_id}: changed: its hash does not match its content"]
+    registry.run("UPDATE audit_log SET who = 'me' WHERE agency_id = :agency AND number = 2", agency=second.agency_id)
+    assert faults()[0] == "entry 2: is not the one with which an earlier check ended: check the whole history"
 
 
 TAMPERED: dict[str, tuple[str, str]] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from datetime import datetime
+from types import MappingProxyType
 from typing import Any
 
 import sqlalchemy as sa
@@ -75,9 +76,20 @@ class AuditLog:
         return page, rows[limit - 1].number if len(rows) > limit else None
 
     def verify(
-        self, agency: str | None = None, expected_head: tuple[int, str] | None = None
+        self,
+        agency: str | None = None,
+        expected_head: tuple[int, str] | None = None,
+        verified_heads: Mapping[str, tuple[int, str]] = MappingProxyType({}),
     ) -> Iterator[tuple[str, ChainReport, Iterator[Fault]]]:
         """For each agency, or the one of this name: its name, what was gone through, and the faults as they are found.
+
+        Parameters
+        ----------
+        agency : str, optional
+        expected_head : tuple of int and str, optional
+            Number and hash of an entry that the log must contain.
+        verified_heads : mapping of str to (int, str), optional
+            By the name of the agency, the entry at which an earlier check ended: only what follows it is checked.
 
         Raises
         ------
@@ -90,7 +102,8 @@ class AuditLog:
                 raise NotFound(f"there is no agency {agency[:80]!r}", field="agency")
             for row in found:
                 report = ChainReport()
-                yield row.name, report, check_history(connection, row.id, report, expected_head)
+                verified = verified_heads.get(row.name)
+                yield row.name, report, check_history(connection, row.id, report, expected_head, verified)
 
 
 def parse_head(text: str) -> tuple[int, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -96,6 +97,11 @@ def test_verify_beside_a_running_server(
         cut = CliRunner().invoke(cli, ["audit", "verify", "checked", "--expect-head", other])
         assert cut.exit_code == 1
         assert "its end was cut off" in cut.output
+        heads = settings.data_dir / "heads.json"
+        for since in ("", f" after entry {head['number']}"):
+            last = CliRunner().invoke(cli, ["audit", "verify", "checked", "--heads", str(heads)])
+            assert f"versions{since}, head {kept}" in last.output, last.output
+            assert json.loads(heads.read_text()) == {"checked": kept}
     engine = sa.create_engine(settings.resolved_database_url)
     with engine.begin() as connection:
         if connection.dialect.name == "postgresql":
