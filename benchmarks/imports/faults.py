@@ -138,17 +138,18 @@ def degrees_text(survey: Survey, rng: np.random.Generator) -> Made:
 def decimal_commas(survey: Survey, rng: np.random.Generator) -> Made:
     """Decimal commas: all rows beside commas, or one row; a file that has only such numbers is read as it is."""
     rows = survey.cells()
-    everywhere = rng.integers(2) == 0
-    for row in rows if everywhere else [rows[_row(survey, rng)]]:
+    how = int(rng.integers(3))
+    one = rows[_row(survey, rng)] if how == 2 else rows[len(rows) // 2]
+    for row in rows if how == 1 else [one]:
         row[1:] = [cell.replace(".", ",") for cell in row[1:]]
-    return survey.csv(rows, delimiter="," if everywhere else ";"), survey.declaration
+    return survey.csv(rows, delimiter="," if how == 1 else ";"), survey.declaration
 
 
-def grouped_digits(survey: Survey, rng: np.random.Generator) -> Made:
-    """4,312,345.123 in one row, as spreadsheets write it."""
-    rows = [[code, f'"{x}"', f'"{y}"', h] for code, x, y, h in survey.cells()]
-    row = rows[_row(survey, rng)]
-    row[1:3] = [f'"{float(cell.strip(chr(34))):,.3f}"' for cell in row[1:3]]
+def grouped_digits(survey: Survey, _rng: np.random.Generator) -> Made:
+    """4,312,345.123 in one row, as spreadsheets write it; a file that has only such numbers is read as it is."""
+    rows = survey.cells()
+    row = rows[len(rows) // 2]
+    row[1:3] = [f'"{float(cell):,.3f}"' for cell in row[1:3]]
     return survey.csv(rows), survey.declaration
 
 

@@ -10,20 +10,16 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import ezdxf
 import httpx
-import numpy as np
 import pytest
-import shapely
-from pyogrio import raw
 
 from app.main import create_app
 from app.settings import Settings
+from tests.api.surveys import survey_files
+from tests.api.surveys.survey_files import LAT, LON, STEP
 from tests.conftest import ADMIN_KEY, LiveServer
 from tests.http import finished
 
-LON, LAT = 8.416412345, 49.0051
-STEP = 0.00015
 DEGREES = {"crs": "EPSG:4326", "family": "cerpm", "columns": {"code": "number"}, "area_deg": [8.4, 48.9, 8.5, 49.1]}
 
 
@@ -205,83 +201,24 @@ def test_swapped_axes_are_refused_with_the_cure(client: httpx.Client) -> None:
 
 # --- every format -----------------------------------------------------------------------------------------------------
 
-POINTS = [(str(k), LON + k * STEP, LAT, 160.0 + k / 10) for k in range(1, 9)]
 
-
-def _geojson() -> bytes:
-    features = [
-        {"type": "Feature", "properties": {"number": n}, "geometry": {"type": "Point", "coordinates": [x, y, z]}}
-        for n, x, y, z in POINTS
-    ]
-    return json.dumps({"type": "FeatureCollection", "features": features}).encode()
-
-
-def _kml() -> bytes:
-    marks = "".join(
-        f"<Placemark><name>{n}</name><Point><coordinates>{x},{y},{z}</coordinates></Point></Placemark>"
-        for n, x, y, z in POINTS
-    )
-    return f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{marks}</Document></kml>'.encode()
-
-
-def _utm() -> list[tuple[str, float, float, float]]:
-    from pyproj import Transformer
-
-    transform = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True).transform
-    return [(n, *transform(x, y), z) for n, x, y, z in POINTS]
-
-
-def _landxml() -> bytes:
-    points = "".join(f'<CgPoint name="{n}">{y:.4f} {x:.4f} {z}</CgPoint>' for n, x, y, z in _utm())
-    return (
-        '<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2"><Units><Metric linearUnit="meter"/></Units>'
-        f'<CoordinateSystem epsgCode="32632"/><CgPoints>{points}</CgPoints></LandXML>'
-    ).encode()
-
-
-def _dxf() -> bytes:
-    document = ezdxf.new("R2010", units=6)
-    block = document.blocks.new("MARKER")
-    block.add_attdef("NUMBER", (0, 0))
-    for number, *place in _utm():
-        document.modelspace().add_blockref("MARKER", place).add_auto_attribs({"NUMBER": number})
-    text = io.StringIO()
-    document.write(text)
-    return text.getvalue().encode()
-
-
-def _pnezd() -> bytes:
-    return "\n".join(f"{n},{y:.4f},{x:.4f},{z},M,left" for n, x, y, z in _utm()).encode()
-
-
-def _layer(tmp_path: Path, driver: str, name: str) -> Path:
-    shapes = shapely.to_wkb(shapely.points([p[1:] for p in POINTS]))
-    numbers = np.array([p[0] for p in POINTS], dtype=object)
-    path = tmp_path / name
-    raw.write(path, shapes, [numbers], ["number"], driver=driver, geometry_type="Point Z", crs="EPSG:4326")
-    return path
-
-
-def _shapefile(tmp_path: Path) -> bytes:
-    _layer(tmp_path, "ESRI Shapefile", "survey.shp")
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for part in tmp_path.glob("survey.*"):
-            archive.write(part, part.name)
-    return packed.getvalue()
-
-
-@pytest.mark.parametrize("kind", ["csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"])
+@pytest.mark.parametrize(
+    "kind", ["csv", "geojson", "gpkg", "shapefile", "kml", "kmz", "gpx", "landxml", "jobxml", "dxf", "gsi"]
+)
 def test_every_format_gives_the_same_markers(client: httpx.Client, kind: str, tmp_path: Path) -> None:
     declared = {"family": "cerpm", "vertical_datum": "ellipsoid", "columns": {"code": "number"}}
     data, more = {
-        "csv": lambda: (_pnezd(), {"layout": "pnezd", "crs": "EPSG:32632", "columns": {"code": "point"}}),
-        "geojson": lambda: (_geojson(), {}),
-        "gpkg": lambda: (_layer(tmp_path, "GPKG", "survey.gpkg").read_bytes(), {}),
-        "shapefile": lambda: (_shapefile(tmp_path), {}),
-        "kml": lambda: (_kml(), {"columns": {"code": "point"}}),
-        "landxml": lambda: (_landxml(), {"columns": {"code": "point"}}),
-        "dxf": lambda: (_dxf(), {"crs": "EPSG:32632"}),
+        "csv": lambda: (survey_files.pnezd(), {"layout": "pnezd", "crs": "EPSG:32632", "columns": {"code": "point"}}),
+        "geojson": lambda: (survey_files.geojson(), {}),
+        "gpkg": lambda: (survey_files.layer(tmp_path, "GPKG", "survey.gpkg").read_bytes(), {}),
+        "shapefile": lambda: (survey_files.shapefile(tmp_path), {}),
+        "kml": lambda: (survey_files.kml(), {"columns": {"code": "point"}}),
+        "kmz": lambda: (survey_files.kmz(), {"columns": {"code": "point"}}),
+        "gpx": lambda: (survey_files.gpx(), {"columns": {"code": "point"}}),
+        "jobxml": lambda: (survey_files.jobxml(), {"crs": "EPSG:32632", "columns": {"code": "point"}}),
+        "gsi": lambda: (survey_files.gsi(), {"crs": "EPSG:32632", "columns": {"code": "point"}}),
+        "landxml": lambda: (survey_files.landxml(), {"columns": {"code": "point"}}),
+        "dxf": lambda: (survey_files.dxf(), {"crs": "EPSG:32632"}),
     }[kind]()
     answer = _send(client, data, {**declared, **more})
     assert answer.status_code == 201, answer.text
@@ -290,7 +227,7 @@ def test_every_format_gives_the_same_markers(client: httpx.Client, kind: str, tm
         (str(m["code"]["number"]), m["position"]["lon_deg"], m["position"]["lat_deg"], m["position"]["height_m"])
         for m in _markers(client)
     ]
-    for (number, *place), (name, *true) in zip(sorted(found), POINTS, strict=True):
+    for (number, *place), (name, *true) in zip(sorted(found), survey_files.POINTS, strict=True):
         assert number == name
         assert place[:2] == pytest.approx(true[:2], abs=2e-9)
         assert place[2] == pytest.approx(true[2], abs=1e-6)
@@ -360,7 +297,7 @@ def test_bad_input_is_a_problem_with_field_limit_and_cure(
 def test_a_geopackage_with_a_view_is_refused(client: httpx.Client, tmp_path: Path) -> None:
     import sqlite3
 
-    path = _layer(tmp_path, "GPKG", "survey.gpkg")
+    path = survey_files.layer(tmp_path, "GPKG", "survey.gpkg")
     with sqlite3.connect(path) as connection:
         connection.execute("CREATE VIEW endless AS SELECT 1")
     connection.close()
