@@ -20,7 +20,7 @@ from app.registry.tenancy import seeing_every_agency
 from app.services.access.access import Access, Scope
 from app.services.surveys.declarations import import_input
 from app.services.surveys.documents import ImportReport
-from app.services.surveys.imports import Imports
+from app.services.surveys.imports import SETTLED, Imports
 
 DECLARED = {"crs": "EPSG:25832", "family": "cerpm", "area_deg": [8.3, 48.9, 8.6, 49.1], "ignore_heights": True}
 EAST, NORTH = 457000.0, 5428000.0
@@ -44,9 +44,9 @@ def send(database: Database, request: pytest.FixtureRequest) -> Send:
     caller = access.authenticate(access.create_key(request.node.name, Scope.PLANNER, "surveys"))
     imports = Imports(database, utc_now, SameProcess(), MarkerRules())
 
-    def run(data: bytes, **declared: Any) -> ImportReport:
+    def run(data: bytes, step: Callable[[float], None] = lambda _progress: None, **declared: Any) -> ImportReport:
         declaration = DeclarationIn.model_validate({**DECLARED, **declared})
-        return imports.run(caller, import_input(declaration.declared(), data))[0]
+        return imports.run(caller, import_input(declaration.declared(), data), step=step)[0]
 
     return run
 
@@ -124,6 +124,20 @@ def test_the_report_states_everything_that_was_not_declared(send: Send) -> None:
     assert {one["what"] for one in report["detected"]} == {"first row", "comments", "columns without a role"}
     assert "role_without_evidence" not in report["counts"]
     assert send(text, dry_run=True, columns={"code": "", "status": None})["good_rows"] == 8
+
+
+def test_the_same_file_at_the_same_time_is_stored_once(database: Database, send: Send) -> None:
+    """The second import is checked again when it may write: another one may have been stored since its first check."""
+    reports: list[ImportReport] = []
+
+    def meanwhile(progress: float) -> None:
+        if progress >= SETTLED:
+            reports.append(send(_csv()))
+
+    report = send(_csv(), step=meanwhile)
+    assert reports[0]["stored"] == 8
+    assert (report["outcome"], report["stored"]) == ("refused", 0)
+    assert report["counts"]["file_already_imported"] == 1
 
 
 def test_a_local_grid_is_declared_and_reported(send: Send, database: Database) -> None:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Annotated, Literal, cast
 
+import numpy as np
 from pydantic import Field
 from typing_extensions import TypedDict
 
 from app.formats.surveys.table import Detected, Fault
+from app.plots.residual_map import draw_residuals
 from app.registry.jobs import JobRow, JobState
+from app.registry.marker_rows import MarkerRow
 from app.services.documents import document_of
 from app.services.error_documents import ErrorDocument, cut_text
 from app.services.markers.accuracy import AccuracyDocument
-from app.surveys.comparison import ComparisonFigures
+from app.surveys.comparison import Comparison, ComparisonFigures
+from app.surveys.georeference import GeoreferencedSurvey
 from app.surveys.local_grid import LocalGridDocument
 
 _MAX_TEXT_BYTES, _MAX_FIELD_BYTES = 320, 120  # source: a report of a thousand faults then takes less than 1 MB
+MAX_RESIDUALS = 1000
+"""Rows of a comparison that a report has the residuals of. Chosen by hand."""
 Outcome = Literal["checked", "stored", "refused"]
 
 
@@ -124,6 +131,27 @@ def import_job_document(job: JobRow) -> ImportJobDocument:
 def import_job_summary(job: JobRow) -> ImportJobSummary:
     """An import without its report."""
     return document_of(ImportJobSummary, job, links={"self": f"/v1/imports/{job.id}"})
+
+
+def comparison_document(
+    found: Comparison | None, survey: GeoreferencedSurvey, known: Sequence[MarkerRow], tolerance_m: float
+) -> ComparisonDocument | None:
+    """A comparison as reports of imports have it; `known` are the markers that its rows are matched with."""
+    if found is None:
+        return None
+    residuals: list[Residual] = [
+        {
+            "row": int(row) + 1,
+            "marker_id": known[int(found.matched[row])].id,
+            "east_m": round(float(found.east_m[row]), 4),
+            "north_m": round(float(found.north_m[row]), 4),
+            "up_m": round(float(found.up_m[row]), 4) if np.isfinite(found.up_m[row]) else None,
+            "horizontal_m": round(float(found.horizontal_m[row]), 4),
+        }
+        for row in np.flatnonzero(np.isfinite(found.east_m))[:MAX_RESIDUALS]
+    ]
+    drawn = draw_residuals(survey, found, tolerance_m)
+    return {**found.document(tolerance_m), "residuals": residuals, "map_svg": drawn}
 
 
 def detected_document(detected: Detected) -> DetectedDocument:

@@ -20,10 +20,9 @@ from app.families.surveys import RowCodes, Rows
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Severity, SurveyTable
-from app.plots.residual_map import draw_residuals
 from app.registry import bulk
 from app.registry import markers as store
-from app.registry.audit import AuditEntry, recording
+from app.registry.audit import AuditEntry, EntryRow, find_head, recording
 from app.registry.bulk_load import LARGE
 from app.registry.columns import Columns
 from app.registry.database import Database
@@ -38,10 +37,9 @@ from app.services.markers.accuracy import accuracy_document
 from app.services.ports import Clock
 from app.services.roads.routes import linear_references
 from app.services.surveys.documents import (
-    ComparisonDocument,
     ImportReport,
     Outcome,
-    Residual,
+    comparison_document,
     detected_document,
     fault_document,
 )
@@ -51,7 +49,7 @@ from app.services.surveys.import_rows import check_values, common_columns, marke
 from app.services.version_kinds import kind_of_change, kind_of_new
 from app.surveys.comparison import Comparison, check_residuals, compare_survey
 from app.surveys.consistency_checks import check_accuracy, check_consistency
-from app.surveys.duplicates import find_duplicates
+from app.surveys.duplicates import RegisteredPoints, find_duplicates
 from app.surveys.georeference import GeoreferencedSurvey, georeference_survey
 from app.surveys.local_grid import LocalGridDocument, apply_local_grid
 from app.surveys.location_checks import KNOWN_M, check_location
@@ -184,16 +182,28 @@ class _Running:
         self._known: list[MarkerRow] = []
         self._comparison: Comparison | None = None
         self._stored = 0
+        self._duplicates: set[Fault] = set()
+        self._checked_head: EntryRow | None = None
 
     def check(self, connection: sa.Connection) -> None:
         """Hold the survey against the registry's places."""
         neighbours, registered = list_neighbours(connection, self._caller.agency_id, self._survey)
         is_known = partial(self._is_known, connection)
         self._faults.add(check_location(self._survey, self._given.declaration, neighbours, is_known))
-        self._faults.add(find_duplicates(self._survey, self._given.declaration, self._sha256, registered))
+        self._add_duplicates(connection, registered)
+
+    def _add_duplicates(self, connection: sa.Connection, registered: RegisteredPoints) -> None:
+        """Add the faults of what is registered, once each."""
+        self._checked_head = find_head(connection, self._caller.agency_id)
+        found = find_duplicates(self._survey, self._given.declaration, self._sha256, registered)
+        new = [fault for fault in found if fault not in self._duplicates]
+        self._duplicates.update(new)
+        self._faults.add(new)
 
     def prepare(self, connection: sa.Connection) -> None:
-        """What would be stored."""
+        """What would be stored; compared again with what was registered since `check`."""
+        if find_head(connection, self._caller.agency_id) != self._checked_head:
+            self._add_duplicates(connection, list_neighbours(connection, self._caller.agency_id, self._survey)[1])
         good = self._good_rows()
         if self._given.declaration.compare:
             self._compare(connection, good)
@@ -273,7 +283,7 @@ class _Running:
             if len(lon)
             else None,
             "counts": dict(self._faults.counts),
-            "comparison": self._comparison_document(),
+            "comparison": comparison_document(self._comparison, self._survey, self._known, tolerance_m),
             "faults": [fault_document(fault) for fault in shown],
             "faults_left_out": len(self._faults) - len(shown),
         }
@@ -397,25 +407,6 @@ class _Running:
             subject=self._sha256,
             detail={"format": self._survey.table.format, "compare": self._given.declaration.compare},
         )
-
-    def _comparison_document(self) -> ComparisonDocument | None:
-        if self._comparison is None:
-            return None
-        found = self._comparison
-        residuals: list[Residual] = [
-            {
-                "row": int(row) + 1,
-                "marker_id": self._known[int(found.matched[row])].id,
-                "east_m": round(float(found.east_m[row]), 4),
-                "north_m": round(float(found.north_m[row]), 4),
-                "up_m": round(float(found.up_m[row]), 4) if np.isfinite(found.up_m[row]) else None,
-                "horizontal_m": round(float(found.horizontal_m[row]), 4),
-            }
-            for row in np.flatnonzero(np.isfinite(found.east_m))[:MAX_FAULTS]
-        ]
-        tolerance_m = self._given.declaration.tolerance_m
-        drawn = draw_residuals(self._survey, found, tolerance_m)
-        return {**found.document(tolerance_m), "residuals": residuals, "map_svg": drawn}
 
 
 def _square_deg(marker: MarkerRow, lon_deg: float, lat_deg: float) -> float:
