@@ -283,7 +283,9 @@ class _Running:
             if len(lon)
             else None,
             "counts": dict(self._faults.counts),
-            "comparison": comparison_document(self._comparison, self._survey, self._known, tolerance_m),
+            "comparison": comparison_document(
+                self._comparison, self._survey, self._known, self._given.declaration.tolerance_m
+            ),
             "faults": [fault_document(fault) for fault in shown],
             "faults_left_out": len(self._faults) - len(shown),
         }
