@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import resource
 import signal
@@ -32,6 +33,15 @@ _LOG = structlog.get_logger(__name__)
 
 class StoppingServer(uvicorn.Server):
     """A server that ends within `_END_S` after SIGTERM or Ctrl-C."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and leave what is in memory then out of garbage collection: it stays until the end.
+
+        A collection stops all threads, and with a million objects of modules it takes 0.3 s.
+        """
+        await super().startup(sockets)
+        gc.collect()
+        gc.freeze()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin to stop; the next SIGTERM ends the process at once."""
