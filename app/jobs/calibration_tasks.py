@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import cv2
@@ -16,18 +17,42 @@ from app.formats.images import load_image
 from app.jobs.memory_limit import memory_is_the_limit
 from app.services.fleet.calibrations import MAX_PHOTOS, CalibrationTask
 
+PROCESSOR_S = 30.0
+"""Time for all photos of a calibration. [s] Source: by hand, a second each of more than are needed."""
+WITHOUT_BOARD = 8
+"""Photos after which it is clear that none shows the board. Source: by hand, two thirds of those that are needed."""
 _PHOTO = ("photo", "send photos at the camera's resolution")
 
 
 def calibrate_photos(task: CalibrationTask, _before: None) -> CameraCalibration:
-    """Find the board in each photo, one after the other, and calibrate the camera that took them."""
+    """Find the board in each photo, one after the other, and calibrate the camera that took them.
+
+    The others are not looked at if none of the first eight shows the board: agencies share this process.
+
+    Raises
+    ------
+    CalibrationRefused
+        The photos do not calibrate the camera.
+    UploadTooLarge
+        There are too many, or they take too long.
+    """
     photos: list[Photo] = []
+    last_s = time.process_time() + PROCESSOR_S
     for name, content in _each(task):
         if len(photos) == MAX_PHOTOS:
             raise UploadTooLarge(
                 "there are too many photos", field="photos", limit=f"{MAX_PHOTOS} photos", cure="send 12 to 20"
             )
+        if time.process_time() > last_s:
+            raise UploadTooLarge(
+                f"the first {len(photos)} photos took all of the time",
+                field="photos",
+                limit=f"{PROCESSOR_S:g} s of a processor",
+                cure="send 12 to 20 photos that show the board",
+            )
         photos.append(_look(name, content, task))
+        if len(photos) == WITHOUT_BOARD and all(photo.view.fault is not None for photo in photos):
+            break
     with memory_is_the_limit(*_PHOTO):
         return calibrate_camera(photos, task.board, coefficients=task.coefficients)
 
