@@ -248,7 +248,7 @@ def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> d
         "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
         "searches": Searches(database),
         "snapshots": Snapshots(database, utc_now, signing_keys),
-        "unused_blobs": UnusedBlobs(database, utc_now, blobs),
+        "unused_blobs": UnusedBlobs(database, utc_now, blobs, alone=settings.is_embedded),
         "vehicles": Vehicles(database, utc_now, ttl),
     }
 

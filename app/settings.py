@@ -200,6 +200,11 @@ class Settings(BaseSettings):
         return self.database_url or f"sqlite:///{self.data_dir / 'waymark.sqlite3'}"
 
     @property
+    def is_embedded(self) -> bool:
+        """Whether database and blobs are files, which no other server uses."""
+        return self.resolved_database_url.startswith("sqlite:") and self.resolved_blobs_url.startswith("file:")
+
+    @property
     def resolved_blobs_url(self) -> str:
         """URL of the blob store with the default filled in."""
         return self.blobs_url or (self.data_dir.resolve() / "blobs").as_uri()

@@ -35,10 +35,14 @@ class UnusedBlobs:
     database : Database
     clock : Clock
     blobs : Blobs
+    alone : bool
+        No other process uses the database and the store, so that every blob from before this object was made belongs to
+        an upload that has ended.
     """
 
-    def __init__(self, database: Database, clock: Clock, blobs: Blobs) -> None:
+    def __init__(self, database: Database, clock: Clock, blobs: Blobs, *, alone: bool = False) -> None:
         self._database, self._clock, self._blobs = database, clock, blobs
+        self._alone_since = clock() if alone else None
         self._stopping = threading.Event()
 
     def stop(self) -> None:
@@ -46,13 +50,15 @@ class UnusedBlobs:
         self._stopping.set()
 
     def delete(self) -> int:
-        """Delete blobs that are older than `MIN_AGE` and that no row refers to; returns their number.
+        """Delete blobs that no row refers to and that belong to no upload that goes on; returns their number.
 
         Nothing is deleted from a store that another database uses, too: its rows cannot be seen from here.
         """
         if not self._is_ours():
             return 0
         before = self._clock() - MIN_AGE
+        if self._alone_since is not None:  # once, at the start: later, a clock that was set back could mislead it
+            before, self._alone_since = max(before, self._alone_since), None
         self._blobs.delete_partial(before)
         # Blobs are listed before rows are read: a row that refers to a listed blob is seen if it is committed by now,
         # and cannot be committed later, because the blob is too old.

@@ -80,6 +80,18 @@ def test_old_blobs_without_a_row_are_deleted(database: Database, blobs: Blobs, u
     assert unused.delete() == 0
 
 
+def test_at_its_start_the_only_server_deletes_young_ones_too(database: Database, blobs: Blobs) -> None:
+    with database.write() as connection:
+        agencies.add_agency(connection, "one", NOW)
+    younger = put(blobs, age=timedelta(seconds=-1))
+    put(blobs, age=timedelta(seconds=1))
+    only = UnusedBlobs(database, lambda: NOW, blobs, alone=True)
+    assert only.delete() == 1
+    assert stored(blobs) == {younger}
+    put(blobs, age=timedelta(seconds=1))
+    assert only.delete() == 0
+
+
 def test_a_store_that_another_database_uses_is_left_alone(
     database: Database, blobs: Blobs, unused: UnusedBlobs
 ) -> None:
