@@ -59,7 +59,7 @@ def test_a_job_that_is_run_twice_makes_one_plan(
     queued: list[str] = []
 
     class Held:
-        def submit(self, job_id: str) -> None:
+        def submit(self, job_id: str, agency_id: str) -> None:
             queued.append(job_id)
 
     monkeypatch.setattr(server.app.state.plan_making, "_queue", Held())

@@ -60,7 +60,7 @@ def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     queued: list[str] = []
 
     class Held:
-        def submit(self, job_id: str) -> None:
+        def submit(self, job_id: str, agency_id: str) -> None:
             queued.append(job_id)
 
     monkeypatch.setattr(server.app.state.proofs, "_queue", Held())
