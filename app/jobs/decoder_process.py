@@ -24,6 +24,7 @@ READY = "ready"
 """What a process sends when it can take tasks."""
 # glibc's mallopt: keep freed memory for the next frame, or the kernel clears every page of every frame anew
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_PR_SET_PDEATHSIG = 1  # Linux's prctl(2)
 _KEPT_BYTES = 256 * 1024**2
 _KEPT_BLOCK_BYTES = 32 * 1024**2  # glibc accepts no more
 
@@ -53,6 +54,7 @@ def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLim
     A task comes in steps: (function, argument, whether it is the last). Each is called with its argument and the result
     of the step before it. The answer is (whether all succeeded, result or exception).
     """
+    end_with_parent()
     warm_process(decode, limits)
     connection.send(READY)
     answer: tuple[bool, Any] = (True, None)
@@ -85,6 +87,16 @@ def warm_process(decode: DecodePlates, limits: ProcessLimits) -> None:
     gc.freeze()  # the libraries' objects are never freed: a collection need not visit them
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (limits.memory_bytes, limits.memory_bytes))
+
+
+def end_with_parent() -> None:
+    """Have the kernel kill this process when the one that it is a fork of ends, also in the middle of native code.
+
+    That one ends when the server does: it waits for the server's requests. Only Linux can do so.
+    """
+    prctl = getattr(ctypes.CDLL(None), "prctl", None)
+    if prctl is not None:
+        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def keep_memory() -> None:

@@ -30,7 +30,7 @@ _RETRY_S = 30.0
 _LOG = structlog.get_logger(__name__)
 _PROCESSES = multiprocessing.get_context("forkserver")
 """One process imports the decoders, and the decoder processes are its forks: each starts in a part of the time."""
-_PROCESSES.set_forkserver_preload(["app.jobs.tasks"])
+_PROCESSES.set_forkserver_preload(["app.jobs.forkserver_preload", "app.jobs.tasks"])
 
 
 class Pending(Generic[T]):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -136,6 +138,42 @@ def test_the_process_that_the_others_are_forks_of_is_replaced_too() -> None:
         assert child_of(made) != victim
     finally:
         made.close()
+
+
+SERVER = """
+import sys
+from app.jobs.pool import DecodePool
+from tests.formats.pictures import png
+from tests.jobs import standin
+from tests.jobs.test_pool import PlateSearch, known, start
+
+pool = DecodePool(standin.decode, workers=1)
+pool.open()
+pending = start(pool, standin.SLEEP)
+print("decoding", flush=True)
+pending.result()
+"""
+
+
+def test_no_process_outlives_a_server_that_is_killed_while_it_decodes() -> None:
+    with subprocess.Popen([sys.executable, "-c", SERVER], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        assert server.stdout.readline() == b"decoding\n"
+        children = psutil.Process(server.pid).children(recursive=True)
+        assert len(children) >= 2
+        server.kill()
+        wait_until(lambda: all(is_gone(child.pid) for child in children), "the server's processes to end")
+
+
+def test_the_process_that_imports_the_decoders_ends_with_the_server() -> None:
+    program = "import app.jobs.forkserver_preload, time\nprint(flush=True)\ntime.sleep(3600)"
+    parent = f"import subprocess, sys\nsubprocess.Popen([sys.executable, '-c', {program!r}]).wait()"
+    with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        server.stdout.readline()
+        [child] = psutil.Process(server.pid).children()
+        server.kill()
+        wait_until(lambda: is_gone(child.pid), "the child to end")
 
 
 def test_a_frame_that_takes_too_long_is_stopped() -> None:
