@@ -27,6 +27,7 @@ _START_S = 300.0
 _PATIENCE_S = 300.0
 _CHECK_S = 1.0
 _RETRY_S = 30.0
+_AGAIN_S = 0.2
 _LOG = structlog.get_logger(__name__)
 _PROCESSES = multiprocessing.get_context("forkserver")
 """One process imports the decoders, and the decoder processes are its forks: each starts in a part of the time."""
@@ -220,7 +221,19 @@ class WorkerSupervisor(threading.Thread):
             self._start()
 
     def _start(self) -> Connection | None:
-        """Start a process and wait until it is warm."""
+        """Start a process and wait until it is warm; once more if the process that it is a fork of was just ending."""
+        for _attempt in range(2):
+            if self._closing:
+                return None
+            if (connection := self._try_to_start()) is not None:
+                return connection
+            time.sleep(_AGAIN_S)
+        self._failed_at = time.monotonic()
+        if not self._closing:
+            _LOG.error("a decoder process did not start")
+        return None
+
+    def _try_to_start(self) -> Connection | None:
         self._drop()
         ours, theirs = _PROCESSES.Pipe()
         process = _PROCESSES.Process(target=serve_tasks, args=(theirs, self._decode, self._limits), daemon=True)
@@ -237,9 +250,6 @@ class WorkerSupervisor(threading.Thread):
         except (EOFError, OSError):
             pass
         self._drop()
-        self._failed_at = time.monotonic()
-        if not self._closing:
-            _LOG.error("a decoder process did not start")
         return None
 
     def _drop(self) -> None:

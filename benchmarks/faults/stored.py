@@ -39,7 +39,7 @@ class Stored:
         """Acknowledged writes that are not there, or not as they were sent."""
         with across_agencies(), self.database.read() as connection:
             ids = set(connection.execute(sa.select(markers.c.id)).scalars())
-            keys = dict(connection.execute(sa.select(decodes.c.id, decodes.c.upload_key)).tuples().all())
+            keys = {row.id: row.upload_key for row in connection.execute(sa.select(decodes.c.id, decodes.c.upload_key))}
         lost = [f"marker {found}" for found in acknowledged.markers - ids]
         for decode_id, sha256 in acknowledged.uploads.items():
             key = keys.get(decode_id)
