@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from itertools import chain
 from queue import Empty
 from typing import Generic, TypeVar
 
@@ -51,7 +52,7 @@ class FairQueue(Generic[ItemT]):
 
     def _take(self) -> ItemT:
         new = (owner for owner in self._waiting if owner not in self._served)
-        owner = next(new, None) or next(owner for owner in self._served if owner in self._waiting)
+        owner = next(chain(new, (owner for owner in self._served if owner in self._waiting)))
         items = self._waiting[owner]
         item = items.popleft()
         if not items:

@@ -35,6 +35,13 @@ def test_a_closed_queue_ends_when_it_is_empty() -> None:
     assert [queue.get(), queue.get(), queue.get()] == ["a0", None, None]
 
 
+def test_an_owner_without_a_name_is_one_like_the_others() -> None:
+    queue: FairQueue[str] = FairQueue()
+    for item in ("first", "second"):
+        queue.put("", item)
+    assert [queue.get(), queue.get()] == ["first", "second"]
+
+
 @pytest.mark.parametrize("at_start", [False, True], ids=["submitted", "unfinished at the start"])
 def test_a_job_waits_for_the_running_one_not_for_a_thousand_of_another_agency(at_start: bool) -> None:
     ran: list[str] = []

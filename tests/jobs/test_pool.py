@@ -166,7 +166,10 @@ def test_no_process_outlives_a_server_that_is_killed_while_it_decodes() -> None:
 
 
 def test_the_process_that_imports_the_decoders_ends_with_the_server() -> None:
-    program = "import app.jobs.forkserver_preload, time\nprint(flush=True)\ntime.sleep(3600)"
+    program = (
+        "import time\nfrom app.jobs.forkserver_preload import end_with_parent\nend_with_parent()\n"
+        "print(flush=True)\ntime.sleep(3600)"
+    )
     parent = f"import subprocess, sys\nsubprocess.Popen([sys.executable, '-c', {program!r}]).wait()"
     with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE) as server:
         assert server.stdout is not None
