@@ -162,8 +162,9 @@ class Database:
                 except BaseException:
                     transaction.rollback()
                     raise
-                with cut_commit_is_unknown():
-                    transaction.commit()
+                if transaction.is_active:  # the block may have rolled it back
+                    with cut_commit_is_unknown():
+                        transaction.commit()
         finally:
             self.writes += 1
             self._one_writer.release()

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import orjson
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import FileResponse
 from starlette.datastructures import MutableHeaders
 from starlette.staticfiles import StaticFiles
 from starlette.types import Message, Receive, Scope, Send
-
-from app.api.http.responses import json_response
 
 STATIC = Path(__file__).resolve().parents[3] / "static"
 _HEADERS = {
@@ -51,8 +50,11 @@ def get_redoc() -> FileResponse:
 
 @router.get("/openapi.json", include_in_schema=False)
 def get_openapi_document(request: Request) -> Response:
-    """The OpenAPI document."""
-    return json_response(request.app.openapi(), headers={"Cache-Control": "no-cache"})
+    """The OpenAPI document, written once: it takes the server longer than most requests."""
+    state = request.app.state
+    if not hasattr(state, "openapi_json"):
+        state.openapi_json = orjson.dumps(request.app.openapi())
+    return Response(state.openapi_json, media_type="application/json", headers={"Cache-Control": "no-cache"})
 
 
 def mount_static(app: FastAPI) -> None:
