@@ -117,16 +117,15 @@ def _nearest_once(points: Floats, others: Floats) -> npt.NDArray[np.intp]:
     return matched
 
 
-def check_residuals(comparison: Comparison, tolerance_m: float) -> list[Fault]:
-    """Faults that the residuals reveal: rows beyond the tolerance, rows without a marker, one shift of all rows."""
+def check_residuals(comparison: Comparison, tolerance_m: float, family: str) -> list[Fault]:
+    """Faults that the residuals of a family's markers show: beyond the tolerance, no marker, one common shift."""
     faults = []
     residual = comparison.horizontal_m
     usual = float(np.nanmedian(residual)) if np.isfinite(residual).any() else 0.0
     for row in np.flatnonzero(comparison.matched < 0):
-        message = "no registered marker belongs to the row"
-        faults.append(
-            Fault(int(row) + 1, "code", "no_marker", message, "correct the code, or import it without compare")
-        )
+        message = f"no registered {family} belongs to the row"
+        proposal = f"correct the code, import it without compare, or declare its family if it is no {family}"
+        faults.append(Fault(int(row) + 1, "code", "no_marker", message, proposal))
     for row in np.flatnonzero(residual > tolerance_m):
         message = f"the marker was found {residual[row]:.3f} m from its registered place"
         far = residual[row] > max(REACH_M, 20 * usual)

@@ -330,7 +330,7 @@ class _Running:
         lon, lat, height = places_of(self._known)
         epoch = np.array([marker.epoch for marker in self._known], dtype=np.float64)
         self._comparison = compare_survey(self._survey, lon, lat, height, matched, epoch)
-        self._faults.add(check_residuals(self._comparison, declaration.tolerance_m))
+        self._faults.add(check_residuals(self._comparison, declaration.tolerance_m, declaration.family))
 
     def _by_code(self, connection: sa.Connection, codes: Sequence[str], good: Rows) -> Any:
         """Index of the marker that each row names: of several with the same digits the nearest."""

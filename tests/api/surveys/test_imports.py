@@ -144,6 +144,13 @@ def test_as_built_is_compared_with_the_plan_and_makes_new_versions(client: httpx
     assert old["position"]["lat_deg"] == pytest.approx(LAT + 1e-8, abs=1e-9)
 
 
+def test_a_comparison_names_the_family_that_it_looked_for(client: httpx.Client) -> None:
+    report = _send(client, _csv(), {**DEGREES, "compare": True, "match": "nearest", "dry_run": True}).json()
+    fault = next(fault for fault in report["faults"] if fault["code"] == "no_marker")
+    assert fault["message"] == "no registered cerpm belongs to the row"
+    assert "declare its family" in fault["proposal"]
+
+
 def test_the_residuals_are_drawn(client: httpx.Client) -> None:
     assert _send(client, _csv(), DEGREES).status_code == 201
     lines = [f"{k},{LON + k * STEP:.9f},{LAT + k % 3 * 1e-8 + (2e-6 if k == 5 else 2e-7):.9f}" for k in range(1, 9)]
