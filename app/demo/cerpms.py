@@ -37,7 +37,7 @@ from app.simulation.vehicle import PoseNoise
 
 Floats = npt.NDArray[np.float64]
 
-INTERVAL_S = 1.0
+INTERVAL_S = 1.6  # [s] at 20 dBm the transmitter may send 1 % of the time: `app.radio.settings`
 SPEED_KM_H = 30
 SPEED_LIMIT = {"value": SPEED_KM_H, "unit": "km/h"}
 SURVEY_RMSE_M = 0.03

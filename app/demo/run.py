@@ -44,7 +44,7 @@ _MAGNET_NOTES = (
 _LANE_NOTES = (
     "Accepted: authentic packets with a new sequence. Path, own track: RMS distance from the lane's true centre line.",
     "Steering: RMS distance of the front axle of a simulated car that follows the path, from the true centre line.",
-    "Radio, drives and attacks are simulated; the paper drove on roads.",
+    "Radio, drives and attacks are simulated; the paper drove on roads, and calls its figures mean squared errors.",
 )
 _PLAN_NOTES = (
     "Read: markers that were read of those that were passed; intervals are Wilson's of 95 %. Drives are simulated,",
