@@ -21,6 +21,9 @@ from benchmarks.abuse.json_bodies import list_bodies, list_json_routes
 from benchmarks.abuse.server import Cost, ObservedServer, running_server
 
 MAX_CPU_S, MAX_MEMORY_MB, MAX_ERROR_BYTES, MAX_HEALTH_MS = 5.0, 200.0, 1_000_000, 250.0
+WITH_DEADLINE = {"POST /v1/artwork": 300.0}
+"""Routes that cost more by design, with the time after which they stop: they run in slots and are charged. [s]
+Source: `WAYMARK_REQUEST_TIMEOUT_S`."""
 NOBODY = "019cb624-0000-7000-8000-00000000ffff"
 
 
@@ -35,7 +38,7 @@ class Outcome(NamedTuple):
     def broken(self, slack: float) -> list[str]:
         """The limits that it broke."""
         limits = (
-            (self.cost.cpu_s, MAX_CPU_S * slack, "processor time"),
+            (self.cost.cpu_s, WITH_DEADLINE.get(self.case.route, MAX_CPU_S * slack), "processor time"),
             (self.cost.memory_mb, MAX_MEMORY_MB, "memory"),
             (self.answer_bytes if self.status >= 400 else 0, MAX_ERROR_BYTES, "error answer"),
             (self.cost.health_ms, MAX_HEALTH_MS * slack, "delay of /healthz"),

@@ -64,6 +64,8 @@ def _documents(ids: dict[str, str], *, short: bool) -> Iterator[Case]:
     yield _json("/v1/markers/bulk", "a thousand plates", {"items": [{"create": plate} for plate in _plates(1_000)]})
     dry = {"items": [{"create": MAGNET_EXAMPLES[0]}] * 300, "dry_run": True}
     yield _json("/v1/markers/bulk", "magnets", dry)
+    lines = [{"create": _line_magnets(k)} for k in range(30)]
+    yield _json("/v1/markers/bulk", "30 lines of magnets", {"items": lines, "dry_run": True})
     zigzag = {"type": "LineString", "coordinates": _zigzag(vertices)}
     yield _json("/v1/roads", "a zigzag", {"name": "zigzag", "crs": "EPSG:25832", "geometry": zigzag})
     positions = {"positions": [[8.4 + 1e-5 * k, 49.0] for k in range(1_000)], "max_offset_m": 1_000}
@@ -71,7 +73,7 @@ def _documents(ids: dict[str, str], *, short: bool) -> Iterator[Case]:
     yield _json(where.format(**ids), "a thousand positions", positions, where)
     radio = {"interval_s": 0.05, "spreading_factor": 7, "bandwidth_hz": 500_000}
     receiver = {"sensitivity_dbm": -150.0}
-    slow = {"radio": radio, "receiver": receiver, "speed_mps": 0.5, "design_speed_mps": 0.5}
+    slow = {"radio": radio, "receiver": receiver, "design_speed_mps": 0.5}
     yield _json("/v1/radio-checks", "short interval, slow, sensitive", slow)
     yield _json("/v1/radio-checks", "recommend, slow", slow | {"recommend": True})
     placed = {"chainage_m": [float(k) for k in range(5_000)], "offset_m": [1.8] * 5_000}
@@ -80,12 +82,22 @@ def _documents(ids: dict[str, str], *, short: bool) -> Iterator[Case]:
         design = {"magnets": magnets, "length_m": 4.0, "segment_m": 0.05}
         book = {"name": f"M{magnets}", "design": design, "rules": {"speed_mps": 13.4, "clearance_m": 0.3}}
         yield _json("/v1/codebooks", f"{magnets} magnets", book)
-    yield _json("/v1/artwork", "all plates", {"family": "plate", "formats": ["pdf", "svg", "dxf", "png"]})
+    formats = {"formats": ["pdf", "svg", "dxf", "png"], "resolution_dpi": 300}
+    yield _json("/v1/artwork", "40 plates", formats | {"bbox": [9.9, 49.99, 11.0, 50.01]})
 
 
 def _plates(count: int) -> Iterator[dict[str, Any]]:
     for k in range(count):
-        yield {"position": {"lon_deg": 10.0 + 0.02 * (k % 40), "lat_deg": 50.0 + 0.02 * (k // 40)}, "status": "planned"}
+        position = {"lon_deg": 10.012345 + 0.020321 * (k % 40), "lat_deg": 50.001234 + 0.020123 * (k // 40)}
+        yield {"position": position, "status": "planned"}
+
+
+def _line_magnets(number: int) -> dict[str, Any]:
+    """330 magnets: all 30 lines are just within the limit of a request."""
+    lat_deg = 42.7 + 1e-4 * number
+    lane = {"geometry": {"type": "LineString", "coordinates": [[-84.48, lat_deg], [-84.47, lat_deg]]}}
+    line = {"style": "solid", "from_m": 1.0, "to_m": 330.0, "spacing_m": 1.0}
+    return {"family": "magnet", "lane": lane, "line": line}
 
 
 def _queries(*, short: bool) -> Iterator[Case]:
@@ -129,7 +141,7 @@ def _uploads(*, short: bool) -> Iterator[Case]:
         ("deep GeoJSON", b'{"type":' + b"[" * 500_000),
         ("entities", _entities()),
     ):
-        yield _form("/v1/imports", name, file, "declaration", b'{"dry_run": true}')
+        yield _form("/v1/imports", name, file, "declaration", b'{"crs": "EPSG:4326", "dry_run": true}')
         yield _form("/v1/alignments", name, file, "declaration", b'{"name": "a"}')
     photos = [
         ("photos", (f"{k}.jpg", _noise(300 if short else 1_200), "image/jpeg")) for k in range(6 if short else 60)
