@@ -276,16 +276,21 @@ def _height_fault(row: int, rise_m: float) -> Fault:
 
 
 def nearest_others(points: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
-    """Distance [m] and index of the nearest other point of each, shape (N,)."""
-    tree: Any = cKDTree(points)
-    count = len(points)
-    nearest_m, nearest = np.empty(count), np.empty(count, dtype=np.intp)
-    for start in range(0, count, _PART):
-        part = slice(start, min(start + _PART, count))
+    """Distance [m] and index of the nearest other point of each, shape (N,).
+
+    Points at one place are found first: a tree with many of them takes quadratic time.
+    """
+    places, first, place, count = np.unique(points, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    order = np.argsort(place, kind="stable")  # points at one place follow each other, the first one ahead
+    second = order[np.minimum(np.cumsum(count) - count + 1, len(points) - 1)]
+    nearest = np.where(first[place] == np.arange(len(points)), second[place], first[place])
+    nearest_m = np.zeros(len(points))
+    tree: Any = cKDTree(places)
+    alone = np.flatnonzero(count[place] == 1)
+    for start in range(0, len(alone), _PART):
+        part = alone[start : start + _PART]
         distance, index = tree.query(points[part], k=2)
-        nearest_m[part] = distance[:, 1]
-        itself = index[:, 1] == np.arange(part.start, part.stop)  # of points at one place it need not come first
-        nearest[part] = np.where(itself, index[:, 0], index[:, 1])
+        nearest_m[part], nearest[part] = distance[:, 1], np.append(first, len(points))[index[:, 1]]
     return nearest_m, nearest
 
 
