@@ -134,7 +134,7 @@ class ProofFailed(WaymarkError):
 
 
 def is_disk_full(error: BaseException) -> bool:
-    """Whether an error of the operating system says that a disk or a quota is full."""
+    """Whether an error of the operating system is that of a full disk or quota."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 

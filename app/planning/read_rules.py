@@ -29,7 +29,7 @@ from app.markers.magnet_design import TagDesign
 from app.markers.plate import PlateGeometry
 from app.planning.magnet_checks import vehicle_clearances
 from app.planning.marking_rules import marking_rules
-from app.planning.rules import SCHEMA_ID, PlanRules
+from app.planning.rules import SCHEMA_ID, CerpmRules, PlanRules, TagRules
 from app.radio.settings import RadioSettings
 
 MAX_RULES_BYTES = 200_000
@@ -265,16 +265,8 @@ def _check_contradictions(rules: PlanRules) -> None:
     if plates := rules.plates:
         with naming("plates"):
             PlateGeometry(plates.n, plates.unit_mm, plates.gap_mm, plates.thickness_mm)
-    if tags := rules.tags:
-        with naming("tags"):
-            TagDesign(tags.magnets, tags.length_m, tags.segment_m)
-        if tags.clearance_class not in vehicle_clearances():
-            raise InvalidParameter(
-                f"there is no kind of vehicle {tags.clearance_class[:40]!r}",
-                field="tags.clearance_class",
-                limit=", ".join(vehicle_clearances()),
-                cure="choose one of these",
-            )
+    if rules.tags:
+        _check_tags(rules.tags)
     if lines := rules.lines:
         _check(
             lines.solid is not None or lines.dashed is not None,
@@ -283,25 +275,10 @@ def _check_contradictions(rules: PlanRules) -> None:
             "a polarity for at least one kind of line",
             "give a polarity, or leave lines out",
         )
-    if cerpm := rules.cerpm:
-        marking_rules(cerpm.marking_rules)
-        _check(
-            cerpm.curve <= cerpm.straight,
-            f"CERPMs in curves are {cerpm.curve:g} cycles apart, on straights only {cerpm.straight:g}",
-            "cerpm.curve",
-            f"at most cerpm.straight, {cerpm.straight:g}",
-            "swap the two, or make them equal",
-        )
-        if cerpm.spreading_factor is not None and cerpm.interval_s is not None:
-            with naming("cerpm"):
-                RadioSettings(
-                    spreading_factor=cerpm.spreading_factor,
-                    interval_s=cerpm.interval_s,
-                    bandwidth_hz=cerpm.bandwidth_hz,
-                )
-    for group in (rules.decision_points, rules.tags):
+    if rules.cerpm:
+        _check_cerpms(rules.cerpm)
+    for name, group in (("decision_points", rules.decision_points), ("tags", rules.tags)):
         if group is not None and not isinstance(group.before, str):
-            name = "tags" if group is rules.tags else "decision_points"
             _check(
                 math.isfinite(group.before) and 0 <= group.before <= 2000,
                 f"{name}.before is {group.before}",
@@ -309,6 +286,38 @@ def _check_contradictions(rules: PlanRules) -> None:
                 "stopping_distance, reaction_distance, or 0 to 2000 m",
                 "choose another distance",
             )
+    _check_prices(rules)
+
+
+def _check_tags(tags: TagRules) -> None:
+    with naming("tags"):
+        TagDesign(tags.magnets, tags.length_m, tags.segment_m)
+    _check(
+        tags.clearance_class in vehicle_clearances(),
+        f"there is no kind of vehicle {tags.clearance_class[:40]!r}",
+        "tags.clearance_class",
+        ", ".join(vehicle_clearances()),
+        "choose one of these",
+    )
+
+
+def _check_cerpms(cerpm: CerpmRules) -> None:
+    marking_rules(cerpm.marking_rules)
+    _check(
+        cerpm.curve <= cerpm.straight,
+        f"CERPMs in curves are {cerpm.curve:g} cycles apart, on straights only {cerpm.straight:g}",
+        "cerpm.curve",
+        f"at most cerpm.straight, {cerpm.straight:g}",
+        "swap the two, or make them equal",
+    )
+    if cerpm.spreading_factor is not None and cerpm.interval_s is not None:
+        with naming("cerpm"):
+            RadioSettings(
+                spreading_factor=cerpm.spreading_factor, interval_s=cerpm.interval_s, bandwidth_hz=cerpm.bandwidth_hz
+            )
+
+
+def _check_prices(rules: PlanRules) -> None:
     daily = next((k for k, item in enumerate(rules.costs.items) if item.per == "day"), None)
     _check(
         daily is None or rules.costs.markers_per_day is not None,

@@ -106,10 +106,10 @@ def _with_roles(source: SourceTable, declaration: ImportDeclaration, code_form: 
             numbers[role], wrong = read_numbers(source.columns[column], role, form=read.form, required=False)
             faults += wrong
     source.faults.add(faults)
-    told = (Detected("format", source.format, "its first bytes"),) if declaration.format is None else ()
+    by_content = (Detected("format", source.format, "its first bytes"),) if declaration.format is None else ()
     return SurveyTable(
         source.format, first, read.second, read.height, bool(system.is_projected), crs, unit, height_unit, texts,
-        numbers, source.faults, (*told, *source.detected, *detected, *read.detected),
+        numbers, source.faults, (*by_content, *source.detected, *detected, *read.detected),
         written=None if zone is None else (read.first, read.second),
     )  # fmt: skip
 

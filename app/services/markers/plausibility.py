@@ -25,7 +25,7 @@ from app.surveys.location_checks import KNOWN_M, NEAR_M, Neighbours, check_locat
 WarningMode: TypeAlias = Literal["store", "refuse"]
 """What warnings mean: the marker is stored, or refused."""
 _OF_SURVEYS = ("place_unchecked", "place_by_area_only", "beside_the_registered_line")
-"""What says something of many rows only; a single marker would get one of them in every new place."""
+"""Faults that are evidence only in many rows: a single marker in a new place would always have one of them."""
 _MAX_NEIGHBOURS = 100  # registered markers that a position is compared with; chosen by hand
 
 

@@ -63,8 +63,8 @@ def common_columns(
     survey: GeoreferencedSurvey, rows: Rows, declaration: ImportDeclaration, *, file_sha256: str
 ) -> Columns:
     """Columns that markers of every family have: place, provenance, road."""
-    placed, said, texts, numbers = survey.placed, declaration.survey, survey.table.texts, survey.table.numbers
-    rmse_m = said.get("horizontal_rmse_m")
+    placed, provenance, texts, numbers = survey.placed, declaration.survey, survey.table.texts, survey.table.numbers
+    rmse_m = provenance.get("horizontal_rmse_m")
     same = {
         "family": declaration.family,
         "status": declaration.status or PLANNED,
@@ -72,14 +72,14 @@ def common_columns(
         "heading_deg": None,
         "heading_rmse_deg": None,
         "horizontal_rmse_m": rmse_m,
-        "vertical_rmse_m": said.get("vertical_rmse_m"),
+        "vertical_rmse_m": provenance.get("vertical_rmse_m"),
         "crs": placed.crs,
         "realization": placed.realization,
         "epoch": placed.epoch,
-        "survey_method": said.get("survey_method"),
-        "check_points": said.get("check_points"),
-        "surveyor": said.get("surveyor"),
-        "instrument": said.get("instrument"),
+        "survey_method": provenance.get("survey_method"),
+        "check_points": provenance.get("check_points"),
+        "surveyor": provenance.get("surveyor"),
+        "instrument": provenance.get("instrument"),
         "survey_file_sha256": file_sha256,
         **grade_columns(rmse_m, placed.transform_accuracy_m, placed.note),
         "measure_m": None,
