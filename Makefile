@@ -47,6 +47,8 @@ lock: $(VENV)/.dev ## Resolve the dependencies again, with hashes
 		--python-version 3.11 -o requirements-dev.txt
 	$(BIN)/uv pip compile pyproject.toml --generate-hashes --no-emit-index-url --universal \
 		--python-version 3.11 -o requirements.txt -c requirements-dev.txt
+	$(BIN)/uv pip compile pyproject.toml --extra s3 --extra tracing --extra bags --generate-hashes --no-emit-index-url \
+		--universal --no-header --python-version 3.11 -o docker/requirements.txt -c requirements-dev.txt
 
 clean: ## Remove what was built
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

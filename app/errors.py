@@ -58,6 +58,10 @@ class UnsupportedUpload(UnreadableUpload):
     """An upload is of a kind that no decoder reads."""
 
 
+class ProcessStopped(UnreadableUpload):
+    """An upload stopped the process that worked on it: it crashed, or took more time or memory than a process has."""
+
+
 class CalibrationRefused(UnreadableUpload):
     """Photos do not calibrate a camera well enough; begins with the name of the reason, `parts` has the photos."""
 
@@ -112,6 +116,30 @@ class TooManyRequests(WaymarkError):
     ) -> None:
         super().__init__(message, limit=limit, cure=cure)
         self.retry_after_s = retry_after_s
+
+
+class QuotaExceeded(TooManyRequests):
+    """A key or its agency would store more than its quota, or has too many uploads in progress."""
+
+
+class UploadLocked(TooManyRequests):
+    """Another request writes the same upload at this moment."""
+
+
+class UploadExpired(NotFound):
+    """An upload was not completed in time; what had arrived of it was deleted."""
+
+
+class WrongOffset(Conflict):
+    """A part of an upload does not begin where the parts before it end."""
+
+
+class WrongChecksum(MalformedRequest):
+    """The bytes that arrived are not those that were sent."""
+
+
+class UnsupportedVersion(WaymarkError):
+    """The request is of a version of a protocol that is not spoken here."""
 
 
 class Unavailable(WaymarkError):

@@ -1,18 +1,14 @@
-"""The only place where things are wired. There is no app at import: call `create_app`."""
+"""The server: its routes, limits and lifetime. There is no app at import: call `create_app`."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
-from functools import lru_cache, partial
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import structlog
 from fastapi import Depends, FastAPI, Response
 from prometheus_client import CollectorRegistry
@@ -20,7 +16,9 @@ from prometheus_client import CollectorRegistry
 from app import __version__
 from app.api.access import audit, keys
 from app.api.decodes import decodes
+from app.api.drives import drives
 from app.api.fleet import calibrations, snapshots, vehicles
+from app.api.health import maintenance
 from app.api.http import system, ui
 from app.api.http.costs import Budget, Slots
 from app.api.http.dependencies import refuse_unknown_parameters
@@ -29,75 +27,33 @@ from app.api.http.openapi import describe, operation_id
 from app.api.http.permissions import Permissions
 from app.api.http.problems import install_problem_handlers
 from app.api.http.rate_limits import RateLimit
+from app.api.jobs import events, files, webhooks
+from app.api.jobs import jobs as job_routes
+from app.api.jobs.streams import Streams
 from app.api.markers import artwork, bulk, cerpms, codebooks, layouts, markers, observations, searches
 from app.api.ogc import mount_ogc
 from app.api.plans import alignments, packages, plan_jobs, plans, proofs, radio_checks
+from app.api.reprocessing import reprocessings
 from app.api.roads import roads
 from app.api.surveys import exports, imports
+from app.api.uploads import uploads
+from app.control.metrics import ProcessMetrics
+from app.control.operations import OperatorCases
+from app.control.server import ControlServer
 from app.decoders.plate import decode_plates
-from app.encoders.plate import PlateReader
-from app.families.rules import MarkerRules
-from app.formats.archives import ArchiveLimits
-from app.formats.images import ImageLimits
-from app.geodesy import use_grids
-from app.jobs.decoder_process import ProcessLimits
 from app.jobs.frame_tasks import DecodePlates
-from app.jobs.local_queue import LocalQueue
-from app.jobs.pool import DecodePool
-from app.markers.plate import PlateGeometry
-from app.markers.reading import PlateReading
 from app.registry.database import Database
-from app.registry.jobs import JobKind
-from app.services.access.access import Access, Bearer
-from app.services.access.agency_secrets import AgencySecrets
-from app.services.access.audit import AuditLog
-from app.services.access.keys import Keys
-from app.services.access.oidc import Issuer, KeySet, Tokens
-from app.services.decodes.archive_handler import ArchiveHandler
-from app.services.decodes.decodes import Decodes
-from app.services.decodes.frame_handler import FrameHandler
-from app.services.decodes.outputs import DecodeOutputs
-from app.services.decodes.packet_handler import PacketHandler
-from app.services.decodes.rules import DecodeRules
-from app.services.decodes.trace_handler import TraceHandler
-from app.services.decodes.upload_path import UploadHandler
-from app.services.fleet.calibrations import Calibrations
-from app.services.fleet.snapshots import Snapshots
-from app.services.fleet.vehicles import Vehicles
-from app.services.jobs import Jobs
-from app.services.markers.artwork import Artworks
-from app.services.markers.bulk import BulkMarkers
-from app.services.markers.cerpm_programs import CerpmPrograms
-from app.services.markers.codebooks import Codebooks
-from app.services.markers.features import Features
-from app.services.markers.layouts import Layouts
-from app.services.markers.markers import Markers
-from app.services.markers.observations import Observations
-from app.services.markers.searches import Searches
-from app.services.plans.alignments import Alignments
-from app.services.plans.making import PlanMaking
-from app.services.plans.packages import Packages
-from app.services.plans.plan_jobs import PlanJobs
-from app.services.plans.plans import Plans
-from app.services.plans.proofs import Proofs
-from app.services.request_work import check_deadline
-from app.services.roads.roads import Roads
-from app.services.surveys.exports import Exports
-from app.services.surveys.import_jobs import ImportJobs
-from app.services.surveys.imports import Imports
-from app.services.unused_blobs import UnusedBlobs
+from app.services.access.access import Access
 from app.settings import Settings
-from app.storage.blobs import Blobs
-from app.storage.jwks import read_jwks
-from app.storage.master_key import load_master_key
 from app.storage.probe import FolderProbe
-from app.storage.signing_key import load_signing_keys
+from app.wiring import Outside, connect_outside, make_use_cases, utc_now
 
 _LOG = structlog.get_logger("waymark")
 ROUTERS = (
     searches.router,
     bulk.router,
     observations.router,
+    maintenance.router,
     roads.router,
     markers.router,
     artwork.router,
@@ -109,8 +65,16 @@ ROUTERS = (
     proofs.router,
     packages.router,
     plan_jobs.router,
+    job_routes.router,
+    files.router,
+    webhooks.router,
+    events.router,
+    reprocessings.router,
+    reprocessings.decode_versions,
     codebooks.router,
     decodes.router,
+    uploads.router,
+    drives.router,
     imports.router,
     exports.router,
     snapshots.router,
@@ -121,42 +85,13 @@ ROUTERS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Outside:
-    """What is opened when the server starts, and closed when it ends."""
-
-    database: Database
-    blobs: Blobs
-    pool: DecodePool
-    queue: LocalQueue
-    plan_queue: LocalQueue
-    proof_queue: LocalQueue
-
-    @property
-    def queues(self) -> tuple[tuple[LocalQueue, tuple[JobKind, ...]], ...]:
-        """The queues with the kinds of their jobs: a proof of hours holds up no upload, nor another plan."""
-        return (
-            (self.queue, (JobKind.DECODE, JobKind.IMPORT)),
-            (self.plan_queue, (JobKind.PLAN, JobKind.PACKAGE)),
-            (self.proof_queue, (JobKind.PROOF,)),
-        )
-
-
 def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> FastAPI:
     """An app with its own database, use cases, metrics and limits. Files are opened when it starts.
 
     `decode` is imported by name in the decoder processes, so it must be a function of a module.
     """
-    use_grids(settings.proj_grids_dir)
-    outside = _Outside(
-        Database(settings.resolved_database_url),
-        Blobs(settings.resolved_blobs_url),
-        _decode_pool(settings, decode),
-        LocalQueue(),
-        LocalQueue(),
-        LocalQueue(),
-    )
-    use_cases = _use_cases(settings, outside, decode)
+    outside = connect_outside(settings, decode)
+    use_cases = make_use_cases(settings, outside, decode)
     app = FastAPI(
         title="Waymark",
         version=__version__,
@@ -168,113 +103,74 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     for name, use_case in use_cases.items():
         setattr(app.state, name, use_case)
     app.state.database = outside.database
+    app.state.spool = outside.spool
     app.state.public_url = settings.public_url.rstrip("/")
     app.state.readiness = {
         "database": outside.database.is_ready,
         "decoders": outside.pool.is_ready,
         "storage": FolderProbe(_folders(outside)).is_writable,
     }
+    app.state.streams = Streams(use_cases["all_jobs"].watched, use_cases["agency_events"].newest_of)
     app.state.metrics = CollectorRegistry()
+    app.state.metrics.register(ProcessMetrics(outside.database, outside.pool, utc_now))
     _add_routes(app)
     _add_guard(app, settings, app.state.access)
     app.add_middleware(Observed, registry=app.state.metrics)
     return app
 
 
-def _folders(outside: _Outside) -> set[Path]:
+def _folders(outside: Outside) -> set[Path]:
     """Folders of this machine in which data are stored."""
     database = outside.database.path
     return {folder for folder in (outside.blobs.folder, database.parent if database else None) if folder is not None}
 
 
-def _use_cases(settings: Settings, outside: _Outside, decode: DecodePlates) -> dict[str, Any]:
-    """The use cases by the names under which routes ask for them."""
-    database, blobs, pool, queue = outside.database, outside.blobs, outside.pool, outside.queue
-    rules = _decode_rules(settings)
-    ttl = rules.idempotency_ttl
-    secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
-    signing_keys = partial(load_signing_keys, settings.resolved_signing_key_file)
-    handlers = _handlers(database, pool, secrets, rules)
-    marker_cases = Markers(database, utc_now, marker_rules(settings))
-    import_cases = Imports(database, utc_now, pool, marker_rules(settings))
-    import_jobs = ImportJobs(database, utc_now, blobs, queue, imports=import_cases, idempotency_ttl=ttl)
-    decode_cases = Decodes(database, utc_now, blobs=blobs, queue=queue, handlers=handlers, rules=rules)
-    access = Access(database, utc_now, _token_check(settings))
-    plan_cases = Plans(database, utc_now, blobs, pool, marker_rules(settings))
-    plan_making = PlanMaking(database, utc_now, outside.plan_queue, plans=plan_cases, idempotency_ttl=ttl)
-    package_cases = Packages(
-        database, utc_now, blobs, pool, outside.plan_queue, in_flight=settings.decode_workers, idempotency_ttl=ttl
-    )
-    proof_cases = Proofs(
-        database, utc_now, blobs, pool, outside.proof_queue, in_flight=settings.decode_workers, idempotency_ttl=ttl
-    )
-    return {
-        "access": access,
-        "artworks": Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode)),
-        "alignments": Alignments(
-            database, utc_now, blobs, pool, accuracy_m=settings.crs_accuracy_m, idempotency_ttl=ttl
-        ),
-        "audit": AuditLog(database),
-        "bulk_markers": BulkMarkers(database, utc_now, marker_cases, ttl),
-        "calibrations": Calibrations(database, utc_now, pool, rules.images, ttl),
-        "codebooks": Codebooks(database, utc_now, ttl),
-        "decode_outputs": DecodeOutputs(database, blobs=blobs, processes=pool, rules=rules),
-        "decodes": decode_cases,
-        "exports": Exports(database),
-        "features": Features(database, utc_now),
-        "import_jobs": import_jobs,
-        "imports": import_cases,
-        "jobs": Jobs(
-            database,
-            utc_now,
-            {
-                JobKind.DECODE: decode_cases,
-                JobKind.IMPORT: import_jobs,
-                JobKind.PLAN: plan_making,
-                JobKind.PROOF: proof_cases,
-                JobKind.PACKAGE: package_cases,
-            },
-        ),
-        "keys": Keys(database, utc_now, access),
-        "layouts": Layouts(database),
-        "markers": marker_cases,
-        "observations": Observations(database),
-        "packages": package_cases,
-        "plan_jobs": PlanJobs(database, utc_now),
-        "plan_making": plan_making,
-        "plans": plan_cases,
-        "proofs": proof_cases,
-        "programs": CerpmPrograms(database, utc_now, secrets),
-        "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
-        "searches": Searches(database),
-        "snapshots": Snapshots(database, utc_now, signing_keys),
-        "unused_blobs": UnusedBlobs(database, utc_now, blobs, alone=settings.is_embedded),
-        "vehicles": Vehicles(database, utc_now, ttl),
-    }
-
-
 @asynccontextmanager
-async def _running(settings: Settings, outside: _Outside, use_cases: Mapping[str, Any]) -> AsyncIterator[None]:
+async def _running(settings: Settings, outside: Outside, use_cases: Mapping[str, Any]) -> AsyncIterator[None]:
     """The time between the server's start and its end."""
     jobs, access, unused_blobs = use_cases["jobs"], use_cases["access"], use_cases["unused_blobs"]
+    control = _control(outside.database, use_cases)
+    upload_cases = use_cases["uploads"]
     outside.database.open()
     try:
         outside.database.migrate()
         for warning in outside.database.list_warnings():
             _LOG.warning(warning)
         outside.blobs.open()
+        outside.spool.open(alone=settings.is_embedded)
         _show_once(access.ensure_first_key(_admin_key(settings)))
         if settings.warm_decoders:
             outside.pool.warm()
-        for queue, kinds in outside.queues:
-            queue.open(jobs.run_job, jobs.list_unfinished(kinds))
-        async with _each_minute(access.write_uses), _each_day(unused_blobs.try_to_delete, stop=unused_blobs.stop):
+        outside.queue.open(jobs)
+        if control is not None:
+            control.open()
+        delivery, job_files = use_cases["webhook_delivery"], use_cases["job_files"]
+        if settings.is_embedded:
+            upload_cases.release_all()
+        async with (
+            _each_minute(access.write_uses),
+            _each(timedelta(days=1), unused_blobs.try_to_delete, stop=unused_blobs.stop),
+            _each(timedelta(days=1), delivery.delete_old, stop=delivery.stop),
+            _each(timedelta(days=1), job_files.try_to_delete_expired, stop=job_files.stop),
+            _each(timedelta(seconds=1), delivery.try_to_work, stop=delivery.stop),
+            _each(timedelta(minutes=1), upload_cases.try_to_tidy, stop=upload_cases.stop),
+        ):
             yield
     finally:
+        if control is not None:
+            control.close()
         outside.pool.close()
-        for queue, _kinds in outside.queues:
-            queue.close()
+        outside.queue.close()
         outside.database.close()
+
+
+def _control(database: Database, use_cases: Mapping[str, Any]) -> ControlServer | None:
+    """What carries out commands; those for PostgreSQL open the database themselves."""
+    if database.path is None:
+        return None
+    names = ("access", "imports", "exports")
+    cases = OperatorCases(database, utc_now, **{name: use_cases[name] for name in names})
+    return ControlServer(database.path, cases)
 
 
 def _add_routes(app: FastAPI) -> None:
@@ -302,6 +198,7 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
             "/v1/imports": settings.max_import_bytes,
             "/v1/alignments": settings.max_import_bytes,
             "/v1/calibrations": settings.max_upload_bytes,
+            "/v1/uploads": settings.max_resumable_bytes,
         },
         permissions=Permissions(),
         body_timeout_s=settings.body_timeout_s,
@@ -330,13 +227,13 @@ async def _each_minute(work: Callable[[], None]) -> AsyncIterator[None]:
 
 
 @asynccontextmanager
-async def _each_day(work: Callable[[], None], *, stop: Callable[[], None]) -> AsyncIterator[None]:
-    """Call `work` in a thread now and once a day; `stop` ends a call."""
+async def _each(wait: timedelta, work: Callable[[], None], *, stop: Callable[[], None]) -> AsyncIterator[None]:
+    """Call `work` in a thread now and again, with a wait in between; `stop` ends a call."""
 
     async def repeat() -> None:
         while True:
             await asyncio.to_thread(work)
-            await asyncio.sleep(24 * 3600)
+            await asyncio.sleep(wait.total_seconds())
 
     task = asyncio.create_task(repeat())
     try:
@@ -346,20 +243,8 @@ async def _each_day(work: Callable[[], None], *, stop: Callable[[], None]) -> As
         task.cancel()
 
 
-def utc_now() -> datetime:
-    """The system's clock."""
-    return datetime.now(UTC)
-
-
 def _admin_key(settings: Settings) -> str | None:
     return settings.admin_key.get_secret_value() if settings.admin_key is not None else None
-
-
-def _token_check(settings: Settings) -> Callable[[str], Bearer] | None:
-    if not settings.oidc_issuer:
-        return None
-    issuer = Issuer(settings.oidc_issuer, settings.oidc_audience, settings.oidc_agency_claim, settings.oidc_scope_claim)
-    return Tokens(issuer, KeySet(partial(read_jwks, settings.oidc_jwks))).verify
 
 
 def _request_limit(settings: Settings) -> RateLimit | None:
@@ -383,56 +268,6 @@ def _failure_limit(settings: Settings) -> RateLimit | None:
         name="wrong-keys",
         message="too many wrong keys were sent from this address",
         cure="wait for the time in Retry-After, and check the key",
-    )
-
-
-def marker_rules(settings: Settings) -> MarkerRules:
-    return MarkerRules(
-        explicit_code_radius_m=settings.explicit_code_radius_m,
-        position_code_radius_m=settings.position_code_radius_m,
-        crs_accuracy_m=settings.crs_accuracy_m,
-        idempotency_ttl=timedelta(hours=settings.idempotency_ttl_h),
-    )
-
-
-def _face_reader(decode: DecodePlates) -> PlateReader:
-    """The decoder as the self-proof wants it: our own drawing is no stranger's upload, so it needs no child process."""
-
-    def read(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> list[PlateReading]:
-        check_deadline()  # once a plate: a bundle has thousands
-        return decode(image, geometries=(geometry,))
-
-    return read
-
-
-def _decode_pool(settings: Settings, decode: DecodePlates) -> DecodePool:
-    return DecodePool(
-        decode,
-        workers=settings.decode_workers,
-        limits=ProcessLimits(settings.decode_memory_bytes, settings.decode_timeout_s, settings.trace_timeout_s),
-        max_pixels=settings.max_image_pixels,
-        max_waiting=max(32, 4 * settings.decode_workers),  # proofs and packages keep every process busy
-    )
-
-
-def _handlers(
-    database: Database, pool: DecodePool, secrets: AgencySecrets, rules: DecodeRules
-) -> tuple[UploadHandler[Any], ...]:
-    """Kinds of uploads; the first one that accepts an upload decodes it."""
-    return (
-        TraceHandler(database, pool, rules),
-        PacketHandler(database, pool, secrets, rules),
-        ArchiveHandler(database, utc_now, pool, rules),
-        FrameHandler(database, pool, rules),
-    )
-
-
-def _decode_rules(settings: Settings) -> DecodeRules:
-    return DecodeRules(
-        images=ImageLimits(pixels=settings.max_image_pixels),
-        archives=ArchiveLimits(members=settings.max_archive_frames, member_bytes=settings.max_upload_bytes),
-        frames_in_flight=settings.decode_workers,
-        idempotency_ttl=timedelta(hours=settings.idempotency_ttl_h),
     )
 
 

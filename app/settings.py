@@ -28,6 +28,29 @@ class Settings(BaseSettings):
     blobs_url: str = Field(
         default="", description="file:///FOLDER or s3://BUCKET/PREFIX; empty: a folder in the data folder."
     )
+    spool_dir: Path | None = Field(
+        default=None,
+        description="Folder for bodies while they arrive, on the disk of the blobs; empty: in the data folder.",
+    )
+    blobs_shared: bool = Field(
+        default=False, description="Whether the folder of `blobs_url` is one that the server and all workers share."
+    )
+    broker_url: str = Field(
+        default="",
+        repr=False,
+        description="amqp://USER:PASSWORD@HOST:PORT/VHOST of RabbitMQ, whose queues `waymark worker` takes jobs from; "
+        "empty: the server runs the jobs itself.",
+    )
+    broker_prefix: str = Field(
+        default="waymark",
+        pattern=r"^[A-Za-z0-9_-]{1,100}$",
+        description="First part of the names of the broker's queues.",
+    )
+    secrets_dir: Path | None = Field(
+        default=None,
+        description="Folder with settings that are secret, each in a file of its name in small letters "
+        "(`waymark_database_url`), and with `aws_access_key_id` and `aws_secret_access_key`.",
+    )
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
     public_url: str = Field(
@@ -46,6 +69,24 @@ class Settings(BaseSettings):
 
     max_json_bytes: int = Field(default=1024**2, ge=1024, description="Maximum size of a JSON body. [byte]")
     max_upload_bytes: int = Field(default=32 * 1024**2, ge=1024, description="Maximum size of an upload. [byte]")
+    max_resumable_bytes: int = Field(
+        default=4 * 1024**3, ge=1024, description="Maximum size of a file that is uploaded in parts. [byte]"
+    )
+    upload_expiry_h: float = Field(
+        default=24.0, gt=0, description="Time after its last part in which an upload in parts has to go on. [h]"
+    )
+    key_stored_bytes: int = Field(
+        default=2**38, ge=0, description="Maximum size of all stored uploads of one key; 0: unlimited. [byte]"
+    )
+    agency_stored_bytes: int = Field(
+        default=2**40, ge=0, description="Maximum size of all stored uploads of one agency; 0: unlimited. [byte]"
+    )
+    key_open_uploads: int = Field(
+        default=16, ge=0, description="Maximum number of uploads in parts of one key at a time; 0: unlimited."
+    )
+    agency_open_uploads: int = Field(
+        default=256, ge=0, description="Maximum number of uploads in parts of one agency at a time; 0: unlimited."
+    )
     max_import_bytes: int = Field(
         default=256 * 1024**2, ge=1024, description="Maximum size of a survey to import. [byte]"
     )
@@ -71,7 +112,7 @@ class Settings(BaseSettings):
         default=500, ge=1, le=10_000, description="Maximum number of frames in one archive."
     )
     decode_memory_bytes: int = Field(
-        default=3 * 1024**3, ge=2**28, description="Maximum address space of a decoder process. [byte]"
+        default=1_280_000_000, ge=2**29, description="Maximum private memory of a decoder process. [byte]"
     )
     decode_timeout_s: float = Field(default=20.0, gt=0, description="Maximum time to decode one frame. [s]")
     trace_timeout_s: float = Field(default=300.0, gt=0, description="Maximum time to decode one recording. [s]")
@@ -146,6 +187,18 @@ class Settings(BaseSettings):
     oidc_agency_claim: str = Field(default="waymark_agency", description="Claim that names the agency.")
     oidc_scope_claim: str = Field(default="waymark_scope", description="Claim that names the scope.")
 
+    webhooks_to_loopback: bool = Field(
+        default=False, description="Webhooks may be sent to this machine, also by http: for trying them out."
+    )
+
+    worker_metrics_port: int = Field(
+        default=0, ge=0, le=65535, description="Port on which a worker answers /metrics and /healthz; 0: none."
+    )
+    otlp_endpoint: str = Field(
+        default="",
+        description="URL of an OpenTelemetry collector for traces (OTLP over HTTP), e.g. http://collector:4318; empty: "
+        "none. Needs the extra `tracing`.",
+    )
     log_format: Literal["console", "json"] = Field(
         default="console", description="Format of log lines: console or json."
     )
@@ -182,6 +235,24 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
+    def _shared_stores(self) -> Self:
+        if not self.broker_url:
+            return self
+        if not self.broker_url.startswith(("amqp://", "amqps://")):
+            raise ValueError("broker_url must be amqp://USER:PASSWORD@HOST:PORT/VHOST or amqps://...")
+        if not self.database_url.startswith("postgresql+psycopg://"):
+            raise ValueError(
+                "workers cannot share an SQLite file: set WAYMARK_DATABASE_URL=postgresql+psycopg://... as well, or "
+                "unset WAYMARK_BROKER_URL"
+            )
+        if not (self.blobs_url.startswith("s3://") or self.blobs_shared):
+            raise ValueError(
+                "workers read the uploads: set WAYMARK_BLOBS_URL=s3://..., or WAYMARK_BLOBS_SHARED=true if all of them "
+                "have the same folder"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _whole_issuer(self) -> Self:
         if self.oidc_issuer and not (self.oidc_audience and self.oidc_jwks):
             raise ValueError("an oidc_issuer needs an oidc_audience and oidc_jwks")
@@ -208,6 +279,11 @@ class Settings(BaseSettings):
     def resolved_blobs_url(self) -> str:
         """URL of the blob store with the default filled in."""
         return self.blobs_url or (self.data_dir.resolve() / "blobs").as_uri()
+
+    @property
+    def resolved_spool_dir(self) -> Path:
+        """Folder of arriving bodies with the default filled in."""
+        return self.spool_dir or self.data_dir / "spool"
 
     @property
     def resolved_master_key_file(self) -> Path:

@@ -39,6 +39,7 @@ def _list_commands(short: bool) -> list[list[str]]:
         ["cerpm", "-m", "benchmarks.cerpm", *(["--short"] if short else [])],
         ["imports", "-m", "benchmarks.imports", *(["--short"] if short else [])],
         ["planning", "-m", "benchmarks.planning", *(["--short"] if short else [])],
+        ["track", "-m", "benchmarks.track", *(["--short"] if short else [])],
         ["registry", "-m", "benchmarks.registry", *(["--short"] if short else [])],
     ]
 

@@ -22,6 +22,7 @@ from app.demo.cerpms import build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import drive_over, list_plates, registered_code
 from app.demo.road_plan import ORIGIN_DEG, ROAD, RULES
 from app.demo.server import LocalServer
+from app.formats.spooled_file import SpooledFile
 from app.jobs.trace_tasks import decode_recording
 from app.markers.magnet import InformationTag, Polarity, parse_tag
 from app.services.decodes.trace_task import TraceTask
@@ -119,7 +120,7 @@ def _write_trace() -> None:
         for name, data in write_recorder_files(drive.trace).items():
             archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
     (IMAGES / "drive.zip").write_bytes(packed.getvalue())
-    result = decode_recording(TraceTask("drive.zip", packed.getvalue(), {}, (tag.text,)), None)
+    result = decode_recording(TraceTask("drive.zip", SpooledFile.of(packed.getvalue()), {}, (tag.text,)), None)
     (IMAGES / "trace.svg").write_bytes(result.plot)
 
 

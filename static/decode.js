@@ -105,7 +105,16 @@ async function showPackets(decoded) {
   await showPicture(decoded.links.plot, `The lane estimated from the markers: ${decoded.summary.text}`);
 }
 
-const SHOWN = { frame: show, archive: show, trace: showTrace, packets: showPackets };
+async function showVideo(decoded) {
+  $("#decoded").hidden = false;
+  $("#summary").textContent = `${decoded.summary.text}. ${decoded.decoder}, registered plates along the drive: ${decoded.codebook_plates}.`;
+  const plates = decoded.plates.map((plate) => make("p", {}, `${plate.digits || plate.outcome}, in ${plate.frames.length} frames from frame ${plate.frames[0]} on`));
+  $("#readings").replaceChildren(...(plates.length ? plates : [make("p", { class: "empty" }, "No plate was found in this video.")]));
+  $("#fix").replaceChildren();
+  $("#annotated").removeAttribute("src");
+}
+
+const SHOWN = { frame: show, archive: show, video: showVideo, trace: showTrace, packets: showPackets };
 
 async function showPicture(path, text) {
   const picture = await api.fetchPicture(path);

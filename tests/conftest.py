@@ -8,7 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,9 @@ import uvicorn
 from fastapi import FastAPI
 
 from app.api.http.connections import ConnectionLimits, limited_connections
+from app.decoders.plate import decode_plates
+from app.jobs import resubmission
+from app.jobs.frame_tasks import DecodePlates
 from app.main import create_app
 from app.registry.feature_text import feature_text
 from app.registry.marker_rows import MarkerRow
@@ -28,6 +31,8 @@ from app.registry.tables import markers
 from app.registry.tenancy import across_agencies
 from app.services.access.access import Scope
 from app.settings import Settings
+from app.worker import running_worker
+from tests.brokers import find_broker, own_queues
 from tests.databases import PostgresServer, postgres_server
 from tests.documented import DEVIATIONS, CheckedResponses
 from tests.http import WITHIN_S
@@ -85,6 +90,16 @@ class LiveServer:
         return self.client(self.app.state.access.create_key(name, scope, label=f"{name} {scope}"))
 
 
+@contextmanager
+def serving(settings: Settings, *, decode: DecodePlates = decode_plates) -> Iterator[LiveServer]:
+    """A server, and a worker if the settings have a broker."""
+    with LiveServer(create_app(settings, decode=decode)) as running, ExitStack() as stack:
+        if settings.broker_url:
+            worker = stack.enter_context(running_worker(settings, decode=decode))
+            assert worker.wait_until_ready(WITHIN_S), "the worker did not start"
+        yield running
+
+
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[PostgresServer]:
     """A PostgreSQL server to make databases on."""
@@ -137,8 +152,35 @@ def backend() -> str:
     return "sqlite"
 
 
+@pytest.fixture(scope="module")
+def engine() -> str:
+    """What runs the jobs of the tests of a module; the marker `both_engines` runs them on both."""
+    return "embedded"
+
+
+@pytest.fixture(scope="module")
+def engine_settings(engine: str) -> Iterator[dict[str, Any]]:
+    """Settings of the engine, with queues that no other module has."""
+    if engine == "embedded":
+        yield {}
+        return
+    broker_url = find_broker()
+    with own_queues(broker_url) as prefix:
+        yield {"broker_url": broker_url, "broker_prefix": prefix, "blobs_shared": True}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_resubmission() -> None:
+    """Tests put jobs into the database that nothing may run; those about resubmission call it themselves."""
+    resubmission.RESUBMIT_S = 3600.0
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run tests with the marker `both_databases` once on each database."""
+    """Run tests with the marker `both_databases` on each database, with `both_engines` also on both engines."""
+    if "engine" in metafunc.fixturenames and metafunc.definition.get_closest_marker("both_engines"):
+        both = [("sqlite", "embedded"), ("postgresql", "embedded"), ("postgresql", "celery")]
+        metafunc.parametrize(("backend", "engine"), both, scope="module")
+        return
     if "backend" in metafunc.fixturenames and metafunc.definition.get_closest_marker("both_databases"):
         metafunc.parametrize("backend", ["sqlite", "postgresql"], scope="module")
 

@@ -69,7 +69,9 @@ class _Document:
             DEVIATIONS.append(f"{method} {path}: {status} {media_type}: {fault}")
 
     def _faults(self, method: str, path: str, status: int, media_type: str, body: bytes) -> list[str]:
-        template, operation = self._operation(method if method != "HEAD" else "GET", path)
+        template, operation = self._operation(method, path)
+        if method == "HEAD" and operation is None:  # of a route for GET
+            template, operation = self._operation("GET", path)
         if method == "HEAD" and operation is not None and media_type != PROBLEM:
             return [] if str(status) in operation["responses"] else ["the status is not documented"]
         if operation is None:  # there is no such resource or method, and the server says so

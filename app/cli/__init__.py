@@ -5,16 +5,37 @@ Each module holds the commands of one use case; this one lists them.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
-from app.cli import audit, ingest, plans, plates, proof, rules, server, snapshots, surveys, traces
+from app import __version__
+from app.cli import (
+    audit,
+    backups,
+    ingest,
+    plans,
+    plates,
+    proof,
+    remote,
+    rules,
+    server,
+    snapshots,
+    surveys,
+    traces,
+    worker,
+)
 from app.errors import WaymarkError
 
 cli = typer.Typer(name="waymark", no_args_is_help=True, add_completion=False, pretty_exceptions_show_locals=False)
 cli.command()(server.serve)
+cli.command()(worker.worker)
 cli.command()(server.demo)
 cli.command()(server.migrate)
 cli.command()(server.key)
+cli.command()(backups.backup)
+cli.command()(backups.restore)
+cli.command()(backups.upgrade)
 cli.command("import")(surveys.import_survey)
 cli.command("export")(surveys.export_markers)
 cli.add_typer(snapshots.cli, name="snapshot")
@@ -24,13 +45,26 @@ cli.command()(plates.board)
 cli.command()(plates.decode)
 cli.command()(traces.decode_trace)
 cli.add_typer(ingest.cli, name="ingest")
+cli.command()(remote.upload)
+cli.command()(remote.artwork)
+cli.command()(remote.reprocess)
 cli.command()(plans.plan)
 cli.command()(proof.proof)
 cli.add_typer(rules.cli, name="rules")
 
 
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"waymark {__version__}")
+        raise typer.Exit
+
+
 @cli.callback()
-def waymark() -> None:
+def waymark(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Print the version and exit.")
+    ] = False,
+) -> None:
     """The registry of machine-readable roads."""
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
@@ -14,9 +15,11 @@ from app.errors import InvalidParameter
 from app.settings import Settings
 
 if TYPE_CHECKING:
+    from app.control.operations import Values
     from app.registry.database import Database
-    from app.services.access.access import Caller
 
+_STORE_SECRETS = ("aws_access_key_id", "aws_secret_access_key")
+"""Files of the folder of secrets that the client of S3 takes from the environment."""
 _NEAR = 0.88
 """How similar a name is to a setting's (`difflib`). Source: by hand; WAYMARK_PROT is near, WAYMARK_KEY is not."""
 
@@ -24,8 +27,15 @@ _NEAR = 0.88
 def read_settings(**overrides: object) -> Settings:
     """Settings from the environment; overrides that are None are ignored."""
     _check_names()
+    given: dict[str, Any] = {name: value for name, value in overrides.items() if value is not None}
+    folder = os.environ.get("WAYMARK_SECRETS_DIR", "")
+    if folder and not Path(folder).is_dir():
+        raise InvalidParameter(f"{folder} is not a folder", field="WAYMARK_SECRETS_DIR")
+    for name in _STORE_SECRETS if folder else ():
+        if (file := Path(folder, name)).is_file():
+            os.environ.setdefault(name.upper(), file.read_text(encoding="utf-8").strip())
     try:
-        return Settings.model_validate({name: value for name, value in overrides.items() if value is not None})
+        return Settings(_secrets_dir=folder or None, **given)
     except ValidationError as error:
         first = error.errors()[0]
         name = "WAYMARK_" + "_".join(str(part) for part in first["loc"]).upper()
@@ -77,16 +87,18 @@ def readable_database(settings: Settings) -> Iterator[Database]:
         database.close()
 
 
-@contextmanager
-def operator(database: Database, agency: str) -> Iterator[Caller]:
-    """An administrator of an agency: whoever may run commands on the server's machine."""
-    from app.registry.agencies import find_agency
-    from app.registry.tenancy import across_agencies, acting_for
-    from app.services.access.access import Caller, Scope
+def perform(settings: Settings, name: str, values: Values, files: Sequence[int] = ()) -> Values:
+    """Carry out an operation of `app.control.operations`, in the server if one owns the database."""
+    from app.control.client import perform as carry_out
+    from app.control.operations import OperatorCases
+    from app.jobs.tasks import SameProcess
+    from app.services.access.access import Access
+    from app.services.surveys.exports import Exports
+    from app.services.surveys.imports import Imports
+    from app.wiring import marker_rules, utc_now
 
-    with across_agencies(), database.read() as connection:
-        agency_id = find_agency(connection, agency)
-    if agency_id is None:
-        raise InvalidParameter(f"there is no agency {agency[:80]!r}", cure="create it with waymark key")
-    with acting_for(agency_id):
-        yield Caller(agency_id, "command-line", "command line", Scope.ADMIN)
+    def make_cases(database: Database) -> OperatorCases:
+        imports = Imports(database, utc_now, SameProcess(), marker_rules(settings))
+        return OperatorCases(database, utc_now, Access(database, utc_now), imports, Exports(database))
+
+    return carry_out(settings.resolved_database_url, name, values, make_cases, files)

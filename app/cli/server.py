@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
 
-from app.cli.database import owned_database, read_settings
+from app.cli.database import owned_database, perform, read_settings
 
 HostOption = Annotated[str | None, typer.Option(help="Address to listen on. Default: WAYMARK_HOST, or 127.0.0.1.")]
 PortOption = Annotated[int | None, typer.Option(help="Port to listen on. Default: WAYMARK_PORT, or 8000.")]
@@ -16,10 +18,12 @@ PortOption = Annotated[int | None, typer.Option(help="Port to listen on. Default
 def serve(host: HostOption = None, port: PortOption = None) -> None:
     """Start the server. On an empty database it prints the first admin key."""
     from app.cli.serving import serve_until_stopped
+    from app.control.exporting import start_tracing
     from app.logs import configure_logs
 
     settings = read_settings(host=host, port=port)
     configure_logs(settings.log_format, settings.log_level)
+    start_tracing(settings, "waymark-server")
     with owned_database(settings):
         pass  # a database that another process owns is reported in one line here, not in a traceback of the server
     serve_until_stopped(settings)
@@ -32,8 +36,14 @@ def demo(
     """Register plates, magnets and CERPMs, decode simulated drives past them, and print a table for each family."""
     from app.demo import run_demo
 
+    signal.signal(signal.SIGTERM, _end)
     if not run_demo(out, say=lambda line: typer.echo(line), keep_serving=serve):
         raise typer.Exit(1)
+
+
+def _end(number: int, _frame: FrameType | None) -> None:
+    """End as after Ctrl-C: the demo's server is stopped on the way."""
+    raise SystemExit(128 + number)
 
 
 def migrate(
@@ -53,13 +63,6 @@ def key(
         int | None, typer.Option(min=1, max=3653, help="Days until the key expires. Default: never.")
     ] = None,
 ) -> None:
-    """Create a key for an agency and print it once. A server on an SQLite file must not be running."""
-    from datetime import timedelta
-
-    from app.main import utc_now
-    from app.services.access.access import Access, parse_scope
-
-    with owned_database(read_settings()) as database:
-        database.migrate()
-        expires_at = utc_now() + timedelta(days=days) if days else None
-        typer.echo(Access(database, utc_now).create_key(agency, parse_scope(scope), label, expires_at))
+    """Create a key for an agency and print it once, also while the server runs."""
+    values = {"agency": agency, "scope": scope, "label": label, "days": days}
+    typer.echo(perform(read_settings(), "key", values)["key"])

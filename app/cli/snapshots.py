@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.database import operator, read_settings, readable_database
+from app.cli.database import read_settings, readable_database
 from app.errors import InvalidParameter
 from app.settings import Settings
 
@@ -35,8 +35,9 @@ def make_snapshot(
 ) -> None:
     """Write the signed snapshot of an area."""
     from app.api.markers.filters import parse_box
-    from app.main import utc_now
+    from app.control.operations import operator
     from app.services.fleet.snapshots import Snapshots
+    from app.wiring import utc_now
 
     _refuse_existing(out)
     box, settings = parse_box(bbox), read_settings()
@@ -55,9 +56,10 @@ def write_trust(
     """Write the trust file of an agency: what its vehicles verify snapshots with."""
     import orjson
 
-    from app.main import utc_now
+    from app.control.operations import operator
     from app.services.fleet.documents import trust_document
     from app.services.fleet.snapshots import Snapshots
+    from app.wiring import utc_now
 
     _refuse_existing(out)
     settings = read_settings()
@@ -81,8 +83,8 @@ def verify_snapshot(
 
     from app.decoders.newest_snapshot import open_newest_snapshot
     from app.decoders.snapshot import open_snapshot
-    from app.main import utc_now
     from app.markers.snapshot import Trust
+    from app.wiring import utc_now
 
     try:
         trusted = Trust.from_document(orjson.loads(trust.read_bytes()))

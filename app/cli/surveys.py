@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from pydantic import ValidationError
 
-from app.cli.database import operator, owned_database, read_settings
+from app.cli.database import perform, read_settings
 from app.errors import InvalidParameter
 
 
@@ -19,17 +19,10 @@ def import_survey(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Report only; nothing is stored.")] = False,
     map_file: Annotated[Path | None, typer.Option("--map", help="SVG file for the residuals of a comparison.")] = None,
 ) -> None:
-    """Import a survey and print the report. The exit status is 1 if the survey is refused.
-
-    A server on an SQLite file must not be running.
-    """
+    """Import a survey and print the report, also while the server runs. The exit status is 1 if it is refused."""
     import orjson
 
     from app.api.surveys.schemas import DeclarationIn
-    from app.jobs.tasks import SameProcess
-    from app.main import marker_rules, utc_now
-    from app.services.surveys.declarations import import_input
-    from app.services.surveys.imports import Imports
 
     try:
         declaration = DeclarationIn.model_validate_json(declared)
@@ -38,12 +31,9 @@ def import_survey(
         place = ".".join(map(str, first["loc"]))
         raise InvalidParameter(f"--declaration {place}: {first['msg']}", cure="see docs/imports.md") from error
     declaration = declaration.model_copy(update={"dry_run": dry_run or declaration.dry_run})
-    given = import_input(declaration.declared(), survey.read_bytes())
-    settings = read_settings()
-    with owned_database(settings) as database:
-        database.migrate()
-        with operator(database, agency) as caller:
-            report, _ = Imports(database, utc_now, SameProcess(), marker_rules(settings)).run(caller, given)
+    values = {"agency": agency, "declaration": declaration.declared()}
+    with survey.open("rb") as file:
+        report = perform(read_settings(), "import", values, (file.fileno(),))["report"]
     shown: dict[str, object] = {**report}
     if map_file is not None and report["comparison"] is not None:
         map_file.write_text(report["comparison"]["map_svg"] or "")
@@ -61,26 +51,21 @@ def export_markers(
     status: Annotated[str | None, typer.Option(help="Only markers with this status.")] = None,
     family: Annotated[str | None, typer.Option(help="Only markers of this family: plate, magnet or cerpm.")] = None,
 ) -> None:
-    """Write an agency's markers to a file. A server on an SQLite file must not be running."""
+    """Write an agency's markers to a file, also while the server runs."""
     from tempfile import TemporaryDirectory
 
-    from app.api.markers.filters import parse_box
-    from app.registry.markers import MarkerFilter
-    from app.services.surveys.exports import KINDS, Exports
+    from app.services.surveys.exports import KINDS
 
     if kind not in KINDS:
         raise InvalidParameter(f"there is no format {kind[:40]!r}", limit=", ".join(KINDS))
     if out.exists():
         raise InvalidParameter(f"{out} already exists", cure="remove it, or choose another name")
-    filtered = MarkerFilter(box=parse_box(bbox) if bbox else None, status=status, family=family)
-    with (
-        owned_database(read_settings()) as database,
-        TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder,
-    ):
-        database.migrate()
-        with operator(database, agency) as caller:
-            path, left_out = Exports(database).write_file(caller, kind, filtered, Path(folder))
-            path.rename(out)
+    values = {"agency": agency, "kind": kind, "bbox": bbox, "status": status, "family": family}
+    with TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder:
+        written = Path(folder, out.name)
+        with written.open("xb") as file:
+            left_out = perform(read_settings(), "export", values, (file.fileno(),))["left_out"]
+        written.rename(out)
     if left_out:
         typer.echo(f"left out, too far from the file's UTM zone: {' '.join(left_out)}", err=True)
     typer.echo(out)

@@ -19,6 +19,7 @@ def decode_trace(
     import orjson
 
     from app.decoders.magnet.match import match_tags
+    from app.formats.spooled_file import SpooledFile
     from app.jobs.trace_tasks import decode_recording
     from app.services.decodes.trace_documents import trace_document
     from app.services.decodes.trace_task import TraceTask, trace_terms
@@ -33,7 +34,7 @@ def decode_trace(
         raise InvalidParameter(
             "--declaration is not a JSON object", field="declaration", cure="an empty declaration is {}"
         )
-    result = decode_recording(TraceTask(recording.name, recording.read_bytes(), terms), None)
+    result = decode_recording(TraceTask(recording.name, SpooledFile.at(recording), terms), None)
     trace = match_tags(result.findings, (), trace_terms(terms).bar)
     if plot is not None:
         plot.write_bytes(result.plot)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import secrets
+import signal
 import socket
 import subprocess
 import sys
@@ -16,6 +18,8 @@ import httpx
 from app.errors import Unavailable, WaymarkError
 
 _START_TIMEOUT_S = 180.0
+_PR_SET_PDEATHSIG = 1  # Linux's prctl(2)
+_PRCTL = getattr(ctypes.CDLL(None), "prctl", None)
 
 
 class LocalServer:
@@ -45,7 +49,9 @@ class LocalServer:
         command = [sys.executable, "-c", "from app.cli import main; main()", "serve", "--port", str(self._port)]
         self._log_path = self._folder / "server.log"
         with self._log_path.open("wb") as log:
-            self._process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+            self._process = subprocess.Popen(
+                command, env=environment, stdout=log, stderr=log, preexec_fn=_end_with_the_demo
+            )
         try:
             self._wait()
         except BaseException:
@@ -88,6 +94,12 @@ class LocalServer:
                     last = self._log_path.read_text(errors="replace")[-2000:]
                     raise Unavailable(f"the demo's server did not start:\n{last}", cure="see the log above")
                 time.sleep(0.1)
+
+
+def _end_with_the_demo() -> None:
+    """In the server's process: have the kernel stop it when the demo is killed; only Linux can do so."""
+    if _PRCTL is not None:
+        _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def checked(answer: httpx.Response) -> httpx.Response:

@@ -9,18 +9,27 @@ import io
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from typing import BinaryIO
 
 from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
+from app.formats.spooled_file import SpooledFile
+
+Source = bytes | BinaryIO | SpooledFile
+"""An archive: its bytes, a stream that can be sought, or a file. Only its directory and one file are in memory."""
 
 FIELD = "file"
 ZIP_MAGIC = b"PK\x03\x04"
 _EOCD = b"PK\x05\x06"
 _ZIP64_LOCATOR = b"PK\x06\x07"
-_NAME_LENGTH = 120  # [character] chosen by hand
+NAME_LENGTH = 120
+"""[character] of a name, without its folder. Chosen by hand."""
 _ENCRYPTED = 0x1  # bit 0 of the flags; PKWARE APPNOTE, section 4.4.4
 _CHUNK = 1 << 16  # [byte] inflated at a time
+_TAIL_BYTES = 20 + 22 + 65535
+"""Locator, end of the directory and longest comment. [byte] Source: PKWARE APPNOTE, sections 4.3.15 and 4.3.16."""
 _DEFECTS = (
     zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError
 )  # fmt: skip
@@ -61,7 +70,7 @@ def is_archive(data: bytes) -> bool:
     return data.startswith((ZIP_MAGIC, _EOCD))
 
 
-def count_members(data: bytes, limits: ArchiveLimits | None = None) -> int:
+def count_members(data: Source, limits: ArchiveLimits | None = None) -> int:
     """Number of files in an archive, after checking its directory.
 
     Raises
@@ -77,7 +86,15 @@ def count_members(data: bytes, limits: ArchiveLimits | None = None) -> int:
         return len(_files(archive))
 
 
-def read_members(data: bytes, limits: ArchiveLimits | None = None, *, start: int = 0) -> Iterator[Member]:
+def list_names(data: Source, limits: ArchiveLimits | None = None) -> list[str]:
+    """Names of the files of an archive, as `Member.name` has them; raises as `count_members`."""
+    with _open(data, limits or ArchiveLimits()) as archive:
+        return [_printable(info.filename) for info in _files(archive)]
+
+
+def read_members(
+    data: Source, limits: ArchiveLimits | None = None, *, start: int = 0, only: Callable[[str], bool] | None = None
+) -> Iterator[Member]:
     """Inflate an archive file by file; a file that breaks a rule is reported and the rest goes on.
 
     Raises
@@ -89,9 +106,9 @@ def read_members(data: bytes, limits: ArchiveLimits | None = None, *, start: int
     spent = 0
     with _open(data, limits) as archive:
         for index, info in enumerate(_files(archive)):
-            if index < start:
-                continue
             name = _printable(info.filename)
+            if index < start or (only is not None and not only(name)):
+                continue
             try:
                 content = _inflate(archive, info, limits)
             except WaymarkError as error:
@@ -108,29 +125,40 @@ def read_members(data: bytes, limits: ArchiveLimits | None = None, *, start: int
             yield Member(index, name, content)
 
 
-def read_member(data: bytes, index: int, limits: ArchiveLimits | None = None) -> Member:
+def read_member(data: Source, index: int, limits: ArchiveLimits | None = None) -> Member:
     """One file of an archive."""
     for member in read_members(data, limits, start=index):
         return member
     raise UnreadableUpload(f"the archive has no file {index}", field="frame")
 
 
-def _open(data: bytes, limits: ArchiveLimits) -> zipfile.ZipFile:
-    _check_directory(data, limits)
-    try:
-        archive = zipfile.ZipFile(io.BytesIO(data))
-    except _DEFECTS as error:
-        raise _damaged() from error
-    count = len(_files(archive))
-    if count == 0:
-        raise UnreadableUpload("the archive is empty", field=FIELD, limit="at least one frame")
-    if count > limits.members:
-        raise _too_many(limits)
-    return archive
+@contextmanager
+def _open(source: Source, limits: ArchiveLimits) -> Iterator[zipfile.ZipFile]:
+    with ExitStack() as stack:
+        if isinstance(source, bytes):
+            stream: BinaryIO = io.BytesIO(source)
+        elif isinstance(source, SpooledFile):
+            stream = stack.enter_context(source.open())
+        else:
+            stream = source
+        _check_directory(stream, limits)
+        try:
+            archive = stack.enter_context(zipfile.ZipFile(stream))
+        except _DEFECTS as error:
+            raise _damaged() from error
+        count = len(_files(archive))
+        if count == 0:
+            raise UnreadableUpload("the archive is empty", field=FIELD, limit="at least one frame")
+        if count > limits.members:
+            raise _too_many(limits)
+        yield archive
 
 
-def _check_directory(data: bytes, limits: ArchiveLimits) -> None:
+def _check_directory(stream: BinaryIO, limits: ArchiveLimits) -> None:
     """Bound the directory before it is parsed: a large one costs a kilobyte of memory per 46 bytes."""
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(max(size - _TAIL_BYTES, 0))
+    data = stream.read(_TAIL_BYTES)
     at = len(data) - 22 if data[-22:-18] == _EOCD and data[-2:] == b"\x00\x00" else data.rfind(_EOCD, -(22 + 65535))
     if at < 0 or at + 22 > len(data):
         raise _damaged()
@@ -180,7 +208,7 @@ def _inflate(archive: zipfile.ZipFile, info: zipfile.ZipInfo, limits: ArchiveLim
 
 def _printable(name: str) -> str:
     last = name.replace("\\", "/").rsplit("/", 1)[-1]
-    return "".join(c if c.isprintable() and not 0xD800 <= ord(c) <= 0xDFFF else "?" for c in last)[:_NAME_LENGTH]
+    return "".join(c if c.isprintable() and not 0xD800 <= ord(c) <= 0xDFFF else "?" for c in last)[:NAME_LENGTH]
 
 
 def _damaged() -> UnreadableUpload:

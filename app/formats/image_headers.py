@@ -4,7 +4,7 @@ The kind is detected by its signature (never by a name or a declared type), the 
 the lengths of the parts with the length of the file. Bytes that are not part of the picture (metadata, trailing bytes)
 are left out.
 
-Sources: PNG specification (3rd edition) sections 5 and 11, ITU-T T.81 annex B, CIPA DC-008 (EXIF) tag 0x0112.
+Sources: PNG specification (3rd edition) sections 5 and 11, ITU-T T.81 annex B, CIPA DC-008 (EXIF).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
+from app.formats.exif import Exif, read_exif
 
 FIELD = "file"
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -46,6 +47,8 @@ class ImageKind(StrEnum):
 
     JPEG = "jpeg"
     PNG = "png"
+    VIDEO = "video"
+    """A frame of a video; no file of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +61,14 @@ class ImageLimits:
         Largest number of pixels of a frame.
     side_min_px, side_max_px : int
         Shortest and longest side of a frame. [px]
+    file_bytes : int
+        Largest file that is read. [byte]
     """
 
     pixels: int = 50_000_000
     side_min_px: int = 32
     side_max_px: int = 32_768
+    file_bytes: int = 32 * 1024**2
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +88,8 @@ class ImageHeader:
         EXIF orientation as stored: 1, 3, 6 or 8.
     trailing_bytes : int
         Bytes after the picture's end, which are ignored.
+    taken : str or None
+        When it was taken by its EXIF, as RFC 3339 writes it; without a zone where the camera states none.
     """
 
     kind: ImageKind
@@ -91,6 +99,7 @@ class ImageHeader:
     bit_depth: int = 8
     orientation: int = 1
     trailing_bytes: int = 0
+    taken: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,42 +159,20 @@ def _check_size(width_px: int, height_px: int, limits: ImageLimits) -> None:
         )
 
 
-def _check_orientation(orientation: int) -> int:
-    if orientation in _MIRRORED:
+def _checked_exif(tiff: bytes) -> Exif:
+    exif = read_exif(tiff)
+    if exif.orientation in _MIRRORED:
         raise UnsupportedUpload(
-            f"EXIF orientation {orientation} mirrors the picture, and a mirrored plate reads as another code",
+            f"EXIF orientation {exif.orientation} mirrors the picture, and a mirrored plate reads as another code",
             field=FIELD,
             limit="EXIF orientation 1, 3, 6 or 8",
             cure="switch off the camera's mirroring (selfie or rear-view mode), or save the frame upright",
         )
-    return orientation
+    return exif
 
 
 def _upright(width_px: int, height_px: int, orientation: int) -> tuple[int, int]:
     return (height_px, width_px) if orientation in (6, 8) else (width_px, height_px)
-
-
-# --- EXIF -----------------------------------------------------------------------------------------------------------
-
-
-def _exif_orientation(tiff: bytes) -> int:
-    """Orientation (tag 0x0112 of IFD 0) of a TIFF header, 1 if there is none or it is invalid."""
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    if order is None or len(tiff) < 8:
-        return 1
-    (offset,) = struct.unpack_from(order + "I", tiff, 4)
-    if offset + 2 > len(tiff):
-        return 1
-    (entries,) = struct.unpack_from(order + "H", tiff, offset)
-    for k in range(entries):
-        at = offset + 2 + 12 * k
-        if at + 12 > len(tiff):
-            break
-        tag, kind, count = struct.unpack_from(order + "HHI", tiff, at)
-        if tag == 0x0112 and count == 1 and kind in (3, 4):
-            (value,) = struct.unpack_from(order + ("H" if kind == 3 else "I"), tiff, at + 8)
-            return int(value) if 1 <= value <= 8 else 1
-    return 1
 
 
 # --- JPEG -----------------------------------------------------------------------------------------------------------
@@ -206,7 +193,7 @@ class _JpegParts:
 
     size_px: tuple[int, int] | None = None
     components: int = 0
-    orientation: int | None = None
+    exif: Exif | None = None
     scans: int = 0
 
 
@@ -232,9 +219,11 @@ def _scan_jpeg(data: bytes, limits: ImageLimits) -> ScannedImage:
         at += length
     if parts.size_px is None or not parts.scans:
         raise _bad_jpeg()
-    orientation = parts.orientation or 1
-    width, height = _upright(*parts.size_px, orientation)
-    header = ImageHeader(ImageKind.JPEG, width, height, parts.components, 8, orientation, len(data) - at)
+    exif = parts.exif or Exif()
+    width, height = _upright(*parts.size_px, exif.orientation)
+    header = ImageHeader(
+        ImageKind.JPEG, width, height, parts.components, 8, exif.orientation, len(data) - at, exif.taken
+    )
     return ScannedImage(header, ((0, at),))
 
 
@@ -243,8 +232,8 @@ def _bad_jpeg() -> UnreadableUpload:
 
 
 def _read_segment(marker: int, body: bytes, parts: _JpegParts, limits: ImageLimits) -> None:
-    if marker == 0xE1 and body.startswith(b"Exif\x00\x00") and parts.orientation is None:
-        parts.orientation = _check_orientation(_exif_orientation(body[6:]))
+    if marker == 0xE1 and body.startswith(b"Exif\x00\x00") and parts.exif is None:
+        parts.exif = _checked_exif(body[6:])
     elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
         if parts.size_px is not None:
             raise _bad_jpeg()
@@ -293,7 +282,7 @@ def _scan_png(data: bytes, limits: ImageLimits) -> ScannedImage:
     """Walk the chunks. Only the critical ones go to the codec: text and profiles can be compressed bombs."""
     at = len(_PNG_SIGNATURE)
     shape: tuple[int, int, int, int] | None = None
-    orientation, name, names, parts = 1, b"", set(), [(0, at)]
+    exif, name, names, parts = Exif(), b"", set(), [(0, at)]
     while name != b"IEND":
         name, end = _next_chunk(data, at)
         if (shape is None) != (name == b"IHDR"):
@@ -305,7 +294,7 @@ def _scan_png(data: bytes, limits: ImageLimits) -> ScannedImage:
                 "the PNG is animated", field=FIELD, limit="one picture a file", cure="send each frame as its own file"
             )
         elif name == b"eXIf":
-            orientation = _check_orientation(_exif_orientation(data[at + 8 : end - 4]))
+            exif = _checked_exif(data[at + 8 : end - 4])
         if name in (b"IHDR", b"PLTE", b"IDAT", b"IEND"):
             parts.append((at, end))
         names.add(name)
@@ -313,8 +302,10 @@ def _scan_png(data: bytes, limits: ImageLimits) -> ScannedImage:
     if shape is None or b"IDAT" not in names:
         raise UnreadableUpload("the PNG holds no pixels", field=FIELD, cure=SEND_AS_IT_IS)
     width, height, depth, colour = shape
-    upright = _upright(width, height, orientation)
-    header = ImageHeader(ImageKind.PNG, *upright, _PNG_CHANNELS[colour], depth, orientation, len(data) - at)
+    upright = _upright(width, height, exif.orientation)
+    header = ImageHeader(
+        ImageKind.PNG, *upright, _PNG_CHANNELS[colour], depth, exif.orientation, len(data) - at, exif.taken
+    )
     return ScannedImage(header, tuple(parts))
 
 

@@ -8,13 +8,17 @@ from app.errors import WaymarkError
 from app.formats.alignments.formats import ALIGNMENT_FORMATS
 from app.formats.archives import is_archive
 from app.formats.format import Confidence, Format, Sample, Use, detect_format
+from app.formats.frame_list import is_frame_list
 from app.formats.images import FRAME_FORMATS
 from app.formats.packets.formats import PACKET_FORMATS
 from app.formats.poses.formats import POSE_FORMATS
+from app.formats.spooled_file import SpooledFile
 from app.formats.surveys.formats import SURVEY_FORMATS
 from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.formats import TRACE_FORMATS
 from app.formats.traces.parts import open_parts
+from app.formats.video.archive import holds_video
+from app.formats.video.container import detect_video
 
 FORMATS: tuple[Format[object], ...] = (
     *FRAME_FORMATS,
@@ -46,37 +50,50 @@ _DECODED_AS = {
 """A track comes with a packet log."""
 
 
-def guess_kind(name: str, data: bytes) -> UploadKind | None:
+def guess_kind(name: str, file: SpooledFile) -> UploadKind | None:
     """What an upload is; None if its content does not show it.
 
     Parameters
     ----------
     name : str
         Of the file.
-    data : bytes
+    file : SpooledFile
         A file, or a ZIP of files. Only the beginning of each file is looked at.
 
     Returns
     -------
     UploadKind or None
-        A ZIP of nothing but pictures is frames; one with a packet log or a track in it is packets.
+        A ZIP of nothing but pictures is frames, also beside a list of frames or a track; one with a packet log in it
+        is packets, and so is a track without pictures.
     """
-    if not is_archive(data):
-        return _guess_file(name, data)
+    head = file.head()
+    if detect_video(head) is not None or holds_video(file):
+        return UploadKind.FRAME
+    if not is_archive(head):
+        return _guess_file(name, head)
     try:
-        parts = [part for part in open_parts({name: data}, TraceLimits()) if not part.name.startswith(".")]
+        with file.open() as stream:
+            parts = [part for part in open_parts({name: stream}, TraceLimits()) if not part.name.startswith(".")]
     except WaymarkError:
         return UploadKind.FRAME  # too many files for a recording; the archive's reader reports any other fault
-    kinds = {_guess_file(part.name, part.head) for part in parts} - {UploadKind.FRAME}
-    if not kinds:
+    if any(is_frame_list(part.name) for part in parts):
+        return UploadKind.FRAME
+    uses = {_guess_use(part.name, part.head) for part in parts}
+    kinds = {use and _DECODED_AS[use] for use in uses} - {UploadKind.FRAME}
+    if not kinds or uses == {Use.FRAME, Use.POSES}:
         return UploadKind.FRAME
     return next((kind for kind in (UploadKind.PACKETS, UploadKind.TRACE) if kind in kinds), None)
 
 
 def _guess_file(name: str, data: bytes) -> UploadKind | None:
+    use = _guess_use(name, data)
+    return None if use is None else _DECODED_AS[use]
+
+
+def _guess_use(name: str, data: bytes) -> Use | None:
     decoded = [found for found in FORMATS if found.use in _DECODED_AS]
     found = detect_format(Sample(name, data[:_SAMPLE_BYTES]), decoded, Confidence.PLAUSIBLE)
-    return None if found is None else _DECODED_AS[found.use]
+    return None if found is None else found.use
 
 
 def detect_drive_file(name: str, data: bytes) -> Use:

@@ -14,6 +14,7 @@ from app.calibration.results import CameraCalibration, Photo
 from app.errors import UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.archives import is_archive, read_members
 from app.formats.images import load_image
+from app.formats.spooled_file import SpooledFile
 from app.jobs.memory_limit import memory_is_the_limit
 from app.services.fleet.calibrations import MAX_PHOTOS, CalibrationTask
 
@@ -58,13 +59,19 @@ def calibrate_photos(task: CalibrationTask, _before: None) -> CameraCalibration:
 
 
 def _each(task: CalibrationTask) -> Iterator[tuple[str, bytes | WaymarkError]]:
-    for name, data in task.photos:
-        if not is_archive(data):
-            yield name, data
+    for name, file in task.photos:
+        if not is_archive(file.head()):
+            yield name, _whole(file, task)
             continue
-        for member in read_members(data, task.archives):
+        for member in read_members(file, task.archives):
             if not member.name.startswith("."):  # what a desktop leaves in a ZIP
                 yield member.name, member.error or member.data
+
+
+def _whole(file: SpooledFile, task: CalibrationTask) -> bytes | WaymarkError:
+    if file.size > task.images.file_bytes:
+        return UploadTooLarge("the photo is too large", limit=f"{task.images.file_bytes} bytes")
+    return file.read()
 
 
 def _look(name: str, content: bytes | WaymarkError, task: CalibrationTask) -> Photo:

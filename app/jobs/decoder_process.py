@@ -1,26 +1,36 @@
-"""What runs inside a decoder process. Nothing here may write a file, open a socket or touch the database."""
+"""What runs inside a decoder process. It has limits, and may open no socket and write into its folder only."""
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
 import os
-import resource
 import signal
-from dataclasses import dataclass
+import time
 from multiprocessing.connection import Connection
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from app.errors import ProcessStopped
 from app.jobs.frame_tasks import DecodePlates, use_decoder
+from app.jobs.process_limits import (
+    ProcessLimits,
+    allow_processor_time,
+    close_network,
+    empty_folder,
+    limit_resources,
+    work_in,
+)
 from app.markers.plate import PlateCode
 from app.services.decoder_processes import Task
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-READY = "ready"
+READY, READY_WITH_NETWORK = "ready", "ready, with network"
 """What a process sends when it can take tasks."""
 # glibc's mallopt: keep freed memory for the next frame, or the kernel clears every page of every frame anew
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -29,53 +39,53 @@ _KEPT_BYTES = 256 * 1024**2
 _KEPT_BLOCK_BYTES = 32 * 1024**2  # glibc accepts no more
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessLimits:
-    """What a decoder process may use.
-
-    Attributes
-    ----------
-    memory_bytes : int
-        Its whole address space, libraries included. [byte]
-    timeout_s : float
-        Longest time on one frame. [s]
-    trace_timeout_s : float
-        Longest time on one recording. [s]
-    """
-
-    memory_bytes: int = 3 * 1024**3
-    timeout_s: float = 20.0
-    trace_timeout_s: float = 300.0
-
-
-def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLimits) -> None:
-    """Load everything, send `READY`, and answer tasks until the server closes the connection.
+def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLimits, folder: Path) -> None:
+    """Load everything, work in a folder, send `READY`, and answer tasks until the server closes the connection.
 
     A task comes in steps: (function, argument, whether it is the last). Each is called with its argument and the result
-    of the step before it. The answer is (whether all succeeded, result or exception).
+    of the step before it. The answer is (whether all succeeded, result or exception, name and times of each step).
     """
     end_with_parent()
-    warm_process(decode, limits)
-    connection.send(READY)
+    warm_process(decode)
+    work_in(folder)
+    limit_resources(limits)
+    connection.send(READY if close_network() else READY_WITH_NETWORK)
     answer: tuple[bool, Any] = (True, None)
+    times_ns: list[tuple[str, int, int]] = []
     while True:
         try:
             function, argument, is_last = connection.recv()
         except EOFError:
             return
+        began_ns = time.time_ns()
         if answer[0]:
+            allow_processor_time(limits)
             try:
                 answer = (True, function(argument, answer[1]))
             except Exception as error:  # noqa: BLE001 - raised again in the server
-                answer = (False, ExceptionWithTraceback(error, error.__traceback__))
+                raised = _limit_of_files(error) or error
+                answer = (False, ExceptionWithTraceback(raised, error.__traceback__))
+        times_ns.append((function.__name__, began_ns, time.time_ns()))
         if is_last:
-            connection.send(answer)
-            answer = (True, None)
+            empty_folder(folder)
+            connection.send((*answer, times_ns))
+            answer, times_ns = (True, None), []
         del function, argument  # a frame's memory is free before the next frame comes
 
 
-def warm_process(decode: DecodePlates, limits: ProcessLimits) -> None:
-    """Prepare a fresh process: one thread, compiled kernels loaded, then the address space closed."""
+def _limit_of_files(error: Exception) -> ProcessStopped | None:
+    """What a write means that the limits of this process refused; None if another thing failed."""
+    if not isinstance(error, OSError) or error.errno not in (errno.EFBIG, errno.EMFILE):
+        return None
+    return ProcessStopped(
+        "decoding the file took larger or more files than a decoder process may write",
+        field="file",
+        cure="send it in smaller parts",
+    )
+
+
+def warm_process(decode: DecodePlates) -> None:
+    """Prepare a fresh process: one thread, and compiled kernels loaded."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a decoder in native code must end at once, too
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which then stops its children
     cv2.setNumThreads(1)
@@ -85,8 +95,6 @@ def warm_process(decode: DecodePlates, limits: ProcessLimits) -> None:
     decode(_warm_frame(), camera=None, codebook=(), thermal=False)
     gc.collect()
     gc.freeze()  # the libraries' objects are never freed: a collection need not visit them
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (limits.memory_bytes, limits.memory_bytes))
 
 
 def end_with_parent() -> None:

@@ -44,6 +44,11 @@ class FairQueue(Generic[ItemT]):
                 raise Empty
             return self._take() if self._waiting else None
 
+    def __len__(self) -> int:
+        """Number of items that wait."""
+        with self._changed:
+            return sum(map(len, self._waiting.values()))
+
     def close(self) -> None:
         """Let `get` return None when no item is left."""
         with self._changed:

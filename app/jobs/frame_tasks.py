@@ -43,7 +43,7 @@ def load_frame(task: FramePicture, _before: None) -> LoadedFrame:
     """First step: the picture's codec."""
     with memory_is_the_limit(*_PICTURE):
         began = time.perf_counter()
-        frame = load_image(task.data, task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
+        frame = load_image(task.file.read(), task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
         return LoadedFrame(frame, task.thermal, 1e3 * (time.perf_counter() - began))
 
 
@@ -64,5 +64,5 @@ def find_markers(search: FrameSearch, loaded: LoadedFrame) -> FrameResult:
 def annotate_frame(task: AnnotationTask, _before: None) -> bytes:
     """Draw outlines over a frame and encode it."""
     with memory_is_the_limit(*_PICTURE):
-        frame = load_image(task.data, task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
+        frame = load_image(task.file.read(), task.limits, thermal=task.thermal, thermal_range=task.thermal_range)
         return encode_picture(draw_outlines(frame.pixels, task.outlines), task.suffix)

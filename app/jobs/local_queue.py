@@ -3,63 +3,99 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from typing import Protocol
 
 import structlog
 
 from app.errors import Unavailable
 from app.jobs.fair_queue import FairQueue
+from app.jobs.resubmission import Resubmission
+from app.registry.jobs import JobKind, UnfinishedJob
+from app.services.job_queues import QUEUES, QueueName
 
 _LOG = structlog.get_logger(__name__)
 _RETRY_S = 2.0
 
 
+class Runner(Protocol):
+    """What runs jobs: `app.services.jobs.Jobs`."""
+
+    def run_job(self, job_id: str) -> bool:
+        """Run a job."""
+
+    def list_startable(self) -> list[UnfinishedJob]:
+        """Jobs that wait, and those of processes that died."""
+
+
 class LocalQueue:
     """Runs jobs in this process: those of an agency in the order they came, agencies in turn (`FairQueue`).
 
-    The queue is not stored: the jobs' rows are, and `open` is given those that an earlier process left unfinished.
+    A thread runs the jobs of the queue `online`. Each kind of job of the other queues has a thread of its own, so that
+    a proof of hours holds up no plan.
 
-    Parameters
-    ----------
-    threads : int
-        Jobs that run at the same time.
+    The queue is not stored: the jobs' rows are, and those that nobody has are submitted again, at the start and from
+    time to time.
     """
 
-    def __init__(self, threads: int = 1) -> None:
-        self._waiting: FairQueue[tuple[str, str]] = FairQueue()
+    def __init__(self) -> None:
         self._closing = threading.Event()
-        self._count = threads
+        self._lanes: dict[str, FairQueue[UnfinishedJob]] = {_lane_of(kind): FairQueue() for kind in QUEUES}
         self._threads: list[threading.Thread] = []
+        self._lock = threading.Lock()
+        self._resubmission: Resubmission | None = None
+        self._known: set[str] = set()  # jobs that wait here or run
 
-    def open(self, run_job: Callable[[str], None], unfinished: Iterable[tuple[str, str]] = ()) -> None:
-        """Start the threads; unfinished jobs, each with its agency, come first."""
-        for job_id, agency_id in unfinished:
-            self.submit(job_id, agency_id)
-        for number in range(self._count):
-            thread = threading.Thread(target=self._work, args=(run_job,), name=f"jobs-{number}", daemon=True)
+    def open(self, jobs: Runner) -> None:
+        """Start the threads; jobs that nobody has come first."""
+        self._resubmit(jobs)
+        for name, waiting in self._lanes.items():
+            thread = threading.Thread(target=self._work, args=(waiting, jobs), name=f"jobs-{name}", daemon=True)
             thread.start()
             self._threads.append(thread)
+        self._resubmission = Resubmission(lambda: self._resubmit(jobs))
 
-    def submit(self, job_id: str, agency_id: str) -> None:
+    def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
         """Have the job of an agency run."""
-        self._waiting.put(agency_id, (job_id, agency_id))
+        with self._lock:
+            if job_id in self._known:
+                return
+            self._known.add(job_id)
+        self._lanes[_lane_of(kind)].put(agency_id, UnfinishedJob(job_id, agency_id, kind))
+
+    def bury(self, job_id: str, kind: JobKind, reason: str) -> None:
+        """Nothing: the job's row has the reason."""
 
     def close(self) -> None:
         """Stop after the running jobs; close the decoder processes first to interrupt those."""
         self._closing.set()
-        self._waiting.close()
+        if self._resubmission is not None:
+            self._resubmission.close()
+        for waiting in self._lanes.values():
+            waiting.close()
         for thread in self._threads:
             thread.join()
         self._threads.clear()
 
-    def _work(self, run_job: Callable[[str], None]) -> None:
-        while (taken := self._waiting.get()) is not None and not self._closing.is_set():
-            job_id, agency_id = taken
+    def _work(self, waiting: FairQueue[UnfinishedJob], jobs: Runner) -> None:
+        while (job := waiting.get()) is not None and not self._closing.is_set():
             try:
-                run_job(job_id)
+                jobs.run_job(job.id)
             except Unavailable as error:
-                _LOG.warning("a job is tried again later", job_id=job_id, why=error.message)
-                if not self._closing.wait(_RETRY_S):
-                    self.submit(job_id, agency_id)
-            except Exception:  # noqa: BLE001 - the next job must still run; this one is run again at the next start
-                _LOG.exception("a job stopped on an error", job_id=job_id)
+                _LOG.warning("a job is tried again later", job_id=job.id, why=error.message)
+                self._closing.wait(_RETRY_S)
+                waiting.put(job.agency_id, job)
+                continue
+            except Exception:  # noqa: BLE001 - the next job must still run; this one is submitted again
+                _LOG.exception("a job stopped on an error", job_id=job.id)
+            with self._lock:
+                self._known.discard(job.id)
+
+    def _resubmit(self, jobs: Runner) -> None:
+        for job in jobs.list_startable():
+            self.submit(*job)
+
+
+def _lane_of(kind: JobKind) -> str:
+    """Jobs with the same answer run one after the other."""
+    queue = QUEUES[kind]
+    return queue.value if queue is QueueName.ONLINE else kind.value

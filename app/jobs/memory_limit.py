@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import cv2
 
-from app.errors import UnreadableUpload
+from app.errors import ProcessStopped
 
 
 @contextmanager
@@ -19,9 +19,9 @@ def memory_is_the_limit(what: str, cure: str) -> Iterator[None]:
     except (MemoryError, cv2.error) as error:
         if isinstance(error, cv2.error) and error.code != cv2.Error.StsNoMem:
             raise
-        raise UnreadableUpload(
+        raise ProcessStopped(
             f"decoding the {what} takes more memory than a decoder process has",
             field="file",
-            limit=f"{resource.getrlimit(resource.RLIMIT_AS)[0]} bytes",
+            limit=f"{resource.getrlimit(resource.RLIMIT_DATA)[0]} bytes",
             cure=cure,
         ) from error

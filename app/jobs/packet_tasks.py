@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import BinaryIO
 
 import numpy as np
 
@@ -37,18 +38,18 @@ _LOG = ("log", "cut the log into shorter ones")
 
 def read_drive(task: DriveTask, _before: None) -> DriveFiles:
     """Read the files of a drive."""
-    with memory_is_the_limit(*_LOG):
-        return _read_drive(task)
+    with memory_is_the_limit(*_LOG), task.file.open() as stream:
+        return _read_drive(task, stream)
 
 
-def _read_drive(task: DriveTask) -> DriveFiles:
+def _read_drive(task: DriveTask, stream: BinaryIO) -> DriveFiles:
     began = time.perf_counter()
     terms = packet_terms(task.declared)
     packets: list[ReceivedPacket] = []
     track: PoseTrack | None = None
     frame: tuple[str, ImageHeader] | None = None
     reports: dict[str, LogReport] = {}
-    for part in open_parts({task.name: task.data}, TraceLimits(file_bytes=task.packets.file_bytes)):
+    for part in open_parts({task.name: stream}, TraceLimits(file_bytes=task.packets.file_bytes)):
         if part.name.startswith("."):
             continue  # what a desktop leaves in a ZIP
         data = part.content()
@@ -155,7 +156,7 @@ def _plot(lane: Lane, task: LaneTask) -> str:
 
 def draw_overlay(task: OverlayTask, _before: None) -> bytes:
     """Draw a lane over the camera frame of an upload."""
-    with memory_is_the_limit("frame", "send the frame at the camera's resolution"):
-        parts = open_parts({task.frame: task.data}, TraceLimits())
+    with memory_is_the_limit("frame", "send the frame at the camera's resolution"), task.file.open() as stream:
+        parts = open_parts({task.frame: stream}, TraceLimits())
         data = next(part.content() for part in parts if part.name == task.frame)
         return encode_picture(draw_lane(load_image(data, task.images).pixels, task.overlay), task.suffix)

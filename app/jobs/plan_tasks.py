@@ -42,7 +42,7 @@ _CURE = "cut the road into sections"
 def summarize_road(task: SummarizeRoadTask, _before: None) -> SummarizedRoad:
     """Read a road and describe it."""
     with memory_is_the_limit("road", _CURE):
-        file = read_alignment(task.road.data, task.road.file_name)
+        file = read_alignment(task.road.file.read(), task.road.file_name)
         road = _build(file, task.road, None)
         return SummarizedRoad(dict(road_summary(road, file.format)), lane_features(road))
 
@@ -51,7 +51,7 @@ def make_plan(task: MakePlanTask, _before: None) -> MadePlan:
     """Place and check a plan."""
     with memory_is_the_limit("road", _CURE):
         rules = check_rules(task.rules)
-        file = read_alignment(task.road.data, task.road.file_name)
+        file = read_alignment(task.road.file.read(), task.road.file_name)
         alignment = _build(file, task.road, rules.road)
         numbers = unused_numbers(task.taken, zlib.crc32(task.name.encode()))
         book = Codebook.from_document(task.codebook) if task.codebook is not None else None
@@ -75,7 +75,7 @@ def write_file_of_plan(task: WritePlanFileTask, _before: None) -> bytes:
 def write_map(task: WriteMapTask, _before: None) -> bytes:
     """Write a road and the markers near it as an HD map."""
     with memory_is_the_limit("road", _CURE):
-        road = _build(read_alignment(task.road.data, task.road.file_name), task.road, None)
+        road = _build(read_alignment(task.road.file.read(), task.road.file_name), task.road, None)
         markers = [point for row in task.markers for point in get_family(row.family).map_markers(row)]
         content = map_of_road(road, markers, within_m=task.within_m)
         return write_lanelet2(content) if task.form == "osm" else write_opendrive(content, leave_out=True)

@@ -7,19 +7,32 @@ want some.
 from __future__ import annotations
 
 import os
+import resource
 import threading
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 from app.errors import Unavailable
-from app.jobs.decoder_process import ONE_THREAD, ProcessIdTask, ProcessLimits
+from app.jobs.decoder_process import ONE_THREAD, ProcessIdTask
 from app.jobs.fair_queue import FairQueue
 from app.jobs.frame_tasks import DecodePlates
 from app.jobs.places import Places
+from app.jobs.process_limits import ProcessLimits, delete_folders_of_the_dead
 from app.jobs.supervisor import Pending, WorkerSupervisor
 from app.registry.tenancy import whose_rows
 from app.services.decoder_processes import Task
 
 ResultT = TypeVar("ResultT")
+
+
+class PoolState(NamedTuple):
+    """Decoder processes that run and that are wanted, their memory [byte], waiting tasks, and starts so far."""
+
+    running: int
+    wanted: int
+    memory_bytes: int
+    waiting: int
+    starts: int
 
 
 class DecodePool:
@@ -90,6 +103,15 @@ class DecodePool:
                 not self._supervisors or any(supervisor.is_up for supervisor in self._supervisors)
             )
 
+    def describe(self) -> PoolState:
+        """What the processes do now."""
+        with self._lock:
+            supervisors = list(self._supervisors)
+        running = [pid for supervisor in supervisors if (pid := supervisor.process_id) is not None]
+        memory_bytes = sum(map(_resident_bytes, running))
+        starts = sum(supervisor.starts for supervisor in supervisors)
+        return PoolState(len(running), self._workers, memory_bytes, len(self._tasks), starts)
+
     def submit(self, task: Task[ResultT], *, wait_s: float = 0.0) -> Pending[ResultT]:
         """As `DecoderProcesses.submit`; `Unavailable` also where the pool was closed."""
         agency_id = whose_rows()
@@ -113,7 +135,16 @@ class DecodePool:
         if self._supervisors or self._closed:
             return
         # children take these from the environment before they import numpy or OpenCV
+        delete_folders_of_the_dead()
         os.environ.update(ONE_THREAD, OPENCV_IO_MAX_IMAGE_PIXELS=str(self._max_pixels))
         self._supervisors = [WorkerSupervisor(self._tasks, self._decode, self._limits) for _ in range(self._workers)]
         for supervisor in self._supervisors:
             supervisor.start()
+
+
+def _resident_bytes(pid: int) -> int:
+    """Resident memory of a process; 0 where it has ended or the system does not say."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return 0

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import multiprocessing
 import queue
+import shutil
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, wait
 from concurrent.futures import TimeoutError as FutureTimeout
+from functools import cache
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import structlog
 
-from app.errors import Unavailable, UnreadableUpload
-from app.jobs.decoder_process import READY, ProcessLimits, serve_tasks
+from app import tracing
+from app.errors import ProcessStopped, Unavailable
+from app.jobs.decoder_process import READY, READY_WITH_NETWORK, serve_tasks
 from app.jobs.fair_queue import FairQueue
 from app.jobs.frame_tasks import DecodePlates
+from app.jobs.process_limits import ProcessLimits, new_folder
 from app.jobs.tasks import STEPS
 from app.services.request_work import add_processor_time, check_deadline
 
@@ -58,6 +63,7 @@ class Pending(Generic[T]):
         self.timeout_s = timeout_s
         self.stopped = False
         self.used_s = 0.0
+        self.traceparent = tracing.current()
         self._interrupt = interrupt
 
     def result(self) -> T:
@@ -109,9 +115,17 @@ class WorkerSupervisor(threading.Thread):
         self._lock = threading.Lock()
         self._process: BaseProcess | None = None
         self._connection: Connection | None = None
+        self._folder: Path | None = None
         self._current: Pending[Any] | None = None
         self._closing = False
         self._failed_at: float | None = None
+        self.starts = 0
+
+    @property
+    def process_id(self) -> int | None:
+        """Of its process, if that runs."""
+        with self._lock:
+            return self._process.pid if self._process is not None and self._process.is_alive() else None
 
     @property
     def is_up(self) -> bool:
@@ -170,7 +184,7 @@ class WorkerSupervisor(threading.Thread):
             if succeeded:
                 return answer
             raise answer
-        raise UnreadableUpload(
+        raise ProcessStopped(
             "the file stopped the decoder process, twice",
             field="file",
             cure="send the frame as the camera wrote it; if it is, report it as a defect",
@@ -187,14 +201,16 @@ class WorkerSupervisor(threading.Thread):
                 argument = self._wait_for(step) if isinstance(step, Future) else step
                 connection.send((STEPS[type(argument)], argument, number == len(pending.steps)))
             if connection.poll(pending.timeout_s):
-                answer: tuple[bool, Any] = connection.recv()
-                return answer
+                succeeded, result, times_ns = connection.recv()
+                for (name, *between), step in zip(times_ns, pending.steps, strict=True):
+                    tracing.record(name, pending.traceparent, tuple(between), task=type(step).__name__)
+                return succeeded, result
         finally:
             pending.used_s += time.monotonic() - started_s
             with self._lock:
                 self._current = None
         self._drop()
-        raise UnreadableUpload(
+        raise ProcessStopped(
             "decoding took too long and was stopped",
             field="file",
             limit=f"{pending.timeout_s:g} s a file",
@@ -236,7 +252,9 @@ class WorkerSupervisor(threading.Thread):
     def _try_to_start(self) -> Connection | None:
         self._drop()
         ours, theirs = _PROCESSES.Pipe()
-        process = _PROCESSES.Process(target=serve_tasks, args=(theirs, self._decode, self._limits), daemon=True)
+        folder = self._folder = new_folder()
+        arguments = (theirs, self._decode, self._limits, folder)
+        process = _PROCESSES.Process(target=serve_tasks, args=arguments, daemon=True)
         try:
             process.start()
             theirs.close()
@@ -244,8 +262,11 @@ class WorkerSupervisor(threading.Thread):
                 self._process, self._connection = process, ours
                 if self._closing:
                     process.kill()
-            if ours.poll(_START_S) and ours.recv() == READY:
+            if ours.poll(_START_S) and (said := ours.recv()) in (READY, READY_WITH_NETWORK):
                 self._failed_at = None
+                self.starts += 1
+                if said == READY_WITH_NETWORK:
+                    _warn_of_network()
                 return ours
         except (EOFError, OSError):
             pass
@@ -255,13 +276,20 @@ class WorkerSupervisor(threading.Thread):
     def _drop(self) -> None:
         """Kill the process, if there is one."""
         with self._lock:
-            process, connection = self._process, self._connection
-            self._process = self._connection = None
+            process, connection, folder = self._process, self._connection, self._folder
+            self._process = self._connection = self._folder = None
         if connection is not None:
             connection.close()
         if process is not None:
             process.kill()
             process.join()
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@cache
+def _warn_of_network() -> None:
+    _LOG.warning("decoder processes can reach the network: the kernel of this machine filters no system calls")
 
 
 def _was_stopped() -> Unavailable:

@@ -11,4 +11,4 @@ from app.services.surveys.imports import SurveyTask
 def read_survey_file(task: SurveyTask, _before: None) -> SurveyTable:
     """Read the rows of a survey."""
     with memory_is_the_limit("survey", "cut the survey into smaller ones"):
-        return read_survey(task.data, task.declaration, task.code_form)
+        return read_survey(task.file.read(), task.declaration, task.code_form)

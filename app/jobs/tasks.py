@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
+from app.jobs.artwork_tasks import draw_plate, write_sheets
 from app.jobs.calibration_tasks import calibrate_photos
 from app.jobs.decoder_process import ProcessIdTask, process_id
+from app.jobs.frame_list_tasks import read_frame_lists
 from app.jobs.frame_tasks import annotate_frame, find_markers, load_frame
 from app.jobs.package_tasks import list_package_parts, write_package_manifest, write_package_part
 from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
@@ -14,11 +16,17 @@ from app.jobs.plan_tasks import compare_plan, make_plan, summarize_road, write_f
 from app.jobs.proof_tasks import list_proof_units, prove_unit, write_proof
 from app.jobs.survey_tasks import read_survey_file
 from app.jobs.trace_tasks import decode_recording
+from app.jobs.track_tasks import write_track
+from app.jobs.video_tasks import decode_segment, index_frames
 from app.services.decoder_processes import Task
+from app.services.decodes.frame_poses import FrameListTask
 from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameSearch
 from app.services.decodes.packet_task import DriveTask, LaneTask, OverlayTask
 from app.services.decodes.trace_task import TraceTask
+from app.services.decodes.video_task import IndexVideoTask, SegmentTask
+from app.services.drives.track_task import TrackTask
 from app.services.fleet.calibrations import CalibrationTask
+from app.services.markers.artwork_tasks import DrawPlateTask, WriteSheetsTask
 from app.services.plans.package_tasks import ListPartsTask, WriteManifestTask, WritePartTask
 from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask
 from app.services.plans.tasks import CompareTask, MakePlanTask, SummarizeRoadTask, WriteMapTask, WritePlanFileTask
@@ -32,7 +40,10 @@ STEPS: dict[type, StepFunction] = {
     FramePicture: load_frame,
     FrameSearch: find_markers,
     AnnotationTask: annotate_frame,
+    FrameListTask: read_frame_lists,
     TraceTask: decode_recording,
+    IndexVideoTask: index_frames,
+    SegmentTask: decode_segment,
     DriveTask: read_drive,
     LaneTask: estimate_lane,
     OverlayTask: draw_overlay,
@@ -49,6 +60,9 @@ STEPS: dict[type, StepFunction] = {
     ListPartsTask: list_package_parts,
     WritePartTask: write_package_part,
     WriteManifestTask: write_package_manifest,
+    DrawPlateTask: draw_plate,
+    WriteSheetsTask: write_sheets,
+    TrackTask: write_track,
     ProcessIdTask: process_id,
 }
 

@@ -5,16 +5,21 @@ from __future__ import annotations
 import time
 
 import numpy as np
+import numpy.typing as npt
 
 from app.decoders.magnet.decoder import VERSION, decode_trace
 from app.decoders.magnet.identify import TagCandidates
 from app.decoders.magnet.readings import Finding
 from app.formats.traces.read import read_trace
+from app.formats.traces.series import NEAR_S
 from app.jobs.memory_limit import memory_is_the_limit
 from app.markers.magnet import InformationTag, parse_tag
 from app.plots.trace import plot_trace
 from app.sensors.magnetometer_bar import MagnetTrace
-from app.services.decodes.trace_task import TraceResult, TraceTask, TraceTerms, trace_terms
+from app.services.decodes.trace_task import TraceMotion, TraceResult, TraceTask, TraceTerms, trace_terms
+
+_MOTION_STEP_S = 0.1  # [s] source: app/tracks/dead_reckoning.py has a node every 0.1 s
+_MOTION_VALUES = 36_000  # at most; source: by hand, an hour, 0.5 MB of JSON
 
 
 def decode_recording(task: TraceTask, _before: None) -> TraceResult:
@@ -26,7 +31,8 @@ def decode_recording(task: TraceTask, _before: None) -> TraceResult:
 def _decode_recording(task: TraceTask) -> TraceResult:
     began = time.perf_counter()
     terms = trace_terms(task.declared)
-    file = read_trace({task.name: task.data}, terms.declaration, task.limits)
+    with task.file.open() as stream:
+        file = read_trace({task.name: stream}, terms.declaration, task.limits)
     loaded = time.perf_counter()
     trace = file.trace
     findings, version = _decode(task, terms, trace)
@@ -39,6 +45,7 @@ def _decode_recording(task: TraceTask) -> TraceResult:
         plot_trace(trace, terms.bar, findings).encode(),
         1e3 * (loaded - began),
         1e3 * (decoded - loaded),
+        _motion(trace),
     )
 
 
@@ -51,6 +58,31 @@ def _decode(task: TraceTask, terms: TraceTerms, trace: MagnetTrace) -> tuple[lis
     tags = [tag for text in task.tags if isinstance(tag := parse_tag(text), InformationTag)]
     candidates = TagCandidates(tags=tags) if tags else TagCandidates(formats=terms.formats or task.formats)
     return decode_trace(trace, terms.bar, candidates=candidates), VERSION
+
+
+def _motion(trace: MagnetTrace) -> TraceMotion:
+    """Speed and heading ten times a second, less often in recordings of more than an hour."""
+    duration = float(trace.t_s[-1] - trace.t_s[0])
+    step = max(_MOTION_STEP_S, duration / _MOTION_VALUES)
+    at = trace.t_s[0] + step * np.arange(int(duration / step) + 1)
+    speed = _near(at, trace.speed_t_s, trace.speed_m_s)
+    heading: list[float] = []
+    if trace.heading_t_s is not None and trace.heading_deg is not None:
+        heading = _near(at, trace.heading_t_s, np.unwrap(trace.heading_deg, period=360.0))
+    return TraceMotion(float(trace.t_s[0]), step, tuple(speed), tuple(value % 360.0 for value in heading))
+
+
+def _near(at: npt.NDArray[np.float64], time_s: npt.ArrayLike, values: npt.ArrayLike) -> list[float]:
+    """Values between samples; NaN where none is near, an empty list where there are none."""
+    time, given = np.asarray(time_s, float), np.asarray(values, float)
+    kept = np.isfinite(time) & np.isfinite(given)
+    time, given = time[kept], given[kept]
+    if not time.size:
+        return []
+    after = np.clip(np.searchsorted(time, at), 1, max(time.size - 1, 1))
+    near = np.minimum(np.abs(at - time[after - 1]), np.abs(at - time[np.minimum(after, time.size - 1)])) <= NEAR_S
+    joined: list[float] = np.where(near, np.interp(at, time, given), np.nan).tolist()
+    return joined
 
 
 def _driven_m(trace: MagnetTrace) -> float:

@@ -100,6 +100,8 @@ class PlateReading:
         Extent of the corners in the image. [px]
     reason : str
         Why it was refused, as a sentence.
+    frames : tuple of int
+        Frames whose evidence the code rests on together; empty where this frame alone shows it.
     """
 
     family: ClassVar[str] = "plate"
@@ -117,6 +119,7 @@ class PlateReading:
     height_px: float = 0.0
     width_px: float = 0.0
     reason: str = ""
+    frames: tuple[int, ...] = ()
 
     @property
     def digits(self) -> str | None:

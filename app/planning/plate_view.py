@@ -30,7 +30,7 @@ def project_road(
     return np.where(z > 0.05, u, np.nan), np.where(z > 0.05, v, np.nan)
 
 
-def unit_heights_px(camera: Camera, geometry: PlateGeometry, ahead_m: Floats, left_m: float = 0.0) -> Floats:
+def unit_heights_px(camera: Camera, geometry: PlateGeometry, ahead_m: Floats, left_m: float | Floats = 0.0) -> Floats:
     """Height of a unit's image when a plate's centre is at distances ahead, shape (K,); 0 where it is not in view. [px]
 
     The height of the whole plate's image over its number of units, as the proof has it.

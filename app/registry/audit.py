@@ -244,6 +244,15 @@ def find_head(connection: sa.Connection, agency_id: str) -> EntryRow | None:
     return find_one(connection, query, EntryRow)
 
 
+def count_history(connection: sa.Connection, agency_id: str) -> int:
+    """Number of entries of the agency's chain and of versions of its markers."""
+    counts = [
+        sa.select(sa.func.count()).select_from(table).where(table.c.agency_id == agency_id).scalar_subquery()
+        for table in (audit_log, marker_versions)
+    ]
+    return int(connection.execute(sa.select(counts[0] + counts[1])).scalar_one())
+
+
 def list_entries(connection: sa.Connection, agency_id: str, *, after: int = 0, limit: int = 100) -> list[EntryRow]:
     """Entries of the agency's chain, oldest first."""
     query = _ENTRIES.where(audit_log.c.agency_id == agency_id, audit_log.c.number > after)

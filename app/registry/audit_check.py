@@ -8,7 +8,7 @@ Only narrow columns are sorted: a sort of whole versions takes longer than all h
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import groupby
@@ -53,6 +53,15 @@ class ChainReport:
     entries: int = 0
     versions: int = 0
     head: tuple[int, str] | None = None
+    watch: Callable[[], None] | None = None
+    """Called from time to time."""
+
+    def count(self, entries: int = 0, versions: int = 0) -> None:
+        """Count what was gone through."""
+        self.entries += entries
+        self.versions += versions
+        if self.watch is not None and (self.entries + self.versions) % _PAGE == 0:
+            self.watch()
 
 
 def check_history(
@@ -129,7 +138,7 @@ def _check_log(
         if expected_head is not None and entry.number == expected_head[0] and entry.hash != expected_head[1]:
             yield Fault(where, "its hash is not the one that was expected: the history up to it was written anew")
         number, previous = entry.number, entry.hash
-        report.entries += 1
+        report.count(entries=1)
         report.head = (number, previous)
     while group is not None:
         yield _uncovered(group)
@@ -234,7 +243,7 @@ def _check_versions(connection: sa.Connection, agency_id: str, report: ChainRepo
     """Each version against its hash."""
     for row in connection.execute(sa.select(*_VERSION).where(*_written_after(agency_id, report.since))):
         version = _Version._make(row)
-        report.versions += 1
+        report.count(versions=1)
         if not version.is_as_written:
             where = f"version {version.version} of marker {version.marker_id}"
             yield Fault(where, "changed: its hash does not match its content")

@@ -10,14 +10,20 @@ import sqlalchemy as sa
 
 from app.registry.jobs import JobKind
 from app.registry.plan_tables import alignments, plans
+from app.registry.reprocessing_tables import decode_versions, reprocessed_decodes
 from app.registry.tables import decodes, jobs
+from app.registry.upload_tables import upload_parts, uploads
 
 COLUMNS = (
     decodes.c.upload_key,
     decodes.c.picture_key,
     jobs.c.upload_key,
+    upload_parts.c.blob_key,
+    uploads.c.store_key,
     alignments.c.source_key,
     plans.c.document_key,
+    decode_versions.c.picture_key,
+    reprocessed_decodes.c.picture_key,
 )
 """Columns that are the key of a blob."""
 _DOCUMENTS = (plans.c.proof, jobs.c.input, jobs.c.result)
@@ -33,7 +39,7 @@ def blob_references(connection: sa.Connection) -> Iterator[str]:
     for column in _DOCUMENTS:
         query = sa.select(sa.cast(column, sa.Text)).where(column.is_not(None))
         if column.table is jobs:
-            query = query.where(jobs.c.kind != JobKind.IMPORT)  # their reports are large and have no keys
+            query = query.where(jobs.c.kind.not_in((JobKind.IMPORT, JobKind.REPROCESS)))  # large, and have no keys
         for text in _stream(connection, query):
             yield from _KEY.findall(text)
 

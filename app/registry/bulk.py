@@ -125,6 +125,12 @@ def list_records(
     return [dict(zip(fields, row, strict=True)) for row in rows]
 
 
+def count_records(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> int:
+    """Number of the agency's markers that a filter leaves."""
+    query = sa.select(sa.func.count()).select_from(markers)
+    return int(connection.execute(query.where(markers.c.agency_id == agency_id, *conditions_of(filtered))).scalar_one())
+
+
 def have_ellipsoidal_heights(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> bool:
     """Whether every marker of the filter has an ellipsoidal height."""
     lacks = sa.or_(markers.c.height_m.is_(None), markers.c.vertical_datum != ELLIPSOID)

@@ -59,9 +59,13 @@ def list_by_number(connection: sa.Connection, agency_id: str, numbers: Iterable[
     return {int(row.digits): row for row in found}
 
 
-def list_spans(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, list[SpanRow]]:
-    """What was heard of each of these markers before, in the order it was uploaded."""
+def list_spans(
+    connection: sa.Connection, agency_id: str, numbers: Iterable[int], before_decode: str | None = None
+) -> dict[int, list[SpanRow]]:
+    """What was heard of each of these markers before, or before a decode, in the order it was uploaded."""
     query = select_rows(SpanRow, cerpm_spans).where(cerpm_spans.c.agency_id == agency_id).order_by(cerpm_spans.c.row)
+    if before_decode is not None:
+        query = query.where(cerpm_spans.c.decode_id < before_decode)
     found: dict[int, list[SpanRow]] = {}
     for row in fetch_in(connection, query, SpanRow, cerpm_spans.c.number, numbers):
         found.setdefault(row.number, []).append(row)

@@ -24,6 +24,7 @@ from app.errors import Unavailable
 from app.registry.engines import (
     BUSY_TIMEOUT_S,
     LONG,
+    WRITE,
     busy_is_unavailable,
     cut_commit_is_unknown,
     isolation,
@@ -51,6 +52,8 @@ class Database:
     ----------
     writes : int
         Write transactions that this process has ended: what was read since the last one is as it was.
+    waiting_writers : int
+        Write transactions of this process that wait for another one of it; nearly exact, for metrics.
     """
 
     def __init__(self, url: str) -> None:
@@ -78,6 +81,7 @@ class Database:
             )
         self._one_writer = threading.Lock()
         self.writes = 0
+        self.waiting_writers = 0
         self._lock_fd: int | None = None
 
     @property
@@ -99,10 +103,20 @@ class Database:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._lock_fd = _lock_file(self.path.with_name(self.path.name + ".lock"), self.path)
 
-    def close(self) -> None:
-        """Close the connections and release the file."""
+    def pools(self) -> Iterator[tuple[str, sa.QueuePool]]:
+        """The pools of connections, by what they are for."""
+        for name, engine in (("transactions", self.engine), ("questions", self._asking)):
+            if isinstance(engine.pool, sa.QueuePool):
+                yield name, engine.pool
+
+    def disconnect(self) -> None:
+        """Close the connections, and open new ones when they are needed."""
         self.engine.dispose()
         self._asking.dispose()
+
+    def close(self) -> None:
+        """Close the connections and release the file."""
+        self.disconnect()
         if self._lock_fd is not None:
             os.close(self._lock_fd)
             self._lock_fd = None
@@ -151,8 +165,12 @@ class Database:
         long : bool, optional
             Single statements may take as long as they take: migrations, bulk imports.
         """
-        if not self._one_writer.acquire(timeout=BUSY_TIMEOUT_S):
-            raise Unavailable("the database is busy", cure="try again in a few seconds")
+        self.waiting_writers += 1
+        try:
+            if not self._one_writer.acquire(timeout=BUSY_TIMEOUT_S):
+                raise Unavailable("the database is busy", cure="try again in a few seconds")
+        finally:
+            self.waiting_writers -= 1
         try:
             with busy_is_unavailable(), self.engine.connect() as connection:
                 connection = connection.execution_options(**isolation(self.url, write=True), **{LONG: long})
@@ -168,6 +186,15 @@ class Database:
         finally:
             self.writes += 1
             self._one_writer.release()
+
+    @contextmanager
+    def write_aside(self) -> Iterator[sa.Connection]:
+        """A write transaction that does not wait for others, for what no other transaction relies on: leases."""
+        with busy_is_unavailable(), self.engine.connect() as connection:
+            options = {WRITE: False, "isolation_level": "READ COMMITTED", "postgresql_readonly": False}
+            connection = connection.execution_options(**options if self.path is None else {WRITE: True})
+            with connection.begin():
+                yield connection
 
     def migrate(self, revision: str = "head") -> None:
         """Bring the schema to a revision, up or down, in one transaction."""
@@ -185,6 +212,21 @@ class Database:
         """The revision of the schema; None if there is none."""
         with self.read() as connection:
             return MigrationContext.configure(connection).get_current_revision()
+
+    def count_other_clients(self) -> int:
+        """Connections of other Waymark processes to a PostgreSQL database; an open SQLite file is ours alone."""
+        if self.path is not None:
+            return 0
+        own = self.url.query.get("application_name", "waymark")
+        with self.engine.connect() as connection:
+            self._asking.dispose()
+            return int(
+                connection.exec_driver_sql(
+                    "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database()"
+                    " AND application_name = %s AND pid <> pg_backend_pid() AND usename = session_user",
+                    (own,),
+                ).scalar_one()
+            )
 
     def is_ready(self) -> bool:
         """Whether the schema is current and a write transaction can start."""
@@ -243,6 +285,11 @@ def alembic_config() -> Config:
 def head_revision() -> str | None:
     """The newest revision of the migrations."""
     return ScriptDirectory.from_config(alembic_config()).get_current_head()
+
+
+def is_known_revision(revision: str) -> bool:
+    """Whether the migrations of this version have a revision."""
+    return any(script.revision == revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions())
 
 
 def _lock_file(lock: Path, database: Path) -> int:

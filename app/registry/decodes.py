@@ -30,6 +30,10 @@ class DecodeRow(NamedTuple):
         What was declared of the upload.
     upload_key, picture_key : str or None
         Keys of the blobs of the upload and of the plot.
+    upload_bytes : int or None
+        Size of the upload; None of those that were stored before it was recorded. [byte]
+    upload_sha256 : str or None
+        Its hash, in hexadecimal digits.
     result : dict or None
         None until the decode is done.
     """
@@ -46,6 +50,8 @@ class DecodeRow(NamedTuple):
     progress: float = 0.0
     attempts: int = 0
     error: dict[str, str] | None = None
+    upload_bytes: int | None = None
+    upload_sha256: str | None = None
 
 
 class NewObservation(NamedTuple):
@@ -89,7 +95,8 @@ _ADD_OBSERVATIONS = {
 def add_decode(connection: sa.Connection, agency_id: str, holder_id: str | None, decode: DecodeRow) -> None:
     """Store a new decode, uploaded with the key of a holder; the columns of its job are not stored here."""
     values = {name: value for name, value in decode._asdict().items() if name in decodes.c}
-    connection.execute(_ADD_DECODE, {**values, "agency_id": agency_id, "holder_id": holder_id})
+    owner = {"agency_id": agency_id, "holder_id": holder_id}
+    connection.execute(_ADD_DECODE, {**values, **owner, "decoder": (decode.result or {}).get("decoder")})
 
 
 def get_decode(connection: sa.Connection, agency_id: str, decode_id: str, *, holder_id: str | None = None) -> DecodeRow:
@@ -132,7 +139,14 @@ def store_result(
 ) -> None:  # fmt: skip
     """Store the result of a decode that was queued, in the transaction that finishes its job."""
     own = sa.update(decodes).where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
-    connection.execute(own.values(result=result, picture_key=picture_key, finished_at=now))
+    decoder = result.get("decoder")
+    connection.execute(own.values(result=result, picture_key=picture_key, finished_at=now, decoder=decoder))
+
+
+def store_part(connection: sa.Connection, agency_id: str, decode_id: str, result: Mapping[str, Any]) -> None:
+    """Store the result so far of a decode that runs."""
+    own = sa.update(decodes).where(decodes.c.id == decode_id, decodes.c.agency_id == agency_id)
+    connection.execute(own.values(result=result))
 
 
 def add_observations(connection: sa.Connection, agency_id: str, decode_id: str, rows: Sequence[NewObservation]) -> None:

@@ -9,8 +9,10 @@ from typing import Any, Literal, NamedTuple
 
 import sqlalchemy as sa
 
+from app import tracing
 from app.errors import NotFound
-from app.registry.rows import fetch_all, find_one, select_rows
+from app.registry.events import add_event
+from app.registry.rows import fetch_all, fetch_in, find_one, select_rows
 from app.registry.tables import jobs
 
 JobState = Literal["queued", "running", "done", "failed", "cancelled"]
@@ -30,6 +32,16 @@ class JobKind(StrEnum):
     """Proves a plan by simulated drives; finished units are in `proof_units`."""
     PACKAGE = "package"
     """Writes all files of a plan into one ZIP."""
+    ARTWORK = "artwork"
+    """Draws plates into one ZIP."""
+    REPROCESS = "reprocess"
+    """Decodes a shard of stored uploads again."""
+    EXPORT = "export"
+    """Writes markers into a file."""
+    DRIVE = "drive"
+    """Fuses decodes of one drive into a track. The input names them, the result is its report and its files."""
+    AUDIT = "audit"
+    """Verifies the agency's log."""
 
 
 class JobRow(NamedTuple):
@@ -51,6 +63,10 @@ class JobRow(NamedTuple):
         Of the row that it is about, e.g. a plan.
     steps_done, steps_total : int or None
         Of jobs that are divided into steps, once they are known.
+    started_at : datetime or None
+        When it was started first.
+    dead_letter : bool
+        Whether it failed because it stopped the processes that worked on it.
     """
 
     id: str
@@ -70,6 +86,16 @@ class JobRow(NamedTuple):
     subject_id: str | None = None
     steps_done: int | None = None
     steps_total: int | None = None
+    started_at: datetime | None = None
+    dead_letter: bool = False
+
+
+class UnfinishedJob(NamedTuple):
+    """A job that is still to be done."""
+
+    id: str
+    agency_id: str
+    kind: JobKind
 
 
 def new_job(
@@ -85,7 +111,12 @@ def new_job(
 
 def add_job(connection: sa.Connection, job: JobRow) -> None:
     """Store a new job."""
-    connection.execute(sa.insert(jobs), job._asdict())
+    connection.execute(sa.insert(jobs), {**job._asdict(), "traceparent": tracing.current()})
+
+
+def find_traceparent(connection: sa.Connection, job_id: str) -> str | None:
+    """The context of the span that made a job."""
+    return connection.execute(sa.select(jobs.c.traceparent).where(jobs.c.id == job_id)).scalar_one_or_none()
 
 
 def get_job(connection: sa.Connection, agency_id: str, kind: JobKind | Sequence[JobKind], job_id: str) -> JobRow:
@@ -104,13 +135,31 @@ def get_job(connection: sa.Connection, agency_id: str, kind: JobKind | Sequence[
     return row
 
 
+def find_job(connection: sa.Connection, agency_id: str, job_id: str) -> JobRow | None:
+    """One job of the agency, of any kind."""
+    return find_one(
+        connection, select_rows(JobRow, jobs).where(jobs.c.id == job_id, jobs.c.agency_id == agency_id), JobRow
+    )
+
+
+def list_progress(connection: sa.Connection, job_ids: Sequence[str]) -> list[JobRow]:
+    """Jobs with some ids, of the agencies of the transaction, without their inputs and results."""
+    query = sa.select(*_without("input", "result"))
+    return list(fetch_in(connection, query, JobRow, jobs.c.id, job_ids))
+
+
+def _without(*names: str) -> list[sa.ColumnElement[Any]]:
+    return [sa.null().label(name) if name in names else jobs.c[name] for name in JobRow._fields]
+
+
 def list_jobs(
     connection: sa.Connection, agency_id: str, kind: JobKind | Sequence[JobKind],
-    *, state: str | None, before: str | None, limit: int, subject_id: str | None = None,
+    *, state: str | None, before: str | None, limit: int, subject_id: str | None = None, holder_id: str | None = None,
 ) -> list[JobRow]:  # fmt: skip
-    """Jobs of one kind or of several without their results, newest first."""
-    columns = [sa.null().label("result") if name == "result" else jobs.c[name] for name in JobRow._fields]
-    query = sa.select(*columns).where(jobs.c.agency_id == agency_id, _of_kind(kind))
+    """Jobs of one kind or of several without their results, newest first; of anybody, or of one holder of a key."""
+    query = sa.select(*_without("result")).where(jobs.c.agency_id == agency_id, _of_kind(kind))
+    if holder_id is not None:
+        query = query.where(jobs.c.holder_id == holder_id)
     if subject_id is not None:
         query = query.where(jobs.c.subject_id == subject_id)
     if state is not None:
@@ -128,31 +177,6 @@ def find_job_about(
         jobs.c.subject_id == subject_id, jobs.c.agency_id == agency_id, jobs.c.kind == kind, jobs.c.state.in_(states)
     )
     return find_one(connection, query.order_by(jobs.c.id.desc()).limit(1), JobRow)
-
-
-def list_unfinished(connection: sa.Connection, kinds: Sequence[JobKind] = tuple(JobKind)) -> list[tuple[str, str]]:
-    """Ids and agencies of the jobs of some kinds and all agencies that are still to be done, oldest first."""
-    unfinished = jobs.c.state.in_(UNFINISHED)
-    query = sa.select(jobs.c.id, jobs.c.agency_id).where(unfinished, _of_kind(kinds)).order_by(jobs.c.id)
-    return [(job_id, agency_id) for job_id, agency_id in connection.execute(query)]
-
-
-def start_job(connection: sa.Connection, job_id: str) -> JobRow | None:
-    """Start a job that is queued, or that an earlier process left running; None if it is finished or gone."""
-    statement = (
-        sa.update(jobs)
-        .where(jobs.c.id == job_id, jobs.c.state.in_(UNFINISHED))
-        .values(state="running", attempts=jobs.c.attempts + 1)
-    )
-    if connection.execute(statement).rowcount != 1:
-        return None
-    return find_one(connection, select_rows(JobRow, jobs).where(jobs.c.id == job_id), JobRow)
-
-
-def return_attempt(connection: sa.Connection, job_id: str) -> None:
-    """Do not count the start of a job that stopped through no fault of its own."""
-    statement = sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state == "running", jobs.c.attempts > 0)
-    connection.execute(statement.values(attempts=jobs.c.attempts - 1))
 
 
 def record_progress(
@@ -187,29 +211,68 @@ def request_cancel(
     Parameters
     ----------
     below_progress : float, optional
-        A running job that has come so far is not stopped any more.
+        A job that has come so far is not stopped any more, nor while it waits to go on.
     """
-    own = (jobs.c.id == job_id, jobs.c.agency_id == agency_id)
+    own = (jobs.c.id == job_id, jobs.c.agency_id == agency_id, jobs.c.progress < below_progress)
     queued = sa.update(jobs).where(*own, jobs.c.state == "queued")
-    connection.execute(queued.values(state="cancelled", cancel_requested=True, finished_at=now))
-    running = sa.update(jobs).where(*own, jobs.c.state == "running", jobs.c.progress < below_progress)
+    end_job(connection, queued.values(state="cancelled", cancel_requested=True, finished_at=now), now)
+    running = sa.update(jobs).where(*own, jobs.c.state == "running")
     connection.execute(running.values(cancel_requested=True))
 
 
 def finish_job(
     connection: sa.Connection, job_id: str, state: JobState, now: datetime,
     *, result: Mapping[str, Any] | None = None, error: Mapping[str, object] | None = None,
-    subject_id: str | None = None,
+    subject_id: str | None = None, dead_letter: bool = False,
 ) -> bool:  # fmt: skip
-    """Record how a job ended, unless it has ended before. Returns whether it did now."""
-    values: dict[str, Any] = {"state": state, "finished_at": now, "result": result, "error": error}
+    """Record how a job ended, unless it has ended before. Returns whether it did now.
+
+    Parameters
+    ----------
+    dead_letter : bool, optional
+        It stopped the processes that worked on it, so it is not to be run again as it is.
+    """
+    values: dict[str, Any] = {
+        "state": state, "finished_at": now, "result": result, "error": error, "dead_letter": dead_letter,
+        "lease_until": None,
+    }  # fmt: skip
     if subject_id is not None:
         values["subject_id"] = subject_id
     if state == "done":
         values["progress"] = 1.0
     statement = sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state.in_(UNFINISHED)).values(**values)
+    return end_job(connection, statement, now)
+
+
+def delete_job(connection: sa.Connection, agency_id: str, job_id: str) -> bool:
+    """Delete a finished job with its result. Returns whether there was one."""
+    statement = sa.delete(jobs).where(
+        jobs.c.id == job_id, jobs.c.agency_id == agency_id, jobs.c.state.not_in(UNFINISHED)
+    )
     return connection.execute(statement).rowcount == 1
+
+
+def end_job(connection: sa.Connection, statement: sa.Update, now: datetime) -> bool:
+    """End a job by a statement, with an event for those who wait for it. Returns whether it had not ended before."""
+    returned = statement.returning(jobs.c.id, jobs.c.agency_id, jobs.c.kind, jobs.c.state)
+    ended = connection.execute(returned).one_or_none()
+    if ended is None:
+        return False
+    detail = {"job_kind": ended.kind}
+    add_event(connection, ended.agency_id, f"job.{ended.state}", subject_id=ended.id, at=now, detail=detail)
+    return True
 
 
 def _of_kind(kind: JobKind | Sequence[JobKind]) -> sa.ColumnElement[bool]:
     return jobs.c.kind == kind if isinstance(kind, JobKind) else jobs.c.kind.in_(kind)
+
+
+def list_ended(connection: sa.Connection, kinds: Sequence[JobKind], before: datetime) -> list[JobRow]:
+    """Jobs of some kinds that were done before a time, of the agencies of the transaction."""
+    query = select_rows(JobRow, jobs).where(jobs.c.state == "done", _of_kind(kinds), jobs.c.finished_at < before)
+    return fetch_all(connection, query.order_by(jobs.c.id), JobRow)
+
+
+def replace_result(connection: sa.Connection, job_id: str, result: Mapping[str, Any]) -> None:
+    """Store another result of a job that is done."""
+    connection.execute(sa.update(jobs).where(jobs.c.id == job_id, jobs.c.state == "done").values(result=dict(result)))

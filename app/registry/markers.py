@@ -66,12 +66,17 @@ def get_markers(connection: sa.Connection, agency_id: str, marker_ids: list[str]
     NotFound
         One is missing, or belongs to another agency.
     """
-    query = MARKERS.where(markers.c.agency_id == agency_id)
-    found = {row.id: row for row in fetch_in(connection, query, MarkerRow, markers.c.id, marker_ids)}
+    found = {row.id: row for row in find_markers(connection, agency_id, marker_ids)}
     missing = next((marker_id for marker_id in marker_ids if marker_id not in found), None)
     if missing is not None:
         raise NotFound(f"there is no marker {missing}", field="marker_ids")
     return [found[marker_id] for marker_id in marker_ids]
+
+
+def find_markers(connection: sa.Connection, agency_id: str, marker_ids: list[str]) -> list[MarkerRow]:
+    """Those of several markers that the agency has, in any order."""
+    query = MARKERS.where(markers.c.agency_id == agency_id)
+    return list(fetch_in(connection, query, MarkerRow, markers.c.id, marker_ids))
 
 
 def list_markers(

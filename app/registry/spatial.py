@@ -34,7 +34,7 @@ def _rtree(table: str) -> sa.TableClause:
     return sa.table(f"{table}_rtree", *(sa.column(name, sa.Double) for name in names))
 
 
-_RTREES = {table: _rtree(table) for table in ("markers", "magnets", "planned_markers")}
+_RTREES = {table: _rtree(table) for table in ("markers", "magnets", "planned_markers", "maintenance_items")}
 
 
 @dataclass(frozen=True, slots=True)

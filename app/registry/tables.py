@@ -7,6 +7,10 @@ import sqlalchemy as sa
 from app.markers.status import STATUSES
 from app.registry import column_types
 from app.registry.column_types import ID, UtcTime, agency_column, one_of
+from app.registry.health_tables import events as events
+from app.registry.health_tables import maintenance_items as maintenance_items
+from app.registry.health_tables import marker_health as marker_health
+from app.registry.health_tables import unregistered_readings as unregistered_readings
 from app.registry.metadata import metadata as metadata
 from app.registry.plan_feature_tables import alignment_lanes as alignment_lanes
 from app.registry.plan_feature_tables import planned_markers as planned_markers
@@ -15,6 +19,14 @@ from app.registry.plan_tables import plan_markers as plan_markers
 from app.registry.plan_tables import plan_versions as plan_versions
 from app.registry.plan_tables import plans as plans
 from app.registry.plan_tables import proof_units as proof_units
+from app.registry.reprocessing_tables import decode_versions as decode_versions
+from app.registry.reprocessing_tables import reprocessed_decodes as reprocessed_decodes
+from app.registry.reprocessing_tables import reprocessings as reprocessings
+from app.registry.upload_tables import stored_bytes as stored_bytes
+from app.registry.upload_tables import upload_parts as upload_parts
+from app.registry.upload_tables import uploads as uploads
+from app.registry.webhook_tables import webhook_deliveries as webhook_deliveries
+from app.registry.webhook_tables import webhooks as webhooks
 
 agencies = sa.Table(
     "agencies",
@@ -229,14 +241,18 @@ decodes = sa.Table(
     sa.Column("holder_id", sa.String(200)),  # of the key that uploaded it
     sa.Column("context", sa.JSON, nullable=False),
     sa.Column("upload_key", sa.String(200)),
+    sa.Column("upload_bytes", sa.BigInteger),
+    sa.Column("upload_sha256", sa.String(64)),
     sa.Column("picture_key", sa.String(200)),
     sa.Column("result", sa.JSON(none_as_null=True)),
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("finished_at", UtcTime),  # when the result was stored
+    sa.Column("decoder", sa.String(200)),  # of the result, with its release
     sa.Index("ix_decodes_agency_id_id", "agency_id", "id"),
 )
 
 # work that outlives the request that asked for it; what is true of a job is true in its row, and nowhere else
+UNFINISHED_JOBS = sa.text("state IN ('queued', 'running')")
 jobs = sa.Table(
     "jobs",
     metadata,
@@ -257,10 +273,26 @@ jobs = sa.Table(
     sa.Column("subject_id", ID),  # of the row that it is about, e.g. a plan
     sa.Column("steps_done", sa.Integer),
     sa.Column("steps_total", sa.Integer),
+    sa.Column("started_at", UtcTime),  # first
+    sa.Column("runner", sa.String(100)),  # the run of a job that has the lease
+    sa.Column("lease_until", UtcTime),
+    sa.Column("turn_at", UtcTime),  # when it was started last
+    sa.Column("dead_letter", sa.Boolean, nullable=False, server_default=sa.false()),
+    sa.Column("traceparent", sa.String(55)),  # of the span that made it
     one_of("state", column_types.JOB_STATES),
     sa.Index("ix_jobs_agency_id_kind_id", "agency_id", "kind", "id"),
+    sa.Index("ix_jobs_agency_id_id", "agency_id", "id"),
     sa.Index("ix_jobs_state", "state"),
     sa.Index("ix_jobs_subject_id", "subject_id"),
+    sa.Index("ix_jobs_agency_id_kind_turn_at", "agency_id", "kind", "turn_at"),
+    sa.Index(
+        "ix_jobs_unfinished",
+        "kind",
+        "agency_id",
+        "id",
+        postgresql_where=UNFINISHED_JOBS,
+        sqlite_where=UNFINISHED_JOBS,
+    ),
 )
 
 observations = sa.Table(

@@ -33,6 +33,8 @@ class Camera:
         Clockwise about the optical axis, seen from behind the camera. [deg]
     forward_m, left_m : float
         Optical centre in the vehicle frame (ISO 8855) from the vehicle's reference point on the road. [m]
+    readout_s : float
+        Rolling shutter: time from the first row's exposure to the last's; 0 is a global shutter. [s]
     """
 
     width_px: int
@@ -48,6 +50,7 @@ class Camera:
     roll_deg: float = 0.0
     forward_m: float = 0.0
     left_m: float = 0.0
+    readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         if self.width_px < 1 or self.height_px < 1:
@@ -56,6 +59,8 @@ class Camera:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise InvalidParameter(f"{name} must be positive", field=f"camera.{name}", limit="> 0")
+        if not 0 <= self.readout_s <= 1:
+            raise InvalidParameter("readout_s is 0 to 1 s", field="camera.readout_s", limit="0 to 1 s")
         if len(self.distortion) not in (0, 4, 5, 8):
             raise InvalidParameter(
                 "distortion has 0, 4, 5 or 8 coefficients", field="camera.distortion", limit="0, 4, 5 or 8 values"
@@ -74,6 +79,7 @@ class Camera:
         roll_deg: float = 0.0,
         forward_m: float = 0.0,
         left_m: float = 0.0,
+        readout_s: float = 0.0,
     ) -> Camera:
         """Camera with square pixels and a centred principal point from its horizontal field of view. [deg]"""
         if not 1 <= horizontal_fov_deg < 179:
@@ -85,7 +91,7 @@ class Camera:
         focal_px = width_px / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
         return cls(
             width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, (),
-            height_m, depression_deg, azimuth_deg, roll_deg, forward_m, left_m,
+            height_m, depression_deg, azimuth_deg, roll_deg, forward_m, left_m, readout_s,
         )  # fmt: skip
 
     @property

@@ -6,7 +6,7 @@ from typing import NotRequired, cast
 
 from typing_extensions import TypedDict
 
-from app.errors import WaymarkError
+from app.errors import ProcessStopped, UnreadableUpload, WaymarkError
 
 _MAX_CHARACTER_BYTES = 6  # of JSON; source: RFC 8259 section 7, \u0001
 
@@ -36,9 +36,13 @@ class ErrorDocument(ErrorCause):
 
 
 def error_document(error: WaymarkError) -> ErrorDocument:
-    """An error as it is stored in a job or in a result."""
+    """An error as it is stored in a job or in a result.
+
+    Clients know `ProcessStopped` as `UnreadableUpload`, as in problem documents.
+    """
+    kind = UnreadableUpload if isinstance(error, ProcessStopped) else type(error)
     return {
-        "kind": type(error).__name__,
+        "kind": kind.__name__,
         "detail": error.message,
         **error_cause(error.field, error.limit, error.cure),
     }

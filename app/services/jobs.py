@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Protocol
 
 import sqlalchemy as sa
 import structlog
 
-from app.errors import StorageFull, Unavailable, UnreadableUpload, WaymarkError, is_disk_full
+from app import tracing
+from app.errors import ProcessStopped, StorageFull, Unavailable, WaymarkError, is_disk_full
+from app.registry import job_leases as leases
 from app.registry import jobs as store
 from app.registry.database import Database
-from app.registry.jobs import JobKind, JobRow, JobState
+from app.registry.jobs import JobKind, JobRow, JobState, UnfinishedJob
 from app.registry.tenancy import across_agencies, acting_for
 from app.services.error_documents import error_document
-from app.services.ports import Clock
+from app.services.job_leases import LeaseKeeper
+from app.services.ports import Clock, DeadLetters
 
 MAX_ATTEMPTS = 10
 """How often a job is started; one that never ends then fails. Starts that ended because the server was stopped, or a
@@ -43,7 +47,7 @@ class RunningJob:
 
     def report_progress(
         self, progress: float, *, steps: tuple[int, int] | None = None,
-        keep: Callable[[sa.Connection], None] | None = None,
+        keep: Callable[[sa.Connection], None] | None = None, resumable: bool = True,
     ) -> None:  # fmt: skip
         """Record how far the job is.
 
@@ -56,6 +60,8 @@ class RunningJob:
         keep : callable, optional
             Stores a part of the result in the same transaction, so that the next attempt goes on from there. A job
             that gets on is never given up for its number of attempts.
+        resumable : bool, optional
+            Whether the next attempt goes on from there; if not, the part is only for those who look meanwhile.
 
         Raises
         ------
@@ -63,7 +69,9 @@ class RunningJob:
             Somebody asked the job to stop; nothing was kept.
         """
         with self._database.write() as connection:
-            if not store.record_progress(connection, self.row.id, progress, steps=steps, kept=keep is not None):
+            if not store.record_progress(
+                connection, self.row.id, progress, steps=steps, kept=keep is not None and resumable
+            ):
                 raise JobCancelled
             if keep is not None:
                 keep(connection)
@@ -78,11 +86,13 @@ class RunningJob:
         """
         return store.finish_job(connection, self.row.id, "done", self._clock(), result=result, subject_id=subject_id)
 
-    def end(self, state: JobState, error: WaymarkError | None = None) -> None:
-        """Record that the job ended without a result."""
+    def end(self, state: JobState, error: WaymarkError | None = None, *, dead_letter: bool = False) -> bool:
+        """Record that the job ended without a result. Returns whether this was the first time."""
         document = error_document(error) if error is not None else None
         with self._database.write() as connection:
-            store.finish_job(connection, self.row.id, state, self._clock(), error=document)
+            return store.finish_job(
+                connection, self.row.id, state, self._clock(), error=document, dead_letter=dead_letter
+            )
 
 
 class JobHandler(Protocol):
@@ -103,6 +113,7 @@ class Jobs:
     database : Database
     clock : Clock
     handlers : mapping of JobKind to JobHandler
+    dead_letters : DeadLetters, optional
     max_attempts : int, optional
     """
 
@@ -111,59 +122,117 @@ class Jobs:
         database: Database,
         clock: Clock,
         handlers: Mapping[JobKind, JobHandler],
+        dead_letters: DeadLetters | None = None,
         max_attempts: int = MAX_ATTEMPTS,
     ) -> None:
         self._database, self._clock = database, clock
         self._handlers = handlers
+        self._dead_letters = dead_letters
         self._max_attempts = max_attempts
+        self._leases = LeaseKeeper(database, clock)
 
-    def run_job(self, job_id: str) -> None:
+    def run_job(self, job_id: str) -> bool:
         """Run a queued job. It may be called again and at the same time: the effect happens once.
+
+        Returns
+        -------
+        bool
+            Whether it ran: not if it is finished or gone, or if another process runs it.
 
         Raises
         ------
         Unavailable
-            The decoder processes or the stores do not answer; the job stays unfinished and can be run again.
+            The decoder processes or the stores do not answer; the job waits and can be run again.
         """
+        runner = self._leases.new_runner()
         with across_agencies(), self._database.write() as connection:
-            row = store.start_job(connection, job_id)
-        if row is not None:
-            with acting_for(row.agency_id):
-                self._run(RunningJob(self._database, self._clock, row))
+            row = leases.start_job(connection, job_id, self._clock(), runner)
+        return self._run_started(row, runner)
 
-    def list_unfinished(self, kinds: Sequence[JobKind] = tuple(JobKind)) -> list[tuple[str, str]]:
-        """Ids and agencies of the jobs of some kinds that an earlier process left unfinished."""
+    def run_next(self, kinds: Sequence[JobKind]) -> bool:
+        """Run the job of some kinds whose turn it is: agencies take turns. As `run_job` otherwise."""
+        runner = self._leases.new_runner()
+        with across_agencies(), self._database.write() as connection:
+            now = self._clock()
+            found = leases.list_next(connection, kinds, now)
+            row = leases.start_job(connection, found[0].id, now, runner) if found else None
+        return self._run_started(row, runner)
+
+    def list_startable(self) -> list[UnfinishedJob]:
+        """The jobs that wait, and those of processes that died."""
         with across_agencies(), self._database.read() as connection:
-            return store.list_unfinished(connection, kinds)
+            return leases.list_startable(connection, self._clock())
 
-    def _run(self, job: RunningJob) -> None:
+    @contextmanager
+    def counted(self) -> Iterator[dict[JobKind, int] | None]:
+        """Numbers of jobs that wait or were left by processes that died; None while another process counts them."""
+        with across_agencies(), self._database.read() as connection:
+            alone = leases.is_only_one(connection)
+            yield leases.count_startable(connection, self._clock()) if alone else None
+
+    def _run_started(self, row: JobRow | None, runner: str) -> bool:
+        if row is None:
+            return False
+        with (
+            structlog.contextvars.bound_contextvars(job_id=row.id, kind=row.kind),
+            tracing.span("job", parent=self._traceparent(row), job_id=row.id, kind=row.kind),
+            acting_for(row.agency_id),
+            self._leases.keep(runner),
+        ):
+            began_s = time.perf_counter()
+            try:
+                self._run(RunningJob(self._database, self._clock, row), runner)
+            finally:
+                _LOG.info("job", agency=row.agency_id, ms=round(1e3 * (time.perf_counter() - began_s), 2))
+        return True
+
+    def _traceparent(self, row: JobRow) -> str | None:
+        """The context of the span that made a job; not asked for where nothing is recorded."""
+        if not tracing.is_on():
+            return None
+        with acting_for(row.agency_id), self._database.read() as connection:
+            return store.find_traceparent(connection, row.id)
+
+    def _run(self, job: RunningJob, runner: str) -> None:
+        if job.row.cancel_requested:
+            job.end("cancelled")
+            return
         if job.row.attempts > self._max_attempts:
-            job.end("failed", _too_many_attempts(self._max_attempts))
+            self._bury(job, _too_many_attempts(self._max_attempts))
             return
         try:
             self._handlers[JobKind(job.row.kind)].run(job)
         except JobCancelled:
             job.end("cancelled")
         except Unavailable:
-            self._return_attempt(job)
+            self._return(job, runner)
             raise
+        except ProcessStopped as error:
+            self._bury(job, error)
         except WaymarkError as error:
             job.end("failed", error)
         except Exception as error:
             if is_disk_full(error):
-                self._return_attempt(job)
+                self._return(job, runner)
                 raise StorageFull("the folder for temporary files") from error
             # a defect must not leave a job that runs for ever
-            _LOG.exception("a job failed on a defect", job_id=job.row.id, kind=job.row.kind)
+            _LOG.exception("a job failed on a defect")
             job.end("failed", WaymarkError("the job failed on a defect of the server; its log has the details"))
 
-    def _return_attempt(self, job: RunningJob) -> None:
+    def _bury(self, job: RunningJob, error: WaymarkError) -> None:
+        """Fail a job that stopped its processes."""
+        if job.end("failed", error, dead_letter=True):
+            _LOG.warning("a job stopped its process", why=error.message)
+            if self._dead_letters is not None:
+                self._dead_letters.bury(job.row.id, JobKind(job.row.kind), error.message)
+
+    def _return(self, job: RunningJob, runner: str) -> None:
         with suppress(Unavailable), self._database.write() as connection:
-            store.return_attempt(connection, job.row.id)
+            leases.return_job(connection, job.row.id, runner, self._clock())
 
 
 def _too_many_attempts(attempts: int) -> WaymarkError:
-    return UnreadableUpload(
+    return ProcessStopped(
         "the job was started again and again and never finished",
         field="file",
         limit=f"{attempts} attempts",

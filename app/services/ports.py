@@ -1,11 +1,15 @@
-"""What the use cases need from outside; app/main.py wires it."""
+"""What the use cases need from outside; app/wiring.py wires it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
 from typing import Protocol
+
+from app.formats.spooled_file import SpooledFile
+from app.registry.jobs import JobKind
 
 
 class Clock(Protocol):
@@ -23,6 +27,12 @@ class Blobs(Protocol):
 
     def put_file(self, key: str, path: Path) -> None:
         """Write a blob from a file."""
+
+    def take_file(self, key: str, path: Path) -> None:
+        """Write a blob from a file that nobody changes any more."""
+
+    def opened(self, key: str) -> AbstractContextManager[SpooledFile]:
+        """A blob as a file of this machine, which has a path; only inside the block."""
 
     def get(self, key: str) -> bytes:
         """Content of a blob."""
@@ -43,5 +53,12 @@ class Blobs(Protocol):
 class JobQueue(Protocol):
     """Where jobs wait for a worker."""
 
-    def submit(self, job_id: str, agency_id: str) -> None:
-        """Have ``run_job(job_id)`` called, at least once; agencies take turns."""
+    def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
+        """Have ``run_job(job_id)`` called, at least once; agencies take turns in the queue of the kind."""
+
+
+class DeadLetters(Protocol):
+    """Where jobs are reported that stopped the processes that worked on them."""
+
+    def bury(self, job_id: str, kind: JobKind, reason: str) -> None:
+        """Report a job that has failed for this reason; its row has both, too."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import structlog
 
 from app.errors import CommitUnknown, Unavailable
+from app.formats.spooled_file import SpooledFile
 from app.services.ports import Blobs
 from app.storage.blobs import new_blob_key
 
@@ -34,6 +35,16 @@ class StagedBlobs:
         key = new_blob_key(folder)
         self._keys.append(key)
         self._blobs.put_file(key, path)
+        return key
+
+    def add(self, folder: str, file: SpooledFile) -> str:
+        """Write an upload as a blob; its temporary file may become the blob. Returns its key."""
+        key = new_blob_key(folder)
+        self._keys.append(key)
+        if file.path is None:
+            self._blobs.put(key, file.read())
+        else:
+            self._blobs.take_file(key, file.path)
         return key
 
     def keep(self) -> None:

@@ -46,11 +46,35 @@ def road_background(photo: Image, camera: Camera, rng: np.random.Generator, *, g
     if rng.random() < 0.5:
         photo = np.ascontiguousarray(photo[:, ::-1])
     ahead_m, left_m = float(rng.uniform(4.5, 8.0)), float(rng.uniform(-1.5, 1.5))
+    return _render_road(photo, camera, rng, (ahead_m, left_m), grain)
+
+
+def moving_backgrounds(
+    photo: Image, camera: Camera, rng: np.random.Generator, step_m: float, frames: int, *, grain: float = 0.04
+) -> list[Image]:
+    """Backgrounds of successive frames in which the road comes nearer.
+
+    Parameters
+    ----------
+    photo, camera, rng, grain
+        As in `road_background`.
+    step_m : float
+        That the vehicle advances from frame to frame. [m]
+    frames : int
+        The photo shows about 30 m of road in enough detail.
+    """
+    ahead_m, left_m = 4.5, float(rng.uniform(-1.5, 1.5))
+    return [_render_road(photo, camera, rng, (ahead_m + k * step_m, left_m), grain) for k in range(frames)]
+
+
+def _render_road(
+    photo: Image, camera: Camera, rng: np.random.Generator, ground_m: tuple[float, float], grain: float
+) -> Image:
     shape = (camera.height_px, camera.width_px)
     rows, cols = np.mgrid[0 : shape[0] + 7 : 8, 0 : shape[1] + 7 : 8].astype(np.float64)
     ideal = np.stack([(cols - camera.cx_px) / camera.fx_px, (rows - camera.cy_px) / camera.fy_px], axis=-1)
     rays = ideal @ camera.camera_from_vehicle[:2] + camera.camera_from_vehicle[2]
-    map_x, map_y = _photo_points(rays, camera.height_m, ahead_m, left_m, (photo.shape[0], photo.shape[1]))
+    map_x, map_y = _photo_points(rays, camera.height_m, *ground_m, (photo.shape[0], photo.shape[1]))
     size = (map_x.shape[1] * 8, map_x.shape[0] * 8)
     full_x, full_y = (cv2.resize(m, size, interpolation=cv2.INTER_LINEAR) for m in (map_x, map_y))
     view = cv2.remap(

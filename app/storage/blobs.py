@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,9 +18,12 @@ from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 
 from app.errors import Conflict, InvalidParameter, NotFound, StorageFull, Unavailable, is_disk_full
+from app.formats.spooled_file import SpooledFile
 
 _CHUNK_BYTES = 5 * 1024**2  # source: S3's smallest part of an upload
 _KEY = re.compile(r"[a-z]+/[0-9a-f]{2}/[0-9a-f]{32}")
+_NO_LINKS = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.EACCES)
+"""Errors of file systems that cannot give a file a second name. Source: link(2)."""
 _DISK_FULL = re.compile(rf"\(os error ({errno.ENOSPC}|{errno.EDQUOT})\)")
 _PARTIAL = re.compile(_KEY.pattern + "#[0-9]+")
 """Name under which obstore writes a file before it is whole. Source: `staged_upload_path` of the crate object_store."""
@@ -39,6 +43,8 @@ class Blobs:
     ----------
     url : str
         ``file:///FOLDER`` or ``s3://BUCKET/PREFIX``; credentials and endpoint of S3 come from AWS_* variables.
+    scratch : Path, optional
+        Folder for copies of blobs that are in S3; by default the system's for temporary files.
 
     Raises
     ------
@@ -46,9 +52,9 @@ class Blobs:
         The URL names no store that is supported.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, scratch: Path | None = None) -> None:
         parts = urlsplit(url)
-        self._url = url
+        self._url, self._scratch = url, scratch
         self._folder: Path | None = None
         self._opened: ObjectStore | None = None
         self._durable_folders: set[Path] = set()
@@ -118,6 +124,69 @@ class Blobs:
         _check_key(key)
         with self._written(key):
             obstore.put(self._store, key, path, chunk_size=_CHUNK_BYTES, max_concurrency=2)
+
+    def take_file(self, key: str, path: Path) -> None:
+        """Write a blob from a file that nobody changes any more, without a copy if that can be.
+
+        The file may share its bytes with the blob afterwards; deleting it leaves the blob as it is.
+
+        Raises
+        ------
+        Conflict
+            The key is taken.
+        StorageFull, Unavailable
+            As `put`.
+        """
+        _check_key(key)
+        if self._folder is not None:
+            with self._written(key):
+                target = self._folder / key
+                target.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    os.link(path, target)
+                    return
+                except FileExistsError as error:
+                    raise AlreadyExistsError(str(error)) from error
+                except OSError as error:
+                    if error.errno not in _NO_LINKS:
+                        raise
+        self.put_file(key, path)
+
+    @contextmanager
+    def opened(self, key: str) -> Iterator[SpooledFile]:
+        """A blob as a file with a path, which must not be changed: the blob itself, or a copy that is then deleted.
+
+        Raises
+        ------
+        NotFound
+            There is no such blob.
+        StorageFull, Unavailable
+            The copy cannot be made, or the store does not answer.
+        """
+        _check_key(key)
+        if self._folder is not None:
+            path = self._folder / key
+            if not path.is_file():
+                raise NotFound(f"blob {key} is gone")
+            yield SpooledFile.at(path)
+            return
+        with self._copied(key) as path:
+            yield SpooledFile.at(path)
+
+    @contextmanager
+    def _copied(self, key: str) -> Iterator[Path]:
+        """A copy of a blob on this machine. A killed process leaves one, which `app.storage.spool` deletes."""
+        blocks = self.stream(key)
+        if self._scratch is not None:
+            self._scratch.mkdir(parents=True, exist_ok=True, mode=0o700)
+        try:
+            with tempfile.NamedTemporaryFile(dir=self._scratch) as file:
+                for block in blocks:
+                    file.write(block)
+                file.flush()
+                yield Path(file.name)
+        except (BaseError, OSError) as error:
+            raise _failure(error) from error
 
     def stream(self, key: str) -> Iterator[bytes]:
         """Content of a blob, a few megabytes at a time.

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from app.main import utc_now
 from app.registry.blob_references import blob_references
 from app.registry.database import Database
 from app.registry.tables import decodes, jobs, markers
@@ -16,6 +15,7 @@ from app.registry.tenancy import across_agencies
 from app.services.access.audit import AuditLog
 from app.services.unused_blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.storage.blobs import Blobs
+from app.wiring import utc_now
 from benchmarks.faults.writers import Acknowledged
 
 

@@ -12,6 +12,7 @@ from app.decoders.plate import decode_plates
 from app.errors import WaymarkError
 from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
+from app.formats.spooled_file import SpooledFile
 from app.jobs.pool import DecodePool
 from app.services.decodes.frame_task import FramePicture, FrameSearch, FrameTask
 from benchmarks.fuzz.parsers import Outcome
@@ -45,7 +46,7 @@ def attack_frames(count: int, *, workers: int = 2, seed: int = 1) -> Outcome:
 def _submit(pool: DecodePool, data: bytes) -> Any:
     search: Future[FrameSearch] = Future()
     search.set_result(FrameSearch({PLATE.name: PlateSearch()}))
-    return pool.submit(FrameTask(FramePicture(data), search), wait_s=60.0)
+    return pool.submit(FrameTask(FramePicture(SpooledFile.of(data)), search), wait_s=60.0)
 
 
 def _collect(found: Outcome, data: bytes, began_s: float, pending: Any) -> None:

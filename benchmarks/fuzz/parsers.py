@@ -26,6 +26,7 @@ from app.formats.image_headers import ImageLimits, scan_image
 from app.formats.kinds import detect_drive_file, guess_kind
 from app.formats.packets.read import read_packets
 from app.formats.poses.read import read_poses
+from app.formats.spooled_file import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.formats.traces.read import read_trace
@@ -235,7 +236,9 @@ def list_parsers() -> list[Parser]:
         Parser("traces", lambda data: read_trace({"drive.zip": data}), archives),
         Parser("archives", lambda data: sum(len(member.data) for member in read_members(data)), archives),
         Parser("image-headers", lambda data: scan_image(data, ImageLimits(), thermal=False), pictures),
-        Parser("kinds", lambda data: (guess_kind("file", data), detect_drive_file("file", data)), kinds),
+        Parser(
+            "kinds", lambda data: (guess_kind("file", SpooledFile.of(data)), detect_drive_file("file", data)), kinds
+        ),
         Parser("rules", read_rules, [_RULES, *_files("app/demo/data/e6-rules.yaml")]),
         Parser("cql2-text", _filters("cql2-text"), _CQL2),
         Parser("cql2-json", _filters("cql2-json"), _CQL2_JSON),

@@ -16,6 +16,7 @@ from pyproj import CRS
 
 from app.errors import WaymarkError
 from app.families.rules import MarkerRules
+from app.formats.spooled_file import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.jobs.tasks import SameProcess
@@ -59,7 +60,7 @@ class Judge:
             declaration = ImportDeclaration(
                 crs=crs, family="cerpm", vertical_datum="ellipsoid", columns={"code": "number"}, status="active"
             )
-            given = ImportInput("\n".join(lines).encode(), declaration, mode="good")
+            given = ImportInput(SpooledFile.of("\n".join(lines).encode()), declaration, mode="good")
             report, _ = self._imports.run(caller, given)
             assert report["stored"] == len(survey.registered), report["faults"][:3]
         return caller
@@ -67,7 +68,7 @@ class Judge:
     def codes(self, caller: Caller, data: bytes, declaration: dict[str, Any]) -> tuple[bool, Counter[str]]:
         """Whether something is refused, and the faults by code."""
         try:
-            given = ImportInput(data, ImportDeclaration(**declaration), dry_run=True)
+            given = ImportInput(SpooledFile.of(data), ImportDeclaration(**declaration), dry_run=True)
             report, _ = self._imports.run(caller, given)
         except WaymarkError as error:
             return True, Counter([error.field or "file"])

@@ -146,6 +146,7 @@ def _measured(what: str, command: list[str]) -> Figure | None:
 def main() -> None:
     """One step in this process; its figures as JSON."""
     from app.families.rules import MarkerRules
+    from app.formats.spooled_file import SpooledFile
     from app.formats.surveys.declaration import ImportDeclaration
     from app.jobs.tasks import SameProcess
     from app.registry.database import Database
@@ -166,7 +167,7 @@ def main() -> None:
         declaration = ImportDeclaration(
             crs="EPSG:4326", vertical_datum="ellipsoid", family="cerpm", columns={"code": "number"}
         )
-        given = ImportInput(Path(survey).read_bytes(), declaration)
+        given = ImportInput(SpooledFile.at(Path(survey)), declaration)
         report, _ = Imports(database, now, SameProcess(), MarkerRules()).run(caller, given)
         if report["stored"] != report["rows"]:
             raise SystemExit(f"{report['stored']} of {report['rows']} rows were stored")

@@ -137,6 +137,7 @@ def _query_us(connection: sa.Connection, points: Floats) -> float:
 def _import(way: str, rows: int) -> None:
     """One import in this process, with the R*Tree filled in one of the ways."""
     from app.families.rules import MarkerRules
+    from app.formats.spooled_file import SpooledFile
     from app.formats.surveys.declaration import ImportDeclaration
     from app.jobs.tasks import SameProcess
     from app.registry.database import Database
@@ -164,7 +165,7 @@ def _import(way: str, rows: int) -> None:
         declaration = ImportDeclaration(
             crs="EPSG:4326", vertical_datum="ellipsoid", family="cerpm", columns={"code": "number"}
         )
-        given = ImportInput(survey.read_bytes(), declaration)
+        given = ImportInput(SpooledFile.at(survey), declaration)
         with mock.patch.object(bulk_load, "fill_rtree", fill):
             began, cpu_began = time.perf_counter(), time.process_time()
             Imports(database, now, SameProcess(), MarkerRules()).run(caller, given)

@@ -12,6 +12,7 @@ import pytest
 from app.errors import WaymarkError
 from app.formats.format import Use
 from app.formats.kinds import FORMATS, UploadKind, detect_drive_file, guess_kind
+from app.formats.spooled_file import SpooledFile
 
 JPEG, PNG = b"\xff\xd8\xff\xe0" + bytes(40), b"\x89PNG\r\n\x1a\n" + bytes(40)
 RAW_DATA = b"Time Stamp,Sensor 1 X,Sensor 1 Y\n0.1,2,3\n"
@@ -55,7 +56,7 @@ def _zip(**files: bytes) -> bytes:
     ids=lambda value: "upload" if isinstance(value, bytes) else str(value),
 )
 def test_an_upload_is_recognized_by_its_content(data: bytes, kind: UploadKind | None) -> None:
-    assert guess_kind("upload", data) is kind
+    assert guess_kind("upload", SpooledFile.of(data)) is kind
 
 
 def test_any_bytes_have_a_kind_none_or_a_problem() -> None:
@@ -66,7 +67,7 @@ def test_any_bytes_have_a_kind_none_or_a_problem() -> None:
         for at in rng.integers(0, len(data), 4):
             data[at] = rng.integers(256)
         try:
-            guess_kind("upload", bytes(data[: rng.integers(0, len(data) + 1)]))
+            guess_kind("upload", SpooledFile.of(bytes(data[: rng.integers(0, len(data) + 1)])))
         except WaymarkError:
             continue
 

@@ -8,6 +8,7 @@ import pytest
 
 from app.calibration.board_view import BoardView, find_board
 from app.errors import CalibrationRefused, UploadTooLarge
+from app.formats.spooled_file import SpooledFile
 from app.jobs import calibration_tasks
 from app.jobs.calibration_tasks import WITHOUT_BOARD, calibrate_photos
 from app.sensors.calibration_board import CalibrationBoard
@@ -17,7 +18,9 @@ from app.services.fleet.calibrations import MAX_PHOTOS, CalibrationTask
 def _noise() -> CalibrationTask:
     pixels = np.random.default_rng(7).integers(0, 256, (240, 320, 3), dtype=np.uint8)
     photo = cv2.imencode(".png", pixels)[1].tobytes()
-    return CalibrationTask(tuple((f"{k}.png", photo) for k in range(MAX_PHOTOS)), CalibrationBoard(7, 10, 25.0, 18.0))
+    return CalibrationTask(
+        tuple((f"{k}.png", SpooledFile.of(photo)) for k in range(MAX_PHOTOS)), CalibrationBoard(7, 10, 25.0, 18.0)
+    )
 
 
 def test_sixty_photos_of_noise_are_refused_after_eight(monkeypatch: pytest.MonkeyPatch) -> None:

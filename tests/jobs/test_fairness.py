@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from queue import Empty
 
 import pytest
@@ -11,7 +13,9 @@ from app.errors import Unavailable
 from app.jobs.fair_queue import FairQueue
 from app.jobs.local_queue import LocalQueue
 from app.jobs.places import Places
+from app.registry.jobs import JobKind, UnfinishedJob
 from app.registry.tenancy import EVERY_AGENCY
+from app.services.job_queues import QUEUES
 from tests.http import WITHIN_S
 
 
@@ -42,6 +46,21 @@ def test_an_owner_without_a_name_is_one_like_the_others() -> None:
     assert [queue.get(), queue.get()] == ["first", "second"]
 
 
+@dataclass
+class Run:
+    """Runs jobs that are in no database."""
+
+    run: Callable[[str], None]
+    startable: list[UnfinishedJob] = field(default_factory=list)
+
+    def run_job(self, job_id: str) -> bool:
+        self.run(job_id)
+        return True
+
+    def list_startable(self) -> list[UnfinishedJob]:
+        return self.startable
+
+
 @pytest.mark.parametrize("at_start", [False, True], ids=["submitted", "unfinished at the start"])
 def test_a_job_waits_for_the_running_one_not_for_a_thousand_of_another_agency(at_start: bool) -> None:
     ran: list[str] = []
@@ -54,13 +73,13 @@ def test_a_job_waits_for_the_running_one_not_for_a_thousand_of_another_agency(at
         if job_id == "other":
             second.set()
 
-    many = [(f"one {number}", "one") for number in range(1000)]
+    many = [UnfinishedJob(f"one {number}", "one", JobKind.DECODE) for number in range(1000)]
     jobs = LocalQueue()
-    jobs.open(run, [*many, ("other", "two")] if at_start else many)
+    jobs.open(Run(run, [*many, UnfinishedJob("other", "two", JobKind.DECODE)] if at_start else many))
     try:
         assert first.wait(WITHIN_S)
         if not at_start:
-            jobs.submit("other", "two")
+            jobs.submit("other", "two", JobKind.DECODE)
         may_go_on.set()
         assert second.wait(WITHIN_S)
     finally:
@@ -106,3 +125,28 @@ def test_a_place_that_is_given_back_goes_to_who_waits_for_it() -> None:
     assert taken.wait(WITHIN_S)
     with pytest.raises(Unavailable):
         places.take(EVERY_AGENCY)
+
+
+def test_every_kind_of_job_has_a_queue_and_a_proof_holds_up_neither_a_plan_nor_an_upload() -> None:
+    assert QUEUES.keys() == set(JobKind)
+    ran: set[str] = set()
+    proof_started, others_ran = threading.Event(), threading.Event()
+
+    def run(job_id: str) -> None:
+        if job_id == JobKind.PROOF:
+            proof_started.set()
+            assert others_ran.wait(WITHIN_S)
+        ran.add(job_id)
+        if ran == set(JobKind) - {JobKind.PROOF}:
+            others_ran.set()
+
+    jobs = LocalQueue()
+    jobs.open(Run(run))
+    try:
+        jobs.submit(JobKind.PROOF, "one", JobKind.PROOF)
+        assert proof_started.wait(WITHIN_S)
+        for kind in set(JobKind) - {JobKind.PROOF}:
+            jobs.submit(kind, "one", kind)
+        assert others_ran.wait(WITHIN_S)
+    finally:
+        jobs.close()

@@ -54,7 +54,7 @@ def test_a_job_waits_for_room(database: Database, error: Exception) -> None:
     for _ in range(2 * MAX_ATTEMPTS):
         with pytest.raises(Unavailable):
             jobs.run_job(job.id)
-    assert jobs.list_unfinished() == [(job.id, agency_id)]
+    assert jobs.list_startable() == [(job.id, agency_id, JobKind.PLAN)]
     jobs.run_job(job.id)
     with database.read() as connection:
         done = store.get_job(connection, agency_id, JobKind.PLAN, job.id)

@@ -18,9 +18,10 @@ import pytest
 
 from app.errors import InvalidParameter, Unavailable, UnreadableUpload
 from app.families.plate.frames import PlateSearch
+from app.formats.spooled_file import SpooledFile
 from app.jobs import supervisor
-from app.jobs.decoder_process import ProcessLimits
 from app.jobs.pool import DecodePool
+from app.jobs.process_limits import ProcessLimits
 from app.jobs.supervisor import Pending, WorkerSupervisor
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
@@ -52,7 +53,7 @@ def start(pool: DecodePool, what: int) -> Pending[FrameResult]:
 
 
 def submit(pool: DecodePool, data: bytes, search: Future[FrameSearch]) -> Pending[FrameResult]:
-    return pool.submit(FrameTask(FramePicture(data), search))
+    return pool.submit(FrameTask(FramePicture(SpooledFile.of(data)), search))
 
 
 def child_of(pool: DecodePool) -> int:
@@ -211,7 +212,7 @@ def test_a_running_frame_can_be_cancelled(tmp_path: Path) -> None:
 def test_memory_has_a_limit(pool: DecodePool) -> None:
     with pytest.raises(UnreadableUpload, match="more memory") as caught:
         start(pool, standin.HOG).result()
-    assert caught.value.limit == f"{3 * 1024**3} bytes"
+    assert caught.value.limit == f"{ProcessLimits().memory_bytes} bytes"
     assert child_of(pool)
 
 
@@ -364,7 +365,7 @@ def test_annotation(pool: DecodePool, suffix: str) -> None:
     frame = np.full((240, 320, 3), 128, np.uint8)
     outline = Outline(((100, 100), (200, 100), (200, 180), (100, 180)), "read", "023792168411 99 %")
     far = Outline(((-1e9, 0), (10, 0), (10, 1e9), (0, 10)), "unsure", "?")
-    drawn = pool.submit(AnnotationTask(jpeg(frame), (outline, far), suffix)).result()
+    drawn = pool.submit(AnnotationTask(SpooledFile.of(jpeg(frame)), (outline, far), suffix)).result()
     assert drawn.startswith({"png": b"\x89PNG", "jpg": b"\xff\xd8"}[suffix])
     pixels = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
     assert pixels.shape == (240, 320, 3)

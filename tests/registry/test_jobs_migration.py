@@ -12,7 +12,8 @@ import sqlalchemy as sa
 
 from app.registry.database import Database
 from app.registry.decodes import get_decode, list_decodes
-from app.registry.jobs import JobKind, list_jobs, list_unfinished, start_job
+from app.registry.job_leases import list_startable, start_job
+from app.registry.jobs import JobKind, list_jobs
 from app.registry.tenancy import acting_for
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)
@@ -133,17 +134,17 @@ def test_decodes_stay_and_imports_become_jobs(database: Database) -> None:
         assert [job.state for job in imports] == ["failed", "running", "queued", "done"]
         assert {job.upload_key for job in imports} == {f"uploads/{k}" for k in (7, 8, 9, 10)}
         assert all(job.input == DECLARED for job in imports)
-        assert [job_id for job_id, _agency in list_unfinished(connection)] == [_id(k) for k in (2, 4, 8, 9)]
+        assert [job.id for job in list_startable(connection, NOW)] == [_id(k) for k in (2, 4, 8, 9)]
         by_state = {
             state: len(list_decodes(connection, AGENCY, state=state, before=None, limit=100))
             for state in ("queued", "running", "done", "failed", "cancelled")
         }
         assert by_state == {"queued": 1, "running": 1, "done": 3, "failed": 1, "cancelled": 1}
     with database.write() as connection:
-        job = start_job(connection, _id(2))
+        job = start_job(connection, _id(2), NOW)
         assert job is not None
         assert (job.kind, job.holder_id, job.attempts) == ("decode", "holder", 1)
-        assert start_job(connection, _id(0)) is None
+        assert start_job(connection, _id(0), NOW) is None
 
 
 def test_documents_have_the_new_names(database: Database) -> None:

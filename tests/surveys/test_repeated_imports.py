@@ -12,8 +12,8 @@ from pyproj import Transformer
 from app.api.surveys.schemas import DeclarationIn
 from app.errors import InvalidParameter
 from app.families.rules import MarkerRules
+from app.formats.spooled_file import SpooledFile
 from app.jobs.tasks import SameProcess
-from app.main import utc_now
 from app.registry.database import Database
 from app.registry.tables import markers
 from app.registry.tenancy import seeing_every_agency
@@ -21,6 +21,7 @@ from app.services.access.access import Access, Scope
 from app.services.surveys.declarations import import_input
 from app.services.surveys.documents import ImportReport
 from app.services.surveys.imports import SETTLED, Imports
+from app.wiring import utc_now
 
 DECLARED = {"crs": "EPSG:25832", "family": "cerpm", "area_deg": [8.3, 48.9, 8.6, 49.1], "ignore_heights": True}
 EAST, NORTH = 457000.0, 5428000.0
@@ -46,7 +47,7 @@ def send(database: Database, request: pytest.FixtureRequest) -> Send:
 
     def run(data: bytes, step: Callable[[float], None] = lambda _progress: None, **declared: Any) -> ImportReport:
         declaration = DeclarationIn.model_validate({**DECLARED, **declared})
-        return imports.run(caller, import_input(declaration.declared(), data), step=step)[0]
+        return imports.run(caller, import_input(declaration.declared(), SpooledFile.of(data)), step=step)[0]
 
     return run
 

@@ -69,7 +69,7 @@ def post_decode(caller: Caller, upload: Upload, decodes: Decodes) -> Response:
     The context comes as the form's part `context`, or beside a bare file in the header `Waymark-Context`, as JSON. With
     an Idempotency-Key a repeated request gets the first answer again. No plate is a result: an empty list.
     """
-    document, replayed = decodes.decode_upload(caller, upload.data, upload.context, upload.idempotency)
+    document, replayed = decodes.decode_upload(caller, upload.file, upload.context, upload.idempotency)
     if document["state"] == "done":
         return created_response(document, replayed, path="/v1/decodes")
     response = created_response(document, replayed, path="/v1/decodes", status=202)

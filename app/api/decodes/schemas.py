@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import AwareDatetime, ConfigDict, Field, JsonValue
 
-from app.api.decodes.schemas_packets import PacketsIn
+from app.api.decodes.schemas_packets import PacketsIn, PosesIn
 from app.api.decodes.schemas_traces import TraceIn
 from app.api.http.dependencies import Number, Text, Whole
 from app.families.inputs import Flag, StrictModel
@@ -51,6 +51,24 @@ class CameraIn(StrictModel):
     roll_deg: Number = Field(0.0, ge=-180, le=180, description="Clockwise about the optical axis. [deg]")
     forward_m: Number = Field(0.0, ge=-100, le=100, description="Ahead of the vehicle's reference point. [m]")
     left_m: Number = Field(0.0, ge=-100, le=100, description="Left of the vehicle's reference point. [m]")
+    readout_s: Number = Field(
+        0.0, ge=0, le=1, description="Rolling shutter: from the first row's exposure to the last's. [s]"
+    )
+
+
+class FramesIn(StrictModel):
+    """What is declared of the frames of a drive: a ZIP of pictures or a video."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"rate_hz": 10.0}, {"poses": {"accuracy_m": 1.5}}]})
+
+    rate_hz: Number | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        description="Frames a second from captured_at on, where the files state no times. A JPEG with it is a raw "
+        "MJPEG stream. [Hz]",
+    )
+    poses: PosesIn | None = Field(None, description="Of frames.csv, or of a track beside the frames.")
 
 
 class ContextIn(StrictModel):
@@ -65,7 +83,10 @@ class ContextIn(StrictModel):
     thermal_range: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = Field(
         None, description="Counts of 16-bit thermal frames that become 0 and 255."
     )
-    captured_at: AwareDatetime | None = Field(None, description="When the frame was taken, or the trace began.")
+    captured_at: AwareDatetime | None = Field(
+        None, description="When the frame was taken, or the trace or the video began."
+    )
+    frames: FramesIn | None = Field(None, description="The frames of a drive: their rate, and where they were taken.")
     trace: TraceIn | None = Field(None, description="The file is a magnetometer trace; {} for METRO's own formats.")
     packets: PacketsIn | None = Field(
         None, description="The file is a packet log of CERPMs, or a ZIP of one with the vehicle's poses and a frame."

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+from anyio import to_thread
 from fastapi import Depends, Header, Request
 from pydantic import TypeAdapter
 from starlette.datastructures import UploadFile
 
 from app.api.decodes.schemas import ContextIn
+from app.api.http.bodies import SpooledPart, received_body, received_form
+from app.api.http.dependencies import caller_of
 from app.api.http.forms import FORM, check_parts, idempotency_of, media_type_of, read_declaration, read_text
+from app.api.http.problems import BodyRefused
 from app.api.http.responses import IdempotencyKeyHeader
 from app.api.http.strict_json import validated
-from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.errors import MalformedRequest, QuotaExceeded, UnreadableUpload, UnsupportedUpload
+from app.formats.spooled_file import SpooledFile
 from app.services.decodes.context import ContextInput
 from app.services.idempotency import IdempotencyKey
+from app.services.uploads.quotas import Quotas
 
 MAX_CONTEXT_BYTES = 64 * 1024
 RAW_TYPES = (
@@ -30,7 +38,7 @@ _CURE = "send multipart/form-data with the parts file and context"
 class UploadedFile:
     """A file with its context, and the client's Idempotency-Key if it sent one."""
 
-    data: bytes
+    file: SpooledFile
     context: ContextInput
     idempotency: IdempotencyKey | None
 
@@ -43,8 +51,8 @@ ContextHeader = Annotated[
 
 async def get_upload(
     request: Request, idempotency_key: IdempotencyKeyHeader = None, context_header: ContextHeader = None
-) -> UploadedFile:
-    """Read the file and its context from the request.
+) -> AsyncIterator[UploadedFile]:
+    """Read the file and its context from the request; the file is deleted when the request ends.
 
     Raises
     ------
@@ -55,13 +63,52 @@ async def get_upload(
     MalformedRequest
         The form or the context's JSON cannot be read.
     """
+    await check_quota(request)
+    async with _received(request, context_header) as (file, text, name, vehicle):
+        context = await context_of(text, name)
+        if vehicle:
+            context = with_vehicle(context, vehicle)
+            text += b"\n" + vehicle.encode()
+        yield UploadedFile(file, context, idempotency_of(request, idempotency_key, text, file))
+
+
+async def check_quota(request: Request) -> None:
+    """Refuse a body beyond the quota of its key before it is read, as far as Content-Length says how long it is."""
+    quotas: Quotas = request.app.state.quotas
+    caller, size = caller_of(request), int(request.headers.get("content-length", "0"))
+    try:
+        if quotas.is_known(caller):
+            quotas.check(caller, size)
+        else:
+            await to_thread.run_sync(quotas.check, caller, size)
+    except QuotaExceeded as error:
+        raise BodyRefused(error) from error
+
+
+async def context_of(text: bytes, file_name: str) -> ContextInput:
+    """The context of an upload from its JSON.
+
+    Raises
+    ------
+    MalformedRequest
+        It is too long, or cannot be read.
+    """
+    if len(text) > MAX_CONTEXT_BYTES:
+        raise MalformedRequest("the context is too long", field="context", limit=f"{MAX_CONTEXT_BYTES} bytes")
+    return (await read_declaration(ContextIn, text, "context")).given(file_name)
+
+
+@asynccontextmanager
+async def _received(request: Request, context_header: str | None) -> AsyncIterator[tuple[SpooledFile, bytes, str, str]]:
+    """The file, the text of its context, its name, and the vehicle of the form."""
     media_type = media_type_of(request)
     if media_type == FORM:
-        data, text, name, vehicle = await _read_form(request)
+        async with _received_form(request) as found:
+            yield found
     elif media_type in RAW_TYPES and (media_type != _JSON or context_header is not None):
-        data, name, vehicle = await request.body(), "", ""
-        # headers arrive as Latin-1; the bytes themselves are the JSON text
-        text = (context_header or "").encode("latin-1")
+        async with received_body(request) as file:
+            # headers arrive as Latin-1; the bytes themselves are the JSON text
+            yield file, (context_header or "").encode("latin-1"), "", ""
     else:
         raise UnsupportedUpload(
             f"the content type {media_type[:80] or '(none)'} carries no upload",
@@ -69,16 +116,9 @@ async def get_upload(
             limit=", ".join((FORM, *RAW_TYPES)),
             cure=_CURE,
         )
-    if len(text) > MAX_CONTEXT_BYTES:
-        raise MalformedRequest("the context is too long", field="context", limit=f"{MAX_CONTEXT_BYTES} bytes")
-    context = (await read_declaration(ContextIn, text, "context")).given(name)
-    if vehicle:
-        context = _of_vehicle(context, vehicle)
-        text += b"\n" + vehicle.encode()
-    return UploadedFile(data, context, idempotency_of(request, idempotency_key, text, data))
 
 
-def _of_vehicle(context: ContextInput, vehicle: str) -> ContextInput:
+def with_vehicle(context: ContextInput, vehicle: str) -> ContextInput:
     """The context with the vehicle that the form's part names."""
     named = validated(TypeAdapter(ContextIn), {"vehicle": vehicle}, "form").vehicle
     if context.vehicle not in (None, named):
@@ -91,25 +131,25 @@ def _of_vehicle(context: ContextInput, vehicle: str) -> ContextInput:
     return replace(context, vehicle=named)
 
 
-async def _read_form(request: Request) -> tuple[bytes, bytes, str, str]:
-    async with request.form(max_files=2, max_fields=3, max_part_size=MAX_CONTEXT_BYTES) as form:
+@asynccontextmanager
+async def _received_form(request: Request) -> AsyncIterator[tuple[SpooledFile, bytes, str, str]]:
+    async with received_form(request, max_files=2, max_fields=3, max_part_size=MAX_CONTEXT_BYTES) as form:
         check_parts(form, None, "file", "context", "vehicle")
         file = form.get("file")
-        if not isinstance(file, UploadFile):
+        if not isinstance(file, SpooledPart):
             raise UnreadableUpload(
                 "there is no file in the form" if file is None else "the part file has no filename, so it came as text",
                 field="file",
                 limit="one part named file, with a filename",
                 cure=_CURE,
             )
-        data = await file.read()
-        text = await read_text(form, "context")
+        text = await read_text(form, "context", MAX_CONTEXT_BYTES)
         vehicle = form.get("vehicle", "")
         if isinstance(vehicle, UploadFile):
             raise MalformedRequest(
                 "the vehicle came as a file", field="vehicle", limit="a name", cure="send it as text"
             )
-    return data, text, file.filename or "", vehicle
+        yield file.spooled, text, file.filename or "", vehicle
 
 
 Upload = Annotated[UploadedFile, Depends(get_upload)]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
-from starlette.datastructures import UploadFile
 
 from app.api.fleet.schemas_calibrations import DECLARATION_EXAMPLE, CalibrationIn
+from app.api.http.bodies import SpooledPart, received_form
 from app.api.http.dependencies import Caller, Identifier, LastId, use_cases
 from app.api.http.forms import FORM, check_parts, form_body, idempotency_of, media_type_of, read_declaration, read_text
 from app.api.http.problems import problem_responses
@@ -25,6 +26,7 @@ from app.api.http.strict_json import StrictRoute
 from app.encoders.calibration_board import encode_board
 from app.encoders.plate import ArtworkFormat, write_artwork
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.formats.spooled_file import SpooledFile
 from app.sensors.calibration_board import CalibrationBoard
 from app.services.fleet.calibrations import MAX_PHOTOS, Calibrations
 from app.services.fleet.documents import CalibrationDocument, CalibrationPage
@@ -50,13 +52,13 @@ _BODY = form_body(
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    photos: tuple[tuple[str, bytes], ...]
+    photos: tuple[tuple[str, SpooledFile], ...]
     declared: CalibrationIn
     idempotency: IdempotencyKey | None
 
 
-async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = None) -> _Asked:
-    """Read the photos and their declaration from the form.
+async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = None) -> AsyncIterator[_Asked]:
+    """Read the photos and their declaration from the form; the files are deleted when the request ends.
 
     Raises
     ------
@@ -69,21 +71,22 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
     """
     if media_type_of(request) != FORM:
         raise UnsupportedUpload("a calibration is a form", field="Content-Type", limit=FORM, cure=_CURE)
-    async with request.form(max_files=MAX_PHOTOS + 1, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
+    form_limits = {"max_files": MAX_PHOTOS + 1, "max_fields": 2, "max_part_size": MAX_DECLARATION_BYTES}
+    async with received_form(request, **form_limits) as form:
         check_parts(form, "photos", "declaration")
         files = form.getlist("photos")
-        if not files or not all(isinstance(file, UploadFile) for file in files):
+        if not files or not all(isinstance(file, SpooledPart) for file in files):
             raise UnreadableUpload("there is no photo in the form", field="photos", limit="files", cure=_CURE)
         photos = [
-            ((file.filename or f"photo {k}")[:120], await file.read())
+            ((file.filename or f"photo {k}")[:120], file.spooled)
             for k, file in enumerate(files)
-            if isinstance(file, UploadFile)
+            if isinstance(file, SpooledPart)
         ]
-        text = await read_text(form, "declaration")
-    if len(text) > MAX_DECLARATION_BYTES:
-        raise MalformedRequest("the declaration is too long", field="declaration", limit="16 KiB", cure=_CURE)
-    key = idempotency_of(request, idempotency_key, text, *(data for _name, data in photos))
-    return _Asked(tuple(photos), await read_declaration(CalibrationIn, text, "declaration"), key)
+        text = await read_text(form, "declaration", MAX_DECLARATION_BYTES)
+        if len(text) > MAX_DECLARATION_BYTES:
+            raise MalformedRequest("the declaration is too long", field="declaration", limit="16 KiB", cure=_CURE)
+        key = idempotency_of(request, idempotency_key, text, *(file for _name, file in photos))
+        yield _Asked(tuple(photos), await read_declaration(CalibrationIn, text, "declaration"), key)
 
 
 Service = Annotated[Calibrations, use_cases("calibrations")]

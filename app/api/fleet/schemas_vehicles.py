@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, JsonValue, field_validator
 
-from app.api.decodes.schemas import CameraIn
+from app.api.decodes.schemas import CameraIn, FramesIn
 from app.api.decodes.schemas_packets import PacketsIn
 from app.api.decodes.schemas_traces import TraceIn
 from app.api.http.dependencies import Identifier, Number, Text
@@ -34,12 +34,6 @@ PROFILE_EXAMPLE: dict[str, JsonValue] = {
 class VehicleCameraIn(CameraIn):
     """A vehicle's camera: that of a context; intrinsics may come later, from a calibration."""
 
-    readout_s: Number | None = Field(
-        None,
-        ge=0,
-        le=1,
-        description="Rolling shutter: from the first row to the last. Kept; no decoder uses it yet. [s]",
-    )
     calibration_id: Identifier | None = Field(None, description="Calibration that the intrinsics are of.")
 
 
@@ -53,6 +47,7 @@ class ProfileIn(StrictModel):
     thermal_range: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = Field(
         None, description="Counts of 16-bit thermal frames that become 0 and 255."
     )
+    frames: FramesIn | None = Field(None, description="Rate and clock of the frames of drives.")
     trace: TraceIn | None = Field(None, description="Magnetometer bar, axes, unit and rate; {} for METRO's own.")
     packets: PacketsIn | None = Field(None, description="Receiver, poses and clock of packet logs; {} for the usual.")
 

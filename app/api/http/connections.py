@@ -18,6 +18,7 @@ import orjson
 import structlog
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from app.api.http.event_stream import STOP
 from app.api.http.rate_limits import address_of
 
 MAX_HEADER_BYTES = 64 * 1024
@@ -136,6 +137,13 @@ class LimitedConnection(HttpToolsProtocol):
     def _end_unread(self, cycle: object) -> None:
         if self.cycle is cycle and self._sends_body:
             self.transport.close()
+
+    def shutdown(self) -> None:
+        """The server stops: end an event stream, which would go on for minutes."""
+        scope = getattr(self, "scope", None) or {}  # uvicorn sets it at the first request
+        if (end := scope.get("state", {}).get(STOP)) is not None:
+            end()
+        super().shutdown()
 
     def resume_writing(self) -> None:
         """The client has read most of what was waiting."""

@@ -14,6 +14,7 @@ from app.api.http.components import reference
 from app.api.http.dependencies import caller_of, checked_idempotency_key
 from app.api.http.strict_json import in_thread_if_large, parse_json, validated
 from app.errors import MalformedRequest
+from app.formats.spooled_file import SpooledFile
 from app.services.idempotency import IdempotencyKey
 
 FORM = "multipart/form-data"
@@ -25,10 +26,13 @@ def media_type_of(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def read_text(form: FormData, name: str) -> bytes:
-    """A part that is text, sent as a file or not; empty if there is none."""
+async def read_text(form: FormData, name: str, max_bytes: int) -> bytes:
+    """A part that is text, sent as a file or not; empty if there is none.
+
+    At most one byte more than `max_bytes` is read, so that the caller can refuse it.
+    """
     part = form.get(name, "")
-    return await part.read() if isinstance(part, UploadFile) else part.encode()
+    return await part.read(max_bytes + 1) if isinstance(part, UploadFile) else part.encode()
 
 
 @cache
@@ -81,15 +85,13 @@ async def read_declaration(model: type[ModelT], text: bytes, *where: str) -> Mod
     return await in_thread_if_large(len(text), read)
 
 
-def idempotency_of(request: Request, header: str | None, text: bytes, *files: bytes) -> IdempotencyKey | None:
+def idempotency_of(request: Request, header: str | None, text: bytes, *files: SpooledFile) -> IdempotencyKey | None:
     """The key with the hash of what was uploaded: a form's boundaries differ at each try."""
     key = checked_idempotency_key(header)
     if key is None:
         return None
-    lengths = " ".join(str(len(part)) for part in (text, *files[:-1]))
-    digest = hashlib.sha256(f"{request.url.path} {lengths}\n".encode())
-    for part in (text, *files):
-        digest.update(part)
+    digest = hashlib.sha256(f"{request.url.path} {len(text)} {[file.sha256 for file in files]}\n".encode())
+    digest.update(text)
     return IdempotencyKey(key, digest.hexdigest(), caller_of(request).key_id)
 
 

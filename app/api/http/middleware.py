@@ -15,6 +15,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app import tracing
 from app.api.http.costs import Budget, Slots, admitted
 from app.api.http.permissions import Permissions
 from app.api.http.problems import BodyRefused, problem_from, unexpected
@@ -29,6 +30,7 @@ _AUTH_THREADS = 4
 _UNKNOWN_PER_S = 20.0
 """Unknown keys from an address that sent too many wrong ones that are checked per second. Source: chosen by hand; a key
 that an operator chose has 24 characters or more, and 20/s are 600 million guesses a year."""
+_ID = re.compile(r"[0-9a-f]{8}(-?[0-9a-f]{4}){3}-?[0-9a-f]{12}")
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _LOG = structlog.get_logger("waymark.access")
 
@@ -59,6 +61,7 @@ class Observed:
         structlog.contextvars.bind_contextvars(request_id=request_id)
         started = time.perf_counter()
         status = 0
+        sent = tracing.accepted(Headers(scope=scope).get("traceparent", "")) if tracing.is_on() else None
 
         async def send_with_id(message: Message) -> None:
             nonlocal status
@@ -70,29 +73,43 @@ class Observed:
                 headers.raw.extend(scope["state"].get("rate_limit", ()))
             await send(message)
 
-        try:
-            await self._app(scope, receive, send_with_id)
-        except Exception as error:
-            if status:
-                raise
-            await unexpected(error, scope)(scope, receive, send_with_id)
-        finally:
-            self._record(scope, status, time.perf_counter() - started)
+        with tracing.span("request", parent=sent, method=scope["method"], request_id=request_id) as attributes:
+            try:
+                await self._app(scope, receive, send_with_id)
+            except Exception as error:
+                if status:
+                    raise
+                await unexpected(error, scope)(scope, receive, send_with_id)
+            finally:
+                self._record(scope, status, time.perf_counter() - started)
+                attributes |= {"http.route": _route_of(scope), "http.response.status_code": str(status)}
 
     def _record(self, scope: Scope, status: int, seconds: float) -> None:
-        route = getattr(scope.get("route"), "path", None) or "unmatched"
+        route = _route_of(scope)
         method = scope["method"] if scope["method"] in _METHODS else "other"
         self._count.labels(method, route, str(status)).inc()
         self._seconds.labels(method, route).observe(seconds)
         _LOG.info(
             "request",
             method=scope["method"],
-            path=scope["path"],
+            path=_shown_path(scope, route),
             route=route,
             status=status,
             ms=round(seconds * 1000, 2),
             agency=scope["state"].get("agency_id"),
         )
+
+
+def _route_of(scope: Scope) -> str:
+    return getattr(scope.get("route"), "path", None) or "unmatched"
+
+
+def _shown_path(scope: Scope, route: str) -> str:
+    """The route with its ids filled in: other parts may be a position, as a tile is, or a key that was misplaced."""
+    for name, value in scope.get("path_params", {}).items():
+        if _ID.fullmatch(str(value)):
+            route = re.sub(rf"\{{{re.escape(name)}(:\w+)?\}}", str(value), route)
+    return route
 
 
 def _protect(headers: MutableHeaders) -> None:

@@ -66,6 +66,12 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     errors.UnreadableUpload: ProblemKind(422, "unreadable-upload", "The upload cannot be read"),
     errors.VersionRequired: ProblemKind(428, "version-required", "The change must state the version it is based on"),
     errors.TooManyRequests: ProblemKind(429, "too-many-requests", "Too many requests in a short time"),
+    errors.QuotaExceeded: ProblemKind(429, "quota-exceeded", "The quota is used up"),
+    errors.UploadLocked: ProblemKind(423, "upload-locked", "Another request writes this upload"),
+    errors.UploadExpired: ProblemKind(410, "upload-expired", "The upload was not completed in time"),
+    errors.WrongOffset: ProblemKind(409, "wrong-offset", "The part does not begin where the upload ends"),
+    errors.WrongChecksum: ProblemKind(460, "wrong-checksum", "The bytes do not have the stated checksum"),
+    errors.UnsupportedVersion: ProblemKind(412, "unsupported-version", "The version of the protocol is not supported"),
     errors.ProofFailed: ProblemKind(500, "proof-failed", "The artwork could not be read back"),
     errors.StorageFull: ProblemKind(507, "storage-full", "There is no room to store this"),
     errors.Unavailable: ProblemKind(503, "unavailable", "The service is temporarily unavailable"),
@@ -176,7 +182,7 @@ def problem(
         if (left_out := left_out + len(faults[MAX_ERRORS:])) > 0:
             body["errors_left_out"] = left_out
     content = orjson.dumps(body, default=str)
-    return Response(content, kind.status, _challenge(kind.status, headers), media_type=MEDIA_TYPE)
+    return Response(content, kind.status, _challenge(kind.status, headers) | _protocol(scope), media_type=MEDIA_TYPE)
 
 
 def report_problem(slug: str, title: str, fault: FieldError, scope: Any, report: object) -> Response:
@@ -295,6 +301,12 @@ def validation_fault(item: Mapping[str, Any]) -> FieldError:
         limit=", ".join(limits) or item["msg"],
         cure=cures.get(item["type"], f"correct {path}; /docs describes what it may be"),
     )
+
+
+def _protocol(scope: Any) -> dict[str, str]:
+    """Every response to a client of tus names the version of the protocol (tus 1.0, "Tus-Resumable")."""
+    is_tus = any(name == b"tus-resumable" for name, _value in scope.get("headers", ()))
+    return {"Tus-Resumable": "1.0.0", "Tus-Version": "1.0.0"} if is_tus else {}
 
 
 def _challenge(status: int, headers: dict[str, str] | None) -> dict[str, str]:

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping
 from typing import Literal
 
 from fastapi import APIRouter, Request, Response
-from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client import CONTENT_TYPE_LATEST
 from typing_extensions import TypedDict
 
 from app.api.http.responses import json_response, text_response
+from app.services.decodes.measures import written_metrics
 
 router = APIRouter(tags=["system"])
 
@@ -52,4 +53,4 @@ def get_readiness(request: Request) -> Response:
 @router.get("/metrics", responses=text_response("text/plain", "Prometheus text format"))
 def get_metrics(request: Request) -> Response:
     """Prometheus metrics."""
-    return Response(generate_latest(request.app.state.metrics), media_type=CONTENT_TYPE_LATEST)
+    return Response(written_metrics(request.app.state.metrics), media_type=CONTENT_TYPE_LATEST)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field, JsonValue
 
-from app.api.http.dependencies import Caller, MarkerId, Number, use_cases
+from app.api.http.dependencies import Caller, Idempotency, MarkerId, Number, use_cases
 from app.api.http.problems import problem_responses
-from app.api.http.responses import NOT_MODIFIED, IfNoneMatch, file_response
+from app.api.http.responses import NOT_MODIFIED, IfNoneMatch, Prefer, file_response, wants_job
 from app.api.http.strict_json import StrictRoute
+from app.api.jobs.files import queued_job
 from app.api.markers.schemas_selection import SelectionIn
-from app.encoders.plate import ArtworkFormat, ArtworkOptions, BundleOptions
+from app.encoders.plate import ArtworkFormat, ArtworkOptions
 from app.families.inputs import Flag, StrictModel
 from app.services.markers.artwork import Artworks, Bundle
+from app.services.markers.artwork_jobs import ArtworkJobs, bundle_options
+from app.services.progress.documents import JobDocument
 
 router = APIRouter(prefix="/v1", tags=["artwork"], route_class=StrictRoute)
 
@@ -46,14 +49,9 @@ class ArtworkIn(SelectionIn):
     resolution_dpi: Resolution = Field(150.0, description="Of PNG files. [1/inch]")
     sheet: SheetIn | None = Field(None, description="Also nest the plates on sheets of this size.")
 
-    def options(self) -> BundleOptions:
-        """The options as the encoders know them."""
-        return BundleOptions(
-            formats=tuple(dict.fromkeys(self.formats)),
-            artwork=ArtworkOptions(heaters=self.heaters, leds=self.leds),
-            sheet_mm=(self.sheet.width_mm, self.sheet.height_mm) if self.sheet else None,
-            dpi=self.resolution_dpi,
-        )
+    def declared(self) -> dict[str, Any]:
+        """The options as they are stored in a job."""
+        return self.model_dump(include={"formats", "heaters", "leds", "resolution_dpi", "sheet"}, mode="json")
 
 
 ArtworkService = Annotated[Artworks, use_cases("artworks")]
@@ -90,11 +88,27 @@ def get_artwork(
 @router.post(
     "/artwork",
     response_class=StreamingResponse,
-    responses={**file_response(["application/zip"]), **problem_responses(404)},
+    responses={
+        **file_response(["application/zip"]),
+        202: {"model": JobDocument, "description": "Queued; Location leads to its progress"},
+        **problem_responses(404),
+    },
 )
-def post_artwork(wanted: ArtworkIn, caller: Caller, artworks: ArtworkService) -> Response:
-    """Artwork of a selection as a ZIP with a manifest and a quality sheet; every plate was read back first."""
-    bundle = artworks.bundle(caller, wanted.selection(), wanted.options())
+def post_artwork(
+    wanted: ArtworkIn,
+    caller: Caller,
+    artworks: ArtworkService,
+    jobs: Annotated[ArtworkJobs, use_cases("artwork_jobs")],
+    idempotency: Idempotency,
+    prefer: Prefer = None,
+) -> Response:
+    """Artwork of a selection as a ZIP with a manifest and a quality sheet; every plate was read back first.
+
+    More than 10 plates, or any with `Prefer: respond-async`, become a job: 202, with the ZIP at its `links.result`.
+    """
+    if wants_job(prefer) or jobs.is_job(caller, wanted.selection()):
+        return queued_job(*jobs.submit(caller, wanted.selection(), wanted.declared(), idempotency))
+    bundle = artworks.bundle(caller, wanted.selection(), bundle_options(wanted.declared()))
     headers = {
         "Content-Length": str(bundle.size),
         "Content-Disposition": 'attachment; filename="waymark-artwork.zip"',

@@ -44,7 +44,8 @@ def list_marker_observations(
 ) -> Response:
     """What decodes saw of the marker, newest first.
 
-    `what` is `seen`, `ambiguous`, `out-of-place`, `wrong-way`, `off-line`, or what else a decode found of it.
+    `what` is `seen`, `missed`, `ambiguous`, `out-of-place`, `out-of-reach`, `moved`, `cloned`, `wrong-way` or
+    `off-line`.
     """
     page, last = observations.page(
         caller,

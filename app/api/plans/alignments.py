@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
-from starlette.datastructures import UploadFile
 
+from app.api.http.bodies import SpooledPart, received_form
 from app.api.http.components import reference
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
 from app.api.http.forms import FORM, check_parts, form_body, idempotency_of, media_type_of, read_declaration, read_text
@@ -27,6 +28,7 @@ from app.api.http.strict_json import StrictRoute
 from app.api.markers.filters import Filtered
 from app.api.plans.schemas import AlignmentIn, RoadAlignmentIn
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.formats.spooled_file import SpooledFile
 from app.services.idempotency import IdempotencyKey
 from app.services.plans.alignments import Alignments
 from app.services.plans.documents import AlignmentDocument, AlignmentPage
@@ -53,13 +55,13 @@ Service = Annotated[Alignments, use_cases("alignments")]
 
 @dataclass(frozen=True, slots=True)
 class _Upload:
-    data: bytes
+    file: SpooledFile
     file_name: str
     declared: AlignmentIn | RoadAlignmentIn
     idempotency: IdempotencyKey | None
 
 
-async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = None) -> _Upload:
+async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = None) -> AsyncIterator[_Upload]:
     """Read the file and its declaration from the form, or the registered road and its lanes from JSON.
 
     Raises
@@ -71,21 +73,22 @@ async def get_upload(request: Request, idempotency_key: IdempotencyKeyHeader = N
         text = await request.body()
         _check_length(text)
         road = await read_declaration(RoadAlignmentIn, text, "body")
-        return _Upload(b"", "", road, idempotency_of(request, idempotency_key, text))
+        yield _Upload(SpooledFile.of(b""), "", road, idempotency_of(request, idempotency_key, text))
+        return
     if media_type_of(request) != FORM:
         raise UnsupportedUpload(
             "a road comes as a form, or is named in JSON", field="Content-Type", limit=f"{FORM}, {JSON}", cure=_CURE
         )
-    async with request.form(max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
+    async with received_form(request, max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
         check_parts(form, None, "file", "declaration")
-        file = form.get("file")
-        if not isinstance(file, UploadFile):
+        part = form.get("file")
+        if not isinstance(part, SpooledPart):
             raise UnreadableUpload("there is no file in the form", field="file", limit="a part file", cure=_CURE)
-        data, file_name = await file.read(), (file.filename or "")[:200]
-        text = await read_text(form, "declaration")
-    _check_length(text)
-    declared = await read_declaration(AlignmentIn, text, "body", "declaration")
-    return _Upload(data, file_name, declared, idempotency_of(request, idempotency_key, text, data))
+        file, file_name = part.spooled, (part.filename or "")[:200]
+        text = await read_text(form, "declaration", MAX_DECLARATION_BYTES)
+        _check_length(text)
+        declared = await read_declaration(AlignmentIn, text, "body", "declaration")
+        yield _Upload(file, file_name, declared, idempotency_of(request, idempotency_key, text, file))
 
 
 def _check_length(declaration: bytes) -> None:
@@ -108,7 +111,7 @@ def post_alignment(upload: Annotated[_Upload, Depends(get_upload)], caller: Call
         )
         return created_response(document, replayed, path="/v1/alignments")
     document, replayed = alignments.add(
-        caller, declared.name, upload.data, upload.file_name, declared.declaration(), upload.idempotency
+        caller, declared.name, upload.file, upload.file_name, declared.declaration(), upload.idempotency
     )
     return created_response(document, replayed, path="/v1/alignments")
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request, Response
-from starlette.datastructures import UploadFile
 
+from app.api.http.bodies import SpooledPart, received_form
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
 from app.api.http.forms import FORM, check_parts, form_body, idempotency_of, media_type_of, read_declaration, read_text
 from app.api.http.problems import FieldError, Problem, problem_responses, report_problem
@@ -58,8 +59,10 @@ class RefusedImport(Problem):
     report: ImportReport
 
 
-async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = None, prefer: Prefer = None) -> _Asked:
-    """Read the file and its declaration from the form.
+async def get_asked(
+    request: Request, idempotency_key: IdempotencyKeyHeader = None, prefer: Prefer = None
+) -> AsyncIterator[_Asked]:
+    """Read the file and its declaration from the form; the file is deleted when the request ends.
 
     Raises
     ------
@@ -72,20 +75,21 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
     """
     if media_type_of(request) != FORM:
         raise UnsupportedUpload("an import is a form", field="Content-Type", limit=FORM, cure=_CURE)
-    async with request.form(max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
+    async with received_form(request, max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
         check_parts(form, None, "file", "declaration")
-        file = form.get("file")
-        if not isinstance(file, UploadFile):
+        part = form.get("file")
+        if not isinstance(part, SpooledPart):
             raise UnreadableUpload("there is no file in the form", field="file", limit="a part file", cure=_CURE)
-        data = await file.read()
-        text = await read_text(form, "declaration")
-    if not data:
-        raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
-    if len(text) > MAX_DECLARATION_BYTES:
-        raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
-    declared = (await read_declaration(DeclarationIn, text, "body", "declaration")).declared()
-    as_job = len(data) > IMMEDIATE_BYTES or wants_job(prefer)
-    return _Asked(import_input(declared, data), declared, idempotency_of(request, idempotency_key, text, data), as_job)
+        file = part.spooled
+        text = await read_text(form, "declaration", MAX_DECLARATION_BYTES)
+        if not file.size:
+            raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
+        if len(text) > MAX_DECLARATION_BYTES:
+            raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
+        declared = (await read_declaration(DeclarationIn, text, "body", "declaration")).declared()
+        as_job = file.size > IMMEDIATE_BYTES or wants_job(prefer)
+        key = idempotency_of(request, idempotency_key, text, file)
+        yield _Asked(import_input(declared, file), declared, key, as_job)
 
 
 Asked = Annotated[_Asked, Depends(get_asked)]
@@ -112,7 +116,7 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
     `Prefer: respond-async`: 202, the report comes at Location.
     """
     if asked.as_job:
-        document, replayed = jobs.submit(caller, asked.declared, asked.given.data, asked.idempotency)
+        document, replayed = jobs.submit(caller, asked.declared, asked.given.file, asked.idempotency)
         response = created_response(document, replayed, path="/v1/imports", status=202)
         response.headers["Retry-After"] = "1"
         return response

@@ -74,10 +74,11 @@ class MarkerSignal:
 
 def half_planes(image: Array) -> Planes:
     """A BGR frame, shape (H, W, 3), at half resolution."""
-    return _planes(cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA))
+    return planes_of(cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA))
 
 
-def _planes(image: Array) -> Planes:
+def planes_of(image: Array) -> Planes:
+    """A BGR frame that is scaled down already, shape (H, W, 3)."""
     blue, green, red = cv2.split(image)
     return Planes(blue, green, red, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.colour import MarkerSignal, coarse_ratio_signal, difference_signal, half_planes, ratio_signal
-from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
 from app.decoders.plate.detect_quads import MARKER_RATIO, MarkerQuad, detect_marker_quads
 from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, fit_warm_plates
+from app.decoders.plate.evidence import CLEAN_EXPLAINED, PlateEvidence, read_evidence
 from app.decoders.plate.fit import PlateFit, fit_plate
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.homography import project
@@ -25,30 +25,16 @@ from app.decoders.plate.marker_colours import MarkerColours, marker_colours
 from app.decoders.plate.pose import locate_plate
 from app.decoders.plate.unit_likelihoods import unit_log_likelihoods
 from app.errors import InvalidParameter
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading
 from app.sensors.camera import Camera
 
 DECODER_VERSION = "plate/1"
 DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
-MIN_CONFIDENCE = 0.9995
-"""[probability] from which digits are returned. Source: no wrong digits (decision record 0005, rule 4)."""
 MAX_FITS = 5
 """[candidates] that are fitted for one signal. Source: chosen by hand, for speed."""
 MIN_EXPLAINED = 0.6
 """[1] share of the pixels' variance below which a candidate is no plate. Source: chosen by hand."""
-MIN_EXPLAINED_ALONE = 0.83
-"""[1] the same for digits that no registry confirms. Source: chosen by hand; effect: `python -m
-benchmarks.plates.thresholds`."""
-MIN_EXPLAINED_SMALL, SMALL_UNIT_PX = 0.9, 2.5
-"""[1, px] the same on units below this size, where a misplaced grid explains nearly as much. Source: chosen by hand;
-effect: `python -m benchmarks.plates.thresholds`."""
-MIN_ROWS_ALONE = 1.5
-"""[px] height of a unit in the image for digits that neither a check of 16 bits nor a registry confirms. Source: one
-wrong frame of 5,192 in the trials of `python -m benchmarks.plates trials`, seeds 71 and 72."""
-CLEAN_EXPLAINED = 0.93
-"""[1] share of variance from which a word may be corrected without a registry. Source: chosen by hand; effect: `python
--m benchmarks.plates.thresholds`."""
 STRONG_RANK = 3.5
 """[log odds] rank of a candidate that gets a second geometry when the first explains nothing. Source: chosen by
 hand."""
@@ -76,9 +62,6 @@ MAX_CENTROID_SHIFT = (0.15, 1.5)
 SIZE_MISFIT_RANGE, CLOSE_SIZE_MISFIT, WORN_RATIO = (-0.4, 0.55), 0.4, 0.95
 """[log, log, 1] measured over expected `MARKER_RATIO` of a geometry that is tried, of one that is tried first, and the
 usual ratio. Source: chosen by hand; wear and blur change the size of markers."""
-SURE_CELL = 0.9
-"""[probability] of each cell above which a refusal is `unsure`, below it `cells-undecodable`. Source: chosen by
-hand."""
 MIN_SIDE_PX = 24
 """[px] least side of a frame. Source: chosen by hand; no plate that can be read fits in less."""
 SAME_MARKER = 0.03
@@ -96,6 +79,7 @@ class _Task:
     codebook: Sequence[PlateCode]
     geometries: Sequence[PlateGeometry]
     fits: list[tuple[PlateGeometry, Array, PlateFit | None]] = field(default_factory=list)
+    evidence: list[PlateEvidence] = field(default_factory=list)
 
     def fit_candidate(self, signal: MarkerSignal, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
         """Fit of a candidate; that of about the same markers in an earlier pass serves again."""
@@ -155,10 +139,26 @@ def decode_plates(
     InvalidParameter
         The image is not of this type, or not of the camera's size.
     """
+    options: dict[str, Any] = {"camera": camera, "codebook": codebook, "thermal": thermal, "geometries": geometries}
+    return [reading for reading, _evidence in read_plates(image, **options)]
+
+
+def read_plates(
+    image: Frame,
+    *,
+    camera: Camera | None = None,
+    codebook: Sequence[PlateCode] = (),
+    thermal: bool = False,
+    geometries: Sequence[PlateGeometry] = DEFAULT_GEOMETRIES,
+) -> list[tuple[PlateReading, PlateEvidence | None]]:
+    """Plates in a frame as `decode_plates`, each with the evidence that it rests on, for `accumulate`."""
     _check(image, camera, thermal, geometries)
     task = _Task(image, camera, codebook, geometries)
     readings = _decode_thermal(task) if thermal else _decode_colour(task)
-    return list(_suppress_overlapping(readings))
+    return [
+        (reading, next((e for e in task.evidence if e.corners_px is reading.corners_px), None))
+        for reading in _suppress_overlapping(readings)
+    ]
 
 
 def _decode_colour(task: _Task) -> list[PlateReading]:
@@ -263,8 +263,8 @@ def _read_candidate(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list
         colours = marker_colours(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
         if np.sort(colours.margins)[1] < MIN_MARGIN:
             continue
-        missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins) or _wrong_colours(colours)
-        reading = _read_fit(task, fit, geometry, missing, weakest_marker=float(colours.margins.min()))
+        missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins) or wrong_colours(colours)
+        reading = _read_fit(task, fit, geometry, missing, colours)
         if reading.code is not None:
             return [reading]
         if best is None or reading.confidence > best.confidence:
@@ -292,7 +292,7 @@ def _read_fit(
     fit: PlateFit,
     geometry: PlateGeometry,
     missing: tuple[PlateOutcome, str] | None,
-    weakest_marker: float = math.inf,
+    colours: MarkerColours | None = None,
 ) -> PlateReading:
     """Reading of a fitted candidate, or the reason why there is none."""
     extent = np.ptp(fit.corners_px, axis=0)
@@ -304,48 +304,20 @@ def _read_fit(
         width_px=float(extent[0]),
         height_px=float(extent[1]),
     )
-    evidence = unit_log_likelihoods(fit)
-    if evidence is None:
+    units = unit_log_likelihoods(fit)
+    if units is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
         return replace(reading, outcome=outcome, reason=reason)
-    thermal = task.image.ndim == 2
-    decoded = decode_symbols(
-        evidence, geometry.n, task.codebook, MIN_CONFIDENCE,
-        clean=fit.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
-        max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
+    weakest_marker = float(colours.margins.min()) if colours is not None else math.inf
+    evidence = PlateEvidence(
+        units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px,
+        float(extent.min()), weakest_marker, thermal=task.image.ndim == 2, missing=missing, colours=colours,
     )  # fmt: skip
-    reading = replace(
-        reading,
-        confidence=decoded.confidence,
-        cell_confidence=decoded.cell_confidence,
-        corrected_cells=decoded.corrected,
-        from_codebook=decoded.from_codebook,
-    )
-    if decoded.code is None:
-        outcome, reason = missing or _undecoded(decoded)
-        return replace(reading, outcome=outcome, reason=reason)
-    min_explained = MIN_EXPLAINED_SMALL if fit.unit_px < SMALL_UNIT_PX else MIN_EXPLAINED_ALONE
-    weak = missing is not None or fit.explained < min_explained
-    small = decoded.code.scheme is not PlateScheme.ID and float(extent.min()) < MIN_ROWS_ALONE * geometry.n
-    if small and not weak and not decoded.confirmed:
-        reason = f"a plate of less than {MIN_ROWS_ALONE * geometry.n:g} rows, and these digits have no check"
-        return replace(reading, outcome=PlateOutcome.UNSURE, reason=reason)
-    if weak and not decoded.confirmed:
-        outcome, reason = missing or (PlateOutcome.UNSURE, "the plate's pattern explains too little of the image")
-        return replace(reading, outcome=outcome, reason=reason)
-    return replace(
-        reading,
-        outcome=PlateOutcome.READ,
-        code=decoded.code,
-        from_codebook=decoded.from_codebook or weak,
-        grade=grade_plate(fit, evidence, decoded, weakest_marker),
-        pose=_pose(task, fit, geometry),
-    )
-
-
-def _undecoded(decoded: DecodedSymbols) -> tuple[PlateOutcome, str]:
-    sure_cells = bool(decoded.cell_confidence) and min(decoded.cell_confidence) > SURE_CELL
-    return (PlateOutcome.UNSURE if sure_cells else PlateOutcome.CELLS_UNDECODABLE), decoded.reason
+    task.evidence.append(evidence)
+    reading, decoded = read_evidence(reading, evidence, task.codebook)
+    if reading.code is None:
+        return reading
+    return replace(reading, grade=grade_plate(fit, units, decoded, weakest_marker), pose=_pose(task, fit, geometry))
 
 
 def _missing_parts(
@@ -366,7 +338,7 @@ def _missing_parts(
     return None
 
 
-def _wrong_colours(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
+def wrong_colours(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
     """A marker or units whose colours need a registry to confirm them: a look-alike or a worn plate."""
     pale = (colours.margins < MIN_MARGIN_ALONE) | (colours.tints < MIN_TINT_ALONE)
     if pale[0]:

@@ -153,7 +153,8 @@ def _shape_order(n: int) -> npt.NDArray[np.intp]:
     return shapes
 
 
-_PATTERNS = np.array(list(itertools.product((0, 1), repeat=4)), dtype=float)  # row k holds the bits of k
+PATTERNS = np.array(list(itertools.product((0, 1), repeat=4)), dtype=float)
+"""Dark units of each symbol of a cell, shape (16, 4): row k holds the bits of k."""
 
 
 class _Levels(NamedTuple):
@@ -197,7 +198,7 @@ def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
     scatter = float(residual @ weight @ residual)
     weight /= (scatter + SCATTER_PRIOR[0] * SCATTER_PRIOR[1]) / (len(residual) + SCATTER_PRIOR[0])
     weight *= _resolution_weight(fit)
-    costs = cell_costs(weight, residual, dark, contrast, _PATTERNS)
+    costs = cell_costs(weight, residual, dark, contrast, PATTERNS)
     level_residual = _level_residuals(levelled, dark, contrast).reshape(-1, 4).max(axis=1)
     if fit.unit_px >= LARGE_UNIT_PX:
         level_residual *= MAX_LEVEL_RESIDUAL / MAX_LARGE_RESIDUAL

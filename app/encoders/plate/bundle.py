@@ -95,19 +95,18 @@ def write_bundle(
         )
     if not options.formats:
         raise InvalidParameter("no format was requested", field="formats", limit="at least one of svg, pdf, dxf, png")
-    names = safe_names([f"{order.plate_id}-r{order.revision}" for order in orders])
+    names = plate_names(orders)
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
         packer = Packer(archive)
         plates = []
         for done, (order, name) in enumerate(zip(orders, names, strict=True), start=1):
-            plates.append(_add_plate(packer, order, name, options, read))
+            files, entry = plate_files(order, name, options, read)
+            _add_all(packer, files)
+            plates.append(entry)
             if progress:
                 progress(done)
-        if options.sheet_mm:
-            _add_sheets(packer, orders, options, options.sheet_mm)
-        packer.add("quality.pdf", write_pdf(quality_sheets(orders), compress=False))
-        packer.add("quality.csv", quality_csv(orders))
-        manifest = _manifest(plates, list(packer.entries), options, proved=read is not None)
+        _add_all(packer, sheet_files(orders, options))
+        manifest = bundle_manifest(plates, list(packer.entries), options, proved=read is not None)
         packer.add("manifest.json", orjson.dumps(manifest, option=orjson.OPT_INDENT_2))
     return manifest
 
@@ -133,28 +132,42 @@ def safe_names(names: Sequence[str]) -> list[str]:
     return safe
 
 
-def _add_plate(
-    packer: Packer, order: PlateOrder, name: str, options: BundleOptions, read: PlateReader | None
-) -> dict[str, Any]:
+def plate_names(orders: Sequence[PlateOrder]) -> list[str]:
+    """Names of the plates' files, without extension."""
+    return safe_names([f"{order.plate_id}-r{order.revision}" for order in orders])
+
+
+def _add_all(packer: Packer, files: Sequence[tuple[str, bytes]]) -> None:
+    for name, content in files:
+        packer.add(name, content)
+
+
+def plate_files(
+    order: PlateOrder, name: str, options: BundleOptions, read: PlateReader | None
+) -> tuple[list[tuple[str, bytes]], dict[str, Any]]:
+    """The files of a plate, by their names in the ZIP, and its entry in the manifest; raises as `write_bundle`."""
     drawing = encode_plate(order, options.artwork)
     proof = prove_plate(drawing, order.code, order.geometry, read) if read else None
+    files = [
+        (f"plates/{name}.{form}", write_artwork(drawing, form, dpi=options.dpi, compress=False).content)
+        for form in options.formats
+    ]
+    return files, _plate_entry(order, [path for path, _content in files], proof)
+
+
+def sheet_files(orders: Sequence[PlateOrder], options: BundleOptions) -> list[tuple[str, bytes]]:
+    """Sheets with nested plates, where these are wanted, and the quality sheets, by their names in the ZIP."""
     files = []
-    for form in options.formats:
-        path = f"plates/{name}.{form}"
-        packer.add(path, write_artwork(drawing, form, dpi=options.dpi, compress=False).content)
-        files.append(path)
-    return _plate_entry(order, files, proof)
-
-
-def _add_sheets(
-    packer: Packer, orders: Sequence[PlateOrder], options: BundleOptions, sheet_mm: tuple[float, float]
-) -> None:
-    width, height = sheet_mm
-    sheets = encode_sheets(orders, width_mm=width, height_mm=height, options=options.artwork)
-    for number, sheet in enumerate(sheets, start=1):
-        for form in options.formats:
-            content = write_artwork(sheet, form, dpi=options.dpi, compress=False).content
-            packer.add(f"sheets/sheet-{number:04d}.{form}", content)
+    if options.sheet_mm:
+        width, height = options.sheet_mm
+        sheets = encode_sheets(orders, width_mm=width, height_mm=height, options=options.artwork)
+        for number, sheet in enumerate(sheets, start=1):
+            for form in options.formats:
+                content = write_artwork(sheet, form, dpi=options.dpi, compress=False).content
+                files.append((f"sheets/sheet-{number:04d}.{form}", content))
+    files.append(("quality.pdf", write_pdf(quality_sheets(orders), compress=False)))
+    files.append(("quality.csv", quality_csv(orders)))
+    return files
 
 
 def _plate_entry(order: PlateOrder, files: list[str], proof: PlateProof | None) -> dict[str, Any]:
@@ -172,9 +185,10 @@ def _plate_entry(order: PlateOrder, files: list[str], proof: PlateProof | None) 
     }
 
 
-def _manifest(
+def bundle_manifest(
     plates: list[dict[str, Any]], files: list[dict[str, Any]], options: BundleOptions, *, proved: bool
 ) -> dict[str, Any]:
+    """The manifest of a bundle, from the entries of its plates and files."""
     return {
         "format": MANIFEST_FORMAT,
         "artwork_version": ARTWORK_VERSION,

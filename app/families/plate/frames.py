@@ -90,6 +90,7 @@ class PlateReadingDocument(TypedDict):
     cell_confidence: list[float]
     corrected_cells: list[int]
     from_codebook: bool
+    evidence_frames: list[int]
     corners_px: list[list[float]] | None
     corner_sigma_px: float | None
     height_px: float
@@ -227,6 +228,7 @@ def _reading_document(reading: PlateReading) -> PlateReadingDocument:
         "cell_confidence": [round(float(value), 6) for value in reading.cell_confidence],
         "corrected_cells": [int(cell) for cell in reading.corrected_cells],
         "from_codebook": bool(reading.from_codebook),
+        "evidence_frames": list(reading.frames),
         "corners_px": rounded(reading.corners_px, 3),
         "corner_sigma_px": _corner_sigma_px(reading.corners_covariance_px2),
         "height_px": round(float(reading.height_px), 2),

@@ -76,7 +76,7 @@ def track_of(name: str, points: Iterable[PosePoint], report: LogReport) -> PoseT
         table = table[np.argsort(table[:, 0], kind="stable")]
     new = np.diff(table[:, 0], prepend=-np.inf) > 0
     table = _keep(table, new, "same-time", "another position has the same time", report)
-    table = _keep(table, ~_jumps(table), "jump", f"faster than {FASTEST_M_S:g} m/s from both sides", report)
+    table = _keep(table, ~find_jumps(table), "jump", f"faster than {FASTEST_M_S:g} m/s from both sides", report)
     heading = np.where(np.isfinite(table[:, 3]), table[:, 3], np.nan) % 360.0
     accuracy = np.where((table[:, 4] > 0) & np.isfinite(table[:, 4]), table[:, 4], np.nan)
     return PoseTrack(table[:, 0], table[:, 1], table[:, 2], heading, accuracy)
@@ -102,7 +102,8 @@ def _check_swapped(name: str, lon_deg: Floats, lat_deg: Floats) -> None:
         )
 
 
-def _jumps(table: Floats) -> npt.NDArray[np.bool_]:
+def find_jumps(table: Floats) -> npt.NDArray[np.bool_]:
+    """Which rows (time [s], longitude, latitude [deg], ...) can only be reached too fast, from both sides."""
     if len(table) < 3:
         return np.zeros(len(table), bool)
     east = (np.diff(table[:, 1]) + 180) % 360 - 180

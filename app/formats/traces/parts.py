@@ -57,14 +57,18 @@ class Part:
         while block:
             size += len(block)
             if size > self.limit_bytes:
-                raise UploadTooLarge(
-                    f"{self.name} is too large",
-                    field=self.name,
-                    limit=f"{self.limit_bytes} bytes expanded",
-                    cure="cut the recording into shorter ones",
-                )
+                raise self.too_large()
             yield block
             block = _read(self.stream, BLOCK_BYTES, self.name)
+
+    def too_large(self) -> UploadTooLarge:
+        """The error of a file that passes its limit."""
+        return UploadTooLarge(
+            f"{self.name} is too large",
+            field=self.name,
+            limit=f"{self.limit_bytes} bytes expanded",
+            cure="cut the recording into shorter ones",
+        )
 
     def content(self) -> bytes:
         """All of it."""
@@ -72,7 +76,7 @@ class Part:
 
 
 def open_parts(parts: Mapping[str, bytes | BinaryIO], limits: TraceLimits) -> list[Part]:
-    """Open files, and those within ZIP archives.
+    """Open files, and those within ZIP archives. A stream that is an archive is sought in, so it has to allow that.
 
     Raises
     ------
@@ -98,11 +102,12 @@ def open_parts(parts: Mapping[str, bytes | BinaryIO], limits: TraceLimits) -> li
 
 
 def _members(archive: Part, limits: TraceLimits) -> list[Part]:
-    data = archive.content()
-    count_members(data, ArchiveLimits(members=_MAX_MEMBERS, total_bytes=limits.file_bytes))
+    if archive.stream.seek(0, io.SEEK_END) > archive.limit_bytes:
+        raise archive.too_large()
+    count_members(archive.stream, ArchiveLimits(members=_MAX_MEMBERS, total_bytes=limits.file_bytes))
     opened = []
     try:
-        packed = zipfile.ZipFile(io.BytesIO(data))
+        packed = zipfile.ZipFile(archive.stream)
         for info in packed.infolist():
             if not is_file(info):
                 continue

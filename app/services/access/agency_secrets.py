@@ -29,6 +29,27 @@ class AgencySecrets:
     def __init__(self, master_key: Callable[[], bytes]) -> None:
         self._master_key = master_key
 
+    def seal(self, owner: str, secret: bytes) -> bytes:
+        """A secret as it may be stored; `owner` says whose it is and what for, and opens it again."""
+        nonce = secrets.token_bytes(_NONCE_BYTES)
+        return nonce + AESGCM(self._master_key()).encrypt(nonce, secret, owner.encode())
+
+    def unseal(self, owner: str, sealed: bytes) -> bytes:
+        """A secret that `seal` has sealed for the same owner.
+
+        Raises
+        ------
+        Unavailable
+            It was stored under another master key.
+        """
+        try:
+            return AESGCM(self._master_key()).decrypt(sealed[:_NONCE_BYTES], sealed[_NONCE_BYTES:], owner.encode())
+        except InvalidTag as error:
+            raise Unavailable(
+                "a stored key cannot be opened with this server's master key",
+                cure="restore the master key that belongs to this database",
+            ) from error
+
     def find_key(self, connection: sa.Connection, agency_id: str) -> bytes | None:
         """The agency's key, if it has one.
 
@@ -38,22 +59,12 @@ class AgencySecrets:
             It was stored under another master key.
         """
         wrapped = cerpms.find_secret(connection, agency_id)
-        if wrapped is None:
-            return None
-        nonce, sealed = wrapped[:_NONCE_BYTES], wrapped[_NONCE_BYTES:]
-        try:
-            return AESGCM(self._master_key()).decrypt(nonce, sealed, agency_id.encode())
-        except InvalidTag as error:
-            raise Unavailable(
-                "the agency's key cannot be opened with this server's master key",
-                cure="restore the master key that belongs to this database",
-            ) from error
+        return None if wrapped is None else self.unseal(agency_id, wrapped)
 
     def ensure_key(self, connection: sa.Connection, agency_id: str, now: datetime) -> bytes:
         """The agency's key; made up in this transaction where it has none."""
         key = self.find_key(connection, agency_id)
         if key is None:
-            key, nonce = secrets.token_bytes(AGENCY_KEY_BYTES), secrets.token_bytes(_NONCE_BYTES)
-            sealed = AESGCM(self._master_key()).encrypt(nonce, key, agency_id.encode())
-            cerpms.add_secret(connection, agency_id, nonce + sealed, now)
+            key = secrets.token_bytes(AGENCY_KEY_BYTES)
+            cerpms.add_secret(connection, agency_id, self.seal(agency_id, key), now)
         return key

@@ -11,6 +11,7 @@ from app.errors import InvalidParameter
 from app.formats.images import ImageHeader, check_thermal_range
 from app.geodesy import check_lon_lat
 from app.sensors.camera import Camera
+from app.services.decodes.frame_terms import frame_terms
 from app.services.decodes.packet_task import packet_terms
 from app.services.decodes.trace_task import trace_terms
 
@@ -67,6 +68,8 @@ class CameraSetup:
         Field of view of an undistorted camera. [deg]
     height_m, depression_deg, azimuth_deg, roll_deg, forward_m, left_m : float
         Mount, as in `Camera`.
+    readout_s : float
+        Rolling shutter, as in `Camera`. [s]
     """
 
     width_px: int | None = None
@@ -83,6 +86,7 @@ class CameraSetup:
     roll_deg: float = 0.0
     forward_m: float = 0.0
     left_m: float = 0.0
+    readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         intrinsics = [name for name in _INTRINSICS if getattr(self, name) is not None]
@@ -143,11 +147,13 @@ class CameraSetup:
                 roll_deg=self.roll_deg,
                 forward_m=self.forward_m,
                 left_m=self.left_m,
+                readout_s=self.readout_s,
             )
         fx, fy, cx, cy = (float(getattr(self, name)) for name in _INTRINSICS)
         return Camera(
             width_px, height_px, fx, fy, cx, cy, self.distortion,
             self.height_m, self.depression_deg, self.azimuth_deg, self.roll_deg, self.forward_m, self.left_m,
+            self.readout_s,
         )  # fmt: skip
 
 
@@ -190,6 +196,9 @@ class DecodeContext:
         The upload is a magnetometer trace, declared like this (`app.services.decodes.trace_task.trace_terms`).
     packets : dict, optional
         The upload is a packet log, declared like this (`app.services.decodes.packet_task.packet_terms`).
+    frames : dict, optional
+        Frame rate, list and track of the frames of a drive, declared like this
+        (`app.services.decodes.frame_terms.frame_terms`).
     vehicle : dict, optional
         Id, name and version of the vehicle, and the source of each member
         (`app.services.fleet.profiles.inherit`).
@@ -203,6 +212,7 @@ class DecodeContext:
     captured_at: datetime | None = None
     trace: dict[str, Any] | None = None
     packets: dict[str, Any] | None = None
+    frames: dict[str, Any] | None = None
     vehicle: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -214,6 +224,8 @@ class DecodeContext:
             trace_terms(self.trace)
         if self.packets is not None:
             packet_terms(self.packets)
+        if self.frames is not None:
+            frame_terms(self.frames)
         if self.heading_deg is not None and not 0 <= self.heading_deg <= 360:
             raise InvalidParameter(
                 f"heading_deg is {self.heading_deg:g}",
@@ -240,9 +252,9 @@ class DecodeContext:
 
     def document(self) -> dict[str, Any]:
         """The context as it is stored: the members that have a value."""
-        stated = _without_none(asdict(replace(self, trace=None, packets=None, vehicle=None)))
+        stated = _without_none(asdict(replace(self, trace=None, packets=None, frames=None, vehicle=None)))
         document = {name: value for name, value in stated.items() if value is not False}
-        declared = {"trace": self.trace, "packets": self.packets, "vehicle": self.vehicle}
+        declared = {name: getattr(self, name) for name in ("trace", "packets", "frames", "vehicle")}
         return {**document, **{name: value for name, value in declared.items() if value is not None}}
 
 
@@ -258,6 +270,7 @@ def context_from_document(document: dict[str, Any]) -> DecodeContext:
         captured_at=datetime.fromisoformat(captured_at) if isinstance(captured_at, str) else captured_at,
         trace=document.get("trace"),
         packets=document.get("packets"),
+        frames=document.get("frames"),
         vehicle=document.get("vehicle"),
     )
     if camera is not None:

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
+import sqlalchemy as sa
+
+from app.errors import NotFound
+from app.formats.spooled_file import SpooledFile
 from app.registry import decodes as store
 from app.registry import jobs
 from app.registry.audit import Author
@@ -14,21 +19,23 @@ from app.services.access.access import Caller
 from app.services.access.audit import author_of
 from app.services.decodes.context import ContextInput, context_from_document
 from app.services.decodes.documents import DecodeDocument, DecodeHead, decode_document, decode_head
+from app.services.decodes.frame_documents import FramesResult
 from app.services.decodes.rules import DecodeRules
 from app.services.decodes.upload_path import (
-    UPLOADS,
     NewRecord,
     QueuedRecord,
     Upload,
     UploadHandler,
     UploadPath,
     new_decode,
+    with_upload,
 )
 from app.services.fleet.vehicle_uploads import count_upload, resolve_context
 from app.services.idempotency import IdempotencyKey, find_response, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, JobQueue
 from app.services.staged_blobs import staged
+from app.services.uploads.quotas import Quotas
 
 _WAIT_S = 60.0
 """How long a job waits for a decoder process before it is put back. [s]"""
@@ -43,6 +50,8 @@ class Decodes:
     clock : Clock
     blobs : Blobs
         Where uploads are stored.
+    quotas : Quotas
+        Of keys and agencies.
     queue : JobQueue
         Where uploads wait that take too long for an immediate response.
     handlers : sequence of UploadHandler
@@ -56,12 +65,13 @@ class Decodes:
         clock: Clock,
         *,
         blobs: Blobs,
+        quotas: Quotas,
         queue: JobQueue,
         handlers: Sequence[UploadHandler[Any]],
         rules: DecodeRules | None = None,
     ) -> None:
         self._database, self._clock = database, clock
-        self._blobs, self._queue = blobs, queue
+        self._blobs, self._quotas, self._queue = blobs, quotas, queue
         self._handlers = handlers
         self._rules = rules or DecodeRules()
         self._path = UploadPath(database, blobs)
@@ -69,9 +79,15 @@ class Decodes:
     # --- uploads ------------------------------------------------------------------------------------------------------
 
     def decode_upload(
-        self, caller: Caller, data: bytes, given: ContextInput, key: IdempotencyKey | None = None
+        self,
+        caller: Caller,
+        file: SpooledFile,
+        given: ContextInput,
+        key: IdempotencyKey | None = None,
+        *,
+        as_job: bool = False,
     ) -> tuple[DecodeDocument, bool]:
-        """Decode an upload now, or queue it if that takes too long.
+        """Decode an upload now, or queue it if that takes too long, or in any case `as_job`.
 
         Returns
         -------
@@ -93,12 +109,14 @@ class Decodes:
             earlier = find_response(connection, caller.agency_id, key, now)
             if earlier is not None:
                 return earlier, True
-            context = resolve_context(connection, caller, given, data)
-        handler = next(handler for handler in self._handlers if handler.accepts(context, data))
-        upload = Upload(caller.agency_id, author_of(caller), data, context, now)
-        if handler.is_job(data):
+            context = resolve_context(connection, caller, given, file)
+        handler = next(handler for handler in self._handlers if handler.accepts(context, file))
+        upload = Upload(caller.agency_id, author_of(caller), file, context, now)
+        if handler.is_job(file) or as_job:
             return self._put_in_queue(caller, upload, handler, key)
-        record = NewRecord(caller, handler, upload, self._clock, key=key, ttl=self._rules.idempotency_ttl)
+        record = NewRecord(
+            caller, handler, upload, self._clock, quotas=self._quotas, key=key, ttl=self._rules.idempotency_ttl
+        )
         self._path.decode(upload, handler, record)
         return record.response, record.replayed
 
@@ -107,10 +125,11 @@ class Decodes:
     ) -> tuple[DecodeDocument, bool]:
         agency_id, now, ttl = caller.agency_id, upload.received_at, self._rules.idempotency_ttl
         with staged(self._blobs) as stage:
-            row = new_decode(handler, upload)._replace(upload_key=stage.put(UPLOADS, upload.data))
+            row = with_upload(new_decode(handler, upload), stage, upload)
             with write_once(self._database, agency_id, key, now, ttl) as (connection, answer):
                 if answer.replayed:
                     return answer.response, True
+                self._quotas.count(connection, caller, upload.file.size)
                 store.add_decode(connection, agency_id, caller.key_id, row)
                 jobs.add_job(
                     connection,
@@ -119,7 +138,7 @@ class Decodes:
                 count_upload(connection, agency_id, row.id, upload.context, now)
                 document = answer.store(decode_document(row))
             stage.keep()
-        self._queue.submit(row.id, agency_id)
+        self._queue.submit(row.id, agency_id, JobKind.DECODE)
         return document, False
 
     def run(self, job: RunningJob) -> None:
@@ -127,13 +146,47 @@ class Decodes:
         with self._database.read() as connection:
             row = store.get_decode(connection, job.row.agency_id, job.row.id)
         assert row.upload_key is not None
-        upload = Upload(
-            job.row.agency_id, Author(job.row.input.get("label", ""), job.row.holder_id),
-            self._blobs.get(row.upload_key), context_from_document(row.context), row.created_at,
-            wait_s=_WAIT_S, report_progress=job.report_progress,
-        )  # fmt: skip
         handler = next(handler for handler in self._handlers if handler.kind == row.kind)
-        self._path.decode(upload, handler, QueuedRecord(job, upload, self._clock))
+        with self._blobs.opened(row.upload_key) as file:
+            upload = Upload(
+                job.row.agency_id, Author(job.row.input.get("label", ""), job.row.holder_id), file,
+                context_from_document(row.context), row.created_at,
+                wait_s=_WAIT_S, report_progress=job.report_progress, report_part=partial(self._keep_part, job),
+            )  # fmt: skip
+            self._path.decode(upload, handler, QueuedRecord(job, upload, self._clock))
+
+    def _keep_part(self, job: RunningJob, progress: float, part: FramesResult) -> None:
+        """Store the result so far."""
+
+        def keep(connection: sa.Connection) -> None:
+            store.store_part(connection, job.row.agency_id, job.row.id, part)
+
+        job.report_progress(progress, keep=keep, resumable=False)
+
+    def decode_again(self, agency_id: str, decode_id: str) -> tuple[dict[str, Any], bytes | None]:
+        """The result of a stored upload by the present decoders, and its plot; nothing is stored.
+
+        Raises
+        ------
+        NotFound
+            There is no such decode, or its upload is gone.
+        UnreadableUpload
+            The upload cannot be decoded any more.
+        Unavailable
+            The decoder processes are busy.
+        """
+        with self._database.read() as connection:
+            row = store.get_decode(connection, agency_id, decode_id)
+        if row.upload_key is None:
+            raise NotFound(f"decode {decode_id} has no upload", field="decode_id")
+        handler = next(handler for handler in self._handlers if handler.kind == row.kind)
+        with self._blobs.opened(row.upload_key) as file:
+            upload = Upload(
+                agency_id, Author(""), file, context_from_document(row.context), row.created_at,
+                wait_s=_WAIT_S, again_id=decode_id,
+            )  # fmt: skip
+            decoded, plot = self._path.decode_again(upload, handler)
+        return dict(decoded.document), plot
 
     # --- stored decodes -----------------------------------------------------------------------------------------------
 

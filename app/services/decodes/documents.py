@@ -11,7 +11,14 @@ from typing_extensions import TypedDict
 
 from app.registry.decodes import DecodeRow
 from app.registry.jobs import JobState
-from app.services.decodes.frame_documents import AnyReading, FixDocument, FrameDocument, FrameSummary
+from app.services.decodes.frame_documents import (
+    AnyReading,
+    FixDocument,
+    FrameDocument,
+    FrameSummary,
+    SeenPlateDocument,
+)
+from app.services.decodes.frame_poses import GapDocument
 from app.services.decodes.kinds import DecodeKind
 from app.services.decodes.lane_documents import DecodedLaneDocument, OverlayDocument, SteeringDocument
 from app.services.decodes.packet_documents import (
@@ -26,6 +33,7 @@ from app.services.decodes.trace_documents import (
     PassedMagnetDocument,
     TagDocument,
     TagFixDocument,
+    TraceMotionDocument,
     TraceReportDocument,
     TraceSummary,
 )
@@ -58,13 +66,18 @@ class DecodeHead(TypedDict):
 
 
 class DecodeDocument(DecodeHead):
-    """A decode. `decoder` and what follows it are there once it is done."""
+    """A decode. `decoder` and what follows it are there once it is done, or as far as it is done: then `partial`."""
+
+    partial: NotRequired[Annotated[bool, Field(description="The decode goes on; this is its result so far.")]]
 
     decoder: NotRequired[str]
     summary: NotRequired[FrameSummary | TraceSummary | PacketSummary]
     codebook_plates: NotRequired[int]
     readings: NotRequired[list[AnyReading]]
     frames: NotRequired[list[FrameDocument]]
+    plates: NotRequired[list[SeenPlateDocument]]
+    gaps: NotRequired[list[GapDocument]]
+    warnings: NotRequired[list[str]]
     fix: NotRequired[FixDocument | TagFixDocument | None]
     codebook_tags: NotRequired[int]
     report: NotRequired[TraceReportDocument | PacketReportDocument]
@@ -72,6 +85,7 @@ class DecodeDocument(DecodeHead):
     crossings: NotRequired[list[CrossingDocument]]
     magnets: NotRequired[list[PassedMagnetDocument]]
     noise: NotRequired[list[NoiseDocument]]
+    motion: NotRequired[TraceMotionDocument]
     markers: NotRequired[list[ReceivedMarkerDocument]]
     lane: NotRequired[DecodedLaneDocument]
     steering: NotRequired[SteeringDocument | None]
@@ -87,7 +101,8 @@ class DecodePage(TypedDict):
 
 def decode_document(row: DecodeRow) -> DecodeDocument:
     """A decode with its result, once there is one."""
-    return cast("DecodeDocument", {**decode_head(row), **(row.result or {})})
+    so_far = {"partial": True} if row.state == "running" and row.result else {}
+    return cast("DecodeDocument", {**decode_head(row), **so_far, **(row.result or {})})
 
 
 def decode_head(row: DecodeRow) -> DecodeHead:
@@ -110,7 +125,7 @@ def _links(path: str, kind: str, result: Mapping[str, Any]) -> DecodeLinks:
     links: DecodeLinks = {"self": path}
     if kind in (DecodeKind.FRAME, DecodeKind.ARCHIVE):
         links["annotated"] = f"{path}/annotated.jpg"
-    else:
+    elif kind != DecodeKind.VIDEO:
         links["plot"] = f"{path}/plot.svg"
     if kind == DecodeKind.PACKETS:
         links["lane"] = f"{path}/lane.geojson"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import types
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from typing_extensions import TypedDict
 
 from app import __version__
 from app.decoders.plate import DECODER_VERSION
+from app.decoders.plate.video_search import FoundPlate
 from app.errors import WaymarkError
 from app.families import get_family, union_of
 from app.families.frames import FrameReading, Match
@@ -21,9 +23,11 @@ from app.formats.images import ImageHeader
 from app.geodesy import LocalizationGrade
 from app.markers.reading import PlateOutcome
 from app.services.decodes.fixes import Fix
+from app.services.decodes.frame_poses import FramePose, GapDocument
 from app.services.decodes.matching import FRAME_READERS
 from app.services.decodes.wording import count_of
 from app.services.error_documents import ErrorDocument, error_document
+from app.services.health.evidence import FrameHealth
 
 DECODER = f"waymark {__version__} {DECODER_VERSION}"
 
@@ -49,6 +53,59 @@ class ReadFrame:
     error: WaymarkError | None = None
     load_ms: float = 0.0
     decode_ms: float = 0.0
+    captured_at: datetime | None = None
+    pose: FramePose | None = None
+    time_s: float | None = None
+    health: FrameHealth = field(default_factory=FrameHealth)
+
+
+class SeenPlateDocument(TypedDict):
+    """A plate that passed by in several frames, and what all of them show together.
+
+    `frames_alone` counts the frames that were read by themselves; without any, only the sum of the evidence was enough.
+    """
+
+    outcome: str
+    reason: str | None
+    digits: str | None
+    confidence: float
+    marker_id: str | None
+    frames: list[int]
+    frames_alone: int
+    speed_m_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class DriveNotes:
+    """What is to be known about the frames of a drive as a whole.
+
+    Attributes
+    ----------
+    warnings, gaps, plates
+        As in `FramesResult`.
+    searched : int or None
+        Frames of a video, of which only those with readings are listed.
+    """
+
+    warnings: Sequence[str] = ()
+    gaps: Sequence[GapDocument] = ()
+    plates: Sequence[SeenPlateDocument] = ()
+    searched: int | None = None
+
+
+class FramePoseDocument(TypedDict):
+    """Where the vehicle was when the frame was taken, by anything but the frame.
+
+    The source is `list` (frames.csv or frames.json), `track` (a track beside the frames) or `context` (the coarse
+    position of the upload).
+    """
+
+    source: str
+    lon_deg: float
+    lat_deg: float
+    heading_deg: float | None
+    accuracy_m: float | None
+    speed_m_s: float | None
 
 
 class SigmaDocument(TypedDict):
@@ -113,6 +170,9 @@ class FrameDocument(TypedDict):
 
     frame: int
     name: str | None
+    captured_at: str | None
+    time_s: float | None
+    pose: FramePoseDocument | None
     error: ErrorDocument | None
     width_px: int | None
     height_px: int | None
@@ -146,18 +206,27 @@ class FramesResult(TypedDict):
     readings: list[AnyReading]
     fix: FixDocument | None
     frames: list[FrameDocument]
+    plates: list[SeenPlateDocument]
+    gaps: list[GapDocument]
+    warnings: list[str]
 
 
-def frames_result(frames: Sequence[ReadFrame], *, codebook_plates: int) -> FramesResult:
+def frames_result(
+    frames: Sequence[ReadFrame], *, codebook_plates: int, notes: DriveNotes | None = None
+) -> FramesResult:
     """The result of decoding frames, as it is stored."""
+    notes = notes or DriveNotes()
     readings = [{"frame": frame.index, **_reading(marker)} for frame in frames for marker in frame.markers]
     return {
         "decoder": DECODER,
         "codebook_plates": codebook_plates,
-        "summary": _summary(frames),
+        "summary": _summary(frames, notes.searched),
         "readings": readings,
         "fix": fix_document(frames[0].fix) if len(frames) == 1 else None,
         "frames": [_frame(frame) for frame in frames],
+        "plates": list(notes.plates),
+        "gaps": list(notes.gaps),
+        "warnings": list(notes.warnings),
     }
 
 
@@ -185,7 +254,30 @@ def fix_document(fix: Fix | None) -> FixDocument | None:
     }
 
 
-def _summary(frames: Sequence[ReadFrame]) -> FrameSummary:
+def seen_plate_document(plate: FoundPlate, frames: Mapping[int, ReadFrame]) -> SeenPlateDocument:
+    """A plate of a video as clients see it; its frames were matched."""
+    reading = plate.reading
+    matched = (
+        marker.match.row.id
+        for seen in plate.seen
+        for marker in frames[seen.frame].markers
+        if marker.reading.family == PLATE.name and marker.match is not None and marker.match.row is not None
+        and getattr(marker.reading, "digits", None) == reading.digits
+    )  # fmt: skip
+    return {
+        "outcome": str(reading.outcome),
+        "reason": reading.reason or None,
+        "digits": reading.digits,
+        "confidence": float(reading.confidence),
+        "marker_id": next(matched, None) if reading.digits else None,
+        "frames": [seen.frame for seen in plate.seen],
+        "frames_alone": len(plate.alone),
+        "speed_m_s": None if plate.speed_m_s is None else round(plate.speed_m_s, 3),
+    }
+
+
+def _summary(frames: Sequence[ReadFrame], searched: int | None) -> FrameSummary:
+    total = len(frames) if searched is None else searched
     markers = [marker for frame in frames for marker in frame.markers]
     read = [marker for marker in markers if marker.reading.outcome == PlateOutcome.READ]
     matched = [marker for marker in read if marker.match is not None and marker.match.row is not None]
@@ -196,12 +288,12 @@ def _summary(frames: Sequence[ReadFrame]) -> FrameSummary:
         outcomes[outcome] = outcomes.get(outcome, 0) + 1
     refused = len(markers) - len(read)
     text = f"{_counts(read)} read" if read else "no plate read"
-    text += f" in {count_of(len(frames), 'frame')}, {len(matched)} of them registered" if read else ""
+    text += f" in {count_of(total, 'frame')}, {len(matched)} of them registered" if read else ""
     text += f"; {count_of(refused, 'candidate')} refused" if refused else ""
     text += f"; {count_of(failed, 'frame')} could not be decoded" if failed else ""
     return {
         "text": text,
-        "frames": len(frames),
+        "frames": total,
         "frames_failed": failed,
         "plates_read": sum(marker.reading.family == PLATE.name for marker in read),
         "plates_matched": sum(marker.reading.family == PLATE.name for marker in matched),
@@ -221,6 +313,9 @@ def _frame(frame: ReadFrame) -> FrameDocument:
     return {
         "frame": frame.index,
         "name": frame.name,
+        "captured_at": frame.captured_at.isoformat().replace("+00:00", "Z") if frame.captured_at else None,
+        "time_s": None if frame.time_s is None else round(frame.time_s, 6),
+        "pose": _pose(frame.pose),
         "error": error_document(frame.error) if frame.error else None,
         "width_px": header.width_px if header else None,
         "height_px": header.height_px if header else None,
@@ -231,6 +326,19 @@ def _frame(frame: ReadFrame) -> FrameDocument:
         "decode_ms": round(frame.decode_ms, 3),
         "readings": len(frame.markers),
         "fix": fix_document(frame.fix),
+    }
+
+
+def _pose(pose: FramePose | None) -> FramePoseDocument | None:
+    if pose is None:
+        return None
+    return {
+        "source": pose.source,
+        "lon_deg": round(pose.lon_deg, 9),
+        "lat_deg": round(pose.lat_deg, 9),
+        "heading_deg": pose.heading_deg,
+        "accuracy_m": pose.accuracy_m,
+        "speed_m_s": None if pose.speed_m_s is None else round(pose.speed_m_s, 3),
     }
 
 

@@ -9,6 +9,7 @@ from typing import ClassVar
 
 from app.families.frames import FrameReading
 from app.formats.images import ImageHeader, ImageLimits
+from app.formats.spooled_file import SpooledFile
 from app.plots.annotated_frame import Outline
 from app.services.decoder_processes import Task
 
@@ -19,7 +20,7 @@ class FramePicture:
 
     Attributes
     ----------
-    data : bytes
+    file : SpooledFile
         JPEG or PNG.
     thermal : bool
     thermal_range : (float, float) or None
@@ -27,7 +28,7 @@ class FramePicture:
     limits : ImageLimits
     """
 
-    data: bytes
+    file: SpooledFile
     thermal: bool = False
     thermal_range: tuple[float, float] | None = None
     limits: ImageLimits = field(default_factory=ImageLimits)
@@ -91,7 +92,7 @@ class AnnotationTask(Task[bytes]):
 
     is_long: ClassVar[bool] = False
 
-    data: bytes
+    file: SpooledFile
     outlines: tuple[Outline, ...]
     suffix: str
     thermal: bool = False

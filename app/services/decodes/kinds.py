@@ -10,5 +10,6 @@ class DecodeKind(StrEnum):
 
     FRAME = "frame"
     ARCHIVE = "archive"
+    VIDEO = "video"
     TRACE = "trace"
     PACKETS = "packets"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import Any
 
 from app.errors import NotFound
 from app.formats.archives import read_member
+from app.formats.spooled_file import SpooledFile
 from app.plots.annotated_frame import Outline
 from app.registry import decodes as store
 from app.registry.database import Database
@@ -48,16 +50,20 @@ class DecodeOutputs:
             There is no such decode or frame, or it is not done.
         """
         row, result = self._result(caller, decode_id)
+        if row.kind == DecodeKind.VIDEO:
+            raise NotFound(f"decode {decode_id} is of a video: its frames are not kept as pictures", field="decode_id")
         shown = next((entry for entry in result.get("frames", ()) if entry["frame"] == frame), None)
         if shown is None or shown["error"] is not None:
             raise NotFound(f"decode {decode_id} has no readable frame {frame}", field="frame")
-        data = self._upload(row)
-        if row.kind == DecodeKind.ARCHIVE:
-            data = read_member(data, frame, self._rules.archives).data
         context = context_from_document(row.context)
         outlines = tuple(_outline(reading) for reading in result["readings"] if reading["frame"] == frame)
-        task = AnnotationTask(data, outlines, suffix, context.thermal, context.thermal_range, limits=self._rules.images)
-        return self._processes.submit(task).result()
+        with self._upload(row) as file:
+            if row.kind == DecodeKind.ARCHIVE:
+                file = SpooledFile.of(read_member(file, frame, self._rules.archives).data)
+            task = AnnotationTask(
+                file, outlines, suffix, context.thermal, context.thermal_range, limits=self._rules.images
+            )
+            return self._processes.submit(task).result()
 
     def overlay(self, caller: Caller, decode_id: str, suffix: str) -> bytes:
         """The camera frame of a drive with its lane drawn over it, encoded as ``png`` or ``jpg``.
@@ -76,10 +82,10 @@ class DecodeOutputs:
                 limit="a packet log with a camera frame, a camera and the vehicle's pose",
                 cure="report.warnings lists what was missing",
             )
-        task = OverlayTask(
-            self._upload(row), overlay["frame"], overlay_from_document(overlay), suffix, self._rules.images
-        )
-        return self._processes.submit(task).result()
+        shown = overlay_from_document(overlay)
+        with self._upload(row) as file:
+            task = OverlayTask(file, overlay["frame"], shown, suffix, self._rules.images)
+            return self._processes.submit(task).result()
 
     def lane(self, caller: Caller, decode_id: str) -> LaneCollection:
         """Path, boundaries and markers of a drive as GeoJSON.
@@ -128,9 +134,9 @@ class DecodeOutputs:
             )
         return row, row.result
 
-    def _upload(self, row: DecodeRow) -> bytes:
+    def _upload(self, row: DecodeRow) -> AbstractContextManager[SpooledFile]:
         assert row.upload_key is not None
-        return self._blobs.get(row.upload_key)
+        return self._blobs.opened(row.upload_key)
 
 
 def _outline(reading: dict[str, Any]) -> Outline:

@@ -9,8 +9,10 @@ import sqlalchemy as sa
 
 from app.decoders.cerpm.match import list_numbers
 from app.decoders.cerpm.vehicle_positions import vehicle_positions
+from app.formats.spooled_file import SpooledFile
 from app.registry import cerpms
 from app.registry.database import Database
+from app.registry.decodes import NewObservation
 from app.sensors.camera import Camera
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.decoder_processes import DecoderProcesses, Pending
@@ -23,6 +25,7 @@ from app.services.decodes.packet_task import DriveFiles, DriveTask, LaneResult, 
 from app.services.decodes.rules import DecodeRules
 from app.services.decodes.trace_handler import check_not_empty
 from app.services.decodes.upload_path import Decoded, OutdatedMatch, Upload, UploadHandler
+from app.services.health.packets import missed_cerpms, packet_evidence, with_evidence
 
 Pose = tuple[float, float, float]
 """Longitude, latitude and heading of a vehicle. [deg]"""
@@ -49,21 +52,22 @@ class PacketHandler(UploadHandler[DriveSignal]):
         self._secrets, self._rules = secrets, rules
         self._invalid_tags = InvalidTagLimit()
 
-    def accepts(self, context: DecodeContext, data: bytes) -> bool:
+    def accepts(self, context: DecodeContext, file: SpooledFile) -> bool:
         """Uploads whose context declares packets."""
         return context.packets is not None
 
-    def is_job(self, data: bytes) -> bool:
+    def is_job(self, file: SpooledFile) -> bool:
         """Whether the log is longer than `DecodeRules.immediate_trace_bytes`."""
-        check_not_empty(data)
-        return len(data) > self._rules.immediate_trace_bytes
+        check_not_empty(file)
+        return file.size > self._rules.immediate_trace_bytes
 
     def start(self, upload: Upload) -> StartedDrive:
         """Have the files of the drive read."""
-        self._invalid_tags.left(_holder(upload), upload.received_at)
+        if upload.again_id is None:
+            self._invalid_tags.left(_holder(upload), upload.received_at)
         declared = upload.context.packets or {}
         name = str(declared.get("file_name") or "packets")
-        task = DriveTask(name, upload.data, declared, self._rules.packets, self._rules.images)
+        task = DriveTask(name, upload.file, declared, self._rules.packets, self._rules.images)
         files = self._processes.submit(task, wait_s=upload.wait_s)
         return StartedDrive(upload, files, self._database, self._processes, self._secrets, self._invalid_tags)
 
@@ -81,17 +85,34 @@ class PacketHandler(UploadHandler[DriveSignal]):
         """
         verification = signal.read.verification
         forged = forgery_detail(verification)
-        spans = cerpms.list_spans(connection, upload.agency_id, verification.spans)
+        spans = cerpms.list_spans(connection, upload.agency_id, verification.spans, upload.again_id)
         newest = cerpms.newest_row(spans)
         if newest > signal.read.known.last_span:
             raise OutdatedMatch
-        self._invalid_tags.add(_holder(upload), verification.invalid_tags, upload.received_at)
+        if upload.again_id is None:
+            self._invalid_tags.add(_holder(upload), verification.invalid_tags, upload.received_at)
         return Decoded(
             packets_document(signal.files, signal.read, signal.result),
-            packet_observations(signal.read, signal.result.lane, upload.observed_at),
+            self._observations(connection, upload, signal),
             spans_of(verification),
             {} if forged is None else {"packets.forged": forged},
         )
+
+    def _observations(self, connection: sa.Connection, upload: Upload, signal: DriveSignal) -> list[NewObservation]:
+        """What was received of registered markers, and which were passed without a packet."""
+        read, at = signal.read, upload.observed_at
+        rows = packet_observations(read, signal.result.lane, at)
+        if not rows:
+            return []
+        kinds = {finding.number: finding.kind for finding in read.merged.findings}
+        observed = {row.marker_id for row in rows}
+        evidence = {
+            row.id: packet_evidence(read, row, kinds.get(number), signal.files)
+            for number, row in read.known.rows.items()
+            if row.id in observed
+        }
+        missed = missed_cerpms(connection, upload.agency_id, read, signal.files, at)
+        return [*with_evidence(rows, evidence), *missed]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +132,7 @@ class StartedDrive:
         terms = packet_terms(upload.context.packets or {})
         camera, pose = _view(files, upload.context)
         with self.database.read() as connection:
-            known = find_known(connection, upload.agency_id, self.secrets, list_numbers(files.packets))
+            known = find_known(connection, upload.agency_id, self.secrets, list_numbers(files.packets), upload.again_id)
         max_invalid_tags = self.invalid_tags.left(_holder(upload), upload.received_at)
         read = read_packets_of(
             files,

@@ -75,9 +75,11 @@ class ReadPackets:
     verify_ms: float
 
 
-def find_known(connection: sa.Connection, agency_id: str, secrets: AgencySecrets, numbers: list[int]) -> KnownMarkers:
-    """Markers, key and earlier drives of an agency."""
-    spans = cerpms.list_spans(connection, agency_id, numbers)
+def find_known(
+    connection: sa.Connection, agency_id: str, secrets: AgencySecrets, numbers: list[int], before: str | None = None
+) -> KnownMarkers:
+    """Markers, key and earlier drives of an agency; of a decode that is done again, those before it."""
+    spans = cerpms.list_spans(connection, agency_id, numbers, before)
     return KnownMarkers(
         cerpms.list_by_number(connection, agency_id, numbers),
         secrets.find_key(connection, agency_id),

@@ -16,6 +16,7 @@ from app.formats.log_times import LogClock, TimeScale
 from app.formats.packets.declaration import PacketDeclaration, PacketLimits
 from app.formats.packets.rows import PayloadText
 from app.formats.poses.declaration import PoseDeclaration
+from app.formats.spooled_file import SpooledFile
 from app.lanes.types import Lane, LaneMarkers, LaneRules
 from app.sensors.camera import Camera
 from app.sensors.pose_track import PoseTrack
@@ -100,7 +101,7 @@ class DriveTask(Task[DriveFiles]):
     ----------
     name : str
         Of the file.
-    data : bytes
+    file : SpooledFile
         A packet log, or a ZIP of packet logs, poses and a camera frame.
     declared : mapping
         The declaration as it was sent; see `packet_terms`.
@@ -109,7 +110,7 @@ class DriveTask(Task[DriveFiles]):
     """
 
     name: str
-    data: bytes
+    file: SpooledFile
     declared: Mapping[str, Any]
     packets: PacketLimits = field(default_factory=PacketLimits)
     images: ImageLimits = field(default_factory=ImageLimits)
@@ -175,7 +176,7 @@ class OverlayTask(Task[bytes]):
 
     Attributes
     ----------
-    data : bytes
+    file : SpooledFile
         The upload.
     frame : str
         Name of the picture in it.
@@ -187,7 +188,7 @@ class OverlayTask(Task[bytes]):
 
     is_long: ClassVar[bool] = False
 
-    data: bytes
+    file: SpooledFile
     frame: str
     overlay: LaneOverlay
     suffix: str
@@ -218,7 +219,7 @@ def packet_terms(declared: Mapping[str, Any]) -> PacketTerms:
         steering = declared.get("steering", PREDICTIVE)
         return PacketTerms(
             _packet_declaration(declared),
-            _pose_declaration(declared.get("poses") or {}),
+            pose_declaration(declared.get("poses") or {}),
             files,
             FreshnessRules(**(declared.get("freshness") or {})),
             LaneRules(**(declared.get("lane") or {})),
@@ -246,7 +247,8 @@ def _packet_declaration(declared: Mapping[str, Any]) -> PacketDeclaration:
     )
 
 
-def _pose_declaration(declared: Mapping[str, Any]) -> PoseDeclaration:
+def pose_declaration(declared: Mapping[str, Any]) -> PoseDeclaration:
+    """The declaration of a track, as `app.api.decodes.schemas_packets.PosesIn` describes it."""
     return PoseDeclaration(
         _clock(declared.get("clock") or {}),
         declared.get("columns") or {},

@@ -9,6 +9,7 @@ from app.formats.archives import ArchiveLimits
 from app.formats.images import ImageLimits
 from app.formats.packets.declaration import PacketLimits
 from app.formats.traces.declaration import TraceLimits
+from app.formats.video.index import VideoLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +20,7 @@ class DecodeRules:
     ----------
     images : ImageLimits
     archives : ArchiveLimits
+    videos : VideoLimits
     traces : TraceLimits
     packets : PacketLimits
     immediate_trace_bytes : int
@@ -32,6 +34,7 @@ class DecodeRules:
 
     images: ImageLimits = field(default_factory=ImageLimits)
     archives: ArchiveLimits = field(default_factory=ArchiveLimits)
+    videos: VideoLimits = field(default_factory=VideoLimits)
     traces: TraceLimits = field(default_factory=TraceLimits)
     packets: PacketLimits = field(default_factory=PacketLimits)
     immediate_trace_bytes: int = 8 * 1024**2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from app.decoders.magnet.localize import TagFix
 from app.decoders.magnet.match import ReadTag, ReadTrace, TagMatch
 from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFinding, TagReading
 from app.formats.traces.report import LeftOut, TraceGap
-from app.services.decodes.trace_task import TraceResult
+from app.services.decodes.trace_task import TraceMotion, TraceResult
 from app.services.decodes.wording import count_of
 
 MAX_NOISE = 500
@@ -166,6 +167,15 @@ class TagDocument(TypedDict):
     fix: TagFixDocument | None
 
 
+class TraceMotionDocument(TypedDict):
+    """Speed and heading at even times from the trace's first sample on; null where the recording has none near by."""
+
+    start_s: float
+    step_s: float
+    speed_m_s: list[float | None]
+    heading_deg: list[float | None]
+
+
 class TraceResultDocument(TypedDict):
     """The result of decoding a trace."""
 
@@ -178,6 +188,7 @@ class TraceResultDocument(TypedDict):
     magnets: list[PassedMagnetDocument]
     noise: list[NoiseDocument]
     fix: TagFixDocument | None
+    motion: TraceMotionDocument
 
 
 def trace_document(result: TraceResult, trace: ReadTrace, *, codebook_tags: int) -> TraceResultDocument:
@@ -209,7 +220,21 @@ def trace_document(result: TraceResult, trace: ReadTrace, *, codebook_tags: int)
         "magnets": [_magnet(magnet) for magnet in trace.magnets],
         "noise": [_noise(finding) for finding in trace.noise[:MAX_NOISE]],
         "fix": tag_fix_document(fixes[-1]) if fixes else None,
+        "motion": _motion(result.motion),
     }
+
+
+def _motion(motion: TraceMotion) -> TraceMotionDocument:
+    return {
+        "start_s": motion.start_s,
+        "step_s": motion.step_s,
+        "speed_m_s": [_rounded(value, 3) for value in motion.speed_m_s],
+        "heading_deg": [_rounded(value, 2) for value in motion.heading_deg],
+    }
+
+
+def _rounded(value: float, places: int) -> float | None:
+    return round(value, places) if math.isfinite(value) else None
 
 
 def _summary(result: TraceResult, trace: ReadTrace) -> TraceSummary:

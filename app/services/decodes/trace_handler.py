@@ -10,6 +10,7 @@ import sqlalchemy as sa
 from app.decoders.magnet.identify import TagFormat
 from app.decoders.magnet.match import ReadTrace, match_tags
 from app.errors import UnreadableUpload
+from app.formats.spooled_file import SpooledFile
 from app.geodesy import decimal_year
 from app.registry.codebooks import CODEBOOKS, book_of
 from app.registry.database import Database
@@ -22,6 +23,8 @@ from app.services.decodes.trace_documents import trace_document
 from app.services.decodes.trace_matching import NearbyTags, find_nearby_tags
 from app.services.decodes.trace_task import TraceResult, TraceTask, trace_terms
 from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
+from app.services.health.evidence import EVIDENCE
+from app.services.health.traces import missed_tags, tag_evidence
 from app.services.markers.codebook_documents import MAX_BOOKS_SEARCHED
 
 
@@ -57,14 +60,14 @@ class TraceHandler(UploadHandler[TraceSignal]):
     def __init__(self, database: Database, processes: DecoderProcesses, rules: DecodeRules) -> None:
         self._database, self._processes, self._rules = database, processes, rules
 
-    def accepts(self, context: DecodeContext, data: bytes) -> bool:
+    def accepts(self, context: DecodeContext, file: SpooledFile) -> bool:
         """Uploads whose context declares a trace."""
         return context.trace is not None
 
-    def is_job(self, data: bytes) -> bool:
+    def is_job(self, file: SpooledFile) -> bool:
         """Whether the recording is longer than `DecodeRules.immediate_trace_bytes`."""
-        check_not_empty(data)
-        return len(data) > self._rules.immediate_trace_bytes
+        check_not_empty(file)
+        return file.size > self._rules.immediate_trace_bytes
 
     def start(self, upload: Upload) -> StartedTrace:
         """Hand the recording over with the tags that the drive can have passed."""
@@ -75,7 +78,7 @@ class TraceHandler(UploadHandler[TraceSignal]):
             nearby = find_nearby_tags(connection, upload.agency_id, position, reach_m, epoch)
             formats = () if nearby.texts else _book_formats(connection, upload.agency_id)
         name = str(declared.get("file_name") or "recording")
-        task = TraceTask(name, upload.data, declared, nearby.texts, formats, self._rules.traces)
+        task = TraceTask(name, upload.file, declared, nearby.texts, formats, self._rules.traces)
         return StartedTrace(nearby, self._processes.submit(task, wait_s=upload.wait_s))
 
     def plot(self, signal: TraceSignal) -> bytes:
@@ -87,12 +90,14 @@ class TraceHandler(UploadHandler[TraceSignal]):
         terms = trace_terms(upload.context.trace or {})
         trace = match_tags(signal.result.findings, signal.nearby.tags, terms.bar)
         document = trace_document(signal.result, trace, codebook_tags=len(signal.nearby.texts))
-        return Decoded(document, _observations(trace, upload.observed_at))
+        nearby, at = signal.nearby, upload.observed_at
+        missed = missed_tags(trace, nearby.tags, nearby.complete, terms.bar, at)
+        return Decoded(document, [*_observations(trace, at), *missed])
 
 
-def check_not_empty(data: bytes) -> None:
+def check_not_empty(file: SpooledFile) -> None:
     """Raise `UnreadableUpload` for a file without content."""
-    if not data:
+    if not file.size:
         raise UnreadableUpload("the file is empty", field="file", cure="send the recording again, whole")
 
 
@@ -106,6 +111,7 @@ def _book_formats(connection: sa.Connection, agency_id: str) -> tuple[TagFormat,
 def _observations(trace: ReadTrace, observed_at: datetime) -> list[NewObservation]:
     """One row for each registered tag; of one that was passed twice the more confident reading counts."""
     rows: dict[str, NewObservation] = {}
+    evidence = tag_evidence(trace)
     for tag in sorted(trace.tags, key=lambda tag: -tag.reading.confidence):
         if tag.match is None or tag.match.tag is None:
             continue
@@ -115,6 +121,7 @@ def _observations(trace: ReadTrace, observed_at: datetime) -> list[NewObservatio
             "missing_magnets": reading.missing,
             "extra_magnets": reading.extra,
             "lateral_cm": round(float(reading.lateral_cm), 2),
+            EVIDENCE: evidence[marker_id],
         }
         what = "wrong-way" if reading.wrong_way else "seen"
         rows.setdefault(marker_id, NewObservation(marker_id, 0, observed_at, what, detail))

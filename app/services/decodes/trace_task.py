@@ -11,6 +11,7 @@ import numpy as np
 from app.decoders.magnet.identify import TagFormat
 from app.decoders.magnet.readings import Finding
 from app.errors import InvalidParameter
+from app.formats.spooled_file import SpooledFile
 from app.formats.traces.declaration import (
     AngleUnit,
     AxisConvention,
@@ -56,6 +57,24 @@ class TraceTerms:
 
 
 @dataclass(frozen=True, slots=True)
+class TraceMotion:
+    """Speed and heading over a recording, at even times.
+
+    Attributes
+    ----------
+    start_s, step_s : float
+        Trace time of the first value, which is that of the first sample, and the time between two. [s]
+    speed_m_s, heading_deg : tuple of float
+        Empty where the recording has none; NaN where it has none near by. [m/s, deg]
+    """
+
+    start_s: float
+    step_s: float
+    speed_m_s: tuple[float, ...] = ()
+    heading_deg: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class TraceResult:
     """What a decoder process found in a recording.
 
@@ -73,6 +92,7 @@ class TraceResult:
         SVG.
     load_ms, decode_ms : float
         Time spent on reading the files and on the magnets. [ms]
+    motion : TraceMotion
     """
 
     findings: tuple[Finding, ...]
@@ -82,6 +102,7 @@ class TraceResult:
     plot: bytes
     load_ms: float
     decode_ms: float
+    motion: TraceMotion
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +125,7 @@ class TraceTask(Task[TraceResult]):
     """
 
     name: str
-    data: bytes
+    file: SpooledFile
     declared: Mapping[str, Any]
     tags: tuple[str, ...] = ()
     formats: tuple[TagFormat, ...] = ()

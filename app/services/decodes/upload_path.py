@@ -15,24 +15,29 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import sqlalchemy as sa
 
 from app.errors import Unavailable
+from app.formats.spooled_file import SpooledFile
 from app.registry import audit, cerpms
 from app.registry import decodes as store
 from app.registry.audit import Author
 from app.registry.database import Database
 from app.registry.decodes import DecodeRow, NewObservation
+from app.registry.health import NewUnregistered, add_unregistered
 from app.registry.ids import new_id
 from app.services.access.access import Caller
 from app.services.decodes.context import DecodeContext
 from app.services.decodes.documents import DecodeDocument, decode_document
 from app.services.decodes.frame_documents import FramesResult
 from app.services.decodes.kinds import DecodeKind
+from app.services.decodes.measures import MeasuredDecode, measured
 from app.services.decodes.packet_documents import PacketsResult
 from app.services.decodes.trace_documents import TraceResultDocument
 from app.services.fleet.vehicle_uploads import count_driven, count_upload
+from app.services.health.record import BAR, CAMERA, RADIO, ObservedDrive, record_drive
 from app.services.idempotency import IdempotencyKey, idempotent
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock
 from app.services.staged_blobs import StagedBlobs, staged
+from app.services.uploads.quotas import Quotas
 
 UPLOADS, PICTURES = "uploads", "pictures"
 """Folders of the blob store."""
@@ -51,22 +56,28 @@ class Upload:
     agency_id : str
     author : Author
         Who uploaded it.
-    data : bytes
+    file : SpooledFile
     context : DecodeContext
     received_at : datetime
     wait_s : float
         How long to wait for a decoder process. [s]
     report_progress : callable
         Called with a number from 0 to 1 by handlers that work for long; what it raises stops the decode.
+    report_part : callable
+        Called with a number from 0 to 1 and the result so far, which is stored; what it raises stops the decode.
+    again_id : str or None
+        Id of the stored decode that is decoded again, to compare; nothing of that is stored with it.
     """
 
     agency_id: str
     author: Author
-    data: bytes
+    file: SpooledFile
     context: DecodeContext
     received_at: datetime
     wait_s: float = 0.0
     report_progress: Callable[[float], None] = lambda _progress: None
+    report_part: Callable[[float, FramesResult], None] = lambda _progress, _part: None
+    again_id: str | None = None
 
     @property
     def observed_at(self) -> datetime:
@@ -83,6 +94,8 @@ class Decoded:
     document
         The result.
     observations : sequence of NewObservation
+    unregistered : sequence of NewUnregistered
+        Markers that were read where none is registered.
     spans : sequence of dict
         Transmissions of CERPMs that were received.
     incidents : mapping of str to mapping
@@ -93,6 +106,7 @@ class Decoded:
     observations: Sequence[NewObservation] = ()
     spans: Sequence[dict[str, Any]] = ()
     incidents: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    unregistered: Sequence[NewUnregistered] = ()
 
 
 class OutdatedMatch(Exception):
@@ -115,11 +129,11 @@ class UploadHandler(ABC, Generic[SignalT]):
     kind: ClassVar[DecodeKind]
 
     @abstractmethod
-    def accepts(self, context: DecodeContext, data: bytes) -> bool:
+    def accepts(self, context: DecodeContext, file: SpooledFile) -> bool:
         """Whether an upload is of this kind."""
 
     @abstractmethod
-    def is_job(self, data: bytes) -> bool:
+    def is_job(self, file: SpooledFile) -> bool:
         """Whether an upload takes too long for an immediate response. Raises if it is not worth decoding."""
 
     @abstractmethod
@@ -180,7 +194,11 @@ class UploadPath:
         Unavailable
             The decoder processes are busy, or other uploads about the same markers were stored in between each time.
         """
-        with staged(self._blobs) as stage, _cancelled_on_error(handler.start(upload)) as started:
+        with (
+            measured(handler.kind) as measure,
+            staged(self._blobs) as stage,
+            _cancelled_on_error(handler.start(upload)) as started,
+        ):
             record.stage(stage)  # while the decoder process works
             for _try in range(MAX_TRIES):
                 signal = started.result()
@@ -188,7 +206,9 @@ class UploadPath:
                 picture_key = stage.put(PICTURES, plot) if plot is not None else None
                 try:
                     with self._database.write() as connection:
-                        is_new = record.store(connection, _bound(handler, connection, upload, signal), picture_key)
+                        is_new = record.store(
+                            connection, _bound(handler, connection, upload, signal, measure), picture_key
+                        )
                 except OutdatedMatch:
                     stage.delete(picture_key)
                     continue
@@ -197,11 +217,29 @@ class UploadPath:
                 return
         raise Unavailable("other drives past the same markers are being stored", cure="try again in a few seconds")
 
+    def decode_again(self, upload: Upload, handler: UploadHandler[SignalT]) -> tuple[Decoded, bytes | None]:
+        """Decode a stored upload again and match it; nothing is stored. Returns what was decoded, and its plot.
+
+        Raises
+        ------
+        Unavailable
+            The decoder processes are busy.
+        """
+        with _cancelled_on_error(handler.start(upload)) as started:
+            signal = started.result()
+            with self._database.read() as connection:
+                return handler.match(connection, upload, signal), handler.plot(signal)
+
 
 def _bound(
-    handler: UploadHandler[SignalT], connection: sa.Connection, upload: Upload, signal: SignalT
+    handler: UploadHandler[SignalT], connection: sa.Connection, upload: Upload, signal: SignalT, measure: MeasuredDecode
 ) -> Callable[[], Decoded]:
-    return lambda: handler.match(connection, upload, signal)
+    def match() -> Decoded:
+        decoded = handler.match(connection, upload, signal)
+        measure.has_read = bool(decoded.observations)
+        return decoded
+
+    return match
 
 
 @contextmanager
@@ -231,16 +269,16 @@ class NewRecord:
 
     def __init__(
         self, caller: Caller, handler: UploadHandler[Any], upload: Upload, clock: Clock,
-        *, key: IdempotencyKey | None, ttl: timedelta,
+        *, quotas: Quotas, key: IdempotencyKey | None, ttl: timedelta,
     ) -> None:  # fmt: skip
-        self._caller, self._upload, self._clock = caller, upload, clock
+        self._caller, self._upload, self._clock, self._quotas = caller, upload, clock, quotas
         self._key, self._ttl = key, ttl
         self._row = new_decode(handler, upload)
         self.replayed = False
 
     def stage(self, stage: StagedBlobs) -> None:
         """Write the upload."""
-        self._row = self._row._replace(upload_key=stage.put(UPLOADS, self._upload.data))
+        self._row = with_upload(self._row, stage, self._upload)
 
     def store(self, connection: sa.Connection, match: Callable[[], Decoded], picture_key: str | None) -> bool:
         """Store a new decode that is done."""
@@ -252,6 +290,7 @@ class NewRecord:
                     state="done", progress=1.0, attempts=1, picture_key=picture_key, result=dict(decoded.document),
                     finished_at=self._clock(),
                 )  # fmt: skip
+                self._quotas.count(connection, self._caller, self._upload.file.size)
                 store.add_decode(connection, agency_id, self._caller.key_id, row)
                 count_upload(connection, agency_id, row.id, self._upload.context, now)
                 _store_decoded(connection, self._upload, row.id, decoded, self._clock())
@@ -287,9 +326,21 @@ def new_decode(handler: UploadHandler[Any], upload: Upload) -> DecodeRow:
     return DecodeRow(new_id(upload.received_at), handler.kind, upload.context.document(), upload.received_at)
 
 
+def with_upload(row: DecodeRow, stage: StagedBlobs, upload: Upload) -> DecodeRow:
+    """A decode with its upload, which is written as a blob."""
+    key = stage.add(UPLOADS, upload.file)
+    return row._replace(upload_key=key, upload_bytes=upload.file.size, upload_sha256=upload.file.sha256)
+
+
 def _store_decoded(connection: sa.Connection, upload: Upload, decode_id: str, decoded: Decoded, now: datetime) -> None:
     cerpms.add_spans(connection, upload.agency_id, decode_id, decoded.spans)
     store.add_observations(connection, upload.agency_id, decode_id, decoded.observations)
+    add_unregistered(connection, upload.agency_id, decode_id, decoded.unregistered)
+    context = upload.context
+    vehicle = context.vehicle["id"] if context.vehicle else upload.author.key_id or ""
+    sensor = BAR if context.trace is not None else RADIO if context.packets is not None else CAMERA
+    drive = ObservedDrive(decode_id, sensor, vehicle, decoded.observations, decoded.unregistered)
+    record_drive(connection, upload.agency_id, drive, now)
     count_driven(connection, upload.agency_id, decode_id, upload.context, decoded.document)
     for action, detail in decoded.incidents.items():
         audit.record(connection, upload.agency_id, upload.author, action, now=now, subject=decode_id, detail=detail)

@@ -11,6 +11,7 @@ from app.calibration.results import CameraCalibration, ViewReport
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
 from app.formats.archives import ArchiveLimits
 from app.formats.images import ImageLimits
+from app.formats.spooled_file import SpooledFile
 from app.registry.database import Database
 from app.registry.ids import new_id
 from app.registry.vehicles import CALIBRATIONS, CalibrationRow
@@ -41,7 +42,7 @@ class CalibrationTask(Task[CameraCalibration]):
 
     Attributes
     ----------
-    photos : tuple of (str, bytes)
+    photos : tuple of (str, SpooledFile)
         Names and contents; a ZIP stands for the photos in it.
     board : CalibrationBoard
     coefficients : int or None
@@ -51,7 +52,7 @@ class CalibrationTask(Task[CameraCalibration]):
     archives : ArchiveLimits
     """
 
-    photos: tuple[tuple[str, bytes], ...]
+    photos: tuple[tuple[str, SpooledFile], ...]
     board: CalibrationBoard
     coefficients: int | None = None
     images: ImageLimits = field(default_factory=ImageLimits)
@@ -88,7 +89,7 @@ class Calibrations:
     def run(
         self,
         caller: Caller,
-        photos: tuple[tuple[str, bytes], ...],
+        photos: tuple[tuple[str, SpooledFile], ...],
         board: CalibrationBoard,
         coefficients: int | None = None,
         key: IdempotencyKey | None = None,
@@ -198,7 +199,7 @@ def _rounded(figure: float | None) -> float | None:
     return None if figure is None else round(figure, 3)
 
 
-def _check_count(photos: tuple[tuple[str, bytes], ...]) -> None:
+def _check_count(photos: tuple[tuple[str, SpooledFile], ...]) -> None:
     if not photos:
         raise UnreadableUpload(
             "there is no photo in the form", field="photos", limit="one ZIP, or several photos", cure="send 12 to 20"

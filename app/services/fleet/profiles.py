@@ -20,14 +20,14 @@ FRAME, TRACE, PACKETS = (str(kind) for kind in UploadKind)
 NEEDED = {FRAME: "camera", TRACE: "trace", PACKETS: "packets"}
 """Section that an upload of a kind cannot do without."""
 SECTIONS = {
-    FRAME: ("camera", "thermal", "thermal_range"),
+    FRAME: ("camera", "thermal", "thermal_range", "frames"),
     TRACE: ("trace",),
     PACKETS: ("packets", "camera"),
 }
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
 _SIZE = ("width_px", "height_px")
 _OF_THE_SIZE = (*INTRINSICS, "distortion")
-_PROFILE_ONLY = ("readout_s", "calibration_id")
+_PROFILE_ONLY = ("calibration_id",)
 """What a vehicle's camera has and a context's has not."""
 _WHOLE = ("trace.can.speed", "trace.can.heading")
 """Objects that are replaced as a whole: a signal by its name and one by its bits declare the same thing."""

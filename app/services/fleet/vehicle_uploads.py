@@ -12,6 +12,7 @@ import sqlalchemy as sa
 
 from app.errors import Conflict, InvalidParameter, NotAllowed, NotFound
 from app.formats.kinds import guess_kind
+from app.formats.spooled_file import SpooledFile
 from app.registry import vehicles as store
 from app.registry.spatial import distance_m
 from app.registry.vehicles import VEHICLES, VehicleRow
@@ -25,7 +26,7 @@ _MIN_BETWEEN_FRAMES_M = 1.0
 _NAMED = {TRACE: "a magnetometer trace", PACKETS: "a packet log"}
 
 
-def resolve_context(connection: sa.Connection, caller: Caller, given: ContextInput, data: bytes) -> DecodeContext:
+def resolve_context(connection: sa.Connection, caller: Caller, given: ContextInput, file: SpooledFile) -> DecodeContext:
     """The context of an upload: its own members, completed by the profile of its vehicle if it has one.
 
     Raises
@@ -39,10 +40,10 @@ def resolve_context(connection: sa.Connection, caller: Caller, given: ContextInp
     InvalidParameter
         The context contradicts itself or a limit, or the vehicle's profile lacks what this kind of upload needs.
     """
-    vehicle = _find_vehicle(connection, caller, given.vehicle)
+    vehicle = find_vehicle(connection, caller, given.vehicle)
     if vehicle is None:
         return _named(context_from_document(inherit({}, given.stated, FRAME).context), given.file_name)
-    kind = _kind(vehicle, given, data)
+    kind = _kind(vehicle, given, file)
     _check_sections(vehicle, given, kind)
     stated = given.stated
     if kind != FRAME and stated.get(kind) is None:
@@ -88,7 +89,14 @@ def driven_m(result: Mapping[str, Any]) -> float:
     return sum(leg for leg in legs if _MIN_BETWEEN_FRAMES_M <= leg <= _MAX_BETWEEN_FRAMES_M)
 
 
-def _find_vehicle(connection: sa.Connection, caller: Caller, named: str | None) -> VehicleRow | None:
+def find_vehicle(connection: sa.Connection, caller: Caller, named: str | None) -> VehicleRow | None:
+    """The vehicle with a name or an id, or that of the caller's key; None without both.
+
+    Raises
+    ------
+    NotFound, NotAllowed, Conflict
+        As `resolve_context`.
+    """
     own = store.find_of_key(connection, caller.agency_id, caller.key_id)
     vehicle = own
     if named is not None:
@@ -115,12 +123,12 @@ def _find_vehicle(connection: sa.Connection, caller: Caller, named: str | None) 
     return vehicle
 
 
-def _kind(vehicle: VehicleRow, given: ContextInput, data: bytes) -> str:
+def _kind(vehicle: VehicleRow, given: ContextInput, file: SpooledFile) -> str:
     """What a vehicle's upload is: as it states, else by its content, else the only kind that the profile has."""
     for kind in (TRACE, PACKETS):
         if given.stated.get(kind) is not None:
             return kind
-    guessed = guess_kind(given.file_name or "upload", data)
+    guessed = guess_kind(given.file_name or "upload", file)
     if guessed is not None:
         return str(guessed)
     possible = [kind for kind in _NAMED if kind in vehicle.profile]

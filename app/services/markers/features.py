@@ -21,6 +21,7 @@ from app.registry.conditions import holds, pinned_values
 from app.registry.database import Database
 from app.registry.features import FIELDS, ON_ROAD, RETIRED, Extent, FeatureFilter, FeatureTable, Field
 from app.registry.lines import LINE_FIELDS, Line, find_line, read_lines
+from app.registry.maintenance import ITEM_FIELDS, MAINTENANCE
 from app.registry.plan_features import LANE_FIELDS, PLAN_FIELDS, PLANNED, AlignmentLanes
 from app.registry.spatial import Box
 from app.registry.tiles import Tile, feature_tile
@@ -130,8 +131,19 @@ PLANS = Collection(
     filters=tuple(field.name for field in PLAN_FIELDS),
     table=PLANNED,
 )
+MAINTENANCE_ITEMS = Collection(
+    "maintenance",
+    "Maintenance",
+    "Faults of markers that vehicles show, one point each, with what people decided on them.",
+    "Point",
+    fields=ITEM_FIELDS,
+    filters=tuple(field.name for field in ITEM_FIELDS if field.kind != "date-time"),
+    table=MAINTENANCE,
+)
 LINE_SOURCES = {family.name: family.lines for family in FAMILIES if family.lines is not None}
-COLLECTIONS = {collection.id: collection for collection in (MARKERS, RETIRED_MARKERS, LINES, ALIGNMENTS, PLANS)}
+COLLECTIONS = {
+    collection.id: collection for collection in (MARKERS, RETIRED_MARKERS, LINES, ALIGNMENTS, PLANS, MAINTENANCE_ITEMS)
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, fields
 from datetime import timedelta
 from typing import Any
@@ -14,6 +13,7 @@ from app.formats.alignments.registered_road import (
     RoadStation,
     write_registered_road,
 )
+from app.formats.spooled_file import SpooledFile
 from app.geodesy import LocalizationGrade
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.registry.database import Database
@@ -62,7 +62,7 @@ class Alignments:
         self,
         caller: Caller,
         name: str,
-        data: bytes,
+        file: SpooledFile,
         file_name: str,
         declaration: AlignmentDeclaration,
         key: IdempotencyKey | None = None,
@@ -78,7 +78,7 @@ class Alignments:
         """
         if earlier := find_earlier(self._database, caller.agency_id, key, self._clock()):
             return earlier, True
-        road = RoadFile(data, file_name, declaration, name, self._accuracy_m)
+        road = RoadFile(file, file_name, declaration, name, self._accuracy_m)
         return self._add(caller, road, {**asdict(declaration), "file_name": file_name}, key)
 
     def add_of_road(
@@ -102,7 +102,7 @@ class Alignments:
         data = write_registered_road(_registered_road(row, lanes))
         declaration = AlignmentDeclaration(realization=row.given["realization"], epoch=row.given["epoch"])
         source = {"road_id": road_id, "road_version": row.version, "lanes": lanes.model_dump(mode="json")}
-        road = RoadFile(data, "road.json", declaration, name, self._accuracy_m)
+        road = RoadFile(SpooledFile.of(data), "road.json", declaration, name, self._accuracy_m)
         return self._add(caller, road, {**asdict(declaration), "file_name": road.file_name, **source}, key)
 
     def _add(
@@ -113,7 +113,7 @@ class Alignments:
             ALIGNMENTS.check_name(connection, agency_id, name)
         read = self._processes.submit(SummarizeRoadTask(road), wait_s=BUSY_WAIT_S).result()
         with staged(self._blobs) as stage:
-            source_key = stage.put("alignments", road.data)
+            source_key = stage.add("alignments", road.file)
             with (
                 self._database.write() as connection,
                 idempotent(connection, agency_id, key, now, self._ttl) as answer,
@@ -125,7 +125,7 @@ class Alignments:
                     **first_version(now),
                     "name": name,
                     "source_key": source_key,
-                    "source_sha256": hashlib.sha256(road.data).hexdigest(),
+                    "source_sha256": road.file.sha256,
                     "declaration": {member: value for member, value in declared.items() if value is not None},
                     "summary": read.summary,
                 }
@@ -162,8 +162,9 @@ class Alignments:
                 limit=f"{MAX_MAP_MARKERS} markers",
                 cure="send a bbox, a family or another filter, or cut the road into sections",
             )
-        road = road_of(row, self._blobs.get(row.source_key), self._accuracy_m)
-        return self._processes.submit(WriteMapTask(road, form, tuple(found), within_m), wait_s=BUSY_WAIT_S).result()
+        with self._blobs.opened(row.source_key) as file:
+            task = WriteMapTask(road_of(row, file, self._accuracy_m), form, tuple(found), within_m)
+            return self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
 
     def get(self, caller: Caller, alignment_id: str) -> AlignmentDocument:
         """One alignment."""
@@ -183,12 +184,12 @@ class Alignments:
         return self._blobs.get(row.source_key), row.declaration.get("file_name") or "road"
 
 
-def road_of(row: AlignmentRow, data: bytes, accuracy_m: float) -> RoadFile:
+def road_of(row: AlignmentRow, file: SpooledFile, accuracy_m: float) -> RoadFile:
     """The road of a stored alignment."""
     declared = {name: value for name, value in row.declaration.items() if name in _DECLARED}
     if declared.get("origin") is not None:
         declared["origin"] = tuple(declared["origin"])
-    return RoadFile(data, row.declaration.get("file_name", ""), AlignmentDeclaration(**declared), row.name, accuracy_m)
+    return RoadFile(file, row.declaration.get("file_name", ""), AlignmentDeclaration(**declared), row.name, accuracy_m)
 
 
 def alignment_document(row: AlignmentRow) -> AlignmentDocument:

@@ -78,7 +78,7 @@ class PlanMaking:
             PLANS.check_name(connection, agency_id, name)
             store.add_job(connection, job)
             document = answer.store(plan_job_document(job))
-        self._queue.submit(job.id, job.agency_id)
+        self._queue.submit(job.id, job.agency_id, JobKind.PLAN)
         return document, False
 
     def run(self, job: RunningJob) -> None:

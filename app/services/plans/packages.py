@@ -111,7 +111,7 @@ class Packages:
             check_only_one(connection, agency_id, JobKind.PACKAGE, plan_id)
             store.add_job(connection, job)
             document = answer.store(plan_job_document(job))
-        self._queue.submit(job.id, job.agency_id)
+        self._queue.submit(job.id, job.agency_id, JobKind.PACKAGE)
         return document, False
 
     def open(self, caller: Caller, plan_id: str) -> StoredPackage:

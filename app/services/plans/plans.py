@@ -322,16 +322,17 @@ class Plans:
             row = ALIGNMENTS.get(connection, caller.agency_id, alignment_id)
             existing = self._existing(connection, caller, row.summary["extent_deg"])
             codebook = _codebook(connection, caller, rules)
-        road = road_of(row, self._blobs.get(row.source_key), self._rules.crs_accuracy_m)
         taken: set[int] = set()
-        for _ in range(_TRIES):
-            task = MakePlanTask(road, rules, name, frozenset(taken), existing, codebook)
-            made = self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
-            with self._database.read() as connection:
-                found = self._taken(connection, caller.agency_id, made.numbers)
-            if not found:
-                return made
-            taken |= found
+        with self._blobs.opened(row.source_key) as file:
+            road = road_of(row, file, self._rules.crs_accuracy_m)
+            for _ in range(_TRIES):
+                task = MakePlanTask(road, rules, name, frozenset(taken), existing, codebook)
+                made = self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
+                with self._database.read() as connection:
+                    found = self._taken(connection, caller.agency_id, made.numbers)
+                if not found:
+                    return made
+                taken |= found
         raise Conflict("no unused registry numbers were found", field="rules", cure="try again, or name the plan anew")
 
     def _existing(

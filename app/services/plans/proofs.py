@@ -98,7 +98,7 @@ class Proofs:
             delete_units(connection, agency_id)
             store.add_job(connection, job)
             document = answer.store(plan_job_document(job))
-        self._queue.submit(job.id, job.agency_id)
+        self._queue.submit(job.id, job.agency_id, JobKind.PROOF)
         return document, False
 
     def file(self, caller: Caller, plan_id: str, name: str) -> tuple[bytes, PlanRow]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from app.formats.spooled_file import SpooledFile
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.planning.plan_checks import ExistingMarker
 from app.registry.columns import Columns
@@ -19,7 +20,7 @@ from app.services.plans.features import LaneFeature
 class RoadFile:
     """A file with a road, as it came, and what is declared of it."""
 
-    data: bytes
+    file: SpooledFile
     file_name: str
     declaration: AlignmentDeclaration
     name: str

@@ -7,6 +7,7 @@ from typing import Any
 
 from app.errors import naming
 from app.families import FAMILIES
+from app.formats.spooled_file import SpooledFile
 from app.formats.surveys.declaration import ControlPoint, ImportDeclaration, LocalGrid
 from app.services.surveys.imports import ImportInput
 
@@ -16,14 +17,14 @@ _NOT_OF_THE_SURVEY = {"dry_run", "mode", "reason", "warnings"}.union(
 )
 
 
-def import_input(declared: Mapping[str, Any], data: bytes) -> ImportInput:
+def import_input(declared: Mapping[str, Any], file: SpooledFile) -> ImportInput:
     """A file with its declaration.
 
     Parameters
     ----------
     declared : mapping
         JSON, with the members of `app.api.surveys.schemas.DeclarationIn`, all of them.
-    data : bytes
+    file : SpooledFile
         The survey.
 
     Raises
@@ -41,7 +42,7 @@ def import_input(declared: Mapping[str, Any], data: bytes) -> ImportInput:
         defaults = _defaults(declared)
         declaration = ImportDeclaration(**values)
     strict = declared["warnings"] == "refuse"
-    return ImportInput(data, declaration, defaults, declared["dry_run"], declared["mode"], declared["reason"], strict)
+    return ImportInput(file, declaration, defaults, declared["dry_run"], declared["mode"], declared["reason"], strict)
 
 
 def _defaults(declared: Mapping[str, Any]) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -59,9 +59,12 @@ class Exports:
         return _blocks(path, folder), left_out
 
     def write_file(
-        self, caller: Caller, kind: str, filtered: MarkerFilter, folder: Path
-    ) -> tuple[Path, tuple[str, ...]]:
+        self, caller: Caller, kind: str, filtered: MarkerFilter, folder: Path,
+        report: Callable[[int], None] = lambda _markers: None,
+    ) -> tuple[Path, tuple[str, ...]]:  # fmt: skip
         """One file of any kind, in an empty folder, and the ids of markers left out of it; raises as `whole`.
+
+        `report` is called with the number of markers that were read so far; what it raises stops the export.
 
         LandXML and DXF have one UTM zone: markers too far from it are left out. They have no status either, so retired
         markers are in them only if the filter asks for these.
@@ -69,10 +72,11 @@ class Exports:
         if kind in STREAMED:
             path = folder / f"markers.{kind}"
             with path.open("wb") as file:
-                file.writelines(self.stream(caller, kind, filtered))
+                pages = _reported(self._pages(caller, filtered), report)
+                file.writelines(write.write_csv(pages) if kind == "csv" else write.write_geojson(pages))
             return path, ()
         in_zone = kind in ("landxml", "dxf")
-        pages = self._pages(caller, filtered, most=MAX_WHOLE[kind], with_retired=not in_zone)
+        pages = _reported(self._pages(caller, filtered, most=MAX_WHOLE[kind], with_retired=not in_zone), report)
         first = next(pages, None)
         if first is None:
             raise InvalidParameter(
@@ -115,6 +119,14 @@ class Exports:
             for record in page:
                 record["updated_at"] = record["updated_at"].isoformat()
             yield page
+
+
+def _reported(pages: Iterator[list[dict[str, Any]]], report: Callable[[int], None]) -> Iterator[list[dict[str, Any]]]:
+    count = 0
+    for page in pages:
+        yield page
+        count += len(page)
+        report(count)
 
 
 def _batched(records: Iterator[dict[str, Any]], count: int) -> Iterator[list[dict[str, Any]]]:

@@ -7,10 +7,11 @@ from datetime import timedelta
 from typing import Any
 
 from app.errors import Conflict
+from app.formats.spooled_file import SpooledFile
 from app.registry import jobs as store
 from app.registry.database import Database
 from app.registry.ids import new_id
-from app.registry.jobs import JobKind, JobRow, new_job
+from app.registry.jobs import UNFINISHED, JobKind, JobRow, new_job
 from app.services.access.access import Caller, Scope
 from app.services.idempotency import IdempotencyKey, write_once
 from app.services.jobs import RunningJob
@@ -50,7 +51,7 @@ class ImportJobs:
         self._imports, self._ttl = imports, idempotency_ttl
 
     def submit(
-        self, caller: Caller, declared: Mapping[str, Any], data: bytes, key: IdempotencyKey | None
+        self, caller: Caller, declared: Mapping[str, Any], file: SpooledFile, key: IdempotencyKey | None
     ) -> tuple[ImportJobDocument, bool]:
         """Store the file and queue its import.
 
@@ -59,7 +60,7 @@ class ImportJobs:
         caller : Caller
         declared : mapping
             See `import_input`.
-        data : bytes
+        file : SpooledFile
         key : IdempotencyKey or None
 
         Returns
@@ -73,13 +74,13 @@ class ImportJobs:
         InvalidParameter
             The declaration contradicts itself.
         """
-        import_input(declared, data)
+        import_input(declared, file)
         now, agency_id = self._clock(), caller.agency_id
         with staged(self._blobs) as stage:
             job = new_job(
                 JobKind.IMPORT, new_id(now), agency_id, caller.key_id, now,
                 job_input={"declaration": dict(declared), "label": caller.label},
-                upload_key=stage.put("uploads", data),
+                upload_key=stage.add("uploads", file),
             )  # fmt: skip
             with write_once(self._database, agency_id, key, now, self._ttl) as (connection, answer):
                 if answer.replayed:
@@ -87,7 +88,7 @@ class ImportJobs:
                 store.add_job(connection, job)
                 document = answer.store(import_job_document(job))
             stage.keep()
-        self._queue.submit(job.id, job.agency_id)
+        self._queue.submit(job.id, job.agency_id, JobKind.IMPORT)
         return document, False
 
     def get(self, caller: Caller, import_id: str) -> ImportJobDocument:
@@ -142,8 +143,9 @@ class ImportJobs:
                 job.report_progress(progress)
 
         step(_STARTED)
-        given = import_input(row.input["declaration"], self._blobs.get(row.upload_key))
-        report, _ = self._imports.run(caller, given, IdempotencyKey(f"import {row.id}", row.id, ""), step)
+        with self._blobs.opened(row.upload_key) as file:
+            given = import_input(row.input["declaration"], file)
+            report, _ = self._imports.run(caller, given, IdempotencyKey(f"import {row.id}", row.id, ""), step)
         with self._database.write() as connection:
             job.finish(connection, report)
 
@@ -153,7 +155,7 @@ def _check_in_time(job: JobRow) -> None:
         raise Conflict(
             f"the import is {job.state}", field="import_id", limit="imports that are not finished", cure=_TOO_LATE
         )
-    if job.state == "running" and job.progress >= SETTLED:
+    if job.state in UNFINISHED and job.progress >= SETTLED:
         raise Conflict(
             "the import is storing already", field="import_id", limit="imports that store nothing yet", cure=_TOO_LATE
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from app.families import FAMILIES, FAMILY_NAMES, get_family
 from app.families.family import Family, Registration
 from app.families.rules import PLANNED, MarkerRules
 from app.families.surveys import RowCodes, Rows
+from app.formats.spooled_file import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Severity, SurveyTable
@@ -71,7 +71,7 @@ _STANDING = "place_by_area_only"
 class SurveyTask(Task[SurveyTable]):
     """A survey to read."""
 
-    data: bytes
+    file: SpooledFile
     declaration: ImportDeclaration
     code_form: CodeForm
 
@@ -80,7 +80,7 @@ class SurveyTask(Task[SurveyTable]):
 class ImportInput:
     """A file with what is declared of it."""
 
-    data: bytes
+    file: SpooledFile
     declaration: ImportDeclaration
     defaults: Any = None
     dry_run: bool = False
@@ -132,13 +132,13 @@ class Imports:
         if earlier := find_earlier(self._database, caller.agency_id, key, now):
             return earlier, True
         pending = self._processes.submit(
-            SurveyTask(given.data, given.declaration, _code_form(given)), wait_s=_BUSY_WAIT_S
+            SurveyTask(given.file, given.declaration, _code_form(given)), wait_s=_BUSY_WAIT_S
         )
         table, grid = apply_local_grid(pending.result(), given.declaration)
         survey = georeference_survey(table, given.declaration, self._rules.crs_accuracy_m)
         step(READ)
         registration = Registration(caller.agency_id, now, self._rules, self._database)
-        running = _Running(caller, given, survey, grid, registration, hashlib.sha256(given.data).hexdigest())
+        running = _Running(caller, given, survey, grid, registration, given.file.sha256)
         with self._database.read() as connection:
             running.check(connection)
         step(SETTLED)

@@ -24,6 +24,7 @@ from app.decoders.magnet.match import match_tags
 from app.decoders.plate import decode_plates
 from app.decoders.snapshot import Snapshot, open_snapshot
 from app.demo.cerpms import build_lane
+from app.formats.spooled_file import SpooledFile
 from app.formats.traces.read import read_trace
 from app.geodesy import decimal_year, move_to_epoch
 from app.jobs.packet_tasks import read_drive
@@ -173,7 +174,7 @@ def test_packets_give_the_same_verdicts_markers_and_lane(real_server: LiveServer
         packets = number_entries([*later.packets, *again])
         online = decoded(client, packed(later, packets))
 
-    files = read_drive(DriveTask("drive.zip", packed(later, packets), {}), None)
+    files = read_drive(DriveTask("drive.zip", SpooledFile.of(packed(later, packets)), {}), None)
     known = snapshot.known_cerpms(list_numbers(files.packets))
     freshness = FreshnessRules(uploaded_at_s=datetime.now(UTC).timestamp())
     verification, merged = match_known_markers(files.packets, built.keys, known, files.track, freshness)

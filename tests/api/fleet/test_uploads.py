@@ -167,7 +167,7 @@ def test_what_the_upload_states_overrides_field_by_field(fleet: httpx.Client) ->
     used, kept = decode["context"]["vehicle"], decode["context"]["camera"]
     assert used["version"] == 2
     assert (kept["height_m"], kept["depression_deg"], kept["fx_px"]) == (1.45, 12.0, 80.0)
-    assert "readout_s" not in kept
+    assert kept["readout_s"] == 0.02
     sources = used["sources"]
     assert sources["camera.depression_deg"] == sources["heading_deg"] == "upload"
     assert sources["camera.height_m"] == sources["camera.distortion"] == "vehicle"

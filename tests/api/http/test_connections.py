@@ -33,9 +33,15 @@ def large(_request: Request) -> Response:
 
 
 @pytest.fixture
-def start() -> Iterator[Start]:
+def app_routes() -> list[Route]:
+    """What the servers answer."""
+    return [Route("/", hello, methods=["GET", "POST"]), Route("/large", large)]
+
+
+@pytest.fixture
+def start(app_routes: list[Route]) -> Iterator[Start]:
     """Start servers with limits; each returns its port."""
-    app = Starlette(routes=[Route("/", hello, methods=["GET", "POST"]), Route("/large", large)])
+    app = Starlette(routes=app_routes)
     with ExitStack() as running:
 
         def serve(limits: ConnectionLimits) -> int:

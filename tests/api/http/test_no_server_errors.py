@@ -24,7 +24,7 @@ from tests.databases import PostgresServer
 
 EXAMPLES = int(os.environ.get("WAYMARK_FUZZ_EXAMPLES", "3"))
 NOT_HTTP = b"Invalid HTTP request received."  # what uvicorn itself says, of a URL over 64 KiB
-FILES = ("application/zip", "application/x-ndjson", "application/vnd.apache.parquet")
+FILES = ("application/offset+octet-stream", "application/zip", "application/x-ndjson", "application/vnd.apache.parquet")
 API = schemathesis.openapi.from_dict(create_app(Settings(data_dir=Path("var"))).openapi())
 OPERATIONS = [operation.ok().label for operation in API.get_all_operations()]
 

@@ -150,7 +150,9 @@ def owslib(server: LiveServer, road: str, monkeypatch: pytest.MonkeyPatch) -> Fe
 
 
 def test_owslib_finds_its_way(owslib: Features) -> None:
-    assert owslib.feature_collections() == ["markers", "retired_markers", "marker_lines", "alignments", "plans"]
+    assert owslib.feature_collections() == [
+        "markers", "retired_markers", "marker_lines", "alignments", "plans", "maintenance",
+    ]  # fmt: skip
     assert owslib.api()["openapi"] == "3.0.3"
     assert any(uri.endswith("/conf/cql2-text") for uri in owslib.conformance()["conformsTo"])
     assert owslib.collection("markers")["storageCrs"].endswith("CRS84")

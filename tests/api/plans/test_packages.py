@@ -15,6 +15,7 @@ import httpx
 import pytest
 
 from app.errors import Unavailable
+from app.registry.jobs import JobKind
 from app.services.plans.package_tasks import WritePartTask
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import LiveServer
@@ -40,7 +41,7 @@ def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     queued: list[str] = []
 
     class Held:
-        def submit(self, job_id: str, agency_id: str) -> None:
+        def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
             queued.append(job_id)
 
     monkeypatch.setattr(server.app.state.packages, "_queue", Held())
@@ -124,7 +125,7 @@ def test_an_interrupted_or_cancelled_package_leaves_nothing(
     monkeypatch.setattr(packages, "_processes", Watched(processes, stop))
     with pytest.raises(Unavailable):
         jobs.run_job(job["id"])
-    assert client.get(f"/v1/plan-jobs/{job['id']}").json()["state"] == "running"
+    assert client.get(f"/v1/plan-jobs/{job['id']}").json()["state"] == "queued"
 
     def cancel(count: int) -> None:
         if count == 3:

@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from app.errors import Unavailable
+from app.registry.jobs import JobKind
 from app.services.plans import making
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import LiveServer
@@ -59,7 +60,7 @@ def test_a_job_that_is_run_twice_makes_one_plan(
     queued: list[str] = []
 
     class Held:
-        def submit(self, job_id: str, agency_id: str) -> None:
+        def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
             queued.append(job_id)
 
     monkeypatch.setattr(server.app.state.plan_making, "_queue", Held())

@@ -14,6 +14,7 @@ import sqlalchemy as sa
 from app.errors import Unavailable
 from app.main import create_app
 from app.planning.proof import prove
+from app.registry.jobs import JobKind
 from app.registry.tables import agencies
 from app.services.plans.proof_tasks import ProveUnitTask, WriteProofTask
 from app.settings import Settings
@@ -60,7 +61,7 @@ def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     queued: list[str] = []
 
     class Held:
-        def submit(self, job_id: str, agency_id: str) -> None:
+        def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
             queued.append(job_id)
 
     monkeypatch.setattr(server.app.state.proofs, "_queue", Held())
@@ -167,7 +168,7 @@ def test_an_interrupted_proof_does_not_drive_finished_units_again(
         with pytest.raises(Unavailable):
             jobs.run_job(job["id"])
     between = client.get(f"/v1/plan-jobs/{job['id']}").json()
-    assert (between["state"], between["steps_done"], between["attempts"]) == ("running", 2, 0)
+    assert (between["state"], between["steps_done"], between["attempts"]) == ("queued", 2, 0)
     refused(prove_plan(client, plan), 409, field="plan_id")
     assert client.get(f"/v1/plans/{plan['id']}").json()["status"] == "checked"
     rest = Watched(processes)

@@ -11,6 +11,7 @@ import pytest
 
 from app.errors import Unavailable
 from app.main import create_app
+from app.registry.jobs import JobKind
 from app.services.surveys import imports
 from app.settings import Settings
 from tests.api.surveys.test_imports import DEGREES, _csv, _finished, _markers, _send
@@ -38,7 +39,7 @@ def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     queued: list[str] = []
 
     class Held:
-        def submit(self, job_id: str, agency_id: str) -> None:
+        def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
             queued.append(job_id)
 
     monkeypatch.setattr(server.app.state.import_jobs, "_queue", Held())
@@ -155,7 +156,9 @@ def test_one_that_was_storing_when_the_server_stopped_goes_on(
     with pytest.raises(Unavailable):
         server.app.state.jobs.run_job(job["id"])
     assert _markers(client) == []
+    assert client.get(f"/v1/imports/{job['id']}").json()["state"] == "queued"
     assert _cancel(client, job["id"]).status_code == 409
+    assert client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 409
     monkeypatch.setattr(imports._Running, "store", store)
     server.app.state.jobs.run_job(job["id"])
     assert client.get(f"/v1/imports/{job['id']}").json()["report"]["stored"] == 8

@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -14,15 +13,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import httpx
 import pytest
 
 from app.api.http.connections import MAX_HEADER_BYTES
 from app.settings import Settings
+from tests.http import WITHIN_S
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NOT_IN_A_CLONE = {".git", ".venv", "var", "demo-out", "bench-out", "build", "dist", ".hypothesis"}
+USER = 10001
+KEY = {"Authorization": "Bearer an-admin-key-for-the-image-only"}
 STARTED = re.compile(r"Uvicorn running on (http://[\d.:]+)")
 
 
@@ -75,58 +78,132 @@ def assemble(image: Path) -> None:
         for source in sources:
             files = [path for path in context if path == Path(source) or Path(source) in path.parents]
             assert files, f"COPY {source}: .dockerignore excludes it"
+            inside = target.lstrip("/")  # of the image, not of this machine
             for path in files:
                 below = path.relative_to(source) if path != Path(source) else Path()
-                copy = image / (Path(target) / path.name if target.endswith("/") else Path(target) / below)
+                copy = image / (Path(inside) / path.name if target.endswith("/") else Path(inside) / below)
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(ROOT / path, copy)
 
 
+def as_the_images_user(data: Path) -> list[str]:
+    """What a command begins with that runs as the user of the image, who may read all files and write none but its own.
+
+    Only root can become another user. The interpreter of a test may lie in a folder that others cannot read, which the
+    capability to read makes up for.
+    """
+    data.mkdir(parents=True, exist_ok=True)
+    setpriv = shutil.which("setpriv")
+    if os.geteuid() != 0 or setpriv is None:
+        return []
+    os.chown(data, USER, USER)
+    may = "--inh-caps=-all,+dac_read_search --ambient-caps=-all,+dac_read_search --bounding-set=-all,+dac_read_search"
+    return [setpriv, f"--reuid={USER}", f"--regid={USER}", "--clear-groups", *may.split(), "--no-new-privs"]
+
+
+def files_of(tree: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(tree)): path.read_bytes() for path in tree.rglob("*") if path.is_file()}
+
+
 @contextmanager
-def serving(image: Path, data: Path) -> Iterator[str]:
-    """Start `waymark serve` on the assembled files alone; yields its address."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = str(probe.getsockname()[1])
-    own = {"PYTHONPATH": str(image), "WAYMARK_DATA_DIR": str(data), "WAYMARK_WARM_DECODERS": "false"}
+def serving(image: Path, data: Path, *, drop: bool = True, **more: str) -> Iterator[str]:
+    """Start `waymark serve` on the assembled files alone, as the image's user; yields its address.
+
+    Without `drop` it runs as this user, who may also keep what Python and Numba compile.
+    """
+    own = {"PYTHONPATH": str(image), "WAYMARK_DATA_DIR": str(data), "WAYMARK_WARM_DECODERS": "false"} | more
+    if drop:
+        own |= {"PYTHONDONTWRITEBYTECODE": "1", "HOME": str(data), "NUMBA_CACHE_DIR": str(data / "numba")}
     environment = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")} | own
-    command = [sys.executable, "-c", "from app.cli import main; main()", "serve", "--port", port]
+    command = [
+        *(as_the_images_user(data) if drop else ()),
+        sys.executable,
+        "-c",
+        "from app.cli import main; main()",
+        "serve",
+    ]
+    command += ["--port", "0"]  # a port that was looked for before may be taken when the server has started
     with subprocess.Popen(
         command, cwd=image, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stderr is not None
         lines: list[str] = []
         try:
-            while not any(STARTED.search(line) for line in lines):
+            while (started := STARTED.search(lines[-1] if lines else "")) is None:
                 lines.append(process.stderr.readline())
                 assert lines[-1], "".join(lines)  # the server ended
             drain = threading.Thread(target=process.stderr.read)
             drain.start()
-            yield f"http://127.0.0.1:{port}"
+            yield started[1]
             process.send_signal(signal.SIGTERM)
             drain.join()
         finally:
             process.kill()
 
 
-def test_the_image_has_what_the_server_needs(tmp_path: Path) -> None:
-    image = tmp_path / "src"
-    assemble(image)
+@pytest.fixture
+def root() -> Iterator[Path]:
+    """A folder that every user can reach, unlike `tmp_path`."""
+    with TemporaryDirectory(prefix="waymark-image-") as folder:
+        Path(folder).chmod(0o755)
+        yield Path(folder)
+
+
+def test_the_image_has_what_the_server_needs(root: Path) -> None:
+    assemble(root)
+    image = root / "opt/waymark/src"
+    assert (root / "tmp/requirements.txt").is_file()
     assert not list(image.glob("**/__pycache__"))
-    assert {path.name for path in image.iterdir()} >= {"app", "migrations", "static", "pyproject.toml"}
-    with serving(image, tmp_path / "var") as url, httpx.Client(base_url=url, trust_env=False) as client:
+    assert {path.name for path in image.iterdir()} == {"app", "migrations", "static", "LICENSE"}
+    for path in (image, *image.rglob("*")):
+        path.chmod(0o555 if path.is_dir() else 0o444)  # the image is read-only, also for the owner of these files
+    before = files_of(image)
+    key = {"WAYMARK_ADMIN_KEY": KEY["Authorization"].removeprefix("Bearer ")}
+    with (
+        serving(image, root / "var", **key) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=WITHIN_S) as client,
+    ):
         assert client.get("/healthz").status_code == 200
         page = client.get("/")
         assert page.status_code == 200
         assert "<title>Waymark</title>" in page.text
         for name in re.findall(r'(?:src|href)="(/static/[^"]+)"', page.text):
             assert client.get(name).content == (image / name.removeprefix("/")).read_bytes()
+        created = client.post("/v1/markers", json={"position": {"lon_deg": 8.4, "lat_deg": 49.0}}, headers=KEY)
+        assert created.status_code == 201, created.text
+    assert files_of(image) == before
+    if os.geteuid() == 0:
+        assert (root / "var/waymark.sqlite3").stat().st_uid == USER
+    for path in (image, *(path for path in image.rglob("*") if path.is_dir())):
+        path.chmod(0o755)  # for pytest, which removes it
+
+
+def test_the_base_is_pinned_and_nothing_is_downloaded_without_a_hash() -> None:
+    lines = (ROOT / "docker/Dockerfile").read_text()
+    bases = set(re.findall(r"^FROM (\S+)", lines, re.MULTILINE))
+    assert bases == {"${PYTHON}"}
+    assert re.search(r"^ARG PYTHON=python:3\.11-slim-bookworm@sha256:[0-9a-f]{64}$", lines, re.MULTILINE)
+    runs = re.findall(r"^RUN (.+?[^\\])$", lines, re.MULTILINE | re.DOTALL)
+    assert len(runs) == 4
+    for run in runs:
+        assert not re.search(r"\b(apt|apt-get|curl|wget|git)\b", run)
+        assert "pip" not in run or "--require-hashes" in run
+    wanted = re.findall(r"^[a-z0-9][^\n]*==[^\n]*(?:\n +[^\n]*)*", (ROOT / "docker/requirements.txt").read_text(), re.M)
+    assert len(wanted) > 80
+    assert all("--hash=sha256:" in requirement for requirement in wanted)
+
+
+def test_the_images_requirements_are_those_of_the_tests() -> None:
+    def versions(path: str) -> set[str]:
+        return set(re.findall(r"^([a-z0-9][\w.-]*==\S+)", (ROOT / path).read_text(), re.MULTILINE))
+
+    assert versions("requirements.txt") <= versions("docker/requirements.txt") <= versions("requirements-dev.txt")
 
 
 def test_what_the_build_does_not_need_stays_outside() -> None:
     files = set(context_files())
     assert Path("static/index.html") in files
-    for path in ("tests/test_docker.py", "docs/ogc.md", "Makefile", ".gitignore"):
+    for path in ("tests/docker/test_image.py", "docs/ogc.md", "Makefile", ".gitignore"):
         assert Path(path) not in files
 
 

@@ -1,0 +1,1 @@
+"""Routes about jobs of every kind, and about events."""

@@ -1,0 +1,213 @@
+"""Commands that talk to a server: upload with progress, artwork, reprocessing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli.progress import Progress
+from app.errors import InvalidParameter, WaymarkError
+
+if TYPE_CHECKING:
+    import httpx
+
+ServerOption = Annotated[str, typer.Option(help="Address of the server.")]
+KeyOption = Annotated[str, typer.Option(envvar="WAYMARK_KEY", help="Key to send; better set it in WAYMARK_KEY.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and no progress.")]
+_SERVER = "http://127.0.0.1:8000"
+_PART = 256 * 1024
+_RETRY_S = 1.0
+
+
+def upload(
+    file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Frame, ZIP, video, trace or packet log.")],
+    server: ServerOption = _SERVER,
+    key: KeyOption = "",
+    context: Annotated[str, typer.Option(help="Context as JSON; see the API's /docs.")] = "{}",
+    as_json: JsonOption = False,
+) -> None:
+    """Upload a file to a server, wait until it is decoded, and print what was found."""
+    with _client(server, key) as client, Progress(quiet=as_json) as shown:
+        body, headers = _multipart(file, context)
+        sent = shown.counted("upload", body, int(headers["Content-Length"]))
+        decode = _checked(client.post("/v1/decodes", content=sent, headers=headers))
+        if decode["state"] != "done":
+            follow_job(client, decode["id"], shown)
+            decode = _checked(client.get(f"/v1/decodes/{decode['id']}"))
+    if as_json:
+        _print_json(decode)
+    elif decode["state"] == "done":
+        typer.echo(decode["summary"]["text"])
+        typer.echo(f"{server}{decode['links']['self']}")
+    if decode["state"] != "done":
+        raise _failure(decode)
+
+
+def artwork(
+    out: Annotated[Path, typer.Argument(dir_okay=False, help="ZIP to write; it must not exist.")],
+    marker: Annotated[list[str] | None, typer.Option(help="Id of a plate; may be repeated.")] = None,
+    status: Annotated[str | None, typer.Option(help="All plates with this status.")] = None,
+    form: Annotated[list[str] | None, typer.Option("--format", help="pdf, svg, dxf or png; may be repeated.")] = None,
+    server: ServerOption = _SERVER,
+    key: KeyOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Have a server draw plates, each read back, and write the ZIP."""
+    if out.exists():
+        raise InvalidParameter(f"{out} already exists", cure="remove it, or choose another name")
+    wanted: dict[str, Any] = {"formats": form} if form else {}
+    wanted |= {"marker_ids": marker} if marker else {"status": status}
+    with _client(server, key) as client, Progress(quiet=as_json) as shown:
+        job = _checked(client.post("/v1/artwork", json=wanted, headers={"Prefer": "respond-async"}))
+        done = follow_job(client, job["id"], shown)
+        if done["state"] != "done":
+            raise _failure(done)
+        with client.stream("GET", done["links"]["result"]) as response:
+            response.raise_for_status()
+            with out.open("xb") as target:
+                size = int(response.headers["content-length"])
+                for part in shown.counted("download", response.iter_bytes(_PART), size):
+                    target.write(part)
+    if as_json:
+        _print_json(done)
+    else:
+        typer.echo(out)
+
+
+def reprocess(
+    kind: Annotated[list[str] | None, typer.Option(help="Kind of uploads; may be repeated.")] = None,
+    older_than: Annotated[str | None, typer.Option(help="Results of earlier releases, e.g. 0.3.0.")] = None,
+    since: Annotated[str | None, typer.Option(help="Uploaded at this time or later (RFC 3339).")] = None,
+    until: Annotated[str | None, typer.Option(help="Uploaded before this time (RFC 3339).")] = None,
+    vehicle: Annotated[str | None, typer.Option(help="Id of a vehicle.")] = None,
+    bbox: Annotated[str | None, typer.Option(help="Coarse positions in west,south,east,north. [deg]")] = None,
+    report: Annotated[Path | None, typer.Option(help="File for the report as CSV.")] = None,
+    accept: Annotated[str | None, typer.Option(help="Id of a reprocessing to accept; nothing else is done.")] = None,
+    server: ServerOption = _SERVER,
+    key: KeyOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Have a server decode stored uploads again, and print what changed. Nothing changes before it is accepted."""
+    with _client(server, key) as client, Progress(quiet=as_json) as shown:
+        if accept is not None:
+            found = _checked(client.post(f"/v1/reprocessings/{accept}/accept"))
+        else:
+            box = [float(part) for part in bbox.split(",")] if bbox else None
+            wanted = {
+                "kinds": kind, "older_than": older_than, "since": since, "until": until, "vehicle_id": vehicle,
+                "bbox": box,
+            }  # fmt: skip
+            chosen = {name: value for name, value in wanted.items() if value is not None}
+            found = _checked(client.post("/v1/reprocessings", json=chosen))
+            while found["state"] == "running":
+                shown.show("reprocess", found["done"], found["total"])
+                time.sleep(_RETRY_S)
+                found = _checked(client.get(found["links"]["self"]))
+            shown.show("reprocess", found["done"], found["total"])
+            if report is not None:
+                report.write_bytes(client.get(found["links"]["csv"]).raise_for_status().content)
+    if as_json:
+        _print_json(found)
+        return
+    sums = ", ".join(f"{count} {name}" for name, count in found["summary"].items())
+    typer.echo(f"{found['id']} {found['state']}: {found['done']} of {found['total']} uploads; readings: {sums}")
+
+
+def follow_job(client: httpx.Client, job_id: str, shown: Progress) -> dict[str, Any]:
+    """Follow a job by server-sent events until it ends; a stream that is cut is opened again."""
+    import httpx
+
+    last = ""
+    while True:
+        try:
+            with client.stream("GET", f"/v1/jobs/{job_id}/events", headers={"Last-Event-ID": last}) as response:
+                if response.status_code not in (200, 204):
+                    response.read()
+                    _checked(response)
+                for name, event_id, job in _events(response.iter_lines()):
+                    last = event_id
+                    if name != "progress":
+                        shown.show(job["kind"], job["total"] or 1, job["total"] or 1)
+                        return job
+                    shown.show(job["kind"], job["done"] if job["total"] else job["progress"], job["total"] or 1)
+        except (httpx.RemoteProtocolError, httpx.ReadError, httpx.ConnectError):
+            time.sleep(_RETRY_S)
+
+
+def _events(lines: Iterator[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    import orjson
+
+    fields: dict[str, str] = {}
+    for line in lines:
+        name, _, value = line.partition(": ")
+        if name:
+            fields[name] = value
+        elif line == "" and "data" in fields:
+            yield fields["event"], fields["id"], orjson.loads(fields["data"])
+            fields = {}
+
+
+def _client(server: str, key: str) -> httpx.Client:
+    import httpx
+
+    if not key:
+        raise InvalidParameter("no key was given", field="--key", cure="set WAYMARK_KEY, or give --key")
+    headers = {"Authorization": f"Bearer {key}"}
+    return httpx.Client(base_url=server.rstrip("/"), headers=headers, timeout=httpx.Timeout(60.0, read=300.0))
+
+
+def _multipart(file: Path, context: str) -> tuple[Iterator[bytes], dict[str, str]]:
+    """The body of a form with a file, part by part, and its headers: a large file is never in memory."""
+    boundary = "waymark-upload-boundary"
+    name = file.name.encode("ascii", "replace").decode().replace('"', "_")
+    head = (
+        f'--{boundary}\r\nContent-Disposition: form-data; name="context"\r\nContent-Type: application/json\r\n\r\n'
+        f'{context}\r\n--{boundary}\r\nContent-Disposition: form-data; name="file"; filename="{name}"\r\n'
+        "Content-Type: application/octet-stream\r\n\r\n"
+    ).encode()
+    end = f"\r\n--{boundary}--\r\n".encode()
+    size = len(head) + file.stat().st_size + len(end)
+
+    def parts() -> Iterator[bytes]:
+        yield head
+        with file.open("rb") as opened:
+            while part := opened.read(_PART):
+                yield part
+        yield end
+
+    return parts(), {"Content-Type": f"multipart/form-data; boundary={boundary}", "Content-Length": str(size)}
+
+
+def _checked(response: httpx.Response) -> dict[str, Any]:
+    """The document of a response.
+
+    Raises
+    ------
+    WaymarkError
+        The server refused the request.
+    """
+    try:
+        document: dict[str, Any] = response.json()
+    except ValueError:
+        document = {}
+    if response.is_success:
+        return document
+    message = document.get("detail") or f"the server answered {response.status_code}"
+    raise WaymarkError(message, limit=document.get("limit"), cure=document.get("cure"))
+
+
+def _failure(job: dict[str, Any]) -> WaymarkError:
+    error = job.get("error") or {}
+    return WaymarkError(
+        error.get("detail") or f"it was {job['state']}", limit=error.get("limit"), cure=error.get("cure")
+    )
+
+
+def _print_json(document: dict[str, Any]) -> None:
+    import orjson
+
+    typer.echo(orjson.dumps(document, option=orjson.OPT_INDENT_2))

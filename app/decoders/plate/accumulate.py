@@ -1,0 +1,156 @@
+"""Evidence that adds up: one plate in several frames is one code.
+
+The cost of a pattern of units in each frame is a quadratic form (`unit_likelihoods`), and so is their sum. The frames
+see the same wear, dirt, light and blur, so that their errors are correlated: the sum counts as fewer frames than it
+has. The prior of the codes counts once, because only the joint costs go through `decode_symbols`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.plate.evidence import PlateEvidence, read_evidence
+from app.decoders.plate.pose import locate_plate
+from app.decoders.plate.reader import MIN_MARGIN, wrong_colours
+from app.decoders.plate.unit_likelihoods import PATTERNS, UnitEvidence
+from app.decoders.plate.unit_patterns import cell_costs, minimize_pattern
+from app.markers.plate import PlateCode
+from app.markers.reading import PlateOutcome, PlateReading
+from app.sensors.camera import Camera
+
+CORRELATION = 0.4
+"""[1] correlation of the errors of two frames of one plate: k frames count as k / (1 + 0.4 (k - 1)), at most 2.5.
+Source: chosen by hand; `python -m benchmarks.video`, seeds 1 to 4: no wrong digits."""
+MAX_FRAMES = 16
+"""[frames] of one plate that are added up, those with the largest units. Source: chosen by hand: more frames than that
+count as hardly more."""
+OUT_OF_VIEW = PlateOutcome.FEWER_THAN_FOUR_VERTICES
+"""Frames that show a part of the plate count only where no frame shows all of it."""
+_COLOUR_OUTCOMES = (PlateOutcome.RED_MARKER_MISSING, PlateOutcome.GREEN_MARKER_MISSING)
+MISSING_SHARE = 0.5
+"""[1] share of the nearer half of the frames that must lack a part of a plate for it to be missing. Source: chosen by
+hand."""
+FIXED = 1e-4
+"""[contrast] spread of the joint contrast, which is 1 by construction. Source: chosen by hand."""
+Array = npt.NDArray[Any]
+
+
+def count_effective(frames: int) -> float:
+    """Number of independent frames that correlated ones count as."""
+    return frames / (1 + CORRELATION * (frames - 1))
+
+
+def accumulate(evidence: Sequence[PlateEvidence]) -> PlateEvidence:
+    """Joint evidence of frames that show the same plate.
+
+    Parameters
+    ----------
+    evidence : sequence of PlateEvidence
+        One or more, of one geometry.
+
+    Returns
+    -------
+    PlateEvidence
+        That of the frame if there is only one.
+    """
+    if len(evidence) == 1:
+        return evidence[0]
+    whole = [one for one in evidence if one.missing is None or one.missing[0] is not OUT_OF_VIEW] or evidence
+    largest = max(whole, key=lambda one: one.extent_px)
+    used = sorted(whole, key=lambda one: -one.unit_px)[:MAX_FRAMES]
+    near = used[: (len(used) + 1) // 2]  # colours and damage that small units hide show in large ones
+    weights = count_effective(len(used)) / len(used)
+    units = _joint_units([one.units for one in used], weights)
+    return replace(
+        largest,
+        units=units,
+        explained=float(np.median([one.explained for one in near])),
+        unit_px=max(one.unit_px for one in used),
+        weakest_marker=float(np.median([one.weakest_marker for one in near])),
+        missing=_usual_missing(near),
+        frames=len(used),
+    )
+
+
+def read_accumulated(
+    evidence: Sequence[PlateEvidence], codebook: Sequence[PlateCode], camera: Camera | None = None
+) -> PlateReading:
+    """The reading that the evidence of several frames gives, placed in the frame that shows the plate largest."""
+    joint = accumulate(evidence)
+    extent = np.ptp(joint.corners_px, axis=0)
+    reading = PlateReading(
+        PlateOutcome.CELLS_UNDECODABLE,
+        joint.corners_px,
+        joint.corners_covariance_px2,
+        geometry=joint.geometry,
+        width_px=float(extent[0]),
+        height_px=float(extent[1]),
+    )
+    reading, _decoded = read_evidence(reading, joint, codebook)
+    if reading.code is None or camera is None:
+        return reading
+    pose = locate_plate(joint.corners_px, joint.corners_covariance_px2, joint.geometry, camera)
+    return replace(reading, pose=pose)
+
+
+def _joint_units(units: Sequence[UnitEvidence], share: float) -> UnitEvidence:
+    """The sum of quadratic forms as one, whose contrast is 1; the frames with the largest units come first.
+
+    The cost of a pattern x in a frame is (x - d)' A (x - d) + 2 (x - d)' b with A = c^2 W and b = c W r, where d is the
+    frame's best pattern, c its contrast, W its weight and r its residual.
+    """
+    size = len(units[0].dark)
+    weight, linear = np.zeros((size, size)), np.zeros(size)
+    votes = np.zeros(size)
+    for one in units:
+        dark = one.dark.astype(float)
+        form = share * one.contrast**2 * one.weight
+        weight += form
+        linear += share * one.contrast * (one.weight @ one.residual) - form @ dark
+        votes += (2 * dark - 1) * np.diag(form)
+    dark = (votes > 0).astype(float)
+    # half the slope of the sum at a pattern x is weight x + linear, that of the joint form is weight times its residual
+    residual = np.linalg.solve(weight, weight @ dark + linear)
+    residual, contrast = minimize_pattern(weight, residual - dark, dark, 1.0, FIXED)
+    costs = cell_costs(weight, residual, dark, contrast, PATTERNS)
+    near = units[: (len(units) + 1) // 2]
+    return UnitEvidence(
+        cell_costs=costs - costs.min(axis=1, keepdims=True),
+        best=np.argmin(costs, axis=1),
+        dark=dark > 0.5,
+        disputed=np.mean([one.disputed for one in near], axis=0) >= MISSING_SHARE,
+        level_residual=np.median([one.level_residual for one in near], axis=0),
+        damage=float(np.median([one.damage for one in near])),
+        weight=weight,
+        residual=residual,
+        contrast=contrast,
+        scatter=float(np.median([one.scatter for one in units])),
+        span=float(np.median([one.span for one in units])),
+    )
+
+
+def _usual_missing(evidence: Sequence[PlateEvidence]) -> tuple[PlateOutcome, str] | None:
+    """What most of the frames lack; colours that are weak in each of them count together."""
+    missing = Counter(one.missing for one in evidence if one.missing is not None)
+    if sum(missing.values()) < MISSING_SHARE * len(evidence):
+        return None
+    usual = missing.most_common(1)[0][0]
+    colours = [one.colours for one in evidence if one.colours is not None]
+    if usual[0] not in _COLOUR_OUTCOMES or len(colours) < len(evidence):
+        return usual
+    # margins are in standard deviations of one frame's noise
+    gain = math.sqrt(count_effective(len(colours)))
+    joint = replace(
+        colours[0],
+        margins=gain * np.mean([one.margins for one in colours], axis=0),
+        tints=np.mean([one.tints for one in colours], axis=0),
+        cast=np.mean([one.cast for one in colours], axis=0),
+    )
+    return usual if joint.margins.min() < MIN_MARGIN else wrong_colours(joint)

@@ -1,0 +1,1 @@
+"""Recordings of robots: MCAP and ROS 1 bags, with compressed pictures and positions."""

@@ -1,0 +1,200 @@
+"""Messages of MCAP files and ROS 1 bags, by one interface. The libraries are an extra of Waymark: `bags`."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, BinaryIO
+
+from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
+from app.formats.spooled_file import SpooledFile
+
+FIELD = "file"
+MAX_CHUNK_BYTES = 256 * 1024**2
+"""[byte] of a chunk once it is expanded. Source: chosen by hand; recorders write 0.8 to 8 MB."""
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_ROS1_MAGIC = b"#ROSBAG V2.0\n"
+_SQLITE_MAGIC = b"SQLite format 3\0"
+
+
+class BagKind(StrEnum):
+    """Kinds of bags that are read."""
+
+    MCAP = "mcap"
+    ROS1 = "ros1"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic with the type of its messages, e.g. ``sensor_msgs/msg/CompressedImage``."""
+
+    name: str
+    type_name: str
+    encoding: str
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """A message: topic, time of recording [ns since 1970], and its bytes."""
+
+    topic: Topic
+    time_ns: int
+    data: bytes
+
+
+def detect_bag(head: bytes) -> BagKind | None:
+    """The kind of a bag by its first bytes; None if it is none.
+
+    Raises
+    ------
+    UnsupportedUpload
+        A ROS 2 bag in SQLite.
+    """
+    if head.startswith(_MCAP_MAGIC):
+        return BagKind.MCAP
+    if head.startswith(_ROS1_MAGIC):
+        return BagKind.ROS1
+    if head.startswith(_SQLITE_MAGIC):
+        raise UnsupportedUpload(
+            "a ROS 2 bag in SQLite is not read", field=FIELD, limit="MCAP, or a ROS 1 bag",
+            cure="convert it: ros2 bag convert, with storage_id mcap",
+        )  # fmt: skip
+    return None
+
+
+class Bag:
+    """An open bag.
+
+    Attributes
+    ----------
+    topics : list of Topic
+    """
+
+    def __init__(self, kind: BagKind, reader: Any) -> None:
+        self._kind, self._reader = kind, reader
+        self.topics: list[Topic] = list(self._list_topics())
+        self._types: Any = None
+
+    def messages(
+        self, topics: Collection[str], *, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[BagMessage]:
+        """Messages of some topics in the order of time, from a time on and before another one."""
+        with _defects():
+            if self._kind is BagKind.MCAP:
+                known = {topic.name: topic for topic in self.topics}
+                options = {"topics": list(topics), "starting_at": start_ns, "ending_before": end_ns}
+                for _schema, channel, message in self._reader.iter_messages(**options):
+                    yield BagMessage(known[channel.topic], int(message.log_time), bytes(message.data))
+                return
+            connections = [c for c in self._reader.connections if c.topic in topics]
+            if connections:
+                for connection, time_ns, data in self._reader.messages(connections, start_ns, end_ns):
+                    topic = Topic(connection.topic, connection.msgtype, "ros1")
+                    yield BagMessage(topic, int(time_ns), bytes(data))
+
+    def decode(self, message: BagMessage) -> Any:
+        """The message as an object with the fields of its type."""
+        from rosbags.typesys import Stores, get_typestore
+
+        with _defects():
+            if self._types is None:
+                self._types = get_typestore(Stores.ROS1_NOETIC if self._kind is BagKind.ROS1 else Stores.ROS2_HUMBLE)
+            if self._kind is BagKind.ROS1:
+                return self._types.deserialize_ros1(message.data, message.topic.type_name)
+            return self._types.deserialize_cdr(message.data, message.topic.type_name)
+
+    def _list_topics(self) -> Iterator[Topic]:
+        with _defects():
+            if self._kind is BagKind.ROS1:
+                for connection in self._reader.connections:
+                    yield Topic(connection.topic, connection.msgtype, "ros1")
+                return
+            summary = self._reader.get_summary()
+            if summary is None:
+                raise _damaged()
+            largest = max((chunk.uncompressed_size for chunk in summary.chunk_indexes), default=0)
+            if largest > MAX_CHUNK_BYTES:
+                raise UploadTooLarge(
+                    f"a chunk of the bag expands to {largest} bytes", field=FIELD, limit=f"{MAX_CHUNK_BYTES} bytes",
+                    cure="record with smaller chunks",
+                )  # fmt: skip
+            for channel in summary.channels.values():
+                schema = summary.schemas.get(channel.schema_id)
+                yield Topic(channel.topic, schema.name if schema else "", channel.message_encoding)
+
+
+@contextmanager
+def open_bag(file: SpooledFile, kind: BagKind) -> Iterator[Bag]:
+    """Open a bag.
+
+    Raises
+    ------
+    UnsupportedUpload
+        The libraries are not installed.
+    UnreadableUpload, UploadTooLarge
+        The bag is damaged, cut off, or has a chunk beyond its limit.
+    """
+    check_installed()
+    if kind is BagKind.MCAP:
+        from mcap.reader import SeekingReader
+
+        with file.open() as stream:
+            with _defects():
+                reader: Any = SeekingReader(stream, record_size_limit=MAX_CHUNK_BYTES)
+            yield Bag(kind, reader)
+        return
+    from rosbags.rosbag1 import Reader
+
+    path: Any = _OpenedByReader(file)
+    reader = Reader(path)
+    with _defects():
+        reader.open()
+    try:
+        yield Bag(kind, reader)
+    finally:
+        reader.close()
+
+
+def check_installed() -> None:
+    """Refuse bags where the libraries are missing."""
+    if any(importlib.util.find_spec(name) is None for name in ("mcap", "rosbags")):
+        raise UnsupportedUpload(
+            "this server does not read bags", field=FIELD, limit="the extra `bags` of Waymark",
+            cure="ask its operator to install waymark[bags], or send the camera's video or a ZIP of frames",
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _OpenedByReader:
+    """What the reader of ROS 1 bags takes for a path."""
+
+    file: SpooledFile
+
+    def exists(self) -> bool:
+        """Always."""
+        return True
+
+    def open(self, _mode: str) -> BinaryIO:
+        """A stream over the content."""
+        return self.file.open()
+
+
+@contextmanager
+def _defects() -> Iterator[None]:
+    """Report what the libraries raise on damaged bags."""
+    try:
+        yield
+    except (MemoryError, UnreadableUpload, UnsupportedUpload, UploadTooLarge):
+        raise
+    except Exception as error:  # the libraries raise errors of many kinds on damaged input
+        raise _damaged() from error
+
+
+def _damaged() -> UnreadableUpload:
+    return UnreadableUpload(
+        "the bag is damaged, cut off, or has no index", field=FIELD, limit="MCAP, or a ROS 1 bag of version 2.0",
+        cure="repair it (mcap recover, rosbag reindex) and send it whole",
+    )  # fmt: skip

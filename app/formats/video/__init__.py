@@ -1,0 +1,1 @@
+"""Videos: which files are videos, what they hold, and their frames."""

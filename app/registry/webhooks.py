@@ -1,0 +1,205 @@
+"""Queries on webhooks and their deliveries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Any, NamedTuple
+
+import sqlalchemy as sa
+
+from app.errors import NotFound
+from app.registry.health_tables import events
+from app.registry.rows import fetch_all, find_one, select_rows
+from app.registry.webhook_tables import webhook_deliveries, webhooks
+
+_W, _D = webhooks.c, webhook_deliveries.c
+
+
+class WebhookRow(NamedTuple):
+    """A webhook.
+
+    Attributes
+    ----------
+    events : list of str
+        Kinds of events that it is sent; ``job.*`` are all that begin so.
+    sealed_secret : bytes
+        Under the server's key.
+    reason : str or None
+        Why it is disabled.
+    last_event_id : int
+        Events up to this one have become deliveries.
+    """
+
+    id: str
+    agency_id: str
+    url: str
+    events: list[str]
+    sealed_secret: bytes
+    state: str
+    reason: str | None
+    last_event_id: int
+    last_success_at: datetime | None
+    who: str
+    created_at: datetime
+
+
+class DeliveryRow(NamedTuple):
+    """One event for one webhook.
+
+    Attributes
+    ----------
+    body : str
+        JSON, as it is signed and sent.
+    due_at : datetime
+        When it is sent next; while it is being sent, when another process may send it.
+    status, error : int or None, str or None
+        Of the last attempt.
+    """
+
+    id: str
+    agency_id: str
+    webhook_id: str
+    event_id: int
+    kind: str
+    body: str
+    state: str
+    attempts: int
+    due_at: datetime
+    give_up_at: datetime
+    status: int | None
+    error: str | None
+    created_at: datetime
+    ended_at: datetime | None
+
+
+def add_webhook(connection: sa.Connection, webhook: WebhookRow) -> None:
+    """Store a new webhook."""
+    connection.execute(sa.insert(webhooks), webhook._asdict())
+
+
+def count_webhooks(connection: sa.Connection, agency_id: str) -> int:
+    """Number of an agency's webhooks."""
+    return int(connection.execute(sa.select(sa.func.count()).where(_W.agency_id == agency_id)).scalar_one())
+
+
+def list_webhooks(connection: sa.Connection, agency_id: str) -> list[WebhookRow]:
+    """All webhooks of an agency, oldest first."""
+    return fetch_all(
+        connection, select_rows(WebhookRow, webhooks).where(_W.agency_id == agency_id).order_by(_W.id), WebhookRow
+    )
+
+
+def get_webhook(connection: sa.Connection, agency_id: str, webhook_id: str) -> WebhookRow:
+    """One webhook of an agency.
+
+    Raises
+    ------
+    NotFound
+    """
+    query = select_rows(WebhookRow, webhooks).where(_W.id == webhook_id, _W.agency_id == agency_id)
+    row = find_one(connection, query, WebhookRow)
+    if row is None:
+        raise NotFound(f"there is no webhook {webhook_id}", field="webhook_id", cure="GET /v1/webhooks lists them")
+    return row
+
+
+def delete_webhook(connection: sa.Connection, webhook_id: str) -> None:
+    """Remove a webhook with its deliveries."""
+    connection.execute(sa.delete(webhook_deliveries).where(_D.webhook_id == webhook_id))
+    connection.execute(sa.delete(webhooks).where(_W.id == webhook_id))
+
+
+def change_webhook(connection: sa.Connection, webhook_id: str, **values: Any) -> None:
+    """Set columns of a webhook."""
+    connection.execute(sa.update(webhooks).where(_W.id == webhook_id).values(**values))
+
+
+def list_webhooks_behind(connection: sa.Connection) -> list[WebhookRow]:
+    """Active webhooks of all agencies whose agency has newer events."""
+    newer = sa.exists().where(events.c.agency_id == _W.agency_id, events.c.id > _W.last_event_id)
+    query = select_rows(WebhookRow, webhooks).where(_W.state == "active", newer)
+    return fetch_all(connection, query.order_by(_W.id), WebhookRow)
+
+
+def add_deliveries(connection: sa.Connection, rows: Sequence[DeliveryRow]) -> None:
+    """Store deliveries."""
+    if rows:
+        connection.execute(sa.insert(webhook_deliveries), [row._asdict() for row in rows])
+
+
+def list_deliveries(
+    connection: sa.Connection, webhook_id: str, *, state: str | None, before: str | None, limit: int
+) -> list[DeliveryRow]:
+    """Deliveries of a webhook, newest first."""
+    query = select_rows(DeliveryRow, webhook_deliveries).where(_D.webhook_id == webhook_id)
+    if state is not None:
+        query = query.where(_D.state == state)
+    if before is not None:
+        query = query.where(_D.id < before)
+    return fetch_all(connection, query.order_by(_D.id.desc()).limit(limit), DeliveryRow)
+
+
+def get_delivery(connection: sa.Connection, webhook_id: str, delivery_id: str) -> DeliveryRow:
+    """One delivery of a webhook.
+
+    Raises
+    ------
+    NotFound
+    """
+    query = select_rows(DeliveryRow, webhook_deliveries).where(_D.id == delivery_id, _D.webhook_id == webhook_id)
+    row = find_one(connection, query, DeliveryRow)
+    if row is None:
+        raise NotFound(f"there is no delivery {delivery_id} of this webhook", field="delivery_id")
+    return row
+
+
+def change_delivery(connection: sa.Connection, delivery_id: str, **values: Any) -> None:
+    """Set columns of a delivery."""
+    connection.execute(sa.update(webhook_deliveries).where(_D.id == delivery_id).values(**values))
+
+
+def postpone_giving_up(connection: sa.Connection, webhook_id: str, give_up_at: datetime, due_at: datetime) -> None:
+    """Give the deliveries that wait a new time: their webhook is enabled again."""
+    waiting = sa.update(webhook_deliveries).where(_D.webhook_id == webhook_id, _D.state == "waiting")
+    connection.execute(waiting.values(give_up_at=give_up_at, due_at=due_at))
+
+
+def _due(now: datetime, per_webhook: int, limit: int) -> sa.Select[Any]:
+    """Ids of deliveries to send now, oldest first: a few of each webhook, so that none that is slow delays others."""
+    place = sa.func.row_number().over(partition_by=_D.webhook_id, order_by=(_D.due_at, _D.id)).label("place")
+    ranked = (
+        sa.select(_D.id, _D.due_at, place)
+        .join(webhooks, _W.id == _D.webhook_id)
+        .where(_D.state == "waiting", _D.due_at <= now, _W.state == "active")
+        .subquery()
+    )
+    return sa.select(ranked.c.id).where(ranked.c.place <= per_webhook).order_by(ranked.c.due_at).limit(limit)
+
+
+def has_due(connection: sa.Connection, now: datetime) -> bool:
+    """Whether there is something to send."""
+    return connection.execute(_due(now, 1, 1)).first() is not None
+
+
+def lease_due(
+    connection: sa.Connection, now: datetime, until: datetime, *, per_webhook: int, limit: int
+) -> list[tuple[DeliveryRow, WebhookRow]]:
+    """Take deliveries to send now; nobody else takes them before `until`, so one that is cut off is sent again."""
+    wanted = select_rows(DeliveryRow, webhook_deliveries).where(_D.id.in_(_due(now, per_webhook, limit)))
+    rows = fetch_all(connection, wanted.with_for_update(skip_locked=True, of=webhook_deliveries), DeliveryRow)
+    taken = []
+    for row in rows:
+        lease = sa.update(webhook_deliveries).where(_D.id == row.id)
+        connection.execute(lease.values(due_at=until, attempts=_D.attempts + 1))
+        taken.append((row._replace(attempts=row.attempts + 1), get_webhook(connection, row.agency_id, row.webhook_id)))
+    return taken
+
+
+def delete_old(connection: sa.Connection, before: datetime) -> None:
+    """Delete deliveries that ended before a time, and events from before it that no active webhook waits for."""
+    connection.execute(sa.delete(webhook_deliveries).where(_D.ended_at < before))
+    awaited = sa.exists().where(
+        _W.agency_id == events.c.agency_id, _W.state == "active", _W.last_event_id < events.c.id
+    )
+    connection.execute(sa.delete(events).where(events.c.at < before, ~awaited))

@@ -1,0 +1,1 @@
+"""Drives: several decodes of one vehicle as one track."""

@@ -1,0 +1,1 @@
+"""Marker health: what uploads show of markers, the tests on it, and the work list."""

@@ -1,0 +1,198 @@
+"""What a decode observed becomes evidence in the tests of its markers, in the transaction that stores the decode."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import sqlalchemy as sa
+
+from app.health import (
+    Fault,
+    JudgedDrive,
+    MarkerState,
+    Pass,
+    VehicleState,
+    judge_drive,
+    update_marker,
+    update_unregistered,
+)
+from app.registry import health as store
+from app.registry.decodes import NewObservation
+from app.registry.health import HealthRow, NewUnregistered
+from app.registry.spatial import distance_m
+from app.services.health.evidence import EVIDENCE, passes_of
+from app.services.health.items import ItemUpload, Suspicion, open_items
+
+SAME_CODE_M = 30.0
+"""[m] readings of an unregistered code that are as near to each other are of one marker. Source: chosen by hand, what
+positions of vehicles without RTK are good to."""
+_SAME_PLACE_DEG = 1e-7  # a centimetre: the registered position is the same
+CAMERA, BAR, RADIO = "camera", "bar", "radio"
+"""Sensors: each of a vehicle has errors of its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedDrive:
+    """What one decode observed.
+
+    Attributes
+    ----------
+    decode_id : str
+    sensor : str
+        `CAMERA`, `BAR` or `RADIO`.
+    vehicle : str
+        Id of the vehicle, else of the holder of the key.
+    observations : sequence of NewObservation
+    unregistered : sequence of NewUnregistered
+    """
+
+    decode_id: str
+    sensor: str
+    vehicle: str
+    observations: Sequence[NewObservation]
+    unregistered: Sequence[NewUnregistered] = ()
+
+
+def record_drive(
+    connection: sa.Connection, agency_id: str, drive: ObservedDrive, now: datetime, *, opens_items: bool = True
+) -> None:
+    """Add what a decode observed to the tests of its markers, and open items of the work list.
+
+    Parameters
+    ----------
+    opens_items : bool
+        False where the states are computed again: people have decided on the items.
+    """
+    passes = passes_of(drive.observations)
+    if not passes and not drive.unregistered:
+        return
+    vehicle = _short(agency_id, drive.vehicle)
+    own = f"vehicle:{vehicle}:{drive.sensor}"
+    stored = store.find_health(connection, agency_id, [own, *(one.marker_id for one, _row in passes)])
+    record = VehicleState(**stored[own].state) if own in stored else VehicleState()
+    at = passes[0][1].at if passes else drive.unregistered[0].at
+    judged = judge_drive([one for one, _row in passes], record, at.timestamp())
+    rows = [_vehicle_row(own, record, at, now)]
+    suspicions = []
+    for (one, row), evidence in zip(passes, judged.evidence, strict=True):
+        state = _state_of(stored.get(one.marker_id), one, row)
+        verdicts = update_marker(state, evidence, vehicle, row.at.timestamp())
+        rows.append(_marker_row(one.marker_id, state, row, now))
+        suspicions += [Suspicion(one.marker_id, verdict, state.month_passes) for verdict in verdicts]
+    unknown_rows, unknown = _add_unregistered(connection, agency_id, drive, vehicle, now)
+    store.store_health(connection, agency_id, [*rows, *unknown_rows])
+    if opens_items:
+        wrong_way = _wrong_way_marker(judged, passes, {row.subject: row for row in rows})
+        upload = ItemUpload(drive.decode_id, drive.sensor == CAMERA, vehicle, at)
+        open_items(connection, agency_id, upload, [*suspicions, *unknown], wrong_way, now)
+
+
+def recompute_health(connection: sa.Connection, agency_id: str, now: datetime) -> int:
+    """Compute the states of all tests of an agency from its stored observations; returns the number of decodes.
+
+    Items of the work list stay as they are. Decodes are taken in the order of their uploads, so a state differs from
+    the one that grew with the uploads where these were stored in another order, and where people have decided.
+    """
+    store.delete_health(connection, agency_id)
+    count = 0
+    for decode in store.iterate_decodes(connection, agency_id):
+        observed, unknown = store.list_of_decode(connection, agency_id, decode.id)
+        sensor = {"trace": BAR, "packets": RADIO}.get(decode.kind, CAMERA)
+        drive = ObservedDrive(decode.id, sensor, decode.vehicle_id or decode.holder_id or "", observed, unknown)
+        record_drive(connection, agency_id, drive, now, opens_items=False)
+        count += 1
+    return count
+
+
+def _short(agency_id: str, vehicle: str) -> str:
+    """A vehicle in the states: enough to tell vehicles apart, and not its id."""
+    return hashlib.blake2s(f"{agency_id} {vehicle}".encode(), digest_size=8).hexdigest()
+
+
+def _state_of(stored: HealthRow | None, one: Pass, row: NewObservation) -> MarkerState:
+    """The marker's state; where its registered position has changed, the evidence against the old one is forgotten."""
+    place = _place(row)
+    if stored is None:
+        return MarkerState.new(one.family)
+    state = MarkerState.from_document(stored.state)
+    if place and stored.lon_deg is not None and stored.lat_deg is not None:
+        same = abs(place[0] - stored.lon_deg) < _SAME_PLACE_DEG and abs(place[1] - stored.lat_deg) < _SAME_PLACE_DEG
+        if not same:
+            for fault in list(state.ratios):
+                state.reset(fault)
+    return state
+
+
+def _place(row: NewObservation) -> list[float] | None:
+    found: list[float] | None = row.detail.get(EVIDENCE, {}).get("place_deg")
+    return found
+
+
+def _marker_row(marker_id: str, state: MarkerState, row: NewObservation, now: datetime) -> HealthRow:
+    lon_deg, lat_deg = _place(row) or (None, None)
+    document = state.document()
+    return HealthRow(
+        marker_id, marker_id, lon_deg, lat_deg, state.passes, state.reads,
+        datetime.fromtimestamp(state.read_s, UTC) if state.reads else None, datetime.fromtimestamp(state.last_s, UTC),
+        document["ratios"], state.quality if state.quality_passes else None, document, now,
+    )  # fmt: skip
+
+
+def _vehicle_row(subject: str, record: VehicleState, at: datetime, now: datetime) -> HealthRow:
+    return HealthRow(subject, None, None, None, 0, 0, None, at, {}, None, record.document(), now)
+
+
+def _add_unregistered(
+    connection: sa.Connection, agency_id: str, drive: ObservedDrive, vehicle: str, now: datetime
+) -> tuple[list[HealthRow], list[Suspicion]]:
+    rows: dict[str, HealthRow] = {}
+    found = []
+    for reading in drive.unregistered:
+        known = [*rows.values(), *store.list_codes(connection, agency_id, reading.family, reading.code)]
+        near = next((row for row in known if _is_near(row, reading)), None)
+        state = MarkerState.from_document(near.state) if near is not None else MarkerState.new(reading.family)
+        subject = near.subject if near is not None else _subject(reading)
+        verdicts = update_unregistered(state, reading.confidence, vehicle, reading.at.timestamp())
+        lon_deg, lat_deg = (near.lon_deg, near.lat_deg) if near is not None else (reading.lon_deg, reading.lat_deg)
+        document = state.document()
+        rows[subject] = HealthRow(
+            subject, None, lon_deg, lat_deg, state.passes, state.reads, reading.at, reading.at, document["ratios"],
+            None, document, now,
+        )  # fmt: skip
+        found += [Suspicion(subject, verdict, state.month_passes, reading) for verdict in verdicts]
+    return list(rows.values()), found
+
+
+def _is_near(row: HealthRow, reading: NewUnregistered) -> bool:
+    if not row.subject.startswith(f"code:{reading.family}:{reading.code}:"):
+        return False
+    if row.lon_deg is None or row.lat_deg is None:
+        return False
+    return distance_m(row.lon_deg, row.lat_deg, reading.lon_deg, reading.lat_deg) <= SAME_CODE_M
+
+
+def _subject(reading: NewUnregistered) -> str:
+    return f"code:{reading.family}:{reading.code}:{reading.lon_deg:.5f},{reading.lat_deg:.5f}"
+
+
+def _wrong_way_marker(
+    judged: JudgedDrive, passes: Sequence[tuple[Pass, NewObservation]], rows: dict[str, HealthRow]
+) -> str | None:
+    """The first reversed marker of a driver on the wrong way; None where there is none, or where the only marker that
+    shows it is itself suspected to be reversed.
+    """
+    if not judged.wrong_way:
+        return None
+    first = next(one.marker_id for one, _row in passes if one.reversed)
+    if judged.only_one and _others_reversed(rows[first]):
+        return None
+    return first
+
+
+def _others_reversed(row: HealthRow) -> bool:
+    """Whether several vehicles met the marker reversed."""
+    shares: dict[str, float] = row.state["shares"].get(Fault.WRONG_WAY, {})
+    return sum(share > 0.0 for share in shares.values()) > 1

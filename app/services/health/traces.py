@@ -1,0 +1,190 @@
+"""What a magnetometer trace shows of the health of tags: those it read, and those it passed over and did not read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from datetime import datetime
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from app.decoders.magnet.localize import TagFix
+from app.decoders.magnet.match import ReadTag, ReadTrace
+from app.decoders.magnet.readings import TagReading
+from app.decoders.magnet.registered_tag import RegisteredTag
+from app.geodesy import enu_from_wgs84
+from app.planning.predict.models import fitted_models
+from app.registry.decodes import NewObservation
+from app.sensors.magnetometer_bar import MagnetometerBar
+from app.services.health.evidence import EVIDENCE, MISSED, rounded
+
+MIN_TAGS = 4
+"""Tags of a drive from which the odometer's scale is known. Source: by hand; of three, one may have moved."""
+MAX_GAP_M = 300.0
+"""[m] between tags whose path between them is known. Source: by hand."""
+ODOMETER_SHARE = 0.002
+"""Standard deviation of the odometer over a distance, after its scale is taken out. Source: by hand."""
+SURVEY_SIGMA_M = 0.7
+"""[m] each axis, without a stated accuracy. Source: `ASSUMED_HORIZONTAL_RMSE_M`, both axes together."""
+WANDER_M, WANDER_PER_M = 0.1, 0.002
+"""[m, 1] standard deviation of the path between two tags from the curve through both. Source: by hand."""
+MAX_BEND = 0.02
+"""Share by which the way driven may exceed the straight line between two tags. Source: by hand, 0.7 rad of a bend."""
+SIGNAL_SIGMA = 0.15
+"""Standard deviation of the logarithm of a tag's mean moment between passes. Source: chosen by hand."""
+_ON_ROAD = frozenset({"built", "surveyed", "active", "suspect"})
+
+
+def tag_evidence(trace: ReadTrace) -> dict[str, dict[str, Any]]:
+    """Evidence of the registered tags that a trace read, by marker; of one that was passed twice, of the first."""
+    read: dict[str, ReadTag] = {}
+    for tag in trace.tags:
+        if tag.match is not None and tag.match.tag is not None:
+            read.setdefault(tag.match.tag.marker_id, tag)
+    along = _along_offsets(list(read.values()))
+    return {
+        marker_id: rounded(_evidence(tag, offset)) for (marker_id, tag), offset in zip(read.items(), along, strict=True)
+    }
+
+
+def missed_tags(
+    trace: ReadTrace, nearby: Sequence[RegisteredTag], complete: bool, bar: MagnetometerBar, at: datetime
+) -> list[NewObservation]:
+    """Tags that lie on the path between two tags that were read, within the width of the bar."""
+    if not complete:
+        return []
+    read = {tag.match.tag.marker_id for tag in trace.tags if tag.match is not None and tag.match.tag is not None}
+    others = {tag.match.others for tag in trace.tags if tag.match is not None}
+    doubtful = {marker_id for several in others for marker_id in several}
+    rows: dict[str, NewObservation] = {}
+    fixed = [tag for tag in trace.tags if tag.fix is not None]
+    for first, second in pairwise(fixed):
+        assert first.fix is not None
+        assert second.fix is not None
+        gap_m = second.reading.magnets[0].odometer_m - first.reading.magnets[-1].odometer_m
+        if not 0.0 < gap_m <= MAX_GAP_M:
+            continue
+        for tag in nearby:
+            if tag.marker_id in read or tag.marker_id in doubtful or tag.status not in _ON_ROAD:
+                continue
+            expected = _passed_probability(first.fix, second.fix, gap_m, tag, bar)
+            if expected > 0.0 and tag.marker_id not in rows:
+                along = 0.5 * (first.reading.start_s + second.reading.start_s)
+                evidence = rounded({**_about(tag), "expected": expected, "along": along})
+                rows[tag.marker_id] = NewObservation(tag.marker_id, 0, at, MISSED, {EVIDENCE: evidence})
+    return list(rows.values())
+
+
+def _about(tag: RegisteredTag) -> dict[str, Any]:
+    survey_m = SURVEY_SIGMA_M if tag.horizontal_rmse_m is None else tag.horizontal_rmse_m / math.sqrt(2)
+    return {"family": "magnet", "place_deg": (tag.lon_deg, tag.lat_deg), "survey_m": survey_m}
+
+
+def _evidence(tag: ReadTag, along: tuple[float, float] | None) -> dict[str, Any]:
+    assert tag.match is not None
+    assert tag.match.tag is not None
+    reading, registered = tag.reading, tag.match.tag
+    evidence = {
+        **_about(registered),
+        "along": reading.start_s,
+        "expected": _read_rate(reading),
+        "reversed": reading.wrong_way,
+    }
+    moment = np.linalg.norm([magnet.moment_am2 for magnet in reading.magnets], axis=1)
+    if (moment > 0.0).all():
+        evidence["quality"] = float(np.log(moment).mean()) / SIGNAL_SIGMA
+    if along is not None:
+        offset_m, sigma_m = along
+        heading = math.radians(registered.bearing_deg + (180.0 if reading.wrong_way else 0.0))
+        evidence |= {
+            "offset_m": (offset_m * math.sin(heading), offset_m * math.cos(heading)),
+            "sigma_m": sigma_m,
+            "heading_deg": math.degrees(heading) % 360.0,
+        }
+    return evidence
+
+
+def _read_rate(reading: TagReading) -> float:
+    """That a tag is read which the bar passes: the decoder's rate by clearance (app/planning/data/predictions.json)."""
+    clearance_m = float(np.median([magnet.clearance_cm for magnet in reading.magnets])) / 100.0
+    return float(fitted_models().tags.read_rate(clearance_m, 0.0))
+
+
+def _along_offsets(tags: Sequence[ReadTag]) -> list[tuple[float, float] | None]:
+    """Where each tag was met along the road, less where it is registered, with the standard deviation. [m]
+
+    The odometer measures distances from tag to tag, and the registry has them too. Its scale is the median over all
+    pairs of tags (Theil and Sen), which one tag that has moved does not change.
+    """
+    if len(tags) < MIN_TAGS:
+        return [None] * len(tags)
+    places, odometer = np.array([_middle(tag) for tag in tags]), np.array([_odometer(tag) for tag in tags])
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    registered = np.concatenate([[0.0], np.cumsum(steps)])
+    pairs = [(i, j) for i, j in combinations(range(len(tags)), 2) if registered[j] - registered[i] > 1.0]
+    if not pairs:
+        return [None] * len(tags)
+    scale = float(np.median([(odometer[j] - odometer[i]) / (registered[j] - registered[i]) for i, j in pairs]))
+    # distances from the tags beside it: an odometer's error grows along the road
+    offsets: list[tuple[float, float] | None] = []
+    for k in range(len(tags)):
+        beside = [j for j in range(max(0, k - 2), min(len(tags), k + 3)) if j != k]
+        apart = [(odometer[k] - odometer[j]) / scale - (registered[k] - registered[j]) for j in beside]
+        gap_m = float(np.median([abs(registered[k] - registered[j]) for j in beside]))
+        offsets.append((float(np.median(apart)), ODOMETER_SHARE * gap_m + tags[k].reading.magnets[0].along_std_m))
+    return offsets
+
+
+def _middle(tag: ReadTag) -> tuple[float, float]:
+    """The middle of a registered tag, east and north of where its lane begins. [m]"""
+    assert tag.match is not None
+    assert tag.match.tag is not None
+    registered = tag.match.tag
+    east, north, _up = enu_from_wgs84(
+        registered.lon_deg, registered.lat_deg, 0.0, (registered.lane_lon_deg, registered.lane_lat_deg, 0.0)
+    )
+    half_m, bearing = 0.5 * registered.tag.length_m, math.radians(registered.bearing_deg)
+    return float(east) + half_m * math.sin(bearing), float(north) + half_m * math.cos(bearing)
+
+
+def _odometer(tag: ReadTag) -> float:
+    """Where the middle of a tag was met. [m]"""
+    return 0.5 * (tag.reading.magnets[0].odometer_m + tag.reading.magnets[-1].odometer_m)
+
+
+def _passed_probability(first: TagFix, second: TagFix, gap_m: float, tag: RegisteredTag, bar: MagnetometerBar) -> float:
+    """That a healthy tag between two fixes is read: that it lies within the bar, times the decoder's rate; 0 elsewhere.
+
+    The path is the cubic curve through both positions in both headings (Hermite).
+    """
+    origin = (first.lon_deg, first.lat_deg, 0.0)
+    end = np.asarray(enu_from_wgs84(second.lon_deg, second.lat_deg, 0.0, origin))[:2]
+    there = np.asarray(enu_from_wgs84(tag.lon_deg, tag.lat_deg, 0.0, origin))[:2]
+    chord_m = float(np.linalg.norm(end))
+    if chord_m < 1.0 or not abs(gap_m - chord_m) <= MAX_BEND * chord_m + 10.0:
+        return 0.0
+    share = np.linspace(0.0, 1.0, 201)[:, None]
+    starts, ends = (chord_m * _direction(fix.heading_deg) for fix in (first, second))
+    path = (
+        (share**3 - 2 * share**2 + share) * starts + (3 * share**2 - 2 * share**3) * end
+        + (share**3 - share**2) * ends
+    )  # fmt: skip
+    nearest = int(np.argmin(np.linalg.norm(path - there, axis=1)))
+    if not 2 <= nearest <= len(path) - 3:
+        return 0.0
+    left = path[nearest + 1] - path[nearest - 1]
+    left = np.array([-left[1], left[0]]) / np.linalg.norm(left)
+    aside_m = float((there - path[nearest]) @ left)
+    array = bar.positions_m[bar.array][:, 1]
+    low, high = float(array.min()), float(array.max())
+    sigma_m = WANDER_M + WANDER_PER_M * min(gap_m, chord_m)
+    inside = float(norm.cdf((high - aside_m) / sigma_m) - norm.cdf((low - aside_m) / sigma_m))
+    rate = float(fitted_models().tags.read_rate(0.16, 0.0))
+    return inside * rate
+
+
+def _direction(heading_deg: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([math.sin(math.radians(heading_deg)), math.cos(math.radians(heading_deg))])

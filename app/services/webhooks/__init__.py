@@ -1,0 +1,1 @@
+"""Webhooks: events of an agency, sent to addresses that it chose."""

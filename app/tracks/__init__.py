@@ -1,0 +1,39 @@
+"""One drive, one track: what several sensors know of a drive, fused on one time base.
+
+The values are in `types`, `estimate` leads through the steps: the clocks of sensors that know their speed are aligned
+(`speed_alignment`), the largest set of fixes that agree starts the filter (`consensus`), the error-state Kalman filter
+and its smoother run to and fro along the drive (`kernel`), and after each round fixes are gated by their distance to
+the track that the others give.
+"""
+
+from app.tracks.estimate import estimate_track
+from app.tracks.types import (
+    Clock,
+    ClockOffset,
+    ClockState,
+    FixResult,
+    LanePath,
+    LeftOutReason,
+    PositionFix,
+    Samples,
+    Track,
+    TrackGap,
+    TrackInput,
+    TrackRules,
+)
+
+__all__ = [
+    "Clock",
+    "ClockOffset",
+    "ClockState",
+    "FixResult",
+    "LanePath",
+    "LeftOutReason",
+    "PositionFix",
+    "Samples",
+    "Track",
+    "TrackGap",
+    "TrackInput",
+    "TrackRules",
+    "estimate_track",
+]

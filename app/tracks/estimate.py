@@ -1,0 +1,389 @@
+"""One track from all that is known of a drive."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from app.errors import InvalidParameter
+from app.tracks import kernel
+from app.tracks.clock_jumps import find_jump, split_where_time_falls
+from app.tracks.consensus import consistent_chain
+from app.tracks.dead_reckoning import DeadReckoning, TimeBase, dead_reckon, local_m, time_base
+from app.tracks.kernel import HEADING_SAMPLE, SPEED_SAMPLE
+from app.tracks.measure import (
+    FixArrays,
+    PathIndex,
+    averaged_rates,
+    fix_arrays,
+    fix_rows,
+    in_order,
+    passage_distances,
+    path_index,
+    path_rows,
+    sample_rows,
+)
+from app.tracks.motion import BIAS, CLOCKS, HEADING, NORTH, SCALE, SPEED, WANDER, YAW_RATE, Motion
+from app.tracks.results import collect_track
+from app.tracks.speed_alignment import align_clocks
+from app.tracks.types import Bools, Clock, Floats, Ints, PositionFix, Track, TrackInput, TrackRules
+
+MAX_ROUNDS = 12
+"""Rounds of smoothing and gating at most. Source: `python -m benchmarks.track`: 4 to 8 are needed."""
+_MOVED_M, _MOVED_S = 0.01, 1e-3  # [m, s] changes that end the rounds; source: by hand, below all noise
+_READMIT = 0.8  # of the gate: no fix goes in and out in turn; source: by hand
+_NEIGHBOURS_S = 20.0  # [s] one outlier at a time is left out of this; source: by hand, it spoils what is near
+_START_SIGMA_M = 2000.0  # [m] source: by hand, dead reckoning of ten minutes back to the start
+MAX_JUMPS = 4
+"""Steps of clocks at most. Source: by hand."""
+_MIN_LEFT_OUT = 3  # fixes, from which on a step of a clock may be the cause; source: app/tracks/clock_jumps.py
+_EXPLORED_S = 0.02  # [s2/s] by which offsets may change while steps are looked for; source: by hand, 0.5 s in 12 s
+_EXPLORING_ROUNDS = 3
+_MOTION = Motion(
+    position_m2_s=2e-5,  # [m2/s] source: by hand, slip of a car in bends, 5 mm in a second
+    speed_m2_s3=1.0,  # [m2/s3] source: by hand, a change of 1 m/s within a second
+    heading_rad2_s=1e-8,
+    turning_m_s2=0.7,  # [m/s2] standard deviation of the lateral acceleration; source: by hand, comfortable bends
+    scale_1_s=3e-7,  # [1/s] source: by hand, 0.4 % in a minute: slip, grades, tyres
+    bias_rad2_s=2.5e-6,  # [rad2/s] source: by hand, 0.7 deg in a minute: a compass beside steel, the drift of a gyro
+    clock_s=0.0,
+    wander_m=0.4,
+    wander_length_m=100.0,
+)
+
+
+@dataclass(slots=True, eq=False)
+class Segment:
+    """A stretch of a sensor's time with one offset; `place` is that of the offset in the state, -1: it has none."""
+
+    clock: Clock
+    place: int
+    is_reference: bool = False
+    jumped: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class Smoothed:
+    """The drive after the last round."""
+
+    states: Floats
+    covs: Floats
+    used: Bools
+    square: Floats
+    residual_m: Floats
+    rounds: int
+    path_points: int
+
+
+@dataclass(slots=True, eq=False)
+class _Drive:
+    """What stays the same from round to round."""
+
+    given: TrackInput
+    rules: TrackRules
+    base: TimeBase
+    fixes: tuple[PositionFix, ...]
+    arrays: FixArrays
+    segments: list[Segment]
+    segment_of: Ints
+    driven: DeadReckoning
+    paths: list[PathIndex] = field(default_factory=list)
+
+    def offsets(self, states: Floats | None) -> Floats:
+        """Offset of each segment. [s]"""
+        return np.array([
+            float(states[0, entry.place]) if states is not None and entry.place >= 0 else entry.clock.offset_s
+            for entry in self.segments
+        ])  # fmt: skip
+
+
+def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
+    """Fuse fixes, speeds, headings and paths.
+
+    Parameters
+    ----------
+    given : TrackInput
+        In any order.
+    rules : TrackRules, optional
+
+    Returns
+    -------
+    Track
+
+    Raises
+    ------
+    InvalidParameter
+        There is no fix, a clock is not declared, or the sensors do not overlap in time.
+    """
+    rules = rules or TrackRules()
+    given = align_clocks(given, _checked_clocks(given))
+    clocks = {clock.name: clock for clock in given.clocks}
+    fixes, warnings = _in_time_order(given, clocks), list[str]()
+    if not fixes:
+        raise InvalidParameter(
+            "there is no fix to place the drive by",
+            field="decodes",
+            limit="one or more registered markers with a position grade, and the time of their reading",
+            cure="decode with coarse_position and captured_at, and register the markers with their accuracy",
+        )
+    base, pauses = time_base(given, clocks)
+    reference = _reference(given, fixes)
+    segments = [Segment(clock, -1, is_reference=clock.name == reference) for clock in clocks.values()]
+    names = [entry.clock.name for entry in segments]
+    segment_of = np.array([names.index(fix.clock) for fix in fixes])
+    segment_of, fallen = split_where_time_falls(fixes, segment_of, segments)
+    driven = dead_reckon(base, given.speeds, given.headings, {name: clock.offset_s for name, clock in clocks.items()})
+    paths = [index for path in given.paths if (index := path_index(path)) is not None]
+    drive = _Drive(given, rules, base, fixes, fix_arrays(fixes), segments, segment_of, driven, paths)
+    smoothed = _smooth(drive)
+    smoothed = _with_jumps(drive, smoothed)
+    if fallen:
+        warnings.append("times of a sensor run backwards: its clock was set; each part has an offset of its own")
+    return collect_track(
+        rules, base, fixes, drive.segments, drive.segment_of, given.clocks, smoothed, pauses, tuple(warnings)
+    )
+
+
+def _checked_clocks(given: TrackInput) -> dict[str, Clock]:
+    clocks = {clock.name: clock for clock in given.clocks}
+    if len(clocks) != len(given.clocks):
+        raise InvalidParameter("two clocks have the same name", field="clocks", limit="each name once")
+    samples = (*given.speeds, *given.headings)
+    used = [*(fix.clock for fix in given.fixes), *(series.clock for series in samples)]
+    missing = next((name for name in used if name not in clocks), None)
+    if missing is not None:
+        raise InvalidParameter(f"the clock {missing} is not declared", field="clocks", limit="all that are used")
+    return clocks
+
+
+def _in_time_order(given: TrackInput, clocks: dict[str, Clock]) -> tuple[PositionFix, ...]:
+    """Fixes by their time; of those at the same time, by all that they hold: the order they came in has no effect."""
+    return tuple(
+        sorted(
+            given.fixes,
+            key=lambda fix: (
+                fix.time_s + clocks[fix.clock].offset_s, fix.clock, fix.source, fix.place, fix.marker_id or "",
+                fix.lon_deg, fix.lat_deg,
+            ),
+        )
+    )  # fmt: skip
+
+
+def _reference(given: TrackInput, fixes: tuple[PositionFix, ...]) -> str:
+    """The clock that all others are compared with: of most speeds, else of most fixes."""
+    weight: Counter[str] = Counter({clock.name: 0 for clock in given.clocks})
+    for series in given.speeds:
+        weight[series.clock] += 1000 * series.time_s.size
+    for fix in fixes:
+        weight[fix.clock] += 1
+    return min(weight, key=lambda name: (-weight[name], name))
+
+
+# --- smoothing --------------------------------------------------------------------------------------------------------
+
+
+def _places(segments: list[Segment]) -> list[int]:
+    """Places of the offsets in the state; -1: known, or the reference."""
+    unknown = [not entry.is_reference and entry.clock.sigma_s > 0 for entry in segments]
+    return [CLOCKS + sum(unknown[:k]) if unknown[k] else -1 for k in range(len(segments))]
+
+
+def _smooth(drive: _Drive, *, clock_s: float = 0.0) -> Smoothed:
+    """Rounds of filter, smoother and gate until nothing changes; `clock_s` lets offsets of clocks change."""
+    places = _places(drive.segments)
+    for entry, own in zip(drive.segments, places, strict=True):
+        entry.place = own
+    place = max(CLOCKS, max(places) + 1)
+    used, turn, scale = _start_set(drive)
+    start, start_cov = _start_state(drive, used, turn, scale, place)
+    motion = _MOTION._replace(
+        wander_m=drive.rules.wander_m, wander_length_m=drive.rules.wander_length_m, clock_s=clock_s
+    )
+    gate2, gate3 = (float(chi2.isf(drive.rules.outlier_probability, dof)) for dof in (2, 3))
+    gate = np.where(np.isfinite(drive.arrays.heading_rad), gate3, gate2)
+    states, covs = None, None
+    around = np.full((drive.base.count, place), np.nan)
+    square, residual = np.zeros(len(used)), np.zeros((len(used), 3))
+    rounds, path_points = 0, 0
+    for rounds in range(1, MAX_ROUNDS + 1):
+        measurements, where, path_points = _measurements(drive, states, covs, used)
+        new_states, new_covs = kernel.filter_track(drive.base.step_s, start, start_cov, around, measurements, motion)
+        kernel.smooth_track(drive.base.step_s, new_states, new_covs, around, motion)
+        square, residual, smoothed, spread = kernel.fix_distances(measurements, where, new_states, new_covs)
+        square = passage_distances(drive.arrays, used, square, measurements.noise[where], smoothed, spread)
+        moved = _moved(states, new_states)
+        states, covs, around = new_states, new_covs, new_states
+        if rounds < 2:
+            continue
+        changed = used if clock_s > 0 else _gate(drive, used, square, gate)
+        if ((changed == used).all() and moved) or (clock_s > 0 and rounds == _EXPLORING_ROUNDS):
+            break
+        if rounds < MAX_ROUNDS:
+            used = changed
+    assert states is not None
+    assert covs is not None
+    return Smoothed(states, covs, used, square, residual, rounds, path_points)
+
+
+def _moved(before: Floats | None, after: Floats) -> bool:
+    """Whether a round has changed nothing any more."""
+    if before is None:
+        return False
+    far = np.abs(after[:, NORTH] - before[:, NORTH]).max() * 6.4e6 < _MOVED_M
+    far &= (np.abs(after[:, 0] - before[:, 0]) * np.cos(after[:, NORTH])).max() * 6.4e6 < _MOVED_M
+    return bool(far and np.abs(after[0, CLOCKS:] - before[0, CLOCKS:]).max(initial=0.0) < _MOVED_S)
+
+
+def _measurements(
+    drive: _Drive, states: Floats | None, covs: Floats | None, used: Bools
+) -> tuple[kernel.Measurements, Ints, int]:
+    offsets = drive.offsets(states)
+    names = {entry.clock.name: k for k, entry in reversed(list(enumerate(drive.segments)))}
+    places = np.array([entry.place for entry in drive.segments])
+    own = drive.segment_of
+    rates = None if states is None else averaged_rates(drive.base, states)
+    parts = [fix_rows(drive.base, drive.arrays, places[own], offsets[own], used, rates)]
+    for kind, all_series in ((SPEED_SAMPLE, drive.given.speeds), (HEADING_SAMPLE, drive.given.headings)):
+        for series in all_series:
+            k = names[series.clock]
+            parts.append(sample_rows(drive.base, series, kind, int(places[k]), float(offsets[k]), rates))
+    path_points = 0
+    if states is not None and covs is not None:
+        for path in drive.paths:
+            rows = path_rows(drive.base, path, states, covs, drive.rules)
+            path_points += len(rows.node)
+            parts.append(rows)
+    return *in_order(parts), path_points
+
+
+def _gate(drive: _Drive, used: Bools, square: Floats, gate: Floats) -> Bools:
+    """Leave out the worst fix in each stretch, and take back those that fit."""
+    changed = used.copy()
+    time = drive.arrays.time_s + np.array([entry.clock.offset_s for entry in drive.segments])[drive.segment_of]
+    bad = np.flatnonzero(used & (square > gate))
+    for k in bad[np.argsort(-square[bad])]:
+        near = np.abs(time - time[k]) <= _NEIGHBOURS_S
+        if not (near & used & ~changed).any():
+            changed[k] = False
+            if (passage := drive.arrays.passage[k]) >= 0:  # the same wrong marker in other frames
+                changed &= ~((drive.arrays.passage == passage) & (square > gate))
+    back = ~used & (square < _READMIT * gate)
+    return changed | back
+
+
+# --- where it starts --------------------------------------------------------------------------------------------------
+
+
+def _start_set(drive: _Drive) -> tuple[Bools, float, float]:
+    node, _after = drive.base.nearest(drive.arrays.time_s + drive.offsets(None)[drive.segment_of])
+    clock_sigma = np.array([0.0 if entry.is_reference else entry.clock.sigma_s for entry in drive.segments])
+    return consistent_chain(
+        local_m(drive.fixes), drive.arrays.sigma_m, drive.base.time_s[node], node, drive.segment_of,
+        clock_sigma[drive.segment_of], drive.driven,
+    )  # fmt: skip
+
+
+def _start_state(drive: _Drive, chain: Bools, turn: float, scale: float, size: int) -> tuple[Floats, Floats]:
+    """State at the first node, by dead reckoning back from the first fix of the chain."""
+    arrays, driven, rules = drive.arrays, drive.driven, drive.rules
+    k = int(np.flatnonzero(chain)[0])
+    node, _after = drive.base.nearest(arrays.time_s[[k]] + drive.offsets(None)[drive.segment_of[k]])
+    first = int(node[0])
+    heading, heading_sigma = _start_heading(drive, chain, turn)
+    twist = heading - float(driven.heading_rad[first] if driven.has_heading else 0.0)
+    east, north = -float(driven.east_m[first]) * scale, -float(driven.north_m[first]) * scale
+    c, s = math.cos(twist), math.sin(twist)
+    start = np.zeros(size)
+    lat = float(arrays.lat_rad[k])
+    curve = 1.0 - 0.0066943799901413165 * math.sin(lat) ** 2
+    start[0] = float(arrays.lon_rad[k]) + (c * east + s * north) * math.sqrt(curve) / (6378137.0 * math.cos(lat))
+    start[1] = lat + (c * north - s * east) * curve**1.5 / (6378137.0 * (1 - 0.0066943799901413165))
+    start[HEADING] = (float(driven.heading_rad[0]) if driven.has_heading else 0.0) + twist
+    start[SPEED] = float(driven.speed_m_s[0])
+    for entry in drive.segments:
+        if entry.place >= 0:
+            start[entry.place] = entry.clock.offset_s
+    sigma = np.zeros(size)
+    sigma[:2] = _START_SIGMA_M
+    sigma[HEADING] = heading_sigma
+    sigma[SPEED] = 5.0 if driven.has_speed else 30.0
+    sigma[YAW_RATE] = 0.2
+    sigma[SCALE] = rules.speed_scale_sigma
+    sigma[BIAS] = math.radians(rules.heading_bias_sigma_deg)
+    sigma[WANDER] = rules.wander_m
+    for entry in drive.segments:
+        if entry.place >= 0:
+            sigma[entry.place] = entry.clock.sigma_s
+    return start, np.diag(sigma**2)
+
+
+def _start_heading(drive: _Drive, chain: Bools, turn: float) -> tuple[float, float]:
+    """Heading at the first fix of the chain, and its standard deviation. [rad]"""
+    arrays, driven = drive.arrays, drive.driven
+    known = chain & np.isfinite(arrays.heading_rad)
+    node, _after = drive.base.nearest(arrays.time_s + drive.offsets(None)[drive.segment_of])
+    first = int(np.flatnonzero(chain)[0])
+    if driven.has_heading:
+        off = turn
+        if known.any():
+            differences = np.exp(1j * (arrays.heading_rad[known] - driven.heading_rad[node[known]]))
+            off = float(np.angle(np.median(differences.real) + 1j * np.median(differences.imag)))
+        return float(driven.heading_rad[node[first]]) + off, math.radians(20.0)
+    if known.any():
+        return float(arrays.heading_rad[np.flatnonzero(known)[0]]), math.radians(30.0)
+    place = local_m(drive.fixes)[chain]
+    far = np.flatnonzero(np.hypot(*(place - place[0]).T) > 3.0)
+    if not far.size:
+        return 0.0, math.pi
+    step = place[far[0]] - place[0]
+    return math.atan2(step[0], step[1]), math.radians(40.0)
+
+
+# --- clocks that jump -------------------------------------------------------------------------------------------------
+
+
+def _with_jumps(drive: _Drive, smoothed: Smoothed) -> Smoothed:
+    """Give a clock that was set during the drive another offset from then on, if more fixes fit then."""
+    for _try in range(MAX_JUMPS):
+        if (~smoothed.used).sum() < _MIN_LEFT_OUT:
+            break
+        segments, segment_of = list(drive.segments), drive.segment_of
+        if not _split_at_jump(drive):
+            break
+        other = _smooth(drive)
+        if other.used.sum() < smoothed.used.sum() + 2:
+            drive.segments, drive.segment_of = segments, segment_of
+            for entry, place in zip(segments, _places(segments), strict=True):
+                entry.place = place
+            break
+        smoothed = other
+    return smoothed
+
+
+def _split_at_jump(drive: _Drive) -> bool:
+    """Look for steps by a smoother whose offsets may change; divide the segment with the largest. Whether there is."""
+    loose = _smooth(drive, clock_s=_EXPLORED_S)
+    node, _after = drive.base.nearest(drive.arrays.time_s + drive.offsets(None)[drive.segment_of])
+    found = []
+    for k, entry in enumerate(drive.segments):
+        rows = np.flatnonzero((drive.segment_of == k) & loose.used)
+        if entry.place >= 0 and rows.size:
+            jump = find_jump(drive.arrays.time_s[rows], loose.states[node[rows], entry.place])
+            if jump is not None:
+                found.append((abs(jump.after_s - jump.before_s), k, jump))
+    if not found:
+        return False
+    _size, k, jump = max(found, key=lambda entry: entry[:2])
+    old = drive.segments[k]
+    parts = [
+        replace(old, clock=replace(old.clock, offset_s=offset), jumped=jumped)
+        for offset, jumped in ((jump.before_s, old.jumped), (jump.after_s, True))
+    ]
+    drive.segments = [*drive.segments[:k], parts[0], *drive.segments[k + 1 :], parts[1]]
+    after = (drive.segment_of == k) & (drive.arrays.time_s >= jump.first_s)
+    drive.segment_of = np.where(after, len(drive.segments) - 1, drive.segment_of)
+    return True

@@ -1,0 +1,147 @@
+"""A track as GeoJSON (RFC 7946), CSV and GPX 1.1. Lines are broken at gaps and at the antimeridian."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from app.tracks.types import FixResult, Floats, Ints, Track
+
+CSV_COLUMNS = (
+    "time", "lon_deg", "lat_deg", "heading_deg", "speed_m_s", "variance_east_m2", "covariance_east_north_m2",
+    "variance_north_m2", "sigma_m", "heading_sigma_deg", "in_gap",
+)  # fmt: skip
+
+
+def write_csv(track: Track) -> str:
+    """One row for each position, with its covariance."""
+    rows = [",".join(CSV_COLUMNS)]
+    stamps = time_texts(track.time_s)
+    columns = zip(
+        stamps, track.lon_deg.tolist(), track.lat_deg.tolist(), track.heading_deg.tolist(), track.speed_m_s.tolist(),
+        track.covariance_m2.tolist(), track.sigma_m.tolist(), track.heading_sigma_deg.tolist(), track.in_gap.tolist(),
+        strict=True,
+    )  # fmt: skip
+    for time, lon, lat, heading, speed, (east, cross, north), sigma, heading_sigma, gap in columns:
+        rows.append(
+            f"{time},{lon:.9f},{lat:.9f},{heading:.4f},{speed:.3f},{east:.6g},{cross:.6g},{north:.6g},{sigma:.4f},"
+            f"{heading_sigma:.4f},{'true' if gap else 'false'}"
+        )
+    return "\r\n".join(rows) + "\r\n"
+
+
+def write_geojson(track: Track, name: str, others: Sequence[dict[str, Any]] = ()) -> str:
+    """The track as lines, the positions of fixes as points.
+
+    Parameters
+    ----------
+    track : Track
+    name : str
+    others : sequence of dict
+        Markers that gave no fix: features without a geometry.
+    """
+    features: list[dict[str, Any]] = []
+    stamps = time_texts(track.time_s)
+    for part in stretches(track):
+        if len(part) < 2:
+            continue
+        features.append({
+            "type": "Feature",
+            "geometry": {"type": "LineString", "coordinates": _coordinates(track.lon_deg[part], track.lat_deg[part])},
+            "properties": {
+                "kind": "gap" if bool(track.in_gap[part[1:]].all()) else "track",
+                "name": name,
+                "times": [stamps[k] for k in part],
+                "heading_deg": np.round(track.heading_deg[part], 4).tolist(),
+                "speed_m_s": np.round(track.speed_m_s[part], 3).tolist(),
+                "covariance_m2": np.round(track.covariance_m2[part], 8).tolist(),
+                "heading_sigma_deg": np.round(track.heading_sigma_deg[part], 4).tolist(),
+            },
+        })  # fmt: skip
+    features += [_fix_feature(result) for result in track.fixes]
+    features += [{"type": "Feature", "geometry": None, "properties": {"kind": "marker", **other}} for other in others]
+    return json.dumps({"type": "FeatureCollection", "features": features}, separators=(",", ":"), allow_nan=False)
+
+
+def write_gpx(track: Track, name: str) -> str:
+    """One segment for each stretch without a gap; markers that were used are waypoints."""
+    parts = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<gpx version="1.1" creator="Waymark" xmlns="http://www.topografix.com/GPX/1/1">',
+    ]
+    for result in track.fixes:
+        if result.used:
+            fix = result.fix
+            parts.append(
+                f'<wpt lat="{fix.lat_deg:.9f}" lon="{fix.lon_deg:.9f}"><time>{_time_text(result.time_s)}</time>'
+                f"<name>{escape(fix.marker_id or fix.clock)}</name><type>{escape(fix.family)}</type></wpt>"
+            )
+    parts.append(f"<trk><name>{escape(name)}</name>")
+    stamps, lon, lat = time_texts(track.time_s), track.lon_deg, track.lat_deg
+    for part in stretches(track):
+        if bool(track.in_gap[part[1:]].all()) and len(part) > 1:
+            continue
+        points = (
+            f'<trkpt lat="{lat[k]:.9f}" lon="{lon[k]:.9f}"><time>{stamps[k]}</time></trkpt>'
+            for k in part
+            if not track.in_gap[k]
+        )
+        parts += ["<trkseg>", *points, "</trkseg>"]
+    parts.append("</trk></gpx>\n")
+    return "\n".join(parts)
+
+
+def stretches(track: Track) -> Iterator[Ints]:
+    """Indices of connected positions: inside a gap or outside, and on one side of the antimeridian."""
+    count = len(track.time_s)
+    if not count:
+        return
+    changed = np.diff(track.in_gap.astype(np.int8)) != 0
+    crossed = np.abs(np.diff(track.lon_deg)) > 180.0
+    edges = np.flatnonzero(changed | crossed)
+    start = 0
+    for edge in [*edges.tolist(), count - 1]:
+        yield np.arange(start, edge + 1)
+        # stretches share the position between them, but for the antimeridian
+        start = edge + 1 if edge < count - 1 and crossed[edge] else max(edge, start)
+
+
+def time_texts(time_s: Floats) -> list[str]:
+    """Times in UTC, RFC 3339 with milliseconds."""
+    stamps = np.datetime_as_string(np.round(time_s * 1000.0).astype("datetime64[ms]"), unit="ms")
+    return [f"{stamp}Z" for stamp in stamps.tolist()]
+
+
+def _time_text(seconds: float) -> str:
+    return datetime.fromtimestamp(round(seconds, 3), UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _coordinates(lon_deg: Floats, lat_deg: Floats) -> list[list[float]]:
+    pairs: list[list[float]] = np.round(np.column_stack([lon_deg, lat_deg]), 9).tolist()
+    return pairs
+
+
+def _fix_feature(result: FixResult) -> dict[str, Any]:
+    fix = result.fix
+    return {
+        "type": "Feature",
+        "geometry": {"type": "Point", "coordinates": [round(fix.lon_deg, 9), round(fix.lat_deg, 9)]},
+        "properties": {
+            "kind": "marker",
+            "marker_id": fix.marker_id,
+            "family": fix.family,
+            "decode_id": fix.source,
+            "place": fix.place,
+            "time": _time_text(result.time_s),
+            "used": result.used,
+            "reason": str(result.reason) if result.reason is not None else None,
+            "distance": round(result.distance, 3),
+            "along_m": round(result.along_m, 3),
+            "across_m": round(result.across_m, 3),
+        },
+    }

@@ -1,0 +1,341 @@
+"""What a track is estimated from, and what is estimated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from app.errors import InvalidParameter
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+
+
+class LeftOutReason(StrEnum):
+    """Why a marker is not used."""
+
+    OUTLIER = "outlier"
+    NO_TIME = "no-time"
+    NO_GRADE = "no-position-grade"
+    AMBIGUOUS = "ambiguous-match"
+    NOT_REGISTERED = "not-registered"
+    IMPLAUSIBLE = "implausible-match"
+    SUSPECT = "status"
+    NO_FIX = "no-fix"
+    OFF_LANE = "off-lane"
+
+
+class ClockState(StrEnum):
+    """What is known of a sensor's clock."""
+
+    REFERENCE = "reference"
+    ESTIMATED = "estimated"
+    NOT_OBSERVABLE = "not-observable"
+    DECLARED = "declared"
+    NO_CLOCK = "no-clock"
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """A sensor's clock, as it is declared.
+
+    Attributes
+    ----------
+    name : str
+        Of the sensor; each once.
+    offset_s : float
+        What is to be added to the sensor's times. [s]
+    sigma_s : float
+        How far that may be off; 0: it is exact. [s]
+    """
+
+    name: str
+    offset_s: float = 0.0
+    sigma_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not (
+            math.isfinite(self.offset_s) and math.isfinite(self.sigma_s) and 0 <= self.sigma_s <= MAX_CLOCK_SIGMA_S
+        ):
+            raise InvalidParameter(
+                f"the clock of {self.name} cannot be off by {self.sigma_s:g} s",
+                field="clock.sigma_s",
+                limit=f"0 to {MAX_CLOCK_SIGMA_S:g} s",
+                cure="set the clocks by GNSS or NTP, or declare offset_s",
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class PositionFix:
+    """Where the vehicle was, by one marker or by one position of its receiver.
+
+    Attributes
+    ----------
+    clock : str
+        Name of the sensor whose time it has.
+    time_s : float
+        Seconds since 1970-01-01 UTC on that clock. [s]
+    lon_deg, lat_deg : float
+        WGS 84 / ITRF. [deg]
+    covariance_m2 : (float, float, float)
+        East-east, east-north, north-north. [m2]
+    heading_deg, heading_sigma_deg : float
+        Clockwise from true north; NaN where it is not known. [deg]
+    common_m2 : float
+        Part of the variance of each axis that all fixes by the same marker share: its survey. [m2]
+    marker_id : str or None
+        None for a position of the vehicle's receiver.
+    family : str
+    source : str
+        What it was read from, e.g. the id of a decode.
+    place : int
+        Index in the source, e.g. of the frame.
+    heading_cross_m_rad : (float, float)
+        Covariances of the heading with east and north. [m rad]
+    """
+
+    clock: str
+    time_s: float
+    lon_deg: float
+    lat_deg: float
+    covariance_m2: tuple[float, float, float]
+    heading_deg: float = math.nan
+    heading_sigma_deg: float = math.nan
+    common_m2: float = 0.0
+    marker_id: str | None = None
+    family: str = ""
+    source: str = ""
+    place: int = 0
+    heading_cross_m_rad: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        east, cross, north = self.covariance_m2
+        finite = all(math.isfinite(value) for value in (self.time_s, self.lon_deg, self.lat_deg, east, cross, north))
+        if not finite or abs(self.lat_deg) > MAX_LAT_DEG or abs(self.lon_deg) > 360 or east * north <= cross * cross:
+            raise InvalidParameter(
+                f"a fix of {self.source or self.clock} has no place, no time or no covariance",
+                field="fixes",
+                limit=f"finite numbers, latitudes to {MAX_LAT_DEG:g} deg, a positive definite covariance",
+            )
+        if min(east, north) <= 0:
+            raise InvalidParameter("a variance of a fix is not positive", field="fixes", limit="> 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Speeds or headings over time.
+
+    Attributes
+    ----------
+    clock : str
+        Name of the sensor whose times they have.
+    time_s, value : ndarray, shape (N,)
+        Seconds since 1970-01-01 UTC; speed along the vehicle, backwards negative [m/s], or heading clockwise from
+        true north [deg].
+    sigma : float
+        Noise of one value, without scale error or bias. [m/s or deg]
+    """
+
+    clock: str
+    time_s: Floats
+    value: Floats
+    sigma: float
+
+    def __post_init__(self) -> None:
+        time, value = np.asarray(self.time_s, float), np.asarray(self.value, float)
+        if time.ndim != 1 or time.shape != value.shape or not self.sigma > 0:
+            raise InvalidParameter("samples have one value for each time, and noise", field="samples")
+        kept = np.isfinite(time) & np.isfinite(value)
+        order = np.argsort(time[kept], kind="stable")
+        object.__setattr__(self, "time_s", time[kept][order])
+        object.__setattr__(self, "value", value[kept][order])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LanePath:
+    """A lane's path: where it leads is known, not when it was driven.
+
+    Attributes
+    ----------
+    source : str
+    lon_deg, lat_deg : ndarray, shape (N,)
+        In the direction of travel. [deg]
+    sigma_m : float
+        Standard deviation of the path across. [m]
+    """
+
+    source: str
+    lon_deg: Floats
+    lat_deg: Floats
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class TrackInput:
+    """All that is known of a drive."""
+
+    clocks: tuple[Clock, ...]
+    fixes: tuple[PositionFix, ...] = ()
+    speeds: tuple[Samples, ...] = ()
+    headings: tuple[Samples, ...] = ()
+    paths: tuple[LanePath, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TrackRules:
+    """How a track is estimated.
+
+    Attributes
+    ----------
+    rate_hz : float
+        Of the positions that are returned. [Hz]
+    max_sigma_m : float
+        Where the larger standard deviation of a position exceeds this, the track has a gap. [m]
+    outlier_probability : float
+        Share of good markers that the gate leaves out.
+    speed_scale_sigma : float
+        Scale error of the speed to be expected.
+    heading_bias_sigma_deg : float
+        Bias of the heading to be expected. [deg]
+    wander_m, wander_length_m : float
+        How far from the middle of its lane a vehicle drives, and over which length that changes. [m]
+    """
+
+    rate_hz: float = 2.0
+    max_sigma_m: float = 2.0
+    outlier_probability: float = 1e-3
+    speed_scale_sigma: float = 0.03
+    heading_bias_sigma_deg: float = 3.0
+    wander_m: float = 0.4
+    wander_length_m: float = 100.0
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value, (low, high) = getattr(self, entry.name), _LIMITS[entry.name]
+            if not low <= value <= high:
+                raise InvalidParameter(
+                    f"{entry.name} is {value:g}", field=f"options.{entry.name}", limit=f"{low:g} to {high:g}"
+                )
+
+
+MAX_CLOCK_SIGMA_S = 10.0
+"""Largest error of a clock that an offset is estimated for. [s] Source: by hand; the filter is linear in the offset,
+and 10 s are 140 m at 50 km/h, about the distance between two markers."""
+MAX_LAT_DEG = 89.9
+"""Northernmost latitude. [deg] Source: by hand; 11 km from the pole a heading changes by 0.1 deg in 20 m."""
+_LIMITS = {
+    "rate_hz": (0.1, 10.0),
+    "max_sigma_m": (0.05, 100.0),
+    "outlier_probability": (1e-9, 0.1),
+    "speed_scale_sigma": (1e-4, 0.2),
+    "heading_bias_sigma_deg": (0.01, 30.0),
+    "wander_m": (0.05, 5.0),
+    "wander_length_m": (1.0, 10_000.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FixResult:
+    """What became of a fix.
+
+    Attributes
+    ----------
+    fix : PositionFix
+    used : bool
+    reason : LeftOutReason or None
+    time_s : float
+        On the reference clock. [s]
+    distance : float
+        Mahalanobis distance to the track that the other fixes give.
+    along_m, across_m : float
+        From that track, forward and left positive. [m]
+    """
+
+    fix: PositionFix
+    used: bool
+    reason: LeftOutReason | None
+    time_s: float
+    distance: float
+    along_m: float
+    across_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOffset:
+    """The offset of a sensor's clock, from one time on.
+
+    Attributes
+    ----------
+    clock : str
+    state : ClockState
+    offset_s, sigma_s : float
+        To be added to the sensor's times. [s]
+    from_s, to_s : float
+        First and last time on the sensor's clock that it holds for. [s]
+    jumped : bool
+        The clock was set before `from_s`.
+    """
+
+    clock: str
+    state: ClockState
+    offset_s: float
+    sigma_s: float
+    from_s: float
+    to_s: float
+    jumped: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class TrackGap:
+    """A stretch whose positions are worse than the limit, or that has no data."""
+
+    from_s: float
+    to_s: float
+    length_m: float
+    max_sigma_m: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A drive as positions on one time base.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (N,)
+        Seconds since 1970-01-01 UTC on the reference clock. [s]
+    lon_deg, lat_deg, heading_deg, speed_m_s : ndarray, shape (N,)
+    covariance_m2 : ndarray, shape (N, 3)
+        East-east, east-north, north-north. [m2]
+    heading_sigma_deg : ndarray, shape (N,)
+    in_gap : ndarray of bool, shape (N,)
+    """
+
+    time_s: Floats
+    lon_deg: Floats
+    lat_deg: Floats
+    heading_deg: Floats
+    speed_m_s: Floats
+    covariance_m2: Floats
+    heading_sigma_deg: Floats
+    in_gap: Bools
+    fixes: tuple[FixResult, ...]
+    clocks: tuple[ClockOffset, ...]
+    gaps: tuple[TrackGap, ...]
+    length_m: float
+    speed_scale: tuple[float, float]
+    heading_bias_deg: tuple[float, float]
+    path_points: int = 0
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def sigma_m(self) -> Floats:
+        """The larger standard deviation of each position, shape (N,). [m]"""
+        east, cross, north = self.covariance_m2.T
+        larger = (east + north) / 2 + np.sqrt(((east - north) / 2) ** 2 + cross**2)
+        return np.asarray(np.sqrt(np.maximum(larger, 0.0)))

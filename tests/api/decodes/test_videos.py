@@ -1,0 +1,113 @@
+"""Videos through the upload route: a job with progress, plates read over frames, refusals."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from typing import Any
+
+import av
+import httpx
+import numpy as np
+import pytest
+
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.sensors.camera import Camera
+from app.simulation.camera import render_plate_scene
+from app.simulation.conditions import draw_daylight
+from app.simulation.plate_face import plate_face
+from app.simulation.plate_scene import PlacedFace, PlateScene
+from tests.api.decodes.conftest import near, post_frame
+from tests.api.decodes.test_archives import wait_for
+from tests.formats.test_video import video
+from tests.http import finished
+
+CAMERA = Camera.from_field_of_view(960, 540, 60.0)
+DECLARED = {"width_px": 960, "height_px": 540, "horizontal_fov_deg": 60.0}
+SPEED_M_S, RATE_HZ = 12.0, 20.0
+
+
+@pytest.fixture(scope="module")
+def passing() -> Any:
+    """A video that passes a plate, by the plate's digits."""
+
+    def encode(code: PlateCode) -> bytes:
+        rng = np.random.default_rng(5)
+        fair = draw_daylight(rng)
+        face = plate_face(code, PlateGeometry(8), fair.look, fair.wear, rng)
+        out = io.BytesIO()
+        with av.open(out, "w", format="mp4") as container:
+            stream: Any = container.add_stream("libx264", rate=round(RATE_HZ))
+            stream.width, stream.height, stream.pix_fmt = 960, 540, "yuv420p"
+            stream.options = {"preset": "ultrafast", "crf": "18", "x264-params": "log-level=none"}
+            for number in range(14):
+                ahead_m = 8.0 - number * SPEED_M_S / RATE_HZ
+                scene = PlateScene(CAMERA, (PlacedFace(face, ahead_m, 0.2),), SPEED_M_S, fair.exposure_s)
+                image = render_plate_scene(scene, None, rng).image
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+            container.mux(stream.encode(None))
+        return out.getvalue()
+
+    return encode
+
+
+def test_a_video_is_a_job_that_reads_the_plates_it_passes(
+    client: httpx.Client, plate: dict[str, Any], passing: Any
+) -> None:
+    shown = plate["code"]
+    data = passing(PlateCode(shown["digits"], PlateScheme(shown["scheme"])))
+    context = near(plate, camera=DECLARED, captured_at="2026-05-04T08:30:00Z")
+    answer = post_frame(client, data, context, name="drive.bin")
+    assert answer.status_code == 202, answer.text
+    decode = wait_for(client, answer.headers["location"])
+    assert (decode["kind"], decode["progress"], decode["summary"]["frames"]) == ("video", 1.0, 14)
+    (seen,) = decode["plates"]
+    assert seen["marker_id"] == plate["id"]
+    assert seen["outcome"] == "read"
+    assert len(seen["frames"]) >= 4
+    assert seen["speed_m_s"] == pytest.approx(SPEED_M_S, rel=0.1)
+    fixes = [frame for frame in decode["frames"] if frame["fix"] is not None]
+    assert len(fixes) >= 3
+    assert {reading["match"]["marker_id"] for reading in decode["readings"] if reading["digits"]} == {plate["id"]}
+    first = decode["frames"][0]
+    assert first["time_s"] == pytest.approx(first["frame"] / RATE_HZ, abs=1e-4)
+    assert first["captured_at"].startswith("2026-05-04T08:30:00")
+    assert client.get(f"{answer.headers['location']}/annotated.jpg").status_code == 404
+
+
+def test_a_video_beside_a_track_has_poses(client: httpx.Client, plate: dict[str, Any]) -> None:
+    lon, lat = plate["position"]["lon_deg"], plate["position"]["lat_deg"]
+    rows = [f"2026-05-04T08:30:{k:02d}Z,{lon},{lat + k * 1e-4}" for k in range(3)]
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("front.mp4", video(20))
+        archive.writestr("poses.csv", "\n".join(["time,lon,lat", *rows]))
+    answer = post_frame(client, out.getvalue(), {"captured_at": "2026-05-04T08:30:00Z"}, name="drive.zip")
+    decode = wait_for(client, answer.headers["location"])
+    assert (decode["kind"], decode["summary"]["frames"]) == ("video", 20)
+    assert decode["codebook_plates"] == 1  # looked up along the track
+
+
+@pytest.mark.parametrize(
+    ("data", "context", "detail"),
+    [
+        (b"\0\0\0\x18ftypisom" + b"\0" * 500, {}, "no index"),
+        (video(5)[:900], {}, "no index"),
+        (b"RIFF\xff\xff\0\0AVI " + b"\0" * 100, {}, ""),
+        (video(5), {"camera": {"width_px": 64, "height_px": 64, "horizontal_fov_deg": 60.0}}, "camera"),
+    ],
+)
+def test_videos_that_cannot_be_read_fail_with_their_reason(
+    client: httpx.Client, data: bytes, context: dict[str, Any], detail: str
+) -> None:
+    answer = post_frame(client, data, context, name="upload.mp4")
+    assert answer.status_code == 202, answer.text
+    decode = finished(client, answer.headers["location"])
+    assert decode["state"] == "failed"
+    assert detail in decode["error"]["detail"]
+
+
+def test_a_playlist_that_is_named_a_video_is_refused(client: httpx.Client) -> None:
+    answer = post_frame(client, b"ffconcat version 1.0\nfile other.avi\n", {}, name="upload.mp4")
+    assert answer.status_code == 415
+    assert "playlist" in answer.json()["detail"]

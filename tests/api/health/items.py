@@ -1,0 +1,32 @@
+"""Items of the work list for tests: opened by verdicts, as the tests of markers open them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import sqlalchemy as sa
+
+from app.health import Fault, Verdict
+from app.registry.ids import new_id
+from app.registry.maintenance import ItemFilter, list_items
+from app.registry.tables import decodes
+from app.services.health.items import ItemUpload, Suspicion, open_items
+
+AT = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
+
+
+def add_test_decode(connection: sa.Connection, agency_id: str) -> str:
+    """A decode of a frame, done."""
+    decode_id = new_id(AT)
+    row = {"id": decode_id, "agency_id": agency_id, "kind": "frame", "context": {}, "created_at": AT}
+    connection.execute(sa.insert(decodes).values(row))
+    return decode_id
+
+
+def add_test_item(connection: sa.Connection, agency_id: str, marker_id: str, fault: Fault = Fault.MOVED) -> str:
+    """An open item of a marker."""
+    verdict = Verdict(fault, 17.5, 13.1, 4, 5, AT.timestamp() - 3600, (1.2, -0.9))
+    upload = ItemUpload(add_test_decode(connection, agency_id), True, "v", AT)
+    open_items(connection, agency_id, upload, [Suspicion(marker_id, verdict, 120.0)], None, AT)
+    found = list_items(connection, agency_id, ItemFilter(marker_id=marker_id, what=str(fault), state="open"))
+    return found[0].id

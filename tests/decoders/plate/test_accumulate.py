@@ -1,0 +1,100 @@
+"""Evidence of several frames of one plate: it adds up as stated, and reads what single frames do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.decoders.plate.accumulate import accumulate, count_effective, read_accumulated
+from app.decoders.plate.evidence import PlateEvidence
+from app.decoders.plate.plate_tracks import PlateTracker, SeenPlate
+from app.decoders.plate.reader import read_plates
+from app.markers.plate import PlateCode
+from app.markers.reading import PlateOutcome, PlateReading
+from app.simulation.camera import render_plate_scene
+from app.simulation.plate_scene import PlacedFace, PlateScene, Sensor
+from tests.decoders.plate.scenes import CAMERA, face_of
+
+CODE = PlateCode.from_registry_number(0xC0FFEE11)
+
+
+def _noisy_frames(full_well_e: float, count: int) -> list[tuple[PlateReading, PlateEvidence]]:
+    """Readings of a plate that comes nearer in frames with few electrons, with their evidence."""
+    found = []
+    for k in range(count):
+        sensor = Sensor(full_well_e=full_well_e, read_noise_e=4, jpeg_quality=None, blur_px=0.9)
+        scene = PlateScene(CAMERA, (PlacedFace(face_of(CODE), 4.6 - 0.12 * k, 0.2),), sensor=sensor)
+        image = render_plate_scene(scene, None, np.random.default_rng(100 + k)).image
+        found += [(r, e) for r, e in read_plates(image, camera=CAMERA) if e is not None and e.geometry.n == CODE.n]
+    return found
+
+
+@pytest.fixture(scope="module")
+def noisy() -> list[tuple[PlateReading, PlateEvidence]]:
+    return _noisy_frames(80.0, 8)
+
+
+def test_equal_frames_count_as_stated(noisy: list[tuple[PlateReading, PlateEvidence]]) -> None:
+    one = noisy[0][1]
+    joint = accumulate([one] * 4)
+    assert joint.frames == 4
+    assert (joint.units.best == one.units.best).all()
+    assert joint.units.cell_costs == pytest.approx(count_effective(4) * one.units.cell_costs, rel=1e-6, abs=1e-6)
+    assert 1 < count_effective(4) < count_effective(100) < 2.5
+    assert accumulate([one]) is one
+
+
+def test_frames_that_are_not_read_alone_are_read_together() -> None:
+    noisy = _noisy_frames(85.0, 14)
+    refused = [evidence for reading, evidence in noisy if reading.code is None]
+    assert len(refused) >= 3
+    together = read_accumulated(refused, (), CAMERA)
+    assert together.code == CODE
+    assert together.pose is not None
+
+
+def test_frames_of_two_plates_do_not_make_a_third(noisy: list[tuple[PlateReading, PlateEvidence]]) -> None:
+    other = PlateCode.from_registry_number(0x12345678)
+    scene = PlateScene(CAMERA, (PlacedFace(face_of(other), 4.0, 0.2),))
+    image = render_plate_scene(scene, None, np.random.default_rng(1)).image
+    foreign = [evidence for _reading, evidence in read_plates(image, camera=CAMERA) if evidence is not None]
+    mixed = read_accumulated([foreign[0], *(evidence for _reading, evidence in noisy[:1])], ())
+    assert mixed.code in (None, CODE, other)
+
+
+def _seen(frame: int, rate_hz: float, ahead_m: float, left_m: float = 0.0, digits: str | None = None) -> SeenPlate:
+    reading = PlateReading(PlateOutcome.UNSURE, confidence=0.5)
+    if digits is not None:
+        reading = replace(reading, outcome=PlateOutcome.READ, code=PlateCode(digits))
+    return SeenPlate(frame, frame / rate_hz, reading, None, None, ahead_m, left_m)
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 3.0, 14.0, 33.0])
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_plate_is_found_again_by_its_place(speed_m_s: float, is_known: bool) -> None:
+    rng = np.random.default_rng(7)
+    tracker, done = PlateTracker(), []
+    for frame in range(90):
+        # a plate every 20 m, and a second one beside each
+        seen = []
+        for at_m in (20.0, 40.0, 60.0):
+            ahead_m = at_m - 10.0 - speed_m_s * frame / 30.0
+            if 2.0 < ahead_m < 11.0:
+                noise = 0.02 * ahead_m * rng.standard_normal()
+                seen += [_seen(frame, 30.0, ahead_m + noise), _seen(frame, 30.0, ahead_m + noise, 1.5)]
+        done += tracker.add(frame / 30.0, seen, speed_m_s if is_known else None)
+    done += tracker.finish()
+    passed = {0.0: 1, 3.0: 1, 14.0: 3, 33.0: 3}[speed_m_s]
+    assert len(done) == 2 * passed
+    assert all(len({round(one.left_m) for one in track.seen}) == 1 for track in done)
+    if speed_m_s > 5:
+        assert all(track.speed_m_s() == pytest.approx(speed_m_s, rel=0.1) for track in done[:4])
+
+
+def test_different_digits_are_different_plates() -> None:
+    tracker = PlateTracker()
+    tracker.add(0.0, [_seen(0, 10.0, 5.0, digits="023792168411")])
+    tracker.add(0.1, [_seen(1, 10.0, 5.0, digits="123792168411")])
+    assert len(tracker.finish()) == 2

@@ -1,0 +1,238 @@
+"""Videos: recognition, the fixed demuxers, times, gaps, segments, rotation, damage."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
+from app.formats.archives import ArchiveLimits
+from app.formats.spooled_file import SpooledFile
+from app.formats.video.archive import holds_video, open_packed_video
+from app.formats.video.container import VideoFile, VideoKind, detect_video
+from app.formats.video.frames import ReadReport, read_frames
+from app.formats.video.index import VideoIndex, VideoLimits, VideoSegment, index_video
+
+WIDTH, HEIGHT = 160, 120
+
+
+def picture(number: int) -> np.ndarray[Any, Any]:
+    """A frame whose left half is red, and whose brightness on the right is its number."""
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[:, : WIDTH // 2] = (0, 0, 220)
+    image[:, WIDTH // 2 :] = 8 * (number % 30)
+    return image
+
+
+def video(
+    frames: int = 20, *, codec: str = "mpeg4", form: str = "mp4", stamps: list[int] | None = None, group: int = 5,
+    rotation: int | None = None,
+) -> bytes:  # fmt: skip
+    """An encoded video at 10 Hz; `stamps` are times in tenths of a second."""
+    out = io.BytesIO()
+    with av.open(out, "w", format=form) as container:
+        stream: Any = container.add_stream(codec, rate=10)
+        stream.width, stream.height = WIDTH, HEIGHT
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        if codec == "libx264":
+            stream.options = {"preset": "ultrafast", "x264-params": f"log-level=none:scenecut=0:keyint={group}"}
+        for number in range(frames):
+            frame = av.VideoFrame.from_ndarray(picture(number), format="bgr24")
+            frame.pts, frame.time_base = (stamps or list(range(frames)))[number], Fraction(1, 10)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return out.getvalue()
+
+
+def indexed(data: bytes, kind: VideoKind = VideoKind.MP4, **options: Any) -> VideoIndex:
+    return index_video(VideoFile(SpooledFile.of(data), kind), **options)
+
+
+def numbers(index: VideoIndex, first: int = 0, end: int | None = None) -> list[int]:
+    segment = VideoSegment(first, len(index.stamps) if end is None else end)
+    return [frame.number for frame in read_frames(index, segment, ReadReport())]
+
+
+@pytest.mark.parametrize(
+    ("codec", "form", "kind"),
+    [
+        ("libx264", "mp4", VideoKind.MP4),
+        ("mpeg4", "mov", VideoKind.MP4),
+        ("mjpeg", "avi", VideoKind.AVI),
+        ("mjpeg", "mjpeg", VideoKind.MJPEG),
+    ],
+)
+def test_every_frame_comes_with_its_number_and_time(codec: str, form: str, kind: VideoKind) -> None:
+    data = video(codec=codec, form=form)
+    assert detect_video(data[:16], is_stream=True) is kind
+    index = indexed(data, kind, rate_hz=10.0 if kind is VideoKind.MJPEG else None)
+    assert index.time_s == pytest.approx(np.arange(20) / 10, abs=1e-6)
+    assert numbers(index) == list(range(20))
+    assert numbers(index, 10) == list(range(10, 20))
+    for frame in read_frames(index, VideoSegment(7, 8), ReadReport()):
+        full, half = frame.bgr(), frame.half_bgr()
+        assert abs(int(full[60, 120, 1]) - 56) < 12
+        assert full[60, 40, 2] > 180
+        assert half.shape == (60, 80, 3)
+        assert half[30, 20, 2] > 150
+        assert half[30, 20, 1] < 60
+
+
+def test_a_jpeg_is_a_stream_only_where_a_rate_is_declared() -> None:
+    data = video(3, codec="mjpeg", form="mjpeg")
+    assert detect_video(data[:16]) is None
+    with pytest.raises(InvalidParameter, match="no times"):
+        indexed(data, VideoKind.MJPEG)
+
+
+def test_a_variable_rate_and_a_clock_that_jumps() -> None:
+    stamps = [0, 1, 3, 4, 5, 6, 7, 8, 60, 61]
+    index = indexed(video(10, stamps=stamps))
+    assert index.time_s == pytest.approx(np.array(stamps) / 10)
+    assert [(gap.after_frame, gap.before_frame, gap.seconds) for gap in index.gaps] == [(7, 8, 5.2)]
+
+
+def test_a_cut_video_gives_what_is_left_and_states_the_gap(tmp_path: Path) -> None:
+    path = tmp_path / "whole.mp4"
+    fast = {"movflags": "faststart"}
+    with av.open(io.BytesIO(video(100))) as source, av.open(str(path), "w", format="mp4", options=fast) as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    data = path.read_bytes()
+    index = indexed(data[: int(0.7 * len(data))])
+    assert 20 < len(numbers(index)) < 100
+    assert "ends before" in index.gaps[-1].reason
+    with pytest.raises(UnreadableUpload, match="cut off"):
+        indexed(video(100)[:2000])  # the index is at the end
+
+
+def test_segments_begin_at_key_frames_and_cover_all_frames() -> None:
+    index = indexed(video(300, group=50, codec="libx264"))
+    assert [(s.first, s.end) for s in index.segments] == [(0, 100), (100, 200), (200, 300)]
+    assert [n for s in index.segments for n in numbers(index, s.first, s.end)] == list(range(300))
+    with pytest.raises(UnsupportedUpload, match="no key frame"):
+        indexed(video(300, group=1000, codec="libx264"), limits=VideoLimits(key_frame_s=5.0))
+
+
+@pytest.mark.parametrize(
+    "limits", [VideoLimits(pixels=1000), VideoLimits(frames=10), VideoLimits(duration_s=1.0), VideoLimits(streams=0)]
+)
+def test_limits(limits: VideoLimits) -> None:
+    with pytest.raises(UploadTooLarge):
+        indexed(video(), limits=limits)
+
+
+# --- files that lead elsewhere ----------------------------------------------------------------------------------------
+
+
+def test_a_playlist_reaches_no_neighbour(tmp_path: Path) -> None:
+    secret = tmp_path / "other.avi"
+    secret.write_bytes(video(codec="mjpeg", form="avi"))
+    concat = f"ffconcat version 1.0\nfile {secret.name}\n".encode()
+    playlist = f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nfile://{secret}\n#EXT-X-ENDLIST\n".encode()
+    for name, content in (("upload.mp4", concat), ("upload.m3u8", playlist)):
+        path = tmp_path / name
+        path.write_bytes(content)
+        assert detect_video(content[:16]) is None
+        # PyAV itself follows the first one by its content, the demuxers that we fix do not
+        for kind in VideoKind:
+            with pytest.raises(WaymarkError):
+                index_video(VideoFile(SpooledFile.at(path), kind), rate_hz=10.0)
+    with av.open(str(tmp_path / "upload.mp4"), options={"safe": "0"}) as leak:
+        assert leak.streams.video
+
+
+def test_a_movie_that_refers_to_another_file_shows_nothing_of_it(tmp_path: Path) -> None:
+    """The data reference `url ` with its flag of self-containment cleared, naming a neighbour."""
+    data = video(codec="mjpeg", form="mov")
+    secret = tmp_path / "secret.mov"
+    secret.write_bytes(data)
+    at = data.index(b"url ") if b"url " in data else data.index(b"alis")
+    entry = data[:at] + b"url " + b"\0\0\0\0" + data[at + 8 :]
+    path = tmp_path / "upload.mov"
+    path.write_bytes(entry)
+    index = index_video(VideoFile(SpooledFile.at(path), VideoKind.MP4))
+    assert len(index.stamps) == 20  # its own samples: no reference is followed
+    # and a pure reference movie holds no samples of its own
+    path.write_bytes(entry[: entry.index(b"mdat") + 4] + b"\0" * 64)
+    with pytest.raises(WaymarkError):
+        index_video(VideoFile(SpooledFile.at(path), VideoKind.MP4))
+
+
+# --- orientation ------------------------------------------------------------------------------------------------------
+
+
+def turned(data: bytes, matrix: tuple[float, ...]) -> bytes:
+    """The video with another display matrix in its track header (ISO/IEC 14496-12, section 8.3.2)."""
+    at = data.index(b"tkhd") + 4 + 4 + 4 * 5 + 8 + 8
+    fixed = [round(v * (1 << 30 if k % 3 == 2 else 1 << 16)) for k, v in enumerate(matrix)]
+    return data[:at] + struct.pack(">9i", *fixed) + data[at + 36 :]
+
+
+@pytest.mark.parametrize(
+    ("matrix", "rotation"),
+    [((0, 1, 0, -1, 0, 0, 0, 0, 1), 90), ((-1, 0, 0, 0, -1, 0, 0, 0, 1), 180), ((0, -1, 0, 1, 0, 0, 0, 0, 1), 270)],
+)
+def test_rotation_is_applied_once(matrix: tuple[float, ...], rotation: int) -> None:
+    frame = next(read_frames(indexed(turned(video(), matrix)), VideoSegment(0, 1), ReadReport()))
+    assert frame.rotation_deg == rotation
+    full = frame.bgr()
+    assert full.shape[:2] == ((WIDTH, HEIGHT) if rotation != 180 else (HEIGHT, WIDTH))
+    # the red half was on the left
+    red = {90: full[:20, 60], 180: full[60, -20:], 270: full[-20:, 60]}[rotation]
+    assert red[..., 2].mean() > 150
+    half = frame.half_bgr()
+    assert half.shape[:2] == (full.shape[0] // 2, full.shape[1] // 2)
+
+
+@pytest.mark.parametrize("matrix", [(-1, 0, 0, 0, 1, 0, 0, 0, 1), (0.7, 0.7, 0, -0.7, 0.7, 0, 0, 0, 1)])
+def test_mirrored_and_tilted_videos_are_refused(matrix: tuple[float, ...]) -> None:
+    with pytest.raises(UnsupportedUpload):
+        next(read_frames(indexed(turned(video(), matrix)), VideoSegment(0, 1), ReadReport()))
+
+
+# --- archives and damage ----------------------------------------------------------------------------------------------
+
+
+def test_a_stored_video_is_read_where_it_lies() -> None:
+    def packed(method: int) -> SpooledFile:
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w", method) as archive:
+            archive.writestr("drive/front.mp4", video())
+            archive.writestr("poses.csv", "time,lon,lat\n")
+        return SpooledFile.of(out.getvalue())
+
+    stored = packed(zipfile.ZIP_STORED)
+    assert holds_video(stored)
+    opened = open_packed_video(stored, ArchiveLimits())
+    assert [name for name, _data in opened.beside] == ["poses.csv"]
+    assert numbers(index_video(opened.video)) == list(range(20))
+    with pytest.raises(UnsupportedUpload, match="compressed"):
+        open_packed_video(packed(zipfile.ZIP_DEFLATED), ArchiveLimits())
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_damaged_videos_raise_only_our_errors(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    codec, form, kind = [("mpeg4", "mp4", VideoKind.MP4), ("mjpeg", "avi", VideoKind.AVI)][seed % 2]
+    data = bytearray(video(10, codec=codec, form=form))
+    for _ in range(int(rng.integers(1, 60))):
+        at = int(rng.integers(16, len(data)))
+        data[at] = int(rng.integers(256))
+    try:
+        index = indexed(bytes(data[: int(rng.integers(100, len(data) + 1))]), kind)
+        for frame in read_frames(index, VideoSegment(0, len(index.stamps)), ReadReport()):
+            frame.half_bgr()
+    except WaymarkError:
+        pass

@@ -1,0 +1,97 @@
+"""Every kind of job on both engines: threads of the server, and a worker that takes messages from RabbitMQ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import sqlalchemy as sa
+
+from app.registry.tables import marker_versions
+from app.registry.tenancy import across_agencies
+from app.services.access.access import Scope
+from app.settings import Settings
+from tests.api.decodes.conftest import post_frame
+from tests.api.decodes.test_archives import pack
+from tests.api.plans.test_packages import RULES, road, send_road
+from tests.api.surveys.test_imports import DEGREES, _csv, _markers, _send
+from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer, serving
+from tests.formats.pictures import png
+from tests.http import created, finished, refused, wait_until
+from tests.jobs import standin
+
+pytestmark = pytest.mark.both_engines
+
+
+@pytest.fixture(scope="module")
+def server(
+    tmp_path_factory: pytest.TempPathFactory, new_database_url: Callable[[Path], str], engine_settings: dict[str, Any]
+) -> Iterator[LiveServer]:
+    """A server, and on Celery a worker."""
+    folder = tmp_path_factory.mktemp("engines") / "var"
+    url = new_database_url(folder)
+    settings = Settings(
+        data_dir=folder, database_url=url, admin_key=ADMIN_KEY, decode_workers=1, decode_timeout_s=5.0, **UNLIMITED,
+        **engine_settings,
+    )  # fmt: skip
+    with serving(settings, decode=standin.decode) as running:
+        yield running
+
+
+def test_an_archive_is_decoded_though_a_frame_kills_its_process(client: httpx.Client) -> None:
+    good, deadly = png(standin.frame_that(standin.OBEY)), png(standin.frame_that(standin.DIE))
+    answer = post_frame(client, pack({"0.png": good, "1.png": deadly, "2.png": good}), name="drive.zip")
+    assert answer.status_code == 202, answer.text
+    decode = finished(client, answer.headers["Location"])
+    assert decode["state"] == "done", decode
+    assert [frame["error"] is not None for frame in decode["frames"]] == [False, True, False]
+
+
+def test_a_running_job_is_cancelled(client: httpx.Client) -> None:
+    good, slow = png(standin.frame_that(standin.OBEY)), png(standin.frame_that(standin.SLEEP))
+    members = {f"{k}.png": slow if k == 1 else good for k in range(20)}
+    location = post_frame(client, pack(members), name="drive.zip").headers["Location"]
+    wait_until(lambda: client.get(location).json()["state"] == "running", "the job to run")
+    assert client.post(f"{location}/cancel").status_code == 200
+    assert finished(client, location)["state"] == "cancelled"
+
+
+def test_a_survey_is_imported_once(client: httpx.Client) -> None:
+    job = _send(client, _csv(3), DEGREES, Prefer="respond-async")
+    assert job.status_code == 202, job.text
+    assert finished(client, f"/v1/imports/{job.json()['id']}")["state"] == "done"
+    assert len(_markers(client)) == 3
+
+
+def test_a_plan_is_packed(client: httpx.Client) -> None:
+    alignment = send_road(client, road(47.0, 41.0, 150.0), name="r").json()
+    plan = created(client, "/v1/plans", name="p", alignment_id=alignment["id"], rules=RULES)
+    answer = client.post(f"/v1/plans/{plan['id']}/package", json={})
+    assert answer.status_code == 202, answer.text
+    job = finished(client, answer.headers["Location"])
+    assert job["state"] == "done", job
+    assert client.get(f"/v1/plans/{plan['id']}/package").content.startswith(b"PK")
+
+
+def test_the_log_is_verified(server: LiveServer, client: httpx.Client, place: Callable[[], dict[str, Any]]) -> None:
+    with server.agency(f"auditors {client.headers['Authorization'][-8:]}", Scope.ADMIN) as admin:
+        marker = created(admin, "/v1/markers", position=place())
+        answer = admin.post("/v1/audit/verifications", json={})
+        assert (answer.status_code, answer.json()["state"]) == (202, "queued"), answer.text
+        done = finished(admin, answer.headers["Location"])
+        head = admin.get("/v1/audit").json()["head"]
+        assert (done["state"], done["progress"], done["result"]["fault_count"]) == ("done", 1.0, 0)
+        assert done["result"]["head"] == f"{head['number']}:{head['hash']}"
+        assert done["result"]["versions"] == 1
+        assert admin.get(f"/v1/jobs/{done['id']}").json()["links"]["result"] == answer.headers["Location"]
+        with across_agencies(), server.app.state.database.write() as connection:
+            changed = sa.update(marker_versions).where(marker_versions.c.marker_id == marker["id"])
+            connection.execute(changed.values(sha256="0" * 64))
+        again = admin.post("/v1/audit/verifications", json={"expected_head": f"999:{'0' * 64}"})
+        result = finished(admin, again.headers["Location"])["result"]
+        assert result["fault_count"] == len(result["faults"]) >= 2
+        assert any(fault["where"] == "entry 999" for fault in result["faults"])
+        refused(admin.post("/v1/audit/verifications", json={"expected_head": "x"}), 422, field="expected_head")

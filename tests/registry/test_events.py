@@ -1,0 +1,48 @@
+"""Events rise in the order of commits, and an agency reads its own."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import pytest
+
+from app.registry import agencies, events
+from app.registry.database import Database
+from app.registry.tenancy import acting_for
+
+NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
+
+
+def test_each_agency_reads_its_own_events_in_order(database: Database) -> None:
+    with database.write() as connection:
+        own, other = (agencies.add_agency(connection, name, NOW) for name in ("one", "two"))
+    for agency_id in (own, other):
+        with acting_for(agency_id), database.write() as connection:
+            for number in range(3):
+                events.add_event(
+                    connection, agency_id, "maintenance.suspect", subject_id=f"s{number}", at=NOW, detail={"n": number}
+                )
+    with acting_for(own), database.read() as connection:
+        found = events.list_events(connection, own)
+        newer = events.list_events(connection, own, after=found[0].id, kinds=["maintenance.suspect"])
+        assert events.list_events(connection, own, kinds=["maintenance.other"]) == []
+        assert events.newest_event(connection, own) == found[-1].id
+    assert [row.subject_id for row in found] == ["s0", "s1", "s2"]
+    assert [row.detail for row in newer] == [{"n": 1}, {"n": 2}]
+    assert [row.id for row in found] == sorted(row.id for row in found)
+
+
+def test_nothing_that_was_rolled_back_is_an_event(database: Database) -> None:
+    with database.write() as connection:
+        own = agencies.add_agency(connection, "one", NOW)
+    with pytest.raises(RuntimeError):
+        _roll_back_an_event(database, own)
+    with acting_for(own), database.read() as connection:
+        assert events.list_events(connection, own) == []
+        assert events.newest_event(connection, own) == 0
+
+
+def _roll_back_an_event(database: Database, agency_id: str) -> None:
+    with acting_for(agency_id), database.write() as connection:
+        events.add_event(connection, agency_id, "maintenance.suspect", subject_id=None, at=NOW)
+        raise RuntimeError
