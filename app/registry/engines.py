@@ -45,6 +45,24 @@ _OPERATIONAL = (sa.exc.OperationalError, sqlite3.OperationalError, psycopg.Opera
 """As SQLAlchemy raises them, and as the drivers do where they are used without it."""
 
 
+class _ClosingPool(sa.QueuePool):
+    """A pool that also closes the connections that are in use when it is disposed of, as soon as they come back.
+
+    SQLAlchemy's keeps them for nobody, and the server keeps their sessions until the garbage collector finds them.
+    """
+
+    _disposed = False
+
+    def dispose(self) -> None:
+        self._disposed = True
+        super().dispose()
+
+    def _do_return_conn(self, record: Any) -> None:
+        if self._disposed:
+            record.close()
+        super()._do_return_conn(record)
+
+
 def sqlite_engine(url: sa.URL) -> sa.Engine:
     """Engine of a SQLite file: WAL, synchronous FULL, foreign keys on; writes start with BEGIN IMMEDIATE."""
     pragmas = (f"page_size = {_PAGE_BYTES}", "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON")
@@ -69,6 +87,7 @@ def _sqlite_engine(url: sa.URL, *pragmas: str, **options: Any) -> sa.Engine:
         connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False},
         json_serializer=_json,
         json_deserializer=orjson.loads,
+        poolclass=_ClosingPool,
         pool_size=40,  # one for each thread that answers requests: opening one costs more than most queries
         max_overflow=8,
         **options,
@@ -105,6 +124,7 @@ def postgres_asking_engine(url: sa.URL) -> sa.Engine:
         connect_args=options,
         isolation_level="AUTOCOMMIT",
         json_deserializer=orjson.loads,
+        poolclass=_ClosingPool,
         pool_size=10,
         max_overflow=30,
         pool_timeout=BUSY_TIMEOUT_S,
@@ -129,6 +149,7 @@ def postgres_engine(url: sa.URL) -> sa.Engine:
         connect_args=_connect_args(url),
         json_serializer=_json,
         json_deserializer=orjson.loads,
+        poolclass=_ClosingPool,
         pool_size=10,
         max_overflow=20,
         pool_timeout=BUSY_TIMEOUT_S,

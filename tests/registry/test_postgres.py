@@ -134,6 +134,19 @@ def test_a_question_can_neither_write_nor_take_for_ever(database: Database, monk
     impatient.close()
 
 
+def test_a_connection_in_use_is_closed_when_it_comes_back(database: Database, second: Database) -> None:
+    with second.read() as connection:
+        session = connection.exec_driver_sql("SELECT pg_backend_pid()").scalar()
+        driver = connection.connection.driver_connection
+        second.disconnect()
+        assert connection.exec_driver_sql("SELECT 1").scalar() == 1  # whoever uses it may end
+    assert session
+    assert driver is not None
+    assert driver.closed
+    with second.read() as connection:
+        assert connection.exec_driver_sql("SELECT pg_backend_pid()").scalar() != session
+
+
 def test_a_server_that_is_away_is_unavailable() -> None:
     database = Database("postgresql+psycopg://waymark:secret@127.0.0.1:1/waymark")
     with pytest.raises(Unavailable, match="cannot be reached") as refused:
