@@ -14,8 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import orjson
 import shapely
-from ezdxf.filemanagement import new
-from pyogrio import raw  # type: ignore[import-untyped]
 from pyproj import Transformer
 
 from app.formats.spreadsheet import TableWriter
@@ -122,6 +120,8 @@ def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, a
         Whether every marker has an ellipsoidal height. The points of a Shapefile all have one or none; those of a
         GeoPackage have it where it is known. KML has none: it takes them to be above the geoid.
     """
+    from pyogrio import raw  # type: ignore[import-untyped]  # 50 MB that most servers never need
+
     name, suffix = {"gpkg": ("GPKG", "gpkg"), "shapefile": ("ESRI Shapefile", "shp"), "kml": ("KML", "kml")}[driver]
     names = [SHAPEFILE_NAMES[n] for n in FIELDS] if driver == "shapefile" else list(FIELDS)
     kind = "Point Z" if all_heights and driver == "shapefile" else "Point"  # GDAL adds z to a GeoPackage's as it comes
@@ -185,6 +185,8 @@ def write_dxf(records: Sequence[Record]) -> CadFile:
     Its z is the ellipsoidal height; 0, the plane of the drawing, where that is unknown: a block always has one. Another
     height is the attribute HEIGHT, with its datum.
     """
+    from ezdxf.filemanagement import new
+
     zone = _utm(records)
     layer = f"WAYMARK_EPSG_{zone.code}"
     document = new("R2010", units=6)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.lapack import dpbtrf, dpbtrs
+import scipy
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -59,12 +59,12 @@ def log_determinant(cholesky: Floats) -> float:
 
 def factor(matrix: Floats) -> Floats:
     """Banded Cholesky factor, lower form, of a matrix that is positive definite except for rounding."""
-    found, info = dpbtrf(matrix, lower=1)
+    found, info = scipy.linalg.lapack.dpbtrf(matrix, lower=1)
     if info:
         lifted = matrix.copy()
         lifted[0] *= 1 + _LIFT
         lifted[0] += _LIFT_OF_LARGEST * matrix[0].max()
-        found, info = dpbtrf(lifted, lower=1)
+        found, info = scipy.linalg.lapack.dpbtrf(lifted, lower=1)
     if info:
         raise np.linalg.LinAlgError("normal matrix is not positive definite")
     return np.asarray(found)
@@ -72,7 +72,7 @@ def factor(matrix: Floats) -> Floats:
 
 def solve(cholesky: Floats, right: Floats) -> Floats:
     """Solution for one right-hand side (N,) or many (N, G)."""
-    solved, _ = dpbtrs(cholesky, right, lower=1)
+    solved, _ = scipy.linalg.lapack.dpbtrs(cholesky, right, lower=1)
     return np.asarray(solved)
 
 

@@ -13,7 +13,7 @@ from enum import StrEnum
 import numba as nb
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import maximum_filter1d
+import scipy
 
 from app.errors import InvalidParameter
 
@@ -227,7 +227,9 @@ def plan_speed(
         holds = np.searchsorted(chainage, np.arange(count) * path.step_m + 1e-9, side="right") - 1
         limits = limits[np.clip(holds, 0, len(limits) - 1)]
     # curvature is an average over a window: a bend that begins within it counts with its full curvature
-    curvature = maximum_filter1d(np.abs(path.curvature_per_m), 2 * max(round(_CURVATURE_OVER_M / path.step_m), 1) + 1)
+    curvature = scipy.ndimage.maximum_filter1d(
+        np.abs(path.curvature_per_m), 2 * max(round(_CURVATURE_OVER_M / path.step_m), 1) + 1
+    )
     speed = np.minimum(limits / 3.6, np.sqrt(comfort_m_s2 / np.maximum(curvature, 1e-9)))
     squares = (speed * np.ones(count)) ** 2
     rise = 2 * braking_m_s2 * path.step_m * np.arange(count)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter1d
+import scipy
 
 from app.errors import InvalidParameter
 
@@ -156,7 +156,7 @@ def direction_rad(points_m: Floats, step_m: float, smoothing_m: float) -> Floats
     turn = np.unwrap(np.arctan2(delta[:, 1], delta[:, 0]))
     reach = int(4 * smoothing_m / step_m) + 1
     extended = np.concatenate([_extrapolated(turn[::-1], reach)[::-1], turn, _extrapolated(turn, reach)])
-    smooth = gaussian_filter1d(extended, smoothing_m / step_m)[reach - 1 : len(turn) + reach + 1]
+    smooth = scipy.ndimage.gaussian_filter1d(extended, smoothing_m / step_m)[reach - 1 : len(turn) + reach + 1]
     return np.asarray((smooth[:-1] + smooth[1:]) / 2)
 
 

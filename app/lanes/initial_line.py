@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
-from scipy.spatial import cKDTree
+import scipy
 
 from app.lanes.banded_matrix import difference_gram, factor, gather, gram, solve
 from app.lanes.smooth_line import SmoothLine, left_normals, lengths_along
@@ -27,7 +25,7 @@ def largest_group(points_m: Floats, bridge_m: float) -> Bools:
     tree = _spanning_tree(points_m)
     tree.data[tree.data > bridge_m] = 0
     tree.eliminate_zeros()
-    _, group = connected_components(tree, directed=False)
+    _, group = scipy.sparse.csgraph.connected_components(tree, directed=False)
     return np.asarray(group == np.argmax(np.bincount(group)))
 
 
@@ -53,7 +51,7 @@ def fit_initial_line(points_m: Floats, side: Ints, half_width_m: float) -> Smoot
         return None
     spine = points_m[path]
     along = lengths_along(spine)
-    far, nearest = (np.asarray(found) for found in cKDTree(spine).query(points_m))
+    far, nearest = (np.asarray(found) for found in scipy.spatial.cKDTree(spine).query(points_m))
     near = far < _MAX_BESIDE_M
     sided = side if (side != UNKNOWN).sum() > 1 else np.zeros_like(side)
     line = _smooth(points_m[near], along[nearest[near]], _UNSIDED_SIGMA_M)
@@ -90,22 +88,27 @@ def _is_single_row(points_m: Floats, station_m: Floats) -> bool:
     return line is None or float(np.median(np.abs(line.project(points_m)[1]))) < _SINGLE_ROW_M
 
 
-def _spanning_tree(points_m: Floats) -> csr_array:
+def _spanning_tree(points_m: Floats) -> scipy.sparse.csr_array:
     k = min(_NEIGHBOURS, len(points_m) - 1)
-    far, index = (np.asarray(found) for found in cKDTree(points_m).query(points_m, k=k + 1))
+    far, index = (np.asarray(found) for found in scipy.spatial.cKDTree(points_m).query(points_m, k=k + 1))
     rows = np.repeat(np.arange(len(points_m)), k)
-    graph = coo_array((np.maximum(far[:, 1:], 1e-6).ravel(), (rows, index[:, 1:].ravel())), (len(points_m),) * 2)
-    return minimum_spanning_tree(graph.tocsr())
+    graph = scipy.sparse.coo_array(
+        (np.maximum(far[:, 1:], 1e-6).ravel(), (rows, index[:, 1:].ravel())), (len(points_m),) * 2
+    )
+    return scipy.sparse.csgraph.minimum_spanning_tree(graph.tocsr())
 
 
 def _longest_path(points_m: Floats) -> Ints:
     """Markers along the longest path through the spanning tree of the largest group."""
     tree = _spanning_tree(points_m)
-    _, group = connected_components(tree, directed=False)
+    _, group = scipy.sparse.csgraph.connected_components(tree, directed=False)
     start = int(np.flatnonzero(group == np.argmax(np.bincount(group)))[0])
-    reach = dijkstra(tree, directed=False, indices=[start])[0]
+    reach = scipy.sparse.csgraph.dijkstra(tree, directed=False, indices=[start])[0]
     end = int(np.argmax(np.where(np.isfinite(reach), reach, -1)))
-    reach, before = (found[0] for found in dijkstra(tree, directed=False, indices=[end], return_predecessors=True))
+    reach, before = (
+        found[0]
+        for found in scipy.sparse.csgraph.dijkstra(tree, directed=False, indices=[end], return_predecessors=True)
+    )
     at = int(np.argmax(np.where(np.isfinite(reach), reach, -1)))
     path = [at]
     while at != end and before[at] >= 0:

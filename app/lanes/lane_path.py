@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.special import erf
+import scipy
 
 from app.lanes.lane_fit import LaneFit
 from app.lanes.local_plane import headings_deg, wgs84_from_plane
@@ -69,7 +68,7 @@ def path_from_fit(fit: LaneFit, observations: LaneObservations, rules: LaneRules
         width_m=np.where(sigma_width < _MAX_WIDTH_SIGMA_M, width, np.nan)[keep],
         speed_limit_km_h=limit[keep],
         sigma_m=sigma[keep],
-        confidence=erf(rules.tolerance_m / (np.sqrt(2) * np.maximum(sigma[keep], _MIN_SIGMA_M))),
+        confidence=scipy.special.erf(rules.tolerance_m / (np.sqrt(2) * np.maximum(sigma[keep], _MIN_SIGMA_M))),
         side=row_side,
         residual_m=row_residual,
         left_out=tuple(notes.left_out),
@@ -91,7 +90,7 @@ def path_from_splines(bounds: SplineBoundaries, observations: LaneObservations, 
     slope = np.gradient(middle, at, axis=0)
     bend = np.gradient(slope, at, axis=0)
     curvature = (slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]) / np.maximum(np.hypot(*slope.T), 1e-9) ** 3
-    markers_at = at[cKDTree(middle).query(observations.point_m)[1]]
+    markers_at = at[scipy.spatial.cKDTree(middle).query(observations.point_m)[1]]
     known = observations.of_row >= 0
     return Lane(
         origin_lon_deg=observations.origin[0],

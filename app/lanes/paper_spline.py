@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from app.lanes.smooth_line import STEP_M, SmoothLine, lengths_along
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints
@@ -59,4 +59,4 @@ def _chain(points_m: Floats, station_m: Floats, which: Bools) -> Floats:
 def _spline(chain_m: Floats, count: int) -> Floats:
     """Equation 1 over the length of the chain, at even steps."""
     along = lengths_along(chain_m)
-    return np.asarray(CubicSpline(along, chain_m, axis=0)(np.linspace(0, along[-1], count)))
+    return np.asarray(scipy.interpolate.CubicSpline(along, chain_m, axis=0)(np.linspace(0, along[-1], count)))

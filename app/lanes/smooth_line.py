@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial import cKDTree
+import scipy
 
 from app.lanes.types import LEFT, RIGHT, Floats, Ints
 
@@ -39,10 +38,10 @@ class SmoothLine:
     def __init__(self, points_m: Floats) -> None:
         along = lengths_along(points_m)
         if len(points_m) > 2:
-            spline = CubicSpline(along, points_m, axis=0, bc_type="natural")
+            spline = scipy.interpolate.CubicSpline(along, points_m, axis=0, bc_type="natural")
         else:
             slope = (points_m[1] - points_m[0]) / along[1]
-            spline = CubicSpline(along, points_m, axis=0, bc_type=((1, slope), (1, slope)))
+            spline = scipy.interpolate.CubicSpline(along, points_m, axis=0, bc_type=((1, slope), (1, slope)))
         count = max(round(along[-1] / STEP_M), 2) + 1
         knots = np.linspace(0.0, along[-1], count)
         self.points_m: Floats = spline(knots)
@@ -94,7 +93,7 @@ class SmoothLine:
 
     def project(self, points_m: Floats) -> tuple[Floats, Floats]:
         """Station and left offset of points, on the nearest leg of the line. [m]"""
-        _, index = cKDTree(self.points_m).query(points_m)
+        _, index = scipy.spatial.cKDTree(self.points_m).query(points_m)
         return self.refine_stations(points_m, self.station_m[index])
 
     def project_markers(self, points_m: Floats, side: Ints, half_width_m: float) -> tuple[Floats, Floats]:
@@ -103,7 +102,7 @@ class SmoothLine:
         Where the line passes a marker twice, the leg is chosen whose offset is closest to half a lane width on the
         marker's side.
         """
-        tree = cKDTree(self.points_m)
+        tree = scipy.spatial.cKDTree(self.points_m)
         near = min(_NEAREST_STATIONS, len(self.points_m))
         far, index = (np.asarray(found) for found in tree.query(points_m, k=near))
         first = index[:, :1]

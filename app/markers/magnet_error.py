@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr, ndtri
+import scipy
 
 from app.errors import InvalidParameter
 from app.markers.magnet import FIELD_UT_M3, MOMENT_AM2
@@ -219,7 +219,7 @@ def separation_for(confusion: float) -> float:
             limit="between 0 and 0.5",
             cure="0.001 is one in a thousand",
         )
-    return float(-2 * ndtri(confusion))
+    return float(-2 * scipy.special.ndtri(confusion))
 
 
 # --- a design -----------------------------------------------------------------------------------------------------
@@ -303,5 +303,5 @@ def _confusion(design: TagDesign, steps: npt.NDArray[np.int64], conditions: Read
         exists = (moved >= design.min_gap_steps).all(axis=1)
         delta = np.array(move) / design.segments
         distance = np.sqrt(np.einsum("i,kij,j->k", delta, inverse, delta))
-        total += np.where(exists, ndtr(-distance / 2), 0.0)
+        total += np.where(exists, scipy.special.ndtr(-distance / 2), 0.0)
     return total

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+import scipy
 
 from app.encoders.magnet.layout import MagnetLayout
 from app.errors import InvalidParameter
@@ -205,10 +205,10 @@ def _reaction(layout: MagnetLayout, stop_line_m: float, speed_mps: float, site: 
 
 def _clearance(vehicle: str, readable_m: float) -> Check:
     mean_m, std_m = vehicle_clearances()[vehicle]
-    share = float(ndtr((readable_m - mean_m) / std_m))
+    share = float(scipy.special.ndtr((readable_m - mean_m) / std_m))
     return _at_most(
         f"clearance-{vehicle.replace(' ', '-')}",
-        mean_m + float(ndtri(_SERVED)) * std_m,
+        mean_m + float(scipy.special.ndtri(_SERVED)) * std_m,
         readable_m,
         "m",
         "METRO figure 14a, section 7.3",

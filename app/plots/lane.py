@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from app.lanes.local_plane import plane_from_wgs84
 from app.lanes.types import Lane, LaneMarkers
@@ -209,7 +209,7 @@ def _plan_view(lane: LanePicture) -> _PlanView | None:
     markers = _finite(lane.marker_m)
     reach = np.ptp(shape, axis=0).max() * 0.1 + 40.0  # a claim farther off is shown at the border
     if len(markers):
-        lines.append(markers[cKDTree(shape).query(markers)[0] < reach])
+        lines.append(markers[scipy.spatial.cKDTree(shape).query(markers)[0] < reach])
     turned = np.vstack(lines) @ turn.T
     low, high = turned.min(axis=0), turned.max(axis=0)
     extent = np.maximum(high - low, _MIN_M)
@@ -317,7 +317,7 @@ def _beside(lane: LanePicture, points_m: Floats) -> Floats:
     rows = np.flatnonzero(np.isfinite(points_m).all(axis=1))
     if not len(rows):
         return out
-    nearest = cKDTree(lane.centre_m).query(points_m[rows])[1]
+    nearest = scipy.spatial.cKDTree(lane.centre_m).query(points_m[rows])[1]
     ahead = np.gradient(lane.centre_m, axis=0)[nearest]
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
     offset = points_m[rows] - lane.centre_m[nearest]

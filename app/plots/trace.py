@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
+import scipy
 
 from app.decoders.magnet.readings import Finding, LineCrossing, MagnetReading, NoiseFinding, TagReading
 from app.markers.magnet import Orientation, Polarity
@@ -89,7 +89,7 @@ def _field_panel(trace: MagnetTrace, bar: MagnetometerBar, odometer: Floats, alo
         largest = np.zeros(len(trace.t_s))
         for sensor in bar.array:
             values = np.nan_to_num(trace.field_ut[:, sensor, axis].astype(float))
-            values = ndimage.median_filter(values, 3, mode="nearest")  # a sample that stands alone is a fault
+            values = scipy.ndimage.median_filter(values, 3, mode="nearest")  # a sample that stands alone is a fault
             largest = np.maximum(largest, np.abs(values - _background(values, trace.rate_hz)))
         curves.append((odometer[starts], np.maximum.reduceat(largest, starts)))
     full = max(float(max(c[1].max() for c in curves)), 10.0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr, ndtri
+import scipy
 
 from app.radio.airtime import check_between, check_modulation
 
@@ -95,12 +95,12 @@ class LinkModel:
         spare_db = np.asarray(level_dbm, float) - np.asarray(threshold_dbm, float)
         if self.fading_db == 0.0:
             return np.asarray(spare_db >= 0.0, float)
-        return np.asarray(ndtr(spare_db / self.fading_db))
+        return np.asarray(scipy.special.ndtr(spare_db / self.fading_db))
 
     def read_levels_dbm(self, level_dbm: npt.ArrayLike, threshold_dbm: float) -> Floats:
         """Equally likely levels of those packets that are above a threshold, shape (...) to (..., Q). [dBm]"""
         level = np.asarray(level_dbm, float)[..., None]
         if self.fading_db == 0.0:
             return level
-        above = ndtr((level - threshold_dbm) / self.fading_db)
-        return np.asarray(level - self.fading_db * ndtri(above * _QUANTILES))
+        above = scipy.special.ndtr((level - threshold_dbm) / self.fading_db)
+        return np.asarray(level - self.fading_db * scipy.special.ndtri(above * _QUANTILES))

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
-from scipy.special import log_expit, log_ndtr, ndtr, stdtrit
+import scipy
 
 from app.radio.link import EXPONENT, NEAR_M
 
@@ -108,12 +107,12 @@ def fit_path_loss(
     low, high = np.quantile(far_db, (0.05, 0.95))
     free = bool(high - low >= 10 * math.log10(_MIN_SPAN))
     weights = _Likelihood(far_db, rssi, free, sensitivity_dbm)
-    found = minimize(
+    found = scipy.optimize.minimize(
         weights.cost, weights.start, method="Nelder-Mead", options={"maxiter": 2000, "xatol": 1e-3, "fatol": 1e-4}
     )
     best = np.asarray(found.x, float)
     deviation, degrees = _deviations(weights, best, groups)
-    reach = stdtrit(degrees, 0.975) * deviation
+    reach = scipy.special.stdtrit(degrees, 0.975) * deviation
     exponent = best[1] if free else EXPONENT
     wide = reach[1] if free else 0.0
     return PathLoss(
@@ -156,14 +155,14 @@ def fit_offset(
     soft_db = math.hypot(line.spread_db, _LOGISTIC_TO_NORMAL * _SOFT_DB)
     level = line.rssi_dbm(distance_m)[:, None] + grid
     received = _log_density(rssi_dbm[:, None], level, line.spread_db, line.sensitivity_dbm)
-    received = received + log_ndtr((level - line.sensitivity_dbm) / soft_db)
-    audible = ndtr((line.rssi_dbm(missed_m)[:, None] + grid - line.sensitivity_dbm) / soft_db)
+    received = received + scipy.special.log_ndtr((level - line.sensitivity_dbm) / soft_db)
+    audible = scipy.special.ndtr((line.rssi_dbm(missed_m)[:, None] + grid - line.sensitivity_dbm) / soft_db)
     silent = np.log1p(-np.minimum(received_share, 0.98) * audible)
     total = received.sum(axis=0) + silent.sum(axis=0) - (grid / _OFFSET_PRIOR_DB) ** 2 / 2
     best = int(total.argmax())
     widened = (1 + correlation) / (1 - correlation)
     count = (len(rssi_dbm) + len(missed_m)) / widened
-    limit = float(stdtrit(max(count - 1, 1), 0.975)) ** 2 * widened / 2
+    limit = float(scipy.special.stdtrit(max(count - 1, 1), 0.975)) ** 2 * widened / 2
     within = grid[total >= total[best] - limit]
     line_db = (line.level_dbm.high - line.level_dbm.low) / 4
     low = grid[best] - math.hypot(grid[best] - within[0], 2 * line_db)
@@ -174,7 +173,7 @@ def fit_offset(
 def audible_share(line: PathLoss, distance_m: Floats) -> Floats:
     """Probability that a packet from this distance is strong enough."""
     soft_db = math.hypot(line.spread_db, _LOGISTIC_TO_NORMAL * _SOFT_DB)
-    return np.asarray(ndtr((line.rssi_dbm(distance_m) - line.sensitivity_dbm) / soft_db))
+    return np.asarray(scipy.special.ndtr((line.rssi_dbm(distance_m) - line.sensitivity_dbm) / soft_db))
 
 
 def residual_correlation(residual_db: Floats, group: npt.NDArray[np.int64]) -> float:
@@ -234,9 +233,11 @@ def _log_density(rssi_dbm: Floats, expected_dbm: Floats, spread_db: float, sensi
     """Log density of received strengths, given that they were received."""
     z = (rssi_dbm - expected_dbm) / spread_db
     normal = -(z**2) / 2 - math.log(spread_db * math.sqrt(2 * math.pi))
-    audible = log_expit((rssi_dbm - sensitivity_dbm) / _SOFT_DB)
+    audible = scipy.special.log_expit((rssi_dbm - sensitivity_dbm) / _SOFT_DB)
     # a logistic step is a normal one of 1.7 times its scale
-    any_received = log_ndtr((expected_dbm - sensitivity_dbm) / math.hypot(spread_db, _LOGISTIC_TO_NORMAL * _SOFT_DB))
+    any_received = scipy.special.log_ndtr(
+        (expected_dbm - sensitivity_dbm) / math.hypot(spread_db, _LOGISTIC_TO_NORMAL * _SOFT_DB)
+    )
     return np.asarray(
         np.logaddexp(
             normal + audible - any_received + math.log1p(-_OUTLIER_SHARE), math.log(_OUTLIER_SHARE * _OUTLIER_DENSITY)

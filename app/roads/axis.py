@@ -20,8 +20,8 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from pyproj import Geod
-from scipy.spatial import cKDTree
 
 from app.errors import InvalidParameter
 from app.geodesy.ellipsoid import ecef_from_wgs84
@@ -118,7 +118,7 @@ class Axis:
         self._last = np.append(self._first[1:], len(self._part)) - 1
         self._start_ecef, self._forward, self._left = _frames(self._lon, self._lat, self._azimuth)
         self._reach = float(self._length.max()) / 2
-        self._tree = cKDTree(self._start_ecef + self._forward * (self._length / 2)[:, None])
+        self._tree = scipy.spatial.cKDTree(self._start_ecef + self._forward * (self._length / 2)[:, None])
 
     @property
     def length_m(self) -> float:
@@ -225,7 +225,9 @@ class Axis:
         start = 0
         while start < len(places):
             end = start + max(1, int(np.searchsorted(np.cumsum(counts[start:]), _PAIRS, side="right")))
-            near = cKDTree(places[start:end]).sparse_distance_matrix(self._tree, radius, output_type="ndarray")
+            near = scipy.spatial.cKDTree(places[start:end]).sparse_distance_matrix(
+                self._tree, radius, output_type="ndarray"
+            )
             if len(near):
                 yield near["i"] + start, near["j"]
             start = end

@@ -7,7 +7,7 @@ from typing import NotRequired
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 from typing_extensions import TypedDict
 
 from app.formats.surveys.table import Fault, Floats, warn
@@ -110,8 +110,8 @@ def _nearest_once(points: Floats, others: Floats) -> npt.NDArray[np.intp]:
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if not len(others) or not len(rows):
         return matched
-    distance, forth = cKDTree(others).query(points[rows], k=1)
-    back = np.asarray(cKDTree(points[rows]).query(others, k=1)[1])
+    distance, forth = scipy.spatial.cKDTree(others).query(points[rows], k=1)
+    back = np.asarray(scipy.spatial.cKDTree(points[rows]).query(others, k=1)[1])
     mutual = (np.asarray(distance) <= REACH_M) & (back[np.asarray(forth)] == np.arange(len(rows)))
     matched[rows[mutual]] = np.asarray(forth)[mutual]
     return matched

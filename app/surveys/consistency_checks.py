@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from app.formats.surveys.table import Fault, Floats, Severity, warn
 from app.surveys.georeference import GeoreferencedSurvey
@@ -252,7 +252,7 @@ def _check_steps(survey: GeoreferencedSurvey, rows: npt.NDArray[np.intp]) -> Ite
         return
     points = np.column_stack([survey.east_m[rows], survey.north_m[rows]])
     height = survey.height_m[rows]
-    tree: Any = cKDTree(points)
+    tree: Any = scipy.spatial.cKDTree(points)
     odd, steepest = [], (0.0, -1)
     for start in range(0, len(rows), _PART):
         part = slice(start, start + _PART)
@@ -285,7 +285,7 @@ def nearest_others(points: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
     second = order[np.minimum(np.cumsum(count) - count + 1, len(points) - 1)]
     nearest = np.where(first[place] == np.arange(len(points)), second[place], first[place])
     nearest_m = np.zeros(len(points))
-    tree: Any = cKDTree(places)
+    tree: Any = scipy.spatial.cKDTree(places)
     alone = np.flatnonzero(count[place] == 1)
     for start in range(0, len(alone), _PART):
         part = alone[start : start + _PART]
@@ -296,7 +296,7 @@ def nearest_others(points: Floats) -> tuple[Floats, npt.NDArray[np.intp]]:
 
 def nearest_of(points: Floats, among: Floats, k: int) -> tuple[Floats, npt.NDArray[np.intp]]:
     """Distances [m] and indices of the k nearest of `among`, each of shape (N, k)."""
-    distance, index = cKDTree(among).query(points, k=k)
+    distance, index = scipy.spatial.cKDTree(among).query(points, k=k)
     return np.asarray(distance).reshape(len(points), k), np.asarray(index, dtype=np.intp).reshape(len(points), k)
 
 

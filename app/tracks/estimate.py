@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from app.errors import InvalidParameter
 from app.tracks import kernel
@@ -203,7 +203,7 @@ def _smooth(drive: _Drive, *, clock_s: float = 0.0) -> Smoothed:
     motion = _MOTION._replace(
         wander_m=drive.rules.wander_m, wander_length_m=drive.rules.wander_length_m, clock_s=clock_s
     )
-    gate2, gate3 = (float(chi2.isf(drive.rules.outlier_probability, dof)) for dof in (2, 3))
+    gate2, gate3 = (float(scipy.stats.chi2.isf(drive.rules.outlier_probability, dof)) for dof in (2, 3))
     gate = np.where(np.isfinite(drive.arrays.heading_rad), gate3, gate2)
     states, covs = None, None
     around = np.full((drive.base.count, place), np.nan)

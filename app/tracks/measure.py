@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.spatial import cKDTree
+import scipy
 
 from app.geodesy.ellipsoid import ecef_from_wgs84, metres_per_radian
 from app.tracks.dead_reckoning import TimeBase
@@ -136,7 +135,7 @@ def averaged_rates(base: TimeBase, states: Floats) -> Floats:
     v, psi = states[:, SPEED], states[:, HEADING]
     change = np.gradient(v, base.step_s) if len(v) > 1 else np.zeros(len(v))
     columns = np.column_stack([v * np.sin(psi), v * np.cos(psi), change, states[:, YAW_RATE]])
-    return np.asarray(uniform_filter1d(columns, size, axis=0, mode="nearest"))
+    return np.asarray(scipy.ndimage.uniform_filter1d(columns, size, axis=0, mode="nearest"))
 
 
 def sample_rows(
@@ -172,7 +171,7 @@ class PathIndex:
     lat_rad: Floats
     heading_rad: Floats
     sigma_m: float
-    tree: cKDTree
+    tree: scipy.spatial.cKDTree
 
 
 def path_index(path: LanePath) -> PathIndex | None:
@@ -193,7 +192,7 @@ def path_index(path: LanePath) -> PathIndex | None:
     lon, lat = np.interp(at, along, lon), np.interp(at, along, lat)
     east, north = metres_per_radian(lat)
     heading = np.arctan2(np.gradient(lon) * east, np.gradient(lat) * north)
-    tree = cKDTree(ecef_from_wgs84(np.degrees(lon), np.degrees(lat)))
+    tree = scipy.spatial.cKDTree(ecef_from_wgs84(np.degrees(lon), np.degrees(lat)))
     return PathIndex(lon, lat, heading, max(path.sigma_m, _MIN_PATH_SIGMA_M), tree)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, signal
+import scipy
 
 from app.decoders.magnet.readings import MagnetReading
 
@@ -41,15 +41,15 @@ def smooth_speed_aware(x: Floats, speed_m_s: Floats) -> Floats:
     for high, samples in SMOOTHING:
         here = (speed_m_s >= low) & (speed_m_s < high)
         if here.any():
-            out[here] = ndimage.convolve1d(x, gaussian_window(samples), axis=0, mode="nearest")[here]
+            out[here] = scipy.ndimage.convolve1d(x, gaussian_window(samples), axis=0, mode="nearest")[here]
         low = high
     return out
 
 
 def derive_savitzky_golay(x: Floats, rate_hz: float) -> Floats:
     """Step 2: first derivative of x (T, ...), Savitzky-Golay over 5 samples of order 2, smoothed over 5. [1/s]"""
-    d = signal.savgol_filter(x, SG_WINDOW, SG_ORDER, deriv=1, delta=1 / rate_hz, axis=0, mode="nearest")
-    out: Floats = ndimage.convolve1d(d, gaussian_window(5), axis=0, mode="nearest")
+    d = scipy.signal.savgol_filter(x, SG_WINDOW, SG_ORDER, deriv=1, delta=1 / rate_hz, axis=0, mode="nearest")
+    out: Floats = scipy.ndimage.convolve1d(d, gaussian_window(5), axis=0, mode="nearest")
     return out
 
 
@@ -67,7 +67,7 @@ def slope_threshold(slopes: Floats, *, first: int = THRESHOLD_CROSSINGS, factor:
 
 def amplitude_steps(x: Floats, crossings: Indices, rate_hz: float) -> Floats:
     """Step 3: how far x (T,) is at each crossing from what is usual there, its mean over a second."""
-    usual = ndimage.uniform_filter1d(x, max(int(rate_hz), 3), mode="nearest")
+    usual = scipy.ndimage.uniform_filter1d(x, max(int(rate_hz), 3), mode="nearest")
     return np.asarray(np.abs(x - usual)[crossings])
 
 

@@ -11,11 +11,11 @@ All lengths are in plate sides.
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
 
 from app.decoders.compiled import routine
 
@@ -29,7 +29,7 @@ NORMAL_DENSITY = 128
 """[entries per standard deviation] of the table. Source: linear interpolation then errs by at most h^2 / 8 max |f''| =
 3e-6."""
 _Z = np.arange(-NORMAL_REACH, NORMAL_REACH + 2.5 / NORMAL_DENSITY, 1 / NORMAL_DENSITY)
-NORMAL_TABLE = np.stack([ndtr(_Z), np.exp(-0.5 * _Z**2) / math.sqrt(2 * math.pi)], axis=1)
+NORMAL_TABLE = np.stack([[NormalDist().cdf(z) for z in _Z], np.exp(-0.5 * _Z**2) / math.sqrt(2 * math.pi)], axis=1)
 """Cumulative distribution and density of the standard normal distribution, shape (entries, 2)."""
 PROFILE_REACH = 3.0
 """[standard deviations] beyond which a unit's share of a point is left out. Source: 0.1 % of the normal distribution

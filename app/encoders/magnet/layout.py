@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from app.errors import InvalidParameter
 from app.markers.magnet import (
@@ -242,7 +242,7 @@ def _point_ahead(lane: LaneLine, chainage_m: float, length_m: float) -> FloatArr
             )
         reach_m *= 1.05
     reach_m = min(reach_m, room_m)
-    arc_m = brentq(beyond, 0.0, reach_m, xtol=1e-10) if beyond(reach_m) > 0 else reach_m
+    arc_m = scipy.optimize.brentq(beyond, 0.0, reach_m, xtol=1e-10) if beyond(reach_m) > 0 else reach_m
     return lane.at(chainage_m + arc_m)
 
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import io
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from ezdxf.document import Drawing as DxfDocument
-from ezdxf.enums import TextEntityAlignment
-from ezdxf.layouts.layout import Modelspace
 from shapely.geometry.base import BaseGeometry
 
 from app.encoders.plate.colours import INKS
 from app.encoders.plate.drawing import Boxes, Drawing, FloatArray, Layer, Modules, Part, Shape, Stroke, Text
 from app.encoders.plate.lettering import contours_mm
+
+if TYPE_CHECKING:
+    from ezdxf.layouts.layout import Modelspace
 
 LAYERS = (
     Layer.CUT,
@@ -31,9 +32,9 @@ LAYERS = (
 
 _MILLIMETRES = 4
 _ALIGNMENTS = {
-    "start": TextEntityAlignment.LEFT,
-    "middle": TextEntityAlignment.CENTER,
-    "end": TextEntityAlignment.RIGHT,
+    "start": "LEFT",
+    "middle": "CENTER",
+    "end": "RIGHT",
 }
 _DATES = re.compile(r"(\$TD(?:CREATE|UPDATE)\n 40\n)[^\n]*")
 _GUIDS = re.compile(r"(\$(?:FINGERPRINT|VERSION)GUID\n  2\n)[^\n]*")
@@ -53,6 +54,8 @@ def write_dxf(drawing: Drawing) -> bytes:
         Model space in millimetres (``$INSUNITS`` = 4). Areas are closed LWPOLYLINE, those of a layer that touch are
         merged; engraved text is outlined, notes are TEXT. The same drawing always gives the same bytes.
     """
+    from ezdxf.document import Drawing as DxfDocument
+
     document = DxfDocument.new("R2010")
     document.header["$INSUNITS"] = _MILLIMETRES
     document.header["$MEASUREMENT"] = 1
@@ -95,13 +98,15 @@ def _ring(points: FloatArray) -> list[tuple[float, float]]:
 
 
 def _add_text(space: Modelspace, text: Text) -> None:
+    from ezdxf.enums import TextEntityAlignment
+
     attributes = {"layer": str(text.layer)}
     if text.layer is Layer.ENGRAVE:
         for contour in contours_mm(text):
             space.add_lwpolyline(np.round(contour, 6).tolist(), close=True, dxfattribs=attributes)
         return
     entity = space.add_text(text.text, height=text.height_mm, dxfattribs=attributes)
-    entity.set_placement((text.x_mm, text.y_mm), align=_ALIGNMENTS[text.anchor])
+    entity.set_placement((text.x_mm, text.y_mm), align=TextEntityAlignment[_ALIGNMENTS[text.anchor]])
 
 
 def _undated(dxf: str) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import sqlalchemy as sa
-from scipy.spatial import cKDTree
 
 from app.encoders.magnet import MagnetLayout
 from app.errors import Conflict
@@ -33,7 +33,7 @@ def find_neighbours(
     rows = _list_near(connection, layout, ignoring)
     if not rows:
         return ()
-    holes = cKDTree([hole.point_enu_m[:2] for hole in layout.holes])
+    holes = scipy.spatial.cKDTree([hole.point_enu_m[:2] for hole in layout.holes])
     points = [layout.lane.from_position(row.lon_deg, row.lat_deg)[:2] for row in rows]
     distances_m = np.asarray(holes.query(np.array(points))[0], dtype=np.float64)
     nearest: dict[int, tuple[float, MagnetRow]] = {}

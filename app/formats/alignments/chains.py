@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+import scipy
 
 Floats = npt.NDArray[np.float64]
 
@@ -93,9 +91,9 @@ def _places_m(ends: Floats, geographic: bool, unit_m: float) -> Floats:
 
 def _meeting_ends(places: Floats) -> dict[int, int]:
     """For each end that meets exactly one other end, that one. Part k has the ends 2 k (start) and 2 k + 1."""
-    pairs = cKDTree(places).query_pairs(JOIN_M, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
-    node = connected_components(graph, directed=False)[1]
+    pairs = scipy.spatial.cKDTree(places).query_pairs(JOIN_M, output_type="ndarray")
+    graph = scipy.sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places)))
+    node = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     order = np.argsort(node, kind="stable")
     first = np.flatnonzero(np.diff(node[order], prepend=-1))
     twos = first[np.diff(first, append=len(order)) == 2]

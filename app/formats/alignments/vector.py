@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import shapely
-from pyogrio import raw, read_info  # type: ignore[import-untyped]
 
 from app.errors import ReferenceSystemError, UnreadableUpload
 from app.formats.alignments.assemble import assemble_road
@@ -69,6 +68,8 @@ def _short(crs: str | None) -> str:
 
 
 def _read_layer(data: bytes, layer: str | None) -> tuple[list[RoadFeature], str | None]:
+    from pyogrio import raw, read_info  # type: ignore[import-untyped]
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GDAL warns of names without suffix

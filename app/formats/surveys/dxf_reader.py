@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from ezdxf.filemanagement import read
-from ezdxf.lldxf.const import DXFError
 
 from app.errors import UnreadableUpload, WaymarkError
 from app.formats.surveys.declaration import FEET
@@ -81,6 +79,8 @@ def read_dxf(data: bytes, layer: str | None, unit: str | None = None) -> SourceT
 @contextmanager
 def reading_dxf() -> Iterator[None]:
     """Raises UnreadableUpload for what ezdxf raises while it reads a damaged file."""
+    from ezdxf.lldxf.const import DXFError
+
     try:
         yield
     except (
@@ -106,6 +106,8 @@ def open_dxf(data: bytes) -> tuple[Any, tuple[str, float] | None]:
     UnreadableUpload
         It is no ASCII DXF, or has units that no survey has.
     """
+    from ezdxf.filemanagement import read
+
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-from pyogrio import raw, read_info  # type: ignore[import-untyped]
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
@@ -161,6 +160,8 @@ def _inflated(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
 
 
 def _read(kind: str, data: bytes, layer: str | None) -> SourceTable:
+    from pyogrio import raw, read_info  # type: ignore[import-untyped]
+
     points: list[Any] = []
     columns: list[list[Any]] = []
     faults = Faults()

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import Bounds, LinearConstraint, OptimizeResult, milp
-from scipy.sparse import csr_array
+import scipy
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -265,16 +264,16 @@ def _solve(
 
 def _program(
     cost: Floats, gain: Floats, rows: tuple[Indices, Indices], need: Floats, *, integral: bool
-) -> OptimizeResult:
+) -> scipy.optimize.OptimizeResult:
     """Result of scipy's solver for one group of rows."""
     first, last = rows
     columns = np.concatenate([np.arange(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)])
     pointers = np.concatenate([[0], np.cumsum(last - first)])
-    matrix = csr_array((gain[columns], columns, pointers), shape=(len(first), len(cost)))
-    return milp(
+    matrix = scipy.sparse.csr_array((gain[columns], columns, pointers), shape=(len(first), len(cost)))
+    return scipy.optimize.milp(
         cost,
         integrality=np.full(len(cost), int(integral)),
-        bounds=Bounds(0, 1),
-        constraints=LinearConstraint(matrix, need, np.inf),
+        bounds=scipy.optimize.Bounds(0, 1),
+        constraints=scipy.optimize.LinearConstraint(matrix, need, np.inf),
         options={"mip_rel_gap": _GAP, "node_limit": _NODES},
     )

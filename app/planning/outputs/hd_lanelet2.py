@@ -7,9 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+import scipy
 
 from app.formats.alignments.geometry import EventKind, LineStyle
 from app.geodesy.ellipsoid import metres_per_radian
@@ -201,9 +199,9 @@ def _shared_nodes(writer: _Writer, pieces: Sequence[_Cut]) -> list[tuple[list[in
     points = np.concatenate([piece.points[side][piece.cuts] for piece, side in sides])
     lon = np.concatenate([piece.lon_deg[side][piece.cuts] for piece, side in sides])
     lat = np.concatenate([piece.lat_deg[side][piece.cuts] for piece, side in sides])
-    pairs = cKDTree(points).query_pairs(SAME_POINT_M, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    _, group = connected_components(links, directed=False)
+    pairs = scipy.spatial.cKDTree(points).query_pairs(SAME_POINT_M, output_type="ndarray")
+    links = scipy.sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+    _, group = scipy.sparse.csgraph.connected_components(links, directed=False)
     _, first = np.unique(group, return_index=True)
     ids = np.array(writer.add_nodes(lon[first], lat[first], points[first, 3]))[group].tolist()
     nodes: list[list[int]] = []

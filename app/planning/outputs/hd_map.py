@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.cerpm import LaneSide
@@ -169,7 +169,7 @@ def _nearest_samples(
     samples = np.concatenate([np.arange(len(lane.chainage_m)) for lane in lanes])
     lon, lat = (np.concatenate([getattr(lane, name) for lane in lanes]) for name in ("lon_deg", "lat_deg"))
     places = np.array([(marker.lon_deg, marker.lat_deg) for marker in markers])
-    away, found = cKDTree(ecef_from_wgs84(lon, lat)).query(ecef_from_wgs84(places[:, 0], places[:, 1]))
+    away, found = scipy.spatial.cKDTree(ecef_from_wgs84(lon, lat)).query(ecef_from_wgs84(places[:, 0], places[:, 1]))
     half_step = np.array([lane.step_m / 2 for lane in lanes])[number[found]]
     # the centre line passes nearer than its samples, by half a step along it at most
     distance = np.sqrt(np.maximum(np.asarray(away) ** 2 - half_step**2, 0.0))

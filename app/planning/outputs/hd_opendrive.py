@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from pyproj import Proj
-from scipy.spatial import cKDTree
 
 from app.errors import InvalidParameter
 from app.formats.alignments.geometry import LineStyle
@@ -121,8 +121,8 @@ def _links(lines: Sequence[ReferenceLine]) -> list[tuple[int | None, int | None]
     """Number of the road before and after each road, None where there is none or more than one."""
     starts = np.array([line.ends[0] for line in lines])
     ends = np.array([line.ends[1] for line in lines])
-    after = [tuple(found) for found in cKDTree(starts).query_ball_point(ends, _SAME_END_M)]
-    before = [tuple(found) for found in cKDTree(ends).query_ball_point(starts, _SAME_END_M)]
+    after = [tuple(found) for found in scipy.spatial.cKDTree(starts).query_ball_point(ends, _SAME_END_M)]
+    before = [tuple(found) for found in scipy.spatial.cKDTree(ends).query_ball_point(starts, _SAME_END_M)]
     return [
         (
             before[k][0] if len(before[k]) == 1 and len(after[before[k][0]]) == 1 else None,
@@ -183,7 +183,9 @@ def _place(
     rest = np.array([i for i in range(len(markers)) if i not in places], dtype=np.intp)
     if len(rest):  # beyond the end of the nearest road they may lie beside another one
         for k, line in enumerate(lines):
-            _add_places(places, k, rest, _feet(line, xy[rest], np.asarray(cKDTree(line.xy).query(xy[rest])[1])))
+            _add_places(
+                places, k, rest, _feet(line, xy[rest], np.asarray(scipy.spatial.cKDTree(line.xy).query(xy[rest])[1]))
+            )
     placed: dict[int, list[_Placed]] = {}
     for i, (k, s, t, direction, ground_m) in sorted(places.items(), key=lambda item: item[1][:2]):
         marker = markers[i]
@@ -220,7 +222,7 @@ def _nearest(
     every = np.concatenate(points)
     if np.isfinite(height).all() and np.isfinite(every).all():
         xy = np.column_stack([xy, height])
-    _, found = cKDTree(every[:, : xy.shape[1]]).query(xy)
+    _, found = scipy.spatial.cKDTree(every[:, : xy.shape[1]]).query(xy)
     return road[found], sample[found]
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
+import scipy
 
 from app.planning.alignment import Floats, Lane
 from app.planning.outputs.hd_map import refine_breaks
@@ -74,7 +74,7 @@ class ReferenceLine:
         self.lane = lane
         self.xy = np.column_stack([x, y])
         chainage = lane.chainage_m
-        self._slope = np.asarray(CubicSpline(chainage, self.xy)(chainage, 1))
+        self._slope = np.asarray(scipy.interpolate.CubicSpline(chainage, self.xy)(chainage, 1))
         whole = np.array([0, len(chainage) - 1])
         self.breaks = refine_breaks(whole, self._error, CURVE_ERROR_M)
         self._b, self._c, self._d = _hermite(chainage, self.xy, self._slope, self.breaks)

@@ -12,10 +12,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import orjson
-import pyogrio  # type: ignore[import-untyped]
 import shapely
-from ezdxf.filemanagement import new
-from pyogrio import raw
 
 from app.formats.surveys.declaration import METRES
 from app.formats.surveys.grids import crs_unit
@@ -119,6 +116,8 @@ def _dxf(stakeout: Stakeout) -> bytes:
 
     The frame of the file is made by ezdxf; the points are written as text, a hundred thousand take a second.
     """
+    from ezdxf.filemanagement import new
+
     document = new("R2010", units=_INSUNITS[stakeout.unit])
     document.header["$INSUNITS"] = _INSUNITS[stakeout.unit]
     document.header["$MEASUREMENT"] = int(stakeout.unit == "m")
@@ -203,6 +202,8 @@ def _undated(dxf: str) -> str:
 
 def _gpkg(stakeout: Stakeout) -> bytes:
     """GeoPackage with one layer of points, in the crew's system; coordinates are in the unit of that system."""
+    import pyogrio  # type: ignore[import-untyped]
+
     own_m = METRES[crs_unit(reference_system(stakeout.crs))]
     scale = METRES[stakeout.unit] / own_m
     points = stakeout.points
@@ -236,7 +237,7 @@ def _gpkg(stakeout: Stakeout) -> bytes:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            raw.write(
+            pyogrio.raw.write(
                 stream, shapely.to_wkb(geometry), columns, list(rows), driver="GPKG", layer="stakeout",
                 geometry_type="Point Z" if known else "Point", crs=stakeout.crs,
                 layer_metadata={"unit": stakeout.unit, "transformation": stakeout.note},

@@ -7,8 +7,8 @@ from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 import shapely
-from scipy.spatial import cKDTree
 
 from app.encoders.pdf import POINTS_PER_MM
 from app.formats.alignments.geometry import EventKind, LineStyle, StationEquation
@@ -204,7 +204,10 @@ class _Row:
         new: npt.NDArray[np.bool_] = np.ones(len(edge), dtype=np.bool_)
         if drawn:
             near = _SHARED_M * 1000 / self.strip.scale
-            new = np.asarray(cKDTree(np.concatenate(drawn)).query(edge, distance_upper_bound=near)[0]) > near
+            new = (
+                np.asarray(scipy.spatial.cKDTree(np.concatenate(drawn)).query(edge, distance_upper_bound=near)[0])
+                > near
+            )
         drawn.append(edge)
         runs = np.flatnonzero(new)
         for run in np.split(runs, np.flatnonzero(np.diff(runs) > 1) + 1):

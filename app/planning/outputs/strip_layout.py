@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from app.errors import InvalidParameter
 from app.geodesy.ellipsoid import ecef_from_wgs84, metres_per_radian
@@ -226,7 +226,7 @@ def find_references(plan: Plan) -> Iterator[Reference]:
         names = np.flatnonzero(remaining)
         if not len(names):
             return
-        tree = cKDTree(ecef_from_wgs84(lane.lon_deg, lane.lat_deg))
+        tree = scipy.spatial.cKDTree(ecef_from_wgs84(lane.lon_deg, lane.lat_deg))
         far, index = tree.query(places[names], distance_upper_bound=_BESIDE_M)
         mine, nearest = np.isfinite(far), np.asarray(index)
         if not any(plan.markers[k].lane == lane.name for k in names[mine]):
@@ -238,7 +238,7 @@ def find_references(plan: Plan) -> Iterator[Reference]:
 def _reference(
     road: Alignment,
     lane: Lane,
-    tree: cKDTree,
+    tree: scipy.spatial.cKDTree,
     markers: Indices,
     nearest: Indices,
 ) -> Reference:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.cerpm import LaneSide
@@ -43,7 +43,7 @@ class Boundaries:
     """Boundaries that are known so far."""
 
     def __init__(self) -> None:
-        self._trees: list[cKDTree] = []
+        self._trees: list[scipy.spatial.cKDTree] = []
         self._sides: list[tuple[str, LaneSide]] = []
         self.shared_as_other_side: set[tuple[str, LaneSide]] = set()
         """Boundaries (lane, side) that are the other side of another lane."""
@@ -60,7 +60,7 @@ class Boundaries:
             covered |= near
             if near.mean() > 0.5 and other_side is not side:
                 self.shared_as_other_side.add((other, other_side))
-        self._trees.append(cKDTree(points))
+        self._trees.append(scipy.spatial.cKDTree(points))
         self._sides.append((lane.name, side))
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         return [Stretch(lane, side, offset, first, last, along) for first, last in _runs(~covered)]

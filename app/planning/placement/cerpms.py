@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.cerpm import LaneSide
@@ -82,7 +82,7 @@ def path_error_m(lane: Lane, chainages_m: Floats, shifts_m: Floats | None = None
         fits = [np.polyfit(chainages_m, (knots - origin)[:, k], degree) for k in range(3)]
         path = np.stack([np.polyval(fit, lane.chainage_m) for fit in fits], 1)
     else:
-        path = CubicSpline(chainages_m, knots - origin)(lane.chainage_m)
+        path = scipy.interpolate.CubicSpline(chainages_m, knots - origin)(lane.chainage_m)
     away = path - (truth - origin)
     tangent = np.gradient(truth, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1)[:, None]

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.checks import Verdict
@@ -145,7 +145,7 @@ def _busiest(cerpms: Sequence[PlannedMarker], air: Air) -> tuple[RoadMarkers, Pl
     Their distances from it are the true ones, so that a bend does not bring them closer.
     """
     lon, lat = np.array([m.lon_deg for m in cerpms]), np.array([m.lat_deg for m in cerpms])
-    tree = cKDTree(ecef_from_wgs84(lon, lat))
+    tree = scipy.spatial.cKDTree(ecef_from_wgs84(lon, lat))
     in_range, heard = (
         tree.query_ball_point(tree.data, away, return_length=True) for away in (air.range_m, air.reach_m + air.harm_m)
     )

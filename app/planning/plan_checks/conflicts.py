@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.markers.checks import Verdict
@@ -76,7 +76,7 @@ def _footprints(markers: Sequence[PlannedMarker]) -> tuple[Floats, list[PlannedM
 
 def _overlaps(places: Floats, owners: list[PlannedMarker], room: Floats) -> PlanFinding:
     """Pairs of markers of one plan that stand in each other's place."""
-    pairs = cKDTree(places).query_pairs(2 * float(room.max()), output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(places).query_pairs(2 * float(room.max()), output_type="ndarray")
     apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
     near = pairs[apart < room[pairs[:, 0]] + room[pairs[:, 1]] - 0.001]
     found = [(a, b) for a, b in near.tolist() if owners[a] is not owners[b]]
@@ -98,7 +98,7 @@ def _equal_codes(markers: Sequence[PlannedMarker]) -> PlanFinding:
     for group in groups.values():
         if len(group) > 1:
             points = ecef_from_wgs84(np.array([m.lon_deg for m in group]), np.array([m.lat_deg for m in group]))
-            found += [(group[a], group[b]) for a, b in sorted(cKDTree(points).query_pairs(CONFUSION_M))]
+            found += [(group[a], group[b]) for a, b in sorted(scipy.spatial.cKDTree(points).query_pairs(CONFUSION_M))]
     names = ", ".join(f"{a.number} and {b.number}" for a, b in found[:3])
     sentence = f"pairs of equal codes within {CONFUSION_M:g} m of each other" + (f": {names}" if found else "")
     return compare(
@@ -111,7 +111,7 @@ def _existing_overlaps(
     places: Floats, owners: list[PlannedMarker], room: Floats, existing: Sequence[ExistingMarker]
 ) -> PlanFinding:
     points = _points(existing)
-    distance, nearest = (np.asarray(found) for found in cKDTree(points).query(places))
+    distance, nearest = (np.asarray(found) for found in scipy.spatial.cKDTree(points).query(places))
     radius = np.array([marker.radius_m for marker in existing])
     over = np.flatnonzero(distance < room + radius[nearest])
     sentence = "planned markers that stand in the place of an installed or planned one"

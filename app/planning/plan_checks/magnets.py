@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.special import ndtr, ndtri
+import scipy
 
 from app.encoders.magnet.codebook import CodebookRules, codebook_capacity, list_conflicts
 from app.geodesy.ellipsoid import ecef_from_wgs84
@@ -83,9 +82,9 @@ def _clearance(rules: TagRules) -> PlanFinding:
             "clearance", 0, ">=", 1, "classes", "METRO figure 14a", f"{name[:40]!r} is none of {', '.join(known)}"
         )
     mean_m, std_m = known[name]
-    served = float(ndtr((READABLE_CLEARANCE_M - mean_m) / std_m))
+    served = float(scipy.special.ndtr((READABLE_CLEARANCE_M - mean_m) / std_m))
     return compare(
-        f"clearance {name}", mean_m + float(ndtri(_SERVED)) * std_m, "<=", READABLE_CLEARANCE_M, "m",
+        f"clearance {name}", mean_m + float(scipy.special.ndtri(_SERVED)) * std_m, "<=", READABLE_CLEARANCE_M, "m",
         "METRO figure 14a, section 7.3", f"{_SERVED:.0%} have less ground clearance; {served:.0%} can read the tags",
         missed=Verdict.WARN,
     )  # fmt: skip
@@ -141,7 +140,7 @@ def _neighbours(lines: list[PlannedMarker], tags: list[PlannedMarker]) -> PlanFi
     points = ecef_from_wgs84(*(np.array(values) for values in zip(*magnets, strict=True)))
     if len(points) < 2:
         return compare("magnet-spacing", MIN_GAP_M, ">=", MIN_GAP_M, "m", "METRO figure 17a", "there is one magnet")
-    distance = np.asarray(cKDTree(points).query(points, k=2)[0])
+    distance = np.asarray(scipy.spatial.cKDTree(points).query(points, k=2)[0])
     k = int(distance[:, 1].argmin())
     return compare(
         "magnet-spacing", float(distance[k, 1]), ">=", MIN_GAP_M - 0.001, "m", "METRO figure 17a",

@@ -11,7 +11,7 @@ from importlib import resources
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import expit
+import scipy
 
 from app.planning.alignment import Floats
 
@@ -65,7 +65,7 @@ class PlateModel:
 
     def readable_share(self, blur_units: npt.ArrayLike) -> Floats:
         """Share of passes that can be read at all."""
-        return np.asarray(expit(self.sharp - self.blur_limit * np.asarray(blur_units)))
+        return np.asarray(scipy.special.expit(self.sharp - self.blur_limit * np.asarray(blur_units)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,9 @@ class MagnetModel:
     def read_rate(self, clearance_m: float, curvature_1pm: npt.ArrayLike) -> Floats:
         """Of the shape of the curvatures."""
         bend = np.abs(np.asarray(curvature_1pm, dtype=np.float64))
-        return np.asarray(expit(self.at_16_cm + self.per_metre * (clearance_m - 0.16) + self.per_curvature * bend))
+        return np.asarray(
+            scipy.special.expit(self.at_16_cm + self.per_metre * (clearance_m - 0.16) + self.per_curvature * bend)
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.merged_markers import RegisteredMarker
@@ -163,7 +163,7 @@ def distances_m(places_m: Floats, line_m: Floats) -> Floats:
     line = line_m[np.concatenate([[True], np.linalg.norm(np.diff(line_m, axis=0), axis=1) > 1e-9])]
     pieces = np.diff(line, axis=0)
     square = (pieces**2).sum(1)
-    nearest = cKDTree(line).query(places_m)[1]
+    nearest = scipy.spatial.cKDTree(line).query(places_m)[1]
     away = np.full(len(places_m), np.inf)
     for piece in (np.maximum(nearest - 1, 0), np.minimum(nearest, len(pieces) - 1)):
         beside = places_m - line[piece]

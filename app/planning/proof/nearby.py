@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from app.geodesy.ellipsoid import ecef_from_wgs84
 from app.planning.alignment import Floats, Lane
@@ -28,8 +28,8 @@ class LaneFrame:
         self._left = np.cross(up, self._along)
 
     @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self._points)
+    def _tree(self) -> scipy.spatial.cKDTree:
+        return scipy.spatial.cKDTree(self._points)
 
     def project(self, lon_deg: Floats, lat_deg: Floats, reach_m: float) -> tuple[Floats, Floats]:
         """Chainage and offset, left positive, each shape (K,); NaN farther than a reach from the centre line. [m]"""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from app.errors import InvalidParameter
 from app.geodesy.ellipsoid import ecef_from_wgs84
@@ -311,13 +311,13 @@ class Prover:
         return tuple(plates[k] for k in sorted(near))
 
     @cached_property
-    def _plates(self) -> tuple[list[PlateCode], cKDTree]:
+    def _plates(self) -> tuple[list[PlateCode], scipy.spatial.cKDTree]:
         found = [marker for marker in self.plan.markers if isinstance(marker.detail, PlannedPlate)]
         codes = [marker.detail.code for marker in found if isinstance(marker.detail, PlannedPlate)]
         places = ecef_from_wgs84(
             np.array([marker.lon_deg for marker in found]), np.array([marker.lat_deg for marker in found])
         )
-        return codes, cKDTree(places)
+        return codes, scipy.spatial.cKDTree(places)
 
 
 def _chunks(kind: UnitKind, drive: int, chosen: Sequence[tuple[PlannedMarker, float]], size: int) -> list[ProofUnit]:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter1d
+import scipy
 
 from app.formats.alignments.geometry import CHORD_ERROR_M
 from app.planning.road.ground_line import GroundLine
@@ -111,7 +111,7 @@ def smooth(values: Floats, width: float) -> Floats:
     before = start + slope * np.arange(-reach - 1, 0)
     slope, start = np.polyfit(at, inner[-fitted:], 1) if fitted > 1 else (0.0, inner[0])
     after = start + slope * (fitted + np.arange(reach + 1))
-    smoothed = gaussian_filter1d(np.concatenate([before, inner, after]), width)
+    smoothed = scipy.ndimage.gaussian_filter1d(np.concatenate([before, inner, after]), width)
     return np.asarray(smoothed[reach : reach + len(values)])
 
 

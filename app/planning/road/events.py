@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from app.errors import InvalidParameter
 from app.formats.alignments.geometry import AlignmentFile, EventGeometry, EventKind, LaneGeometry
@@ -113,7 +113,7 @@ def _stated_events(
     if not file.events:
         return []
     known = {geometry.name for geometry in file.lanes}
-    trees: dict[str | None, tuple[cKDTree, list[Lane], Floats]] = {}
+    trees: dict[str | None, tuple[scipy.spatial.cKDTree, list[Lane], Floats]] = {}
     events = []
     for event, (lon, lat) in zip(file.events, places_deg.tolist(), strict=True):
         if event.lane is not None and event.lane not in known:
@@ -145,14 +145,18 @@ def _stated_events(
     return events
 
 
-def _tree(lanes: list[Lane]) -> tuple[cKDTree, list[Lane], Floats]:
+def _tree(lanes: list[Lane]) -> tuple[scipy.spatial.cKDTree, list[Lane], Floats]:
     """Samples of lanes to search in, and the number of the first sample of each lane."""
     places = np.concatenate([_sphere_m(lane.lon_deg, lane.lat_deg) for lane in lanes])
-    return cKDTree(places), lanes, np.cumsum([0, *(len(lane.lon_deg) for lane in lanes)]).astype(np.float64)
+    return (
+        scipy.spatial.cKDTree(places),
+        lanes,
+        np.cumsum([0, *(len(lane.lon_deg) for lane in lanes)]).astype(np.float64),
+    )
 
 
 def _nearest(
-    event: EventGeometry, lon: float, lat: float, tree: cKDTree, lanes: list[Lane], firsts: Floats
+    event: EventGeometry, lon: float, lat: float, tree: scipy.spatial.cKDTree, lanes: list[Lane], firsts: Floats
 ) -> RoadEvent | None:
     away, sample = tree.query(_sphere_m(np.array([lon]), np.array([lat]))[0])
     if away > REACH_M:

@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
+import scipy
 
 from app.families.frames import Match, Nearby
 from app.families.plate.plates import PLATE
@@ -238,5 +238,5 @@ def _frame_rate(unit_px: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[An
     model = fitted_models().plate_model(DAY)
     nodes, weights = normal_quadrature()
     odds = model.pass_log_odds(unit_px, 0.0)[:, None] + model.spread * nodes
-    rate = (weights * expit(odds)).sum(axis=1) * model.readable_share(0.0)
+    rate = (weights * scipy.special.expit(odds)).sum(axis=1) * model.readable_share(0.0)
     return np.where(unit_px > 0.0, rate, 0.0)

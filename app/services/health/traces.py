@@ -9,7 +9,7 @@ from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+import scipy
 
 from app.decoders.magnet.localize import TagFix
 from app.decoders.magnet.match import ReadTag, ReadTrace
@@ -181,7 +181,7 @@ def _passed_probability(first: TagFix, second: TagFix, gap_m: float, tag: Regist
     array = bar.positions_m[bar.array][:, 1]
     low, high = float(array.min()), float(array.max())
     sigma_m = WANDER_M + WANDER_PER_M * min(gap_m, chord_m)
-    inside = float(norm.cdf((high - aside_m) / sigma_m) - norm.cdf((low - aside_m) / sigma_m))
+    inside = float(scipy.stats.norm.cdf((high - aside_m) / sigma_m) - scipy.stats.norm.cdf((low - aside_m) / sigma_m))
     rate = float(fitted_models().tags.read_rate(0.16, 0.0))
     return inside * rate
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy import signal
+import scipy
 
 from app.sensors.magnetometer_bar import MagnetometerBar
 from app.simulation.magnetic.dipoles import dipole_field_ut
@@ -146,7 +146,7 @@ def drive_course(course: Course, vehicle: Vehicle, length_m: float, rng: np.rand
     if course.speeds:
         speed = np.interp(at, *np.array(course.speeds, float).T)
     rough = rng.standard_normal(at.size)
-    slow = signal.sosfilt(signal.butter(2, 1 / 60.0, fs=1 / step_m, output="sos"), rough)
+    slow = scipy.signal.sosfilt(scipy.signal.butter(2, 1 / 60.0, fs=1 / step_m, output="sos"), rough)
     speed = np.maximum(speed * (1 + course.hunting * slow / max(slow.std(), 1e-9)), 0.5)
     time = np.concatenate([[0], np.cumsum(2 * step_m / (speed[1:] + speed[:-1]))])
     t = np.arange(0, time[-1], _STEP_S)
@@ -179,14 +179,17 @@ def _smooth_steps(x: Floats, knots: Floats) -> Floats:
 def _lowpass(x: Floats, corner_hz: float) -> Floats:
     padding = min(300, x.size - 2)
     return np.asarray(
-        signal.sosfiltfilt(signal.butter(2, corner_hz, fs=1 / _STEP_S, output="sos"), x, padlen=max(padding, 0))
+        scipy.signal.sosfiltfilt(
+            scipy.signal.butter(2, corner_hz, fs=1 / _STEP_S, output="sos"), x, padlen=max(padding, 0)
+        )
     )
 
 
 def _band(t: Floats, low_hz: float, high_hz: float, std: float, rng: np.random.Generator) -> Floats:
     lead = 400
-    filtered = signal.sosfilt(
-        signal.butter(2, (low_hz, high_hz), "band", fs=1 / _STEP_S, output="sos"), rng.standard_normal(t.size + lead)
+    filtered = scipy.signal.sosfilt(
+        scipy.signal.butter(2, (low_hz, high_hz), "band", fs=1 / _STEP_S, output="sos"),
+        rng.standard_normal(t.size + lead),
     )
     return np.asarray(filtered[lead:] * std / max(float(filtered.std()), 1e-12))
 

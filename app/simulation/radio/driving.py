@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter1d, minimum_filter1d
-from scipy.signal import lfilter
+import scipy
 
 from app.errors import InvalidParameter
 from app.sensors.pose_track import PoseTrack
@@ -145,7 +144,9 @@ def drive_lane(lane: TrueLane, driver: Driver, rng: np.random.Generator, *, star
     time, chainage, speed = _advance(lane, driver, rng)
     inside = np.clip(chainage, 0.0, lane.length_m)
     bend = np.interp(
-        inside, lane.chainage_m, gaussian_filter1d(lane.curvature_1pm, _CURVATURE_SD_M / lane.chainage_m[1])
+        inside,
+        lane.chainage_m,
+        scipy.ndimage.gaussian_filter1d(lane.curvature_1pm, _CURVATURE_SD_M / lane.chainage_m[1]),
     )
     left = matern_noise(len(time), _TICK_S, driver.wander_time_s, rng) * driver.wander_sd_m
     left = left + float(rng.normal(0, driver.habit_sd_m)) + float(rng.normal(1, 1)) * driver.cut_m2 * bend
@@ -207,15 +208,15 @@ def matern_noise(count: int, step_s: float, time_s: float, rng: np.random.Genera
 
 
 def _recursed(values: Floats, keep: float) -> Floats:
-    return np.asarray(lfilter([1.0], [1.0, -keep], values, axis=0))
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -keep], values, axis=0))
 
 
 def _advance(lane: TrueLane, driver: Driver, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
     """Times, chainages and speeds of the drive: slower in bends, and uneven."""
     step = float(lane.chainage_m[1])
     cap = np.sqrt(_LATERAL_M_S2 / np.maximum(np.abs(lane.curvature_1pm), 1e-6))
-    cap = minimum_filter1d(np.minimum(cap, driver.speed_m_s), int(_SLOW_BEFORE_M / step), mode="nearest")
-    cap = gaussian_filter1d(cap, _CURVATURE_SD_M / step, mode="nearest")
+    cap = scipy.ndimage.minimum_filter1d(np.minimum(cap, driver.speed_m_s), int(_SLOW_BEFORE_M / step), mode="nearest")
+    cap = scipy.ndimage.gaussian_filter1d(cap, _CURVATURE_SD_M / step, mode="nearest")
     pad = int(driver.lead_m / step) + 1
     at = np.concatenate(
         [

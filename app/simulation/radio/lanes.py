@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pymap3d
-from scipy.ndimage import gaussian_filter1d
+import scipy
 
 from app.errors import InvalidParameter
 from app.lanes.cross_sections import cut_lane, direction_rad
@@ -209,4 +209,7 @@ def _widths(rng: np.random.Generator, at_m: Floats, low: float, high: float) -> 
 
 
 def _smoothed(points_m: Floats, step_m: float) -> Floats:
-    return np.stack([gaussian_filter1d(points_m[:, k], _CAR_SMOOTHING_M / step_m, mode="nearest") for k in range(2)], 1)
+    return np.stack(
+        [scipy.ndimage.gaussian_filter1d(points_m[:, k], _CAR_SMOOTHING_M / step_m, mode="nearest") for k in range(2)],
+        1,
+    )
