@@ -21,7 +21,7 @@ function showView() {
   }
   clearProblem();
   if (!key.get()) {
-    showStatus("Enter an API key. The server printed an admin key at its first start; the command `waymark key` creates more.");
+    showStatus("Enter an API key. The server printed an admin key at its first start; the command waymark key creates more.");
     $("#key").focus();
   } else if (name === "markers") {
     showMarkers(id);

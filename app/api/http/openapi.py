@@ -11,12 +11,39 @@ from fastapi.routing import APIRoute
 from app.api.http.components import component_schemas
 from app.api.http.middleware import is_protected
 
-DESCRIPTION = """The registry of machine-readable roads: coded plates, from a coordinate to a plate to print
-to a decoded frame, and magnet tags, from a meaning to holes to drill.
+DESCRIPTION = """The registry of machine-readable roads: coded plates, magnet tags, radio markers (CERPMs) and fiducial
+signs, from the plan of a road to artwork and surveys, and to the decoded uploads and drives of vehicles.
 
 Send your key as `Authorization: Bearer KEY` or `X-API-Key: KEY`. Every error is an RFC 9457 problem document that names
 the field, the limit and the cure. Positions are longitude, latitude in degrees; headings are clockwise from true north.
 """
+
+_TAGS = {
+    "markers": "Markers of every family: surveyed positions, states, history, bulk writes and searches.",
+    "artwork": "Printable plates and signs, with proofs of what a camera reads.",
+    "layouts": "Magnet tags: holes to drill for a meaning.",
+    "cerpms": "Radio markers: keys, frames, and how far they are heard.",
+    "codebooks": "Meanings of magnet tags.",
+    "roads": "Road axes, stations along them, and the markers beside them.",
+    "plans": "Plans of a road: alignments, rules, placement, proofs, files for crews, and commits.",
+    "imports": "Surveys and tables that become markers.",
+    "exports": "Markers as files.",
+    "uploads": "Files that vehicles send: in one request, resumed, or in parts of an S3 store.",
+    "decodes": "What was read in photos, videos, traces and packet logs, against the registry.",
+    "drives": "Several decodes of one vehicle as one track.",
+    "maintenance": "Markers that vehicles found missing, moved, cloned, reversed or fading; people decide.",
+    "jobs": "Work that goes on after the answer: state, progress, cancellation.",
+    "events": "What happened, as it happens.",
+    "webhooks": "Signed messages to your server when jobs end and markers become suspect.",
+    "reprocessing": "New versions of the decoders over stored uploads, and what they change.",
+    "fleet": "Vehicles, cameras and their calibrations.",
+    "snapshots": "Files of the registry for vehicles that decode offline.",
+    "audit": "The log of all changes, chained by hashes.",
+    "access": "Keys and agencies.",
+    "ogc": "OGC API Features and Tiles, for GIS clients.",
+    "system": "Health of the server, and what it runs.",
+}
+"""The parts of the API in the order in which /docs shows them."""
 
 
 def operation_id(route: APIRoute) -> str:
@@ -30,8 +57,9 @@ def describe(app: FastAPI) -> None:
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
             document = get_openapi(
-                title=app.title, version=app.version, description=DESCRIPTION, routes=app.routes, license_info=_LICENSE
-            )
+                title=app.title, version=app.version, description=DESCRIPTION, routes=app.routes, license_info=_LICENSE,
+                tags=[{"name": name, "description": description} for name, description in _TAGS.items()],
+            )  # fmt: skip
             components = document.setdefault("components", {})
             components.setdefault("schemas", {}).update(component_schemas())
             components["securitySchemes"] = {

@@ -31,6 +31,13 @@ def test_headers_of_requests_are_parameters(server: LiveServer) -> None:
     assert _headers(document, "/v1/decodes", "post") == {"Idempotency-Key": False, "Waymark-Context": False}
 
 
+def test_every_operation_belongs_to_a_part_that_is_described(server: LiveServer) -> None:
+    document = server.app.openapi()
+    used = {tag for path in document["paths"].values() for operation in path.values() for tag in operation["tags"]}
+    assert used == {tag["name"] for tag in document["tags"]}
+    assert all(tag["description"].endswith(".") for tag in document["tags"])
+
+
 def test_files_have_media_types_and_are_binary(server: LiveServer) -> None:
     artwork = server.app.openapi()["paths"]["/v1/markers/{marker_id}/artwork.{form}"]["get"]["responses"]
     assert set(artwork["200"]["content"]) == {"image/svg+xml", "application/pdf", "image/vnd.dxf", "image/png"}
