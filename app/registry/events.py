@@ -65,13 +65,14 @@ def list_events(
     agency_id: str,
     *,
     after: int = 0,
-    kinds: Sequence[str] | None = None,
+    job_kinds: Sequence[str] | None = None,
     limit: int = 100,
 ) -> list[EventRow]:
-    """Events after one, oldest first; of some kinds only where these are named."""
+    """Events after one, oldest first; where kinds of jobs are named, those of no other jobs."""
     query = select_rows(EventRow, events).where(_E.agency_id == agency_id, _E.id > after)
-    if kinds is not None:
-        query = query.where(_E.kind.in_(kinds))
+    if job_kinds is not None:
+        job_kind = _E.detail["job_kind"].as_string()
+        query = query.where(sa.or_(_E.kind.not_like("job.%"), job_kind.in_(job_kinds)))
     return fetch_all(connection, query.order_by(_E.id).limit(limit), EventRow)
 
 

@@ -155,6 +155,7 @@ def _without(*names: str) -> list[sa.ColumnElement[Any]]:
 def list_jobs(
     connection: sa.Connection, agency_id: str, kind: JobKind | Sequence[JobKind],
     *, state: str | None, before: str | None, limit: int, subject_id: str | None = None, holder_id: str | None = None,
+    dead_letter: bool | None = None,
 ) -> list[JobRow]:  # fmt: skip
     """Jobs of one kind or of several without their results, newest first; of anybody, or of one holder of a key."""
     query = sa.select(*_without("result")).where(jobs.c.agency_id == agency_id, _of_kind(kind))
@@ -164,6 +165,8 @@ def list_jobs(
         query = query.where(jobs.c.subject_id == subject_id)
     if state is not None:
         query = query.where(jobs.c.state == state)
+    if dead_letter is not None:
+        query = query.where(jobs.c.dead_letter == dead_letter)
     if before is not None:
         query = query.where(jobs.c.id < before)
     return fetch_all(connection, query.order_by(jobs.c.id.desc()).limit(limit), JobRow)

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 
 from app.api.http import event_stream
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
@@ -34,11 +34,14 @@ def list_jobs(
     jobs: Service,
     kind: JobKind | None = None,
     state: JobState | None = None,
+    dead_letter: Annotated[
+        bool | None, Query(description="`true`: only jobs that stopped the processes that worked on them.")
+    ] = None,
     limit: PageSize = 100,
     before: LastId = None,
 ) -> Response:
     """Jobs of all kinds that the key may see, newest first."""
-    page, last = jobs.page(caller, kind=kind, state=state, before=before, limit=limit)
+    page, last = jobs.page(caller, kind=kind, state=state, dead_letter=dead_letter, before=before, limit=limit)
     return page_response(request, page, before=last)
 
 

@@ -39,6 +39,10 @@ class JobDocument(TypedDict):
     started_at: Annotated[datetime | None, Field(description="When it was started first.")]
     finished_at: datetime | None
     error: Annotated[ErrorDocument | None, Field(description="Why there is no result.")]
+    dead_letter: Annotated[
+        bool,
+        Field(description="It failed because it stopped the processes that worked on it, or exceeded their limits."),
+    ]
     links: JobLinks
 
 
@@ -64,6 +68,7 @@ def job_document(job: JobRow, now: datetime) -> JobDocument:
         "started_at": job.started_at,
         "finished_at": job.finished_at,
         "error": cast("ErrorDocument | None", job.error),
+        "dead_letter": job.dead_letter,
         "links": _links(job),
     }
 

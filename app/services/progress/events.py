@@ -13,6 +13,7 @@ from app.registry import events as store
 from app.registry.database import Database
 from app.registry.tenancy import across_agencies
 from app.services.access.access import Caller
+from app.services.progress.kinds import visible_kinds
 
 
 class EventDocument(TypedDict):
@@ -43,9 +44,10 @@ class AgencyEvents:
             return store.newest_event(connection, caller.agency_id)
 
     def list(self, caller: Caller, after: int, limit: int = 100) -> list[EventDocument]:
-        """Events after one, oldest first."""
+        """Events after one, oldest first; those of jobs only where the caller may read jobs of the kind."""
+        kinds = visible_kinds(caller)
         with self._database.read() as connection:
-            rows = store.list_events(connection, caller.agency_id, after=after, limit=limit)
+            rows = store.list_events(connection, caller.agency_id, after=after, job_kinds=kinds, limit=limit)
         return [cast("EventDocument", row._asdict()) for row in rows]
 
     def newest_of(self, agency_ids: Sequence[str]) -> dict[str, int]:

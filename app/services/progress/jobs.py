@@ -44,15 +44,15 @@ class AllJobs:
             return _visible(connection, caller, job_id)
 
     def page(
-        self, caller: Caller, *, kind: JobKind | None = None, state: str | None = None, before: str | None = None,
-        limit: int = 100,
+        self, caller: Caller, *, kind: JobKind | None = None, state: str | None = None, dead_letter: bool | None = None,
+        before: str | None = None, limit: int = 100,
     ) -> tuple[JobPage, str | None]:  # fmt: skip
         """A page of jobs, newest first, and the id to continue before."""
         kinds = [one for one in visible_kinds(caller) if kind is None or one == kind]
         with self._database.read() as connection:
             rows = store.list_jobs(
                 connection, caller.agency_id, kinds,
-                state=state, before=before, limit=limit + 1, holder_id=caller.own_key_id,
+                state=state, before=before, limit=limit + 1, holder_id=caller.own_key_id, dead_letter=dead_letter,
             )  # fmt: skip
         now = self.clock()
         page = JobPage(items=[job_document(row, now) for row in rows[:limit]])

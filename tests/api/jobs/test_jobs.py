@@ -275,6 +275,40 @@ def test_events_of_an_agency_are_a_stream_that_misses_nothing(server: LiveServer
     assert [event["kind"] for event in client.get(page.links["next"]["url"]).json()["items"]] == ["job.failed"]
 
 
+def test_events_of_jobs_are_for_the_scopes_that_may_read_them(server: LiveServer) -> None:
+    name = f"events {server.url}"
+    sse = {"Accept": "text/event-stream", "Last-Event-ID": "0"}
+    with (
+        server.agency(name, Scope.ADMIN) as admin, server.agency(name) as planner,
+        server.agency(name, Scope.VIEWER) as viewer, server.agency(name, Scope.VEHICLE) as vehicle,
+        server.agency("strangers") as stranger,
+    ):  # fmt: skip
+        wanted = [JobKind.AUDIT, JobKind.REPROCESS, JobKind.IMPORT, JobKind.DECODE]
+        for kind in wanted:
+            finish(server, add(server, admin, kind))
+        finish(server, add(server, stranger, JobKind.DECODE))
+        for reader, seen in ((admin, wanted), (planner, wanted[2:]), (viewer, wanted[3:])):
+            items = reader.get("/v1/events").json()["items"]
+            assert [event["detail"]["job_kind"] for event in items] == seen
+            stream = Reader(reader, "/v1/events", **sse)
+            assert [stream.next()["data"]["detail"]["job_kind"] for _ in seen] == seen
+            stream.leave()
+        refused(vehicle.get("/v1/events"), 403, "not-allowed")
+
+
+def test_dead_letters_are_listed_with_their_reasons(server: LiveServer, client: httpx.Client) -> None:
+    dead, failed = add(server, client, JobKind.DECODE), add(server, client, JobKind.DECODE)
+    reason = error_document(UnreadableUpload("the file stopped the decoder process, twice", field="file"))
+    finish(server, dead, "failed", error=reason, dead_letter=True)
+    finish(server, failed, "failed", error=error_document(UnreadableUpload("no frame", field="file")))
+    (found,) = client.get("/v1/jobs?dead_letter=true").json()["items"]
+    assert (found["id"], found["dead_letter"], found["state"]) == (dead.id, True, "failed")
+    assert found["error"]["detail"] == "the file stopped the decoder process, twice"
+    assert [job["id"] for job in client.get("/v1/jobs?state=failed&dead_letter=false").json()["items"]] == [failed.id]
+    with server.agency("strangers") as stranger:
+        assert stranger.get("/v1/jobs?dead_letter=true").json()["items"] == []
+
+
 def test_a_server_that_stops_ends_its_streams(serve: Callable[..., LiveServer], settings: Any) -> None:
     server = serve(settings)
     with server.client() as client:
