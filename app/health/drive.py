@@ -121,21 +121,21 @@ def _median(values: Floats) -> Floats:
 def _read_probabilities(passes: Sequence[Pass], vehicle: VehicleState) -> Floats:
     """That this vehicle reads each marker, from the markers beside it and from its last minutes; 0 says nothing."""
     expected = np.array([one.expected for one in passes])
-    tells = expected >= MIN_EXPECTED
+    enough = expected >= MIN_EXPECTED
     families = [one.family for one in passes]
-    reads = np.nansum(_beside(np.where(tells, [one.read for one in passes], np.nan).astype(float), families), axis=1)
-    others = np.nansum(_beside(np.where(tells, expected, np.nan), families), axis=1)
+    reads = np.nansum(_beside(np.where(enough, [one.read for one in passes], np.nan).astype(float), families), axis=1)
+    others = np.nansum(_beside(np.where(enough, expected, np.nan), families), axis=1)
     alive = reads + vehicle.reads
     recent = 1.0 + min(vehicle.expected, RECENT_PASSES)
     record = recent * min((vehicle.reads + 1.0) / (vehicle.expected + 1.0), 1.0)
     read = np.array([one.read for one in passes], dtype=np.float64)
     alike = (np.array(families)[:, None] == np.array(families)).astype(np.float64)
-    all_reads, all_others = alike @ (tells * read) - tells * read, alike @ (tells * expected) - tells * expected
+    all_reads, all_others = alike @ (enough * read) - enough * read, alike @ (enough * expected) - enough * expected
     rate = np.minimum(
         (reads + record) / (others + recent + DOUBT_PASSES), (all_reads + record) / (all_others + recent + DOUBT_PASSES)
     )
     probability = np.minimum(expected * np.clip(rate, *RATE_LIMITS), _MAX_PROBABILITY)
-    return np.where(tells & (alive >= MIN_ALIVE), probability, 0.0)
+    return np.where(enough & (alive >= MIN_ALIVE), probability, 0.0)
 
 
 def _offsets(passes: Sequence[Pass], vehicle: VehicleState) -> tuple[Floats, Floats, tuple[float, float] | None]:

@@ -90,7 +90,7 @@ def add_markers(
 ) -> None:
     """Store new markers of the entry's agency, each with the first version of its history.
 
-    The columns are those of `MarkerRow`, the rows in the order of their ids; `kind` tells a version's kind from the
+    The columns are those of `MarkerRow`, the rows in the order of their ids; `kind` distinguishes a version's kind from the
     status.
     """
     kinds = [str(kind(status)) for status in columns.values("status")]

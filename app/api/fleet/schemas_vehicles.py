@@ -78,7 +78,7 @@ class VehicleIn(StrictModel):
     model_config = ConfigDict(json_schema_extra={"examples": [{"name": "BUS-7", "profile": PROFILE_EXAMPLE}]})
 
     name: Name = Field(description="What uploads call it; each name once in an agency.")
-    note: Note | None = Field(None, description="Make, number plate, whatever tells it apart.")
+    note: Note | None = Field(None, description="Make, number plate, whatever distinguishes it.")
     profile: ProfileIn = Field(default_factory=ProfileIn)
 
     @field_validator("name")

@@ -102,7 +102,7 @@ async def _events(row: JobRow, watch: Watch[JobRow], clock: Clock, seen: str | N
 
 
 def _event_id(row: JobRow) -> str:
-    """What tells two states of a job apart."""
+    """What distinguishes two states of a job."""
     return f"{row.state}.{row.attempts}.{row.steps_done or 0}.{row.progress:.6f}"
 
 

@@ -26,7 +26,7 @@ _LOG = structlog.get_logger(__name__)
 
 
 class _Follower(Protocol[StateT_contra]):
-    def tell(self, state: StateT_contra, /) -> None:
+    def notify(self, state: StateT_contra, /) -> None:
         """Note a state."""
 
 
@@ -52,7 +52,7 @@ class Watch(Generic[StateT]):
 
     @contextmanager
     def following(self, followed_id: str, follower: _Follower[StateT]) -> Iterator[None]:
-        """Have a follower told of states in a block."""
+        """Notify a follower of states while a block runs."""
         self._followers[followed_id].add(follower)
         if not self.is_looking:
             self._task = asyncio.create_task(self._look())
@@ -75,7 +75,7 @@ class Watch(Generic[StateT]):
                 states = {}
             for followed_id, state in states.items():
                 for follower in self._followers.get(followed_id, ()):
-                    follower.tell(state)
+                    follower.notify(state)
             await asyncio.sleep(self._tick_s)
 
 
@@ -111,7 +111,7 @@ class JobFollower:
         self._changed = _Flag()
         self._note(row)
 
-    def tell(self, row: JobRow) -> None:
+    def notify(self, row: JobRow) -> None:
         """Replace the state."""
         if _progress_of(row) != _progress_of(self.row):
             self.row = row
@@ -137,7 +137,7 @@ class JobFollower:
 
 
 def _progress_of(row: JobRow) -> tuple[object, ...]:
-    """What a follower is told of; a row that was read for a stream has neither input nor result."""
+    """The state that a follower gets; a row that was read for a stream has neither input nor result."""
     return row.state, row.attempts, row.progress, row.steps_done, row.steps_total, row.cancel_requested
 
 
@@ -154,7 +154,7 @@ class AgencyFollower:
         self.after = after
         self._newer = _Flag()
 
-    def tell(self, newest: int) -> None:
+    def notify(self, newest: int) -> None:
         """There are events up to this one."""
         if newest > self.after:
             self._newer.set()

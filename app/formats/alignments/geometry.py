@@ -33,7 +33,7 @@ class LineStyle(StrEnum):
 
 
 class EventKind(StrEnum):
-    """What a vehicle is told of ahead of time."""
+    """What a vehicle knows ahead of time."""
 
     STOP_LINE = "stop_line"
     JUNCTION = "junction"

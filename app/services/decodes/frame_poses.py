@@ -245,11 +245,11 @@ def find_gaps(times: Sequence[tuple[int, datetime | None]]) -> tuple[list[GapDoc
 
 def describe_report(name: str, report: LogReport) -> list[str]:
     """Warnings of reading a list or a track."""
-    told = [f"{name}: {warning}" for warning in report.warnings]
+    notes = [f"{name}: {warning}" for warning in report.warnings]
     if report.left_out_count:
         first = report.left_out[0]
-        told.append(f"{name}: {report.left_out_count} rows were left out; row {first.entry}: {first.reason}")
-    return told
+        notes.append(f"{name}: {report.left_out_count} rows were left out; row {first.entry}: {first.reason}")
+    return notes
 
 
 def _gap(after: int, before: int, seconds: float, reason: str) -> GapDocument:

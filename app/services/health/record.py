@@ -108,7 +108,7 @@ def recompute_health(connection: sa.Connection, agency_id: str, now: datetime) -
 
 
 def _short(agency_id: str, vehicle: str) -> str:
-    """A vehicle in the states: enough to tell vehicles apart, and not its id."""
+    """A vehicle in the states: enough to distinguish vehicles, and not its id."""
     return hashlib.blake2s(f"{agency_id} {vehicle}".encode(), digest_size=8).hexdigest()
 
 

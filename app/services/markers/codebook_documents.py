@@ -140,7 +140,7 @@ def rules_columns(rules: CodebookRules) -> RulesDocument:
 
 
 def design_figures(design: TagDesign, rules: CodebookRules) -> FiguresDocument:
-    """How many codes a design has, how many of them fit the rules, and how many are told apart when all are used."""
+    """How many codes a design has, how many fit the rules, and how many can be distinguished when all are used."""
     fitting = codebook_capacity(design, rules, max_count=MAX_COUNTED)
     apart = distinguishable(design, rules.conditions, accuracy=_ACCURACY)
     return {

@@ -90,7 +90,7 @@ class JobFiles:
         if job.state != "done" or job.result is None:
             raise Conflict(
                 f"the job is {job.state}", field="job_id", limit="jobs that are done",
-                cure=f"GET /v1/jobs/{job_id}/events tells when it is",
+                cure=f"GET /v1/jobs/{job_id}/events reports when it is",
             )  # fmt: skip
         if job.result.get("blob_key") is None:
             raise NotFound(
