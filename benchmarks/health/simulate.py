@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from zlib import crc32
 
 import numpy as np
 
@@ -207,7 +208,10 @@ def _pass(
     if name != "cerpm":
         is_reversed = bool((fault == "wrong-way") ^ is_wrong_way ^ (rng.random() < 0.001))
     quality = (
-        light + rng.normal(0.0, 1.0) + 0.5 * (hash(marker_id) % 100 / 50 - 1) - (4.0 if fault == "fading" else 0.0)
+        light
+        + rng.normal(0.0, 1.0)
+        + 0.5 * (crc32(marker_id.encode()) % 100 / 50 - 1)
+        - (4.0 if fault == "fading" else 0.0)
     )
     return Pass(
         marker_id, name, True, expected, along, (float(offset[0]), float(offset[1])), sigma, 0.1, name == "cerpm",
