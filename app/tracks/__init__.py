@@ -3,7 +3,7 @@
 The values are in `types`, `estimate` leads through the steps: the clocks of sensors that know their speed are aligned
 (`speed_alignment`), the largest set of fixes that agree starts the filter (`consensus`), the error-state Kalman filter
 and its smoother run to and fro along the drive (`kernel`), and after each round fixes are gated by their distance to
-the track that the others give.
+the track that the others give. Positions of the vehicle's own receiver come last (`receiver`).
 """
 
 from app.tracks.estimate import estimate_track
@@ -15,6 +15,7 @@ from app.tracks.types import (
     LanePath,
     LeftOutReason,
     PositionFix,
+    ReceiverResult,
     Samples,
     Track,
     TrackGap,
@@ -30,6 +31,7 @@ __all__ = [
     "LanePath",
     "LeftOutReason",
     "PositionFix",
+    "ReceiverResult",
     "Samples",
     "Track",
     "TrackGap",

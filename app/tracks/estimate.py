@@ -28,6 +28,7 @@ from app.tracks.measure import (
     sample_rows,
 )
 from app.tracks.motion import BIAS, CLOCKS, HEADING, NORTH, SCALE, SPEED, WANDER, YAW_RATE, Motion
+from app.tracks.receiver import believed, is_receiver, receiver_results
 from app.tracks.results import collect_track
 from app.tracks.speed_alignment import align_clocks
 from app.tracks.types import Bools, Clock, Floats, Ints, PositionFix, Track, TrackInput, TrackRules
@@ -68,20 +69,41 @@ class Segment:
 
 @dataclass(slots=True, eq=False)
 class Smoothed:
-    """The drive after the last round."""
+    """The drive after the last round.
+
+    Attributes
+    ----------
+    states : ndarray, shape (N, n)
+    position_m2 : ndarray, shape (N, 3)
+        East-east, east-north, north-north.
+    heading_rad2 : ndarray, shape (N,)
+    ends : ndarray, shape (2, n)
+        Variances of the first and of the last state.
+    used : ndarray of bool, shape (K,)
+    square : ndarray, shape (K,)
+        Squared distances of the fixes from the track by all others.
+    residual_m : ndarray, shape (K, 3)
+        From the track by all others.
+    offset_m, spread : ndarray, shape (K, 3) and (K, 3, 3)
+        From the track, and its covariance there.
+    """
 
     states: Floats
-    covs: Floats
+    position_m2: Floats
+    heading_rad2: Floats
+    ends: Floats
     used: Bools
     square: Floats
     residual_m: Floats
+    offset_m: Floats
+    spread: Floats
     rounds: int
     path_points: int
 
 
 @dataclass(slots=True, eq=False)
 class _Drive:
-    """What stays the same from round to round."""
+    """What stays the same from round to round; `markers` are the fixes that the drive is placed by first."""
 
     given: TrackInput
     rules: TrackRules
@@ -91,6 +113,7 @@ class _Drive:
     segments: list[Segment]
     segment_of: Ints
     driven: DeadReckoning
+    markers: Bools
     paths: list[PathIndex] = field(default_factory=list)
 
     def offsets(self, states: Floats | None) -> Floats:
@@ -138,14 +161,21 @@ def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
     segment_of, fallen = split_where_time_falls(fixes, segment_of, segments)
     driven = dead_reckon(base, given.speeds, given.headings, {name: clock.offset_s for name, clock in clocks.items()})
     paths = [index for path in given.paths if (index := path_index(path)) is not None]
-    drive = _Drive(given, rules, base, fixes, fix_arrays(fixes), segments, segment_of, driven, paths)
+    receiver = is_receiver(fixes)
+    markers = np.ones_like(receiver) if receiver.all() else ~receiver
+    drive = _Drive(given, rules, base, fixes, fix_arrays(fixes), segments, segment_of, driven, markers, paths)
     smoothed = _smooth(drive)
     smoothed = _with_jumps(drive, smoothed)
+    factor = np.ones(len(fixes))
+    if not markers.all():
+        drive.arrays, factor = believed(fixes, drive.arrays, smoothed)
+        smoothed = _smooth(drive, known=smoothed)
     if fallen:
         warnings.append("times of a sensor run backwards: its clock was set; each part has an offset of its own")
-    return collect_track(
+    track = collect_track(
         rules, base, fixes, drive.segments, drive.segment_of, given.clocks, smoothed, pauses, tuple(warnings)
     )
+    return replace(track, receivers=receiver_results(fixes, factor, smoothed.used))
 
 
 def _checked_clocks(given: TrackInput) -> dict[str, Clock]:
@@ -174,12 +204,12 @@ def _in_time_order(given: TrackInput, clocks: dict[str, Clock]) -> tuple[Positio
 
 
 def _reference(given: TrackInput, fixes: tuple[PositionFix, ...]) -> str:
-    """The clock that all others are compared with: of most speeds, else of most fixes."""
+    """The clock that all others are compared with: of most speeds, else of most fixes by markers."""
     weight: Counter[str] = Counter({clock.name: 0 for clock in given.clocks})
     for series in given.speeds:
-        weight[series.clock] += 1000 * series.time_s.size
+        weight[series.clock] += 1_000_000 * series.time_s.size
     for fix in fixes:
-        weight[fix.clock] += 1
+        weight[fix.clock] += 1 if fix.marker_id is None else 1000
     return min(weight, key=lambda name: (-weight[name], name))
 
 
@@ -192,41 +222,47 @@ def _places(segments: list[Segment]) -> list[int]:
     return [CLOCKS + sum(unknown[:k]) if unknown[k] else -1 for k in range(len(segments))]
 
 
-def _smooth(drive: _Drive, *, clock_s: float = 0.0) -> Smoothed:
-    """Rounds of filter, smoother and gate until nothing changes; `clock_s` lets offsets of clocks change."""
+def _smooth(drive: _Drive, *, clock_s: float = 0.0, known: Smoothed | None = None) -> Smoothed:
+    """Rounds of filter, smoother and gate until nothing changes; `clock_s` lets offsets of clocks change.
+
+    `known` is the drive by its markers alone, which positions of a receiver are added to.
+    """
     places = _places(drive.segments)
     for entry, own in zip(drive.segments, places, strict=True):
         entry.place = own
     place = max(CLOCKS, max(places) + 1)
-    used, turn, scale = _start_set(drive)
-    start, start_cov = _start_state(drive, used, turn, scale, place)
+    chain, turn, scale = _start_set(drive)
+    start, start_cov = _start_state(drive, chain, turn, scale, place)
+    used, decided = (chain, drive.markers) if known is None else (known.used, ~drive.markers)
     motion = _MOTION._replace(
         wander_m=drive.rules.wander_m, wander_length_m=drive.rules.wander_length_m, clock_s=clock_s
     )
     gate2, gate3 = (float(scipy.stats.chi2.isf(drive.rules.outlier_probability, dof)) for dof in (2, 3))
     gate = np.where(np.isfinite(drive.arrays.heading_rad), gate3, gate2)
-    states, covs = None, None
-    around = np.full((drive.base.count, place), np.nan)
-    square, residual = np.zeros(len(used)), np.zeros((len(used), 3))
+    states, position = (None, None) if known is None else (known.states, known.position_m2)
+    around = np.full((drive.base.count, place), np.nan) if known is None else known.states
     rounds, path_points = 0, 0
     for rounds in range(1, MAX_ROUNDS + 1):
-        measurements, where, path_points = _measurements(drive, states, covs, used)
-        new_states, new_covs = kernel.filter_track(drive.base.step_s, start, start_cov, around, measurements, motion)
-        kernel.smooth_track(drive.base.step_s, new_states, new_covs, around, motion)
-        square, residual, smoothed, spread = kernel.fix_distances(measurements, where, new_states, new_covs)
+        measurements, where, path_points = _measurements(drive, states, position, used)
+        new_states, covs = kernel.filter_track(drive.base.step_s, start, start_cov, around, measurements, motion)
+        kernel.smooth_track(drive.base.step_s, new_states, covs, around, motion)
+        square, residual, smoothed, spread = kernel.fix_distances(measurements, where, new_states, covs)
+        position, heading = covs[:, [0, 0, 1], [0, 1, 1]], covs[:, HEADING, HEADING].copy()
+        ends = np.array([np.diag(covs[0]), np.diag(covs[-1])])
+        del covs  # the largest array by far: not two of them at once
         square = passage_distances(drive.arrays, used, square, measurements.noise[where], smoothed, spread)
         moved = _moved(states, new_states)
-        states, covs, around = new_states, new_covs, new_states
-        if rounds < 2:
+        states, around = new_states, new_states
+        if rounds < 2 and known is None:
             continue
-        changed = used if clock_s > 0 else _gate(drive, used, square, gate)
+        changed = used if clock_s > 0 else _gate(drive, used, decided, square, gate)
         if ((changed == used).all() and moved) or (clock_s > 0 and rounds == _EXPLORING_ROUNDS):
             break
         if rounds < MAX_ROUNDS:
             used = changed
     assert states is not None
-    assert covs is not None
-    return Smoothed(states, covs, used, square, residual, rounds, path_points)
+    assert position is not None
+    return Smoothed(states, position, heading, ends, used, square, residual, smoothed, spread, rounds, path_points)
 
 
 def _moved(before: Floats | None, after: Floats) -> bool:
@@ -239,7 +275,7 @@ def _moved(before: Floats | None, after: Floats) -> bool:
 
 
 def _measurements(
-    drive: _Drive, states: Floats | None, covs: Floats | None, used: Bools
+    drive: _Drive, states: Floats | None, position_m2: Floats | None, used: Bools
 ) -> tuple[kernel.Measurements, Ints, int]:
     offsets = drive.offsets(states)
     names = {entry.clock.name: k for k, entry in reversed(list(enumerate(drive.segments)))}
@@ -252,26 +288,26 @@ def _measurements(
             k = names[series.clock]
             parts.append(sample_rows(drive.base, series, kind, int(places[k]), float(offsets[k]), rates))
     path_points = 0
-    if states is not None and covs is not None:
+    if states is not None and position_m2 is not None:
         for path in drive.paths:
-            rows = path_rows(drive.base, path, states, covs, drive.rules)
+            rows = path_rows(drive.base, path, states, position_m2, drive.rules)
             path_points += len(rows.node)
             parts.append(rows)
     return *in_order(parts), path_points
 
 
-def _gate(drive: _Drive, used: Bools, square: Floats, gate: Floats) -> Bools:
-    """Leave out the worst fix in each stretch, and take back those that fit."""
+def _gate(drive: _Drive, used: Bools, decided: Bools, square: Floats, gate: Floats) -> Bools:
+    """Leave out the worst fix in each stretch, and take back those that fit; of those that are decided on."""
     changed = used.copy()
     time = drive.arrays.time_s + np.array([entry.clock.offset_s for entry in drive.segments])[drive.segment_of]
-    bad = np.flatnonzero(used & (square > gate))
+    bad = np.flatnonzero(used & decided & (square > gate))
     for k in bad[np.argsort(-square[bad])]:
         near = np.abs(time - time[k]) <= _NEIGHBOURS_S
         if not (near & used & ~changed).any():
             changed[k] = False
-            if (passage := drive.arrays.passage[k]) >= 0:  # the same wrong marker in other frames
-                changed &= ~((drive.arrays.passage == passage) & (square > gate))
-    back = ~used & (square < _READMIT * gate)
+            # the same wrong marker in other frames
+            changed &= ~((drive.arrays.passage == drive.arrays.passage[k]) & (square > gate))
+    back = ~used & decided & (square < _READMIT * gate)
     return changed | back
 
 
@@ -279,12 +315,17 @@ def _gate(drive: _Drive, used: Bools, square: Floats, gate: Floats) -> Bools:
 
 
 def _start_set(drive: _Drive) -> tuple[Bools, float, float]:
-    node, _after = drive.base.nearest(drive.arrays.time_s + drive.offsets(None)[drive.segment_of])
+    who = np.flatnonzero(drive.markers)
+    segment = drive.segment_of[who]
+    node, _after = drive.base.nearest(drive.arrays.time_s[who] + drive.offsets(None)[segment])
     clock_sigma = np.array([0.0 if entry.is_reference else entry.clock.sigma_s for entry in drive.segments])
-    return consistent_chain(
-        local_m(drive.fixes), drive.arrays.sigma_m, drive.base.time_s[node], node, drive.segment_of,
-        clock_sigma[drive.segment_of], drive.driven,
+    chain, turn, scale = consistent_chain(
+        local_m(drive.fixes)[who], drive.arrays.sigma_m[who], drive.base.time_s[node], node, segment,
+        clock_sigma[segment], drive.driven,
     )  # fmt: skip
+    used = np.zeros(len(drive.fixes), bool)
+    used[who] = chain
+    return used, turn, scale
 
 
 def _start_state(drive: _Drive, chain: Bools, turn: float, scale: float, size: int) -> tuple[Floats, Floats]:
@@ -349,7 +390,7 @@ def _start_heading(drive: _Drive, chain: Bools, turn: float) -> tuple[float, flo
 def _with_jumps(drive: _Drive, smoothed: Smoothed) -> Smoothed:
     """Give a clock that was set during the drive another offset from then on, if more fixes fit then."""
     for _try in range(MAX_JUMPS):
-        if (~smoothed.used).sum() < _MIN_LEFT_OUT:
+        if (drive.markers & ~smoothed.used).sum() < _MIN_LEFT_OUT:
             break
         segments, segment_of = list(drive.segments), drive.segment_of
         if not _split_at_jump(drive):

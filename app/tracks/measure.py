@@ -18,6 +18,7 @@ COMMON_POSE_SHARE = 0.1
 """Part of the variance of a pose that all frames past one marker share: calibration and mount of the camera. Source:
 by hand, no measurement kept."""
 _PASS_S = 30.0  # [s] fixes by a marker within this are one pass; source: by hand
+_RECEIVER_S = 60.0  # [s] in which the error of a receiver stays; source: by hand, reflections beside one street
 _RATE_OVER_S = 3.0  # [s] source: by hand, braking takes longer
 _NO_HEADING = 1e6  # [rad2] variance of a heading that is not known
 _MIN_SIGMA_M = 1e-3  # [m] no fix is better; source: by hand, a tenth of the best survey
@@ -44,7 +45,7 @@ class FixArrays:
     cross_m_rad : ndarray, shape (K, 2)
     common_m2 : ndarray, shape (K,)
     passage : ndarray of int, shape (K,)
-        The same for fixes by one marker in one pass; -1: alone.
+        The same for fixes by one marker in one pass, and for positions of a receiver in one minute.
     """
 
     time_s: Floats
@@ -74,13 +75,13 @@ def fix_arrays(fixes: tuple[PositionFix, ...]) -> FixArrays:
     known = np.isfinite(heading) & np.isfinite(sigma) & (sigma > 0)
     cross = np.array([fix.heading_cross_m_rad for fix in fixes], float).reshape(-1, 2)
     time = np.array([fix.time_s for fix in fixes], float)
-    passage, open_passes = np.full(len(fixes), -1), dict[tuple[str, str | None], tuple[int, float]]()
+    passage, open_passes = np.zeros(len(fixes), np.int64), dict[tuple[str, str | None], tuple[int, float]]()
     for k, fix in enumerate(fixes):
-        if fix.marker_id is None:
-            continue
-        number, until = open_passes.get((fix.clock, fix.marker_id), (k, -math.inf))
-        number = number if fix.time_s <= until else k
-        passage[k], open_passes[fix.clock, fix.marker_id] = number, (number, fix.time_s + _PASS_S)
+        whose = (fix.clock, fix.marker_id)
+        number, until = open_passes.get(whose, (k, -math.inf))
+        number, until = (number, until) if fix.time_s <= until else (k, fix.time_s + _RECEIVER_S)
+        passage[k] = number
+        open_passes[whose] = number, until if fix.marker_id is None else fix.time_s + _PASS_S
     return FixArrays(
         time,
         np.radians(np.array([fix.lon_deg for fix in fixes], float)),
@@ -114,8 +115,7 @@ def fix_rows(
     """
     count = len(fixes.time_s)
     node, after = base.nearest(fixes.time_s + offset_s)
-    passes = np.where(fixes.passage >= 0, fixes.passage, np.arange(count))
-    together = np.maximum(np.bincount(passes[used], minlength=max(count, 1))[passes], 1) if count else np.ones(0)
+    together = np.maximum(np.bincount(fixes.passage[used], minlength=max(count, 1))[fixes.passage], 1)
     trace = (fixes.cov_m2[:, 0] + fixes.cov_m2[:, 2]) / 2
     common = np.minimum(fixes.common_m2, 0.95 * trace)
     shared = common + COMMON_POSE_SHARE * (trace - common)
@@ -196,7 +196,7 @@ def path_index(path: LanePath) -> PathIndex | None:
     return PathIndex(lon, lat, heading, max(path.sigma_m, _MIN_PATH_SIGMA_M), tree)
 
 
-def path_rows(base: TimeBase, path: PathIndex, states: Floats, covs: Floats, rules: TrackRules) -> Measurements:
+def path_rows(base: TimeBase, path: PathIndex, states: Floats, position_m2: Floats, rules: TrackRules) -> Measurements:
     """The lane's path where the vehicle drives along it, every ten metres."""
     east, north = metres_per_radian(states[:, NORTH])
     driven = np.concatenate([[0.0], np.cumsum(np.abs(states[1:, SPEED]) * base.step_s)])
@@ -216,7 +216,8 @@ def path_rows(base: TimeBase, path: PathIndex, states: Floats, covs: Floats, rul
         (states[nodes, NORTH] - path.lat_rad[near]) * north[nodes],
     ])  # fmt: skip
     across = (off * left).sum(1)
-    spread = np.einsum("ki,kij,kj->k", left, covs[nodes][:, :2, :2], left) + rules.wander_m**2 + path.sigma_m**2
+    products = np.column_stack([left[:, 0] ** 2, 2 * left[:, 0] * left[:, 1], left[:, 1] ** 2])
+    spread = (position_m2[nodes] * products).sum(1) + rules.wander_m**2 + path.sigma_m**2
     kept = (np.abs(way) > _SAME_WAY) & (np.abs(across) <= _PATH_SIGMAS * np.sqrt(spread))
     nodes, near, heading = nodes[kept], near[kept], heading[kept]
     count = len(nodes)
@@ -260,7 +261,7 @@ def passage_distances(
         From the track, and the track's covariance there.
     """
     result = square.copy()
-    numbers, counts = np.unique(fixes.passage[used & (fixes.passage >= 0)], return_counts=True)
+    numbers, counts = np.unique(fixes.passage[used], return_counts=True)
     upper = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     for number in numbers[counts > 1]:
         members = used & (fixes.passage == number)

@@ -44,15 +44,16 @@ def collect_track(
     margin = 1.0 + 3.0 * max(clock.sigma_s for clock in declared)
     first, last = base.start_s + margin, base.start_s + base.step_s * (base.count - 1) - margin
     regular = np.arange(first, max(last, first) + 1e-6, 1.0 / rules.rate_hz)
-    time = np.unique(np.round(np.concatenate([regular, fix_time[smoothed.used]]), 4))
+    by_marker = np.array([fix.marker_id is not None for fix in fixes], bool)
+    time = np.unique(np.round(np.concatenate([regular, fix_time[smoothed.used & by_marker]]), 4))
     place = np.clip((time - base.start_s) / base.step_s, 0, base.count - 1)
     low = np.minimum(place.astype(np.int64), max(base.count - 2, 0))
     share = (place - low)[:, None]
     high = np.minimum(low + 1, base.count - 1)
     state = (1 - share) * states[low] + share * states[high]
-    cov = (1 - share[:, :, None]) * smoothed.covs[low] + share[:, :, None] * smoothed.covs[high]
-    covariance = np.column_stack([cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]])
-    heading_sigma = np.degrees(np.sqrt(np.maximum(cov[:, HEADING, HEADING], 0.0)))
+    covariance = (1 - share) * smoothed.position_m2[low] + share * smoothed.position_m2[high]
+    heading_var = (1 - share[:, 0]) * smoothed.heading_rad2[low] + share[:, 0] * smoothed.heading_rad2[high]
+    heading_sigma = np.degrees(np.sqrt(np.maximum(heading_var, 0.0)))
     east, cross, north = covariance.T
     sigma = np.sqrt(np.maximum((east + north) / 2 + np.sqrt(((east - north) / 2) ** 2 + cross**2), 0.0))
     driven = np.concatenate([[0.0], np.cumsum(np.abs(states[1:, SPEED]) * base.step_s)])
@@ -60,7 +61,7 @@ def collect_track(
     in_gap, gaps = _gaps(rules, time, sigma, odometer, pauses)
     node, _after = base.nearest(fix_time)
     results = _fix_results(fixes, fix_time, smoothed, states[node, HEADING])
-    scale_var, bias_var = smoothed.covs[-1, SCALE, SCALE], smoothed.covs[-1, BIAS, BIAS]
+    scale_var, bias_var = smoothed.ends[1, SCALE], smoothed.ends[1, BIAS]
     return Track(
         time_s=time,
         lon_deg=(np.degrees(state[:, 0]) + 180.0) % 360.0 - 180.0,
@@ -98,6 +99,7 @@ def _fix_results(
             float(across[k]),
         )
         for k, fix in enumerate(fixes)
+        if fix.marker_id is not None
     )
 
 
@@ -112,7 +114,7 @@ def _clocks(
             state, sigma = ClockState.REFERENCE, 0.0
         elif entry.place >= 0:
             offset = float(smoothed.states[0, entry.place])
-            sigma = math.sqrt(max(float(smoothed.covs[0, entry.place, entry.place]), 0.0))
+            sigma = math.sqrt(max(float(smoothed.ends[0, entry.place]), 0.0))
             observed = sigma < _OBSERVED * entry.clock.sigma_s
             state = ClockState.ESTIMATED if observed else ClockState.NOT_OBSERVABLE
         low, high = (min(times), max(times)) if times else (math.nan, math.nan)

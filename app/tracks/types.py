@@ -89,7 +89,7 @@ class PositionFix:
     common_m2 : float
         Part of the variance of each axis that all fixes by the same marker share: its survey. [m2]
     marker_id : str or None
-        None for a position of the vehicle's receiver.
+        None for a position of the vehicle's own receiver.
     family : str
     source : str
         What it was read from, e.g. the id of a decode.
@@ -266,6 +266,27 @@ class FixResult:
 
 
 @dataclass(frozen=True, slots=True)
+class ReceiverResult:
+    """What became of the positions of one receiver.
+
+    Attributes
+    ----------
+    source, clock : str
+    used, left_out : int
+        Positions.
+    stated_m, believed_m : float
+        Median of their stated standard deviations, both axes together, and what the markers show of it. [m]
+    """
+
+    source: str
+    clock: str
+    used: int
+    left_out: int
+    stated_m: float
+    believed_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class ClockOffset:
     """The offset of a sensor's clock, from one time on.
 
@@ -314,6 +335,9 @@ class Track:
         East-east, east-north, north-north. [m2]
     heading_sigma_deg : ndarray, shape (N,)
     in_gap : ndarray of bool, shape (N,)
+    fixes : tuple of FixResult
+        By markers.
+    receivers : tuple of ReceiverResult
     """
 
     time_s: Floats
@@ -331,6 +355,7 @@ class Track:
     speed_scale: tuple[float, float]
     heading_bias_deg: tuple[float, float]
     path_points: int = 0
+    receivers: tuple[ReceiverResult, ...] = ()
     warnings: tuple[str, ...] = field(default=())
 
     @property

@@ -114,7 +114,7 @@ class StartedArchive:
         while self._waiting:
             frames.append(self._finish(self._waiting.popleft()))
         gaps, warnings = find_gaps([(frame.index, frame.captured_at) for frame in frames])
-        notes = DriveNotes((*self._places.warnings, *warnings), gaps)
+        notes = DriveNotes((*self._places.warnings, *warnings), gaps, receiver=self._places.receiver)
         return ArchiveSignal(frames, len(self._codebook), notes)
 
     def _result_so_far(self, frames: list[ReadFrame]) -> FramesResult:

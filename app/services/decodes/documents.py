@@ -27,6 +27,7 @@ from app.services.decodes.packet_documents import (
     PathLossDocument,
     ReceivedMarkerDocument,
 )
+from app.services.decodes.receiver_positions import ReceiverPositions
 from app.services.decodes.trace_documents import (
     CrossingDocument,
     NoiseDocument,
@@ -77,6 +78,7 @@ class DecodeDocument(DecodeHead):
     frames: NotRequired[list[FrameDocument]]
     plates: NotRequired[list[SeenPlateDocument]]
     gaps: NotRequired[list[GapDocument]]
+    receiver: NotRequired[ReceiverPositions | None]
     warnings: NotRequired[list[str]]
     fix: NotRequired[FixDocument | TagFixDocument | None]
     codebook_tags: NotRequired[int]

@@ -25,6 +25,7 @@ from app.markers.reading import PlateOutcome
 from app.services.decodes.fixes import Fix
 from app.services.decodes.frame_poses import FramePose, GapDocument
 from app.services.decodes.matching import FRAME_READERS
+from app.services.decodes.receiver_positions import ReceiverPositions
 from app.services.decodes.wording import count_of
 from app.services.error_documents import ErrorDocument, error_document
 from app.services.health.evidence import FrameHealth
@@ -85,12 +86,14 @@ class DriveNotes:
         As in `FramesResult`.
     searched : int or None
         Frames of a video, of which only those with readings are listed.
+    receiver : ReceiverPositions or None
     """
 
     warnings: Sequence[str] = ()
     gaps: Sequence[GapDocument] = ()
     plates: Sequence[SeenPlateDocument] = ()
     searched: int | None = None
+    receiver: ReceiverPositions | None = None
 
 
 class FramePoseDocument(TypedDict):
@@ -208,6 +211,7 @@ class FramesResult(TypedDict):
     frames: list[FrameDocument]
     plates: list[SeenPlateDocument]
     gaps: list[GapDocument]
+    receiver: ReceiverPositions | None
     warnings: list[str]
 
 
@@ -226,6 +230,7 @@ def frames_result(
         "frames": [_frame(frame) for frame in frames],
         "plates": list(notes.plates),
         "gaps": list(notes.gaps),
+        "receiver": notes.receiver,
         "warnings": list(notes.warnings),
     }
 

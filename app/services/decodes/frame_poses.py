@@ -21,6 +21,7 @@ from app.sensors.pose_track import PoseTrack
 from app.services.decoder_processes import Task
 from app.services.decodes.context import MAX_ACCURACY_M, CoarsePosition, DecodeContext
 from app.services.decodes.frame_terms import frame_terms
+from app.services.decodes.receiver_positions import ReceiverPositions, receiver_positions
 
 RADIUS_SIGMAS, LEAST_RADIUS_M = 4.0, 5.0
 """[1, m] radius round a pose that holds the vehicle with near certainty, over its standard deviation, and the least.
@@ -117,6 +118,11 @@ class FramePlaces:
         self._listed: Mapping[str, ListedFrame] = self._lists.frames.frames if self._lists.frames else {}
         self._track = self._lists.track or _track_of_list(self._listed)
         self.warnings = list(self._lists.warnings)
+
+    @property
+    def receiver(self) -> ReceiverPositions | None:
+        """The vehicle's positions by the list or the track."""
+        return receiver_positions(self._track)
 
     def check_names(self, names: Sequence[str]) -> None:
         """Warn of rows without a picture, pictures without a row, and names of more than one picture."""

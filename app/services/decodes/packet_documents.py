@@ -29,6 +29,7 @@ from app.services.decodes.lane_documents import (
 )
 from app.services.decodes.packet_matching import ReadPackets
 from app.services.decodes.packet_task import DriveFiles, LaneResult
+from app.services.decodes.receiver_positions import ReceiverPositions, receiver_positions
 from app.services.decodes.wording import count_of
 
 DECODER_VERSION = "cerpm/1"
@@ -164,6 +165,7 @@ class PacketsResult(TypedDict):
     steering: SteeringDocument | None
     overlay: OverlayDocument | None
     path_loss: PathLossDocument | None
+    receiver: ReceiverPositions | None
 
 
 def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -> PacketsResult:
@@ -193,6 +195,7 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
             "packets": path_loss.packets,
             "fitted_exponent": path_loss.fitted_exponent,
         },
+        "receiver": receiver_positions(files.track),
     }
 
 

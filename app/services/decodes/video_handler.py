@@ -35,6 +35,7 @@ from app.services.decodes.frame_task import FrameResult
 from app.services.decodes.frame_terms import frame_terms
 from app.services.decodes.kinds import DecodeKind
 from app.services.decodes.matching import FRAME_READERS, NearbyMarkers, find_nearby_markers
+from app.services.decodes.receiver_positions import ReceiverPositions
 from app.services.decodes.rules import DecodeRules
 from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
 from app.services.decodes.video_task import IndexVideoTask, SegmentResult, SegmentTask
@@ -56,11 +57,12 @@ class VideoSignal:
     searched: int = 0
     gaps: list[GapDocument] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    receiver: ReceiverPositions | None = None
 
     @property
     def notes(self) -> DriveNotes:
         """As the result has them."""
-        return DriveNotes(tuple(self.warnings), tuple(self.gaps), tuple(self.plates), self.searched)
+        return DriveNotes(tuple(self.warnings), tuple(self.gaps), tuple(self.plates), self.searched, self.receiver)
 
 
 class VideoHandler(UploadHandler[VideoSignal]):
@@ -156,6 +158,7 @@ class StartedVideo:
         ]  # fmt: skip
         if index.track is not None:
             self._places = FramePlaces(context, FrameLists(track=index.track))
+        self._signal.receiver = self._places.receiver
         self._began_at = index.created_at if index.has_clock else context.captured_at
         if self._began_at is None and index.created_at is not None:
             self._began_at = index.created_at

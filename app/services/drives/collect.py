@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any
 
@@ -22,6 +22,8 @@ HEADING_SIGMA_DEG = 0.5
 """Noise of a vehicle's heading besides its bias. [deg] Source: chosen by hand."""
 DEFAULT_CLOCK_SIGMA_S = 0.5
 """Error of a clock that nothing is declared of. [s] Source: chosen by hand; a camera's clock set by NTP once a day."""
+MIN_RECEIVER_M = 0.02
+"""Least standard deviation of a receiver's position, both axes together. [m] Source: by hand; RTK, with its antenna."""
 _EPOCH_S = 1e9  # times beyond are seconds since 1970: no recording lasts 30 years
 _IN_USE = ("active", "surveyed", "built")
 
@@ -70,10 +72,12 @@ class Collected:
     left_out: list[LeftOutMarker] = field(default_factory=list)
     on_lane: list[LeftOutMarker] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    positions: list[PositionFix] = field(default_factory=list)
 
     def given(self, survey_m2: Mapping[str, float]) -> TrackInput:
         """The input of the track, with the survey's variance of each marker. [m2]"""
         fixes = tuple(_with_survey(fix, survey_m2.get(fix.marker_id or "", 0.0)) for fix in self.fixes)
+        fixes += tuple(self.positions)
         used = {fix.clock for fix in fixes} | {series.clock for series in (*self.speeds, *self.headings)}
         clocks = tuple(clock for name, clock in self.clocks.items() if name in used)
         return TrackInput(clocks, fixes, tuple(self.speeds), tuple(self.headings), tuple(self.paths))
@@ -119,6 +123,7 @@ def collect(rows: Sequence[tuple[DecodeClock, DecodeRow]], *, use_unfit: bool) -
             _add_packets(found, row)
         else:
             _add_frames(found, row, declared.clock, where, use_unfit)
+        _add_positions(found, row, clock)
     return found
 
 
@@ -222,6 +227,32 @@ def _add_packets(found: Collected, row: DecodeRow) -> None:
         (found.left_out if why else found.on_lane).append(entry)
 
 
+def _add_positions(found: Collected, row: DecodeRow, clock: Clock) -> None:
+    """Positions of the vehicle's own receiver, which has a clock of its own beside that of the decode's sensor."""
+    assert row.result is not None
+    positions = row.result.get("receiver")
+    if not positions:
+        return
+    own = replace(clock, name=f"{clock.name}, receiver")
+    columns = zip(*(positions[name] for name in ("time_s", "lon_deg", "lat_deg", "accuracy_m")), strict=True)
+    unknown = 0
+    for place, (time_s, lon_deg, lat_deg, accuracy_m) in enumerate(columns):
+        if not accuracy_m:
+            unknown += 1
+            continue
+        axis_m2 = max(accuracy_m, MIN_RECEIVER_M) ** 2 / 2
+        found.positions.append(
+            PositionFix(
+                own.name, time_s, lon_deg, lat_deg, (axis_m2, 0.0, axis_m2),
+                common_m2=axis_m2, family="receiver", source=row.id, place=place,
+            )
+        )  # fmt: skip
+    if unknown:
+        found.warnings.append(f"{unknown} positions of the receiver of decode {row.id} state no accuracy: not used")
+    if unknown < len(positions["time_s"]):
+        found.clocks.setdefault(own.name, own)
+
+
 def _refused(
     match: Mapping[str, Any], fix: Mapping[str, Any] | None, use_unfit: bool
 ) -> tuple[LeftOutReason | None, str]:
@@ -270,5 +301,4 @@ def _no_time(row: DecodeRow, where: str, what: str, cure: str) -> InvalidParamet
 def _with_survey(fix: PositionFix, variance_m2: float) -> PositionFix:
     if not variance_m2 or fix.marker_id is None:
         return fix
-    values = {name: getattr(fix, name) for name in fix.__dataclass_fields__}
-    return PositionFix(**{**values, "common_m2": variance_m2})
+    return replace(fix, common_m2=variance_m2)

@@ -21,6 +21,7 @@ TRACK_FILES = {
     "plot.svg": "image/svg+xml",
 }
 """Files of a drive with their media types."""
+_DOUBTED = 2.5  # times the stated standard deviation of a receiver, from which on it is said; source: by hand
 MAX_MARKERS = 2000
 """Markers in a drive's document; its GeoJSON has all."""
 
@@ -57,6 +58,17 @@ class DriveMarker(TypedDict):
     distance: Annotated[float | None, Field(description="Mahalanobis distance to the track by all others.")]
     along_m: Annotated[float | None, Field(description="From that track, forward positive.")]
     across_m: Annotated[float | None, Field(description="From that track, left positive.")]
+
+
+class DriveReceiver(TypedDict):
+    """Positions of the vehicle's own receiver, of one decode."""
+
+    decode_id: str
+    clock: str
+    used: int
+    left_out: Annotated[int, Field(description="Too far from the track by all others.")]
+    stated_m: Annotated[float, Field(description="Median of the standard deviations that the receiver states.")]
+    believed_m: Annotated[float, Field(description="The same, enlarged to what the markers show of it.")]
 
 
 class DriveGap(TypedDict):
@@ -98,6 +110,7 @@ class DriveReport(TypedDict):
     clocks: list[ClockDocument]
     gaps: list[DriveGap]
     markers: list[DriveMarker]
+    receivers: list[DriveReceiver]
     warnings: list[str]
 
 
@@ -203,7 +216,14 @@ def track_report(
             for gap in track.gaps
         ],
         "markers": markers[:MAX_MARKERS],
-        "warnings": [*warnings, *track.warnings, *_clock_warnings(track)],
+        "receivers": [
+            {
+                "decode_id": entry.source, "clock": entry.clock, "used": entry.used, "left_out": entry.left_out,
+                "stated_m": round(entry.stated_m, 3), "believed_m": round(entry.believed_m, 3),
+            }
+            for entry in track.receivers
+        ],
+        "warnings": [*warnings, *track.warnings, *_clock_warnings(track), *_receiver_warnings(track)],
     }  # fmt: skip
 
 
@@ -222,6 +242,15 @@ def _clock_warnings(track: Track) -> list[str]:
         f"the clock {clock.clock} was set before {time_text(clock.from_s)}: another offset holds from there on"
         for clock in jumped
         if clock.from_s == clock.from_s
+    ]
+
+
+def _receiver_warnings(track: Track) -> list[str]:
+    return [
+        f"the positions of the receiver of decode {entry.source} are further from the markers than their standard "
+        f"deviation of {entry.stated_m:.2g} m allows: {entry.believed_m:.2g} m were assumed"
+        for entry in track.receivers
+        if entry.believed_m > _DOUBTED * entry.stated_m
     ]
 
 

@@ -119,6 +119,17 @@ def frames(*times_s: float, late_s: float = 0.0, left_m: float = 0.0, **match: A
     return {"readings": readings, "frames": pictures}
 
 
+def receiver(*times_s: float, left_m: float = 0.0, accuracy_m: float | None = 1.0) -> dict[str, Any]:
+    """Positions as the decodes of frames, videos and packet logs keep them."""
+    places = [lon_lat(at_s, left_m) for at_s in times_s]
+    return {
+        "time_s": [BEGAN.timestamp() + at_s for at_s in times_s],
+        "lon_deg": [lon for lon, _lat in places],
+        "lat_deg": [lat for _lon, lat in places],
+        "accuracy_m": [accuracy_m] * len(times_s),
+    }
+
+
 def lane() -> dict[str, Any]:
     at = np.arange(-50.0, 900.0, 5.0)
     places = [wgs84_from_enu(np.array([x, 0.0, 0.0]), ORIGIN) for x in at]
@@ -226,6 +237,35 @@ def test_a_real_trace_becomes_a_drive(client: httpx.Client) -> None:
     first, last = place._lon_lat(bar_m), place._lon_lat(110.0 + bar_m)
     for end, true in ((path[0], first), (path[-1], last)):
         assert math.hypot((end[0] - true[0]) * 82500, (end[1] - true[1]) * 111000) < 8.0
+
+
+def test_positions_of_the_receiver_are_used_and_gated(server: LiveServer, client: httpx.Client) -> None:
+    bar = store(server, client, "trace", trace(), captured_at=BEGAN.isoformat())
+    every = [float(at) for at in range(2, 58, 5)]
+    good = {**lane(), "receiver": receiver(*every)}
+    biased = {**frames(8.0, 12.0), "receiver": receiver(*every, left_m=9.0, accuracy_m=0.03)}
+    unknown = {**frames(9.0), "receiver": receiver(*every, accuracy_m=None)}
+    logs = [store(server, client, kind, result) for kind, result in (("packets", good), ("archive", biased))]
+    silent = store(server, client, "archive", unknown)
+    drive = made(client, {"id": bar, "clock": "bar"}, *logs, silent)
+    by_decode = {entry["decode_id"]: entry for entry in drive["report"]["receivers"]}
+    assert list(by_decode) == logs
+    assert (by_decode[logs[0]]["used"], by_decode[logs[0]]["left_out"]) == (12, 0)
+    assert by_decode[logs[0]]["stated_m"] == by_decode[logs[0]]["believed_m"] == 1.0
+    assert by_decode[logs[1]]["believed_m"] > 4.0
+    assert all(marker["used"] for marker in drive["report"]["markers"] if marker["family"] != "cerpm")
+    warned = "\n".join(drive["report"]["warnings"])
+    assert f"decode {logs[1]} are further from the markers" in warned
+    assert f"decode {silent} state no accuracy" in warned
+    rows = list(csv.DictReader(io.StringIO(client.get(drive["links"]["csv"]).text)))
+    for row in rows[10:-10]:
+        _lon, lat = lon_lat((datetime.fromisoformat(row["time"]) - BEGAN).total_seconds())
+        assert abs(float(row["lat_deg"]) - lat) * 111200 < 0.3
+
+
+def test_a_drive_of_positions_alone_is_refused(server: LiveServer, client: httpx.Client) -> None:
+    alone = {"readings": [], "frames": [], "receiver": receiver(1.0, 6.0, 11.0)}
+    refused(make(client, store(server, client, "archive", alone)), 422, field="decodes")
 
 
 def test_an_idempotency_key_makes_one_drive(server: LiveServer, client: httpx.Client) -> None:
