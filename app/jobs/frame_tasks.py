@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from app.errors import ProcessStopped, WaymarkError
 from app.families.frames import FrameReader, FrameReading
 from app.families.plate.frames import PlateFrames
 from app.families.plate.plates import PLATE
@@ -14,7 +15,7 @@ from app.formats.images import Frame, load_image
 from app.jobs.memory_limit import memory_is_the_limit
 from app.markers.reading import PlateReading
 from app.plots.annotated_frame import draw_outlines, encode_picture
-from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameResult, FrameSearch
+from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameResult, FrameRunTask, FrameSearch
 from app.services.decodes.matching import FRAME_READERS
 
 DecodePlates = Callable[..., list[PlateReading]]
@@ -59,6 +60,19 @@ def find_markers(search: FrameSearch, loaded: LoadedFrame) -> FrameResult:
             readings += _Readers.by_family[name].read(frame.pixels, wanted, thermal=loaded.thermal)
         decode_ms = 1e3 * (time.perf_counter() - began)
     return FrameResult(frame.header, tuple(readings), loaded.load_ms, decode_ms)
+
+
+def decode_run(task: FrameRunTask, _before: None) -> tuple[FrameResult | WaymarkError, ...]:
+    """Frame by frame."""
+    results: list[FrameResult | WaymarkError] = []
+    for picture, search in task.frames:
+        try:
+            results.append(find_markers(search, load_frame(picture, None)))
+        except ProcessStopped:
+            raise
+        except WaymarkError as error:
+            results.append(error)
+    return tuple(results)
 
 
 def annotate_frame(task: AnnotationTask, _before: None) -> bytes:

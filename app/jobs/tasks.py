@@ -9,7 +9,7 @@ from app.jobs.artwork_tasks import draw_plate, write_sheets
 from app.jobs.calibration_tasks import calibrate_photos
 from app.jobs.decoder_process import ProcessIdTask, process_id
 from app.jobs.frame_list_tasks import read_frame_lists
-from app.jobs.frame_tasks import annotate_frame, find_markers, load_frame
+from app.jobs.frame_tasks import annotate_frame, decode_run, find_markers, load_frame
 from app.jobs.package_tasks import list_package_parts, write_package_manifest, write_package_part
 from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
 from app.jobs.plan_tasks import compare_plan, make_plan, summarize_road, write_file_of_plan, write_map
@@ -20,7 +20,7 @@ from app.jobs.track_tasks import write_track
 from app.jobs.video_tasks import decode_segment, index_frames
 from app.services.decoder_processes import Task
 from app.services.decodes.frame_poses import FrameListTask
-from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameSearch
+from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameRunTask, FrameSearch
 from app.services.decodes.packet_task import DriveTask, LaneTask, OverlayTask
 from app.services.decodes.trace_task import TraceTask
 from app.services.decodes.video_task import IndexVideoTask, SegmentTask
@@ -39,6 +39,7 @@ StepFunction = Callable[[Any, Any], Any]
 STEPS: dict[type, StepFunction] = {
     FramePicture: load_frame,
     FrameSearch: find_markers,
+    FrameRunTask: decode_run,
     AnnotationTask: annotate_frame,
     FrameListTask: read_frame_lists,
     TraceTask: decode_recording,

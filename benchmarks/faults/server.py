@@ -51,6 +51,21 @@ class FaultServer:
         }
         self.log = folder.with_name(folder.name + ".log")
         self.process: subprocess.Popen[bytes] | None = None
+        self.workers: list[subprocess.Popen[bytes]] = []
+
+    @property
+    def database_name(self) -> str:
+        """Of the database in PostgreSQL; empty for SQLite."""
+        return self.environment["WAYMARK_DATABASE_URL"].partition("?")[0].rpartition("/")[2]
+
+    def pids(self) -> list[int]:
+        """Of the process, and of the workers beside it."""
+        return [self.pid, *(worker.pid for worker in self.workers)]
+
+    def start_worker(self) -> None:
+        """Start `waymark worker` beside the server."""
+        with self.log.open("ab") as log:
+            self.workers.append(subprocess.Popen([*_COMMAND, "worker"], env=self.environment, stdout=log, stderr=log))
 
     @property
     def pid(self) -> int:
@@ -91,8 +106,11 @@ class FaultServer:
         """Ask the server to end; returns the seconds until it did."""
         assert self.process is not None
         began = time.monotonic()
-        self.process.terminate()
-        self.process.wait(_WITHIN_S)
+        for process in (*self.workers, self.process):
+            process.terminate()
+        for process in (*self.workers, self.process):
+            process.wait(_WITHIN_S)
+        self.workers.clear()
         return time.monotonic() - began
 
     def client(self) -> httpx.Client:

@@ -13,7 +13,6 @@ import io
 import json
 import multiprocessing
 import os
-import subprocess
 import sys
 import tempfile
 import threading
@@ -29,7 +28,6 @@ from typing import Any
 import cv2
 import httpx
 import numpy as np
-import psutil
 
 from app.decoders.plate import decode_plates
 from app.families.plate.frames import DEFAULT_GEOMETRIES
@@ -42,6 +40,7 @@ from app.sensors.camera import Camera
 from app.services.decodes.trace_task import TraceTask
 from benchmarks.faults.server import FaultServer
 from benchmarks.http_overhead import CAMERA, LAT_DEG, LON_DEG, STEP_DEG, frame_1080p
+from benchmarks.service.processor_time import ProcessorTime, counted
 
 PROCESSES = 2
 _CAMERA = {"horizontal_fov_deg": 70.0, "width_px": 1920, "height_px": 1080}
@@ -59,11 +58,27 @@ class Row:
         Files decoded in a second. [1/s]
     client_share : float
         Processor time of the clients over that of both cores.
+    bare_ms : float
+        Processor time of a bare process for a file. [ms]
+    files : int
+    spent : ProcessorTime, optional
+        Of the parts of the service, for all files.
     """
 
     what: str
     per_s: float
     client_share: float = 0.0
+    bare_ms: float = 0.0
+    files: int = 0
+    spent: ProcessorTime | None = None
+
+    def processor_ms(self) -> str:
+        """Processor time of each part for a file."""
+        return f"{self.bare_ms:.2f}" if self.spent is None else self.spent.per_file(self.files)
+
+    def decoder_share(self, bare: Row) -> float:
+        """Processor time of bare decoding over that of the service: what the ratio is where no core waits."""
+        return 1.0 if self.spent is None else bare.bare_ms * self.files / (1e3 * self.spent.service_s)
 
 
 # --- bare -------------------------------------------------------------------------------------------------------------
@@ -106,13 +121,15 @@ def _bare_traces(files: Sequence[bytes]) -> Callable[[bytes], object]:
     return decode
 
 
-def _bare_process(kind: str, files: Sequence[bytes], count: int, barrier: Barrier) -> None:
+def _bare_process(kind: str, files: Sequence[bytes], count: int, barrier: Barrier, spent: Any) -> None:
     cv2.setNumThreads(1)
     keep_memory()
     decode = {"frames": _bare_frames, "traces": _bare_traces}[kind](files)
     barrier.wait()
+    began = time.process_time()
     for k in range(count):
         decode(files[k % len(files)])
+    spent.put(time.process_time() - began)
     barrier.wait()
 
 
@@ -120,9 +137,9 @@ def measure_bare(kind: str, files: Sequence[bytes], count: int) -> Row:
     """Two processes, each with half of the files."""
     context = multiprocessing.get_context("spawn")
     barrier = context.Barrier(PROCESSES + 1, timeout=600)
-    workers = [
-        context.Process(target=_bare_process, args=(kind, files, count // PROCESSES, barrier)) for _ in range(PROCESSES)
-    ]
+    spent: Any = context.SimpleQueue()
+    arguments = (kind, files, count // PROCESSES, barrier, spent)
+    workers = [context.Process(target=_bare_process, args=arguments) for _ in range(PROCESSES)]
     for worker in workers:
         worker.start()
     barrier.wait()
@@ -131,7 +148,8 @@ def measure_bare(kind: str, files: Sequence[bytes], count: int) -> Row:
     took = time.perf_counter() - began
     for worker in workers:
         worker.join()
-    return Row(f"two bare processes, {kind}", count / took)
+    used = sum(spent.get() for _ in range(PROCESSES))
+    return Row(f"two bare processes, {kind}", count / took, bare_ms=1e3 * used / count)
 
 
 # --- the service ------------------------------------------------------------------------------------------------------
@@ -143,7 +161,6 @@ def service(folder: Path, engine: str) -> Iterator[FaultServer]:
     settings = {"WAYMARK_WARM_DECODERS": "true", "WAYMARK_KEY_PROCESSOR_S_PER_MIN": "0",
                 "WAYMARK_AGENCY_PROCESSOR_S_PER_MIN": "0", "WAYMARK_EXPENSIVE_AT_ONCE": "64",
                 "WAYMARK_EXPENSIVE_PER_AGENCY": "64"}  # fmt: skip
-    worker: subprocess.Popen[bytes] | None = None
     url = ""
     if engine == "celery":
         url = os.environ["WAYMARK_BENCH_POSTGRES_URL"]
@@ -152,18 +169,13 @@ def service(folder: Path, engine: str) -> Iterator[FaultServer]:
     server.start()
     try:
         if engine == "celery":
-            command = [sys.executable, "-c", "from app.cli import main; main()", "worker"]
-            with server.log.open("ab") as log:
-                worker = subprocess.Popen(command, env=server.environment, stdout=log, stderr=log)
+            server.start_worker()
         with server.client() as client:
             for k in range(_REGISTERED):
                 position = {"lon_deg": LON_DEG + k * STEP_DEG, "lat_deg": LAT_DEG, "horizontal_rmse_m": 0.01}
                 client.post("/v1/markers", json={"position": position, "heading_deg": 90.0, "status": "surveyed"})
         yield server
     finally:
-        if worker is not None:
-            worker.terminate()
-            worker.wait(60)
         server.stop()
 
 
@@ -198,28 +210,28 @@ def measure_requests(
 ) -> Row:
     """Single requests, each answered with its decode."""
     _post_all(server, bodies, headers, clients, 2 * clients)
-    own = psutil.Process()
-    began, used = time.perf_counter(), sum(own.cpu_times()[:2])
-    _post_all(server, bodies, headers, clients, count)
-    took = time.perf_counter() - began
-    share = (sum(own.cpu_times()[:2]) - used) / (2 * took)
-    return Row(f"{what}, {clients} clients that wait", count / took, share)
+    with counted(server) as spent:
+        began = time.perf_counter()
+        _post_all(server, bodies, headers, clients, count)
+        took = time.perf_counter() - began
+    share = spent.clients / (PROCESSES * took)
+    return Row(f"{what}, {clients} clients that wait", count / took, share, files=count, spent=spent)
 
 
 def measure_jobs(server: FaultServer, what: str, archives: Sequence[bytes], headers: dict[str, str], each: int) -> Row:
     """Jobs, from the first upload to the last result."""
     with server.client() as client:
         _wait(client, [client.post("/v1/decodes", content=archives[0], headers=headers).json()["id"]])
-        own = psutil.Process()
-        began, used = time.perf_counter(), sum(own.cpu_times()[:2])
-        answers = [client.post("/v1/decodes", content=archive, headers=headers) for archive in archives]
-        for answer in answers:
-            if answer.status_code != 202:
-                raise RuntimeError(answer.text[:300])
-        _wait(client, [answer.json()["id"] for answer in answers])
-        took = time.perf_counter() - began
-        share = (sum(own.cpu_times()[:2]) - used) / (2 * took)
-    return Row(what, len(archives) * each / took, share)
+        with counted(server) as spent:
+            began = time.perf_counter()
+            answers = [client.post("/v1/decodes", content=archive, headers=headers) for archive in archives]
+            for answer in answers:
+                if answer.status_code != 202:
+                    raise RuntimeError(answer.text[:300])
+            _wait(client, [answer.json()["id"] for answer in answers])
+            took = time.perf_counter() - began
+    files, share = len(archives) * each, spent.clients / (PROCESSES * took)
+    return Row(what, files / took, share, files=files, spent=spent)
 
 
 def _wait(client: httpx.Client, ids: Sequence[str]) -> None:
@@ -247,18 +259,20 @@ def zip_of(frames: Sequence[bytes], count: int) -> bytes:
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
-def measure(short: bool, engines: Sequence[str]) -> list[tuple[Row, float]]:
-    """Rows with their ratio to the bare processes of the same run."""
+def measure(short: bool, engines: Sequence[str]) -> list[tuple[Row, Row]]:
+    """Rows, each with the one of the bare processes of the same run."""
     os.environ.update(ONE_THREAD)
     frames, trace = make_frames(), Path("docs/images/drive.zip").read_bytes()
     count, traces = (80, 8) if short else (800, 60)
     headers, zipped = context_headers("image/jpeg"), context_headers("application/zip")
     recorded = {"Content-Type": "application/zip", "Waymark-Context": json.dumps({"trace": {}})}
-    rows: list[tuple[Row, float]] = []
+    rows: list[tuple[Row, Row]] = []
 
     def add(row: Row, bare: Row) -> None:
-        rows.append((row, row.per_s / bare.per_s))
-        print(f"{row.what:60s} {row.per_s:8.1f} /s  {row.per_s / bare.per_s:6.1%}  clients {row.client_share:.1%}")
+        rows.append((row, bare))
+        ratios = f"{row.per_s / bare.per_s:6.1%}  clients {row.client_share:.1%}"
+        processor = f"processor {row.processor_ms()} ms  {row.decoder_share(bare):.1%}"
+        print(f"{row.what:55s} {row.per_s:8.1f} /s  {ratios}  {processor}", file=sys.stderr, flush=True)
 
     for engine in engines:
         with tempfile.TemporaryDirectory() as folder, service(Path(folder) / "data", engine) as server:
@@ -277,12 +291,20 @@ def measure(short: bool, engines: Sequence[str]) -> list[tuple[Row, float]]:
 
 def tables(short: bool, engines: Sequence[str] = ("embedded", "celery")) -> str:
     """The table as Markdown."""
-    lines = ["| what | files/s | of two bare processes | clients' share of the cores |", "|---|---|---|---|"]
-    lines += [
-        f"| {row.what} | {row.per_s:.1f} | {ratio:.0%} | {row.client_share:.0%} |"
-        for row, ratio in measure(short, engines)
+    lines = [
+        "| what | files/s | of two bare processes | clients' share of the cores "
+        "| processor time a file: decoders + server + database + clients | of it bare decoding |",
+        "|---|---|---|---|---|---|",
     ]
-    return "\n".join(lines)
+    lines += [
+        f"| {row.what} | {row.per_s:.1f} | {row.per_s / bare.per_s:.0%} | {row.client_share:.0%} "
+        f"| {row.processor_ms()} ms | {row.decoder_share(bare):.0%} |"
+        for row, bare in measure(short, engines)
+    ]
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+    return "\n".join(
+        (*lines, "", f"Bare decoding: the processor time that the bare processes take. Load average: {load}.")
+    )
 
 
 def main(arguments: Sequence[str] = sys.argv[1:]) -> Any:

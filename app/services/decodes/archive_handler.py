@@ -8,18 +8,21 @@ from datetime import timedelta
 
 import sqlalchemy as sa
 
-from app.errors import Unavailable, WaymarkError
+from app.errors import WaymarkError
 from app.formats.archives import Member, count_members, is_archive, list_names, read_members
 from app.formats.frame_list import is_beside_frames
-from app.formats.images import inspect_image
+from app.formats.images import ImageHeader
 from app.formats.spooled_file import SpooledFile
 from app.markers.plate import PlateCode
 from app.registry.database import Database
+from app.sensors.camera import Camera
 from app.services.decoder_processes import DecoderProcesses
 from app.services.decodes.context import CoarsePosition, DecodeContext
-from app.services.decodes.frame_documents import DriveNotes, FramesResult, ReadFrame, frames_result
-from app.services.decodes.frame_handler import FrameMoment, StartedFrame, decoded_frames, read_frame, start_frame
+from app.services.decodes.frame_documents import DriveNotes, ReadFrame, frames_result
+from app.services.decodes.frame_handler import FrameMoment, decoded_frames, inspect_frame, read_frame, search_for
 from app.services.decodes.frame_poses import FrameListTask, FramePlaces, find_gaps
+from app.services.decodes.frame_runs import ArchiveFrame, StartedRun, in_runs
+from app.services.decodes.frame_task import FramePicture, FrameResult, FrameSearch
 from app.services.decodes.frame_terms import frame_terms
 from app.services.decodes.kinds import DecodeKind
 from app.services.decodes.matching import NearbyMarkers, find_nearby_markers
@@ -67,17 +70,8 @@ class ArchiveHandler(UploadHandler[ArchiveSignal]):
         return decoded_frames(signal.frames, signal.codebook_plates, upload.observed_at, signal.notes)
 
 
-@dataclass(frozen=True, slots=True)
-class _OnItsWay:
-    """A frame in a decoder process, or the error that kept it from there."""
-
-    member: Member
-    started: StartedFrame | WaymarkError
-    moment: FrameMoment
-
-
 class StartedArchive:
-    """An archive whose frames go through the decoder processes, some at the same time."""
+    """An archive whose frames go through the decoder processes in runs, more than one at the same time."""
 
     def __init__(
         self, upload: Upload, database: Database, clock: Clock, processes: DecoderProcesses, rules: DecodeRules
@@ -85,9 +79,12 @@ class StartedArchive:
         self._upload = upload
         self._database, self._clock = database, clock
         self._processes, self._rules = processes, rules
-        self._waiting: deque[_OnItsWay] = deque()
+        self._waiting: deque[StartedRun] = deque()
+        self._frames: list[ReadFrame] = []
+        self._reported_at = self._part_at = clock()
         self._nearby: tuple[CoarsePosition | None, NearbyMarkers] | None = None
         self._codebook: set[PlateCode] = set()
+        self._search: tuple[NearbyMarkers, Camera | None, FrameSearch] | None = None
         self._places = FramePlaces(upload.context)
         self._ordinal = 0
 
@@ -96,35 +93,36 @@ class StartedArchive:
         file, limits = self._upload.file, self._rules.archives
         total = count_members(file, limits)
         self._read_lists(file)
-        frames: list[ReadFrame] = []
-        reported_at = part_at = self._clock()
-        for member in read_members(file, limits):
-            if is_beside_frames(member.name):
-                continue
-            self._waiting.append(self._start(member))
-            if len(self._waiting) >= self._rules.frames_in_flight:
-                frames.append(self._finish(self._waiting.popleft()))
-            if self._clock() - reported_at >= self._rules.progress_every:
-                reported_at = self._clock()
-                if reported_at - part_at < PART_EVERY:
-                    self._upload.report_progress(len(frames) / total)
-                    continue
-                part_at = reported_at
-                self._upload.report_part(len(frames) / total, self._result_so_far(frames))
+        frames = self._frames
+        frames.clear()
+        self._reported_at = self._part_at = self._clock()
+        for run in in_runs(self._prepare(m) for m in read_members(file, limits) if not is_beside_frames(m.name)):
+            self._waiting.append(StartedRun(self._processes, run, self._upload.wait_s))
+            if len(self._waiting) > self._rules.frames_in_flight:  # one waits, so that no process does
+                self._finish(self._waiting.popleft(), total)
         while self._waiting:
-            frames.append(self._finish(self._waiting.popleft()))
+            self._finish(self._waiting.popleft(), total)
         gaps, warnings = find_gaps([(frame.index, frame.captured_at) for frame in frames])
         notes = DriveNotes((*self._places.warnings, *warnings), gaps, receiver=self._places.receiver)
         return ArchiveSignal(frames, len(self._codebook), notes)
 
-    def _result_so_far(self, frames: list[ReadFrame]) -> FramesResult:
-        return frames_result(frames, codebook_plates=len(self._codebook), notes=DriveNotes(self._places.warnings))
+    def _report(self, total: int) -> None:
+        """Record now and then how far the job is; what this raises stops it."""
+        now, done = self._clock(), len(self._frames) / total
+        if now - self._reported_at < self._rules.progress_every:
+            return
+        self._reported_at = now
+        if now - self._part_at < PART_EVERY:
+            self._upload.report_progress(done)
+            return
+        self._part_at = now
+        notes = DriveNotes(self._places.warnings)
+        self._upload.report_part(done, frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes))
 
     def cancel(self) -> None:
         """Stop the frames that are on their way."""
         for waiting in self._waiting:
-            if not isinstance(waiting.started, WaymarkError):
-                waiting.started.cancel()
+            waiting.cancel()
 
     def _read_lists(self, file: SpooledFile) -> None:
         """Have the files beside the frames read."""
@@ -140,32 +138,35 @@ class StartedArchive:
             self._places = FramePlaces(context, lists)
         self._places.check_names([name for name in names if not is_beside_frames(name)])
 
-    def _start(self, member: Member) -> _OnItsWay:
-        moment = FrameMoment(self._upload.context)
-        if member.error is not None:
-            return _OnItsWay(member, member.error, moment)
+    def _prepare(self, member: Member) -> ArchiveFrame:
+        """Check a frame's header, and find out what to look for in it."""
+        context, images = self._upload.context, self._rules.images
+        moment = FrameMoment(context)
         try:
-            moment = self._moment(member)
-            started = start_frame(
-                self._processes,
-                SpooledFile.of(member.data),
-                moment.context,
-                self._rules.images,
-                wait_s=self._upload.wait_s,
-            )
-        except Unavailable:
-            raise
+            if member.error is not None:
+                raise member.error
+            file = SpooledFile.of(member.data)
+            header = inspect_frame(file, context, images)
+            moment = self._moment(member, header)
+            camera = moment.context.camera.camera_for(header) if moment.context.camera else None
         except WaymarkError as error:
-            return _OnItsWay(member, error, moment)
-        started.look_for(self._markers_near(moment.context.coarse_position))
-        return _OnItsWay(member, started, moment)
+            return ArchiveFrame(member.index, member.name, moment, error=error)
+        nearby = self._markers_near(moment.context.coarse_position)
+        picture = FramePicture(file, context.thermal, context.thermal_range, images)
+        pixels = header.width_px * header.height_px
+        return ArchiveFrame(member.index, member.name, moment, picture, self._look_for(nearby, camera), nearby, pixels)
 
-    def _moment(self, member: Member) -> FrameMoment:
-        taken = inspect_image(member.data, self._rules.images, thermal=self._upload.context.thermal).taken
-        at = self._places.time_of(self._ordinal, member.name, taken)
+    def _moment(self, member: Member, header: ImageHeader) -> FrameMoment:
+        at = self._places.time_of(self._ordinal, member.name, header.taken)
         self._ordinal += 1
         pose = self._places.pose_of(at, member.name)
         return FrameMoment(self._places.context_at(pose), at, pose)
+
+    def _look_for(self, nearby: NearbyMarkers, camera: Camera | None) -> FrameSearch:
+        """The same object for frames that share it, so that a run has it once."""
+        if self._search is None or self._search[0] is not nearby or self._search[1] != camera:
+            self._search = nearby, camera, search_for(nearby, camera)
+        return self._search[2]
 
     def _markers_near(self, position: CoarsePosition | None) -> NearbyMarkers:
         """The markers that could be in view from a position; those of the frame before serve at the same position."""
@@ -175,15 +176,15 @@ class StartedArchive:
             self._codebook.update(self._nearby[1].codebook)
         return self._nearby[1]
 
-    def _finish(self, waiting: _OnItsWay) -> ReadFrame:
-        member, started, moment = waiting.member, waiting.started, waiting.moment
-        try:
-            if isinstance(started, WaymarkError):
-                raise started
-            signal = started.result()
-        except Unavailable:
-            raise
-        except WaymarkError as error:
-            return ReadFrame(member.index, member.name, error=error, captured_at=moment.at, pose=moment.pose)
+    def _finish(self, run: StartedRun, total: int) -> None:
+        """Wait for a run, and match its frames."""
+        results = run.results(lambda: self._report(total))
         with self._database.read() as connection:
-            return read_frame(connection, self._upload, member, signal.result, signal.nearby, moment)
+            self._frames += [self._matched(connection, frame, result) for frame, result in results]
+        self._report(total)
+
+    def _matched(self, connection: sa.Connection, frame: ArchiveFrame, result: FrameResult | WaymarkError) -> ReadFrame:
+        moment = frame.moment
+        if isinstance(result, WaymarkError):
+            return ReadFrame(frame.index, frame.name, error=result, captured_at=moment.at, pose=moment.pose)
+        return read_frame(connection, self._upload, Member(frame.index, frame.name), result, frame.nearby, moment)

@@ -59,8 +59,7 @@ class StartedFrame:
     def look_for(self, nearby: NearbyMarkers) -> None:
         """Let the process go on: the markers that the registry has near by are known."""
         self.nearby = nearby
-        searches = {name: reader.search(nearby.of(name), self.camera) for name, reader in FRAME_READERS.items()}
-        self.search.set_result(FrameSearch({name: search for name, search in searches.items() if search is not None}))
+        self.search.set_result(search_for(nearby, self.camera))
 
     def result(self) -> FrameSignal:
         """Wait for the readings."""
@@ -70,6 +69,12 @@ class StartedFrame:
     def cancel(self) -> None:
         """Stop the process."""
         self.pending.cancel()
+
+
+def search_for(nearby: NearbyMarkers, camera: Camera | None) -> FrameSearch:
+    """What to look for in a frame of this camera."""
+    searches = {name: reader.search(nearby.of(name), camera) for name, reader in FRAME_READERS.items()}
+    return FrameSearch({name: search for name, search in searches.items() if search is not None})
 
 
 class FrameHandler(UploadHandler[FrameSignal]):
@@ -123,13 +128,14 @@ def start_frame(
     Unavailable
         The decoder processes are busy.
     """
-    header = _inspect(file, context, limits)
+    header = inspect_frame(file, context, limits)
     camera = context.camera.camera_for(header) if context.camera else None
     task = FrameTask(FramePicture(file, context.thermal, context.thermal_range, limits))
     return StartedFrame(camera, processes.submit(task, wait_s=wait_s), task.search)
 
 
-def _inspect(file: SpooledFile, context: DecodeContext, limits: ImageLimits) -> ImageHeader:
+def inspect_frame(file: SpooledFile, context: DecodeContext, limits: ImageLimits) -> ImageHeader:
+    """Header of a frame, checked against the limits; raises as `start_frame`."""
     if file.size > limits.file_bytes:
         raise UploadTooLarge(
             f"a picture of {file.size} bytes",

@@ -7,6 +7,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from app.errors import WaymarkError
 from app.families.frames import FrameReading
 from app.formats.images import ImageHeader, ImageLimits
 from app.formats.spooled_file import SpooledFile
@@ -78,6 +79,22 @@ class FrameTask(Task[FrameResult]):
     def steps(self) -> tuple[object, ...]:
         """The picture, then the search."""
         return (self.picture, self.search)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRunTask(Task[tuple[FrameResult | WaymarkError, ...]]):
+    """Several frames to decode one after the other, so that their processes are handed work less often.
+
+    The result has the error of each frame that cannot be read. A frame that stops the process stops the whole run.
+
+    Attributes
+    ----------
+    frames : tuple of (FramePicture, FrameSearch)
+    """
+
+    is_long: ClassVar[bool] = False
+
+    frames: tuple[tuple[FramePicture, FrameSearch], ...]
 
 
 @dataclass(frozen=True, slots=True)
