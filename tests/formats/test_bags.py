@@ -1,8 +1,9 @@
-"""Bags: pictures and positions of MCAP files and ROS 1 bags."""
+"""Bags: pictures, positions and magnetic fields of MCAP files, ROS 2 bags in SQLite and ROS 1 bags."""
 
 from __future__ import annotations
 
 import io
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.bags import messages as bag_messages
 from app.formats.spooled_file import SpooledFile
+from app.formats.traces.declaration import AxisConvention, TraceDeclaration
+from app.formats.traces.read import read_trace
 from app.formats.video.container import VideoFile, VideoKind, detect_video
 from app.formats.video.frames import ReadReport, read_frames
 from app.formats.video.index import VideoIndex, index_video
@@ -27,6 +30,7 @@ from tests.formats.pictures import jpeg
 START_NS = 1_777_883_400_000_000_000
 STEP_NS = 100_000_000
 FRAMES = 12
+FIELD_STEP_NS = 2_000_000
 
 
 def _pictures() -> list[bytes]:
@@ -57,6 +61,62 @@ def _messages(store: Any) -> list[tuple[str, str, int, Any]]:
         listed.append(("/gps/fix", fix.__msgtype__, at, position))
         listed.append(("/chatter", text.__msgtype__, at, text("hello")))
     return listed
+
+
+def _fields(store: Any, sensors: int, samples: int) -> list[tuple[str, str, int, Any]]:
+    """Messages of magnetometers, whose clocks differ by a part of a sample, and speeds."""
+    types = store.types
+    names = "sensor_msgs/msg/MagneticField", "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Vector3"
+    field, twist, vector = (types[name] for name in names)
+    header, time_of = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+
+    def head(at: int) -> Any:
+        return header(time_of(at // 10**9, at % 10**9), "bar")
+
+    listed: list[tuple[str, str, int, Any]] = []
+    for k in range(samples):
+        at = START_NS + k * FIELD_STEP_NS
+        for sensor in range(sensors):
+            own = at + sensor * 100_000
+            value = vector(1e-8 * (own - START_NS) / FIELD_STEP_NS, 2e-5, -4e-5)
+            message = field(head(own), value, np.zeros(9))
+            listed.append((f"/mag_{sensor + 8}", field.__msgtype__, own + 5_000_000, message))
+        if k % 20 == 0:
+            moved = types["geometry_msgs/msg/Twist"](vector(12.0, 0, 0), vector(0, 0, 0))
+            listed.append(("/speed", twist.__msgtype__, at, twist(head(at), moved)))
+    return listed
+
+
+def _raw(store: Any) -> list[tuple[str, str, int, Any]]:
+    """Raw pictures, red."""
+    types = store.types
+    image, header, time_of = (
+        types[name] for name in ("sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    pixels = np.zeros((20, 34, 3), np.uint8)
+    pixels[..., 0] = 200
+    rows = np.pad(pixels.reshape(20, 102), ((0, 0), (0, 2))).ravel()
+    at = [START_NS + k * STEP_NS for k in range(3)]
+    head = [header(time_of(t // 10**9, t % 10**9), "camera") for t in at]
+    return [("/image", image.__msgtype__, at[k], image(head[k], 20, 34, "rgb8", 0, 104, rows)) for k in range(3)]
+
+
+def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None) -> bytes:
+    """A ROS 2 bag in SQLite, with the tables of rosbag2_storage_sqlite3."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    database = sqlite3.connect(path)
+    database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+    database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+    topics: dict[str, int] = {}
+    for topic, kind, at, message in reversed(_messages(store) if listed is None else listed):  # not in order of time
+        if topic not in topics:
+            topics[topic] = len(topics) + 1
+            database.execute("INSERT INTO topics VALUES (?, ?, ?, 'cdr')", (topics[topic], topic, kind))
+        data = bytes(store.serialize_cdr(message, kind))
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", (topics[topic], at, data))
+    database.commit()
+    database.close()
+    return path.read_bytes()
 
 
 def mcap() -> bytes:
@@ -93,9 +153,10 @@ def _indexed(data: bytes) -> VideoIndex:
     return index_video(VideoFile(SpooledFile.of(data), kind))
 
 
-@pytest.mark.parametrize("kind", [VideoKind.MCAP, VideoKind.ROS1])
+@pytest.mark.parametrize("kind", [VideoKind.MCAP, VideoKind.ROS1, VideoKind.ROS2_SQLITE])
 def test_pictures_with_times_and_positions(kind: VideoKind, tmp_path: Path) -> None:
-    data = mcap() if kind is VideoKind.MCAP else ros1(tmp_path / "a.bag")
+    make = {VideoKind.MCAP: lambda _path: mcap(), VideoKind.ROS1: ros1, VideoKind.ROS2_SQLITE: sqlite_bag}
+    data = make[kind](tmp_path / "a bag?")
     index = _indexed(data)
     assert index.file.kind is kind
     assert index.time_s == pytest.approx(np.arange(FRAMES) / 10)
@@ -114,8 +175,8 @@ def test_bags_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     data = mcap()
     with pytest.raises(UnreadableUpload, match="cut off"):
         _indexed(data[: len(data) // 2])
-    with pytest.raises(UnsupportedUpload, match="SQLite"):
-        detect_video(b"SQLite format 3\0" + b"\0" * 100)
+    with pytest.raises(UnsupportedUpload, match="GeoPackage"):
+        detect_video(b"SQLite format 3\0" + b"\0" * 52 + b"GPKG")
     monkeypatch.setattr(bag_messages, "MAX_CHUNK_BYTES", 100)
     with pytest.raises(UploadTooLarge):
         _indexed(data)
@@ -129,7 +190,8 @@ def test_bags_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("seed", range(30))
 def test_damaged_bags_raise_only_our_errors(seed: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(seed)
-    data = bytearray(mcap() if seed % 2 else ros1(tmp_path / "a.bag"))
+    make = (lambda _path: mcap(), ros1, sqlite_bag)[seed % 3]
+    data = bytearray(make(tmp_path / "a.bag"))
     for _ in range(int(rng.integers(1, 40))):
         data[int(rng.integers(16, len(data)))] = int(rng.integers(256))
     try:
@@ -138,3 +200,58 @@ def test_damaged_bags_raise_only_our_errors(seed: int, tmp_path: Path) -> None:
             frame.half_bgr()
     except WaymarkError:
         pass
+
+
+def test_a_bag_in_sqlite_is_opened_by_its_path(tmp_path: Path) -> None:
+    path = tmp_path / "a b?.db3"
+    before = sqlite_bag(path)
+    index = index_video(VideoFile(SpooledFile.at(path), VideoKind.ROS2_SQLITE))
+    assert len(list(read_frames(index, index.segments[0], ReadReport()))) == FRAMES
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_sqlite_files_that_are_no_bags(tmp_path: Path) -> None:
+    for number, tables in enumerate(("CREATE TABLE markers(id)", VIEWS)):
+        path = tmp_path / f"{number}.db3"
+        database = sqlite3.connect(path)
+        database.executescript(tables)
+        database.close()
+        with pytest.raises(UnsupportedUpload, match="no ROS 2 bag"):
+            _indexed(path.read_bytes())
+
+
+VIEWS = """
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i FROM n;
+"""
+
+
+def test_raw_pictures(tmp_path: Path) -> None:
+    index = _indexed(sqlite_bag(tmp_path / "a.db3", _raw(get_typestore(Stores.ROS2_HUMBLE))))
+    assert (index.width_px, index.height_px) == (34, 20)
+    frames = list(read_frames(index, index.segments[0], ReadReport()))
+    assert [frame.bgr()[19, 33].tolist() for frame in frames] == [[0, 0, 200]] * 3
+
+
+def test_magnetometers_are_a_trace(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    data = sqlite_bag(tmp_path / "a.db3", _fields(store, 3, 600))
+    declared = TraceDeclaration(sensors=3, axes=AxisConvention.ISO8855, references=())
+    with (tmp_path / "a.db3").open("rb") as stream:
+        traces = [read_trace({"drive.db3": given}, declared).trace for given in (data, stream)]
+    for trace in traces:
+        # the fields rise by 0.01 uT a sample, also between the samples of the sensors, whose clocks differ
+        rising = trace.field_ut[5:-5, :, 0]
+        assert rising[:, 1] == pytest.approx(rising[:, 0], abs=1e-4)
+        assert np.diff(rising[:, 0]) == pytest.approx(np.full(len(rising) - 1, 0.01), abs=1e-4)
+        assert trace.field_ut[5, :, 2] == pytest.approx([-40.0] * 3, abs=1e-3)
+        assert trace.speed_m_s == pytest.approx(np.full(len(trace.speed_m_s), 12.0))
+    with pytest.raises(InvalidParameter, match="3 topics of magnetic fields, and 14 sensors") as refused:
+        read_trace({"drive.db3": data}, TraceDeclaration(axes=AxisConvention.ISO8855))
+    assert "/mag_8 (sensor_msgs/msg/MagneticField)" in refused.value.message
+    with pytest.raises(InvalidParameter, match="the bag has no pictures") as refused:
+        _indexed(data)
+    assert "/mag_8 (sensor_msgs/msg/MagneticField)" in refused.value.message
+    assert "sensor_msgs/Image" in str(refused.value.limit)
+    assert "declare the trace" in str(refused.value.cure)

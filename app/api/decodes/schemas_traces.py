@@ -88,8 +88,10 @@ class TraceIn(StrictModel):
     model_config = ConfigDict(json_schema_extra={"examples": [{}, {"unit": "uT", "axes": "FRD"}]})
 
     bar: BarIn | None = None
-    unit: Literal["uT", "nT", "mT", "gauss", "mG"] | None = Field(None, description="Of CSV and Parquet.")
-    axes: Literal["ISO8855", "FLU", "FRD"] | None = Field(None, description="Of CSV and Parquet.")
+    unit: Literal["uT", "nT", "mT", "gauss", "mG"] | None = Field(
+        None, description="Of CSV and Parquet, and of bags whose fields are not in tesla."
+    )
+    axes: Literal["ISO8855", "FLU", "FRD"] | None = Field(None, description="Of CSV, Parquet and bags.")
     calibrated: Flag = Field(False, description="Offsets are taken off: the earth's field remains.")
     background_removed: Flag = Field(False, description="The earth's field is taken off too.")
     columns: ColumnsIn | None = None

@@ -1,1 +1,1 @@
-"""Recordings of robots: MCAP and ROS 1 bags, with compressed pictures and positions."""
+"""Recordings of robots: MCAP, ROS 2 bags in SQLite and ROS 1 bags, with pictures, positions and magnetic fields."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
@@ -11,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge, WaymarkError
-from app.formats.bags.messages import FIELD, Bag, BagKind, Topic, open_bag
-from app.formats.images import ImageLimits, inspect_image, load_image
+from app.formats.bags.fields import FIELDS
+from app.formats.bags.messages import FIELD, Bag, BagKind, Topic, describe_topics, open_bag, types_of
+from app.formats.bags.pictures import COMPRESSED, RAW, pixels_of, size_px
+from app.formats.images import ImageLimits
 from app.formats.log_report import LogReport
 from app.formats.poses.points import PosePoint, track_of
 from app.formats.video.container import VideoFile, VideoKind
@@ -20,11 +21,10 @@ from app.formats.video.frames import PictureFrame, ReadReport
 from app.formats.video.index import VideoIndex, VideoLimits, VideoSegment, cut_segments, find_time_gaps
 from app.sensors.pose_track import PoseTrack
 
-IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/CompressedImage")
-FIXES = ("sensor_msgs/msg/NavSatFix", "sensor_msgs/NavSatFix")
+FIXES = types_of("sensor_msgs", "NavSatFix")
 MAX_FIXES = 200_000
 """[positions] chosen by hand, as `PoseLimits`."""
-_KINDS = {VideoKind.MCAP: BagKind.MCAP, VideoKind.ROS1: BagKind.ROS1}
+_KINDS = {VideoKind(kind): kind for kind in BagKind}
 _NS = 1e-9
 
 
@@ -36,8 +36,7 @@ def index_bag(file: VideoFile, limits: VideoLimits) -> VideoIndex:
         first: tuple[int, int] | None = None
         for message in bag.messages([topic.name]):
             if first is None:
-                header = inspect_image(bytes(bag.decode(message).data), ImageLimits(pixels=limits.pixels))
-                first = header.width_px, header.height_px
+                first = size_px(topic.type_name, bag.decode(message), ImageLimits(pixels=limits.pixels))
             stamps.append(message.time_ns)
             if len(stamps) > limits.frames:
                 raise UploadTooLarge("the bag has too many pictures", field=FIELD, limit=f"{limits.frames}")
@@ -73,35 +72,38 @@ def read_pictures(index: VideoIndex, segment: VideoSegment, report: ReadReport, 
                 continue
             done = number
             try:
-                frame = load_image(bytes(bag.decode(message).data))
+                pixels = pixels_of(message.topic.type_name, bag.decode(message))
             except WaymarkError:
                 report.damaged += 1
                 continue
-            if (frame.header.width_px, frame.header.height_px) != (index.width_px, index.height_px):
+            if pixels.shape[:2] != (index.height_px, index.width_px):
                 report.other_size += 1
                 continue
-            yield PictureFrame(number, float(index.time_s[number]), frame.pixels)
+            yield PictureFrame(number, float(index.time_s[number]), pixels)
 
 
 def _choose_topic(bag: Bag) -> tuple[Topic, list[str]]:
-    """The first topic of compressed pictures, and warnings about those that are not used."""
-    images = sorted((topic for topic in bag.topics if topic.type_name in IMAGES), key=lambda topic: topic.name)
+    """The first topic of pictures, of compressed ones if there are some, and warnings about those that are not used."""
+    pictures = [topic for topic in bag.topics if topic.type_name in (*COMPRESSED, *RAW)]
+    images = sorted(pictures, key=lambda topic: (topic.type_name in RAW, topic.name))
     if not images:
         raise _without_pictures(bag.topics)
     unused = [topic for topic in bag.topics if topic is not images[0] and topic.type_name not in FIXES]
     warnings = []
     if unused:
-        shown = ", ".join(f"{topic.name[:80]} ({topic.type_name[:80]})" for topic in unused[:10])
-        warnings.append(f"topics that are not used: {shown}{' and more' if len(unused) > 10 else ''}")
+        warnings.append(f"topics that are not used: {describe_topics(unused)}")
     return images[0], warnings
 
 
 def _without_pictures(topics: list[Topic]) -> InvalidParameter:
-    counts = Counter(topic.type_name[:80] or "unknown" for topic in topics)
-    shown = ", ".join(list(counts)[:10]) or "nothing"
+    has_fields = any(topic.type_name in FIELDS for topic in topics)
     return InvalidParameter(
-        f"the bag has no compressed pictures; it has {shown}", field=FIELD, limit="sensor_msgs/CompressedImage",
-        cure="record the topic of compressed pictures, e.g. /camera/image_raw/compressed",
+        f"the bag has no pictures; it has {describe_topics(topics)}", field=FIELD,
+        limit="topics of sensor_msgs/CompressedImage or sensor_msgs/Image, and for the track sensor_msgs/NavSatFix; "
+        "sensor_msgs/MagneticField where a trace is declared",
+        cure="declare the trace in the context: trace with bar and axes"
+        if has_fields
+        else "record the topic of compressed pictures, e.g. /camera/image_raw/compressed",
     )  # fmt: skip
 
 

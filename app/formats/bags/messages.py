@@ -1,4 +1,7 @@
-"""Messages of MCAP files and ROS 1 bags, by one interface. The libraries are an extra of Waymark: `bags`."""
+"""Messages of MCAP files, ROS 2 bags in SQLite and ROS 1 bags, by one interface.
+
+The libraries are an extra of Waymark: `bags`.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,10 @@ MAX_CHUNK_BYTES = 256 * 1024**2
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _SQLITE_MAGIC = b"SQLite format 3\0"
+SIGNATURES = (_MCAP_MAGIC, _ROS1_MAGIC, _SQLITE_MAGIC)
+ACCEPTED = "MCAP, a ROS 2 bag in SQLite (.db3), or a ROS 1 bag of version 2.0"
+_GEOPACKAGE = slice(68, 72), b"GPKG"
+"""Application id in the header of an SQLite file. Source: OGC 12-128r19, requirement 2."""
 
 
 class BagKind(StrEnum):
@@ -25,6 +32,7 @@ class BagKind(StrEnum):
 
     MCAP = "mcap"
     ROS1 = "ros1"
+    SQLITE = "ros2-sqlite"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +59,34 @@ def detect_bag(head: bytes) -> BagKind | None:
     Raises
     ------
     UnsupportedUpload
-        A ROS 2 bag in SQLite.
+        A GeoPackage.
     """
     if head.startswith(_MCAP_MAGIC):
         return BagKind.MCAP
     if head.startswith(_ROS1_MAGIC):
         return BagKind.ROS1
     if head.startswith(_SQLITE_MAGIC):
-        raise UnsupportedUpload(
-            "a ROS 2 bag in SQLite is not read", field=FIELD, limit="MCAP, or a ROS 1 bag",
-            cure="convert it: ros2 bag convert, with storage_id mcap",
-        )  # fmt: skip
+        place, name = _GEOPACKAGE
+        if head[place] == name:
+            raise UnsupportedUpload(
+                "a GeoPackage is a survey and not a recording",
+                field=FIELD,
+                limit=ACCEPTED,
+                cure="POST it to /v1/imports",
+            )
+        return BagKind.SQLITE
     return None
+
+
+def types_of(package: str, name: str) -> tuple[str, str]:
+    """Name of a type of messages in ROS 2 and in ROS 1, e.g. ``sensor_msgs/msg/Image``."""
+    return f"{package}/msg/{name}", f"{package}/{name}"
+
+
+def describe_topics(topics: list[Topic]) -> str:
+    """Topics with their types, the first ten."""
+    shown = ", ".join(f"{topic.name[:80]} ({topic.type_name[:80] or 'unknown'})" for topic in topics[:10])
+    return f"{shown or 'no topic'}{' and more' if len(topics) > 10 else ''}"
 
 
 class Bag:
@@ -89,6 +113,11 @@ class Bag:
                 for _schema, channel, message in self._reader.iter_messages(**options):
                     yield BagMessage(known[channel.topic], int(message.log_time), bytes(message.data))
                 return
+            if self._kind is BagKind.SQLITE:
+                known = {topic.name: topic for topic in self.topics}
+                for name, time_ns, data in self._reader.messages(topics, start_ns, end_ns):
+                    yield BagMessage(known[name], time_ns, data)
+                return
             connections = [c for c in self._reader.connections if c.topic in topics]
             if connections:
                 for connection, time_ns, data in self._reader.messages(connections, start_ns, end_ns):
@@ -111,6 +140,9 @@ class Bag:
             if self._kind is BagKind.ROS1:
                 for connection in self._reader.connections:
                     yield Topic(connection.topic, connection.msgtype, "ros1")
+                return
+            if self._kind is BagKind.SQLITE:
+                yield from (Topic(*topic) for topic in self._reader.topics)
                 return
             summary = self._reader.get_summary()
             if summary is None:
@@ -145,6 +177,16 @@ def open_bag(file: SpooledFile, kind: BagKind) -> Iterator[Bag]:
             with _defects():
                 reader: Any = SeekingReader(stream, record_size_limit=MAX_CHUNK_BYTES)
             yield Bag(kind, reader)
+        return
+    if kind is BagKind.SQLITE:
+        from app.formats.bags.sqlite_bag import SqliteBag
+
+        with _defects():
+            opened = SqliteBag(file, MAX_CHUNK_BYTES)
+        try:
+            yield Bag(kind, opened)
+        finally:
+            opened.close()
         return
     from rosbags.rosbag1 import Reader
 
@@ -195,6 +237,6 @@ def _defects() -> Iterator[None]:
 
 def _damaged() -> UnreadableUpload:
     return UnreadableUpload(
-        "the bag is damaged, cut off, or has no index", field=FIELD, limit="MCAP, or a ROS 1 bag of version 2.0",
-        cure="repair it (mcap recover, rosbag reindex) and send it whole",
+        "the bag is damaged, cut off, or has no index", field=FIELD, limit=ACCEPTED,
+        cure="repair it (mcap recover, ros2 bag reindex, rosbag reindex) and send it whole",
     )  # fmt: skip

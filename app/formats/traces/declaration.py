@@ -26,6 +26,7 @@ class TraceFormat(StrEnum):
     PARQUET = "parquet"
     CAN = "can-log"
     DBC = "dbc"
+    BAG = "bag"
 
 
 class FieldUnit(StrEnum):

@@ -22,7 +22,10 @@ _BLOCK = 1 << 16  # samples that are converted at a time; bounds the memory
 _VEHICLE_FROM = {AxisConvention.ISO8855: (1, 1, 1), AxisConvention.FLU: (1, 1, 1), AxisConvention.FRD: (1, -1, -1)}
 
 
-def convert_field(field: Field, part: str, declaration: TraceDeclaration, metro: bool, report: TraceReport) -> Field:
+def convert_field(
+    field: Field, part: str, declaration: TraceDeclaration, metro: bool, report: TraceReport,
+    known_unit: FieldUnit | None = None,
+) -> Field:  # fmt: skip
     """Recorded values as microtesla in ISO 8855; what is damaged becomes NaN. Changes its input.
 
     Raises
@@ -30,7 +33,7 @@ def convert_field(field: Field, part: str, declaration: TraceDeclaration, metro:
     InvalidParameter
         Unit or axes are not declared where the format does not fix them, or the unit is implausible.
     """
-    unit = declaration.unit or (FieldUnit.MICROTESLA if metro else None)
+    unit = declaration.unit or known_unit or (FieldUnit.MICROTESLA if metro else None)
     axes = declaration.axes or (AxisConvention.FRD if metro else None)
     if unit is None:
         raise InvalidParameter(

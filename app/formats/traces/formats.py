@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload
+from app.formats.bags.messages import SIGNATURES
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, detect_signature, list_accepted
 from app.formats.traces.can_log import CanSeries, read_can_log
-from app.formats.traces.declaration import AngleUnit, SpeedUnit, TraceDeclaration, TraceFormat, TraceLimits
+from app.formats.traces.declaration import AngleUnit, FieldUnit, SpeedUnit, TraceDeclaration, TraceFormat, TraceLimits
 from app.formats.traces.parts import Part
 from app.formats.traces.recorder import read_raw_data, read_raw_series
 from app.formats.traces.report import TraceReport
@@ -26,7 +27,8 @@ _CAN_SUFFIXES = (".asc", ".blf", ".trc", ".log")
 _TEXT_SUFFIXES = (".csv", ".txt", ".dbc", ".asc", ".trc", ".log", ".json", ".xlsx", ".mf4", ".mat")
 """Of files that are never a binary stream of samples."""
 _BINARY_SIGNATURES = (b"PAR1", b"LOGG")
-_BINARY = (TraceFormat.PARQUET, TraceFormat.CAN, TraceFormat.STREAM)
+_BINARY = (TraceFormat.PARQUET, TraceFormat.CAN, TraceFormat.STREAM, TraceFormat.BAG)
+_UT_PER_TESLA = 1e6
 _TRACE_COLUMN = re.compile(r"(s\d+_[xyz]|sensor .*|arbitration_id|time stamp)\Z", re.IGNORECASE)
 
 
@@ -40,6 +42,8 @@ class TraceContents:
         Times [s], fields [uT], and the file they are from.
     metro : bool
         The fields are METRO's: axes and unit are known.
+    unit : FieldUnit or None
+        Of the fields, where the format fixes it.
     speeds, headings : list of (Series, unit)
     can : list of (str, dict of CanSeries)
         Series `speed` and `heading` of each CAN log.
@@ -49,6 +53,7 @@ class TraceContents:
     field_ut: npt.NDArray[np.float32] | None = None
     field_part: str = ""
     metro: bool = False
+    unit: FieldUnit | None = None
     speeds: list[tuple[Series, SpeedUnit]] = field(default_factory=list)
     headings: list[tuple[Series, AngleUnit]] = field(default_factory=list)
     can: list[tuple[str, dict[str, CanSeries]]] = field(default_factory=list)
@@ -132,6 +137,21 @@ def _read_recorder_steering(part: Part, reading: TraceReading) -> None:
     reason = "the steering wheel's angle is not the heading, and is not used"
     reading.report.leave_out(part.name, "steering-wheel-angle", t.size, reason)
     reading.report.warn(f"{part.name}: {reason}")
+
+
+def _read_bag(part: Part, reading: TraceReading) -> None:
+    from app.formats.bags.fields import read_fields  # only here: the libraries are an extra
+
+    found = read_fields(part.as_file(), reading.declaration.sensors, reading.limits.rows)
+    shift_s = reading.shift_s(part)
+    reading.contents.set_field(part.name, found.t_s + shift_s, found.field_t, metro=False)
+    if reading.declaration.unit is None:
+        np.multiply(found.field_t, np.float32(_UT_PER_TESLA), out=found.field_t)
+        reading.contents.unit = FieldUnit.MICROTESLA
+    if found.speed is not None:
+        reading.contents.speeds.append(
+            (Series(f"the speed in {part.name}", found.speed[0] + shift_s, found.speed[1]), SpeedUnit.M_S)
+        )
 
 
 def _read_csv(part: Part, reading: TraceReading) -> None:
@@ -236,6 +256,7 @@ def _columns(sample: Sample) -> list[str]:
 _STREAM: Format[TraceReader] = Format(TraceFormat.STREAM, Use.TRACE, "METRO stream", _detect_stream, _read_stream)
 TRACE_FORMATS: tuple[Format[TraceReader], ...] = (
     Format(TraceFormat.PARQUET, Use.TRACE, "Parquet", detect_signature(b"PAR1"), _read_parquet),
+    Format(TraceFormat.BAG, Use.TRACE, "bag (MCAP, .db3, ROS 1)", detect_signature(*SIGNATURES), _read_bag),
     Format(TraceFormat.DBC, Use.TRACE, "DBC", _detect_dbc, _read_dbc),
     Format(TraceFormat.CAN, Use.TRACE, "CAN log (asc, blf, csv, log, trc)", _detect_can, _read_can),
     Format(

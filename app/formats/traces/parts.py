@@ -8,10 +8,12 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import BinaryIO
 
 from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.archives import ArchiveLimits, count_members, is_archive, is_file
+from app.formats.spooled_file import SpooledFile
 from app.formats.traces.declaration import TraceLimits
 
 BLOCK_BYTES = 4 * 1024**2
@@ -69,6 +71,23 @@ class Part:
             limit=f"{self.limit_bytes} bytes expanded",
             cure="cut the recording into shorter ones",
         )
+
+    def as_file(self) -> SpooledFile:
+        """All of it, as a file; one in an archive, or in memory, is held in memory.
+
+        Raises
+        ------
+        UploadTooLarge
+            The limit is passed.
+        """
+        name = getattr(self.stream, "name", None)
+        path = Path(name) if isinstance(self.stream, io.BufferedReader) and isinstance(name, str | Path) else None
+        if path is None:
+            return SpooledFile.of(self.content())
+        found = SpooledFile.at(path)
+        if found.size > self.limit_bytes:
+            raise self.too_large()
+        return found
 
     def content(self) -> bytes:
         """All of it."""

@@ -88,7 +88,7 @@ def _assemble(
         for name in {found.field_part, *others}:
             report.clock_offsets_s[name] = declaration.clock_offsets_s.get(name, 0.0) - origin
     check_sampling(t, found.field_part, limits, report)
-    values = convert_field(values, found.field_part, declaration, found.metro, report)
+    values = convert_field(values, found.field_part, declaration, found.metro, report, found.unit)
 
     def placed(series: Series) -> Series:
         kept = rows if series.part == found.field_part else slice(None)

@@ -12,7 +12,8 @@ from app.formats.frame_list import is_beside_frames
 from app.formats.spooled_file import SpooledFile
 from app.formats.video.container import FIELD, VideoFile, detect_video
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi")
+_BAG_SUFFIXES = (".db3", ".mcap", ".bag")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", *_BAG_SUFFIXES)
 """Names of videos in an archive; the content decides what they are."""
 _LOCAL_HEADER_BYTES = 30  # PKWARE APPNOTE, section 4.3.7
 
@@ -55,6 +56,11 @@ def open_packed_video(file: SpooledFile, limits: ArchiveLimits) -> PackedVideo:
                 cure="send each video in an archive of its own",
             )  # fmt: skip
         info = videos[0]
+        if info.filename.lower().endswith(_BAG_SUFFIXES):
+            raise UnsupportedUpload(
+                "a bag in an archive is not read", field=FIELD, limit="a bag as it is",
+                cure="send the .db3, .mcap or .bag file itself; metadata.yaml is not needed",
+            )  # fmt: skip
         if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
             raise UnsupportedUpload(
                 "the video is compressed in the archive, or encrypted", field=FIELD, limit="stored as it is",

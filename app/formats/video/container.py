@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 FIELD = "file"
-EXPECTED = "MP4 or MOV (H.264, H.265, MPEG-4), AVI or raw stream (MJPEG), MCAP or ROS 1 bag"
+EXPECTED = "MP4 or MOV (H.264, H.265, MPEG-4), AVI or raw stream (MJPEG), MCAP, ROS 2 bag (.db3) or ROS 1 bag"
 _PICTURE_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
 """Major brands of pictures in the container of MP4. Source: ISO/IEC 23008-12, section 10."""
 _OPTIONS = {"protocol_whitelist": "none", "enable_drefs": "0", "use_absolute_path": "0"}
@@ -36,9 +36,11 @@ class VideoKind(StrEnum):
     MJPEG = "mjpeg"
     MCAP = "mcap"
     ROS1 = "ros1"
+    ROS2_SQLITE = "ros2-sqlite"
     """Bags: their pictures are read by `app.formats.bags`, not by a demuxer."""
 
 
+BAGS = (VideoKind.MCAP, VideoKind.ROS1, VideoKind.ROS2_SQLITE)
 _DEMUXERS = {VideoKind.MP4: "mov", VideoKind.AVI: "avi", VideoKind.MJPEG: "mjpeg"}
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import UnsupportedUpload
-from app.formats.video.container import FIELD, VideoKind
+from app.formats.video.container import BAGS, FIELD, VideoKind
 from app.formats.video.index import VideoIndex, VideoSegment
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def read_frames(index: VideoIndex, segment: VideoSegment, report: ReadReport, *,
         The video is mirrored, or turned by no multiple of 90 degrees.
     """
     last = min(segment.end + beyond, len(index.stamps))
-    if index.file.kind in (VideoKind.MCAP, VideoKind.ROS1):
+    if index.file.kind in BAGS:
         from app.formats.bags.drive import read_pictures
 
         yield from read_pictures(index, segment, report, last)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
-from app.formats.video.container import EXPECTED, FIELD, VideoFile, VideoKind
+from app.formats.video.container import BAGS, EXPECTED, FIELD, VideoFile, VideoKind
 from app.sensors.pose_track import PoseTrack
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: 
         It has no times, and no rate is declared.
     """
     limits = limits or VideoLimits()
-    if file.kind in (VideoKind.MCAP, VideoKind.ROS1):
+    if file.kind in BAGS:
         from app.formats.bags.drive import index_bag
 
         return index_bag(file, limits)

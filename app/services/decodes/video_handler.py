@@ -249,7 +249,7 @@ class StartedVideo:
 
 def _kind_of(context: DecodeContext, file: SpooledFile) -> VideoKind | None:
     is_stream = (context.frames or {}).get("rate_hz") is not None
-    return detect_video(file.head(16), is_stream=is_stream)
+    return detect_video(file.head(), is_stream=is_stream)
 
 
 def _header(width_px: int, height_px: int) -> ImageHeader:
