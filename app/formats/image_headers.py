@@ -33,6 +33,7 @@ _OTHER_SIGNATURES = (
     (b"PK\x03\x04", "a ZIP archive"),
     (b"ffconcat", "a playlist"),
     (b"#EXTM3U", "a playlist"),
+    (b"v=0", "a session description (SDP)"),
     (b"<svg", "an SVG"),
     (b"<?xml", "an XML document"),
 )
@@ -122,7 +123,7 @@ def scan_image(data: bytes, limits: ImageLimits, *, thermal: bool) -> ScannedIma
     elif data.startswith(_JPEG_SIGNATURE):
         scan = _scan_jpeg(data, limits)
     else:
-        raise _unknown(data)
+        raise unknown_picture(data)
     if scan.header.bit_depth == 16 and not thermal:
         raise UnsupportedUpload(
             "a 16-bit PNG is read from thermal cameras only",
@@ -133,12 +134,18 @@ def scan_image(data: bytes, limits: ImageLimits, *, thermal: bool) -> ScannedIma
     return scan
 
 
-def _unknown(data: bytes) -> UnsupportedUpload:
-    kind = next((name for signature, name in _OTHER_SIGNATURES if data.startswith(signature)), None)
-    if data[4:8] == b"ftyp":
+def is_picture(head: bytes) -> bool:
+    """Whether a file begins like a JPEG or a PNG."""
+    return head.startswith((_PNG_SIGNATURE, _JPEG_SIGNATURE))
+
+
+def unknown_picture(head: bytes, accepted: str = _KINDS, cure: str = SEND_AS_IT_IS) -> UnsupportedUpload:
+    """The refusal of a file that is no picture; it says what the file looks like, and what is accepted."""
+    kind = next((name for signature, name in _OTHER_SIGNATURES if head.startswith(signature)), None)
+    if head[4:8] == b"ftyp":
         kind = "a video, HEIC or AVIF"
     what = f"the file is {kind}" if kind else "the file is neither a JPEG nor a PNG"
-    return UnsupportedUpload(f"{what}, which no frame decoder reads", field=FIELD, limit=_KINDS, cure=SEND_AS_IT_IS)
+    return UnsupportedUpload(f"{what}, which no frame decoder reads", field=FIELD, limit=accepted, cure=cure)
 
 
 def _check_size(width_px: int, height_px: int, limits: ImageLimits) -> None:

@@ -18,6 +18,7 @@ from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.formats import TRACE_FORMATS
 from app.formats.traces.parts import open_parts
 from app.formats.video.archive import holds_video
+from app.formats.video.container import EXPECTED as VIDEOS
 from app.formats.video.container import detect_video
 
 FORMATS: tuple[Format[object], ...] = (
@@ -31,6 +32,16 @@ FORMATS: tuple[Format[object], ...] = (
 """Of equally likely formats the first is detected."""
 _SAMPLE_BYTES = 1 << 16  # [byte] chosen by hand; as much as `open_parts` reads of each file at first
 _POSE_SUFFIXES = (".gpx", ".nmea", ".nma")
+
+
+def list_decoded() -> str:
+    """All kinds of files that are decoded, for a message."""
+    accepted = {use: ", ".join(found.name for found in FORMATS if found.use is use) for use in _DECODED_AS}
+    return (
+        f"frames ({accepted[Use.FRAME]}, or a ZIP of them); videos ({VIDEOS}, or a ZIP of one); "
+        f"traces ({accepted[Use.TRACE]}, or a ZIP of them); packet logs ({accepted[Use.PACKETS]}), "
+        f"also in a ZIP with the vehicle's track ({accepted[Use.POSES]})"
+    )
 
 
 class UploadKind(StrEnum):

@@ -48,7 +48,9 @@ class RulesIn(StrictModel):
         0.001, ge=1e-12, lt=0.5, description="Most probability with which a code is taken for another."
     )
     wrong_way_safe: Flag = Field(False, description="No code is another's reverse, nor its own.")
-    survive_missing: Flag = Field(False, description="A code is recognised although one magnet is missed; from M = 4 on.")
+    survive_missing: Flag = Field(
+        False, description="A code is recognised although one magnet is missed; from M = 4 on."
+    )
 
     def given(self) -> CodebookRules:
         """The rules as the core knows them."""

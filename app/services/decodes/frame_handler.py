@@ -15,7 +15,9 @@ from app.errors import UploadTooLarge
 from app.families.frames import FrameReading, Match
 from app.families.plate.plates import PLATE
 from app.formats.archives import Member
+from app.formats.image_headers import is_picture, unknown_picture
 from app.formats.images import ImageHeader, ImageLimits, inspect_image
+from app.formats.kinds import list_decoded
 from app.formats.spooled_file import SpooledFile
 from app.geodesy import decimal_year
 from app.markers.reading import PlateReading
@@ -35,6 +37,8 @@ from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
 from app.services.health.evidence import EVIDENCE
 from app.services.health.frames import frame_health, missed_observations, unregistered_readings
 
+_SIGNATURE_BYTES = 16
+_DECLARE = "send one of these; a trace or a packet log of any name is read where the context has trace or packets"
 _LARGE = threading.Semaphore(2)
 """Frames that are not held in memory are inspected two at a time, because that reads them whole."""
 
@@ -90,7 +94,10 @@ class FrameHandler(UploadHandler[FrameSignal]):
         return True
 
     def is_job(self, file: SpooledFile) -> bool:
-        """Never: a frame takes some milliseconds."""
+        """Never: a frame takes some milliseconds. What is no picture is of no kind that any handler decodes."""
+        head = file.head(_SIGNATURE_BYTES)
+        if head and not is_picture(head):
+            raise unknown_picture(head, list_decoded(), _DECLARE)
         return False
 
     def start(self, upload: Upload) -> StartedFrame:

@@ -12,6 +12,10 @@ import httpx
 import numpy as np
 import pytest
 
+from app.formats.images import FRAME_FORMATS
+from app.formats.packets.formats import PACKET_FORMATS
+from app.formats.poses.formats import POSE_FORMATS
+from app.formats.traces.formats import TRACE_FORMATS
 from app.main import create_app
 from app.services.access.access import Scope
 from app.settings import Settings
@@ -135,6 +139,21 @@ def test_retired_plates_are_no_codebook(client: httpx.Client, plate: dict[str, A
 @pytest.mark.usefixtures("unchanged")
 def test_bad_files(client: httpx.Client, data: bytes, status: int, slug: str) -> None:
     check_problem(post_frame(client, data), status, slug, "file")
+
+
+@pytest.mark.usefixtures("unchanged")
+def test_a_file_of_no_kind_is_refused_with_all_kinds(client: httpx.Client) -> None:
+    for data, looks_like in (
+        (b"no picture", "neither a JPEG"),
+        (b"v=0\no=- 0 0 IN IP4 127.0.0.1", "SDP"),
+        (b"GIF89a", "GIF"),
+    ):
+        problem = check_problem(post_frame(client, data), 415, "unsupported-upload", "file")
+        assert looks_like in problem["detail"]
+        for found in (*FRAME_FORMATS, *TRACE_FORMATS, *PACKET_FORMATS, *POSE_FORMATS):
+            assert found.name in problem["limit"]
+        assert "MP4" in problem["limit"]
+        assert "ROS 1" in problem["limit"]
 
 
 def test_a_frame_that_takes_too_long_is_refused(tmp_path: Path) -> None:
