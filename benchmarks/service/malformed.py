@@ -3,7 +3,8 @@
 Every file is sent to the route of its kind. What the answers and the jobs are is counted; a status of 500 or above
 (503 with Retry-After is repeated), a job beyond its time limit, and a process above 1.5 GB are failures.
 
-Run: python -m benchmarks.service --only malformed [--short]
+Run: python -m benchmarks.service --only malformed [--short]; on Celery too with WAYMARK_BENCH_POSTGRES_URL and
+WAYMARK_BENCH_BROKER_URL.
 """
 
 from __future__ import annotations
@@ -42,12 +43,21 @@ _CONTEXTS = {"traces": {"trace": {}}, "packets": {"packets": {}}}
 
 @dataclass(slots=True)
 class Outcome:
-    """What came of the files of one format."""
+    """What came of the files of one format.
+
+    Attributes
+    ----------
+    slowest_s : float
+        Longest time from the request to the end of its job. [s]
+    slowest : int
+        Number of that file in `make_files`.
+    """
 
     files: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
     jobs: Counter[str] = field(default_factory=Counter)
     slowest_s: float = 0.0
+    slowest: int = 0
     failures: list[str] = field(default_factory=list)
 
 
@@ -110,6 +120,7 @@ def tables(short: bool, engines: tuple[str, ...] = ("embedded",)) -> str:
             ]
             lines.append(
                 f"| {engine} | {kind} | {found.files} | {counted[0]} | {counted[1]} | {found.slowest_s:.1f} s "
+                f"(file {found.slowest}) "
                 f"| {len(found.failures)} |"
             )
             lines += [f"|  | {failure[:200]} |  |  |  |  |  |" for failure in found.failures[:5]]
@@ -121,29 +132,29 @@ def attack(server: FaultServer, files: list[tuple[str, bytes]]) -> tuple[dict[st
     """Send files one after the other; returns the outcomes by format, and the most memory of a process. [MiB]"""
     outcomes: dict[str, Outcome] = {}
     ended, peak = threading.Event(), [0.0]
-    watcher = threading.Thread(target=_watch, args=(server.pid, ended, peak))
+    watcher = threading.Thread(target=_watch, args=(server, ended, peak))
     watcher.start()
     try:
         with server.client() as client:
             client.timeout = httpx.Timeout(400)
-            for kind, data in files:
-                _send(client, kind, data, outcomes.setdefault(kind, Outcome()))
+            for number, (kind, data) in enumerate(files):
+                _send(client, kind, data, number, outcomes.setdefault(kind, Outcome()))
     finally:
         ended.set()
         watcher.join()
     return outcomes, peak[0]
 
 
-def _watch(pid: int, ended: threading.Event, peak: list[float]) -> None:
+def _watch(server: FaultServer, ended: threading.Event, peak: list[float]) -> None:
     while not ended.wait(0.05):
-        for process in psutil.Process(pid).children(recursive=True):
+        for process in [child for pid in server.pids() for child in psutil.Process(pid).children(recursive=True)]:
             try:
                 peak[0] = max(peak[0], process.memory_info().rss / 2**20)
             except psutil.NoSuchProcess:
                 continue
 
 
-def _send(client: httpx.Client, kind: str, data: bytes, found: Outcome) -> None:
+def _send(client: httpx.Client, kind: str, data: bytes, number: int, found: Outcome) -> None:
     found.files += 1
     began = time.monotonic()
     response = _post(client, kind, data)
@@ -155,7 +166,8 @@ def _send(client: httpx.Client, kind: str, data: bytes, found: Outcome) -> None:
         found.failures.append(f"{response.status_code} {response.text[:150]}")
     if response.status_code == 202:
         found.jobs[_wait(client, response.headers["Location"], began, found)] += 1
-    found.slowest_s = max(found.slowest_s, time.monotonic() - began)
+    if (took := time.monotonic() - began) > found.slowest_s:
+        found.slowest_s, found.slowest = took, number
 
 
 def _post(client: httpx.Client, kind: str, data: bytes) -> httpx.Response:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer, serving
 from tests.formats.pictures import png
 from tests.http import created, finished, refused, wait_until
 from tests.jobs import standin
+from tests.jobs.hostile_files import hostile_files, send
 
 pytestmark = pytest.mark.both_engines
 
@@ -48,6 +50,30 @@ def test_an_archive_is_decoded_though_a_frame_kills_its_process(client: httpx.Cl
     decode = finished(client, answer.headers["Location"])
     assert decode["state"] == "done", decode
     assert [frame["error"] is not None for frame in decode["frames"]] == [False, True, False]
+
+
+def test_damaged_and_hostile_files_are_refused_or_fail_their_job(client: httpx.Client, tmp_path: Path) -> None:
+    """None is a defect of the server, none reaches another file or an address, and sound files are decoded after."""
+    other = tmp_path / "another.png"
+    other.write_bytes(png(standin.frame_that(standin.OBEY)))
+    with socket.create_server(("127.0.0.1", 0)) as elsewhere:
+        address = f"http://127.0.0.1:{elsewhere.getsockname()[1]}"
+        for file in hostile_files(address, other):
+            answer = send(client, file)
+            document = answer.json()
+            if answer.status_code in (200, 201, 202) and "Location" in answer.headers:
+                document = finished(client, answer.headers["Location"])
+                assert document["state"] in ("done", "failed"), (file.what, document)
+            else:
+                assert answer.status_code < 500, (file.what, answer.text)
+            assert not document.get("readings"), (file.what, document)
+            assert not any(frame.get("readings") for frame in document.get("frames") or ()), (file.what, document)
+            if file.what.startswith("video:"):
+                assert answer.status_code in (415, 422) or document["state"] == "failed", (file.what, document)
+        elsewhere.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            elsewhere.accept()
+    assert post_frame(client, png(standin.frame_that(standin.OBEY))).status_code == 201
 
 
 def test_a_running_job_is_cancelled(client: httpx.Client) -> None:
