@@ -15,6 +15,7 @@ import structlog
 import uvicorn
 
 from app.api.http.connections import ConnectionLimits, limited_connections
+from app.cli.loading import collector_paused
 from app.errors import InvalidParameter
 from app.settings import Settings
 
@@ -60,7 +61,8 @@ def serve_until_stopped(settings: Settings) -> None:
     InvalidParameter
         The address or the port cannot be used.
     """
-    from app.main import create_app
+    with collector_paused():
+        from app.main import create_app
 
     _check_port(settings.host, settings.port)
     _raise_file_limit(_FILES_PER_CONNECTION * settings.max_connections + _OTHER_FILES)

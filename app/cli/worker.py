@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from app.cli.database import read_settings
+from app.cli.loading import collector_paused
 from app.errors import InvalidParameter, Unavailable
 
 _END_S = 8.0
@@ -37,7 +38,8 @@ def worker(
         raise InvalidParameter(str(error), field="--queues", limit=_QUEUES) from error
     if not names:
         raise InvalidParameter("a worker needs a queue", field="--queues", limit=_QUEUES)
-    from app.worker import running_worker
+    with collector_paused():
+        from app.worker import running_worker
 
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

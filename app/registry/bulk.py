@@ -90,8 +90,8 @@ def add_markers(
 ) -> None:
     """Store new markers of the entry's agency, each with the first version of its history.
 
-    The columns are those of `MarkerRow`, the rows in the order of their ids; `kind` distinguishes a version's kind from the
-    status.
+    The columns are those of `MarkerRow`, the rows in the order of their ids; `kind` gives a version's kind from
+    the status.
     """
     kinds = [str(kind(status)) for status in columns.values("status")]
     versions = entry.first_versions(columns.values("id"), json_objects(columns), kinds=kinds, why=why)
