@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from app.cli.database import owned_database, read_settings
+from app.cli.progress import Progress
 from app.errors import InvalidParameter, Unavailable
 from app.settings import Settings
 
 if TYPE_CHECKING:
     from app.registry.database import Database
-    from app.services.backups.backup import BackupOptions, Progress
+    from app.services.backups.backup import BackupOptions
     from app.services.backups.manifest import Manifest
     from app.storage.blobs import Blobs
 
@@ -66,8 +65,8 @@ def restore(
     from app.services.backups.restore import Restores
 
     settings = read_settings()
-    with owned_database(settings) as database, _progress() as progress:
-        report = Restores(database, _blobs(settings), _key_files(settings)).restore(source, progress)
+    with owned_database(settings) as database, Progress() as shown:
+        report = Restores(database, _blobs(settings), _key_files(settings)).restore(source, shown.show)
     for fault in report.faults:
         typer.echo(f"waymark: {fault}", err=True)
     for name in report.absent_keys:
@@ -128,9 +127,9 @@ def _write_backup(settings: Settings, target: Path, options: BackupOptions) -> M
     from app.services.backups.backup import Backups
     from app.wiring import utc_now
 
-    with closing(Database(settings.resolved_database_url)) as database, _progress() as progress:
+    with closing(Database(settings.resolved_database_url)) as database, Progress() as shown:
         backups = Backups(database, _blobs(settings), utc_now, __version__, _key_files(settings))
-        return backups.write(target, options, progress)
+        return backups.write(target, options, shown.show)
 
 
 def _blobs(settings: Settings) -> Blobs:
@@ -163,20 +162,3 @@ def _describe(path: Path, manifest: Manifest) -> None:
         typer.echo(f"does not contain {', '.join(apart)}: keep copies apart; without them secrets cannot be read")
     if blobs["missing"]:
         typer.echo(f"{len(blobs['missing'])} blobs are lost, as {blobs['missing'][0]}", err=True)
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """A line on a terminal that is written again and again; nothing elsewhere."""
-    shown = sys.stderr.isatty()
-
-    def show(what: str, done: int, total: int) -> None:
-        if shown and done % 100 == 0:
-            sys.stderr.write(f"\r\033[K{what} {done}/{total}" if total else f"\r\033[K{what}")
-            sys.stderr.flush()
-
-    try:
-        yield show
-    finally:
-        if shown:
-            sys.stderr.write("\r\033[K")

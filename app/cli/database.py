@@ -88,7 +88,8 @@ def readable_database(settings: Settings) -> Iterator[Database]:
 
 
 def perform(settings: Settings, name: str, values: Values, files: Sequence[int] = ()) -> Values:
-    """Carry out an operation of `app.control.operations`, in the server if one owns the database."""
+    """Carry out an operation of `app.control.operations`, in the server if one owns the database, with its progress."""
+    from app.cli.progress import Progress
     from app.control.client import perform as carry_out
     from app.control.operations import OperatorCases
     from app.jobs.tasks import SameProcess
@@ -101,4 +102,5 @@ def perform(settings: Settings, name: str, values: Values, files: Sequence[int] 
         imports = Imports(database, utc_now, SameProcess(), marker_rules(settings))
         return OperatorCases(database, utc_now, Access(database, utc_now), imports, Exports(database))
 
-    return carry_out(settings.resolved_database_url, name, values, make_cases, files)
+    with Progress() as shown:
+        return carry_out(settings.resolved_database_url, name, values, make_cases, files, shown.show)

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from rich.progress import Progress as Bars
     from rich.progress import TaskID
 
 _LINE_EVERY_S = 5.0
+_MEGABYTE = 1e6
+BYTES = "MB"
+"""Unit of steps that are counted in bytes and shown in megabytes."""
+
+
+class _Line(NamedTuple):
+    """What was shown of a step last, and how far it was at first."""
+
+    at_s: float
+    share: float
+    began_s: float
+    began: float
 
 
 class Progress:
-    """Shows how far several steps of a command are, on standard error.
+    """Shows how far several steps of a command are, with their rates, on standard error.
 
     Parameters
     ----------
@@ -24,22 +38,13 @@ class Progress:
     """
 
     def __init__(self, *, quiet: bool = False) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
-        from rich.progress import Progress as Bars
-
         self._quiet = quiet
-        console = Console(stderr=True)
-        self._bars: Bars | None = None
-        if console.is_terminal and not quiet:
-            columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-            self._bars = Bars(*columns, console=console)
+        is_terminal = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+        self._bars: Bars | None = _make_bars() if is_terminal and not quiet else None
         self._tasks: dict[str, TaskID] = {}
-        self._shown: dict[str, tuple[float, float]] = {}
+        self._lines: dict[str, _Line] = {}
 
     def __enter__(self) -> Progress:
-        if self._bars is not None:
-            self._bars.start()
         return self
 
     def __exit__(
@@ -48,27 +53,84 @@ class Progress:
         if self._bars is not None:
             self._bars.stop()
 
-    def show(self, step: str, done: float, total: float) -> None:
-        """Say how far a step is."""
-        if self._bars is not None:
-            if step not in self._tasks:
-                self._tasks[step] = self._bars.add_task(step, total=total)
-            self._bars.update(self._tasks[step], completed=done, total=total)
-        elif not self._quiet:
-            self._show_line(step, done, total)
+    def show(self, step: str, done: float, total: float, unit: str = "") -> None:
+        """Show how far a step is.
 
-    def counted(self, step: str, parts: Iterable[bytes], size_bytes: int) -> Iterator[bytes]:
-        """Parts of a file on their way, shown by their bytes."""
-        done = 0
+        Parameters
+        ----------
+        step : str
+            Its name; a new one gets a bar of its own.
+        done, total : float
+            Total 0 is not known; of 1 only the share is shown.
+        unit : str, optional
+            Of what is counted; `BYTES` for bytes.
+        """
+        if self._bars is not None:
+            self._bars.start()
+            if step not in self._tasks:
+                self._tasks[step] = self._bars.add_task(step, total=total or None, unit=unit)
+            self._bars.update(self._tasks[step], completed=done, total=total or None)
+        elif not self._quiet:
+            self._show_line(step, done, total, unit)
+
+    def counted(self, step: str, parts: Iterable[bytes], size_bytes: int, *, done: int = 0) -> Iterator[bytes]:
+        """Parts of a file on their way, shown by their bytes, from those that are there already."""
         for part in parts:
             yield part
             done += len(part)
-            self.show(step, done, size_bytes)
+            self.show(step, done, size_bytes, BYTES)
 
-    def _show_line(self, step: str, done: float, total: float) -> None:
-        share = done / total if total else 1.0
-        before_s, before = self._shown.get(step, (-_LINE_EVERY_S, -1.0))
+    def _show_line(self, step: str, done: float, total: float, unit: str) -> None:
+        share = done / total if total else 0.0
         now_s = time.monotonic()
-        if share != before and (now_s - before_s >= _LINE_EVERY_S or share >= 1.0):
-            self._shown[step] = now_s, share
-            print(f"{step}: {share:.0%}", file=sys.stderr, flush=True)
+        before = self._lines.get(step) or _Line(now_s - _LINE_EVERY_S, -1.0, now_s, done)
+        if share == before.share or (now_s - before.at_s < _LINE_EVERY_S and share < 1.0):
+            self._lines.setdefault(step, before)
+            return
+        self._lines[step] = before._replace(at_s=now_s, share=share)
+        elapsed_s = now_s - before.began_s
+        rate = (done - before.began) / elapsed_s if elapsed_s > 0 else None
+        shown = [f"{share:.0%}" if total else "", amount(done, total, unit), speed(rate, total, unit)]
+        text = ", ".join(text for text in shown if text)
+        print(f"{step}: {text}" if text else step, file=sys.stderr, flush=True)
+
+
+def amount(done: float, total: float | None, unit: str) -> str:
+    """How much of a step is done, e.g. ``3 of 12``; empty where nothing is counted."""
+    if total == 1 or not (done or total):
+        return ""
+    of_all = f" of {_number(total, unit)}" if total else ""
+    return f"{_number(done, unit)}{of_all} {unit}".rstrip()
+
+
+def speed(rate: float | None, total: float | None, unit: str) -> str:
+    """Steps a second, e.g. ``4.1/s``; empty where it is not known."""
+    if not rate or rate <= 0 or total == 1:
+        return ""
+    return f"{rate / _MEGABYTE:.1f} MB/s" if unit == BYTES else f"{rate:.3g}/s" if rate < 1000 else f"{rate:.0f}/s"
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value / _MEGABYTE:.1f}" if unit == BYTES else f"{value:.0f}"
+
+
+def _make_bars() -> Bars:
+    from rich.console import Console
+    from rich.progress import BarColumn, ProgressColumn, Task, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+    from rich.text import Text
+
+    class Counts(ProgressColumn):
+        """Done, total and rate."""
+
+        def render(self, task: Task) -> Text:
+            unit = task.fields["unit"]
+            rate = task.finished_speed or task.speed
+            return Text(
+                "  ".join(filter(None, (amount(task.completed, task.total, unit), speed(rate, task.total, unit))))
+            )
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), Counts(), TimeRemainingColumn(),
+    )  # fmt: skip
+    return Bars(*columns, console=Console(stderr=True))

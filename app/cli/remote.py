@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app.cli.progress import Progress
-from app.errors import InvalidParameter, WaymarkError
+from app.errors import InvalidParameter, Unavailable, WaymarkError
 
 if TYPE_CHECKING:
     import httpx
@@ -21,6 +22,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JS
 _SERVER = "http://127.0.0.1:8000"
 _PART = 256 * 1024
 _RETRY_S = 1.0
+_SMALL_BYTES = 8 * 1024**2
+"""Larger files are sent so that the upload can go on after an interruption. [byte] Source: chosen by hand."""
 
 
 def upload(
@@ -30,11 +33,12 @@ def upload(
     context: Annotated[str, typer.Option(help="Context as JSON; see the API's /docs.")] = "{}",
     as_json: JsonOption = False,
 ) -> None:
-    """Upload a file to a server, wait until it is decoded, and print what was found."""
+    """Upload a file to a server, wait until it is decoded, and print what was found.
+
+    A file of more than 8 MiB is sent by tus: run the command again after an interruption, and it goes on where it was.
+    """
     with _client(server, key) as client, Progress(quiet=as_json) as shown:
-        body, headers = _multipart(file, context)
-        sent = shown.counted("upload", body, int(headers["Content-Length"]))
-        decode = _checked(client.post("/v1/decodes", content=sent, headers=headers))
+        decode = _sent(client, file, context, shown)
         if decode["state"] != "done":
             follow_job(client, decode["id"], shown)
             decode = _checked(client.get(f"/v1/decodes/{decode['id']}"))
@@ -45,6 +49,17 @@ def upload(
         typer.echo(f"{server}{decode['links']['self']}")
     if decode["state"] != "done":
         raise _failure(decode)
+
+
+def _sent(client: httpx.Client, file: Path, context: str, shown: Progress) -> dict[str, Any]:
+    """Send a file; returns its decode, which may be a job still."""
+    if file.stat().st_size > _SMALL_BYTES:
+        from app.cli.resumable import ResumableUpload
+
+        return _checked(client.get(ResumableUpload(client, file, context, shown, _checked).send()))
+    body, headers = _multipart(file, context)
+    sent = shown.counted("upload", body, int(headers["Content-Length"]))
+    return _checked(client.post("/v1/decodes", content=sent, headers=headers))
 
 
 def artwork(
@@ -131,11 +146,20 @@ def follow_job(client: httpx.Client, job_id: str, shown: Progress) -> dict[str, 
                 for name, event_id, job in _events(response.iter_lines()):
                     last = event_id
                     if name != "progress":
-                        shown.show(job["kind"], job["total"] or 1, job["total"] or 1)
+                        if name == "done":
+                            _show_job(shown, job, is_done=True)
                         return job
-                    shown.show(job["kind"], job["done"] if job["total"] else job["progress"], job["total"] or 1)
+                    _show_job(shown, job)
         except (httpx.RemoteProtocolError, httpx.ReadError, httpx.ConnectError):
             time.sleep(_RETRY_S)
+
+
+def _show_job(shown: Progress, job: dict[str, Any], *, is_done: bool = False) -> None:
+    """A job by its steps, where they are counted."""
+    if job["total"]:
+        shown.show(job["kind"], job["total"] if is_done else job["done"], job["total"])
+    else:
+        shown.show(job["kind"], 1.0 if is_done else job["progress"], 1.0)
 
 
 def _events(lines: Iterator[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -151,13 +175,29 @@ def _events(lines: Iterator[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
             fields = {}
 
 
-def _client(server: str, key: str) -> httpx.Client:
+@contextmanager
+def _client(server: str, key: str) -> Iterator[httpx.Client]:
+    """A client of a server; what goes wrong on the way is an error with its cure."""
     import httpx
 
     if not key:
         raise InvalidParameter("no key was given", field="--key", cure="set WAYMARK_KEY, or give --key")
     headers = {"Authorization": f"Bearer {key}"}
-    return httpx.Client(base_url=server.rstrip("/"), headers=headers, timeout=httpx.Timeout(60.0, read=300.0))
+    try:
+        timeout = httpx.Timeout(60.0, read=300.0)
+        with httpx.Client(base_url=server.rstrip("/"), headers=headers, timeout=timeout) as client:
+            yield client
+    except (httpx.InvalidURL, httpx.UnsupportedProtocol) as error:
+        raise InvalidParameter(
+            f"{server!r} is no address of a server", field="--server", limit="http:// or https://, a host and a port",
+            cure="for example --server https://waymark.example.org",
+        ) from error  # fmt: skip
+    except httpx.TransportError as error:
+        raise Unavailable(
+            f"the server at {server} does not answer: {error}", cure="check --server, and that the server runs"
+        ) from error
+    except httpx.HTTPStatusError as error:
+        raise WaymarkError(f"the server answered {error.response.status_code} to {error.request.url.path}") from error
 
 
 def _multipart(file: Path, context: str) -> tuple[Iterator[bytes], dict[str, str]]:

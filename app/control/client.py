@@ -9,8 +9,8 @@ from contextlib import contextmanager
 
 import orjson
 
-from app.control.operations import OPERATIONS, OperatorCases, Values
-from app.control.sockets import receive_all, short_address, socket_path
+from app.control.operations import OPERATIONS, OperatorCases, Report, Values, show_nothing
+from app.control.sockets import short_address, socket_path
 from app.errors import Unavailable, WaymarkError
 from app.registry.database import Database
 from app.registry.tenancy import across_agencies
@@ -22,8 +22,9 @@ _MAX_ANSWER_BYTES = 512 * 1024**2
 
 
 def perform(
-    url: str, name: str, values: Values, make_cases: Callable[[Database], OperatorCases], files: Sequence[int] = ()
-) -> Values:
+    url: str, name: str, values: Values, make_cases: Callable[[Database], OperatorCases], files: Sequence[int] = (),
+    report: Report = show_nothing,
+) -> Values:  # fmt: skip
     """Carry out an operation: in this process if no other owns the database, else in the server.
 
     Parameters
@@ -38,6 +39,8 @@ def perform(
         The use cases on a database that this process has opened and migrated.
     files : sequence of int
         Descriptors of open files.
+    report : callable, optional
+        Shows progress.
 
     Raises
     ------
@@ -54,7 +57,7 @@ def perform(
                 raise
             with _connected(database) as connection:
                 if connection is not None:
-                    return _ask(connection, name, values, files)
+                    return _ask(connection, name, values, files, report)
             if time.monotonic() > last_s:
                 raise
             time.sleep(_AGAIN_S)
@@ -62,7 +65,7 @@ def perform(
         try:
             database.migrate()
             with across_agencies():
-                return OPERATIONS[name](make_cases(database), values, files)
+                return OPERATIONS[name](make_cases(database), values, files, report)
         finally:
             database.close()
 
@@ -81,14 +84,15 @@ def _connected(database: Database) -> Iterator[socket.socket | None]:
         yield connection
 
 
-def _ask(connection: socket.socket, name: str, values: Values, files: Sequence[int]) -> Values:
-    request = orjson.dumps({"operation": name, "values": values})
+def _ask(connection: socket.socket, name: str, values: Values, files: Sequence[int], report: Report) -> Values:
+    request = orjson.dumps({"operation": name, "values": values, "progress": True})
     try:
         sent = socket.send_fds(connection, [request], list(files)) if files else connection.send(request)
         connection.sendall(request[sent:])
         connection.shutdown(socket.SHUT_WR)
-        content = receive_all(connection, _MAX_ANSWER_BYTES)
-        answer = orjson.loads(content)
+        with connection.makefile("rb") as lines:
+            while "progress" in (answer := orjson.loads(lines.readline(_MAX_ANSWER_BYTES))):
+                report(*answer["progress"])
     except (OSError, ValueError) as error:
         raise Unavailable(
             "the server ended before it answered; the command may have been carried out or not",

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,6 +20,7 @@ from app.api.markers.filters import parse_box
 from app.errors import InvalidParameter
 from app.formats.spooled_file import SpooledFile
 from app.registry.agencies import find_agency
+from app.registry.bulk import count_records
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter
 from app.registry.tenancy import across_agencies, acting_for
@@ -26,7 +28,7 @@ from app.services.access.access import Access, Caller, Scope, parse_scope
 from app.services.ports import Clock
 from app.services.surveys.declarations import import_input
 from app.services.surveys.exports import Exports
-from app.services.surveys.imports import Imports
+from app.services.surveys.imports import SETTLED, Imports
 
 _CHUNK_BYTES = 1024**2
 
@@ -43,11 +45,17 @@ class OperatorCases:
 
 
 Values = Mapping[str, Any]
-Operation = Callable[[OperatorCases, Values, Sequence[int]], Values]
-"""Takes arguments and the descriptors of open files; returns the result. Both mappings are JSON."""
+Report = Callable[[str, float, float], None]
+"""Takes the name of a step, how much of it is done, and all of it. It returns at once and raises nothing."""
+Operation = Callable[[OperatorCases, Values, Sequence[int], Report], Values]
+"""Takes arguments, descriptors of open files and what shows progress; returns the result. Both mappings are JSON."""
 
 
-def create_key(cases: OperatorCases, values: Values, _files: Sequence[int]) -> Values:
+def show_nothing(_step: str, _done: float, _total: float) -> None:
+    """Show no progress."""
+
+
+def create_key(cases: OperatorCases, values: Values, _files: Sequence[int], _report: Report) -> Values:
     """Create a key for an agency."""
     days = values["days"]
     expires_at = cases.clock() + timedelta(days=days) if days else None
@@ -56,23 +64,29 @@ def create_key(cases: OperatorCases, values: Values, _files: Sequence[int]) -> V
     return {"key": key}
 
 
-def import_survey(cases: OperatorCases, values: Values, files: Sequence[int]) -> Values:
+def import_survey(cases: OperatorCases, values: Values, files: Sequence[int], report: Report) -> Values:
     """Import the survey in the first file."""
     with TemporaryDirectory(prefix="waymark-import-") as folder, operator(cases.database, values["agency"]) as caller:
         survey = Path(folder, "survey")  # decoder processes open it by its path, and not all paths are theirs
         with os.fdopen(os.dup(files[0]), "rb") as given_file, survey.open("xb") as copy:
             shutil.copyfileobj(given_file, copy, _CHUNK_BYTES)
         given = import_input(values["declaration"], SpooledFile.at(survey))
-        report, _ = cases.imports.run(caller, given)
-    return {"report": report}
+        found, _ = cases.imports.run(
+            caller, given, step=lambda done: report("check", done / SETTLED, 1.0), stored=partial(report, "store")
+        )
+    return {"report": found}
 
 
-def export_markers(cases: OperatorCases, values: Values, files: Sequence[int]) -> Values:
+def export_markers(cases: OperatorCases, values: Values, files: Sequence[int], report: Report) -> Values:
     """Write an agency's markers into the first file."""
     box = parse_box(values["bbox"]) if values["bbox"] else None
     filtered = MarkerFilter(box=box, status=values["status"], family=values["family"])
     with TemporaryDirectory(prefix="waymark-export-") as folder, operator(cases.database, values["agency"]) as caller:
-        path, left_out = cases.exports.write_file(caller, values["kind"], filtered, Path(folder))
+        with cases.database.read() as connection:
+            total = count_records(connection, caller.agency_id, filtered)
+        path, left_out = cases.exports.write_file(
+            caller, values["kind"], filtered, Path(folder), lambda done: report("export", min(done, total), total)
+        )
         with path.open("rb") as content, os.fdopen(os.dup(files[0]), "wb") as file:
             shutil.copyfileobj(content, file, _CHUNK_BYTES)
             file.flush()

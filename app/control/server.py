@@ -6,6 +6,7 @@ import os
 import socket
 import struct
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +14,7 @@ from pathlib import Path
 import orjson
 import structlog
 
-from app.control.operations import OPERATIONS, OperatorCases
+from app.control.operations import OPERATIONS, OperatorCases, Report, show_nothing
 from app.control.sockets import MAX_FILES, MAX_REQUEST_BYTES, receive_all, short_address, socket_path
 from app.errors import InvalidParameter, Unavailable, WaymarkError
 
@@ -22,6 +23,7 @@ _REQUEST_S = 10.0
 """Longest wait for a request that a client has begun. [s] Source: by hand; it comes from the same machine."""
 _CREDENTIALS = struct.Struct("3i")  # pid, uid, gid: unix(7), SO_PEERCRED
 _AT_ONCE = 4  # operations at a time; source: by hand
+_REPORT_EVERY_S = 0.2
 
 
 class ControlServer:
@@ -78,7 +80,7 @@ class ControlServer:
                 request = first + receive_all(connection, MAX_REQUEST_BYTES)
                 connection.settimeout(None)
                 _check_peer(connection)  # after it was read: whoever still sends could not be told why
-                answer = self._answer(request, files)
+                answer = self._answer(request, files, connection)
             except WaymarkError as error:
                 answer = {"error": _described(error)}
             except OSError:
@@ -89,11 +91,12 @@ class ControlServer:
             with suppress(OSError):
                 connection.sendall(orjson.dumps(answer))
 
-    def _answer(self, request: bytes, files: Sequence[int]) -> dict[str, object]:
+    def _answer(self, request: bytes, files: Sequence[int], connection: socket.socket) -> dict[str, object]:
         try:
             document = orjson.loads(request)
             name, values = document["operation"], document["values"]
             operation = OPERATIONS[name]
+            report = _reporter(connection) if document.get("progress") else show_nothing
         except (ValueError, KeyError, TypeError) as error:
             raise InvalidParameter(
                 "the server does not know this operation", cure="use the server's version"
@@ -101,7 +104,7 @@ class ControlServer:
         if not self._places.acquire(timeout=_REQUEST_S):
             raise Unavailable("other commands are running", cure="try again in a few seconds")
         try:
-            result = operation(self._cases, values, files)
+            result = operation(self._cases, values, files, report)
         except WaymarkError:
             raise
         except Exception as error:
@@ -111,6 +114,21 @@ class ControlServer:
             self._places.release()
         _LOG.info("command", operation=name, agency_name=values.get("agency"))
         return {"result": result}
+
+
+def _reporter(connection: socket.socket) -> Report:
+    """Sends progress as lines before the answer. A client that does not read misses some: nobody waits for it."""
+    last: dict[str, float] = {}
+
+    def report(step: str, done: float, total: float) -> None:
+        now_s = time.monotonic()
+        if done < total and now_s - last.get(step, -_REPORT_EVERY_S) < _REPORT_EVERY_S:
+            return
+        last[step] = now_s
+        with suppress(OSError):
+            connection.send(orjson.dumps({"progress": [step, done, total]}) + b"\n", socket.MSG_DONTWAIT)
+
+    return report
 
 
 def _check_peer(connection: socket.socket) -> None:

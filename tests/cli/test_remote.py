@@ -10,13 +10,15 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
+from app.errors import WaymarkError
 from app.main import create_app
 from app.services.access.access import Scope
-from app.services.decodes import archive_handler
+from app.services.decodes import archive_handler, frame_runs
 from app.settings import Settings
 from tests.api.decodes.conftest import near
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
@@ -72,7 +74,8 @@ def test_a_frame_and_a_zip_are_uploaded_and_followed(
     assert "upload: 100%" in done.stderr
     followed = run("upload", str(archive(tmp_path / "drive.zip", 3)))
     assert followed.exit_code == 0, followed.output
-    assert "decode: 100%" in followed.stderr
+    assert "decode: 100%, 3 of 3" in followed.stderr
+    assert not set(followed.stderr) & set("\r\x1b")  # no terminal: no control characters
     as_json = run("upload", str(archive(tmp_path / "again.zip", 2)), "--json")
     assert printed(as_json)["summary"]["frames"] == 2
     assert as_json.stderr == ""
@@ -104,14 +107,16 @@ def test_a_running_decode_shows_its_result_so_far(
     server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(archive_handler, "PART_EVERY", timedelta(0))
-    decodes, seen = server.app.state.decodes, []
+    monkeypatch.setattr(frame_runs, "RUN_FRAMES", 1)
+    decodes, seen, steps = server.app.state.decodes, [], []
     keep_part = decodes._keep_part
     handler = next(handler for handler in decodes._handlers if handler.kind == "archive")
     monkeypatch.setattr(handler, "_rules", replace(handler._rules, progress_every=timedelta(0)))
     with server.agency("partial", Scope.PLANNER) as client:
 
-        def keep_and_look(job: Any, progress: float, part: Any) -> None:
-            keep_part(job, progress, part)
+        def keep_and_look(job: Any, done: int, total: int, part: Any) -> None:
+            keep_part(job, done, total, part)
+            steps.append((client.get(f"/v1/jobs/{job.row.id}").json()["done"], total))
             seen.append(client.get(f"/v1/decodes/{job.row.id}").json())
 
         monkeypatch.setattr(decodes, "_keep_part", keep_and_look)
@@ -121,8 +126,116 @@ def test_a_running_decode_shows_its_result_so_far(
         done = finished(client, path)
     assert [len(document["frames"]) for document in seen] == sorted(len(document["frames"]) for document in seen)
     assert any(0 < len(document["frames"]) < 4 for document in seen)
+    assert steps == [(len(document["frames"]), 4) for document in seen]
     assert all(
         document["partial"] is True and document["state"] == "running" for document in seen if document["frames"]
     )
     assert len(done["frames"]) == 4
     assert "partial" not in done
+
+
+class Cut(httpx.BaseTransport):
+    """A connection that breaks after some bytes of a part, so often."""
+
+    def __init__(self, after_bytes: int, times: int) -> None:
+        self._inner, self._after, self.left = httpx.HTTPTransport(), after_bytes, times
+        self.methods: list[str] = []
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        self.methods.append(request.method)
+        if request.method == "PATCH" and self.left:
+            self.left -= 1
+            request.stream = Broken(request.stream, self._after)
+        return self._inner.handle_request(request)
+
+    def close(self) -> None:
+        self._inner.close()
+
+
+class Broken(httpx.SyncByteStream):
+    """A body whose connection breaks."""
+
+    def __init__(self, stream: Any, after_bytes: int) -> None:
+        self._stream, self._after = stream, after_bytes
+
+    def __iter__(self) -> Iterator[bytes]:
+        sent = 0
+        for part in self._stream:
+            yield part
+            sent += len(part)
+            if sent >= self._after:
+                raise httpx.WriteError("the connection broke")
+
+
+@pytest.fixture
+def cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int], Cut]:
+    """Have the command's next connections break, and its uploads take the way of large files."""
+    monkeypatch.setattr("app.cli.remote._SMALL_BYTES", 0)
+    monkeypatch.setattr("app.cli.resumable._PAUSES_S", (0.1,) * 600)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    make = httpx.Client
+
+    def prepare(times: int) -> Cut:
+        transport = Cut(600_000, times)
+        monkeypatch.setattr(httpx, "Client", lambda **given: make(**{**given, "transport": transport}))
+        return transport
+
+    return prepare
+
+
+def long_archive(path: Path) -> Path:
+    archive(path, 2)
+    with zipfile.ZipFile(path, "a") as packed:
+        packed.writestr("noise.bin", bytes(3_000_000))
+    return path
+
+
+def test_a_large_upload_goes_on_after_interruptions(
+    run: Callable[..., Result], cut: Callable[[int], Cut], tmp_path: Path
+) -> None:
+    connection = cut(2)
+    done = run("upload", str(long_archive(tmp_path / "drive.zip")))
+    assert done.exit_code == 0, done.output
+    assert connection.methods.count("POST") == 1
+    assert connection.methods.count("PATCH") == 3
+    assert "upload: 100%, 3.0 of 3.0 MB" in done.stderr
+
+
+def test_an_upload_goes_on_in_the_next_run_of_the_command(
+    run: Callable[..., Result], cut: Callable[[int], Cut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = long_archive(tmp_path / "drive.zip")
+    monkeypatch.setattr("app.cli.resumable._PAUSES_S", ())
+    cut(1)
+    broken = run("upload", str(path))
+    assert broken.exit_code == 1
+    assert "run the command again" in str(getattr(broken.exception, "cure", ""))
+    connection = cut(0)
+    done = run("upload", str(path), "--json")
+    assert done.exit_code == 0, done.output
+    assert connection.methods.count("POST") == 0
+    assert printed(done)["summary"]["frames"] == 3
+    assert list((tmp_path / "state/waymark/uploads").iterdir()) == []
+    run("upload", str(path))
+    assert connection.methods.count("POST") == 1  # the same file again is another upload
+
+
+def test_a_large_file_that_is_refused_is_not_sent_again(
+    run: Callable[..., Result], cut: Callable[[int], Cut], tmp_path: Path
+) -> None:
+    path = tmp_path / "drive.zip"
+    path.write_bytes(b"this is no picture" * 1000)
+    connection = cut(0)
+    assert run("upload", str(path)).exit_code == 1
+    assert connection.methods.count("PATCH") == 1
+    assert list((tmp_path / "state/waymark/uploads").iterdir()) == []
+
+
+@pytest.mark.parametrize("address", ["http://127.0.0.1:9", "ftp://here", "http://[", "no address"])
+def test_a_server_that_does_not_answer(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WAYMARK_KEY", "key")
+    frame = tmp_path / "frame.png"
+    frame.write_bytes(GOOD)
+    failed = CliRunner().invoke(cli, ["upload", str(frame), "--server", address])
+    assert isinstance(failed.exception, WaymarkError), failed.exception
+    assert "--server" in failed.exception.cure

@@ -95,6 +95,7 @@ class StartedArchive:
         self._read_lists(file)
         frames = self._frames
         frames.clear()
+        self._upload.report_progress(0, total)
         self._reported_at = self._part_at = self._clock()
         for run in in_runs(self._prepare(m) for m in read_members(file, limits) if not is_beside_frames(m.name)):
             self._waiting.append(StartedRun(self._processes, run, self._upload.wait_s))
@@ -108,16 +109,17 @@ class StartedArchive:
 
     def _report(self, total: int) -> None:
         """Record now and then how far the job is; what this raises stops it."""
-        now, done = self._clock(), len(self._frames) / total
+        now, done = self._clock(), len(self._frames)
         if now - self._reported_at < self._rules.progress_every:
             return
         self._reported_at = now
         if now - self._part_at < PART_EVERY:
-            self._upload.report_progress(done)
+            self._upload.report_progress(done, total)
             return
         self._part_at = now
         notes = DriveNotes(self._places.warnings)
-        self._upload.report_part(done, frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes))
+        part = frames_result(self._frames, codebook_plates=len(self._codebook), notes=notes)
+        self._upload.report_part(done, total, part)
 
     def cancel(self) -> None:
         """Stop the frames that are on their way."""

@@ -151,17 +151,17 @@ class Decodes:
             upload = Upload(
                 job.row.agency_id, Author(job.row.input.get("label", ""), job.row.holder_id), file,
                 context_from_document(row.context), row.created_at,
-                wait_s=_WAIT_S, report_progress=job.report_progress, report_part=partial(self._keep_part, job),
+                wait_s=_WAIT_S, report_progress=partial(_report, job), report_part=partial(self._keep_part, job),
             )  # fmt: skip
             self._path.decode(upload, handler, QueuedRecord(job, upload, self._clock))
 
-    def _keep_part(self, job: RunningJob, progress: float, part: FramesResult) -> None:
+    def _keep_part(self, job: RunningJob, done: int, total: int, part: FramesResult) -> None:
         """Store the result so far."""
 
         def keep(connection: sa.Connection) -> None:
             store.store_part(connection, job.row.agency_id, job.row.id, part)
 
-        job.report_progress(progress, keep=keep, resumable=False)
+        job.report_progress(done / total, steps=(done, total), keep=keep, resumable=False)
 
     def decode_again(self, agency_id: str, decode_id: str) -> tuple[dict[str, Any], bytes | None]:
         """The result of a stored upload by the present decoders, and its plot; nothing is stored.
@@ -215,3 +215,7 @@ class Decodes:
             store.get_decode(connection, caller.agency_id, decode_id, holder_id=own)
             jobs.request_cancel(connection, caller.agency_id, decode_id, self._clock())
             return decode_document(store.get_decode(connection, caller.agency_id, decode_id, holder_id=own))
+
+
+def _report(job: RunningJob, done: int, total: int) -> None:
+    job.report_progress(done / total, steps=(done, total))

@@ -62,9 +62,9 @@ class Upload:
     wait_s : float
         How long to wait for a decoder process. [s]
     report_progress : callable
-        Called with a number from 0 to 1 by handlers that work for long; what it raises stops the decode.
+        Called with the frames that are done, and all, by handlers that work for long; what it raises stops the decode.
     report_part : callable
-        Called with a number from 0 to 1 and the result so far, which is stored; what it raises stops the decode.
+        Called as `report_progress`, and with the result so far, which is stored; what it raises stops the decode.
     again_id : str or None
         Id of the stored decode that is decoded again, to compare; nothing of that is stored with it.
     """
@@ -75,8 +75,8 @@ class Upload:
     context: DecodeContext
     received_at: datetime
     wait_s: float = 0.0
-    report_progress: Callable[[float], None] = lambda _progress: None
-    report_part: Callable[[float, FramesResult], None] = lambda _progress, _part: None
+    report_progress: Callable[[int, int], None] = lambda _done, _total: None
+    report_part: Callable[[int, int, FramesResult], None] = lambda _done, _total, _part: None
     again_id: str | None = None
 
     @property

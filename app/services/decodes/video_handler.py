@@ -119,14 +119,15 @@ class StartedVideo:
         self._signal, self._last = VideoSignal(), []
         index = self._index()
         done = 0
+        self._upload.report_progress(0, len(index.stamps))
         for number, segment in enumerate(index.segments):
             self._waiting.append(self._start(index, number, segment))
             if len(self._waiting) >= self._rules.frames_in_flight:
                 done = self._finish(index, self._waiting.popleft())
-                self._report(done / len(index.stamps))
+                self._report(done, len(index.stamps))
         while self._waiting:
             done = self._finish(index, self._waiting.popleft())
-            self._report(done / len(index.stamps))
+            self._report(done, len(index.stamps))
         self._signal.warnings += [text for text in self._places.warnings if text not in self._signal.warnings]
         return self._signal
 
@@ -236,15 +237,15 @@ class StartedVideo:
         pose = self._places.pose_of(at)
         return FrameMoment(self._places.context_at(pose), at, pose)
 
-    def _report(self, progress: float) -> None:
+    def _report(self, done: int, total: int) -> None:
         now = self._clock()
         if now - self._part_at < PART_EVERY:
-            self._upload.report_progress(progress)
+            self._upload.report_progress(done, total)
             return
         self._part_at = now
         signal = self._signal
         part = frames_result(signal.frames, codebook_plates=len(signal.codebook), notes=signal.notes)
-        self._upload.report_part(progress, part)
+        self._upload.report_part(done, total, part)
 
 
 def _kind_of(context: DecodeContext, file: SpooledFile) -> VideoKind | None:

@@ -104,6 +104,7 @@ class Imports:
         given: ImportInput,
         key: IdempotencyKey | None = None,
         step: Callable[[float], None] = lambda progress: None,
+        stored: Callable[[int, int], None] = lambda rows, total: None,
     ) -> tuple[ImportReport, bool]:
         """Import a survey, or say what an import would do.
 
@@ -113,6 +114,8 @@ class Imports:
         step : callable, optional
             Called with `READ` when the file was read, and with `SETTLED` before anything is stored, outside of any
             transaction; what it raises stops the import.
+        stored : callable, optional
+            Called with the rows that are stored and all that will be, inside the transaction.
 
         Returns
         -------
@@ -155,7 +158,7 @@ class Imports:
             running.prepare(connection)
             if running.is_refused:
                 return running.report("refused"), False
-            running.store(connection, get_family(given.declaration.family))
+            running.store(connection, get_family(given.declaration.family), stored)
             return answer.store(running.report("stored")), False
 
 
@@ -229,7 +232,9 @@ class _Running:
         """Whether nothing is to be stored."""
         return self.is_hopeless or not len(self._good_rows())
 
-    def store(self, connection: sa.Connection, family: Family[Any, Any]) -> None:
+    def store(
+        self, connection: sa.Connection, family: Family[Any, Any], stored: Callable[[int, int], None]
+    ) -> None:  # fmt: skip
         """Store what was prepared."""
         if self._given.declaration.compare:
             self._resurvey(connection, family)
@@ -250,6 +255,7 @@ class _Running:
                 columns = self._measured(connection, columns)
                 bulk.add_markers(connection, entry, columns, kind=kind_of_new, why=why)
                 self._stored += columns.count
+                stored(self._stored, total)
 
     def report(self, outcome: Outcome) -> ImportReport:
         """What was found, and what was stored of it."""
