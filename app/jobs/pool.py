@@ -21,6 +21,7 @@ from app.jobs.process_limits import ProcessLimits, delete_folders_of_the_dead
 from app.jobs.supervisor import Pending, WorkerSupervisor
 from app.registry.tenancy import whose_rows
 from app.services.decoder_processes import Task
+from app.services.decodes.trace_task import CompileTracesTask
 
 ResultT = TypeVar("ResultT")
 
@@ -71,9 +72,14 @@ class DecodePool:
         self._closed = False
 
     def warm(self) -> None:
-        """Start the processes without waiting for them; without it the first task starts them."""
+        """Start the processes without waiting for them; without it the first task starts them.
+
+        One of them compiles what decodes traces, which takes half a minute on a machine that never did: a recording
+        then need not wait for it. The others load it from the disk.
+        """
         with self._lock:
             self._start_supervisors()
+        self.submit(CompileTracesTask())
 
     def open(self) -> None:
         """Start the processes and wait until one is ready.

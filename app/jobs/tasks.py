@@ -15,14 +15,14 @@ from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
 from app.jobs.plan_tasks import compare_plan, make_plan, summarize_road, write_file_of_plan, write_map
 from app.jobs.proof_tasks import list_proof_units, prove_unit, write_proof
 from app.jobs.survey_tasks import read_survey_file
-from app.jobs.trace_tasks import decode_recording
+from app.jobs.trace_tasks import compile_traces, decode_recording
 from app.jobs.track_tasks import write_track
 from app.jobs.video_tasks import decode_segment, index_frames
 from app.services.decoder_processes import Task
 from app.services.decodes.frame_poses import FrameListTask
 from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameRunTask, FrameSearch
 from app.services.decodes.packet_task import DriveTask, LaneTask, OverlayTask
-from app.services.decodes.trace_task import TraceTask
+from app.services.decodes.trace_task import CompileTracesTask, TraceTask
 from app.services.decodes.video_task import IndexVideoTask, SegmentTask
 from app.services.drives.track_task import TrackTask
 from app.services.fleet.calibrations import CalibrationTask
@@ -43,6 +43,7 @@ STEPS: dict[type, StepFunction] = {
     AnnotationTask: annotate_frame,
     FrameListTask: read_frame_lists,
     TraceTask: decode_recording,
+    CompileTracesTask: compile_traces,
     IndexVideoTask: index_frames,
     SegmentTask: decode_segment,
     DriveTask: read_drive,

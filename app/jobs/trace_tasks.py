@@ -16,16 +16,38 @@ from app.jobs.memory_limit import memory_is_the_limit
 from app.markers.magnet import InformationTag, parse_tag
 from app.plots.trace import plot_trace
 from app.sensors.magnetometer_bar import MagnetTrace
-from app.services.decodes.trace_task import TraceMotion, TraceResult, TraceTask, TraceTerms, trace_terms
+from app.services.decodes.trace_task import (
+    CompileTracesTask,
+    TraceMotion,
+    TraceResult,
+    TraceTask,
+    TraceTerms,
+    trace_terms,
+)
 
 _MOTION_STEP_S = 0.1  # [s] source: app/tracks/dead_reckoning.py has a node every 0.1 s
 _MOTION_VALUES = 36_000  # at most; source: by hand, an hour, 0.5 MB of JSON
+
+_COMPILED_M = 40.0
 
 
 def decode_recording(task: TraceTask, _before: None) -> TraceResult:
     """Read the files of a recording and decode their trace."""
     with memory_is_the_limit("recording", "cut the recording into shorter ones"):
         return _decode_recording(task)
+
+
+def compile_traces(_task: CompileTracesTask, _before: None) -> None:
+    """Decode a drive over one tag: the kernels are compiled, or loaded from numba's cache."""
+    from app.simulation.magnetic.drive import Scene, simulate_drive  # only here: takes half of a second to load
+    from app.simulation.magnetic.road import PlacedTag, Road
+    from app.simulation.magnetic.vehicle import Course, Vehicle
+
+    tag = parse_tag("SNS_4_0.1_10-30")
+    assert isinstance(tag, InformationTag)
+    scene = Scene(Road(_COMPILED_M), Vehicle.compact(), Course(speed_m_s=12.0), tags=[PlacedTag(tag, 20.0, 0.05)])
+    trace = simulate_drive(scene, np.random.default_rng(1)).trace
+    decode_trace(trace, trace_terms({}).bar, candidates=TagCandidates(tags=[tag]))
 
 
 def _decode_recording(task: TraceTask) -> TraceResult:

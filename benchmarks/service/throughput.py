@@ -263,7 +263,7 @@ def measure(short: bool, engines: Sequence[str]) -> list[tuple[Row, Row]]:
     """Rows, each with the one of the bare processes of the same run."""
     os.environ.update(ONE_THREAD)
     frames, trace = make_frames(), Path("docs/images/drive.zip").read_bytes()
-    count, traces = (80, 8) if short else (800, 60)
+    count, traces = (80, 8) if short else (800, 240)
     headers, zipped = context_headers("image/jpeg"), context_headers("application/zip")
     recorded = {"Content-Type": "application/zip", "Waymark-Context": json.dumps({"trace": {}})}
     rows: list[tuple[Row, Row]] = []

@@ -106,6 +106,11 @@ class TraceResult:
 
 
 @dataclass(frozen=True, slots=True)
+class CompileTracesTask(Task[None]):
+    """Compile what decodes traces, so that no upload waits for it."""
+
+
+@dataclass(frozen=True, slots=True)
 class TraceTask(Task[TraceResult]):
     """One recording to decode.
 
