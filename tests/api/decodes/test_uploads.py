@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -104,6 +105,23 @@ def test_only_the_plates_within_reach_are_the_codebook(client: httpx.Client, pla
     assert post_frame(client, GOOD, context).json()["codebook_plates"] == 0
     context["coarse_position"]["accuracy_m"] = 250.0
     assert post_frame(client, GOOD, context).json()["codebook_plates"] == 1
+
+
+def test_the_same_bytes_or_their_hash_give_no_other_agency_anything(
+    client: httpx.Client, server: LiveServer, plate: dict[str, Any]
+) -> None:
+    own = post_frame(client, GOOD, near(plate)).json()
+    digest = hashlib.sha256(GOOD).hexdigest()
+    assert client.get(f"/v1/decodes/{own['id']}").status_code == 200
+    with server.agency("agency that guesses hashes") as other:
+        for path in (own["id"], f"{own['id']}/annotated.jpg", digest, f"uploads/{digest}"):
+            answer = other.get(f"/v1/decodes/{path}")
+            assert answer.status_code in (404, 422), (path, answer.text)
+        same = post_frame(other, GOOD, near(plate)).json()
+        assert same["id"] != own["id"]
+        assert (own["codebook_plates"], same["codebook_plates"]) == (1, 0)
+        assert other.get(f"/v1/decodes/{own['id']}").status_code == 404
+        assert [decode["id"] for decode in other.get("/v1/decodes").json()["items"]] == [same["id"]]
 
 
 def test_retired_plates_are_no_codebook(client: httpx.Client, plate: dict[str, Any]) -> None:

@@ -316,6 +316,23 @@ def test_parquet_that_is_damaged_or_holds_text() -> None:
         read_trace({"drive.parquet": content}, DECLARED, TraceLimits(rows=500))
 
 
+def test_rows_of_parquet_are_counted_whatever_its_footer_says() -> None:
+    content = _parquet(make_trace(20_000))
+    footer = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+    at = content.index(_thrift_i64(20_000), footer)  # the first is that of the file, before those of its columns
+    lying = content[:at] + _thrift_i64(9_000) + content[at + 3 :]
+    pq = pytest.importorskip("pyarrow.parquet")
+    assert pq.ParquetFile(io.BytesIO(lying)).metadata.num_rows == 9_000
+    with pytest.raises(UploadTooLarge):
+        read_trace({"drive.parquet": lying}, DECLARED, TraceLimits(rows=10_000))
+
+
+def _thrift_i64(value: int) -> bytes:
+    """A positive number of three bytes as Thrift's compact protocol writes it: zigzag, seven bits a byte."""
+    doubled = 2 * value
+    return bytes([doubled & 127 | 128, doubled >> 7 & 127 | 128, doubled >> 14])
+
+
 def test_parquet_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
     content = _parquet(make_trace(50))
     monkeypatch.setitem(sys.modules, "pyarrow", None)
