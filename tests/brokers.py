@@ -14,6 +14,8 @@ from app.jobs.celery_app import dead_letter_name, queue_name
 from app.services.job_queues import QueueName
 
 LOCAL_BROKER = "amqp://guest:guest@127.0.0.1:5672"
+_USED: set[tuple[str, str]] = set()
+"""URLs and prefixes of all queues of this run."""
 
 
 def find_broker() -> str:
@@ -37,10 +39,17 @@ def find_broker() -> str:
 def own_queues(url: str) -> Iterator[str]:
     """A prefix of queues that no other test has; they are deleted at the end."""
     prefix = f"waymark_test_{secrets.token_hex(4)}"
+    _USED.add((url, prefix))
     try:
         yield prefix
     finally:
         delete_queues(url, prefix)
+
+
+def delete_all_queues() -> None:
+    """Delete the queues of all tests again: what a test left running may have declared them once more."""
+    while _USED:
+        delete_queues(*_USED.pop())
 
 
 def delete_queues(url: str, prefix: str) -> None:

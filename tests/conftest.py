@@ -32,7 +32,7 @@ from app.registry.tenancy import across_agencies
 from app.services.access.access import Scope
 from app.settings import Settings
 from app.worker import running_worker
-from tests.brokers import find_broker, own_queues
+from tests.brokers import delete_all_queues, find_broker, own_queues
 from tests.databases import PostgresServer, postgres_server
 from tests.documented import DEVIATIONS, CheckedResponses
 from tests.http import WITHIN_S
@@ -167,6 +167,12 @@ def engine_settings(engine: str) -> Iterator[dict[str, Any]]:
     broker_url = find_broker()
     with own_queues(broker_url) as prefix:
         yield {"broker_url": broker_url, "broker_prefix": prefix, "blobs_shared": True}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_queues_left() -> Iterator[None]:
+    yield
+    delete_all_queues()
 
 
 @pytest.fixture(scope="session", autouse=True)

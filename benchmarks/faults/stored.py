@@ -10,13 +10,14 @@ import sqlalchemy as sa
 
 from app.registry.blob_references import blob_references
 from app.registry.database import Database
-from app.registry.tables import decodes, jobs, markers
+from app.registry.jobs import UNFINISHED
+from app.registry.tables import decodes, jobs, markers, plan_markers, planned_markers
 from app.registry.tenancy import across_agencies
 from app.services.access.audit import AuditLog
 from app.services.unused_blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.storage.blobs import Blobs
 from app.wiring import utc_now
-from benchmarks.faults.writers import Acknowledged
+from benchmarks.faults.writers import IMPORT_ROAD, IMPORT_ROWS, Acknowledged
 
 
 class Stored:
@@ -40,12 +41,54 @@ class Stored:
         with across_agencies(), self.database.read() as connection:
             ids = set(connection.execute(sa.select(markers.c.id)).scalars())
             keys = {row.id: row.upload_key for row in connection.execute(sa.select(decodes.c.id, decodes.c.upload_key))}
+            known_jobs = set(connection.execute(sa.select(jobs.c.id)).scalars())
+            committed = _count_by(connection, plan_markers.c.plan_id)
         lost = [f"marker {found}" for found in acknowledged.markers - ids]
         for decode_id, sha256 in acknowledged.uploads.items():
             key = keys.get(decode_id)
             if key is None or hashlib.sha256(self.blobs.get(key)).hexdigest() != sha256:
                 lost.append(f"upload of {decode_id}")
+        lost += [f"import {found}" for found in acknowledged.imports.keys() - known_jobs]
+        lost += [f"plan {found}" for found, number in acknowledged.plans.items() if committed.get(found) != number]
         return lost
+
+    def list_partial(self) -> list[str]:
+        """Surveys and committed plans of which some markers are stored and others are not, or some twice.
+
+        The plans have plates only: each planned marker becomes one.
+        """
+        with across_agencies(), self.database.read() as connection:
+            imported = _count_by(connection, markers.c.road, markers.c.road.startswith(IMPORT_ROAD))
+            committed = _count_by(connection, plan_markers.c.plan_id)
+            planned = _count_by(connection, planned_markers.c.plan_id)
+        return [
+            *(f"{road}: {number} of {IMPORT_ROWS}" for road, number in imported.items() if number != IMPORT_ROWS),
+            *(f"plan {plan}: {number} of {planned.get(plan)}" for plan, number in committed.items()
+              if number != planned.get(plan)),
+        ]  # fmt: skip
+
+    def list_without_blob(self) -> list[str]:
+        """Keys of blobs that a row refers to and that are not there."""
+        with across_agencies(), self.database.read() as connection:
+            used = set(blob_references(connection))
+        return sorted(used - set(self.blobs.list_keys()))
+
+    def list_unfinished(self) -> set[str]:
+        """Ids of the jobs that wait or run."""
+        with across_agencies(), self.database.read() as connection:
+            return set(connection.execute(sa.select(jobs.c.id).where(jobs.c.state.in_(UNFINISHED))).scalars())
+
+    def list_running(self) -> set[tuple[str, str]]:
+        """Ids of the running jobs, and the name of each run: another start has another."""
+        query = sa.select(jobs.c.id, jobs.c.runner).where(jobs.c.state == "running")
+        with across_agencies(), self.database.read() as connection:
+            return {(row.id, row.runner) for row in connection.execute(query)}
+
+    def list_failed(self) -> list[str]:
+        """Failed jobs with their reasons."""
+        query = sa.select(jobs.c.id, jobs.c.kind, jobs.c.error).where(jobs.c.state == "failed")
+        with across_agencies(), self.database.read() as connection:
+            return [f"{row.kind} {row.id}: {row.error}" for row in connection.execute(query)]
 
     def count_markers(self) -> int:
         """Number of markers."""
@@ -73,3 +116,8 @@ class Stored:
 
     def _list_blobs(self) -> set[str]:
         return {key for key in self.blobs.list_keys() if not key.startswith(OWNERS)}
+
+
+def _count_by(connection: sa.Connection, column: sa.Column[str], *conditions: sa.ColumnElement[bool]) -> dict[str, int]:
+    query = sa.select(column, sa.func.count()).where(*conditions).group_by(column)
+    return {str(name): int(number) for name, number in connection.execute(query)}

@@ -1,13 +1,16 @@
 """``python -m benchmarks.service [--short] [--only PART]``: the service as a whole, part by part.
 
 Each part prints tables as Markdown. Parts that need PostgreSQL or RabbitMQ take them from WAYMARK_BENCH_POSTGRES_URL
-(an empty database with PostGIS) and WAYMARK_BENCH_BROKER_URL, and leave those rows out without them.
+(an empty database with PostGIS) and WAYMARK_BENCH_BROKER_URL, and leave those rows out without them; `kills` starts its
+own.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import signal
+import sys
 from collections.abc import Callable
 
 from benchmarks.service import kills, limits, malformed, overload, soak, throughput
@@ -35,7 +38,7 @@ PARTS: dict[str, tuple[str, Callable[[bool], str]]] = {
     "limits": ("Limits of the database, and what a fleet needs", limits.tables),
     "overload": ("64 clients at once, and slow connections", overload.tables),
     "malformed": ("Damaged and hostile files through the upload routes", _malformed),
-    "kills": ("kill -9 of server, worker and decoder process", kills.tables),
+    "kills": ("kill -9 of every process of a service", kills.tables),
     "soak": ("An hour of load", _soak),
 }
 """Heading, and what makes the tables of a part; its argument is whether to run the short mode."""
@@ -47,6 +50,7 @@ def main() -> None:
     parser.add_argument("--short", action="store_true", help="a sample of everything")
     parser.add_argument("--only", choices=PARTS, help="one part")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that what was started is ended
     for name, (heading, tables) in PARTS.items():
         if arguments.only in (None, name):
             print(f"### {heading}\n\n{tables(arguments.short)}\n", flush=True)
