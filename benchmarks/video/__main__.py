@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from app.markers.plate import PlateCode
-from benchmarks.video.drive import CAMERA, DriveShape, PassedPlate, write_drive
+from benchmarks.video.drive import CAMERA, DriveShape, PassedPlate, kept_drive
 from benchmarks.video.measure import VideoScore, measure_video
 
 REGISTERED_SHARE = 0.9
@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--spacing", type=float, default=60.0, help="distance of the plates [m]")
     parser.add_argument("--preset", default="veryfast", help="of x264")
     parser.add_argument("--crf", type=int, default=23, help="quality of x264: smaller is better")
+    parser.add_argument("--keep", type=Path, help="folder for rendered drives, which the next run takes from there")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     rows: dict[str, list[VideoScore]] = {"none": [], "nine of ten plates": []}
@@ -42,8 +43,8 @@ def main() -> None:
     for seed in range(args.seed, args.seed + args.seeds):
         shape = DriveShape(seconds, spacing_m=SHORT_SPACING_M if args.short else args.spacing, seed=seed)
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "drive.mp4"
-            truth = write_drive(path, shape, preset="ultrafast" if args.short else args.preset, crf=args.crf)
+            path = (args.keep or Path(folder)) / f"{seconds:g}s_{shape.spacing_m:g}m_crf{args.crf}_{seed}.mp4"
+            truth = kept_drive(path, shape, preset="ultrafast" if args.short else args.preset, crf=args.crf)
             size_bytes += path.stat().st_size
             rows["none"].append(measure_video(path, truth, CAMERA))
             rows["nine of ten plates"].append(measure_video(path, truth, CAMERA, _registry(truth, seed)))

@@ -7,6 +7,7 @@ drive, and the encoder adds its artefacts.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from app.markers.plate import PlateCode, PlateGeometry
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Conditions, draw_daylight, draw_stress
@@ -99,6 +100,20 @@ def write_drive(path: Path, shape: DriveShape, *, preset: str = "veryfast", crf:
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     return [PassedPlate(p.code, p.at_m, tuple(seen.get(p.at_m, ())), p.is_hard) for p in plates]
+
+
+def kept_drive(path: Path, shape: DriveShape, *, preset: str, crf: int) -> list[PassedPlate]:
+    """The truth of a drive that an earlier run left in the folder, else of one that is rendered there."""
+    truth_path = path.with_suffix(".json")
+    if not truth_path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        truth = write_drive(path, shape, preset=preset, crf=crf)
+        rows = [(p.code.digits, p.code.scheme, p.at_m, p.frames, p.is_hard) for p in truth]
+        truth_path.write_text(json.dumps(rows))
+    return [
+        PassedPlate(PlateCode(digits, PlateScheme(scheme)), at_m, tuple(frames), is_hard)
+        for digits, scheme, at_m, frames, is_hard in json.loads(truth_path.read_text())
+    ]
 
 
 def _place_plates(shape: DriveShape) -> Iterator[_Plate]:

@@ -19,21 +19,33 @@ import numpy.typing as npt
 from app.decoders.plate.evidence import PlateEvidence, read_evidence
 from app.decoders.plate.pose import locate_plate
 from app.decoders.plate.reader import MIN_MARGIN, wrong_colours
-from app.decoders.plate.unit_likelihoods import PATTERNS, UnitEvidence
+from app.decoders.plate.unit_likelihoods import (
+    LARGE_UNIT_PX,
+    MAX_LARGE_RESIDUAL,
+    MAX_LEVEL_RESIDUAL,
+    PATTERNS,
+    UnitEvidence,
+    level_residuals,
+)
 from app.decoders.plate.unit_patterns import cell_costs, minimize_pattern
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
 from app.sensors.camera import Camera
 
-CORRELATION = 0.4
-"""[1] correlation of the errors of two frames of one plate: k frames count as k / (1 + 0.4 (k - 1)), at most 2.5.
-Source: chosen by hand; `python -m benchmarks.video`, seeds 1 to 4: no wrong digits."""
+CORRELATION = 0.6
+"""[1] correlation of the errors of two frames of one plate: k frames count as k / (1 + 0.6 (k - 1)), at most 1.7.
+Source: `python -m benchmarks.video.correlation`: median of the residuals of the true units, whitened by the model."""
+MAX_ODD_UNITS = 0.1
+"""[1] share of the units by which frames that show the same may differ. Source: chosen by hand; a grid that is off by
+a unit differs in half of them."""
 MAX_FRAMES = 16
 """[frames] of one plate that are added up, those with the largest units. Source: chosen by hand: more frames than that
 count as hardly more."""
 OUT_OF_VIEW = PlateOutcome.FEWER_THAN_FOUR_VERTICES
 """Frames that show a part of the plate count only where no frame shows all of it."""
 _COLOUR_OUTCOMES = (PlateOutcome.RED_MARKER_MISSING, PlateOutcome.GREEN_MARKER_MISSING)
+RESOLVED_UNIT_PX = 6.0
+"""[px] size of a unit from which on larger ones show no more of it. Source: chosen by hand."""
 MISSING_SHARE = 0.5
 """[1] share of the nearer half of the frames that must lack a part of a plate for it to be missing. Source: chosen by
 hand."""
@@ -65,18 +77,37 @@ def accumulate(evidence: Sequence[PlateEvidence]) -> PlateEvidence:
     whole = [one for one in evidence if one.missing is None or one.missing[0] is not OUT_OF_VIEW] or evidence
     largest = max(whole, key=lambda one: one.extent_px)
     used = sorted(whole, key=lambda one: -one.unit_px)[:MAX_FRAMES]
-    near = used[: (len(used) + 1) // 2]  # colours and damage that small units hide show in large ones
+    agreeing = _largest_agreement(used)
+    if len(agreeing) > 1:
+        used = agreeing  # a frame whose grid is displaced, or that compression has spoilt, agrees with no other
+    near = used[: (len(used) + 1) // 2]  # damage that small units hide shows in large ones
+    coloured = [one for one in whole if one.colours is not None] or near
+    coloured = sorted(coloured, key=lambda one: -one.unit_px)[: (len(coloured) + 1) // 2]
     weights = count_effective(len(used)) / len(used)
-    units = _joint_units([one.units for one in used], weights)
+    units = _joint_units([one.units for one in used], weights, used[0].unit_px)
     return replace(
         largest,
         units=units,
         explained=float(np.median([one.explained for one in near])),
         unit_px=max(one.unit_px for one in used),
-        weakest_marker=float(np.median([one.weakest_marker for one in near])),
-        missing=_usual_missing(near),
+        weakest_marker=float(np.median([one.weakest_marker for one in coloured])),
+        missing=_usual_missing(coloured),
         frames=len(used),
+        agreeing=len(agreeing),
     )
+
+
+def differing_units(one: UnitEvidence, other: UnitEvidence) -> float:
+    """Share of the units that are dark in one of two frames only."""
+    return float((one.dark != other.dark).mean())
+
+
+def _largest_agreement(evidence: Sequence[PlateEvidence]) -> list[PlateEvidence]:
+    """The most frames, counted by the size of their units, that show about the same units as one of them."""
+    groups = (
+        [one for one in evidence if differing_units(one.units, middle.units) <= MAX_ODD_UNITS] for middle in evidence
+    )
+    return max(groups, key=lambda group: sum(min(one.unit_px, RESOLVED_UNIT_PX) for one in group))
 
 
 def read_accumulated(
@@ -100,7 +131,7 @@ def read_accumulated(
     return replace(reading, pose=pose)
 
 
-def _joint_units(units: Sequence[UnitEvidence], share: float) -> UnitEvidence:
+def _joint_units(units: Sequence[UnitEvidence], share: float, max_unit_px: float) -> UnitEvidence:
     """The sum of quadratic forms as one, whose contrast is 1; the frames with the largest units come first.
 
     The cost of a pattern x in a frame is (x - d)' A (x - d) + 2 (x - d)' b with A = c^2 W and b = c W r, where d is the
@@ -121,13 +152,19 @@ def _joint_units(units: Sequence[UnitEvidence], share: float) -> UnitEvidence:
     residual, contrast = minimize_pattern(weight, residual - dark, dark, 1.0, FIXED)
     costs = cell_costs(weight, residual, dark, contrast, PATTERNS)
     near = units[: (len(units) + 1) // 2]
+    # what units differ by in all frames is theirs, the rest is noise
+    levels = np.mean([one.residual / one.contrast - one.dark for one in near], axis=0)
+    distance = level_residuals(levels, dark, 1.0)
+    scale = MAX_LEVEL_RESIDUAL / MAX_LARGE_RESIDUAL if max_unit_px >= LARGE_UNIT_PX else 1.0
+    outlier_ratio = float(np.median([one.outlier_ratio for one in near]))
     return UnitEvidence(
         cell_costs=costs - costs.min(axis=1, keepdims=True),
         best=np.argmin(costs, axis=1),
         dark=dark > 0.5,
         disputed=np.mean([one.disputed for one in near], axis=0) >= MISSING_SHARE,
         level_residual=np.median([one.level_residual for one in near], axis=0),
-        damage=float(np.median([one.damage for one in near])),
+        damage=scale * float(distance.max()) * outlier_ratio,
+        outlier_ratio=outlier_ratio,
         weight=weight,
         residual=residual,
         contrast=contrast,

@@ -77,6 +77,7 @@ def decode_symbols(
     *,
     clean: bool = True,
     max_damage: float = MAX_DAMAGE,
+    min_checked: float = MIN_CHECKED,
 ) -> DecodedSymbols:
     """Most likely code: read as it is, corrected, or taken from the codebook, in this order.
 
@@ -93,11 +94,13 @@ def decode_symbols(
         The image looks so much like a plate that wrong cells may be corrected without a registry.
     max_damage : float
         Of digits that neither a check nor the registry confirms.
+    min_checked : float
+        Probability of each cell from which a check confirms digits beside a stain.
     """
     read = _decode_alone(evidence, n, min_confidence, clean=clean)
     known = [code for code in codebook if code.n == n]
     if not known:
-        return _refuse_damaged(read, evidence, max_damage)
+        return _refuse_damaged(read, evidence, max_damage, min_checked)
     same = next((code for code in known if read.code is not None and code.digits == read.code.digits), None)
     if same is not None:
         return replace(read, code=same, confirmed=True)
@@ -109,10 +112,12 @@ def decode_symbols(
     near = min(known, key=lambda code: pattern_cost(evidence, code))
     if read.code is not None and sum(a != b for a, b in zip(near.digits, read.code.digits, strict=True)) <= n // 2:
         return replace(read, code=None, reason=f"close to the registered {near.digits}, but not the same")
-    return _refuse_damaged(read, evidence, max_damage)
+    return _refuse_damaged(read, evidence, max_damage, min_checked)
 
 
-def _refuse_damaged(read: DecodedSymbols, evidence: UnitEvidence, max_damage: float) -> DecodedSymbols:
+def _refuse_damaged(
+    read: DecodedSymbols, evidence: UnitEvidence, max_damage: float, min_checked: float
+) -> DecodedSymbols:
     """Refuse digits that neither a check nor the registry confirms where a unit looks stained.
 
     A check confirms only cells that are certain: damaged position plates come near words of the id scheme.
@@ -121,7 +126,7 @@ def _refuse_damaged(read: DecodedSymbols, evidence: UnitEvidence, max_damage: fl
         return read
     if read.code.scheme is not PlateScheme.ID:
         return replace(read, code=None, reason="a unit looks stained, and these digits have no check")
-    if read.corrected or min(read.cell_confidence) < MIN_CHECKED:
+    if read.corrected or min(read.cell_confidence) < min_checked:
         return replace(read, code=None, reason="a unit looks stained, and the check was used up on uncertain cells")
     return read
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
+from app.decoders.plate.decode_symbols import MAX_DAMAGE, MIN_CHECKED, DecodedSymbols, decode_symbols
 from app.decoders.plate.marker_colours import MarkerColours
 from app.decoders.plate.unit_likelihoods import UnitEvidence
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
@@ -58,7 +58,9 @@ class PlateEvidence:
     frames : int
         That the evidence is of.
     colours : MarkerColours or None
-        Of the markers; None of thermal frames.
+        Of the markers; None of thermal frames, and of views that were found by following a plate.
+    agreeing : int
+        Frames of these whose units are about the same.
     """
 
     units: UnitEvidence
@@ -73,6 +75,7 @@ class PlateEvidence:
     missing: tuple[PlateOutcome, str] | None = None
     frames: int = 1
     colours: MarkerColours | None = None
+    agreeing: int = 1
 
 
 def read_evidence(
@@ -93,6 +96,7 @@ def read_evidence(
         evidence.units, geometry.n, codebook, MIN_CONFIDENCE,
         clean=evidence.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
+        min_checked=MIN_CHECKED if evidence.agreeing < 2 else 0.0,
     )  # fmt: skip
     reading = replace(
         reading,

@@ -69,9 +69,18 @@ def place_candidate(
 
 @dataclass(slots=True)
 class PlateTrack:
-    """One plate over the frames in which it was seen."""
+    """One plate over the frames in which it was seen.
+
+    Attributes
+    ----------
+    seen : list of SeenPlate
+        In which it was found by its colours.
+    followed : dict of int to PlateEvidence or None
+        Of frames that were searched for it at its predicted place; None where it was not seen.
+    """
 
     seen: list[SeenPlate] = field(default_factory=list)
+    followed: dict[int, PlateEvidence | None] = field(default_factory=dict)
 
     @property
     def last(self) -> SeenPlate:
@@ -81,12 +90,19 @@ class PlateTrack:
     @property
     def evidence(self) -> list[PlateEvidence]:
         """Of its frames, of the geometry that most of them have."""
-        known = [seen.evidence for seen in self.seen if seen.evidence is not None]
+        found = [*(seen.evidence for seen in self.seen), *self.followed.values()]
+        known = [one for one in found if one is not None]
         if not known:
             return []
         sizes = [one.geometry for one in known]
         usual = max(set(sizes), key=lambda geometry: (sizes.count(geometry), -geometry.n, -geometry.side_mm))
         return [one for one in known if one.geometry == usual]
+
+    @property
+    def evidence_frames(self) -> tuple[int, ...]:
+        """Frames that show it clearly enough to be evidence."""
+        found = {seen.frame: seen.evidence for seen in self.seen} | self.followed
+        return tuple(sorted(frame for frame, evidence in found.items() if evidence is not None))
 
     @property
     def has_one_code(self) -> bool:
@@ -110,6 +126,11 @@ class PlateTracker:
     def __init__(self) -> None:
         self._open: list[PlateTrack] = []
         self._speed_m_s: float | None = None
+
+    @property
+    def open(self) -> Sequence[PlateTrack]:
+        """Plates that may still be in view."""
+        return self._open
 
     @property
     def expected(self) -> bool:

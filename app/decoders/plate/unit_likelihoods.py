@@ -111,6 +111,8 @@ class UnitEvidence:
     damage : float
         Largest level residual times the outlier ratio of some unit's pixels: their residual over what is usual. A stain
         that turns a light unit dark ends beside it, on gaps and neighbours, and the plate has others that end half way.
+    outlier_ratio : float
+        Of the worst unit's pixels, as in `damage`.
     scatter : float
         Mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model.
     span : float
@@ -123,6 +125,7 @@ class UnitEvidence:
     disputed: npt.NDArray[np.bool_]
     level_residual: Array
     damage: float
+    outlier_ratio: float
     weight: Array
     residual: Array
     contrast: float
@@ -199,11 +202,12 @@ def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
     weight /= (scatter + SCATTER_PRIOR[0] * SCATTER_PRIOR[1]) / (len(residual) + SCATTER_PRIOR[0])
     weight *= _resolution_weight(fit)
     costs = cell_costs(weight, residual, dark, contrast, PATTERNS)
-    level_residual = _level_residuals(levelled, dark, contrast).reshape(-1, 4).max(axis=1)
+    level_residual = level_residuals(levelled, dark, contrast).reshape(-1, 4).max(axis=1)
     if fit.unit_px >= LARGE_UNIT_PX:
         level_residual *= MAX_LEVEL_RESIDUAL / MAX_LARGE_RESIDUAL
     misfit = np.sqrt(fit.unit_misfit.reshape(-1)[unit_index(n).reshape(-1)])
-    damage = float(level_residual.max()) * _worst_misfit(misfit, levels.values, dark)
+    outlier_ratio = _worst_misfit(misfit, levels.values, dark) * min(1.0, fit.unit_px / STAIN_UNIT_PX)
+    damage = float(level_residual.max()) * outlier_ratio
     level_residual *= max(1.0, _blur_units(fit) * MAX_LEVEL_RESIDUAL / MAX_RESIDUAL_SPREAD)
     return UnitEvidence(
         cell_costs=costs - costs.min(axis=1, keepdims=True),
@@ -211,7 +215,8 @@ def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
         dark=dark > 0.5,
         disputed=(first != dark).reshape(-1, 4).any(axis=1),
         level_residual=np.where(_odd_light_cells(light, dark, n), 1.0, level_residual),
-        damage=damage * min(1.0, fit.unit_px / STAIN_UNIT_PX),
+        damage=damage,
+        outlier_ratio=outlier_ratio,
         weight=weight,
         residual=residual,
         contrast=contrast,
@@ -281,7 +286,7 @@ def _odd_light_cells(light: Array, dark: Array, n: int) -> npt.NDArray[np.bool_]
     return patches
 
 
-def _level_residuals(levelled: Array, dark: Array, contrast: float) -> Array:
+def level_residuals(levelled: Array, dark: Array, contrast: float) -> Array:
     """Distance of units from the median of their level towards the other one, as a share of the contrast."""
     distance = np.zeros(len(levelled))
     for level, towards in ((dark < 0.5, -1.0), (dark > 0.5, 1.0)):

@@ -6,17 +6,20 @@ plate at its place on the road. What one plate shows in several frames adds up (
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.accumulate import read_accumulated
+from app.decoders.plate.accumulate import MAX_ODD_UNITS, OUT_OF_VIEW, RESOLVED_UNIT_PX, read_accumulated
 from app.decoders.plate.colour import Planes, coarse_ratio_signal, difference_signal, planes_of, ratio_signal
 from app.decoders.plate.detect_quads import MarkerQuad, detect_marker_quads
 from app.decoders.plate.evidence import MIN_EXPLAINED_ALONE, PlateEvidence
+from app.decoders.plate.follow_plate import is_large_enough, predict_corners, view_elsewhere
 from app.decoders.plate.plate_tracks import PlateTrack, PlateTracker, SeenPlate, place_candidate
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES, MAX_FITS, read_plates
 from app.markers.plate import SIDE_MM, PlateCode, PlateGeometry, PlateScheme, unit_index
@@ -33,10 +36,27 @@ FRUITLESS = ((30, 3), (8, 2))
 decoded. Source: chosen by hand; a plate is in 9 frames at 30 m/s and 30 Hz."""
 STANDING_M_S, STANDING_STEP = 0.5, 10
 """[m/s, frames] a vehicle that stands sees the same plate again; every tenth frame is decoded. Source: by hand."""
-MAX_ODD_UNITS = 0.1
-"""[1] share of a frame's units that may differ from the joint code where the frame gives a pose for it. Source: chosen
-by hand: a grid that is off by a unit differs in half of them."""
+RECENT_FRAMES = 8
+"""[frames] that are searched back for a plate that was found. Source: chosen by hand: at 25 m/s and 30 Hz the plate
+was 7 m further away then, where a unit has 1 px."""
+MIN_CLEAR_EXPLAINED, MIN_CLEAR_UNIT_PX = 0.85, 3.0
+"""[1, px] share of variance and size of a unit from which on a plate is followed back. Source: chosen by hand."""
+MAX_CORRECTED = 1
+"""[cells] that a check may correct without a registry. Source: one wrong plate of 164 in compressed videos
+(`python -m benchmarks.video --short --seed 101 --seeds 16 --crf 30`): compression spoils many units at once."""
 Pixels = npt.NDArray[np.uint8]
+
+
+class _RecentFrame:
+    """A frame that is kept for a while; its pixels are converted when they are wanted."""
+
+    def __init__(self, number: int, time_s: float, full: Callable[[], Pixels]) -> None:
+        self.number, self.time_s = number, time_s
+        self._full = full
+
+    @cached_property
+    def pixels(self) -> Pixels:
+        return self._full()
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +113,7 @@ class PlateVideoSearch:
         self._known = {code.digits for code in codebook}
         self._thermal = thermal
         self._tracker = PlateTracker()
+        self._recent: deque[_RecentFrame] = deque(maxlen=RECENT_FRAMES)
         self._fruitless, self._waited = 0, 0
         self.decoded = 0
 
@@ -118,17 +139,41 @@ class PlateVideoSearch:
             Of the vehicle, where it is known. [m/s]
         """
         seen = []
+        frame = _RecentFrame(number, time_s, full)
         if self._is_due(speed_m_s) and (self._thermal or self._tracker.expected or self._has_candidates(half())):
             self.decoded += 1
             self._waited = 0
-            for reading, evidence in read_plates(full(), **self._options):
+            for reading, evidence in read_plates(frame.pixels, **self._options):
                 seen.append(place_candidate(number, time_s, reading, evidence, self._camera))
             self._fruitless = 0 if any(one.evidence is not None for one in seen) else self._fruitless + 1
-        return [self._found(track) for track in self._tracker.add(time_s, seen, speed_m_s)]
+        done = self._tracker.add(time_s, seen, speed_m_s)
+        for track in self._tracker.open:
+            if track.last.frame == number and not self._thermal:
+                self._follow_back(track, frame, speed_m_s or track.speed_m_s() or self._tracker.speed_m_s)
+        self._recent.append(frame)
+        return [self._found(track) for track in done]
 
     def finish(self) -> list[FoundPlate]:
         """The plates that are in view at the end."""
         return [self._found(track) for track in self._tracker.finish()]
+
+    def _follow_back(self, track: PlateTrack, frame: _RecentFrame, speed_m_s: float | None) -> None:
+        """Look for a plate where it was in the last frames, if they do not show it yet."""
+        last, camera = track.last, self._camera
+        if not speed_m_s or camera is None or not _is_clear(last):
+            return
+        assert last.evidence is not None
+        assert last.pose is not None
+        shown = {seen.frame for seen in track.seen}
+        for earlier in self._recent:
+            if earlier.number in shown or earlier.number in track.followed:
+                continue
+            advance_m = speed_m_s * (earlier.time_s - last.time_s)
+            corners = predict_corners(last.pose, last.evidence.geometry, camera, advance_m)
+            if corners is None or not is_large_enough(corners, last.evidence):
+                continue
+            view = view_elsewhere(last.evidence, frame.pixels, earlier.pixels, corners)
+            track.followed[earlier.number] = view
 
     def _is_due(self, speed_m_s: float | None) -> bool:
         self._waited += 1
@@ -164,39 +209,55 @@ class PlateVideoSearch:
                     low_m * across_px <= width_px + 2 and width_px <= 1.5 * high_m * across_px)  # fmt: skip
 
     def _found(self, track: PlateTrack) -> FoundPlate:
-        alone = tuple(seen.frame for seen in track.seen if seen.reading.code is not None)
+        seen = [replace(one, reading=_without_guesses(one.reading)) for one in track.seen]
+        alone = tuple(one.frame for one in seen if one.reading.code is not None)
         speed = track.speed_m_s()
-        best = max((seen.reading for seen in track.seen), key=lambda r: (r.code is not None, r.confidence))
+        best = max((one.reading for one in seen), key=lambda r: (r.code is not None, r.confidence))
         evidence = track.evidence
-        if len(track.seen) == 1 or not evidence:
-            return FoundPlate(best, tuple(track.seen), alone, speed)
-        joint = read_accumulated(evidence, self._codebook, self._camera)
-        shown = {seen.reading.code.digits for seen in track.seen if seen.reading.code is not None}
+        if len(evidence) < 2:
+            return FoundPlate(best, tuple(seen), alone, speed)
+        joint = _without_guesses(read_accumulated(evidence, self._codebook, self._camera))
+        shown = {one.reading.code.digits for one in seen if one.reading.code is not None}
         if len(shown | ({joint.code.digits} if joint.code else set())) > 1:
             reason = "frames of the plate show different codes"
-            refused = [replace(seen, reading=_refused(seen.reading, reason)) for seen in track.seen]
+            refused = [replace(one, reading=_refused(one.reading, reason)) for one in seen]
             return FoundPlate(_refused(joint, reason), tuple(refused), (), speed, tuple(sorted(shown)))
         if joint.code is None:
-            if all(seen.reading.code is None or self._stands_alone(seen.reading) for seen in track.seen):
-                return FoundPlate(best if best.code is not None else joint, tuple(track.seen), alone, speed)
+            if all(one.reading.code is None or self._stands_alone(one) for one in seen):
+                return FoundPlate(best if best.code is not None else joint, tuple(seen), alone, speed)
             # a stain that hides in small units shows in large ones
             reason = joint.reason or "the frames together do not show the digits of one of them"
             kept = [
-                seen if self._stands_alone(seen.reading) else replace(seen, reading=_refused(seen.reading, reason))
-                for seen in track.seen
+                one if self._stands_alone(one) else replace(one, reading=_refused(one.reading, reason)) for one in seen
             ]
-            alone = tuple(seen.frame for seen in kept if seen.reading.code is not None)
-            best = max((seen.reading for seen in kept), key=lambda r: (r.code is not None, r.confidence))
+            alone = tuple(one.frame for one in kept if one.reading.code is not None)
+            best = max((one.reading for one in kept), key=lambda r: (r.code is not None, r.confidence))
             taken_back = tuple(sorted(shown)) if len(alone) == 0 else ()
             return FoundPlate(best if best.code is not None else joint, tuple(kept), alone, speed, taken_back)
-        frames = tuple(seen.frame for seen in track.seen if seen.evidence is not None)
-        joint = replace(joint, frames=frames, grade=best.grade)
-        return FoundPlate(joint, tuple(_with_code(seen, joint) for seen in track.seen), alone, speed)
+        joint = replace(joint, frames=track.evidence_frames, grade=best.grade)
+        return FoundPlate(joint, tuple(_with_code(one, joint) for one in seen), alone, speed)
 
-    def _stands_alone(self, reading: PlateReading) -> bool:
-        """Whether the code of one frame needs no other frame: a check or the registry confirms it."""
-        code = reading.code
-        return code is not None and (code.scheme is PlateScheme.ID or code.digits in self._known)
+    def _stands_alone(self, seen: SeenPlate) -> bool:
+        """Whether one frame's code needs no other frame: a check or the registry confirms it, or it hides no stain."""
+        code = seen.reading.code
+        if code is None or seen.evidence is None:
+            return False
+        is_resolved = seen.evidence.unit_px >= RESOLVED_UNIT_PX
+        return code.scheme is PlateScheme.ID or code.digits in self._known or is_resolved
+
+
+def _is_clear(seen: SeenPlate) -> bool:
+    evidence = seen.evidence
+    if evidence is None or seen.pose is None or (evidence.missing is not None and evidence.missing[0] is OUT_OF_VIEW):
+        return False
+    return evidence.explained >= MIN_CLEAR_EXPLAINED and evidence.unit_px >= MIN_CLEAR_UNIT_PX
+
+
+def _without_guesses(reading: PlateReading) -> PlateReading:
+    """The reading, or its refusal where a check had to correct more than a video's units allow."""
+    if reading.code is None or reading.from_codebook or len(reading.corrected_cells) <= MAX_CORRECTED:
+        return reading
+    return _refused(reading, "more wrong cells than a check may correct in a video")
 
 
 def _candidates(planes: Planes) -> Iterator[MarkerQuad]:
