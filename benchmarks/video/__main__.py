@@ -53,6 +53,11 @@ def main() -> None:
         f"{8e-6 * size_bytes / (seconds * args.seeds):.1f} Mbit/s.\n"
     )
     print(_table(rows))
+    alone = rows["none"]
+    pairs = [value for score in alone for value in score.correlations]
+    if pairs:
+        print(f"Correlation of two frames' residuals: median {np.median(pairs):.2f} over {len(pairs)} pairs.")
+    print(f"Wrong plates that the confidences without a registry expect: {sum(score.doubt for score in alone):.3f}.")
     for name, scores in rows.items():
         for score in scores:
             for missed in score.wrong:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from app.decoders.plate.accumulate import MAX_ODD_UNITS
+from app.decoders.plate.unit_likelihoods import LARGE_UNIT_PX
 from app.decoders.plate.video_search import FoundPlate
 from app.families.plate.frames import DEFAULT_GEOMETRIES, PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.spooled_file import SpooledFile
 from app.formats.video.container import VideoFile, VideoKind
 from app.jobs.video_tasks import decode_segment, index_frames
-from app.markers.plate import PlateCode
+from app.markers.plate import PlateCode, unit_index
 from app.sensors.camera import Camera
 from app.services.decodes.video_task import IndexVideoTask, SegmentTask
 from benchmarks.video.drive import PassedPlate
@@ -37,6 +42,10 @@ class VideoScore:
         Different digits than any plate in view has.
     missed, wrong : list of str
         Plates that were not read, and digits that no plate in view has.
+    correlations : list of float
+        Of the residuals of two frames of one plate, for each pair of frames with large units.
+    doubt : float
+        Wrong plates that the stated confidences expect among those that were read together.
     """
 
     frames: int = 0
@@ -53,6 +62,8 @@ class VideoScore:
     wrong_together: int = 0
     missed: list[str] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
+    correlations: list[float] = field(default_factory=list)
+    doubt: float = 0.0
 
 
 def measure_video(
@@ -93,10 +104,12 @@ def _compare(score: VideoScore, truth: Sequence[PassedPlate], found: Sequence[Fo
         alone |= {single for single in singles if single in expected and single is not None}
         if digits is not None:
             score.wrong_together += digits not in expected
+            score.doubt += 1 - one.reading.confidence
             together |= {digits} & expected
     for plate in truth:
         if not plate.frames:
             continue
+        score.correlations += _correlations(plate, found)
         score.plates += 1
         score.alone += plate.code.digits in alone
         score.together += plate.code.digits in together
@@ -105,3 +118,20 @@ def _compare(score: VideoScore, truth: Sequence[PassedPlate], found: Sequence[Fo
         score.hard_together += plate.is_hard and plate.code.digits in together
         if plate.code.digits not in together:
             score.missed.append(f"{plate.code.digits} at {plate.at_m:.0f} m, frames {plate.frames}")
+
+
+def _correlations(plate: PassedPlate, found: Sequence[FoundPlate]) -> list[float]:
+    """How much the residuals of the true units in two frames resemble each other, whitened by the model."""
+    code = plate.code
+    dark = code.units.reshape(-1)[unit_index(code.n).reshape(-1)] > 0
+    residuals = []
+    for seen in (seen for one in found for seen in one.seen if seen.frame in plate.frames):
+        evidence = seen.evidence
+        if evidence is None or evidence.geometry.n != code.n or evidence.unit_px < LARGE_UNIT_PX:
+            continue
+        units = evidence.units
+        odd = dark.astype(float) - units.dark
+        if np.abs(odd).mean() <= MAX_ODD_UNITS:
+            whitened = np.linalg.cholesky(units.weight).T @ (units.residual + units.contrast * odd)
+            residuals.append((whitened - whitened.mean()) / whitened.std())
+    return [float((a * b).mean()) for a, b in itertools.combinations(residuals, 2)]

@@ -34,7 +34,8 @@ from app.sensors.camera import Camera
 
 CORRELATION = 0.6
 """[1] correlation of the errors of two frames of one plate: k frames count as k / (1 + 0.6 (k - 1)), at most 1.7.
-Source: `python -m benchmarks.video.correlation`: median of the residuals of the true units, whitened by the model."""
+Source: `python -m benchmarks.video` prints the median over pairs of frames, of the residuals of the true units,
+whitened by the model: 0.4 to 0.8, more where units are large and compression is weak."""
 MAX_ODD_UNITS = 0.1
 """[1] share of the units by which frames that show the same may differ. Source: chosen by hand; a grid that is off by
 a unit differs in half of them."""

@@ -25,6 +25,9 @@ SEGMENT_S = 10.0
 """[s] of a video that one task decodes. Source: chosen by hand: progress and cancelling every few seconds."""
 GAP_S, GAP_FACTOR = 1.0, 5.0
 """[s, 1] as in `app.services.decodes.frame_poses`."""
+MAX_RATE_HZ = 1000.0
+"""[Hz] frames a second beyond which the times are not those of a camera: recorders that know none write one unit of
+time for each frame. Source: that of `frames.rate_hz`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +173,11 @@ def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: 
         raise UploadTooLarge(
             f"the video takes {time_s[-1]:.0f} s", field=FIELD, limit=f"{limits.duration_s:g} s", cure="cut it"
         )
+    if len(time_s) > 2 and float(np.median(np.diff(time_s))) < 1 / MAX_RATE_HZ:
+        raise UnreadableUpload(
+            f"its frames are {float(np.median(np.diff(time_s))):.1g} s apart: their times are not those of a camera",
+            field=FIELD, limit=f"{MAX_RATE_HZ:g} frames a second", cure="convert it at its true rate",
+        )  # fmt: skip
     if file.kind is not VideoKind.MJPEG and rate_hz is not None:
         warnings.append("frames.rate_hz is not used: the video has times of its own")
     if damaged:

@@ -19,7 +19,7 @@ from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene
 from tests.api.decodes.conftest import near, post_frame
 from tests.api.decodes.test_archives import wait_for
-from tests.formats.test_video import video
+from tests.formats.test_video import HEIGHT, WIDTH, cut_video, turned, video
 from tests.http import finished
 
 CAMERA = Camera.from_field_of_view(960, 540, 60.0)
@@ -88,11 +88,63 @@ def test_a_video_beside_a_track_has_poses(client: httpx.Client, plate: dict[str,
     assert decode["codebook_plates"] == 1  # looked up along the track
 
 
+def _encoded(width_px: int, height_px: int, form: str, codec: str, rate_hz: int) -> bytes:
+    out = io.BytesIO()
+    with av.open(out, "w", format=form) as container:
+        stream: Any = container.add_stream(codec, rate=rate_hz)
+        stream.width, stream.height = width_px, height_px
+        stream.pix_fmt = "yuvj444p" if codec == "mjpeg" else "yuv420p"
+        for level in range(6):
+            image = np.full((height_px, width_px, 3), 20 * level, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode(None))
+    return out.getvalue()
+
+
+def _without_frames() -> bytes:
+    out = io.BytesIO()
+    with av.open(out, "w", format="mp4") as container:
+        stream: Any = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        container.start_encoding()
+    return out.getvalue()
+
+
+TURNED = turned(video(20), (0, 1, 0, -1, 0, 0, 0, 0, 1))
+UPRIGHT = {"width_px": HEIGHT, "height_px": WIDTH, "horizontal_fov_deg": 60.0}
+
+
+@pytest.mark.parametrize(
+    ("data", "camera", "frames", "gaps"),
+    [
+        pytest.param(cut_video(), None, range(20, 100), "ends before", id="cut off"),
+        pytest.param(video(10, stamps=[0, 1, 3, 4, 6, 7, 9, 10, 12, 13]), None, 10, "", id="variable rate"),
+        pytest.param(video(10, stamps=[0, 1, 2, 3, 4, 5, 6, 7, 60, 61]), None, 10, "jumped", id="clock jumps"),
+        pytest.param(_encoded(161, 121, "avi", "mjpeg", 10), None, 6, "", id="odd size"),
+        pytest.param(TURNED, UPRIGHT, 20, "", id="turned"),
+    ],
+)
+def test_odd_videos_are_decoded_and_what_is_missing_is_stated(
+    client: httpx.Client, data: bytes, camera: dict[str, Any] | None, frames: Any, gaps: str
+) -> None:
+    context: dict[str, Any] = {"captured_at": "2026-05-04T08:30:00Z"} | ({"camera": camera} if camera else {})
+    answer = post_frame(client, data, context, name="drive.bin")
+    assert answer.status_code == 202, answer.text
+    decode = wait_for(client, answer.headers["location"])
+    searched = decode["summary"]["frames"]
+    assert searched in frames if isinstance(frames, range) else searched == frames
+    assert [gaps in gap["reason"] for gap in decode["gaps"]] == ([True] if gaps else [])
+    assert decode["warnings"] == []
+
+
 @pytest.mark.parametrize(
     ("data", "context", "detail"),
     [
         (b"\0\0\0\x18ftypisom" + b"\0" * 500, {}, "no index"),
         (video(5)[:900], {}, "no index"),
+        (_without_frames(), {}, "no video"),
+        (_encoded(160, 120, "mp4", "mpeg4", 10_000), {}, "not those of a camera"),
+        (TURNED, {"camera": UPRIGHT | {"width_px": WIDTH, "height_px": HEIGHT}}, "upright"),
         (b"RIFF\xff\xff\0\0AVI " + b"\0" * 100, {}, ""),
         (video(5), {"camera": {"width_px": 64, "height_px": 64, "horizontal_fov_deg": 60.0}}, "camera"),
     ],

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from app.decoders.plate.accumulate import accumulate, count_effective, read_accumulated
+from app.decoders.plate.accumulate import accumulate, count_effective, differing_units, read_accumulated
 from app.decoders.plate.evidence import PlateEvidence
+from app.decoders.plate.follow_plate import predict_corners, view_elsewhere
 from app.decoders.plate.plate_tracks import PlateTracker, SeenPlate
+from app.decoders.plate.pose import locate_plate
 from app.decoders.plate.reader import read_plates
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
@@ -42,7 +45,7 @@ def test_equal_frames_count_as_stated(noisy: list[tuple[PlateReading, PlateEvide
     assert joint.frames == 4
     assert (joint.units.best == one.units.best).all()
     assert joint.units.cell_costs == pytest.approx(count_effective(4) * one.units.cell_costs, rel=1e-6, abs=1e-6)
-    assert 1 < count_effective(4) < count_effective(100) < 2.5
+    assert 1 < count_effective(4) < count_effective(100) < 1.7
     assert accumulate([one]) is one
 
 
@@ -62,6 +65,39 @@ def test_frames_of_two_plates_do_not_make_a_third(noisy: list[tuple[PlateReading
     foreign = [evidence for _reading, evidence in read_plates(image, camera=CAMERA) if evidence is not None]
     mixed = read_accumulated([foreign[0], *(evidence for _reading, evidence in noisy[:1])], ())
     assert mixed.code in (None, CODE, other)
+
+
+def test_a_spoilt_frame_does_not_outweigh_frames_that_agree(noisy: list[tuple[PlateReading, PlateEvidence]]) -> None:
+    rng = np.random.default_rng(3)
+    good = [evidence for _reading, evidence in noisy]
+    largest = max(good, key=lambda one: one.unit_px)
+    dark = rng.random(len(largest.units.dark)) < 0.5
+    units = replace(largest.units, dark=dark, weight=100 * largest.units.weight)
+    spoilt = replace(largest, units=units, unit_px=2 * largest.unit_px)
+    assert (accumulate([spoilt, *good]).units.best == accumulate(good).units.best).all()
+    assert accumulate([spoilt, *good]).frames == accumulate(good).frames
+
+
+def test_a_plate_is_followed_into_a_frame_without_its_colours() -> None:
+    face = face_of(CODE)
+    images = [
+        render_plate_scene(PlateScene(CAMERA, (PlacedFace(face, ahead_m, 0.2),)), None, np.random.default_rng(k)).image
+        for k, ahead_m in enumerate((3.9, 3.2))
+    ]
+    grey = cv2.cvtColor(cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+    assert not any(reading.code for reading, _evidence in read_plates(grey, camera=CAMERA))
+    ((_reading, known),) = [found for found in read_plates(images[1], camera=CAMERA) if found[0].code]
+    assert known is not None
+    pose = locate_plate(known.corners_px, known.corners_covariance_px2, known.geometry, CAMERA)
+    assert pose is not None
+    for off_m, is_found in ((0.0, True), (0.05, True), (2.0, False)):  # the last is beyond the search
+        corners_px = predict_corners(pose, known.geometry, CAMERA, -0.7 - off_m)
+        assert corners_px is not None
+        view = view_elsewhere(known, images[1], grey, corners_px)
+        assert (view is not None and differing_units(view.units, known.units) == 0.0) is is_found
+    empty = np.full_like(grey, 90)
+    assert view_elsewhere(known, images[1], empty, predict_corners(pose, known.geometry, CAMERA, -0.7)) is None
+    assert predict_corners(pose, known.geometry, CAMERA, 10.0) is None  # behind
 
 
 def _seen(frame: int, rate_hz: float, ahead_m: float, left_m: float = 0.0, digits: str | None = None) -> SeenPlate:
