@@ -16,6 +16,7 @@ $(VENV)/.runtime: requirements.txt pyproject.toml
 	$(PIP) install --quiet --no-deps -e .
 	$(BIN)/waymark decode docs/images/frame.jpg > /dev/null  # compiles the decoders' kernels, once
 	$(BIN)/waymark decode-trace docs/images/drive.zip > /dev/null
+	$(BIN)/python -m app.tracks
 	@touch $@
 
 $(VENV)/.dev: requirements-dev.txt $(VENV)/.runtime

@@ -10,12 +10,14 @@ import numpy as np
 
 from app.errors import InvalidParameter
 from app.geodesy.ellipsoid import metres_per_radian
+from app.tracks.motion import CLOCKS
 from app.tracks.types import Clock, Floats, PositionFix, Samples, TrackInput
 
 STEP_S = 0.1
 """Time between nodes. [s] Source: by hand; a car turns by less than 3 deg and brakes by less than 1 m/s in it."""
-MAX_NODES = 400_000
-"""Nodes at most; longer drives have longer steps. Source: by hand, 11 hours at 10 Hz, 0.4 GB."""
+MAX_NUMBERS = 36_500_000
+"""Numbers in the covariances of all nodes at most, 0.3 GB. Source: `python -m benchmarks.track --hours 10`, which stays
+below the memory and the time of a decoder process: 89 s and 1.2 GB, the simulation with it, for 34,500,000."""
 MAX_PAUSE_S = 600.0
 """Longest time without any data that a track leads across. [s] Source: by hand; a constant speed is no forecast for
 ten minutes, but a wait at a ferry is one drive."""
@@ -101,8 +103,22 @@ def time_base(given: TrackInput, clocks: dict[str, Clock]) -> tuple[TimeBase, li
             end, last = to, clock
     margin = 1.0 + 3.0 * max((clock.sigma_s for clock in clocks.values()), default=0.0)
     start, duration = spans[0][0] - margin, end - spans[0][0] + 2 * margin
-    step = max(STEP_S, duration / (MAX_NODES - 1))
-    return TimeBase(float(start), step, math.ceil(duration / step) + 1), pauses
+    base = TimeBase(float(start), STEP_S, math.ceil(duration / STEP_S) + 1)
+    _check_size(base, len(clocks))
+    return base, pauses
+
+
+def _check_size(base: TimeBase, clocks: int) -> None:
+    """Refuse a drive that is too long for the number of its clocks."""
+    unknown = max(clocks - 1, 0)
+    most = MAX_NUMBERS / (CLOCKS + unknown) ** 2
+    if base.count > most:
+        raise InvalidParameter(
+            f"the drive takes {base.count * STEP_S / 3600:.1f} h, and offsets of {unknown} clocks are to be estimated",
+            field="decodes",
+            limit=f"{most * STEP_S / 3600:.1f} h with so many clocks",
+            cure="make several drives of it, or give decodes of one sensor the same clock",
+        )
 
 
 def dead_reckon(

@@ -178,6 +178,17 @@ def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
     return replace(track, receivers=receiver_results(fixes, factor, smoothed.used))
 
 
+def check_times(given: TrackInput) -> None:
+    """Refuse what has no track, without estimating one.
+
+    Raises
+    ------
+    InvalidParameter
+        The drive is too long for the number of its clocks, sensors do not overlap in time, or a clock is not declared.
+    """
+    time_base(given, _checked_clocks(given))
+
+
 def _checked_clocks(given: TrackInput) -> dict[str, Clock]:
     clocks = {clock.name: clock for clock in given.clocks}
     if len(clocks) != len(given.clocks):

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from itertools import count
 from statistics import median
 
-from benchmarks.health.scenes import SCENES, Scene
+from app.health import Evidence, MarkerState, update_marker
+from benchmarks.health.scenes import FAMILIES, SCENES, Scene
 from benchmarks.health.simulate import Found, Outcome, simulate
 
 MAX_PASSES_MOVED = 5
@@ -29,6 +31,7 @@ def main() -> int:
     print(f"{SCENES[0].drives} drives in 30 days, seeds {seeds.start} to {seeds.stop - 1}\n")
     _print_found(outcomes)
     _print_alarms(outcomes)
+    _print_misses()
     broken = _broken([one for several in outcomes.values() for one in several])
     alone = [simulate(SCENES[0], seed, only_vehicle=True) for seed in seeds]
     by_one = sum(len(one.false_alarms) + sum(f is not None for fs in one.found.values() for f in fs) for one in alone)
@@ -74,6 +77,28 @@ def _print_alarms(outcomes: dict[Scene, list[Outcome]]) -> None:
             f"| {scene.name} | {healthy} | {len(alarms)}{f' ({kinds})' if kinds else ''} | {len(alarms) / healthy:.3%} "
             f"| {found}/{drives} | {wrong} | {fewest} |"
         )
+
+
+def _print_misses() -> None:
+    """Passes without a reading, each of another vehicle, until a marker is suspected to be missing."""
+    print("\nMisses in a row until a marker is suspected to be missing: without a record, after 100 readings\n")
+    probabilities = (0.35, 0.5, 0.7, 0.9)
+    print("| reading probability | " + " | ".join(f"{value:g}" for value in probabilities) + " |")
+    print("|---" * (len(probabilities) + 1) + "|")
+    for family in FAMILIES:
+        cells = (", ".join(str(_misses(family, value, record)) for record in (0, 100)) for value in probabilities)
+        print(f"| {family} | " + " | ".join(cells) + " |")
+
+
+def _misses(family: str, probability: float, record: int) -> int:
+    state = MarkerState.new(family)
+    for number in range(record):
+        update_marker(state, Evidence("m", family, True, probability), f"reader {number}", 1000.0 * number)
+    for number in count(1):
+        missed = Evidence("m", family, False, probability)
+        if update_marker(state, missed, f"vehicle {number}", 1000.0 * (record + number)):
+            return number
+    raise AssertionError
 
 
 def _broken(outcomes: Sequence[Outcome]) -> list[str]:

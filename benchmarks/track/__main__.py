@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,6 +14,9 @@ from scipy.stats import chi2
 from app.tracks import ClockState, Track, TrackInput, estimate_track
 from benchmarks.track import drives
 from benchmarks.track.drives import Drive, Floats, simulate
+from benchmarks.track.end_to_end import print_end_to_end
+
+_MEAN_SPEED_M_S = 12.4  # of the simulated drives
 
 
 def main() -> int:
@@ -21,7 +25,11 @@ def main() -> int:
     parser.add_argument("--short", action="store_true", help="20 drives")
     parser.add_argument("--drives", type=int, help="default: 200, short: 20")
     parser.add_argument("--seed", type=int, default=50_000, help="of the first drive")
+    parser.add_argument("--hours", type=float, help="only time and memory of one drive of this length")
     arguments = parser.parse_args()
+    if arguments.hours:
+        return _print_long(arguments.hours, arguments.seed)
+    print_end_to_end(range(7, 8 if arguments.short else 17))
     count = arguments.drives or (20 if arguments.short else 200)
     rng = np.random.default_rng(arguments.seed)
     inputs = {"all three families": _all, "bar alone: tags, speed, heading": _bar, "camera alone: plates": _camera}
@@ -65,6 +73,26 @@ def main() -> int:
 | wrong fixes used | {used} of {wrong_total} | 0 |
 | good fixes left out | {lost} of {good_total} ({100 * lost / max(good_total, 1):.2f} %) | |
 | processor time for a drive of 4 km, median [s] | {float(np.median(seconds)):.2f} | |
+""")
+    return 0
+
+
+def _print_long(hours: float, seed: int) -> int:
+    """Time and memory of fusing one long drive."""
+    estimate_track(simulate(seed).given)  # compiles the filter
+    drive = simulate(seed, length_m=hours * 3600.0 * _MEAN_SPEED_M_S)
+    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    began = time.process_time()
+    track = estimate_track(drive.given)
+    seconds = time.process_time() - began
+    along, across, inside = _errors(drive, track)
+    used = sum(result.used for result in track.fixes)
+    print(f"""
+| drive [h] | fixes | used | along [m] | across [m] | processor time [s] | memory before, at most [MB] |
+|---|---|---|---|---|---|---|
+| {(drive.time_s[-1] - drive.time_s[0]) / 3600:.2f} | {len(track.fixes)} | {used} \
+| {_rms(along[inside]):.3f} | {_rms(across[inside]):.3f} | {seconds:.0f} \
+| {before_mb:.0f}, {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} |
 """)
     return 0
 

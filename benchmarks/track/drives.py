@@ -106,13 +106,13 @@ def _longest_line(document: dict[str, object]) -> Floats:
 
 
 def _speeds(rng: np.random.Generator, bends: Floats, length_m: float) -> tuple[Floats, Floats, Floats]:
-    at = np.arange(len(bends))
     wanted = rng.uniform(11, 20) * (1 + 0.25 * gaussian_filter1d(rng.standard_normal(len(bends)), 120) * 20)
     comfort = np.sqrt(2.0 / np.maximum(gaussian_filter1d(np.abs(bends), 10), 1e-4))
     by_place = gaussian_filter1d(np.clip(np.minimum(wanted, comfort), 5.0, 25.0), 30)
     chainage, where = [0.0], 0.0
     while where < length_m:
-        where += float(np.interp(where, at, by_place)) * STEP_S
+        k = int(where)
+        where += float(by_place[k] + (where - k) * (by_place[k + 1] - by_place[k])) * STEP_S
         chainage.append(where)
     along = np.array(chainage)
     return along, np.gradient(along, STEP_S), STEP_S * np.arange(along.size)

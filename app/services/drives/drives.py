@@ -28,6 +28,7 @@ from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, JobQueue
 from app.services.staged_blobs import delete_unused, staged
+from app.tracks import check_times
 from app.tracks.types import TrackRules
 
 MAX_DECODES = 100
@@ -91,7 +92,7 @@ class Drives:
         Conflict
             A decode is not done, or of another vehicle.
         InvalidParameter
-            A decode has no times, or nothing places the drive.
+            A decode has no times, nothing places the drive, its sensors do not overlap in time, or it is too long.
         """
         now, agency_id = self._clock(), caller.agency_id
         if earlier := find_earlier(self._database, agency_id, key, now):
@@ -99,8 +100,10 @@ class Drives:
         with self._database.read() as connection:
             rows = _decodes(connection, caller.agency_id, drive.decodes, caller.own_key_id)
             vehicle_id = _vehicle(connection, caller, drive.vehicle, rows)
-        if not collect(rows, use_unfit=drive.use_unfit).fixes:
+        found = collect(rows, use_unfit=drive.use_unfit)
+        if not found.fixes:
             raise _nothing(rows)
+        check_times(found.given({}))
         job_input = {
             "name": drive.name,
             "decodes": [asdict(entry) for entry in drive.decodes],

@@ -128,10 +128,11 @@ def _along_offsets(tags: Sequence[ReadTag]) -> list[tuple[float, float] | None]:
     if not pairs:
         return [None] * len(tags)
     scale = float(np.median([(odometer[j] - odometer[i]) / (registered[j] - registered[i]) for i, j in pairs]))
-    # distances from the tags beside it: an odometer's error grows along the road
+    # distances from the nearest tags, as an odometer's error grows along the road; four also at the ends, of which one
+    # that has moved does not change the median
     offsets: list[tuple[float, float] | None] = []
     for k in range(len(tags)):
-        beside = [j for j in range(max(0, k - 2), min(len(tags), k + 3)) if j != k]
+        beside = sorted((j for j in range(len(tags)) if j != k), key=lambda j: abs(j - k))[:4]
         apart = [(odometer[k] - odometer[j]) / scale - (registered[k] - registered[j]) for j in beside]
         gap_m = float(np.median([abs(registered[k] - registered[j]) for j in beside]))
         offsets.append((float(np.median(apart)), ODOMETER_SHARE * gap_m + tags[k].reading.magnets[0].along_std_m))

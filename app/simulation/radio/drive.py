@@ -70,6 +70,7 @@ def drive_past(
     radio: Radio | None = None,
     driver: Driver | None = None,
     receiver: SatelliteReceiver | None = None,
+    drive: Drive | None = None,
     start_s: float = 1.78e9,
     first_sequence: npt.ArrayLike | None = None,
 ) -> SimulatedDrive:
@@ -88,13 +89,15 @@ def drive_past(
     driver : Driver, optional
     receiver : SatelliteReceiver, optional
         RTK by default.
+    drive : Drive, optional
+        What is driven, in place of a drive of `driver`.
     start_s : float
         Seconds since 1970-01-01 UTC. [s]
     first_sequence : array_like of int, shape (N,), optional
         Of each marker's first transmission.
     """
     radio = radio or Radio()
-    drive = drive_lane(lane, driver or Driver(), rng, start_s=start_s)
+    drive = drive or drive_lane(lane, driver or Driver(), rng, start_s=start_s)
     track = observe_track(lane, drive, receiver or SatelliteReceiver.rtk(), rng)
     sent = send_beacons(
         len(markers), radio, float(drive.time_s[0]), float(drive.time_s[-1]), rng, first_sequence=first_sequence

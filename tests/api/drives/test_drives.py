@@ -342,10 +342,32 @@ def test_decodes_of_two_vehicles_are_refused(server: LiveServer, client: httpx.C
 def test_sensors_that_do_not_overlap_fail_with_a_clear_error(server: LiveServer, client: httpx.Client) -> None:
     bar = store(server, client, "trace", trace(), captured_at=BEGAN.isoformat())
     later = store(server, client, "archive", frames(5.0, 9.0, late_s=-7200.0))
-    drive = finished(client, make(client, bar, {"id": later, "clock": "camera"}).headers["location"])
-    assert drive["state"] == "failed"
-    assert "do not overlap in time" in drive["error"]["detail"]
-    refused(client.get(drive["links"]["self"] + "/track.csv"), 404)
+    problem = refused(make(client, bar, {"id": later, "clock": "camera"}), 422, field="decodes")
+    assert "do not overlap in time" in problem["detail"]
+    assert "camera" in problem["detail"]
+
+
+def test_a_pause_between_two_sensors_is_a_gap(server: LiveServer, client: httpx.Client) -> None:
+    bar = store(server, client, "trace", trace(), captured_at=BEGAN.isoformat())
+    later = store(server, client, "archive", frames(*(140.0 + 0.5 * k for k in range(12))))
+    drive = made(client, {"id": bar, "clock": "vehicle"}, {"id": later, "clock": "vehicle"})
+    (gap,) = [gap for gap in drive["report"]["gaps"] if gap["reason"] == "no sensor recorded"]
+    times = [(datetime.fromisoformat(gap[name]) - BEGAN).total_seconds() for name in ("from_time", "to_time")]
+    assert times == pytest.approx([60.0, 140.0], abs=2.0)
+
+
+def test_a_drive_that_is_too_long_is_refused(server: LiveServer, client: httpx.Client) -> None:
+    def day(hours: float, **more: Any) -> str:
+        values = {"speed_m_s": [15.0] * 13, "heading_deg": [90.0] * 13}
+        motion = {"start_s": 0.0, "step_s": hours * 300.0, **values}
+        return store(server, client, "trace", {"motion": motion, "tags": [tag(5.0)]}, **more)
+
+    hours = [day(0.5, captured_at=(BEGAN + timedelta(hours=hour)).isoformat()) for hour in np.arange(0.0, 20.0, 0.5)]
+    problem = refused(make(client, *({"id": entry, "clock": "bar"} for entry in hours)), 422, field="decodes")
+    assert "20.0 h" in problem["detail"]
+    problem = refused(make(client, *hours[:12]), 422, field="decodes")
+    assert "11 clocks" in problem["detail"]
+    assert "same clock" in problem["cure"]
 
 
 def test_vehicles_see_their_own_drives_only(server: LiveServer, client: httpx.Client) -> None:
