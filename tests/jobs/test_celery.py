@@ -14,7 +14,14 @@ import sqlalchemy as sa
 from kombu import Connection
 
 from app.errors import InvalidParameter, ProcessStopped, Unavailable
-from app.jobs.celery_app import dead_letter_name, make_celery, queue_name
+from app.jobs.celery_app import (
+    DELIVERY_LIMIT,
+    dead_letter_name,
+    declare_queues,
+    job_queue,
+    make_celery,
+    queue_name,
+)
 from app.jobs.celery_queue import CeleryQueue
 from app.jobs.celery_worker import CeleryWorker
 from app.registry import agencies, job_leases
@@ -141,6 +148,34 @@ def test_a_job_that_stops_its_process_is_a_dead_letter_and_others_go_on(fleet: F
     with Connection(fleet.url) as connection, connection.channel() as channel:
         letter = json.loads(channel.basic_get(name, no_ack=True).body)
     assert letter == {"job_id": deadly, "kind": "decode", "reason": "the file stopped the decoder process, twice"}
+
+
+@pytest.mark.parametrize(
+    ("argument", "other", "shown"),
+    [("x-delivery-limit", 7, str(DELIVERY_LIMIT)), ("x-dead-letter-exchange", "other", "PREFIX.dead")],
+)
+def test_the_broker_has_the_limits_of_the_queues(fleet: Fleet, argument: str, other: object, shown: str) -> None:
+    queue = job_queue(QueueName.ONLINE, fleet.prefix)
+    with Connection(fleet.url) as connection, connection.channel() as channel:
+        declare_queues(connection, fleet.prefix)
+        arguments = {**queue.queue_arguments, argument: other}
+        stored = shown.replace("PREFIX", fleet.prefix)
+        with pytest.raises(connection.channel_errors, match=f"inequivalent arg '{argument}'.*current is '{stored}'"):
+            channel.queue_declare(queue.name, durable=True, auto_delete=False, arguments=arguments)
+
+
+def test_a_message_that_no_worker_survives_is_a_dead_letter(fleet: Fleet) -> None:
+    name, dead = queue_name(QueueName.ONLINE, fleet.prefix), dead_letter_name(fleet.prefix)
+    with Connection(fleet.url) as connection, connection.channel() as channel:
+        declare_queues(connection, fleet.prefix)
+        fleet.add("never run")
+        wait_until(lambda: fleet.messages(name) == 1, "the message")
+        for _ in range(DELIVERY_LIMIT + 1):
+            message = wait_until(lambda: channel.basic_get(name), "the message again")
+            channel.basic_reject(message.delivery_tag, requeue=True)
+        wait_until(lambda: fleet.messages(dead) == 1, "the dead letter")
+        assert channel.basic_get(name) is None
+        assert channel.basic_get(dead, no_ack=True).headers["x-death"][0]["reason"] == "delivery_limit"
 
 
 def test_a_job_waits_while_a_store_does_not_answer(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:

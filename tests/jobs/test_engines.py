@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import json
 import socket
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,7 @@ import sqlalchemy as sa
 from app.registry.tables import marker_versions
 from app.registry.tenancy import across_agencies
 from app.services.access.access import Scope
+from app.services.markers.artwork_jobs import IMMEDIATE_PLATES
 from app.settings import Settings
 from tests.api.decodes.conftest import post_frame
 from tests.api.decodes.test_archives import pack
@@ -100,6 +104,29 @@ def test_a_plan_is_packed(client: httpx.Client) -> None:
     job = finished(client, answer.headers["Location"])
     assert job["state"] == "done", job
     assert client.get(f"/v1/plans/{plan['id']}/package").content.startswith(b"PK")
+
+
+def test_artwork_of_many_plates_is_drawn(client: httpx.Client, place: Callable[[], dict[str, Any]]) -> None:
+    ids = [created(client, "/v1/markers", position=place())["id"] for _ in range(IMMEDIATE_PLATES + 1)]
+    answer = client.post("/v1/artwork", json={"marker_ids": ids, "formats": ["svg"]})
+    assert answer.status_code == 202, answer.text
+    job = finished(client, answer.headers["Location"])
+    assert (job["kind"], job["state"], job["done"]) == ("artwork", "done", len(ids)), job
+    with zipfile.ZipFile(io.BytesIO(client.get(job["links"]["result"]).content)) as bundle:
+        plates = json.loads(bundle.read("manifest.json"))["plates"]
+    assert [plate["plate_id"] for plate in plates] == ids
+
+
+def test_a_plan_is_proved(client: httpx.Client) -> None:
+    alignment = send_road(client, road(47.0, 43.0, 60.0), name="r").json()
+    rules = {"version": 1, "plates": {"spacing_m": 50}}
+    plan = created(client, "/v1/plans", name="p", alignment_id=alignment["id"], rules=rules)
+    terms = {"drives": 1, "seed": 5, "max_markers_per_drive": 1}
+    answer = client.post(f"/v1/plans/{plan['id']}/proof", json=terms, headers={"If-Match": '"1"'})
+    assert answer.status_code == 202, answer.text
+    job = finished(client, answer.headers["Location"])
+    assert (job["kind"], job["state"], job["steps_done"]) == ("proof", "done", job["steps_total"]), job
+    assert client.get(f"/v1/plans/{plan['id']}/proof").json()["complete"]
 
 
 def test_the_log_is_verified(server: LiveServer, client: httpx.Client, place: Callable[[], dict[str, Any]]) -> None:
