@@ -78,3 +78,8 @@ def main() -> None:
             if value := getattr(error, name):
                 typer.echo(f"  {name}: {value}", err=True)
         raise SystemExit(1) from None
+    except OSError as error:  # a file that cannot be read or written
+        if error.filename is None:
+            raise
+        typer.echo(f"waymark: {error.filename}: {error.strerror}", err=True)
+        raise SystemExit(1) from None

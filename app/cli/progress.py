@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 _LINE_EVERY_S = 5.0
+BYTES = "B"
+"""Unit of steps that are counted in bytes; they are shown in kB or MB."""
 _MEGABYTE = 1e6
-BYTES = "MB"
-"""Unit of steps that are counted in bytes and shown in megabytes."""
 
 
 class _Line(NamedTuple):
@@ -99,8 +99,11 @@ def amount(done: float, total: float | None, unit: str) -> str:
     """How much of a step is done, e.g. ``3 of 12``; empty where nothing is counted."""
     if total == 1 or not (done or total):
         return ""
-    of_all = f" of {_number(total, unit)}" if total else ""
-    return f"{_number(done, unit)}{of_all} {unit}".rstrip()
+    if unit == BYTES:
+        scale, unit = (_MEGABYTE, "MB") if max(done, total or 0) >= _MEGABYTE else (1e3, "kB")
+        of_all = f" of {total / scale:.1f}" if total else ""
+        return f"{done / scale:.1f}{of_all} {unit}"
+    return (f"{done:.0f} of {total:.0f} {unit}" if total else f"{done:.0f} {unit}").rstrip()
 
 
 def speed(rate: float | None, total: float | None, unit: str) -> str:
@@ -108,10 +111,6 @@ def speed(rate: float | None, total: float | None, unit: str) -> str:
     if not rate or rate <= 0 or total == 1:
         return ""
     return f"{rate / _MEGABYTE:.1f} MB/s" if unit == BYTES else f"{rate:.3g}/s" if rate < 1000 else f"{rate:.0f}/s"
-
-
-def _number(value: float, unit: str) -> str:
-    return f"{value / _MEGABYTE:.1f}" if unit == BYTES else f"{value:.0f}"
 
 
 def _make_bars() -> Bars:

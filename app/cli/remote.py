@@ -107,11 +107,11 @@ def reprocess(
     as_json: JsonOption = False,
 ) -> None:
     """Have a server decode stored uploads again, and print what changed. Nothing changes before it is accepted."""
+    box = _box(bbox) if bbox else None
     with _client(server, key) as client, Progress(quiet=as_json) as shown:
         if accept is not None:
             found = _checked(client.post(f"/v1/reprocessings/{accept}/accept"))
         else:
-            box = [float(part) for part in bbox.split(",")] if bbox else None
             wanted = {
                 "kinds": kind, "older_than": older_than, "since": since, "until": until, "vehicle_id": vehicle,
                 "bbox": box,
@@ -130,6 +130,16 @@ def reprocess(
         return
     sums = ", ".join(f"{count} {name}" for name, count in found["summary"].items())
     typer.echo(f"{found['id']} {found['state']}: {found['done']} of {found['total']} uploads; readings: {sums}")
+
+
+def _box(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise InvalidParameter(
+            f"--bbox {text[:80]!r} is not made of numbers", field="--bbox", limit="west,south,east,north in degrees",
+            cure="for example --bbox 8.0,49.0,8.5,49.5",
+        ) from error  # fmt: skip
 
 
 def follow_job(client: httpx.Client, job_id: str, shown: Progress) -> dict[str, Any]:

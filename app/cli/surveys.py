@@ -49,15 +49,24 @@ def export_markers(
     kind: Annotated[str, typer.Option("--format", help="csv, geojson, gpkg, shapefile, kml, landxml or dxf.")] = "gpkg",
     bbox: Annotated[str | None, typer.Option(help="Only markers in west,south,east,north. [deg]")] = None,
     status: Annotated[str | None, typer.Option(help="Only markers with this status.")] = None,
-    family: Annotated[str | None, typer.Option(help="Only markers of this family: plate, magnet or cerpm.")] = None,
+    family: Annotated[
+        str | None, typer.Option(help="Only markers of this family: plate, magnet, cerpm or fiducial.")
+    ] = None,
 ) -> None:
     """Write an agency's markers to a file, also while the server runs."""
     from tempfile import TemporaryDirectory
 
+    from app.families import FAMILY_NAMES
+    from app.markers.status import STATUSES
     from app.services.surveys.exports import KINDS
 
-    if kind not in KINDS:
-        raise InvalidParameter(f"there is no format {kind[:40]!r}", limit=", ".join(KINDS))
+    for name, given, allowed in (
+        ("format", kind, KINDS),
+        ("status", status, STATUSES),
+        ("family", family, FAMILY_NAMES),
+    ):
+        if given is not None and given not in allowed:
+            raise InvalidParameter(f"there is no {name} {given[:40]!r}", field=f"--{name}", limit=", ".join(allowed))
     if out.exists():
         raise InvalidParameter(f"{out} already exists", cure="remove it, or choose another name")
     values = {"agency": agency, "kind": kind, "bbox": bbox, "status": status, "family": family}

@@ -63,6 +63,9 @@ def test_import_export_and_errors_while_the_server_runs(waymark: Run, folder: Pa
         status, _, error = waymark("export", str(tmp_path / "b"), "--agency", "nobody", "--format", "csv")
         assert (status, "there is no agency 'nobody'" in error, "waymark key" in error) == (1, True, True)
         assert not (tmp_path / "b").exists()
+        for name in ("status", "family", "format"):
+            status, _, error = waymark("export", str(tmp_path / "b"), "--agency", agency, f"--{name}", "nonsense")
+            assert (status, f"there is no {name} 'nonsense'" in error) == (1, True)
         assert not list(tmp_path.glob(".waymark-*"))
     assert not socket_path(folder / "waymark.sqlite3").exists()
     assert waymark("export", str(tmp_path / "c"), "--agency", agency, "--format", "csv")[0] == 0

@@ -15,6 +15,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
+from app.cli.progress import BYTES, amount, speed
 from app.errors import WaymarkError
 from app.main import create_app
 from app.services.access.access import Scope
@@ -239,3 +240,19 @@ def test_a_server_that_does_not_answer(address: str, tmp_path: Path, monkeypatch
     failed = CliRunner().invoke(cli, ["upload", str(frame), "--server", address])
     assert isinstance(failed.exception, WaymarkError), failed.exception
     assert "--server" in failed.exception.cure
+
+
+def test_a_box_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WAYMARK_KEY", "key")
+    failed = CliRunner().invoke(cli, ["reprocess", "--bbox", "1,2,x"])
+    assert isinstance(failed.exception, WaymarkError)
+    assert "1,2,x" in failed.exception.message
+
+
+def test_amounts_are_shown_with_their_units() -> None:
+    assert amount(3, 12, "") == "3 of 12"
+    assert amount(1500, 2500, BYTES) == "1.5 of 2.5 kB"
+    assert amount(1.5e6, 1e9, BYTES) == "1.5 of 1000.0 MB"
+    assert (amount(7, 0, ""), amount(0.5, 1, ""), amount(0, 0, "")) == ("7", "", "")
+    assert (speed(2.5e6, 1e9, BYTES), speed(0.5, 9, ""), speed(4321.0, 9999, "")) == ("2.5 MB/s", "0.5/s", "4321/s")
+    assert (speed(None, 9, ""), speed(3.0, 1, "")) == ("", "")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -12,7 +14,7 @@ import pytest
 from pyproj import Geod
 
 from tests.conftest import LiveServer
-from tests.http import created, refused
+from tests.http import WITHIN_S, created, refused
 
 pytestmark = pytest.mark.both_databases
 
@@ -156,6 +158,32 @@ def test_a_plan_is_made_checked_approved_and_committed(
     [entry] = [e for e in client.get(f"{url}/versions").json()["items"] if e["plan"]["status"] == "committed"]
     assert entry["version"] == 3
     refused(client.patch(url, json={"name": "late"}, headers={"If-Match": '"3"'}), 409, field="status")
+
+
+def test_of_two_that_commit_a_plan_at_once_one_does(
+    client: httpx.Client, alignment: dict[str, Any], other_planner: httpx.Client
+) -> None:
+    plan = make_plan(client, alignment)
+    url = f"/v1/plans/{plan['id']}"
+    other_planner.post(f"{url}/approve", headers={"If-Match": '"1"'})
+    other_planner.timeout = client.timeout
+    both = threading.Barrier(2)
+
+    def commit(who: httpx.Client, version: str) -> httpx.Response:
+        both.wait(WITHIN_S)
+        return who.post(f"{url}/commit", headers={"If-Match": version})
+
+    with ThreadPoolExecutor(2) as pool:
+        started = [pool.submit(commit, client, '"2"'), pool.submit(commit, other_planner, "*")]
+        done = sorted((one.result() for one in started), key=lambda response: response.status_code)
+    assert done[0].status_code == 201, done[0].text
+    assert done[1].status_code in (409, 412), done[1].text  # by the plan's state, or by its version
+    assert done[1].json()["cure"]
+    committed = done[0].json()
+    assert (committed["status"], committed["uncommitted"]) == ("committed", 0)
+    markers = client.get("/v1/markers", params={"limit": 1000}).json()["items"]
+    assert len(markers) == committed["markers"]
+    assert len(client.get(f"{url}/versions").json()["items"]) == 3
 
 
 def test_other_rules_place_it_again_and_take_the_approval_back(
