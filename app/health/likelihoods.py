@@ -7,8 +7,9 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 
-DISPLACEMENT_M = 1.5
-"""[m] standard deviation of a moved marker's displacement before it is seen, each axis. Source: by hand."""
+DISPLACEMENT_M, DISPLACEMENT_SHARE = (1.5, 15.0), (0.9, 0.1)
+"""Standard deviations of a moved marker's displacement before it is seen, each axis [m], and how common they are:
+pushed aside, or installed or programmed at another place. Source: by hand."""
 WIDE_SHARE, WIDE_SIGMAS = 0.05, 3.0
 """Share of offsets with so many times the stated error. Source: by hand; position errors have heavy tails."""
 OUTLIER_SHARE, OUTLIER_M = 0.02, 10.0
@@ -63,8 +64,19 @@ def moved_ratios(
     angle = 2.0 * np.pi * np.arange(DISC_POINTS) / DISC_POINTS
     ring = np.vstack([np.zeros((1, 2)), np.column_stack([np.cos(angle), np.sin(angle)])])
     points = disc_m[:, None, None] * ring
-    total = np.zeros((len(offset_m), len(ring)))
-    weight = np.full(len(offset_m), 1.0 / DISPLACEMENT_M**2)
+    parts = [_moved_by(offset_m, sigma_m, used, points, sigma, bound) for sigma in DISPLACEMENT_M]
+    totals = np.stack([total + np.log(share) for (total, _), share in zip(parts, DISPLACEMENT_SHARE, strict=True)])
+    likelier = totals.min(axis=2).argmax(axis=0)
+    mean = np.stack([mean for _, mean in parts])[likelier, np.arange(len(offset_m))]
+    return np.logaddexp(totals[0], totals[1]).min(axis=1), mean
+
+
+def _moved_by(
+    offset_m: Floats, sigma_m: Floats, used: npt.NDArray[np.bool_], points: Floats, displacement_m: float, bound: float
+) -> tuple[Floats, Floats]:
+    """Ratios against each point of the disc, and the estimated displacement, for one size of displacements."""
+    total = np.zeros((len(offset_m), points.shape[1]))
+    weight = np.full(len(offset_m), 1.0 / displacement_m**2)
     mean = np.zeros((len(offset_m), 2))
     variance = sigma_m**2
     for k in range(offset_m.shape[1]):
@@ -78,7 +90,7 @@ def moved_ratios(
         added = trust / var
         mean += (added / (weight + added))[:, None] * (seen - mean)
         weight += added
-    return total.min(axis=1), mean
+    return total, mean
 
 
 def missing_gain(

@@ -46,7 +46,7 @@ def _fleet() -> Iterator[str]:
     yield from (f"v{k}" for k in range(100))
 
 
-@pytest.mark.parametrize("distance_m", [1.0, 1.5, 4.0])
+@pytest.mark.parametrize("distance_m", [1.0, 1.5, 4.0, 12.0, 30.0])
 def test_a_marker_that_moved_is_found_after_at_most_five_vehicles(distance_m: float) -> None:
     count, verdicts = _run(_seen(offset_m=(distance_m, 0.0), sigma_m=0.18), _fleet())
     assert 3 <= count <= 5

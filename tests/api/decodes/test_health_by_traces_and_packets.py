@@ -15,6 +15,8 @@ import httpx
 import numpy as np
 import pytest
 
+from app.demo.cerpms import BuiltLane, build_lane, write_packets, write_poses
+from app.encoders.cerpm.payload import encode_message
 from app.geodesy import wgs84_from_enu
 from app.markers.magnet import InformationTag, parse_tag
 from app.services.access.access import Scope
@@ -22,6 +24,10 @@ from app.simulation.magnetic.drive import Scene, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road
 from app.simulation.magnetic.vehicle import Course, Vehicle
+from app.simulation.radio.attacks import move_claim
+from app.simulation.radio.drive import drive_past
+from app.simulation.radio.link import Radio
+from app.simulation.radio.markers import InstalledMarkers
 from tests.api.decodes.conftest import post_frame
 from tests.conftest import LiveServer
 
@@ -146,3 +152,34 @@ def test_a_driver_on_the_wrong_way_is_an_item_and_accuses_no_tag(server: LiveSer
         assert _found(owner) == set()
         _post(owner, _trace(road, 4, faults=False, wrong_way=True), _context(road, 1, ELSEWHERE))
         assert {what for what, _marker in _found(owner)} == {"wrong-way-driver"}
+
+
+# --- CERPMs -----------------------------------------------------------------------------------------------------------
+
+
+def _log(built: BuiltLane, installed: InstalledMarkers, hour: int) -> bytes:
+    """What a vehicle hears: every hour markers go on counting their messages."""
+    heard = drive_past(
+        built.lane, installed, np.random.default_rng(hour % 2), radio=Radio(interval_s=1.0),
+        sign=lambda message: encode_message(message, built.keys[message.number]),
+        start_s=BEGAN.timestamp() + 3600.0 * hour, first_sequence=np.full(len(installed), 3600 * hour),
+    )  # fmt: skip
+    return _zipped({
+        "packets.jsonl": write_packets(heard.packets).encode(), "poses.csv": write_poses(heard.track).encode(),
+    })  # fmt: skip
+
+
+def test_a_cerpm_that_claims_another_place_is_found_by_the_logs_of_several_vehicles(server: LiveServer) -> None:
+    name = "health by packets"
+    with server.agency(name, Scope.ADMIN) as owner:
+        built = build_lane(owner, np.random.default_rng(1901))
+        ids = {int(marker["code"]["number"]): marker["id"] for marker in built.markers}
+        row = len(built.installed) // 2
+        moved = move_claim(built.lane, built.installed, row, np.random.default_rng(1))
+        for hour in range(4):
+            _post(owner, _log(built, moved, hour), {"packets": {}})
+        assert _found(owner) == set()  # however often one vehicle passes
+        for hour in range(4, 10):
+            with server.agency(name, Scope.VEHICLE) as vehicle:
+                _post(vehicle, _log(built, moved, hour), {"packets": {}})
+        assert _found(owner) == {("moved", ids[int(built.installed.number[row])])}
