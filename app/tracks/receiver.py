@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from app.tracks.measure import FixArrays
 from app.tracks.types import Bools, Floats, PositionFix, ReceiverResult
@@ -41,7 +41,7 @@ def believed(fixes: tuple[PositionFix, ...], arrays: FixArrays, by_markers: Smoo
     from the track by markers and S the covariance of that track, of the receiver's clock with it.
     """
     factor = np.ones(len(fixes))
-    limit = float(chi2.ppf(0.5, 2))
+    limit = float(scipy.stats.chi2.ppf(0.5, 2))
     upper = np.array([[0, 1], [1, 2]])
     own = arrays.cov_m2[:, upper]
     off, spread = by_markers.offset_m[:, :2], by_markers.spread[:, :2, :2]

@@ -14,7 +14,7 @@ import app
 ROOT = Path(__file__).resolve().parents[2]
 CORE = (
     "planning", "surveys", "simulation", "encoders", "decoders", "lanes", "formats", "radio", "calibration", "markers",
-    "sensors", "roads", "geodesy", "errors",
+    "sensors", "roads", "geodesy", "errors", "tracks", "health",
 )  # fmt: skip
 MAX_LINES = 450
 
