@@ -29,7 +29,7 @@ from app.registry.jobs import JobState
 from app.services.idempotency import IdempotencyKey
 from app.services.surveys.declarations import import_input
 from app.services.surveys.documents import ImportJobDocument, ImportJobPage, ImportReport
-from app.services.surveys.import_jobs import IMMEDIATE_BYTES, ImportJobs
+from app.services.surveys.import_jobs import ImportJobs, takes_long
 from app.services.surveys.imports import ImportInput
 from app.services.surveys.imports import Imports as ImportsService
 
@@ -87,7 +87,7 @@ async def get_asked(
         if len(text) > MAX_DECLARATION_BYTES:
             raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
         declared = (await read_declaration(DeclarationIn, text, "body", "declaration")).declared()
-        as_job = file.size > IMMEDIATE_BYTES or wants_job(prefer)
+        as_job = wants_job(prefer) or takes_long(file)
         key = idempotency_of(request, idempotency_key, text, file)
         yield _Asked(import_input(declared, file), declared, key, as_job)
 
@@ -112,8 +112,8 @@ def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports
     """Import a survey: CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, KMZ, GPX, LandXML, JobXML, GSI or DXF.
 
     With `dry_run` the report says what would be stored. A refused import answers 422 with the report in the problem;
-    nothing of it is stored. A file of more than 8 MiB becomes a job, and so does one that is sent with
-    `Prefer: respond-async`: 202, the report comes at Location.
+    nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does one that is
+    sent with `Prefer: respond-async`: 202, the report comes at Location.
     """
     if asked.as_job:
         document, replayed = jobs.submit(caller, asked.declared, asked.given.file, asked.idempotency)

@@ -12,7 +12,7 @@ import pytest
 from app.errors import Unavailable
 from app.main import create_app
 from app.registry.jobs import JobKind
-from app.services.surveys import imports
+from app.services.surveys import import_jobs, imports
 from app.settings import Settings
 from tests.api.surveys.test_imports import DEGREES, _csv, _finished, _markers, _send
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
@@ -48,6 +48,16 @@ def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def _cancel(client: httpx.Client, import_id: str) -> httpx.Response:
     return client.post(f"/v1/imports/{import_id}/cancel")
+
+
+@pytest.mark.parametrize(("limit", "value"), [("IMMEDIATE_LINES", 4), ("IMMEDIATE_BYTES", 200)])
+def test_long_surveys_become_jobs(
+    client: httpx.Client, waiting: list[str], monkeypatch: pytest.MonkeyPatch, limit: str, value: int
+) -> None:
+    monkeypatch.setattr(import_jobs, limit, value)
+    assert _send(client, _csv(4), {**DEGREES, "dry_run": True}).status_code == 200
+    answer = _send(client, _csv(8), DEGREES)
+    assert (answer.status_code, waiting) == (202, [answer.json()["id"]])
 
 
 def test_jobs_are_listed_newest_first(server: LiveServer, client: httpx.Client, waiting: list[str]) -> None:
