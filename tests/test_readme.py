@@ -111,12 +111,15 @@ def test_every_benchmark_has_its_block() -> None:
     from benchmarks.magnets.__main__ import ITEMS as MAGNETS
     from benchmarks.planning.__main__ import RUNS as PLANNING
     from benchmarks.plates.__main__ import ITEMS as PLATES
+    from benchmarks.service.__main__ import PARTS as SERVICE
 
     magnets = [f"magnets-{item}" for item in ("run", *MAGNETS)]
     cerpm = [f"cerpm-{item}" for item in ("run", *CERPM)]
     imports = [f"imports-{item}" for item in ("faults", "clean", "speed")]
     registry = [f"registry-{item}" for item in ("boxes", "tiles", "searches", "growth")]
+    service = [f"service-{part}" for part in SERVICE]
     planning = [f"planning-{item}" for item in ("run", *PLANNING)]
-    blocks = ["demo", "run", *PLATES, *magnets, *cerpm, *imports, *registry, *planning, "bundle", "http"]
+    blocks = ["demo", "run", *PLATES, *magnets, *cerpm, *imports, *registry, *planning, *service]
+    blocks += ["bundle", "http", "video", "track", "health"]
     filled = [name for page in PAGES for name in re.findall(r"<!-- bench:([\w-]+) -->", page.read_text())]
     assert sorted(filled) == sorted(blocks)

@@ -28,7 +28,7 @@ def main() -> int:
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + (1 if arguments.short else 8))
     outcomes = {scene: [simulate(scene, seed) for seed in seeds] for scene in SCENES}
-    print(f"{SCENES[0].drives} drives in 30 days, seeds {seeds.start} to {seeds.stop - 1}\n")
+    print(f"### health\n\n{SCENES[0].drives} drives in 30 days, seeds {seeds.start} to {seeds.stop - 1}\n")
     _print_found(outcomes)
     _print_alarms(outcomes)
     _print_misses()

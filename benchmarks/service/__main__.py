@@ -53,7 +53,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that what was started is ended
     for name, (heading, tables) in PARTS.items():
         if arguments.only in (None, name):
-            print(f"### {heading}\n\n{tables(arguments.short)}\n", flush=True)
+            print(f"### service-{name}\n\n{heading}.\n\n{tables(arguments.short)}\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.hours:
         return _print_long(arguments.hours, arguments.seed)
+    print("### track\n")
     print_end_to_end(range(7, 8 if arguments.short else 17))
     count = arguments.drives or (20 if arguments.short else 200)
     rng = np.random.default_rng(arguments.seed)
@@ -61,8 +62,6 @@ def main() -> int:
     offset_low, offset_high = chi2.ppf([0.025, 0.975], count) / count
     squares = float(np.mean((difference / sigma) ** 2))
     print(f"""
-### Consistency, clocks and outliers
-
 | figure | value | goal |
 |---|---|---|
 | NEES of the position, one time a drive | {np.mean(nees):.2f} | {low:.2f} to {high:.2f} (95 %) |
@@ -142,7 +141,6 @@ def _print_errors(errors: dict[str, list[tuple[float, float]]], count: int, seed
         f" {drives.MAX_OFFSET_S} s, speed scale {100 * drives.SPEED_SCALE:g} %, heading bias"
         f" {drives.HEADING_BIAS_DEG:g} deg.\n"
     )
-    print("### One drive, one track\n")
     print("| sensors | along [m] | worst decile | worst drive | across [m] | worst decile | worst drive |")
     print("|---|---|---|---|---|---|---|")
     for name, pairs in errors.items():

@@ -48,6 +48,7 @@ def main() -> None:
             size_bytes += path.stat().st_size
             rows["none"].append(measure_video(path, truth, CAMERA))
             rows["nine of ten plates"].append(measure_video(path, truth, CAMERA, _registry(truth, seed)))
+    print("### video\n")
     print(
         f"Seeds {args.seed} to {args.seed + args.seeds - 1}: {seconds * args.seeds:.0f} s at 1080p30 and 25 m/s, "
         f"{8e-6 * size_bytes / (seconds * args.seeds):.1f} Mbit/s.\n"
