@@ -197,15 +197,21 @@ def test_a_shard_goes_on_where_it_was_killed_and_can_be_cancelled(
 def test_packets_are_no_repetitions_of_themselves(server: LiveServer, admin: httpx.Client) -> None:
     built = build_lane(admin, np.random.default_rng(2702))
     first, hour = drive(built, 2703)
-    decode = decoded(admin, packed(first))
-    decoded(admin, packed(drive(built, 2704, hour=hour + 1)[0]))  # later transmissions do not make it an old one
+    decodes = [decoded(admin, packed(first))]
+    later, _hour = drive(built, 2704, hour=hour + 1)  # later transmissions do not make it an old one
+    newest = {packet.payload[:16]: packet.payload for packet in later.packets if packet.payload}
+    untimed = "".join(f"{payload.hex()}\n" for payload in newest.values())
+    decodes.append(decoded(admin, untimed.encode(), name="packets.txt"))
+    assert decoded(admin, untimed.encode(), name="packets.txt")["report"]["verdicts"]["authentic"] == 0
     run = ended(admin, admin.post("/v1/reprocessings", json={"kinds": ["packets"]}))
-    assert run["summary"] == {"gained": 0, "lost": 0, "changed": 0, "same": 2 * len(decode["markers"]), "failed": 0}
-    own = reprocessed_decodes.c.decode_id == decode["id"]
-    with across_agencies(), server.app.state.database.read() as connection:
-        result = connection.execute(sa.select(reprocessed_decodes.c.result).where(own)).scalar_one()
-    assert result["report"]["verdicts"] == decode["report"]["verdicts"]
-    assert result["report"]["verdicts"]["authentic"] == len(first.packets)
+    same = sum(len(decode["markers"]) for decode in decodes)
+    assert run["summary"] == {"gained": 0, "lost": 0, "changed": 0, "same": same, "failed": 0}
+    for decode, sent in zip(decodes, (len(first.packets), len(newest)), strict=True):
+        own = reprocessed_decodes.c.decode_id == decode["id"]
+        with across_agencies(), server.app.state.database.read() as connection:
+            result = connection.execute(sa.select(reprocessed_decodes.c.result).where(own)).scalar_one()
+        assert result["report"]["verdicts"] == decode["report"]["verdicts"]
+        assert result["report"]["verdicts"]["authentic"] == sent
 
 
 def test_readings_are_compared_by_place_and_code() -> None:
