@@ -30,7 +30,7 @@ serve: $(VENV)/.runtime ## Serve on http://127.0.0.1:8000
 	$(BIN)/waymark serve
 
 test: $(VENV)/.dev ## All tests
-	$(BIN)/python -m pytest -n 2 --dist worksteal --durations=30 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n 3 --dist worksteal --durations=30 $(PYTEST_ARGS)
 
 static: $(VENV)/.dev
 	$(BIN)/ruff format --check .

@@ -22,7 +22,7 @@ from app.settings import Settings
 from tests.conftest import LiveServer, verified_server
 from tests.databases import PostgresServer
 
-EXAMPLES = int(os.environ.get("WAYMARK_FUZZ_EXAMPLES", "3"))
+EXAMPLES = int(os.environ.get("WAYMARK_FUZZ_EXAMPLES", "2"))
 NOT_HTTP = b"Invalid HTTP request received."  # what uvicorn itself says, of a URL over 64 KiB
 FILES = ("application/offset+octet-stream", "application/zip", "application/x-ndjson", "application/vnd.apache.parquet")
 API = schemathesis.openapi.from_dict(create_app(Settings(data_dir=Path("var"))).openapi())
