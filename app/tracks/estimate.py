@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 
@@ -12,9 +11,9 @@ import scipy
 from app.errors import InvalidParameter
 from app.tracks import kernel
 from app.tracks.clock_jumps import find_jump, split_where_time_falls
-from app.tracks.consensus import consistent_chain
-from app.tracks.dead_reckoning import DeadReckoning, TimeBase, dead_reckon, local_m, time_base
+from app.tracks.dead_reckoning import DeadReckoning, TimeBase, dead_reckon, time_base
 from app.tracks.kernel import HEADING_SAMPLE, SPEED_SAMPLE
+from app.tracks.left_out import count_passages, stretches_left_out
 from app.tracks.measure import (
     FixArrays,
     PathIndex,
@@ -27,18 +26,18 @@ from app.tracks.measure import (
     path_rows,
     sample_rows,
 )
-from app.tracks.motion import BIAS, CLOCKS, HEADING, NORTH, SCALE, SPEED, WANDER, YAW_RATE, Motion
+from app.tracks.motion import CLOCKS, HEADING, NORTH, Motion
 from app.tracks.receiver import believed, is_receiver, receiver_results
 from app.tracks.results import collect_track
 from app.tracks.speed_alignment import align_clocks
+from app.tracks.start import start_set, start_state
 from app.tracks.types import Bools, Clock, Floats, Ints, PositionFix, Track, TrackInput, TrackRules
 
-MAX_ROUNDS = 12
-"""Rounds of smoothing and gating at most. Source: `python -m benchmarks.track`: 4 to 8 are needed."""
+MAX_ROUNDS = 40
+"""Rounds of smoothing and gating at most. Source: `python -m benchmarks.track`: 4 to 8 are needed, rarely 30."""
 _MOVED_M, _MOVED_S = 0.01, 1e-3  # [m, s] changes that end the rounds; source: by hand, below all noise
 _READMIT = 0.8  # of the gate: no fix goes in and out in turn; source: by hand
 _NEIGHBOURS_S = 20.0  # [s] one outlier at a time is left out of this; source: by hand, it spoils what is near
-_START_SIGMA_M = 2000.0  # [m] source: by hand, dead reckoning of ten minutes back to the start
 MAX_JUMPS = 4
 """Steps of clocks at most. Source: by hand."""
 _MIN_LEFT_OUT = 3  # fixes, from which on a step of a clock may be the cause; source: app/tracks/clock_jumps.py
@@ -102,7 +101,7 @@ class Smoothed:
 
 
 @dataclass(slots=True, eq=False)
-class _Drive:
+class DriveData:
     """What stays the same from round to round; `markers` are the fixes that the drive is placed by first."""
 
     given: TrackInput
@@ -163,9 +162,8 @@ def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
     paths = [index for path in given.paths if (index := path_index(path)) is not None]
     receiver = is_receiver(fixes)
     markers = np.ones_like(receiver) if receiver.all() else ~receiver
-    drive = _Drive(given, rules, base, fixes, fix_arrays(fixes), segments, segment_of, driven, markers, paths)
-    smoothed = _smooth(drive)
-    smoothed = _with_jumps(drive, smoothed)
+    drive = DriveData(given, rules, base, fixes, fix_arrays(fixes), segments, segment_of, driven, markers, paths)
+    smoothed = _with_jumps(drive, _with_stretches(drive, _smooth(drive)))
     factor = np.ones(len(fixes))
     if not markers.all():
         drive.arrays, factor = believed(fixes, drive.arrays, smoothed)
@@ -173,7 +171,16 @@ def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
     if fallen:
         warnings.append("times of a sensor run backwards: its clock was set; each part has an offset of its own")
     track = collect_track(
-        rules, base, fixes, drive.segments, drive.segment_of, given.clocks, smoothed, pauses, tuple(warnings)
+        rules,
+        base,
+        fixes,
+        drive.segments,
+        drive.segment_of,
+        given.clocks,
+        smoothed,
+        drive.arrays.passage,
+        pauses,
+        tuple(warnings),
     )
     return replace(track, receivers=receiver_results(fixes, factor, smoothed.used))
 
@@ -233,18 +240,22 @@ def _places(segments: list[Segment]) -> list[int]:
     return [CLOCKS + sum(unknown[:k]) if unknown[k] else -1 for k in range(len(segments))]
 
 
-def _smooth(drive: _Drive, *, clock_s: float = 0.0, known: Smoothed | None = None) -> Smoothed:
+def _smooth(
+    drive: DriveData, *, clock_s: float = 0.0, known: Smoothed | None = None, tried: Bools | None = None
+) -> Smoothed:
     """Rounds of filter, smoother and gate until nothing changes; `clock_s` lets offsets of clocks change.
 
-    `known` is the drive by its markers alone, which positions of a receiver are added to.
+    `known` is the drive by its markers alone, which positions of a receiver are added to; `tried` are the fixes that
+    are used at first instead of a consistent chain.
     """
     places = _places(drive.segments)
     for entry, own in zip(drive.segments, places, strict=True):
         entry.place = own
     place = max(CLOCKS, max(places) + 1)
-    chain, turn, scale = _start_set(drive)
-    start, start_cov = _start_state(drive, chain, turn, scale, place)
+    chain, turn, scale = start_set(drive)
+    start, start_cov = start_state(drive, chain, turn, scale, place)
     used, decided = (chain, drive.markers) if known is None else (known.used, ~drive.markers)
+    used = used if tried is None else tried
     motion = _MOTION._replace(
         wander_m=drive.rules.wander_m, wander_length_m=drive.rules.wander_length_m, clock_s=clock_s
     )
@@ -257,6 +268,8 @@ def _smooth(drive: _Drive, *, clock_s: float = 0.0, known: Smoothed | None = Non
         measurements, where, path_points = _measurements(drive, states, position, used)
         new_states, covs = kernel.filter_track(drive.base.step_s, start, start_cov, around, measurements, motion)
         kernel.smooth_track(drive.base.step_s, new_states, covs, around, motion)
+        if tried is not None and not np.isfinite(new_states).all():
+            raise FloatingPointError("the fixes that were tried contradict each other")
         square, residual, smoothed, spread = kernel.fix_distances(measurements, where, new_states, covs)
         position, heading = covs[:, [0, 0, 1], [0, 1, 1]], covs[:, HEADING, HEADING].copy()
         ends = np.array([np.diag(covs[0]), np.diag(covs[-1])])
@@ -286,7 +299,7 @@ def _moved(before: Floats | None, after: Floats) -> bool:
 
 
 def _measurements(
-    drive: _Drive, states: Floats | None, position_m2: Floats | None, used: Bools
+    drive: DriveData, states: Floats | None, position_m2: Floats | None, used: Bools
 ) -> tuple[kernel.Measurements, Ints, int]:
     offsets = drive.offsets(states)
     names = {entry.clock.name: k for k, entry in reversed(list(enumerate(drive.segments)))}
@@ -307,7 +320,7 @@ def _measurements(
     return *in_order(parts), path_points
 
 
-def _gate(drive: _Drive, used: Bools, decided: Bools, square: Floats, gate: Floats) -> Bools:
+def _gate(drive: DriveData, used: Bools, decided: Bools, square: Floats, gate: Floats) -> Bools:
     """Leave out the worst fix in each stretch, and take back those that fit; of those that are decided on."""
     changed = used.copy()
     time = drive.arrays.time_s + np.array([entry.clock.offset_s for entry in drive.segments])[drive.segment_of]
@@ -322,83 +335,25 @@ def _gate(drive: _Drive, used: Bools, decided: Bools, square: Floats, gate: Floa
     return changed | back
 
 
-# --- where it starts --------------------------------------------------------------------------------------------------
+# --- stretches and clocks ---------------------------------------------------------------------------------------------
 
 
-def _start_set(drive: _Drive) -> tuple[Bools, float, float]:
-    who = np.flatnonzero(drive.markers)
-    segment = drive.segment_of[who]
-    node, _after = drive.base.nearest(drive.arrays.time_s[who] + drive.offsets(None)[segment])
-    clock_sigma = np.array([0.0 if entry.is_reference else entry.clock.sigma_s for entry in drive.segments])
-    chain, turn, scale = consistent_chain(
-        local_m(drive.fixes)[who], drive.arrays.sigma_m[who], drive.base.time_s[node], node, segment,
-        clock_sigma[segment], drive.driven,
-    )  # fmt: skip
-    used = np.zeros(len(drive.fixes), bool)
-    used[who] = chain
-    return used, turn, scale
+def _with_stretches(drive: DriveData, smoothed: Smoothed) -> Smoothed:
+    """Begin again with the markers that were left out one after another, and keep what fits more markers."""
+    passage = drive.arrays.passage
+    tried = smoothed.used.copy()
+    for rows in stretches_left_out(smoothed.used, drive.markers, passage):
+        tried[rows] = True
+    if (tried == smoothed.used).all():
+        return smoothed
+    try:
+        other = _smooth(drive, tried=tried)
+    except FloatingPointError:
+        return smoothed
+    return other if count_passages(other.used, passage) > count_passages(smoothed.used, passage) else smoothed
 
 
-def _start_state(drive: _Drive, chain: Bools, turn: float, scale: float, size: int) -> tuple[Floats, Floats]:
-    """State at the first node, by dead reckoning back from the first fix of the chain."""
-    arrays, driven, rules = drive.arrays, drive.driven, drive.rules
-    k = int(np.flatnonzero(chain)[0])
-    node, _after = drive.base.nearest(arrays.time_s[[k]] + drive.offsets(None)[drive.segment_of[k]])
-    first = int(node[0])
-    heading, heading_sigma = _start_heading(drive, chain, turn)
-    twist = heading - float(driven.heading_rad[first] if driven.has_heading else 0.0)
-    east, north = -float(driven.east_m[first]) * scale, -float(driven.north_m[first]) * scale
-    c, s = math.cos(twist), math.sin(twist)
-    start = np.zeros(size)
-    lat = float(arrays.lat_rad[k])
-    curve = 1.0 - 0.0066943799901413165 * math.sin(lat) ** 2
-    start[0] = float(arrays.lon_rad[k]) + (c * east + s * north) * math.sqrt(curve) / (6378137.0 * math.cos(lat))
-    start[1] = lat + (c * north - s * east) * curve**1.5 / (6378137.0 * (1 - 0.0066943799901413165))
-    start[HEADING] = (float(driven.heading_rad[0]) if driven.has_heading else 0.0) + twist
-    start[SPEED] = float(driven.speed_m_s[0])
-    for entry in drive.segments:
-        if entry.place >= 0:
-            start[entry.place] = entry.clock.offset_s
-    sigma = np.zeros(size)
-    sigma[:2] = _START_SIGMA_M
-    sigma[HEADING] = heading_sigma
-    sigma[SPEED] = 5.0 if driven.has_speed else 30.0
-    sigma[YAW_RATE] = 0.2
-    sigma[SCALE] = rules.speed_scale_sigma
-    sigma[BIAS] = math.radians(rules.heading_bias_sigma_deg)
-    sigma[WANDER] = rules.wander_m
-    for entry in drive.segments:
-        if entry.place >= 0:
-            sigma[entry.place] = entry.clock.sigma_s
-    return start, np.diag(sigma**2)
-
-
-def _start_heading(drive: _Drive, chain: Bools, turn: float) -> tuple[float, float]:
-    """Heading at the first fix of the chain, and its standard deviation. [rad]"""
-    arrays, driven = drive.arrays, drive.driven
-    known = chain & np.isfinite(arrays.heading_rad)
-    node, _after = drive.base.nearest(arrays.time_s + drive.offsets(None)[drive.segment_of])
-    first = int(np.flatnonzero(chain)[0])
-    if driven.has_heading:
-        off = turn
-        if known.any():
-            differences = np.exp(1j * (arrays.heading_rad[known] - driven.heading_rad[node[known]]))
-            off = float(np.angle(np.median(differences.real) + 1j * np.median(differences.imag)))
-        return float(driven.heading_rad[node[first]]) + off, math.radians(20.0)
-    if known.any():
-        return float(arrays.heading_rad[np.flatnonzero(known)[0]]), math.radians(30.0)
-    place = local_m(drive.fixes)[chain]
-    far = np.flatnonzero(np.hypot(*(place - place[0]).T) > 3.0)
-    if not far.size:
-        return 0.0, math.pi
-    step = place[far[0]] - place[0]
-    return math.atan2(step[0], step[1]), math.radians(40.0)
-
-
-# --- clocks that jump -------------------------------------------------------------------------------------------------
-
-
-def _with_jumps(drive: _Drive, smoothed: Smoothed) -> Smoothed:
+def _with_jumps(drive: DriveData, smoothed: Smoothed) -> Smoothed:
     """Give a clock that was set during the drive another offset from then on, if more fixes fit then."""
     for _try in range(MAX_JUMPS):
         if (drive.markers & ~smoothed.used).sum() < _MIN_LEFT_OUT:
@@ -407,7 +362,8 @@ def _with_jumps(drive: _Drive, smoothed: Smoothed) -> Smoothed:
         if not _split_at_jump(drive):
             break
         other = _smooth(drive)
-        if other.used.sum() < smoothed.used.sum() + 2:
+        passages = [count_passages(one.used, drive.arrays.passage) for one in (smoothed, other)]
+        if passages[1] < passages[0] + 2:
             drive.segments, drive.segment_of = segments, segment_of
             for entry, place in zip(segments, _places(segments), strict=True):
                 entry.place = place
@@ -416,7 +372,7 @@ def _with_jumps(drive: _Drive, smoothed: Smoothed) -> Smoothed:
     return smoothed
 
 
-def _split_at_jump(drive: _Drive) -> bool:
+def _split_at_jump(drive: DriveData) -> bool:
     """Look for steps by a smoother whose offsets may change; divide the segment with the largest. Whether there is."""
     loose = _smooth(drive, clock_s=_EXPLORED_S)
     node, _after = drive.base.nearest(drive.arrays.time_s + drive.offsets(None)[drive.segment_of])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from app.tracks.dead_reckoning import TimeBase
+from app.tracks.left_out import times_lost
 from app.tracks.motion import BIAS, HEADING, SCALE, SPEED
 from app.tracks.types import (
     Bools,
@@ -33,7 +34,8 @@ _PAUSE_S = 10.0  # [s] longer pauses without any data are gaps, whatever the fil
 
 def collect_track(
     rules: TrackRules, base: TimeBase, fixes: tuple[PositionFix, ...], segments: list[Segment], segment_of: Ints,
-    declared: tuple[Clock, ...], smoothed: Smoothed, pauses: list[tuple[float, float]], warnings: tuple[str, ...],
+    declared: tuple[Clock, ...], smoothed: Smoothed, passage: Ints, pauses: list[tuple[float, float]],
+    warnings: tuple[str, ...],
 ) -> Track:  # fmt: skip
     """The track with all that belongs to it."""
     states = smoothed.states
@@ -58,7 +60,8 @@ def collect_track(
     sigma = np.sqrt(np.maximum((east + north) / 2 + np.sqrt(((east - north) / 2) ** 2 + cross**2), 0.0))
     driven = np.concatenate([[0.0], np.cumsum(np.abs(states[1:, SPEED]) * base.step_s)])
     odometer = np.interp(time, base.time_s, driven)
-    in_gap, gaps = _gaps(rules, time, sigma, odometer, pauses)
+    lost = times_lost(fix_time, smoothed.used, by_marker, passage)
+    in_gap, gaps = _gaps(rules, time, sigma, odometer, pauses, lost)
     node, _after = base.nearest(fix_time)
     results = _fix_results(fixes, fix_time, smoothed, states[node, HEADING])
     scale_var, bias_var = smoothed.ends[1, SCALE], smoothed.ends[1, BIAS]
@@ -123,18 +126,30 @@ def _clocks(
 
 
 def _gaps(
-    rules: TrackRules, time: Floats, sigma: Floats, odometer: Floats, pauses: list[tuple[float, float]]
+    rules: TrackRules,
+    time: Floats,
+    sigma: Floats,
+    odometer: Floats,
+    pauses: list[tuple[float, float]],
+    lost: list[tuple[float, float]],
 ) -> tuple[Bools, tuple[TrackGap, ...]]:
     wide = sigma > rules.max_sigma_m
     paused = np.zeros(len(time), bool)
     for start, end in pauses:
         if end - start >= _PAUSE_S:
             paused |= (time > start) & (time < end)
-    in_gap = wide | paused
+    astray = np.zeros(len(time), bool)
+    for start, end in lost:
+        astray |= (time > start) & (time < end)
+    in_gap = wide | paused | astray
     edges = np.flatnonzero(np.diff(np.r_[False, in_gap, False].astype(np.int8)))
     gaps = []
     for a, b in zip(edges[::2], edges[1::2], strict=True):
-        reason = "no sensor recorded" if paused[a:b].any() else "too far from the next marker"
+        reason = "too far from the next marker"
+        if paused[a:b].any():
+            reason = "no sensor recorded"
+        elif astray[a:b].any():
+            reason = "the markers there do not fit the track"
         low, high = max(a - 1, 0), min(b, len(time) - 1)
         length = float(odometer[high] - odometer[low])
         gaps.append(TrackGap(float(time[low]), float(time[high]), length, float(sigma[a:b].max()), reason))
