@@ -20,7 +20,7 @@ from app.settings import Settings
 from app.wiring import Outside, connect_outside, make_use_cases, utc_now
 
 _LOG = structlog.get_logger(__name__)
-_SCHEMA_WITHIN_S = 60.0
+_DATABASE_WITHIN_S = 60.0
 _ASK_EVERY_S = 0.5
 
 
@@ -50,9 +50,8 @@ def running_worker(
         )
     jobs = make_use_cases(settings, outside, decode)["jobs"]
     worker = CeleryWorker(outside.queue, names, concurrency)
-    outside.database.open()
     try:
-        _wait_for_schema(outside.database)
+        _wait_for_database(outside.database)
         outside.blobs.open()
         outside.spool.open(alone=False)
         if settings.warm_decoders:
@@ -74,14 +73,21 @@ def metrics_server(settings: Settings, outside: Outside) -> MetricsServer:
     return MetricsServer(settings.host, settings.worker_metrics_port, metrics)
 
 
-def _wait_for_schema(database: Database) -> None:
-    """Wait until the server has migrated the database."""
-    last_s = time.monotonic() + _SCHEMA_WITHIN_S
-    while database.current_revision() != head_revision():
-        if time.monotonic() > last_s:
-            raise Unavailable(
+def _wait_for_database(database: Database) -> None:
+    """Open the database as soon as it answers, which it may not while it starts, and the server has migrated it."""
+    last_s = time.monotonic() + _DATABASE_WITHIN_S
+    while True:
+        try:
+            database.open()
+            if database.current_revision() == head_revision():
+                return
+            missing = Unavailable(
                 f"{database.name} has another schema than this release",
                 cure="run waymark migrate, or start waymark serve of this release",
             )
-        _LOG.info("the worker waits for the database to be migrated")
+        except Unavailable as error:
+            missing = error
+        if time.monotonic() > last_s:
+            raise missing
+        _LOG.info("the worker waits for the database", why=missing.message)
         time.sleep(_ASK_EVERY_S)

@@ -7,12 +7,14 @@ import threading
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
 import sqlalchemy as sa
 from kombu import Connection
 
+from app import worker
 from app.errors import InvalidParameter, ProcessStopped, Unavailable
 from app.jobs.celery_app import (
     DELIVERY_LIMIT,
@@ -262,3 +264,20 @@ def test_a_worker_needs_a_broker(settings: Settings) -> None:
 
     with pytest.raises(InvalidParameter, match="none is set"), running_worker(settings):
         pass
+
+
+def test_a_worker_waits_for_its_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[float] = []
+
+    def away(_database: Database) -> None:
+        opened.append(time.monotonic())
+        raise Unavailable("the database is starting up")
+
+    monkeypatch.setattr(Database, "open", away)
+    monkeypatch.setattr(worker, "_DATABASE_WITHIN_S", 1.0)
+    broker_url = "amqp://guest:guest@127.0.0.1:1"
+    url = "postgresql+psycopg:///absent?host=/nowhere"
+    settings = Settings(data_dir=tmp_path, database_url=url, broker_url=broker_url, blobs_shared=True)
+    with pytest.raises(Unavailable, match="is starting up"), worker.running_worker(settings):
+        pass
+    assert len(opened) > 1
