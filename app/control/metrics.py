@@ -145,7 +145,7 @@ class MetricsServer:
 
 class _MetricsHandler(BaseHTTPRequestHandler):
     registry: CollectorRegistry
-    timeout = 10  # of a client that says nothing [s]
+    timeout = 10  # of a silent client [s]
 
     def do_GET(self) -> None:
         """Answer one request."""

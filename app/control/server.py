@@ -79,7 +79,7 @@ class ControlServer:
                 first, files, _, _ = socket.recv_fds(connection, 65_536, MAX_FILES)
                 request = first + receive_all(connection, MAX_REQUEST_BYTES)
                 connection.settimeout(None)
-                _check_peer(connection)  # after it was read: whoever still sends could not be told why
+                _check_peer(connection)  # after it was read: a client that still sends would not read the reason
                 answer = self._answer(request, files, connection)
             except WaymarkError as error:
                 answer = {"error": _described(error)}

@@ -140,7 +140,7 @@ def is_picture(head: bytes) -> bool:
 
 
 def unknown_picture(head: bytes, accepted: str = _KINDS, cure: str = SEND_AS_IT_IS) -> UnsupportedUpload:
-    """The refusal of a file that is no picture; it says what the file looks like, and what is accepted."""
+    """The refusal of a file that is no picture; with the detected kind of the file and the accepted kinds."""
     kind = next((name for signature, name in _OTHER_SIGNATURES if head.startswith(signature)), None)
     if head[4:8] == b"ftyp":
         kind = "a video, HEIC or AVIF"

@@ -22,7 +22,7 @@ class SpooledFile:
     data : bytes or None
         All of it, if it is held in memory.
     path : Path or None
-        Absolute path of the file that holds it. The name is the server's own, and says nothing of the content.
+        Absolute path of the file that holds it. The server chose the name, which does not depend on the content.
     size : int
         [byte]
     sha256 : str, optional

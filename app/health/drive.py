@@ -22,7 +22,7 @@ BESIDE = 6
 MIN_OTHERS = 3
 """Other markers for a common shift: of three, one may have moved. Source: the median's breakdown point."""
 MIN_EXPECTED = 0.3
-"""Reading probability below which a pass says nothing of a missing marker. Source: by hand."""
+"""Reading probability below which a pass is no evidence of a missing marker. Source: by hand."""
 RECENT_PASSES = 6.0
 """Passes of its last minutes that a vehicle's reading rate rests on besides those of the drive. Source: by hand."""
 DOUBT_PASSES = 0.7
@@ -31,7 +31,7 @@ probability of a binomial with Jeffreys' prior."""
 RATE_LIMITS = (0.05, 1.0)
 _MAX_PROBABILITY = 0.95  # source: by hand; a truck in front hides a marker in some percent of passes
 MIN_ALIVE = 0.5
-"""Readings of other markers, the decaying ones of the last minutes with them, without which a miss says nothing."""
+"""Readings of other markers, the decaying ones of the last minutes with them, without which a miss is no evidence."""
 WRONG_WAY_SHARE = 0.6
 """Share of reversed markers from which the vehicle is on the wrong way. Source: by hand."""
 STATED_PASSES = 4.0
@@ -43,7 +43,7 @@ _MAD_SIGMA, _MEDIAN_LOSS = 1.4826, 1.2533  # of a normal distribution: MAD to si
 
 @dataclass(frozen=True, slots=True)
 class JudgedDrive:
-    """Evidence of a drive, and what it says of the vehicle.
+    """Evidence of a drive on markers and on the vehicle.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ def _median(values: Floats) -> Floats:
 
 
 def _read_probabilities(passes: Sequence[Pass], vehicle: VehicleState) -> Floats:
-    """That this vehicle reads each marker, from the markers beside it and from its last minutes; 0 says nothing."""
+    """That this vehicle reads each marker, from the markers beside it and from its last minutes; 0 is no evidence."""
     expected = np.array([one.expected for one in passes])
     enough = expected >= MIN_EXPECTED
     families = [one.family for one in passes]
@@ -172,7 +172,7 @@ def _common_shift(
     shift = np.where(by_others[:, None], median, [vehicle.forward_m, vehicle.left_m])
     by_median = _MEDIAN_LOSS * spread / np.sqrt(np.maximum(others, 1))
     shift_sigma = np.where(by_others, by_median, np.hypot(own, vehicle.shift_sigma_m))
-    # what the markers beside it scatter by, this one scatters by too; few of them say little of it
+    # what the markers beside it scatter by, this one scatters by too; few of them are weak evidence of it
     pooled = (others * np.nan_to_num(spread) ** 2 + STATED_PASSES * stated**2) / (others + STATED_PASSES)
     variance = np.where(by_others, np.maximum(pooled, stated**2), stated**2)
     return shift, np.sqrt(variance + shift_sigma**2 + SIGMA_FLOOR_M**2)
@@ -184,7 +184,7 @@ def _directions(passes: Sequence[Pass]) -> tuple[list[bool | None], bool, bool]:
     """
     shown = [one.reversed for one in passes if one.reversed is not None]
     reversed_ones = sum(shown)
-    if len(shown) <= 2 and reversed_ones == 1:  # of two that differ, nobody knows which is right
+    if len(shown) <= 2 and reversed_ones == 1:  # of two that differ, either may be right
         return [one.reversed for one in passes], len(shown) == 1, True
     wrong_way = reversed_ones > WRONG_WAY_SHARE * len(shown) and reversed_ones >= 2
     against = [None if one.reversed is None else one.reversed != wrong_way for one in passes]

@@ -96,7 +96,7 @@ def _moved_by(
 def missing_gain(
     probability: float, levels: list[float], factors: tuple[float, ...], false_read: float
 ) -> tuple[float, list[float]]:
-    """What a miss says for a marker that is gone, and the probabilities of its factors after the miss.
+    """Log-likelihood ratio of a miss for a marker that is gone, and the probabilities of its factors after the miss.
 
     Parameters
     ----------

@@ -64,12 +64,12 @@ class Pass:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a pass says of its marker after the vehicle's own errors.
+    """Evidence of a pass on its marker after the vehicle's own errors.
 
     Attributes
     ----------
     read_probability : float
-        That this vehicle reads a healthy, clean marker in this pass; 0 where a miss says nothing.
+        That this vehicle reads a healthy, clean marker in this pass; 0 where a miss is no evidence.
     offset_m, sigma_m : (float, float) or None, float
         Less the drive's common shift, east and north, and the standard deviation of each with that of the shift. [m]
     reversed : bool or None

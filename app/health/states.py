@@ -123,7 +123,7 @@ class MarkerState:
 
 
 MEMORY_S = 600.0
-"""[s] for which a vehicle's readings say that its sensors work. Source: chosen by hand, some kilometres of road."""
+"""[s] for which a vehicle's readings are evidence that its sensors work. Source: by hand, some kilometres of road."""
 SHIFT_PRIOR_M = 0.5
 """[m] standard deviation of the shift of a vehicle without a record, each axis. Source: by hand: a camera that is
 turned by 3 degrees shifts a plate at 10 m by this."""

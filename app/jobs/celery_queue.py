@@ -1,4 +1,4 @@
-"""The job queue of many processes: messages in RabbitMQ say that there is work, the jobs' rows say which.
+"""The job queue of many processes: messages in RabbitMQ announce work, the jobs' rows define it.
 
 A message wakes a worker, which then runs the job of its queue whose turn it is (`Jobs.run_next`), so that one agency's
 thousand jobs do not hold up another's. A message too few is replaced, one too many finds nothing to do.

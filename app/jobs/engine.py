@@ -12,7 +12,7 @@ class JobEngine(JobQueue, DeadLetters, Protocol):
     """A queue of jobs that is opened and closed with the process."""
 
     def open(self, jobs: Jobs) -> None:
-        """Start; `jobs` runs them, or says which are waiting."""
+        """Start; `jobs` runs them, and lists those that wait."""
 
     def close(self) -> None:
         """Stop; close the decoder processes first to interrupt running jobs."""

@@ -27,7 +27,7 @@ ResultT = TypeVar("ResultT")
 
 
 class PoolState(NamedTuple):
-    """Decoder processes that run and that are wanted, their memory [byte], waiting tasks, and starts so far."""
+    """Decoder processes that run and that are wanted, their memory [byte], waiting tasks, and the number of starts."""
 
     running: int
     wanted: int
@@ -149,7 +149,7 @@ class DecodePool:
 
 
 def _resident_bytes(pid: int) -> int:
-    """Resident memory of a process; 0 where it has ended or the system does not say."""
+    """Resident memory of a process; 0 where it has ended or the system does not report it."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
     except OSError:

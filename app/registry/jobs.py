@@ -214,7 +214,7 @@ def request_cancel(
     Parameters
     ----------
     below_progress : float, optional
-        A job that has come so far is not stopped any more, nor while it waits to go on.
+        A job beyond this progress is not stopped any more, nor while it waits to go on.
     """
     own = (jobs.c.id == job_id, jobs.c.agency_id == agency_id, jobs.c.progress < below_progress)
     queued = sa.update(jobs).where(*own, jobs.c.state == "queued")

@@ -1,6 +1,6 @@
 """The largest chain of fixes that agree with each other: where the filter starts from.
 
-A wrong first fix must not be believed: a filter that starts at it leaves out all that are right. Fixes i and j agree if
+A wrong first fix must be rejected: a filter that starts at it leaves out all that are right. Fixes i and j agree if
 the vector between them is the one that was driven, by dead reckoning, within its error. The longest chain of fixes each
 of which agrees with the one before is found by dynamic programming. What it leaves out is tested again against the
 smoothed track.

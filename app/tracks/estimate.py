@@ -27,7 +27,7 @@ from app.tracks.measure import (
     sample_rows,
 )
 from app.tracks.motion import CLOCKS, HEADING, NORTH, Motion
-from app.tracks.receiver import believed, is_receiver, receiver_results
+from app.tracks.receiver import with_estimated_accuracy, is_receiver, receiver_results
 from app.tracks.results import collect_track
 from app.tracks.speed_alignment import align_clocks
 from app.tracks.start import start_set, start_state
@@ -166,7 +166,7 @@ def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
     smoothed = _with_jumps(drive, _with_stretches(drive, _smooth(drive)))
     factor = np.ones(len(fixes))
     if not markers.all():
-        drive.arrays, factor = believed(fixes, drive.arrays, smoothed)
+        drive.arrays, factor = with_estimated_accuracy(fixes, drive.arrays, smoothed)
         smoothed = _smooth(drive, known=smoothed)
     if fallen:
         warnings.append("times of a sensor run backwards: its clock was set; each part has an offset of its own")

@@ -31,7 +31,9 @@ def is_receiver(fixes: tuple[PositionFix, ...]) -> Bools:
     return np.array([fix.marker_id is None for fix in fixes], bool)
 
 
-def believed(fixes: tuple[PositionFix, ...], arrays: FixArrays, by_markers: Smoothed) -> tuple[FixArrays, Floats]:
+def with_estimated_accuracy(
+    fixes: tuple[PositionFix, ...], arrays: FixArrays, by_markers: Smoothed
+) -> tuple[FixArrays, Floats]:
     """Fixes with the covariance of the receivers' positions enlarged to what markers show, and the factors (K,).
 
     Notes

@@ -48,7 +48,7 @@ def _all(outcomes: Sequence[Outcome], kind: str) -> list[Found | None]:
 
 
 def _print_found(outcomes: dict[Scene, list[Outcome]]) -> None:
-    print("Found / injected, and passes needed: median, worst (passes that say something of the fault)\n")
+    print("Found / injected, and passes needed: median, worst (passes that are evidence of the fault)\n")
     print("| scene | " + " | ".join(KINDS) + " |")
     print("|---|" + "---|" * len(KINDS))
     rows = [*outcomes.items(), (Scene("all"), [one for several in outcomes.values() for one in several])]

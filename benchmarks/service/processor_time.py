@@ -1,4 +1,4 @@
-"""Processor time of the parts of a service: it says what a file costs, however busy the machine is."""
+"""Processor time of the parts of a service: the cost of a file, independent of the load of the machine."""
 
 from __future__ import annotations
 

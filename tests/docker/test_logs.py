@@ -47,7 +47,7 @@ def use(url: str) -> None:
 
 
 def address_of(server: subprocess.Popen[bytes], log: Path) -> str | None:
-    """Where a server listens, as its log says; None while it starts. One that ended fails the test at once."""
+    """The address of a server, from its log; None while it starts. One that ended fails the test at once."""
     ended, started = server.poll() is not None, STARTED.search(log.read_text())
     assert not ended, "the server ended"
     return started[1] if started else None

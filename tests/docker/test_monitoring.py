@@ -106,7 +106,7 @@ def test_every_name_and_label_is_in_a_scrape_and_queues_are_counted(settings: Se
         assert value(samples, "waymark_database_up") == 1
         assert value(samples, "waymark_decoder_processes_wanted") == 2
         assert value(samples, "waymark_database_connections_max", pool="transactions") >= 30
-        # a second process says the same of the queues, and a worker says it on a port of its own
+        # a second process reports the same queues, and a worker reports them on a port of its own
         metrics = ProcessMetrics(server.app.state.database, server_pool(server), utc_now)
         found = {m.name: m for m in metrics.collect()}
         again = [s.value for s in found["waymark_jobs"].samples if s.labels["kind"] == "export"]

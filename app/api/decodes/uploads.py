@@ -73,7 +73,7 @@ async def get_upload(
 
 
 async def check_quota(request: Request) -> None:
-    """Refuse a body beyond the quota of its key before it is read, as far as Content-Length says how long it is."""
+    """Refuse a body beyond the quota of its key before it is read, by its Content-Length."""
     quotas: Quotas = request.app.state.quotas
     caller, size = caller_of(request), int(request.headers.get("content-length", "0"))
     try:

@@ -1,4 +1,4 @@
-"""Headers of tus 1.0: what a request says, and what a response does (https://tus.io/protocols/resumable-upload)."""
+"""Request and response headers of tus 1.0 (https://tus.io/protocols/resumable-upload)."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def described(document: UploadDocument) -> dict[str, str]:
 
 
 def options(max_bytes: int) -> Mapping[str, str]:
-    """What the server speaks."""
+    """The versions and extensions of tus that the server supports."""
     return {
         "Tus-Resumable": VERSION,
         "Tus-Version": VERSION,

@@ -123,14 +123,14 @@ def complete_upload(upload_id: UploadId, caller: Caller, uploads: Service, body:
 
 @router.get("/{upload_id}", responses=document_response(UploadDocument, 404, 410))
 def get_upload(upload_id: UploadId, caller: Caller, uploads: Service) -> Response:
-    """One upload: how far it is, and the decode that it became or why it was refused."""
+    """One upload: its offset, and its decode or the reason of its refusal."""
     document = uploads.get(caller, upload_id)
     return json_response(document, headers=described(document))
 
 
 @router.head(
     "/{upload_id}",
-    responses={200: {"description": "Upload-Offset says how far it is"}, **problem_responses(404, 410, 412)},
+    responses={200: {"description": "Upload-Offset is the number of bytes stored"}, **problem_responses(404, 410, 412)},
 )
 def head_upload(request: Request, upload_id: UploadId, caller: Caller, uploads: Service) -> Response:
     """How far an upload is (tus 1.0), and in `Waymark-Decode` the decode that it became."""
@@ -164,7 +164,7 @@ async def _patched(request: Request, upload_id: UploadId, caller: Caller, upload
     status_code=204,
     openapi_extra=_body(required=True),
     responses={
-        204: {"description": "Stored; Upload-Offset says how far it is. With the last part, Location is the decode"},
+        204: {"description": "Upload-Offset is the number of bytes stored. With the last part, Location is the decode"},
         **problem_responses(404, 409, 410, 412, 423, 460),
     },
 )

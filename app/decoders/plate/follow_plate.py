@@ -1,6 +1,6 @@
 """Views of a plate in earlier frames, in which its colours were not found.
 
-Once a plate is found, its pose and the vehicle's speed say where it was before. Its image, warped to that place, is
+Once a plate is found, its pose and the vehicle's speed predict where it was before. Its image, warped to that place, is
 compared with the frame, and the plate is fitted where the two agree best.
 """
 

@@ -33,7 +33,7 @@ class LineStyle(StrEnum):
 
 
 class EventKind(StrEnum):
-    """What a vehicle knows ahead of time."""
+    """Events on the road of which a vehicle is informed in advance."""
 
     STOP_LINE = "stop_line"
     JUNCTION = "junction"

@@ -30,7 +30,7 @@ class AgencySecrets:
         self._master_key = master_key
 
     def seal(self, owner: str, secret: bytes) -> bytes:
-        """A secret as it may be stored; `owner` says whose it is and what for, and opens it again."""
+        """A secret as it may be stored; `owner` names its owner and purpose, and is needed to decrypt it."""
         nonce = secrets.token_bytes(_NONCE_BYTES)
         return nonce + AESGCM(self._master_key()).encrypt(nonce, secret, owner.encode())
 

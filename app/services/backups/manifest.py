@@ -1,4 +1,4 @@
-"""What a backup says about itself, and the checks that need nothing but its files."""
+"""The manifest of a backup, and the checks that need nothing but its files."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def verify_opened(backup: BackupReader) -> Manifest:
         for table in manifest["tables"]:
             lines = sum(chunk.count(b"\n") for chunk in backup.stream(f"database/{table['name']}.copy"))
             if lines != table["rows"]:
-                raise DamagedBackup(f"the table {table['name']} has {lines} rows, the manifest says {table['rows']}")
+                raise DamagedBackup(f"the table {table['name']} has {lines} rows, the manifest states {table['rows']}")
     return manifest
 
 
@@ -131,7 +131,9 @@ def check_sqlite(file: Path, manifest: Manifest) -> None:
         expected = {table["name"]: table["rows"] for table in manifest["tables"]}
         if differing := [name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name)]:
             name = min(differing)
-            raise DamagedBackup(f"the table {name} has {found.get(name)} rows, the manifest says {expected.get(name)}")
+            raise DamagedBackup(
+                f"the table {name} has {found.get(name)} rows, the manifest states {expected.get(name)}"
+            )
         if (summary.revision, summary.heads) != (manifest["revision"], manifest["heads"]):
             raise DamagedBackup("the schema's revision or the end of the audit log is not that of the manifest")
         if summary.revision == head_revision():

@@ -21,7 +21,7 @@ TRACK_FILES = {
     "plot.svg": "image/svg+xml",
 }
 """Files of a drive with their media types."""
-_DOUBTED = 2.5  # times the stated standard deviation of a receiver, from which on it is said; source: by hand
+_DOUBTED = 2.5  # times the stated standard deviation of a receiver, above which a warning is given; source: by hand
 MAX_MARKERS = 2000
 """Markers in a drive's document; its GeoJSON has all."""
 

@@ -1,4 +1,4 @@
-"""What an observation says of its marker's health, as its detail stores it, and back to a pass."""
+"""Evidence of an observation on its marker's health: to the stored detail, and back to a pass."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class FrameHealth:
     Attributes
     ----------
     of_readings : tuple of dict
-        Evidence of each reading; empty where it says nothing.
+        Evidence of each reading; empty where there is none.
     in_view : mapping of str to dict
         Evidence of markers that are in view at a readable size, whether they were read or not.
     unregistered : tuple of NewUnregistered

@@ -31,7 +31,7 @@ from app.services.health.evidence import EVIDENCE, MISSED, FrameHealth, rounded
 SIGMAS_IN_ACCURACY = 3.0
 """Standard deviations in the accuracy of a coarse position, which holds the vehicle with near certainty."""
 MAX_POSITION_SIGMA_M = 1.0
-"""[m] of the vehicle's position, above which nothing is said of what is in view. Source: by hand, two plates."""
+"""[m] of the vehicle's position, above which markers in view are not predicted. Source: by hand, two plates."""
 HEADING_SIGMA_RAD = math.radians(0.5)
 """[rad] of the vehicle's heading. Source: chosen by hand; what changes less is the vehicle's own shift."""
 SURVEY_SIGMA_M = 0.7
@@ -143,7 +143,7 @@ def _about(row: MarkerRow, frame: ReadFrame) -> dict[str, Any]:
 def _reading_evidence(
     marker: ReadMarker, frame: ReadFrame, context: DecodeContext, view: VehicleView | None, at: datetime
 ) -> dict[str, Any]:
-    """Evidence of a reading of a registered marker; empty where it says nothing of the marker's health."""
+    """Evidence of a reading of a registered marker; empty where there is none."""
     match = marker.match
     if match is None or match.row is None or match.ambiguous or match.row.status == RETIRED:
         return {}
@@ -166,7 +166,7 @@ def _reading_evidence(
 
 
 def _unregistered(frame: ReadFrame, context: DecodeContext, at: datetime) -> Iterator[NewUnregistered]:
-    """Markers that were read where none is registered: where their digits say, else where the vehicle was."""
+    """Markers that were read where none is registered: where their digits place them, else where the vehicle was."""
     position = context.coarse_position
     for marker in frame.markers:
         reading, match = marker.reading, marker.match
@@ -176,7 +176,7 @@ def _unregistered(frame: ReadFrame, context: DecodeContext, at: datetime) -> Ite
         if reading.confidence < MIN_CONFIDENCE or position is None or match.fits_two_places:
             continue
         if match.lon_deg is not None and not match.plausible:
-            continue  # the digits say a place that is out of reach: no plate of this kind, or a misread
+            continue  # the digits encode a place that is out of reach: no plate of this kind, or a misread
         digits = str(getattr(code, "digits", None) or getattr(code, "text", ""))
         lon_deg = position.lon_deg if match.lon_deg is None else match.lon_deg
         lat_deg = position.lat_deg if match.lat_deg is None else match.lat_deg

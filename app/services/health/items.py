@@ -146,7 +146,7 @@ def _new_item(
 
 
 def _is_acted_on(marker: MarkerRow | None) -> bool:
-    """Whether vehicles act on what the marker says: a meaning of its code, or a speed limit."""
+    """Whether vehicles act on the marker's message: a meaning of its code, or a speed limit."""
     if marker is None:
         return False
     spec = marker.spec if isinstance(marker.spec, dict) else {}

@@ -33,7 +33,7 @@ RECEIVED_SHARE = 0.7
 MAX_PROBABILITY = 0.97
 """Of receiving a marker at all. Source: by hand; a truck beside the vehicle shades it."""
 MIN_TRANSMISSIONS = 2.0
-"""Near a marker, without which a miss says nothing. Source: by hand."""
+"""Near a marker, without which a miss is no evidence. Source: by hand."""
 MAX_TRACK_M = 50_000.0
 MAX_MARKERS = 1000
 MESSAGE_SIGMA_M = 0.1
@@ -105,7 +105,7 @@ def _heard_at_s(read: ReadPackets, number: int) -> float:
 
 
 def _quality(profile: SignalProfile) -> dict[str, Any]:
-    """Level above the fleet's line in standard deviations; without a fleet nobody knows what is usual."""
+    """Level above the fleet's line in standard deviations; without a fleet there is no usual level."""
     level = profile.level_db
     if level is None or profile.compared_with != "fleet":
         return {}

@@ -25,7 +25,7 @@ class JobRules:
     result_path : callable
         Path of the result of a job that is done; None if it has none.
     too_late_progress : float
-        A job that has come so far cannot be cancelled any more; over 1: it always can.
+        A job beyond this progress cannot be cancelled any more; over 1: it always can.
     """
 
     readers: frozenset[Scope]

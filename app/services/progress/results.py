@@ -49,7 +49,7 @@ class JobFiles:
     ----------
     database, clock, blobs
     jobs : AllJobs
-        Says which jobs a caller may see.
+        Decides which jobs a caller may see.
     """
 
     def __init__(self, database: Database, clock: Clock, blobs: Blobs, jobs: AllJobs) -> None:

@@ -1,6 +1,6 @@
 """Uploads that arrive in parts: each part is a blob and a row; the last one makes them one file and a decode.
 
-Several servers may take parts of one upload: the row says how far it is and who writes it, and a part counts when its
+Several servers may take parts of one upload: the row has the offset and the writer, and a part counts when its
 row is committed. Nothing is on the disk of one server alone but the part that is arriving.
 """
 

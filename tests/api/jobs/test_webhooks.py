@@ -42,7 +42,7 @@ pytestmark = pytest.mark.both_databases
 
 
 class Receiver:
-    """A web server on this machine that notes what it is sent and answers as it is told."""
+    """A web server on this machine that records its requests and answers as configured."""
 
     def __init__(self) -> None:
         self.got: list[tuple[dict[str, str], bytes]] = []

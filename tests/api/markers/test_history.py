@@ -181,7 +181,7 @@ WITHOUT_VERSION = {
     "DELETE /v1/vehicles/{vehicle_id}/keys/{key_id}": "links, which are there or not",
     "DELETE /v1/keys/{key_id}": "keys only end",
     "DELETE /v1/drives/{drive_id}": "drives are jobs: a finished one does not change any more",
-    "PATCH /v1/uploads/{upload_id}": "tus: Upload-Offset says what a part is based on",
+    "PATCH /v1/uploads/{upload_id}": "tus: Upload-Offset is what a part is based on",
     "DELETE /v1/uploads/{upload_id}": "tus: termination",
     "DELETE /v1/webhooks/{webhook_id}": "webhooks are not changed, only enabled and removed",
 }
