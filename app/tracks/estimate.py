@@ -27,7 +27,7 @@ from app.tracks.measure import (
     sample_rows,
 )
 from app.tracks.motion import CLOCKS, HEADING, NORTH, Motion
-from app.tracks.receiver import with_estimated_accuracy, is_receiver, receiver_results
+from app.tracks.receiver import is_receiver, receiver_results, with_estimated_accuracy
 from app.tracks.results import collect_track
 from app.tracks.speed_alignment import align_clocks
 from app.tracks.start import start_set, start_state

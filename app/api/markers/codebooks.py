@@ -30,7 +30,7 @@ Service = Annotated[Codebooks, use_cases("codebooks")]
 
 @router.post("", status_code=201, responses=document_response(CodebookDocument, 409, status=201, description="Made"))
 def post_codebook(wanted: CodebookIn, caller: Caller, codebooks: Service, idempotency: Idempotency) -> Response:
-    """Make a codebook and give codes to its first meanings. The answer counts those that fit and are distinguishable."""
+    """Make a codebook and give codes to its first meanings. The answer counts those that fit and are distinct."""
     meanings = [meaning.pair for meaning in wanted.meanings]
     document, replayed = codebooks.make(
         caller, wanted.name, wanted.design.given(), wanted.rules.given(), meanings, idempotency
