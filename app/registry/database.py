@@ -115,8 +115,10 @@ class Database:
         self._asking.dispose()
 
     def close(self) -> None:
-        """Close the connections and release the file."""
+        """Close the connections and release the file; a connection that a thread still opens is closed after its use."""
         self.disconnect()
+        for _, pool in self.pools():
+            pool.dispose()  # the pool that `disconnect` made, without another one in its place
         if self._lock_fd is not None:
             os.close(self._lock_fd)
             self._lock_fd = None

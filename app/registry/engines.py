@@ -46,7 +46,7 @@ _OPERATIONAL = (sa.exc.OperationalError, sqlite3.OperationalError, psycopg.Opera
 
 
 class _ClosingPool(sa.QueuePool):
-    """A pool that also closes the connections that are in use when it is disposed of, as soon as they come back.
+    """A pool that, once it is disposed of, closes every connection as soon as it comes back.
 
     SQLAlchemy's keeps them for nobody, and the server keeps their sessions until the garbage collector finds them.
     """
@@ -61,6 +61,8 @@ class _ClosingPool(sa.QueuePool):
         if self._disposed:
             record.close()
         super()._do_return_conn(record)
+        if self._disposed:  # perhaps since the question above: nothing stays
+            super().dispose()
 
 
 def sqlite_engine(url: sa.URL) -> sa.Engine:

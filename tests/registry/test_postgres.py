@@ -147,6 +147,16 @@ def test_a_connection_in_use_is_closed_when_it_comes_back(database: Database, se
         assert connection.exec_driver_sql("SELECT pg_backend_pid()").scalar() != session
 
 
+def test_a_thread_that_outlives_the_database_leaves_no_connection_open(second: Database) -> None:
+    second.close()
+    with second.read() as connection:
+        driver = connection.connection.driver_connection
+    assert driver is not None
+    assert driver.closed
+    second.ask(lambda connection: connection.exec_driver_sql("SELECT 1").scalar())
+    assert [pool.checkedin() for _, pool in second.pools()] == [0, 0]
+
+
 def test_a_server_that_is_away_is_unavailable() -> None:
     database = Database("postgresql+psycopg://waymark:secret@127.0.0.1:1/waymark")
     with pytest.raises(Unavailable, match="cannot be reached") as refused:
