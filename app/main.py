@@ -40,7 +40,7 @@ from app.api.uploads import uploads
 from app.control.metrics import ProcessMetrics
 from app.control.operations import OperatorCases
 from app.control.server import ControlServer
-from app.decoders.plate import decode_plates
+from app.families.plate.frames import decode_plates
 from app.jobs.frame_tasks import DecodePlates
 from app.registry.database import Database
 from app.services.access.access import Access

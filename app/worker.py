@@ -9,8 +9,8 @@ from contextlib import closing, contextmanager
 import structlog
 
 from app.control.metrics import MetricsServer, ProcessMetrics
-from app.decoders.plate import decode_plates
 from app.errors import InvalidParameter, Unavailable
+from app.families.plate.frames import decode_plates
 from app.jobs.celery_queue import CeleryQueue
 from app.jobs.celery_worker import CeleryWorker
 from app.jobs.frame_tasks import DecodePlates

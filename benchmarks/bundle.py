@@ -11,7 +11,7 @@ import time
 
 import cv2
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.encoders.plate import BundleOptions, PlateOrder, write_bundle
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateReading

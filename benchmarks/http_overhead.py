@@ -29,7 +29,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.families.plate.frames import DEFAULT_GEOMETRIES
 from app.formats.images import load_image
 from app.jobs.decoder_process import keep_memory

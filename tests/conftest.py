@@ -20,7 +20,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from app.api.http.connections import ConnectionLimits, limited_connections
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.jobs import resubmission
 from app.jobs.frame_tasks import DecodePlates
 from app.main import create_app

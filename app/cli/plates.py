@@ -30,7 +30,7 @@ def encode(
     form: FormatOption = None,
 ) -> None:
     """Write the artwork of one plate at true size, after the decoder has read it back."""
-    from app.decoders.plate import decode_plates
+    from app.decoders.plate.reader import decode_plates
     from app.markers.plate import PlateGeometry
     from app.services.markers.plate_files import encode_plate_files, plate_code_for
 
@@ -78,7 +78,7 @@ def decode(
     """Decode the plates in pictures, and print one JSON object for each picture."""
     import orjson
 
-    from app.decoders.plate import decode_plates
+    from app.decoders.plate.reader import decode_plates
     from app.formats.images import ImageLimits
     from app.services.markers.plate_files import decode_picture
 

@@ -13,7 +13,8 @@ import orjson
 
 from app.errors import UnreadableUpload
 from app.planning.outputs.plan_document import read_plan
-from app.planning.proof import ProofReport, ProofTerms, ProofUnit, Prover, UnitResult, summarize
+from app.planning.proof import ProofReport, ProofTerms, ProofUnit, UnitResult, summarize
+from app.planning.proof.prove import Prover
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished units and of all."""

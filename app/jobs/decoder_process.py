@@ -42,9 +42,12 @@ _KEPT_BLOCK_BYTES = 32 * 1024**2  # glibc accepts no more
 def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLimits, folder: Path) -> None:
     """Load everything, work in a folder, send `READY`, and answer tasks until the server closes the connection.
 
-    A task comes in steps: (function, argument, whether it is the last). Each is called with its argument and the result
-    of the step before it. The answer is (whether all succeeded, result or exception, name and times of each step).
+    A task comes in steps: (argument, whether it is the last). The function of the argument's type is called with it and
+    the result of the step before. The answer is (whether all succeeded, result or exception, name and times of each
+    step).
     """
+    from app.jobs.tasks import STEPS  # only here: it loads every decoder
+
     end_with_parent()
     warm_process(decode)
     work_in(folder)
@@ -54,10 +57,10 @@ def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLim
     times_ns: list[tuple[str, int, int]] = []
     while True:
         try:
-            function, argument, is_last = connection.recv()
+            argument, is_last = connection.recv()
         except EOFError:
             return
-        began_ns = time.time_ns()
+        began_ns, function = time.time_ns(), STEPS[type(argument)]
         if answer[0]:
             allow_processor_time(limits)
             try:
@@ -70,7 +73,7 @@ def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLim
             empty_folder(folder)
             connection.send((*answer, times_ns))
             answer, times_ns = (True, None), []
-        del function, argument  # a frame's memory is free before the next frame comes
+        del argument  # a frame's memory is free before the next frame comes
 
 
 def _limit_of_files(error: Exception) -> ProcessStopped | None:

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.jobs.memory_limit import memory_is_the_limit
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlateReading

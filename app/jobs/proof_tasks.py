@@ -9,8 +9,9 @@ import orjson
 
 from app.jobs.memory_limit import memory_is_the_limit
 from app.planning.outputs.plan_document import read_plan
-from app.planning.proof import ProofTerms, ProofUnit, Prover, UnitResult, summarize
+from app.planning.proof import ProofTerms, ProofUnit, UnitResult, summarize
 from app.planning.proof.documents import markers_csv, report_document
+from app.planning.proof.prove import Prover
 from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask, WrittenProof
 from app.services.plans.summaries import proof_figures
 

@@ -24,7 +24,6 @@ from app.jobs.decoder_process import READY, READY_WITH_NETWORK, serve_tasks
 from app.jobs.fair_queue import FairQueue
 from app.jobs.frame_tasks import DecodePlates
 from app.jobs.process_limits import ProcessLimits, new_folder
-from app.jobs.tasks import STEPS
 from app.services.request_work import add_processor_time, check_deadline
 
 T = TypeVar("T")
@@ -199,7 +198,7 @@ class WorkerSupervisor(threading.Thread):
         try:
             for number, step in enumerate(pending.steps, 1):
                 argument = self._wait_for(step) if isinstance(step, Future) else step
-                connection.send((STEPS[type(argument)], argument, number == len(pending.steps)))
+                connection.send((argument, number == len(pending.steps)))
             if connection.poll(pending.timeout_s):
                 succeeded, result, times_ns = connection.recv()
                 for (name, *between), step in zip(times_ns, pending.steps, strict=True):

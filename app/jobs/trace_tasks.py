@@ -25,7 +25,7 @@ from app.services.decodes.trace_task import (
     trace_terms,
 )
 
-_MOTION_STEP_S = 0.1  # [s] source: app/tracks/dead_reckoning.py has a node every 0.1 s
+_MOTION_STEP_S = 0.1  # [s] source: app/tracks/time_base.py has a node every 0.1 s
 _MOTION_VALUES = 36_000  # at most; source: by hand, an hour, 0.5 MB of JSON
 
 _COMPILED_M = 40.0

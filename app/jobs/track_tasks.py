@@ -12,7 +12,7 @@ from app.services.drives.track_task import TrackTask, WrittenTrack
 def write_track(task: TrackTask, _before: None) -> WrittenTrack:
     """Estimate a track and write its files."""
     from app.plots.track import plot_track  # only here: numba takes a second to load
-    from app.tracks import estimate_track
+    from app.tracks.estimate import estimate_track
     from app.tracks.files import write_csv, write_geojson, write_gpx
 
     with memory_is_the_limit("drive", "make several drives of it"):

@@ -115,7 +115,7 @@ class Database:
         self._asking.dispose()
 
     def close(self) -> None:
-        """Close the connections and release the file; a connection that a thread still opens is closed after its use."""
+        """Close the connections and release the file. What a thread opens later is closed after its use."""
         self.disconnect()
         for _, pool in self.pools():
             pool.dispose()  # the pool that `disconnect` made, without another one in its place

@@ -6,7 +6,6 @@ and its smoother run to and fro along the drive (`kernel`), and after each round
 the track that the others give. Positions of the vehicle's own receiver come last (`receiver`).
 """
 
-from app.tracks.estimate import check_times, estimate_track
 from app.tracks.types import (
     Clock,
     ClockOffset,
@@ -37,6 +36,4 @@ __all__ = [
     "TrackGap",
     "TrackInput",
     "TrackRules",
-    "check_times",
-    "estimate_track",
 ]

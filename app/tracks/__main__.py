@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.tracks import Clock, LanePath, PositionFix, Samples, TrackInput, estimate_track
+from app.tracks import Clock, LanePath, PositionFix, Samples, TrackInput
+from app.tracks.estimate import estimate_track
 
 _STEP_DEG = 1e-4
 

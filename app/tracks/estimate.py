@@ -11,7 +11,7 @@ import scipy
 from app.errors import InvalidParameter
 from app.tracks import kernel
 from app.tracks.clock_jumps import find_jump, split_where_time_falls
-from app.tracks.dead_reckoning import DeadReckoning, TimeBase, dead_reckon, time_base
+from app.tracks.dead_reckoning import DeadReckoning, dead_reckon
 from app.tracks.kernel import HEADING_SAMPLE, SPEED_SAMPLE
 from app.tracks.left_out import count_passages, stretches_left_out
 from app.tracks.measure import (
@@ -26,12 +26,25 @@ from app.tracks.measure import (
     path_rows,
     sample_rows,
 )
-from app.tracks.motion import CLOCKS, HEADING, NORTH, Motion
+from app.tracks.motion import Motion
 from app.tracks.receiver import is_receiver, receiver_results, with_estimated_accuracy
 from app.tracks.results import collect_track
 from app.tracks.speed_alignment import align_clocks
 from app.tracks.start import start_set, start_state
-from app.tracks.types import Bools, Clock, Floats, Ints, PositionFix, Track, TrackInput, TrackRules
+from app.tracks.time_base import TimeBase, checked_clocks, time_base
+from app.tracks.types import (
+    CLOCKS,
+    HEADING,
+    NORTH,
+    Bools,
+    Clock,
+    Floats,
+    Ints,
+    PositionFix,
+    Track,
+    TrackInput,
+    TrackRules,
+)
 
 MAX_ROUNDS = 40
 """Rounds of smoothing and gating at most. Source: `python -m benchmarks.track`: 4 to 8 are needed, rarely 30."""
@@ -142,7 +155,7 @@ def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
         There is no fix, a clock is not declared, or the sensors do not overlap in time.
     """
     rules = rules or TrackRules()
-    given = align_clocks(given, _checked_clocks(given))
+    given = align_clocks(given, checked_clocks(given))
     clocks = {clock.name: clock for clock in given.clocks}
     fixes, warnings = _in_time_order(given, clocks), list[str]()
     if not fixes:
@@ -183,29 +196,6 @@ def estimate_track(given: TrackInput, rules: TrackRules | None = None) -> Track:
         tuple(warnings),
     )
     return replace(track, receivers=receiver_results(fixes, factor, smoothed.used))
-
-
-def check_times(given: TrackInput) -> None:
-    """Refuse what has no track, without estimating one.
-
-    Raises
-    ------
-    InvalidParameter
-        The drive is too long for the number of its clocks, sensors do not overlap in time, or a clock is not declared.
-    """
-    time_base(given, _checked_clocks(given))
-
-
-def _checked_clocks(given: TrackInput) -> dict[str, Clock]:
-    clocks = {clock.name: clock for clock in given.clocks}
-    if len(clocks) != len(given.clocks):
-        raise InvalidParameter("two clocks have the same name", field="clocks", limit="each name once")
-    samples = (*given.speeds, *given.headings)
-    used = [*(fix.clock for fix in given.fixes), *(series.clock for series in samples)]
-    missing = next((name for name in used if name not in clocks), None)
-    if missing is not None:
-        raise InvalidParameter(f"the clock {missing} is not declared", field="clocks", limit="all that are used")
-    return clocks
 
 
 def _in_time_order(given: TrackInput, clocks: dict[str, Clock]) -> tuple[PositionFix, ...]:

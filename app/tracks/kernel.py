@@ -15,22 +15,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from app.tracks.motion import (
-    BIAS,
-    EAST,
-    HEADING,
-    NORTH,
-    SCALE,
-    SPEED,
-    WANDER,
-    YAW_RATE,
-    lengths,
-    minus,
-    move_rows,
-    plus,
-    predict,
-    wrap,
-)
+from app.tracks.motion import lengths, minus, move_rows, plus, predict, wrap
+from app.tracks.types import BIAS, EAST, HEADING, NORTH, SCALE, SPEED, WANDER, YAW_RATE
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

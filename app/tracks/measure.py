@@ -9,10 +9,21 @@ import numpy as np
 import scipy
 
 from app.geodesy.ellipsoid import ecef_from_wgs84, metres_per_radian
-from app.tracks.dead_reckoning import TimeBase
 from app.tracks.kernel import FIX, HEADING_SAMPLE, PATH, Measurements
-from app.tracks.motion import HEADING, NORTH, SPEED, YAW_RATE
-from app.tracks.types import Bools, Floats, Ints, LanePath, PositionFix, Samples, TrackRules
+from app.tracks.time_base import TimeBase
+from app.tracks.types import (
+    HEADING,
+    NORTH,
+    SPEED,
+    YAW_RATE,
+    Bools,
+    Floats,
+    Ints,
+    LanePath,
+    PositionFix,
+    Samples,
+    TrackRules,
+)
 
 COMMON_POSE_SHARE = 0.1
 """Part of the variance of a pose that all frames past one marker share: calibration and mount of the camera. Source:

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numba as nb
 
-EAST, NORTH, HEADING, SPEED, YAW_RATE, SCALE, BIAS, WANDER, CLOCKS = range(9)
-"""Places in the state; the offsets of the clocks follow from `CLOCKS` on."""
+from app.tracks.types import BIAS, CLOCKS, EAST, HEADING, NORTH, SCALE, SPEED, WANDER, YAW_RATE
+
 _TURN_S = 3.0  # [s] in which a yaw rate fades; source: by hand, half a bend
 _SLOW_M_S = 3.0  # [m/s] below, the steering limits the yaw rate and not the comfort; source: by hand, a radius of 6 m
 _LEAST_RAD_S = 0.005  # [rad/s] source: by hand, lane keeping

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.tracks.dead_reckoning import TimeBase
 from app.tracks.left_out import times_lost
-from app.tracks.motion import BIAS, HEADING, SCALE, SPEED
+from app.tracks.time_base import TimeBase
 from app.tracks.types import (
+    BIAS,
+    HEADING,
+    SCALE,
+    SPEED,
     Bools,
     Clock,
     ClockOffset,

@@ -9,8 +9,7 @@ import numpy as np
 
 from app.tracks.consensus import consistent_chain
 from app.tracks.dead_reckoning import local_m
-from app.tracks.motion import BIAS, HEADING, SCALE, SPEED, WANDER, YAW_RATE
-from app.tracks.types import Bools, Floats
+from app.tracks.types import BIAS, HEADING, SCALE, SPEED, WANDER, YAW_RATE, Bools, Floats
 
 if TYPE_CHECKING:
     from app.tracks.estimate import DriveData

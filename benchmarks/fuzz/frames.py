@@ -8,7 +8,7 @@ from collections import deque
 from concurrent.futures import Future
 from typing import Any
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.errors import WaymarkError
 from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE

@@ -13,8 +13,9 @@ from app.planning.outputs.bill import magnet_line_length_m, plan_bill
 from app.planning.placement import place_plan
 from app.planning.plan import Plan, PlannedLineMagnet, PlannedPlate, PlannedTag
 from app.planning.plan_checks import check_plan
-from app.planning.proof import ProofTerms, Prover
+from app.planning.proof import ProofTerms
 from app.planning.proof.plates import FramesRead, read_frames
+from app.planning.proof.prove import Prover
 from app.planning.proof.terms import drive_terms
 from app.planning.rules import PlanRules
 from app.radio.link import LinkModel

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.plate_scene import FaceTruth

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from benchmarks.plates.__main__ import BATCH, COUNTS, SHORT_SHARE
 from benchmarks.plates.sets import SETS, Job, Shot, find_shot
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.formats.images import load_image
 from benchmarks.plates.peers import FAMILIES, TagFamily, detector, tag_face
 from benchmarks.plates.sets import Job, Shot, replace_face, shoot

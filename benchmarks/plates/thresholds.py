@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import cv2
 
-from app.decoders.plate import decode_plates, decode_symbols, detect_thermal, reader, unit_likelihoods
+from app.decoders.plate import decode_symbols, detect_thermal, reader, unit_likelihoods
+from app.decoders.plate.reader import decode_plates
 from benchmarks.plates.evaluate import find_right
 from benchmarks.plates.sets import Job, Shot, read_trials, shoot
 from benchmarks.plates.tables import table

@@ -29,7 +29,7 @@ import cv2
 import httpx
 import numpy as np
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.families.plate.frames import DEFAULT_GEOMETRIES
 from app.formats.images import load_image
 from app.formats.spooled_file import SpooledFile

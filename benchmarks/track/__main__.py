@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from app.tracks import ClockState, Track, TrackInput, estimate_track
+from app.tracks import ClockState, Track, TrackInput
+from app.tracks.estimate import estimate_track
 from benchmarks.track import drives
 from benchmarks.track.drives import Drive, Floats, simulate
 from benchmarks.track.end_to_end import print_end_to_end

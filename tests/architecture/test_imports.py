@@ -45,6 +45,13 @@ def test_the_core_imports_no_framework_no_database_and_nothing_heavy() -> None:
     assert run.stdout.strip() == "[]"
 
 
+def test_a_server_loads_decoders_and_simulations_only_when_it_needs_one() -> None:
+    """They compile with Numba, which takes 70 MB and a second at each start."""
+    program = "import app.main, sys; print({'numba', 'app.jobs.tasks', 'app.decoders.plate.reader'} & set(sys.modules))"
+    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "set()"
+
+
 def test_no_module_creates_an_app_or_reads_settings_at_import(tmp_path: Path) -> None:
     program = f"""
 import importlib, os, sys

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.encoders.plate import (
     ArtworkOptions,
     PlateOrder,

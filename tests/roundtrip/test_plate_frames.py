@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.encoders.plate import PlateOrder, encode_plate, write_png
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.plate_position import resolve_position

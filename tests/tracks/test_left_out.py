@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.tracks import estimate_track
+from app.tracks.estimate import estimate_track
 from app.tracks.left_out import count_passages, stretches_left_out, times_lost
 from benchmarks.track.drives import simulate
 

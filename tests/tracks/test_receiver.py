@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from app.geodesy.ellipsoid import metres_per_radian
-from app.tracks import Clock, PositionFix, Track, TrackInput, estimate_track
+from app.tracks import Clock, PositionFix, Track, TrackInput
+from app.tracks.estimate import estimate_track
 from tests.tracks.drives import T0_S, Truth, drive, recording
 
 CLOCKS = (Clock("trace"), Clock("camera"), Clock("receiver"))

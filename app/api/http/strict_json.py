@@ -20,6 +20,7 @@ from fastapi.routing import APIRoute
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from app.api.http.components import with_reference
 from app.api.http.costs import EXPENSIVE, bounded
 from app.errors import MalformedRequest, UnsupportedUpload
 from app.services.request_work import counted
@@ -48,11 +49,15 @@ _TEXT = re.compile(rb'"(?:[^"\\]|\\.)*+(?:"|\Z)', re.DOTALL)
 
 
 class StrictRoute(APIRoute):
-    """A route whose endpoint is `bounded`, and whose JSON body goes through `parse_json`: a large one in a thread."""
+    """A route whose endpoint is `bounded`, and whose JSON body goes through `parse_json`: a large one in a thread.
+
+    The schemas of its responses are made for the OpenAPI document only, not when the server starts.
+    """
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         expensive = any(f"{method} {path}" in EXPENSIVE for method in options.get("methods") or ())
-        super().__init__(path, bounded(endpoint, expensive=expensive), **options)
+        described = {status: with_reference(response) for status, response in (options.pop("responses") or {}).items()}
+        super().__init__(path, bounded(endpoint, expensive=expensive), responses=described, **options)
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """Handle the request with a strict reader of its body."""

@@ -1,5 +1,3 @@
-"""Camera frame to readings of coded plates."""
+"""Camera frame to readings of coded plates: `reader.decode_plates`."""
 
-from app.decoders.plate.reader import DECODER_VERSION, decode_plates
-
-__all__ = ["DECODER_VERSION", "decode_plates"]
+DECODER_VERSION = "plate/1"

@@ -29,7 +29,6 @@ from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading
 from app.sensors.camera import Camera
 
-DECODER_VERSION = "plate/1"
 DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
 MAX_FITS = 5
 """[candidates] that are fitted for one signal. Source: chosen by hand, for speed."""

@@ -12,7 +12,6 @@ import numpy.typing as npt
 import sqlalchemy as sa
 from typing_extensions import TypedDict
 
-from app.decoders.plate import decode_plates
 from app.errors import NotFound
 from app.families.frame_documents import PoseDocument, pose_document, rounded
 from app.families.frames import (
@@ -98,6 +97,13 @@ class PlateReadingDocument(TypedDict):
     geometry: ReadGeometryDocument | None
     grade: PlateGradeDocument | None
     pose: PoseDocument | None
+
+
+def decode_plates(pixels: Pixels, **options: Any) -> list[PlateReading]:
+    """As `app.decoders.plate.reader.decode_plates`, which is loaded with the first frame: a server decodes none."""
+    from app.decoders.plate import reader
+
+    return reader.decode_plates(pixels, **options)
 
 
 class PlateFrames(FrameReader[PlateReading, PlateSearch]):

@@ -1,6 +1,5 @@
-"""The proof of a plan: simulated drives through the real encoders, simulation and decoders."""
+"""The proof of a plan: simulated drives through the real encoders, simulation and decoders (`prove`)."""
 
-from app.planning.proof.prove import Prover, list_units, prove_plan, prove_unit
 from app.planning.proof.report import DriveResult, MarkerProof, ProofReport, ReadRate, summarize, wilson
 from app.planning.proof.results import UnitResult
 from app.planning.proof.terms import Condition, ProofTerms, ProofUnit, UnitKind
@@ -12,13 +11,9 @@ __all__ = [
     "ProofReport",
     "ProofTerms",
     "ProofUnit",
-    "Prover",
     "ReadRate",
     "UnitKind",
     "UnitResult",
-    "list_units",
-    "prove_plan",
-    "prove_unit",
     "summarize",
     "wilson",
 ]

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate import decode_plates
 from app.decoders.plate.pose import fix_vehicle
+from app.decoders.plate.reader import decode_plates
 from app.geodesy import enu_from_heading, enu_from_wgs84, wgs84_from_enu
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading

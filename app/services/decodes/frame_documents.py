@@ -7,14 +7,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from typing_extensions import TypedDict
 
 from app import __version__
 from app.decoders.plate import DECODER_VERSION
-from app.decoders.plate.video_search import FoundPlate
 from app.errors import WaymarkError
 from app.families import get_family, union_of
 from app.families.frames import FrameReading, Match
@@ -29,6 +28,9 @@ from app.services.decodes.receiver_positions import ReceiverPositions
 from app.services.decodes.wording import count_of
 from app.services.error_documents import ErrorDocument, error_document
 from app.services.health.evidence import FrameHealth
+
+if TYPE_CHECKING:  # it loads numba
+    from app.decoders.plate.video_search import FoundPlate
 
 DECODER = f"waymark {__version__} {DECODER_VERSION}"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,9 @@ from typing_extensions import TypedDict
 from app.lanes.local_plane import wgs84_from_plane
 from app.lanes.overlay import LaneOverlay, LineInFrame, PointsInFrame
 from app.lanes.types import Lane
-from app.simulation.steering import SteeringCheck
+
+if TYPE_CHECKING:  # it loads numba
+    from app.simulation.steering import SteeringCheck
 
 Floats = npt.NDArray[np.float64]
 LonLat = list[list[float]]

@@ -6,11 +6,11 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from typing import TYPE_CHECKING
 
 import numpy as np
 import sqlalchemy as sa
 
-from app.decoders.plate.video_search import FoundPlate
 from app.families.frames import FrameReading, Nearby, distance_to_row
 from app.formats.archives import Member
 from app.formats.images import ImageHeader, ImageKind
@@ -40,6 +40,9 @@ from app.services.decodes.rules import DecodeRules
 from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
 from app.services.decodes.video_task import IndexVideoTask, SegmentResult, SegmentTask
 from app.services.ports import Clock
+
+if TYPE_CHECKING:  # it loads numba
+    from app.decoders.plate.video_search import FoundPlate
 
 POSE_EVERY_S = 0.5
 """[s] between the poses along a segment by which markers are looked up. Source: chosen by hand; 15 m at 30 m/s."""

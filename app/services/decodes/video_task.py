@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from app.decoders.plate.video_search import FoundPlate
 from app.families.frames import FrameReading
 from app.formats.video.container import VideoFile
 from app.formats.video.index import VideoIndex, VideoLimits
 from app.services.decoder_processes import Task
+
+if TYPE_CHECKING:  # it loads numba
+    from app.decoders.plate.video_search import FoundPlate
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, JobQueue
 from app.services.staged_blobs import delete_unused, staged
-from app.tracks import check_times
+from app.tracks.time_base import check_times
 from app.tracks.types import TrackRules
 
 MAX_DECODES = 100

@@ -21,7 +21,7 @@ from app.decoders.cerpm.match import grade_markers, list_numbers, match_known_ma
 from app.decoders.cerpm.verify import Verdict
 from app.decoders.magnet.decoder import decode_trace
 from app.decoders.magnet.match import match_tags
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.decoders.snapshot import Snapshot, open_snapshot
 from app.demo.cerpms import build_lane
 from app.formats.spooled_file import SpooledFile

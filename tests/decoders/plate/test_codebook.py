@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
 from tests.decoders.plate.scenes import PAPER, road, shoot_plate

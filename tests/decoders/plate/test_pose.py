@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from app.decoders.plate import decode_plates
 from app.decoders.plate.pose import VehicleFix, camera_position_m, fix_vehicle, locate_plate
+from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlatePose, PlateReading
 from app.sensors.camera import Camera

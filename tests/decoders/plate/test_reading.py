@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.errors import InvalidParameter
 from app.formats.images import load_image
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode, code_cells
 from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.plate_face import Face, PlateWear

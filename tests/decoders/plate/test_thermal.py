@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from app.decoders.plate import decode_plates
 from app.decoders.plate.detect_thermal import _quad_around
+from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
 from benchmarks.plates.sets import Job, Shot, find_shot

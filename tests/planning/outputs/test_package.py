@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from app.decoders.plate import decode_plates
+from app.decoders.plate.reader import decode_plates
 from app.encoders.packer import file_entry
 from app.encoders.plate import ArtworkFormat
 from app.errors import InvalidParameter, ProofFailed

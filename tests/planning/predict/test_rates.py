@@ -20,8 +20,9 @@ from app.planning.plan_checks import check_plan
 from app.planning.plan_checks.predictions import check_predictions
 from app.planning.predict.models import fitted_models
 from app.planning.predict.rates import line_rates, path_errors_m, plate_rates, plate_read_rate, tag_rates
-from app.planning.proof import ProofTerms, Prover, UnitKind
+from app.planning.proof import ProofTerms, UnitKind
 from app.planning.proof.cerpms import drive_cerpms
+from app.planning.proof.prove import Prover
 from app.planning.read_rules import check_rules
 from app.planning.rules import CameraRules, PlanRules, PredictionRules
 from tests.planning.roads import bend, road, straight

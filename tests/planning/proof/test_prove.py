@@ -10,7 +10,8 @@ from pydantic import ValidationError
 
 from app.errors import InvalidParameter
 from app.planning.plan import Plan, PlannedCerpm
-from app.planning.proof import ProofTerms, Prover, UnitKind, list_units, prove_plan, prove_unit, summarize
+from app.planning.proof import ProofTerms, UnitKind, summarize
+from app.planning.proof.prove import Prover, list_units, prove_plan, prove_unit
 from tests.planning.proof.conftest import plan_on
 from tests.planning.roads import bend, straight
 
