@@ -13,11 +13,13 @@ from starlette.datastructures import FormData, Headers, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 
+from app.api.http.turns import Turns
 from app.formats.spooled_file import SpooledFile
 from app.storage.spool import Spool, SpoolWriter
 
 _THREADS = anyio.CapacityLimiter(8)
 """Threads that write bodies: a slow disk must not take the threads of other requests. Source: chosen by hand."""
+_TURNS = Turns()
 
 
 def spool_of(request: Request) -> Spool:
@@ -27,9 +29,10 @@ def spool_of(request: Request) -> Spool:
 
 
 async def append(writer: SpoolWriter, chunk: bytes) -> None:
-    """Add bytes to a file."""
+    """Add bytes to a file, and wait for the turn of the next ones."""
     if writer.add(chunk):
         await to_thread.run_sync(writer.flush, limiter=_THREADS)
+    await _TURNS.wait()
 
 
 async def finish(writer: SpoolWriter) -> SpooledFile:
