@@ -25,7 +25,7 @@ from app.services.decodes.packet_task import DriveFiles, DriveTask, LaneResult, 
 from app.services.decodes.rules import DecodeRules
 from app.services.decodes.trace_handler import check_not_empty
 from app.services.decodes.upload_path import Decoded, OutdatedMatch, Upload, UploadHandler
-from app.services.health.packets import missed_cerpms, packet_evidence, with_evidence
+from app.services.health.packets import lane_directions, missed_cerpms, packet_evidence, with_evidence
 
 Pose = tuple[float, float, float]
 """Longitude, latitude and heading of a vehicle. [deg]"""
@@ -106,13 +106,13 @@ class PacketHandler(UploadHandler[DriveSignal]):
             return []
         kinds = {finding.number: finding.kind for finding in read.merged.findings}
         observed = {row.marker_id for row in rows}
+        received = {number: row for number, row in read.known.rows.items() if row.id in observed}
         evidence = {
-            row.id: packet_evidence(read, row, kinds.get(number), signal.files)
-            for number, row in read.known.rows.items()
-            if row.id in observed
+            row.id: packet_evidence(read, row, kinds.get(number), signal.files) for number, row in received.items()
         }
+        directions = lane_directions(list(received.values()), signal.files.track)
         missed = missed_cerpms(connection, upload.agency_id, read, signal.files, at)
-        return [*with_evidence(rows, evidence), *missed]
+        return [*with_evidence(rows, evidence, directions), *missed]
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -123,6 +124,14 @@ def _observations(trace: ReadTrace, observed_at: datetime) -> list[NewObservatio
             "lateral_cm": round(float(reading.lateral_cm), 2),
             EVIDENCE: evidence[marker_id],
         }
-        what = "wrong-way" if reading.wrong_way else "seen"
+        what = _what(reading.wrong_way, evidence[marker_id])
         rows.setdefault(marker_id, NewObservation(marker_id, 0, observed_at, what, detail))
     return list(rows.values())
+
+
+def _what(wrong_way: bool, evidence: dict[str, Any]) -> str:
+    if evidence.get("two_places"):
+        return "cloned"
+    if "elsewhere_deg" in evidence:
+        return "out-of-place"
+    return "wrong-way" if wrong_way else "seen"

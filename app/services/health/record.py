@@ -186,7 +186,7 @@ def _wrong_way_marker(
     """
     if not judged.wrong_way:
         return None
-    first = next(one.marker_id for one, _row in passes if one.reversed)
+    first = min((one for one, _row in passes if one.reversed), key=lambda one: one.along).marker_id
     if judged.only_one and _others_reversed(rows[first]):
         return None
     return first

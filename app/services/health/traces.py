@@ -15,7 +15,8 @@ from app.decoders.magnet.localize import TagFix
 from app.decoders.magnet.match import ReadTag, ReadTrace
 from app.decoders.magnet.readings import TagReading
 from app.decoders.magnet.registered_tag import RegisteredTag
-from app.geodesy import enu_from_wgs84
+from app.geodesy import enu_from_wgs84, wgs84_from_enu
+from app.health.passes import LonLat
 from app.planning.predict.models import fitted_models
 from app.registry.decodes import NewObservation
 from app.sensors.magnetometer_bar import MagnetometerBar
@@ -33,21 +34,34 @@ WANDER_M, WANDER_PER_M = 0.1, 0.002
 """[m, 1] standard deviation of the path between two tags from the curve through both. Source: by hand."""
 MAX_BEND = 0.02
 """Share by which the way driven may exceed the straight line between two tags. Source: by hand, 0.7 rad of a bend."""
-SIGNAL_SIGMA = 0.15
-"""Standard deviation of the logarithm of a tag's mean moment between passes. Source: chosen by hand."""
+SIGNAL_SIGMA = 0.06
+"""Standard deviation of the logarithm of a tag's mean moment between passes. Source: by hand, twice the 0.03 of
+simulated passes at a clearance of 28 cm (0.02 at 16 cm); the decoder reads tags down to about 0.65 of their moment."""
+FAR_M = 50.0
+"""[m] from its place, from where a tag is elsewhere. Source: `app.health.marker_tests.SAME_PLACE_M`; a bend that
+`MAX_BEND` allows between tags `MAX_GAP_M` apart is 41 m beside the straight line."""
 _ON_ROAD = frozenset({"built", "surveyed", "active", "suspect"})
 
 
 def tag_evidence(trace: ReadTrace) -> dict[str, dict[str, Any]]:
-    """Evidence of the registered tags that a trace read, by marker; of one that was passed twice, of the first."""
+    """Evidence of the registered tags that a trace read, by marker; of one that was passed twice, of the first.
+
+    A tag that was read far from its place is evidence of where it was read; one that was read at its place too is in
+    two places.
+    """
+    at_place, far = _by_place(trace)
     read: dict[str, ReadTag] = {}
-    for tag in trace.tags:
-        if tag.match is not None and tag.match.tag is not None:
-            read.setdefault(tag.match.tag.marker_id, tag)
+    for tag in at_place:
+        read.setdefault(_marker_id(tag), tag)
     along = _along_offsets(list(read.values()))
-    return {
-        marker_id: rounded(_evidence(tag, offset)) for (marker_id, tag), offset in zip(read.items(), along, strict=True)
+    found = {
+        marker_id: rounded(_evidence(tag, offset) | ({"two_places": True} if marker_id in far else {}))
+        for (marker_id, tag), offset in zip(read.items(), along, strict=True)
     }
+    for marker_id, (tag, place) in far.items():
+        about = _about(_registered(tag)) | {"along": tag.reading.start_s, "elsewhere_deg": place}
+        found.setdefault(marker_id, rounded(about))
+    return found
 
 
 def missed_tags(
@@ -56,11 +70,11 @@ def missed_tags(
     """Tags that lie on the path between two tags that were read, within the width of the bar."""
     if not complete:
         return []
-    read = {tag.match.tag.marker_id for tag in trace.tags if tag.match is not None and tag.match.tag is not None}
+    read = {_marker_id(tag) for tag in trace.tags if tag.match is not None and tag.match.tag is not None}
     others = {tag.match.others for tag in trace.tags if tag.match is not None}
     doubtful = {marker_id for several in others for marker_id in several}
     rows: dict[str, NewObservation] = {}
-    fixed = [tag for tag in trace.tags if tag.fix is not None]
+    fixed = [tag for tag in _by_place(trace)[0] if tag.fix is not None]
     for first, second in pairwise(fixed):
         assert first.fix is not None
         assert second.fix is not None
@@ -78,15 +92,73 @@ def missed_tags(
     return list(rows.values())
 
 
+def _registered(tag: ReadTag) -> RegisteredTag:
+    """The registered tag of a reading that has one."""
+    assert tag.match is not None
+    assert tag.match.tag is not None
+    return tag.match.tag
+
+
+def _marker_id(tag: ReadTag) -> str:
+    return _registered(tag).marker_id
+
+
+def _by_place(trace: ReadTrace) -> tuple[list[ReadTag], dict[str, tuple[ReadTag, LonLat]]]:
+    """Readings of registered tags at their place; and by marker the first one far from it, with where it was."""
+    matched = [tag for tag in trace.tags if tag.match is not None and tag.match.tag is not None]
+    at_place: list[ReadTag] = []
+    far: dict[str, tuple[ReadTag, LonLat]] = {}
+    for number, tag in enumerate(matched):
+        place = _elsewhere_deg(matched, number)
+        if place is None:
+            at_place.append(tag)
+        else:
+            far.setdefault(_marker_id(tag), (tag, place))
+    return at_place, far
+
+
+def _elsewhere_deg(tags: Sequence[ReadTag], number: int) -> LonLat | None:
+    """Where a tag was read, if that is far from its place: longitude and latitude. [deg]
+
+    The tags that were read before and after it give the place, if their own distance is that of the odometer, and the
+    way from one to the other is the direction of one of them.
+    """
+    tag = tags[number]
+    if not 0 < number < len(tags) - 1:
+        return None
+    before, after = tags[number - 1], tags[number + 1]
+    first, second = _registered(before), _registered(after)
+    if tag.reading.tag is None or _marker_id(tag) in (first.marker_id, second.marker_id):
+        return None
+    origin = (first.lon_deg, first.lat_deg, 0.0)
+    chord = np.asarray(enu_from_wgs84(second.lon_deg, second.lat_deg, 0.0, origin))
+    driven_m = _odometer(after) - _odometer(before)
+    if not 0.0 < driven_m <= MAX_GAP_M or not _is_way_between(driven_m, float(np.linalg.norm(chord[:2]))):
+        return None
+    if not any(fix and chord[:2] @ _direction(fix.heading_deg) > 0.0 for fix in (before.fix, after.fix)):
+        return None
+    share = (_odometer(tag) - _odometer(before)) / driven_m
+    place_m = share * chord[:2]
+    registered = _registered(tag)
+    own_m = np.asarray(enu_from_wgs84(registered.lon_deg, registered.lat_deg, 0.0, origin))[:2]
+    if float(np.linalg.norm(place_m - own_m)) < FAR_M:
+        return None
+    lon_deg, lat_deg, _up = wgs84_from_enu(np.array([*place_m, 0.0]), origin)
+    return float(lon_deg), float(lat_deg)
+
+
+def _is_way_between(driven_m: float, chord_m: float) -> bool:
+    """Whether a way driven fits the straight line between two tags."""
+    return chord_m >= 1.0 and abs(driven_m - chord_m) <= MAX_BEND * chord_m + 10.0
+
+
 def _about(tag: RegisteredTag) -> dict[str, Any]:
     survey_m = SURVEY_SIGMA_M if tag.horizontal_rmse_m is None else tag.horizontal_rmse_m / math.sqrt(2)
     return {"family": "magnet", "place_deg": (tag.lon_deg, tag.lat_deg), "survey_m": survey_m}
 
 
 def _evidence(tag: ReadTag, along: tuple[float, float] | None) -> dict[str, Any]:
-    assert tag.match is not None
-    assert tag.match.tag is not None
-    reading, registered = tag.reading, tag.match.tag
+    reading, registered = tag.reading, _registered(tag)
     evidence = {
         **_about(registered),
         "along": reading.start_s,
@@ -141,9 +213,7 @@ def _along_offsets(tags: Sequence[ReadTag]) -> list[tuple[float, float] | None]:
 
 def _middle(tag: ReadTag) -> tuple[float, float]:
     """The middle of a registered tag, east and north of where its lane begins. [m]"""
-    assert tag.match is not None
-    assert tag.match.tag is not None
-    registered = tag.match.tag
+    registered = _registered(tag)
     east, north, _up = enu_from_wgs84(
         registered.lon_deg, registered.lat_deg, 0.0, (registered.lane_lon_deg, registered.lane_lat_deg, 0.0)
     )
@@ -165,7 +235,7 @@ def _passed_probability(first: TagFix, second: TagFix, gap_m: float, tag: Regist
     end = np.asarray(enu_from_wgs84(second.lon_deg, second.lat_deg, 0.0, origin))[:2]
     there = np.asarray(enu_from_wgs84(tag.lon_deg, tag.lat_deg, 0.0, origin))[:2]
     chord_m = float(np.linalg.norm(end))
-    if chord_m < 1.0 or not abs(gap_m - chord_m) <= MAX_BEND * chord_m + 10.0:
+    if not _is_way_between(gap_m, chord_m):
         return 0.0
     share = np.linspace(0.0, 1.0, 201)[:, None]
     starts, ends = (chord_m * _direction(fix.heading_deg) for fix in (first, second))

@@ -26,6 +26,8 @@ from app.simulation.magnetic.road import PlacedTag, Road
 from app.simulation.magnetic.vehicle import Course, Vehicle
 from app.simulation.radio.attacks import move_claim
 from app.simulation.radio.drive import drive_past
+from app.simulation.radio.driving import Driver, drive_lane
+from app.simulation.radio.lanes import lane_between
 from app.simulation.radio.link import Radio
 from app.simulation.radio.markers import InstalledMarkers
 from tests.api.decodes.conftest import post_frame
@@ -33,10 +35,12 @@ from tests.conftest import LiveServer
 
 CODES = (
     "SNS_4_0.1_10-30", "NNS_4_0.1_15-25", "SSN_4_0.1_30-10", "NSN_4_0.1_12-28", "SNN_4_0.1_25-15", "SNS_4_0.1_16-24",
+    "NNS_4_0.1_22-18", "SSN_4_0.1_13-27",
 )  # fmt: skip
-AT_M = (30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
-MISSING, MOVED, REVERSED = 1, 2, 4
-LENGTH_M, MOVED_M = 205.0, 2.0
+AT_M = tuple(25.0 * number for number in range(1, 9))
+CLONED, MISSING, MOVED, REVERSED, FADING, FAR = 0, 1, 2, 4, 5, 6
+LENGTH_M, MOVED_M, CLONE_AT_M, FAR_AT_M, FADED_SHARE = 215.0, 2.0, 137.0, 87.0, 0.75
+SPEED_M_S = 20.0
 Origin = tuple[float, float, float]
 ORIGIN, ELSEWHERE = (31.0, 47.0, 100.0), (33.0, 47.0, 100.0)
 BEGAN = datetime(2026, 6, 1, 8, tzinfo=UTC)
@@ -101,17 +105,26 @@ def _register_tags(client: httpx.Client, road: Road, origin: Origin = ORIGIN) ->
 
 
 def _trace(road: Road, seed: int, *, wrong_way: bool = False, faults: bool = True) -> bytes:
-    """What a bar records: one tag is gone, one lies 2 m further on, one was installed in reverse."""
-    placed = []
-    for number, (code, at_m) in enumerate(zip(CODES, AT_M, strict=True)):
-        if faults and number == MISSING:
-            continue
-        tag = _tag(code).reversed_wrong_way() if faults and number == REVERSED else _tag(code)
-        placed.append(PlacedTag(tag, at_m + (MOVED_M if faults and number == MOVED else 0.0), 0.0))
+    """What a bar records of tags of which one is gone, one lies 2 m further on, one 88 m from its place, one was
+    installed in reverse, one has a copy 112 m away, and the magnets of one are weak.
+    """
+    at_m, tags = list(AT_M), [_tag(code) for code in CODES]
+    if faults:
+        at_m[MOVED], at_m[FAR] = AT_M[MOVED] + MOVED_M, FAR_AT_M
+        tags[REVERSED] = tags[REVERSED].reversed_wrong_way()
+    placed = [PlacedTag(tag, at, 0.0) for tag, at in zip(tags, at_m, strict=True)]
+    if faults:
+        placed[MISSING] = PlacedTag(tags[CLONED], CLONE_AT_M, 0.0)
     if wrong_way:
         placed = [replace(one, chainage_m=LENGTH_M - one.chainage_m - one.tag.length_m) for one in reversed(placed)]
-    scene = Scene(road, Vehicle.compact(), Course(speed_m_s=13.0), tags=placed, wrong_way=wrong_way)
-    return _zipped(write_recorder_files(simulate_drive(scene, np.random.default_rng(seed)).trace))
+    scene = Scene(road, Vehicle.compact(), Course(speed_m_s=SPEED_M_S), tags=placed, wrong_way=wrong_way)
+    drive = simulate_drive(scene, np.random.default_rng(seed))
+    if faults:  # the same drive over weak magnets, while it passes one of the tags
+        weak = simulate_drive(replace(scene, moment_am2=FADED_SHARE * scene.moment_am2), np.random.default_rng(seed))
+        passed_s = [magnet.t_s for magnet in drive.magnets if magnet.tag == FADING]
+        near = (drive.trace.t_s > min(passed_s) - 0.3) & (drive.trace.t_s < max(passed_s) + 0.3)
+        drive.trace.field_ut[near] = weak.trace.field_ut[near]
+    return _zipped(write_recorder_files(drive.trace))
 
 
 def _context(road: Road, hour: int, origin: Origin = ORIGIN) -> dict[str, Any]:
@@ -126,11 +139,13 @@ def test_tags_with_faults_are_found_by_the_traces_of_several_vehicles(server: Li
     with server.agency(name, Scope.ADMIN) as owner:
         ids = _register_tags(owner, road)
         first = _post(owner, traces[0], _context(road, 0))
-        assert len(first["tags"]) == len(CODES) - 1
+        assert len(first["tags"]) == len(CODES)
         for hour in range(1, 4):
             _post(owner, traces[hour % 2], _context(road, hour))
         assert _found(owner) == set()  # however often one vehicle passes
-        wanted = {("missing", ids[MISSING]), ("moved", ids[MOVED]), ("wrong-way", ids[REVERSED])}
+        faults = {"cloned": CLONED, "missing": MISSING, "wrong-way": REVERSED, "fading": FADING}
+        wanted = {(what, ids[number]) for what, number in faults.items()}
+        wanted |= {("moved", ids[MOVED]), ("moved", ids[FAR])}
         passed = 0
         while _found(owner) != wanted:
             passed += 1
@@ -140,9 +155,16 @@ def test_tags_with_faults_are_found_by_the_traces_of_several_vehicles(server: Li
             assert _found(owner) <= wanted
             if passed == 5:
                 assert _found(owner) >= wanted - {("missing", ids[MISSING])}
-        moved = next(item for item in owner.get("/v1/maintenance").json()["items"] if item["what"] == "moved")
-        assert moved["evidence"]["offset_m"] == pytest.approx(MOVED_M, abs=0.3)
+        items = {item["marker_id"]: item for item in owner.get("/v1/maintenance").json()["items"]}
+        assert items[ids[MOVED]]["evidence"]["offset_m"] == pytest.approx(MOVED_M, abs=0.3)
+        seen = items[ids[FAR]]["evidence"]
+        there = _lon_lat(road, FAR_AT_M)
+        assert (seen["elsewhere_lon_deg"], seen["elsewhere_lat_deg"]) == pytest.approx(there, abs=5e-5)
         assert {owner.get(f"/v1/markers/{marker_id}").json()["status"] for marker_id in ids} == {"active"}
+        decided = owner.post(f"/v1/maintenance/{items[ids[FAR]]['id']}/approve", json={"outcome": "suspect"})
+        assert decided.status_code == 200, decided.text
+        assert owner.get(f"/v1/markers/{ids[FAR]}").json()["status"] == "suspect"
+        assert owner.get(f"/v1/markers/{ids[FAR]}/health").json()["ratios"] == {}
 
 
 def test_a_driver_on_the_wrong_way_is_an_item_and_accuses_no_tag(server: LiveServer, road: Road) -> None:
@@ -157,29 +179,49 @@ def test_a_driver_on_the_wrong_way_is_an_item_and_accuses_no_tag(server: LiveSer
 # --- CERPMs -----------------------------------------------------------------------------------------------------------
 
 
-def _log(built: BuiltLane, installed: InstalledMarkers, hour: int) -> bytes:
-    """What a vehicle hears: every hour markers go on counting their messages."""
+def _log(built: BuiltLane, installed: InstalledMarkers, hour: int, *, wrong_way: bool = False) -> bytes:
+    """What a vehicle hears: every hour markers go on counting their messages. Of two with one number one is ahead."""
+    rng, lane, start_s = np.random.default_rng(hour % 2), built.lane, BEGAN.timestamp() + 3600.0 * hour
+    first_sequence = np.full(len(installed), 3600 * hour)
+    first_sequence[-1] += 5
+    against = lane_between(lane.right_m[::-1], lane.left_m[::-1], lane.origin)
     heard = drive_past(
-        built.lane, installed, np.random.default_rng(hour % 2), radio=Radio(interval_s=1.0),
+        lane, installed, rng, radio=Radio(interval_s=1.0), start_s=start_s, first_sequence=first_sequence,
         sign=lambda message: encode_message(message, built.keys[message.number]),
-        start_s=BEGAN.timestamp() + 3600.0 * hour, first_sequence=np.full(len(installed), 3600 * hour),
+        drive=drive_lane(against, Driver(), rng, start_s=start_s) if wrong_way else None,
     )  # fmt: skip
     return _zipped({
         "packets.jsonl": write_packets(heard.packets).encode(), "poses.csv": write_poses(heard.track).encode(),
     })  # fmt: skip
 
 
-def test_a_cerpm_that_claims_another_place_is_found_by_the_logs_of_several_vehicles(server: LiveServer) -> None:
+def test_cerpms_with_faults_are_found_by_the_logs_of_several_vehicles(server: LiveServer) -> None:
+    """One sends another place, one is gone, one was registered 5 km away, and the number of one is sent by two."""
     name = "health by packets"
     with server.agency(name, Scope.ADMIN) as owner:
         built = build_lane(owner, np.random.default_rng(1901))
+        count, numbers = len(built.installed), built.installed.number
         ids = {int(marker["code"]["number"]): marker["id"] for marker in built.markers}
-        row = len(built.installed) // 2
-        moved = move_claim(built.lane, built.installed, row, np.random.default_rng(1))
+        moved, missing, far, cloned, copy = (count * k // 6 for k in range(1, 6))
+        place = {"lon_deg": 8.4, "lat_deg": 49.1, "horizontal_rmse_m": 0.03, "realization": "ITRF2014", "epoch": 2026.4}
+        path, unchanged = f"/v1/markers/{ids[int(numbers[far])]}", {"If-Match": '"1"'}
+        answer = owner.patch(path, json={"position": place}, headers=unchanged)
+        assert answer.status_code == 200, answer.text
+        installed = move_claim(built.lane, built.installed, moved, np.random.default_rng(1))
+        installed = installed.chosen(np.array([row for row in [*range(count), copy] if row != missing]))
+        installed.number[-1] = numbers[cloned]
+        found = {(what, ids[int(numbers[row])]) for what, row in (("moved", moved), ("moved", far), ("cloned", cloned))}
+        wanted = {*found, ("missing", ids[int(numbers[missing])])}
         for hour in range(4):
-            _post(owner, _log(built, moved, hour), {"packets": {}})
+            _post(owner, _log(built, installed, hour), {"packets": {}})
         assert _found(owner) == set()  # however often one vehicle passes
-        for hour in range(4, 10):
+        hour = 4
+        while _found(owner) != wanted:
+            assert hour < MANY, _found(owner)
             with server.agency(name, Scope.VEHICLE) as vehicle:
-                _post(vehicle, _log(built, moved, hour), {"packets": {}})
-        assert _found(owner) == {("moved", ids[int(built.installed.number[row])])}
+                _post(vehicle, _log(built, installed, hour), {"packets": {}})
+            assert _found(owner) <= wanted
+            hour += 1
+        _post(owner, _log(built, built.installed, hour, wrong_way=True), {"packets": {}})
+        drivers = owner.get("/v1/maintenance", params={"what": "wrong-way-driver"}).json()["items"]
+        assert [driver["family"] for driver in drivers] == ["cerpm"]
