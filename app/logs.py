@@ -11,6 +11,9 @@ from typing import Any, Literal
 import orjson
 import structlog
 
+_CHATTY = ("alembic.runtime.plugins", "app.registry.engines")
+"""Loggers of libraries that report each connection that is closed and each part of theirs that is loaded."""
+
 
 def configure_logs(log_format: Literal["console", "json"], level: str) -> None:
     """Write one line an event: readable on a console, JSON for a collector."""
@@ -38,6 +41,8 @@ def configure_logs(log_format: Literal["console", "json"], level: str) -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level)
+    for chatty in _CHATTY:
+        logging.getLogger(chatty).setLevel(logging.WARNING)
 
 
 def _json(event: Any, default: Any) -> str:

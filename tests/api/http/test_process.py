@@ -77,6 +77,7 @@ def test_a_fresh_server_prints_its_key_once_and_keeps_what_it_is_told(tmp_path: 
     key = re.fullmatch(r"Admin key \(shown once, keep it\): (wm_\w{8}_\w{43}_\w{6})\n", first.output)
     assert key, first.output
     assert key[1] not in first.logs
+    assert "Pool" not in first.logs, "nobody wants to read of each connection"
     headers = {"X-API-Key": key[1]}
     with _serving(tmp_path / "new" / "var", WAYMARK_LOG_FORMAT="json") as second:
         body = {"position": {"lon_deg": 1.5, "lat_deg": 2.5}}
