@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from pyproj import Geod
 
-from app.formats.alignments.geometry import EventKind, LineStyle, StationEquation
+from app.formats.alignments.geometry import BoundaryStyle, EventKind, StationEquation
 from app.geodesy import LocalizationGrade, grade_accuracy
 
 Floats = npt.NDArray[np.float64]
@@ -46,7 +46,7 @@ class Lane:
     design_speed_mps : ndarray, shape (N,)
     station_m : ndarray, shape (N,)
         True distance along the road's reference line; decreases in lanes of the opposite direction. [m]
-    left_style, right_style : LineStyle
+    left_style, right_style : BoundaryStyle
         Paint of the boundaries.
     """
 
@@ -63,8 +63,8 @@ class Lane:
     width_m: Floats
     design_speed_mps: Floats
     station_m: Floats
-    left_style: LineStyle = LineStyle.UNKNOWN
-    right_style: LineStyle = LineStyle.UNKNOWN
+    left_style: BoundaryStyle = BoundaryStyle.UNKNOWN
+    right_style: BoundaryStyle = BoundaryStyle.UNKNOWN
 
     @property
     def length_m(self) -> float:

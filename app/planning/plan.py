@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 
-from app.formats.alignments.geometry import LineStyle
+from app.formats.alignments.geometry import BoundaryStyle
 from app.markers.cerpm import LaneSide, SpeedLimit
 from app.markers.checks import ComparedFigure, Verdict
 from app.markers.magnet import InformationTag, LineTag
@@ -53,7 +53,7 @@ class PlannedLineMagnet:
 
     tag: LineTag
     side: LaneSide
-    style: LineStyle
+    style: BoundaryStyle
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pyproj import Geod
 
-from app.formats.alignments.geometry import LineStyle
+from app.formats.alignments.geometry import BoundaryStyle
 from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent
 
 GEOD = Geod(ellps="WGS84")
@@ -21,7 +21,7 @@ def lane_of_curvature(
     speed_kmh: float = 90.0,
     width_m: float = 3.5,
     grade: float = 0.0,
-    styles: tuple[LineStyle, LineStyle] = (LineStyle.DASHED, LineStyle.SOLID),
+    styles: tuple[BoundaryStyle, BoundaryStyle] = (BoundaryStyle.DASHED, BoundaryStyle.SOLID),
 ) -> Lane:
     """A lane of 1 m steps with a curvature at each sample, left positive."""
     count = len(curvature_per_m)

@@ -28,10 +28,10 @@ from app.formats.alignments.features import (
 from app.formats.alignments.geometry import (
     AlignmentFile,
     AreaGeometry,
+    BoundaryStyle,
     EventGeometry,
     EventKind,
     LaneGeometry,
-    LineStyle,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -243,10 +243,10 @@ class _Joined:
             return None
         return np.full(count, self.speed[0])
 
-    def style(self, *names: str) -> LineStyle:
+    def style(self, *names: str) -> BoundaryStyle:
         """The one style of all features."""
         found = {feature.style(*names) for feature in self.features}
-        return found.pop() if len(found) == 1 else LineStyle.UNKNOWN
+        return found.pop() if len(found) == 1 else BoundaryStyle.UNKNOWN
 
 
 def _join(name: str, features: Sequence[RoadFeature], frame: Frame, notes: list[str]) -> _Joined:

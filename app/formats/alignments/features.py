@@ -15,7 +15,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.alignments.geometry import MAX_COORDINATE, MAX_VERTICES, EventKind, LineStyle
+from app.formats.alignments.geometry import MAX_COORDINATE, MAX_VERTICES, BoundaryStyle, EventKind
 
 Floats = npt.NDArray[np.float64]
 
@@ -131,7 +131,7 @@ class RoadFeature:
             return speed_kmh / 3.6
         return math.nan
 
-    def style(self, *names: str) -> LineStyle:
+    def style(self, *names: str) -> BoundaryStyle:
         """Style of the first of several properties that is there.
 
         Raises
@@ -141,16 +141,16 @@ class RoadFeature:
         """
         name, text = next(((name, found) for name in names if (found := self.text(name)) is not None), ("", "unknown"))
         style = _STYLE_SYNONYMS.get(text.lower(), text.lower())
-        if style in set(LineStyle):
-            return LineStyle(style)
+        if style in set(BoundaryStyle):
+            return BoundaryStyle(style)
         if name in ("left_style", "right_style"):
             raise InvalidParameter(
                 f"{self.where}: {name} is {text[:40]!r}",
                 field=f"properties.{name}",
-                limit=", ".join(LineStyle),
+                limit=", ".join(BoundaryStyle),
                 cure="name one of these, or leave the property out",
             )
-        return LineStyle.UNKNOWN
+        return BoundaryStyle.UNKNOWN
 
 
 def normalize_kind(text: str) -> str:

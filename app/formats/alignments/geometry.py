@@ -23,7 +23,7 @@ MAX_COORDINATE = 1e12
 """Largest coordinate or height. Source: app/formats/surveys/json_reader.py, far beyond every projection."""
 
 
-class LineStyle(StrEnum):
+class BoundaryStyle(StrEnum):
     """How a boundary of a lane is painted."""
 
     SOLID = "solid"
@@ -67,7 +67,7 @@ class LaneGeometry:
         NaN where none is given. [m/s]
     station_m : ndarray, shape (N,), or None
         Along the road's reference line, in its direction; decreases along a lane of the opposite direction. [m]
-    left_style, right_style : LineStyle
+    left_style, right_style : BoundaryStyle
     road : str or None
         Name of the road in the file.
     """
@@ -81,8 +81,8 @@ class LaneGeometry:
     width_m: Floats | None = None
     speed_limit_mps: Floats | None = None
     station_m: Floats | None = None
-    left_style: LineStyle = LineStyle.UNKNOWN
-    right_style: LineStyle = LineStyle.UNKNOWN
+    left_style: BoundaryStyle = BoundaryStyle.UNKNOWN
+    right_style: BoundaryStyle = BoundaryStyle.UNKNOWN
     road: str | None = None
 
 

@@ -15,11 +15,11 @@ from app.formats.alignments.geometry import (
     MAX_VERTICES,
     AlignmentFile,
     AreaGeometry,
+    BoundaryStyle,
     EventGeometry,
     EventKind,
     Floats,
     LaneGeometry,
-    LineStyle,
 )
 from app.formats.alignments.osm import OsmMap, Relation, Way, read_osm
 from app.markers.magnet_codebook import Arrow
@@ -30,7 +30,7 @@ _STOPPING = frozenset({"traffic_light", "all_way_stop", "right_of_way"})
 """Regulatory elements whose ref_line is a stop line. Source: lanelet2, RegulatoryElementTagging."""
 _UNPAINTED = frozenset({"virtual", "curbstone", "road_border", "guard_rail", "wall", "fence", "rail"})
 """Boundaries without paint. Source: lanelet2, LinestringTagging."""
-_STYLES = {"solid": LineStyle.SOLID, "dashed": LineStyle.DASHED}
+_STYLES = {"solid": BoundaryStyle.SOLID, "dashed": BoundaryStyle.DASHED}
 _SPEED = re.compile(r"(?P<value>\d+(\.\d+)?)\s*(?P<unit>km/h|kmh|kph|mph|m/s|mps)?", re.IGNORECASE)
 _SPEED_SIGN = re.compile(r"de274[-_.](?P<value>\d+)", re.IGNORECASE)
 _UNITS_MPS = {"m/s": 1.0, "mps": 1.0, "mph": 0.44704}
@@ -259,16 +259,16 @@ def _between(values: Floats, shares: Floats, ends: tuple[float, float]) -> Float
     return np.concatenate([cuts[:1], values[inside], cuts[1:]])
 
 
-def _style(osm: OsmMap, sides: list[tuple[Way, bool, bool]]) -> LineStyle:
+def _style(osm: OsmMap, sides: list[tuple[Way, bool, bool]]) -> BoundaryStyle:
     """Paint along the greater part of a boundary. Of a double line the one nearer to the lane counts."""
-    lengths: dict[LineStyle, float] = {}
+    lengths: dict[BoundaryStyle, float] = {}
     for way, turned, is_left in sides:
         words = way.tags.get("subtype", "").split("_")
         # Double lines are named from left to right in the direction of the way.
         word = words[-1] if is_left != turned else words[0]
-        style = LineStyle.NONE if way.tags.get("type") in _UNPAINTED else LineStyle.UNKNOWN
+        style = BoundaryStyle.NONE if way.tags.get("type") in _UNPAINTED else BoundaryStyle.UNKNOWN
         if way.tags.get("type") in ("line_thin", "line_thick"):
-            style = _STYLES.get(word, LineStyle.UNKNOWN)
+            style = _STYLES.get(word, BoundaryStyle.UNKNOWN)
         lengths[style] = lengths.get(style, 0.0) + osm.length_m(way)
     return max(lengths, key=lambda style: lengths[style])
 

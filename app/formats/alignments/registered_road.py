@@ -17,10 +17,10 @@ from app.formats.alignments.features import SPEEDS_KMH
 from app.formats.alignments.geometry import (
     MAX_VERTICES,
     AlignmentFile,
+    BoundaryStyle,
     EarlierTransformation,
     Floats,
     LaneGeometry,
-    LineStyle,
     StationEquation,
 )
 from app.roads.axis import Axis
@@ -52,9 +52,9 @@ class RoadLanes(_Part):
     width_m: Annotated[float, Field(ge=1.5, le=12.0, description="Of each lane. [m]")] = 3.5
     speed_limit_kmh: Annotated[float, Field(ge=SPEEDS_KMH[0], le=SPEEDS_KMH[1])]
     driving_side: Literal["right", "left"] = "right"
-    centre_style: Annotated[LineStyle, Field(description="Paint between the directions.")] = LineStyle.UNKNOWN
-    lane_style: Annotated[LineStyle, Field(description="Paint between lanes of one direction.")] = LineStyle.UNKNOWN
-    edge_style: Annotated[LineStyle, Field(description="Paint at the edges.")] = LineStyle.UNKNOWN
+    centre_style: Annotated[BoundaryStyle, Field(description="Paint between the directions.")] = BoundaryStyle.UNKNOWN
+    lane_style: Annotated[BoundaryStyle, Field(description="Paint between lanes one way.")] = BoundaryStyle.UNKNOWN
+    edge_style: Annotated[BoundaryStyle, Field(description="Paint at the edges.")] = BoundaryStyle.UNKNOWN
 
 
 class RoadStation(_Part):

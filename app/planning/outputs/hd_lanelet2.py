@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from app.formats.alignments.geometry import EventKind, LineStyle
+from app.formats.alignments.geometry import BoundaryStyle, EventKind
 from app.geodesy.ellipsoid import metres_per_radian
 from app.planning.alignment import Floats, Lane
 from app.planning.outputs.hd_map import (
@@ -32,10 +32,10 @@ SAME_POINT_M = 0.02
 line's width."""
 _LONGEST_M, _SHORTEST_M = 50.0, 1.0  # [m] of a lanelet; source: TIER IV's convention
 _LINE_TAGS = {
-    LineStyle.SOLID: {"type": "line_thin", "subtype": "solid"},
-    LineStyle.DASHED: {"type": "line_thin", "subtype": "dashed"},
-    LineStyle.NONE: {"type": "virtual"},
-    LineStyle.UNKNOWN: {"type": "virtual"},
+    BoundaryStyle.SOLID: {"type": "line_thin", "subtype": "solid"},
+    BoundaryStyle.DASHED: {"type": "line_thin", "subtype": "dashed"},
+    BoundaryStyle.NONE: {"type": "virtual"},
+    BoundaryStyle.UNKNOWN: {"type": "virtual"},
 }  # source: lanelet2, LinestringTagging.md; a virtual line allows no change of lanes
 
 
@@ -146,7 +146,7 @@ class _Way:
     id: int
     nodes: list[int]
     middle: Floats
-    style: LineStyle
+    style: BoundaryStyle
 
 
 def _cut(lane: Lane) -> _Cut:
@@ -252,7 +252,7 @@ def _bound(
     k: int,
     ends: Sequence[int],
     ways: dict[tuple[int, int], list[_Way]],
-    style: LineStyle,
+    style: BoundaryStyle,
 ) -> int:
     """Id of a lanelet's boundary: that of the neighbour if it is the same line, or a new way."""
     start, end = int(piece.cuts[k]), int(piece.cuts[k + 1])
@@ -263,7 +263,7 @@ def _bound(
     known = ways.setdefault((min(ends[k], ends[k + 1]), max(ends[k], ends[k + 1])), [])
     for way in known:
         if np.linalg.norm(way.middle - middle) <= SAME_POINT_M:
-            if way.style is LineStyle.UNKNOWN:
+            if way.style is BoundaryStyle.UNKNOWN:
                 way.style = style
             return way.id
     first, last = np.searchsorted(piece.breaks, [start + 1, end])

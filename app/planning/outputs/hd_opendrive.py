@@ -11,7 +11,7 @@ import scipy
 from pyproj import Proj
 
 from app.errors import InvalidParameter
-from app.formats.alignments.geometry import LineStyle
+from app.formats.alignments.geometry import BoundaryStyle
 from app.planning.alignment import Floats, Lane
 from app.planning.outputs.hd_map import HdMap, MapMarker, attribute, number
 from app.planning.outputs.reference_line import Profile, ReferenceLine
@@ -21,10 +21,10 @@ MAX_BESIDE_M = 100.0
 _MISPLACED_M = 0.01  # [m] between a marker and its place by s and t; source: the error that maps may have
 _SAME_END_M = 0.05  # [m] between the end of a lane and the start of its successor; source: chosen by hand
 _MARKS = {
-    LineStyle.SOLID: "solid",
-    LineStyle.DASHED: "broken",
-    LineStyle.NONE: "none",
-    LineStyle.UNKNOWN: "none",
+    BoundaryStyle.SOLID: "solid",
+    BoundaryStyle.DASHED: "broken",
+    BoundaryStyle.NONE: "none",
+    BoundaryStyle.UNKNOWN: "none",
 }
 
 

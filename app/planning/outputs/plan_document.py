@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.alignments.geometry import LineStyle, StationEquation
+from app.formats.alignments.geometry import BoundaryStyle, StationEquation
 from app.markers.magnet_codebook import Codebook
 from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent
 from app.planning.plan import LeftOut, Plan, PlanFinding, PlannedMarker
@@ -56,8 +56,8 @@ class LaneDocument(_Part):
     road: str
     length_m: float
     samples: int
-    left_style: LineStyle
-    right_style: LineStyle
+    left_style: BoundaryStyle
+    right_style: BoundaryStyle
     arrays: dict[str, _Array | float | None]
 
     @model_validator(mode="after")

@@ -11,7 +11,7 @@ import scipy
 import shapely
 
 from app.encoders.pdf import POINTS_PER_MM
-from app.formats.alignments.geometry import EventKind, LineStyle, StationEquation
+from app.formats.alignments.geometry import BoundaryStyle, EventKind, StationEquation
 from app.planning.alignment import Alignment, Floats, RoadEvent, format_station
 from app.planning.outputs.drawing_sheet import (
     BLACK,
@@ -194,12 +194,12 @@ class _Row:
         for piece in self._pieces:
             self._draw_travel(piece)
 
-    def _draw_edge(self, edge: Floats, style: LineStyle, drawn: list[Floats]) -> None:
+    def _draw_edge(self, edge: Floats, style: BoundaryStyle, drawn: list[Floats]) -> None:
         width, colour, dash = {
-            LineStyle.SOLID: (0.35, BLACK, ()),
-            LineStyle.DASHED: (0.35, BLACK, (8, 6)),
-            LineStyle.NONE: (0.13, LIGHT, ()),
-            LineStyle.UNKNOWN: (0.18, GREY, ()),
+            BoundaryStyle.SOLID: (0.35, BLACK, ()),
+            BoundaryStyle.DASHED: (0.35, BLACK, (8, 6)),
+            BoundaryStyle.NONE: (0.13, LIGHT, ()),
+            BoundaryStyle.UNKNOWN: (0.18, GREY, ()),
         }[style]
         new: npt.NDArray[np.bool_] = np.ones(len(edge), dtype=np.bool_)
         if drawn:

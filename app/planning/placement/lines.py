@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from app.formats.alignments.geometry import LineStyle
+from app.formats.alignments.geometry import BoundaryStyle
 from app.markers.cerpm import LaneSide
 from app.planning.alignment import Lane
 from app.planning.placement.boundaries import Boundaries
@@ -18,8 +18,8 @@ def place_line_magnets(lane: Lane, rules: LineRules, painted: Boundaries) -> lis
     """
     sites = []
     for side, style in ((LaneSide.LEFT, lane.left_style), (LaneSide.RIGHT, lane.right_style)):
-        polarity = rules.dashed if style is LineStyle.DASHED else rules.solid
-        if rules.sides not in ("both", side.name.lower()) or style is LineStyle.NONE or polarity is None:
+        polarity = rules.dashed if style is BoundaryStyle.DASHED else rules.solid
+        if rules.sides not in ("both", side.name.lower()) or style is BoundaryStyle.NONE or polarity is None:
             continue
         for stretch in painted.add(lane, side, rules.offset_m):
             if stretch.length_m < rules.max_spacing_m / 2:

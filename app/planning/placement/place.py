@@ -12,7 +12,7 @@ import numpy as np
 from pyproj import Geod
 
 from app.errors import InvalidParameter
-from app.formats.alignments.geometry import LineStyle
+from app.formats.alignments.geometry import BoundaryStyle
 from app.markers.cerpm import MAX_SPEED_LIMIT, LaneSide, SpeedLimit
 from app.markers.magnet import InformationTag, LineTag, Polarity
 from app.markers.magnet_codebook import Codebook, Meaning
@@ -245,9 +245,9 @@ class _Placer:
         tags = {
             style: LineTag(Polarity(polarity))
             for style, polarity in (
-                (LineStyle.SOLID, rules.solid),
-                (LineStyle.UNKNOWN, rules.solid),
-                (LineStyle.DASHED, rules.dashed),
+                (BoundaryStyle.SOLID, rules.solid),
+                (BoundaryStyle.UNKNOWN, rules.solid),
+                (BoundaryStyle.DASHED, rules.dashed),
             )
             if polarity is not None
         }

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.formats.alignments.geometry import LineStyle
+from app.formats.alignments.geometry import BoundaryStyle
 from app.markers.cerpm import LaneSide
 from app.markers.magnet_codebook import Meaning
 from app.planning.alignment import Floats, Lane, RoadEvent
@@ -35,7 +35,7 @@ class Site:
         Of a tag.
     side : LaneSide
         Of the boundary or the painted line on which it stands.
-    style : LineStyle
+    style : BoundaryStyle
         Of the painted line.
     """
 
@@ -45,7 +45,7 @@ class Site:
     event: RoadEvent | None = None
     meaning: Meaning | None = None
     side: LaneSide = LaneSide.UNKNOWN
-    style: LineStyle = LineStyle.UNKNOWN
+    style: BoundaryStyle = BoundaryStyle.UNKNOWN
 
 
 def distance_ahead_m(lane: Lane, event_m: float, rule: Ahead) -> float:

@@ -11,7 +11,7 @@ import orjson
 import pytest
 
 from app.errors import InvalidParameter, ReferenceSystemError, UnreadableUpload, WaymarkError
-from app.formats.alignments.geometry import AlignmentFile, EventKind, LineStyle
+from app.formats.alignments.geometry import AlignmentFile, BoundaryStyle, EventKind
 from app.formats.alignments.read import read_alignment
 
 LINE = [[8.4, 49.0], [8.401, 49.0], [8.402, 49.0]]
@@ -35,7 +35,7 @@ def test_a_file_with_one_unnamed_line_is_one_lane() -> None:
     assert lane.centre[:, :2].tolist() == LINE
     assert np.isnan(lane.centre[:, 2]).all()
     assert (lane.speed_limit_mps, lane.width_m, lane.road, file.crs) == (None, None, None, None)
-    assert lane.left_style is LineStyle.UNKNOWN
+    assert lane.left_style is BoundaryStyle.UNKNOWN
 
 
 def test_a_bare_geometry_and_a_bare_feature_are_roads() -> None:
@@ -53,7 +53,7 @@ def test_properties_of_a_lane() -> None:
     assert first.width_m is not None
     assert first.width_m.tolist() == [3.2] * 3
     assert first.speed_limit_mps == pytest.approx(np.full(3, 80 / 3.6))
-    assert (first.left_style, first.right_style) == (LineStyle.SOLID, LineStyle.DASHED)
+    assert (first.left_style, first.right_style) == (BoundaryStyle.SOLID, BoundaryStyle.DASHED)
     assert second.speed_limit_mps == pytest.approx(np.full(2, 30 * 0.44704))
     assert second.centre is not None
     assert np.isnan(second.centre[0, 2])
@@ -99,7 +99,7 @@ def test_boundaries_are_one_lane(left: str, right: str) -> None:
     assert lane.left is not None
     assert lane.right is not None
     assert (len(lane.left), len(lane.right)) == (3, 2)
-    assert lane.left_style is LineStyle.DASHED
+    assert lane.left_style is BoundaryStyle.DASHED
     assert lane.speed_limit_mps is not None
     assert len(lane.speed_limit_mps) == 3
 
@@ -292,4 +292,4 @@ def test_a_style_that_is_none_is_refused() -> None:
     with pytest.raises(InvalidParameter) as refused:
         _read(_feature(LINE, lane="A", width_m=3.2, left_style="zigzag"))
     assert refused.value.field == "properties.left_style"
-    assert _read(_feature(LINE, lane="A", width_m=3.2, style="blue")).lanes[0].left_style is LineStyle.UNKNOWN
+    assert _read(_feature(LINE, lane="A", width_m=3.2, style="blue")).lanes[0].left_style is BoundaryStyle.UNKNOWN

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.errors import UnreadableUpload, WaymarkError
-from app.formats.alignments.geometry import AlignmentFile, EventKind, Floats, LaneGeometry, LineStyle
+from app.formats.alignments.geometry import AlignmentFile, BoundaryStyle, EventKind, Floats, LaneGeometry
 from app.formats.alignments.lanelet2 import read_lanelet2
 from app.formats.alignments.read import read_alignment
 from tests.formats.alignments.mutations import damaged
@@ -107,25 +107,25 @@ def test_successive_lanelets_are_one_lane_with_styles_and_heights() -> None:
     np.testing.assert_allclose(values(lane.left)[:, 1] * DEGREE_M, 3.0, atol=1e-6)
     np.testing.assert_allclose(values(lane.right)[:, 2], [12.5, np.nan, np.nan])
     # Of both double lines the dashed one is nearer to the lane: one is stored westwards.
-    assert (lane.left_style, lane.right_style) == (LineStyle.DASHED, LineStyle.DASHED)
+    assert (lane.left_style, lane.right_style) == (BoundaryStyle.DASHED, BoundaryStyle.DASHED)
     assert lane.speed_limit_mps is None
 
 
 @pytest.mark.parametrize(
     ("kind", "subtype", "style"),
     [
-        ("line_thin", "solid", LineStyle.SOLID),
-        ("line_thick", "dashed", LineStyle.DASHED),
-        ("line_thin", "", LineStyle.UNKNOWN),
-        ("virtual", "", LineStyle.NONE),
-        ("curbstone", "high", LineStyle.NONE),
-        ("zig-zag", "", LineStyle.UNKNOWN),
+        ("line_thin", "solid", BoundaryStyle.SOLID),
+        ("line_thick", "dashed", BoundaryStyle.DASHED),
+        ("line_thin", "", BoundaryStyle.UNKNOWN),
+        ("virtual", "", BoundaryStyle.NONE),
+        ("curbstone", "high", BoundaryStyle.NONE),
+        ("zig-zag", "", BoundaryStyle.UNKNOWN),
     ],
 )
-def test_line_styles(kind: str, subtype: str, style: LineStyle) -> None:
+def test_line_styles(kind: str, subtype: str, style: BoundaryStyle) -> None:
     plain = way(10, 3, 4, type=kind, subtype=subtype) + way(11, 0, 1, type="virtual")
     (lane,) = read_lanelet2(osm(NODES, plain, lanelet(20, 10, 11))).lanes
-    assert (lane.left_style, lane.right_style) == (style, LineStyle.NONE)
+    assert (lane.left_style, lane.right_style) == (style, BoundaryStyle.NONE)
 
 
 def test_a_fork_ends_a_lane() -> None:

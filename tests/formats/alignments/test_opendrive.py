@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.special import fresnel
 
-from app.formats.alignments.geometry import AlignmentFile, EventKind, Floats, LaneGeometry, LineStyle
+from app.formats.alignments.geometry import AlignmentFile, BoundaryStyle, EventKind, Floats, LaneGeometry
 from app.formats.alignments.opendrive import read_opendrive
 from app.formats.alignments.opendrive.road import parse_road
 from app.formats.alignments.read import read_alignment
@@ -219,22 +219,22 @@ def test_direction_of_travel(rule: str, east: str) -> None:
         eastwards = lane.name == f"road 7 lane {east}"
         assert (centre(lane)[-1, 0] > centre(lane)[0, 0]) == eastwards
         assert (values(lane.station_m)[-1] > 50.0) == eastwards
-        styles = (LineStyle.DASHED, LineStyle.SOLID)
+        styles = (BoundaryStyle.DASHED, BoundaryStyle.SOLID)
         assert (lane.left_style, lane.right_style) == (styles if "LHT" not in rule else styles[::-1])
 
 
 @pytest.mark.parametrize(
     ("mark", "left_lane", "right_lane"),
     [
-        ("solid broken", LineStyle.SOLID, LineStyle.DASHED),
-        ("broken solid", LineStyle.DASHED, LineStyle.SOLID),
-        ("solid solid", LineStyle.SOLID, LineStyle.SOLID),
-        ("botts dots", LineStyle.DASHED, LineStyle.DASHED),
-        ("none", LineStyle.NONE, LineStyle.NONE),
-        ("curb", LineStyle.UNKNOWN, LineStyle.UNKNOWN),
+        ("solid broken", BoundaryStyle.SOLID, BoundaryStyle.DASHED),
+        ("broken solid", BoundaryStyle.DASHED, BoundaryStyle.SOLID),
+        ("solid solid", BoundaryStyle.SOLID, BoundaryStyle.SOLID),
+        ("botts dots", BoundaryStyle.DASHED, BoundaryStyle.DASHED),
+        ("none", BoundaryStyle.NONE, BoundaryStyle.NONE),
+        ("curb", BoundaryStyle.UNKNOWN, BoundaryStyle.UNKNOWN),
     ],
 )
-def test_of_a_double_line_the_near_one_counts(mark: str, left_lane: LineStyle, right_lane: LineStyle) -> None:
+def test_of_a_double_line_the_near_one_counts(mark: str, left_lane: BoundaryStyle, right_lane: BoundaryStyle) -> None:
     found = lanes(read_opendrive(document(road(lanes=section(centre=f'<roadMark sOffset="0" type="{mark}"/>')))))
     assert found["road 7 lane 1"].left_style == left_lane
     assert found["road 7 lane -1"].left_style == right_lane

@@ -10,7 +10,7 @@ import pytest
 from pyproj import Geod
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.alignments.geometry import LineStyle
+from app.formats.alignments.geometry import BoundaryStyle
 from app.formats.alignments.read import read_alignment
 from app.formats.alignments.registered_road import RegisteredRoad, RoadLanes, RoadStation, write_registered_road
 from app.geodesy import LocalizationGrade
@@ -79,7 +79,7 @@ def test_a_road_of_one_direction_has_its_axis_in_the_middle() -> None:
     offsets = [axis.locate(lane.lon_deg[50:51], lane.lat_deg[50:51], 20.0)[0][0].offset_m for lane in built.lanes]
     assert offsets == pytest.approx([1.75, -1.75], abs=0.005)
     styles = [(lane.left_style, lane.right_style) for lane in built.lanes]
-    assert styles == [(LineStyle.SOLID, LineStyle.DASHED), (LineStyle.DASHED, LineStyle.SOLID)]
+    assert styles == [(BoundaryStyle.SOLID, BoundaryStyle.DASHED), (BoundaryStyle.DASHED, BoundaryStyle.SOLID)]
 
 
 def test_stations_are_the_measures_of_the_road() -> None:

@@ -15,7 +15,7 @@ from lanelet2.core import GPSPoint
 from lanelet2.io import Origin
 from lanelet2.projection import UtmProjector
 
-from app.formats.alignments.geometry import EventKind, LineStyle
+from app.formats.alignments.geometry import BoundaryStyle, EventKind
 from app.formats.alignments.read import read_alignment
 from app.planning.alignment import Alignment, Lane, RoadEvent
 from app.planning.alignment_declaration import AlignmentDeclaration
@@ -143,9 +143,11 @@ def test_lanelets_are_routable_and_have_1_to_50_metres(loaded: lanelet2.core.Lan
 
 
 def test_lanes_of_one_direction_may_be_changed_over_dashed_lines_only(tmp_path: Path) -> None:
-    right = straight(200, styles=(LineStyle.DASHED, LineStyle.SOLID))
+    right = straight(200, styles=(BoundaryStyle.DASHED, BoundaryStyle.SOLID))
     lon, lat = right.position_at(right.chainage_m, right.width_m)
-    left = replace(right, name="2", lon_deg=lon, lat_deg=lat, left_style=LineStyle.NONE, right_style=LineStyle.DASHED)
+    left = replace(
+        right, name="2", lon_deg=lon, lat_deg=lat, left_style=BoundaryStyle.NONE, right_style=BoundaryStyle.DASHED
+    )
     loaded = load(tmp_path, write_lanelet2(HdMap("lanes", (right, left), ())))
     rules = lanelet2.traffic_rules.create(
         lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
@@ -238,6 +240,6 @@ def test_our_own_reader_gets_the_lane_and_its_stop_line_back(content: HdMap) -> 
     assert GEOD.inv(lon, lat, lane.lon_deg, lane.lat_deg)[2].max() < 0.01
     assert np.abs(again.value_at(again.height_m, lane.chainage_m) - lane.height_m).max() < 0.01
     assert again.width_m == pytest.approx(3.5, abs=0.002)
-    assert (again.left_style, again.right_style) == (LineStyle.DASHED, LineStyle.SOLID)
+    assert (again.left_style, again.right_style) == (BoundaryStyle.DASHED, BoundaryStyle.SOLID)
     (stop,) = [event for event in read.events if event.kind is EventKind.STOP_LINE]
     assert (stop.lane, stop.chainage_m) == (again.name, pytest.approx(700, abs=0.01))

@@ -17,7 +17,7 @@ from lxml import etree
 from pyproj import Transformer
 
 from app.errors import InvalidParameter
-from app.formats.alignments.geometry import LineStyle
+from app.formats.alignments.geometry import BoundaryStyle
 from app.formats.alignments.read import read_alignment
 from app.planning.alignment import Alignment, Lane
 from app.planning.alignment_declaration import AlignmentDeclaration
@@ -217,7 +217,7 @@ def test_roads_that_continue_one_another_are_linked_unless_they_branch(schema: A
     schema.assertValid(root)
     links = [[(e.tag, e.get("elementId"), e.get("contactPoint")) for e in r.find("link")] for r in root.findall("road")]
     assert links == [[("successor", "2", "start")], [("predecessor", "1", "end")]]
-    exit_lane = replace(second, name="c", left_style=LineStyle.NONE)
+    exit_lane = replace(second, name="c", left_style=BoundaryStyle.NONE)
     root = etree.fromstring(write_opendrive(HdMap("three", (first, second, exit_lane), ())))
     assert [len(r.find("link")) for r in root.findall("road")] == [0, 0, 0]
 

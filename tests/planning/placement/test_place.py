@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.errors import InvalidParameter
-from app.formats.alignments.geometry import EventKind, LineStyle
+from app.formats.alignments.geometry import BoundaryStyle, EventKind
 from app.markers.cerpm import LaneSide
 from app.markers.magnet_codebook import MeaningKind
 from app.planning.alignment import Alignment, AvoidedArea, RoadEvent
@@ -85,16 +85,16 @@ def test_line_magnets_follow_painted_lines_and_a_shared_line_is_placed_once() ->
     made = plan(road(lane, opposite(lane, "2")), lines={"max_spacing_m": 6})
     styles = {(m.lane, m.detail.side, m.detail.style) for m in made.markers if isinstance(m.detail, PlannedLineMagnet)}
     assert styles == {
-        ("1", LaneSide.LEFT, LineStyle.DASHED),
-        ("1", LaneSide.RIGHT, LineStyle.SOLID),
-        ("2", LaneSide.RIGHT, LineStyle.SOLID),
+        ("1", LaneSide.LEFT, BoundaryStyle.DASHED),
+        ("1", LaneSide.RIGHT, BoundaryStyle.SOLID),
+        ("2", LaneSide.RIGHT, BoundaryStyle.SOLID),
     }
     for key in styles:
         line = [m for m in made.markers if (m.lane, m.detail.side, m.detail.style) == key]  # type: ignore[union-attr]
         apart = [GEOD.inv(a.lon_deg, a.lat_deg, b.lon_deg, b.lat_deg)[2] for a, b in pairwise(line)]
         assert min(apart) > 5.8
         assert max(apart) <= 6.0
-        assert {m.code for m in line} == {"S_90" if key[2] is LineStyle.DASHED else "N_90"}
+        assert {m.code for m in line} == {"S_90" if key[2] is BoundaryStyle.DASHED else "N_90"}
 
 
 def test_tags_have_the_meaning_of_their_event_and_equal_meanings_one_code() -> None:

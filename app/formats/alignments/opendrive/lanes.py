@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.formats.alignments.curves import GAP_ERROR_M, GAP_WARNING_M, Frame, Ints, sample
-from app.formats.alignments.geometry import Floats, LaneGeometry, LineStyle
+from app.formats.alignments.geometry import BoundaryStyle, Floats, LaneGeometry
 from app.formats.alignments.opendrive.road import LaneRecord, Road, Section
 
 MIN_WIDTH_M = 0.05
@@ -288,9 +288,9 @@ def _free(name: str, s: float, names: set[str]) -> str:
     return found
 
 
-def _styles(road: Road, chain: list[tuple[int, int]]) -> tuple[LineStyle, LineStyle]:
+def _styles(road: Road, chain: list[tuple[int, int]]) -> tuple[BoundaryStyle, BoundaryStyle]:
     """Paint left and right in the direction of travel: the styles along the greater part of the lane."""
-    lengths: tuple[dict[LineStyle, float], ...] = (defaultdict(float), defaultdict(float))
+    lengths: tuple[dict[BoundaryStyle, float], ...] = (defaultdict(float), defaultdict(float))
     for i, number in chain:
         section = road.sections[i]
         inside = section.lanes.get(_inside(section, number))
@@ -304,7 +304,7 @@ def _styles(road: Road, chain: list[tuple[int, int]]) -> tuple[LineStyle, LineSt
                 part = max(min(end, section.end) - max(mark[0], section.start), 0.0)
                 lengths[side][mark[1][line]] += part
                 covered += part
-            lengths[side][LineStyle.UNKNOWN] += section.end - section.start - covered
+            lengths[side][BoundaryStyle.UNKNOWN] += section.end - section.start - covered
     inner, outer = (max(part, key=lambda style: part[style]) for part in lengths)
     return (outer, inner) if road.left_hand else (inner, outer)
 
@@ -315,7 +315,7 @@ def _inside(section: Section, number: int) -> int:
     return max((n for n in section.lanes if 0 < n * sign < number * sign), key=abs, default=0)
 
 
-def _geometry(run: Floats, name: str, styles: tuple[LineStyle, LineStyle], road: str) -> LaneGeometry:
+def _geometry(run: Floats, name: str, styles: tuple[BoundaryStyle, BoundaryStyle], road: str) -> LaneGeometry:
     speed = run[:, _SPEED]
     return LaneGeometry(
         name=name,

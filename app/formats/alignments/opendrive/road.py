@@ -12,7 +12,7 @@ import numpy as np
 
 from app.errors import UnreadableUpload
 from app.formats.alignments.curves import GAP_WARNING_M, Curve, Piece, build_curve
-from app.formats.alignments.geometry import Floats, LineStyle
+from app.formats.alignments.geometry import BoundaryStyle, Floats
 from app.formats.xml_tree import attribute
 
 LANE_TYPES = frozenset({"driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp"})
@@ -20,9 +20,9 @@ LANE_TYPES = frozenset({"driving", "entry", "exit", "onRamp", "offRamp", "connec
 _LANE_ID = re.compile(r"-?[0-9]{1,9}")
 _SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 _STYLES = {
-    "solid": LineStyle.SOLID,
-    "broken": LineStyle.DASHED,
-    "none": LineStyle.NONE,
+    "solid": BoundaryStyle.SOLID,
+    "broken": BoundaryStyle.DASHED,
+    "none": BoundaryStyle.NONE,
 }
 """First words of e_roadMarkType; marks of two lines have two words. Source: ASAM OpenDRIVE 1.7."""
 
@@ -71,7 +71,7 @@ class LaneRecord:
     id: int
     drivable: bool
     width: Cubics
-    marks: list[tuple[float, tuple[LineStyle, LineStyle]]]
+    marks: list[tuple[float, tuple[BoundaryStyle, BoundaryStyle]]]
     speeds: list[tuple[float, float]]
     predecessor: int | None
     successor: int | None
@@ -288,10 +288,10 @@ def _integer(text: str) -> int | None:
     return int(text) if _LANE_ID.fullmatch(text.strip()) else None
 
 
-def _styles(mark: str) -> tuple[LineStyle, LineStyle]:
+def _styles(mark: str) -> tuple[BoundaryStyle, BoundaryStyle]:
     """Styles of the lines nearer to and farther from the reference line; left and right of it for lane 0."""
     words = mark.replace("botts dots", "broken").split() or [""]
-    return _STYLES.get(words[0], LineStyle.UNKNOWN), _STYLES.get(words[-1], LineStyle.UNKNOWN)
+    return _STYLES.get(words[0], BoundaryStyle.UNKNOWN), _STYLES.get(words[-1], BoundaryStyle.UNKNOWN)
 
 
 def _speeds(elements: list[ET.Element], place: str, start: float | None = None) -> list[tuple[float, float]]:
