@@ -11,7 +11,7 @@ import orjson
 import pytest
 from pydantic import SecretStr
 
-from app import cli
+from app import __version__, cli
 from app.main import create_app
 from app.settings import Settings
 from tests.conftest import LiveServer
@@ -75,6 +75,10 @@ def test_wrong_settings_are_named(waymark: Run, monkeypatch: pytest.MonkeyPatch,
     status, _, error = waymark("migrate")
     assert status == 1
     assert name.removeprefix("WAYMARK_").lower() in error.lower()
+
+
+def test_the_version_is_printed(waymark: Run) -> None:
+    assert waymark("--version") == (0, f"waymark {__version__}\n", "")
 
 
 def test_without_a_command_the_commands_are_listed(waymark: Run) -> None:
@@ -158,12 +162,13 @@ def test_a_survey_goes_in_and_markers_come_out(waymark: Run, tmp_path: Path) -> 
     arguments = ("import", str(survey), "--agency", "Roads", "--declaration", DECLARED)
     status, printed, _ = waymark(*arguments, "--dry-run")
     assert (status, orjson.loads(printed)["outcome"], orjson.loads(printed)["stored"]) == (0, "checked", 0)
-    status, printed, _ = waymark(*arguments)
+    status, printed, shown = waymark(*arguments)
     assert (status, orjson.loads(printed)["stored"]) == (0, 8)
+    assert shown.endswith("check: 100%\nstore: 100%, 8 of 8\n")
     status, printed, _ = waymark(*arguments)
     assert (status, orjson.loads(printed)["counts"]["file_already_imported"]) == (1, 1)
-    status, printed, _ = waymark("export", str(out), "--agency", "Roads", "--format", "geojson")
-    assert (status, printed.strip()) == (0, str(out))
+    status, printed, shown = waymark("export", str(out), "--agency", "Roads", "--format", "geojson")
+    assert (status, printed.strip(), shown) == (0, str(out), "export: 100%, 8 of 8\n")
     assert len(orjson.loads(out.read_bytes())["features"]) == 8
     assert not list(tmp_path.glob(".waymark-*"))
     compare = '{"crs": "EPSG:4326", "family": "cerpm", "columns": {"code": "number"}, "compare": true}'

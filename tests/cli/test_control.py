@@ -56,9 +56,10 @@ def test_import_export_and_errors_while_the_server_runs(waymark: Run, folder: Pa
             agency = connection.exec_driver_sql("SELECT name FROM agencies").scalar_one()
         status, printed, error = waymark("import", str(survey), "--agency", agency, "--declaration", DECLARED)
         assert status == 0, printed + error
+        assert "store: 100%, 5 of 5" in error
         assert len(client.get("/v1/markers").json()["items"]) == 5
         status, _, error = waymark("export", str(out), "--agency", agency, "--format", "geojson")
-        assert status == 0, error
+        assert (status, error) == (0, "export: 100%, 5 of 5\n")
         assert len(orjson.loads(out.read_bytes())["features"]) == 5
         status, _, error = waymark("export", str(tmp_path / "b"), "--agency", "nobody", "--format", "csv")
         assert (status, "there is no agency 'nobody'" in error, "waymark key" in error) == (1, True, True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
-from app.cli.progress import BYTES, amount, speed
+from app.cli.progress import BYTES, Progress, amount, speed
 from app.errors import WaymarkError
 from app.main import create_app
 from app.services.access.access import Scope
@@ -102,6 +103,36 @@ def test_stored_uploads_are_decoded_again(server: LiveServer, run: Callable[...,
     assert report.read_text().startswith("decode_id,change,")
     accepted = run("reprocess", "--accept", found["id"])
     assert "accepted" in accepted.stdout
+
+
+def test_artwork_is_drawn_and_fetched_with_progress(
+    server: LiveServer, run: Callable[..., Result], tmp_path: Path, place: Callable[[], dict[str, Any]]
+) -> None:
+    with server.client() as client:
+        ids = [created(client, "/v1/markers", position=place())["id"] for _ in range(2)]
+    out = tmp_path / "plates.zip"
+    arguments = ("artwork", str(out), "--marker", ids[0], "--marker", ids[1], "--format", "svg")
+    done = run(*arguments)
+    assert done.exit_code == 0, done.output
+    assert "artwork: 100%, 2 of 2" in done.stderr
+    assert "download: 100%" in done.stderr
+    with zipfile.ZipFile(out) as bundle:
+        assert [plate["plate_id"] for plate in json.loads(bundle.read("manifest.json"))["plates"]] == ids
+    assert "already exists" in str(run(*arguments).exception)
+
+
+def test_a_terminal_gets_bars(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("sys.stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    with Progress() as shown:
+        shown.show("upload", 1e6, 4e6, BYTES)
+        shown.show("decode", 3, 12)
+    lines = terminal.getvalue().splitlines()
+    for step, share, counted in (("upload", "25%", "1.0 of 4.0 MB"), ("decode", "25%", "3 of 12")):
+        assert any(step in line and share in line and counted in line for line in lines), lines
 
 
 def test_a_running_decode_shows_its_result_so_far(
