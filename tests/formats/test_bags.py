@@ -63,7 +63,7 @@ def _messages(store: Any) -> list[tuple[str, str, int, Any]]:
     return listed
 
 
-def _fields(store: Any, sensors: int, samples: int) -> list[tuple[str, str, int, Any]]:
+def bag_fields(store: Any, sensors: int, samples: int) -> list[tuple[str, str, int, Any]]:
     """Messages of magnetometers, whose clocks differ by a part of a sample, and speeds."""
     types = store.types
     names = "sensor_msgs/msg/MagneticField", "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Vector3"
@@ -101,8 +101,8 @@ def _raw(store: Any) -> list[tuple[str, str, int, Any]]:
     return [("/image", image.__msgtype__, at[k], image(head[k], 20, 34, "rgb8", 0, 104, rows)) for k in range(3)]
 
 
-def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None) -> bytes:
-    """A ROS 2 bag in SQLite, with the tables of rosbag2_storage_sqlite3."""
+def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None, padding: int = 0) -> bytes:
+    """A ROS 2 bag in SQLite, with the tables of rosbag2_storage_sqlite3 and some bytes that no reader asks for."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     database = sqlite3.connect(path)
     database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
@@ -114,6 +114,8 @@ def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None
             database.execute("INSERT INTO topics VALUES (?, ?, ?, 'cdr')", (topics[topic], topic, kind))
         data = bytes(store.serialize_cdr(message, kind))
         database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", (topics[topic], at, data))
+    if padding:
+        database.execute(f"CREATE TABLE padding AS SELECT zeroblob({padding}) AS data")
     database.commit()
     database.close()
     return path.read_bytes()
@@ -236,7 +238,7 @@ def test_raw_pictures(tmp_path: Path) -> None:
 
 def test_magnetometers_are_a_trace(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
-    data = sqlite_bag(tmp_path / "a.db3", _fields(store, 3, 600))
+    data = sqlite_bag(tmp_path / "a.db3", bag_fields(store, 3, 600))
     declared = TraceDeclaration(sensors=3, axes=AxisConvention.ISO8855, references=())
     with (tmp_path / "a.db3").open("rb") as stream:
         traces = [read_trace({"drive.db3": given}, declared).trace for given in (data, stream)]

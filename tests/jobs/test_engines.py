@@ -13,6 +13,7 @@ from typing import Any
 import httpx
 import pytest
 import sqlalchemy as sa
+from rosbags.typesys import Stores, get_typestore
 
 from app.registry.tables import marker_versions
 from app.registry.tenancy import across_agencies
@@ -21,10 +22,13 @@ from app.services.markers.artwork_jobs import IMMEDIATE_PLATES
 from app.settings import Settings
 from tests.api.decodes.conftest import post_frame
 from tests.api.decodes.test_archives import pack
+from tests.api.drives.test_drives import BEGAN, frames, made, store, trace
 from tests.api.plans.test_packages import RULES, road, send_road
 from tests.api.surveys.test_imports import DEGREES, _csv, _markers, _send
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer, serving
 from tests.formats.pictures import png
+from tests.formats.test_bags import bag_fields, sqlite_bag
+from tests.formats.test_video import video
 from tests.http import created, finished, refused, wait_until
 from tests.jobs import standin
 from tests.jobs.hostile_files import hostile_files, send
@@ -87,6 +91,32 @@ def test_a_running_job_is_cancelled(client: httpx.Client) -> None:
     wait_until(lambda: client.get(location).json()["state"] == "running", "the job to run")
     assert client.post(f"{location}/cancel").status_code == 200
     assert finished(client, location)["state"] == "cancelled"
+
+
+def test_a_video_and_a_bag_in_a_zip_are_decoded_and_become_a_drive(
+    server: LiveServer, client: httpx.Client, tmp_path: Path
+) -> None:
+    fields = sqlite_bag(tmp_path / "drive.db3", bag_fields(get_typestore(Stores.ROS2_HUMBLE), 14, 150), padding=9 << 20)
+    bag = pack({"drive.db3": fields}, zipfile.ZIP_STORED)
+    uploads = {"video": (video(20), {}), "trace": (bag, {"trace": {"axes": "ISO8855"}})}
+    answers = {kind: post_frame(client, data, context) for kind, (data, context) in uploads.items()}
+    for kind, answer in answers.items():
+        assert answer.status_code == 202, answer.text
+        decode = finished(client, answer.headers["Location"])
+        assert (decode["state"], decode["kind"], decode["attempts"]) == ("done", kind, 1), decode
+    bar = store(server, client, "trace", trace(), captured_at=BEGAN.isoformat())
+    camera = store(server, client, "archive", frames(8.0, 16.0, 24.0))
+    assert made(client, bar, camera)["report"]["statistics"]["markers_used"] == 6
+
+
+def test_a_plan_is_made(client: httpx.Client) -> None:
+    alignment = send_road(client, road(47.0, 45.0, 60.0), name="r").json()
+    wanted = {"name": "p", "alignment_id": alignment["id"], "rules": {"version": 1, "plates": {"spacing_m": 50}}}
+    answer = client.post("/v1/plans", json=wanted, headers={"Prefer": "respond-async"})
+    assert answer.status_code == 202, answer.text
+    job = finished(client, answer.headers["Location"])
+    assert (job["kind"], job["state"]) == ("plan", "done"), job
+    assert client.get(job["links"]["plan"]).json()["name"] == "p"
 
 
 def test_a_survey_is_imported_once(client: httpx.Client) -> None:
