@@ -15,7 +15,6 @@ import argparse
 import http.client
 import json
 import os
-import socket
 import sqlite3
 import statistics
 import subprocess
@@ -30,6 +29,7 @@ import cv2
 import numpy as np
 
 from app.decoders.plate.reader import decode_plates
+from app.demo.free_ports import free_ports
 from app.families.plate.frames import DEFAULT_GEOMETRIES
 from app.formats.images import load_image
 from app.jobs.decoder_process import keep_memory
@@ -67,9 +67,7 @@ class Server:
     """`waymark serve` in a process of its own, on a free port."""
 
     def __init__(self, folder: Path) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
+        (self.port,) = free_ports(1)
         self._environment = os.environ | {
             "WAYMARK_DATA_DIR": str(folder),
             "WAYMARK_ADMIN_KEY": KEY,

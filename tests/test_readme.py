@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from app.demo.free_ports import free_ports
 from benchmarks.readme import PAGES, SHORT_MARK, fill_blocks, read_sections
 from tests.http import WITHIN_S
 
@@ -31,12 +31,6 @@ def require(name: str) -> None:
         pytest.skip(f"{name} is not installed")
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(3600)  # a loaded machine compiles the decoders for minutes
 def test_the_tour_prints_what_the_readme_shows(tmp_path: Path) -> None:
@@ -50,7 +44,7 @@ def test_the_tour_prints_what_the_readme_shows(tmp_path: Path) -> None:
     (programs / "waymark").write_text(f'#!/bin/sh\nexec {sys.executable} -c "from app.cli import main; main()" "$@"\n')
     (programs / "waymark").chmod(0o755)
     script = f"\necho '{END}'\n".join(commands for commands, _ in BLOCKS)
-    script = script.replace("WAYMARK_PORT=8000", f"WAYMARK_PORT={free_port()}")
+    script = script.replace("WAYMARK_PORT=8000", f"WAYMARK_PORT={free_ports(1)[0]}")
     environment = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")} | {
         "PATH": f"{programs}:{os.environ['PATH']}",
         "PYTHONPATH": str(ROOT),

@@ -6,7 +6,6 @@ import ctypes
 import os
 import secrets
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ from types import TracebackType
 
 import httpx
 
+from app.demo.free_ports import free_ports
 from app.errors import Unavailable, WaymarkError
 
 _START_TIMEOUT_S = 180.0
@@ -34,9 +34,7 @@ class LocalServer:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self.key = secrets.token_urlsafe(32)
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self._port = probe.getsockname()[1]
+        (self._port,) = free_ports(1)
         self.url = f"http://127.0.0.1:{self._port}"
 
     def __enter__(self) -> LocalServer:

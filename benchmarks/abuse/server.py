@@ -6,7 +6,6 @@ import http.client
 import multiprocessing
 import os
 import secrets
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,8 @@ from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
 import httpx
+
+from app.demo.free_ports import free_ports
 
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _POLL_S = 0.02
@@ -135,9 +136,7 @@ def _poll(port: int, slowest_s: Synchronized[float]) -> None:
 def running_server(folder: Path) -> Iterator[ObservedServer]:
     """`waymark serve` on an empty folder, without limits on rates: single requests are measured."""
     key = secrets.token_hex(16)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
+    (port,) = free_ports(1)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")} | {
         "WAYMARK_DATA_DIR": str(folder),
         "WAYMARK_ADMIN_KEY": key,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,8 @@ from pathlib import Path
 
 import httpx
 import psutil
+
+from app.demo.free_ports import free_ports
 
 ADMIN_KEY = "an-admin-key-for-the-faults"
 HEADERS = {"X-API-Key": ADMIN_KEY}
@@ -35,9 +36,7 @@ class FaultServer:
 
     def __init__(self, folder: Path, database_url: str = "", settings: Mapping[str, str] | None = None) -> None:
         self.folder = folder
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = int(probe.getsockname()[1])
+        (self.port,) = free_ports(1)
         self.url = f"http://127.0.0.1:{self.port}"
         plain = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")}
         self.environment = plain | {

@@ -15,6 +15,8 @@ from pathlib import Path
 import psutil
 import sqlalchemy as sa
 
+from app.demo.free_ports import free_ports
+
 PEER = ("tipg==1.6.1", "uvicorn==0.54.0", "uvloop==0.23.0", "httptools==0.9.0")
 _LOCAL = "postgresql+psycopg://postgres@127.0.0.1:5432/postgres"
 
@@ -130,9 +132,7 @@ def _install(folder: Path) -> Path:
 
 @contextmanager
 def _running(command: list[str], environment: dict[str, str], ready: str) -> Iterator[int]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
+    (port,) = free_ports(1)
     with tempfile.TemporaryFile() as log:
         process = subprocess.Popen([*command, str(port)], env=os.environ | environment, stdout=log, stderr=log)
         try:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import glob
 import os
 import shutil
-import socket
 import subprocess
 import tempfile
 import time
@@ -20,6 +19,8 @@ from typing import Any
 import psutil
 import sqlalchemy as sa
 from kombu import Connection
+
+from app.demo.free_ports import free_ports
 
 _WITHIN_S = 120.0
 _RABBITMQ = "/usr/lib/rabbitmq/lib/rabbitmq_server-*/sbin/rabbitmq-server"
@@ -83,7 +84,7 @@ class Broker(_Node):
 
     def __init__(self) -> None:
         super().__init__("waymark-rabbitmq-")
-        port, distribution_port, self._mapper_port = _free_ports(3)
+        port, distribution_port, self._mapper_port = free_ports(3)
         self.url = f"amqp://guest:guest@127.0.0.1:{port}"
         names = ("PATH", "LANG", "LC_ALL")
         self._environment = {name: os.environ[name] for name in names if name in os.environ} | {
@@ -173,14 +174,3 @@ def _find_rabbitmq() -> str | None:
 def _find_postgresql(program: str) -> str | None:
     folders = sorted(glob.glob(_POSTGRESQL), reverse=True)
     return next(filter(None, (shutil.which(program, path=folder) for folder in (*folders, None))), None)
-
-
-def _free_ports(number: int) -> list[int]:
-    probes = [socket.socket() for _ in range(number)]
-    try:
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [int(probe.getsockname()[1]) for probe in probes]
-    finally:
-        for probe in probes:
-            probe.close()

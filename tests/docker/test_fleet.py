@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -18,6 +17,7 @@ import pytest
 import yaml
 
 from app.cli.database import read_settings
+from app.demo.free_ports import free_ports
 from app.settings import Settings
 from tests.conftest import ADMIN_KEY
 from tests.databases import PostgresServer
@@ -109,16 +109,10 @@ def test_the_secrets_are_what_compose_and_the_settings_ask_for(tmp_path: Path, m
 # --- the proxy ------------------------------------------------------------------------------------------------------
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @contextmanager
 def proxy(folder: Path, servers: list[str], find: Callable[..., str]) -> Iterator[str]:
     """The real nginx with the real file; only names, ports and the rate are changed."""
-    port = free_port()
+    (port,) = free_ports(1)
     text = (ROOT / "docker/fleet/nginx.conf").read_text().replace("listen 8080", f"listen 127.0.0.1:{port}")
     for name, url in zip(("api-1:8000", "api-2:8000"), servers, strict=True):
         text = text.replace(name, url.removeprefix("http://"))

@@ -15,6 +15,7 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from app.control.metrics import MetricsServer, ProcessMetrics
+from app.demo.free_ports import free_ports
 from app.errors import Unavailable, UnreadableUpload
 from app.main import create_app
 from app.registry import jobs as store
@@ -24,7 +25,6 @@ from app.services.decodes.measures import DECODE_METRICS, measured
 from app.settings import Settings
 from app.wiring import utc_now
 from tests.conftest import LiveServer
-from tests.docker.test_fleet import free_port
 from tests.http import WITHIN_S
 
 FOLDER = Path(__file__).resolve().parents[2] / "docker/monitoring"
@@ -145,7 +145,7 @@ def test_outcomes_are_told_apart() -> None:
 
 def test_a_worker_answers_on_its_own_port(settings: Settings) -> None:
     with LiveServer(create_app(settings)) as server:
-        port = free_port()
+        (port,) = free_ports(1)
         metrics = ProcessMetrics(server.app.state.database, server_pool(server), utc_now)
         worker = MetricsServer("127.0.0.1", port, metrics)
         try:

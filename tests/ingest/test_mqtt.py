@@ -21,6 +21,7 @@ import pytest
 from paho.mqtt.enums import CallbackAPIVersion
 
 from app.demo.cerpms import BuiltLane, build_lane
+from app.demo.free_ports import free_ports
 from app.encoders.cerpm.payload import encode_message
 from app.errors import InvalidParameter, NotAllowed, Unavailable
 from app.ingest.mqtt import MqttIngest, MqttSource, Sink
@@ -135,9 +136,7 @@ def test_a_server_that_is_away_costs_time_not_packets(
     topic = f"application/{name}/device/00/event/up"
     source = MqttSource(broker, (topic,), client_id=f"test-{name}")
     messages = uplinks(built, 52)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        nowhere = f"http://127.0.0.1:{probe.getsockname()[1]}"
+    nowhere = f"http://127.0.0.1:{free_ports(1)[0]}"
     half = len(messages) // 2
     with Running(source, Sink(nowhere, key, {"packets": {}}, batch_s=0.3), tmp_path) as away:
         publish(topic, messages[:half])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from app.demo.free_ports import free_ports
 from tests.http import WITHIN_S
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -28,12 +28,6 @@ def _environment(folder: Path, **extra: str) -> dict[str, str]:
     return {**plain, **own, **extra}
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 class _Served:
     url = ""
     output = ""
@@ -42,7 +36,7 @@ class _Served:
 
 @contextmanager
 def _serving(folder: Path, **extra: str) -> Iterator[_Served]:
-    served, port = _Served(), _free_port()
+    served, port = _Served(), free_ports(1)[0]
     process = subprocess.Popen(
         [*WAYMARK, "serve", "--port", str(port)],
         env=_environment(folder, **extra),
@@ -84,7 +78,7 @@ def test_a_fresh_server_prints_its_key_once_and_keeps_what_it_is_told(tmp_path: 
         made = httpx.post(f"{second.url}/v1/markers", json=body, headers=headers, trust_env=False)
         assert made.status_code == 201
         rival = subprocess.run(
-            [*WAYMARK, "serve", "--port", str(_free_port())],
+            [*WAYMARK, "serve", "--port", str(free_ports(1)[0])],
             env=_environment(tmp_path / "new" / "var"),
             capture_output=True,
             text=True,
