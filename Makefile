@@ -14,9 +14,7 @@ $(VENV)/.runtime: requirements.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install --quiet --require-hashes -r requirements.txt
 	$(PIP) install --quiet --no-deps -e .
-	$(BIN)/waymark decode docs/images/frame.jpg > /dev/null  # compiles the decoders' kernels, once
-	$(BIN)/waymark decode-trace docs/images/drive.zip > /dev/null
-	$(BIN)/python -m app.tracks
+	$(BIN)/python -m app.jobs.compile_kernels  # once for all processes
 	@touch $@
 
 $(VENV)/.dev: requirements-dev.txt $(VENV)/.runtime
@@ -30,7 +28,7 @@ serve: $(VENV)/.runtime ## Serve on http://127.0.0.1:8000
 	$(BIN)/waymark serve
 
 test: $(VENV)/.dev ## All tests
-	$(BIN)/python -m pytest -n 3 --dist worksteal --durations=30 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n 4 --dist worksteal --durations=30 $(PYTEST_ARGS)
 
 static: $(VENV)/.dev
 	$(BIN)/ruff format --check .

@@ -95,7 +95,7 @@ def warm_process(decode: DecodePlates) -> None:
     cv2.ocl.setUseOpenCL(False)
     keep_memory()
     use_decoder(decode)
-    decode(_warm_frame(), camera=None, codebook=(), thermal=False)
+    decode(warm_frame(), camera=None, codebook=(), thermal=False)
     gc.collect()
     gc.freeze()  # the libraries' objects are never freed: a collection need not visit them
 
@@ -129,7 +129,7 @@ def process_id(_task: ProcessIdTask, _before: None) -> int:
     return os.getpid()
 
 
-def _warm_frame() -> np.ndarray[Any, np.dtype[np.uint8]]:
+def warm_frame() -> np.ndarray[Any, np.dtype[np.uint8]]:
     """A plate seen from straight above, so that every stage of the decoder runs once."""
     pitch, gap, unit = 10, 1, 9
     code = PlateCode.from_position(114.179583, 22.305278)
@@ -138,6 +138,8 @@ def _warm_frame() -> np.ndarray[Any, np.dtype[np.uint8]]:
     for row, column in np.argwhere(code.units):
         y, x = gap + row * pitch, gap + column * pitch
         plate[y : y + unit, x : x + unit] = 25
+    row, column = np.argwhere(code.units == 0)[-10]  # a stain, so that the pixels are judged, too
+    plate[gap + row * pitch + 2 : gap + (row + 1) * pitch, gap + column * pitch : gap + (column + 1) * pitch] = 170
     near, far, cell = gap, side - gap - 2 * pitch + gap, 2 * pitch - gap
     for y, x in ((near, far), (far, far), (far, near)):
         plate[y : y + cell, x : x + cell] = (60, 160, 30)

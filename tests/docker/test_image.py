@@ -149,6 +149,21 @@ def root() -> Iterator[Path]:
         yield Path(folder)
 
 
+def test_the_command_copies_the_compiled_decoders_once(tmp_path: Path) -> None:
+    kernels, numba = tmp_path / "kernels", tmp_path / "numba"
+    (kernels / "plate").mkdir(parents=True)
+    (kernels / "plate/fit.nbi").write_bytes(b"compiled")
+    script = (ROOT / "docker/waymark").read_text().replace("/opt/waymark/kernels", str(kernels))
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(numba)}
+    for stored in (b"compiled", b"compiled later"):
+        done = subprocess.run(
+            [sys.executable, "-c", script, "--version"], cwd=ROOT, env=environment, check=True, capture_output=True
+        )
+        assert b"waymark" in done.stdout.lower()
+        assert (numba / "plate/fit.nbi").read_bytes() == stored  # what a process wrote since then is kept
+        (numba / "plate/fit.nbi").write_bytes(b"compiled later")
+
+
 def test_the_image_has_what_the_server_needs(root: Path) -> None:
     assemble(root)
     image = root / "opt/waymark/src"

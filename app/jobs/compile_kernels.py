@@ -1,0 +1,40 @@
+"""``python -m app.jobs.compile_kernels``: compile what decodes plates and traces and estimates tracks, ahead of use.
+
+Numba keeps the result beside the code, or in NUMBA_CACHE_DIR, for processors like this one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from app.decoders.plate.reader import decode_plates
+from app.jobs.decoder_process import warm_frame
+from app.jobs.trace_tasks import compile_traces
+from app.services.decodes.trace_task import CompileTracesTask
+from app.tracks import Clock, LanePath, PositionFix, Samples, TrackInput
+from app.tracks.estimate import estimate_track
+
+_STEP_DEG = 1e-4
+
+
+def main() -> None:
+    """Decode a plate and a trace, and estimate a track, so that every kernel takes part."""
+    decode_plates(warm_frame())
+    compile_traces(CompileTracesTask(), None)
+    estimate_track(_short_track())
+
+
+def _short_track() -> TrackInput:
+    time_s = np.arange(0.0, 10.0, 0.1)
+    fixes = tuple(
+        PositionFix(name, second, 0.0, _STEP_DEG * second, (0.01, 0.0, 0.01), 0.0, 1.0, marker_id=f"{name} {second}")
+        for second, name in enumerate(["bar", "camera"] * 5)
+    )
+    lane = LanePath("lane", np.zeros(12), _STEP_DEG * np.arange(-1.0, 11.0), 0.1)
+    speeds = Samples("bar", time_s, np.full(time_s.size, 11.1), 0.1)
+    headings = Samples("bar", time_s, np.zeros(time_s.size), 0.5)
+    return TrackInput((Clock("bar"), Clock("camera")), fixes, (speeds,), (headings,), (lane,))
+
+
+if __name__ == "__main__":
+    main()
