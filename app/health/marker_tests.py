@@ -65,7 +65,6 @@ def update_marker(
     if evidence.elsewhere is None or evidence.read_probability > 0.0:
         state.count(at_s, read=at_place)
     state.survey_m = evidence.survey_m
-    upper = rules.upper(state.month_passes)
     found = [
         _test_missing(state, evidence, vehicle, at_s, rules, at_place=at_place),
         _test_moved(state, evidence, vehicle, at_s, rules),
@@ -73,7 +72,8 @@ def update_marker(
         _test_direction(state, evidence, vehicle, at_s, rules),
         _test_quality(state, evidence, vehicle, at_s, rules),
     ]
-    return [_limited(one, upper) for one in found if one is not None and one.ratio >= upper]
+    limited = [_limited(one, rules.upper(one.fault, state.month_passes)) for one in found if one is not None]
+    return [one for one in limited if one.ratio >= one.limit]
 
 
 def update_unregistered(
@@ -83,7 +83,7 @@ def update_unregistered(
     state.count(at_s, read=True)
     gain = min(-math.log(UNREGISTERED_MISREAD + (1.0 - confidence)), rules.vehicle_bound)
     verdict = _add_share(state, Fault.UNREGISTERED, vehicle, max(gain, 0.0), at_s, rules)
-    upper = rules.upper(state.month_passes)
+    upper = rules.upper(Fault.UNREGISTERED, state.month_passes)
     return [_limited(verdict, upper)] if verdict is not None and verdict.ratio >= upper else []
 
 

@@ -156,8 +156,10 @@ def test_a_state_survives_being_stored() -> None:
 
 def test_the_limit_follows_the_traffic() -> None:
     rules = HealthRules()
-    assert rules.upper(10_000.0) - rules.upper(1000.0) == pytest.approx(math.log(10))
-    assert rules.upper(1.0) == rules.upper(100.0) == pytest.approx(math.log(5 * 100 / 1e-3))
+    missing, moved = Fault.MISSING, Fault.MOVED
+    assert rules.upper(missing, 10_000.0) - rules.upper(missing, 1000.0) == pytest.approx(math.log(10))
+    assert rules.upper(missing, 1.0) == rules.upper(missing, 100.0) == pytest.approx(math.log(5 * 100 / 1e-3))
+    assert rules.upper(missing, 500.0) - rules.upper(moved, 500.0) == pytest.approx(math.log(100))
 
 
 def test_ratios_of_many_markers_are_those_of_each() -> None:
@@ -229,6 +231,20 @@ def test_a_single_frame_rests_on_the_vehicles_last_minutes() -> None:
         judge_drive([Pass(f"o{k}", "plate", True, 0.95)], vehicle, 10.0 + k)
     assert judge_drive(miss, vehicle, 20.0).evidence[0].read_probability > 0.5
     assert judge_drive(miss, vehicle, 20.0 + 7200).evidence[0].read_probability == 0.0
+
+
+def test_a_lone_cerpm_that_nobody_receives_is_missing_after_many_drives() -> None:
+    def missed(family: str) -> Evidence:
+        return judge_drive([Pass("m", family, False, 0.9)], VehicleState(), 0.0).evidence[0]
+
+    assert missed("plate").read_probability == 0.0
+    state = MarkerState.new("cerpm")
+    assert _run(missed("cerpm"), _fleet(), state) == (0, [])
+    count, verdicts = _run(missed("cerpm"), (f"w{k}" for k in range(100)), state)
+    assert verdicts[0].fault is Fault.MISSING
+    assert 60 + count < 80
+    silent = [Pass(f"m{k}", "cerpm", False, 0.9, float(k)) for k in range(4)]
+    assert {one.read_probability for one in judge_drive(silent, VehicleState(), 0.0).evidence} == {0.0}
 
 
 def test_a_driver_on_the_wrong_way_accuses_no_marker_but_one_that_is_reversed_does_stand_out() -> None:

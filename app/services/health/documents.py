@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Literal, NotRequired
 
 from typing_extensions import TypedDict
 
+from app.health.rules import Fault
 from app.registry.health import HealthRow
 from app.registry.maintenance import ItemRow
 from app.services.documents import document_of
@@ -82,7 +84,8 @@ class MaintenancePage(TypedDict):
 
 
 class HealthDocument(TypedDict):
-    """Tests of a marker: logarithms of the likelihood ratios of the faults that have evidence, and its record.
+    """Tests of a marker: logarithms of the likelihood ratios of the faults that have evidence, of the limits from which
+    each fault is suspected, and its record.
 
     `quality` is the mean grade or signal less the usual one, in standard deviations of a pass.
     """
@@ -93,7 +96,7 @@ class HealthDocument(TypedDict):
     last_at: datetime | None
     read_at: datetime | None
     ratios: dict[str, float]
-    limit: float
+    limits: dict[str, float]
     quality: float | None
 
 
@@ -102,12 +105,13 @@ def item_document(row: ItemRow) -> MaintenanceItem:
     return document_of(MaintenanceItem, row, status=row.state)
 
 
-def health_document(marker_id: str, row: HealthRow | None, limit: float) -> HealthDocument:
+def health_document(marker_id: str, row: HealthRow | None, limits: Mapping[Fault, float]) -> HealthDocument:
     """A marker's tests as clients see them."""
+    shown = {str(fault): round(limit, 3) for fault, limit in limits.items()}
     if row is None:
         return {
             "marker_id": marker_id, "passes": 0, "reads": 0, "last_at": None, "read_at": None, "ratios": {},
-            "limit": limit, "quality": None,
+            "limits": shown, "quality": None,
         }  # fmt: skip
     return {
         "marker_id": marker_id,
@@ -116,6 +120,6 @@ def health_document(marker_id: str, row: HealthRow | None, limit: float) -> Heal
         "last_at": row.last_at,
         "read_at": row.read_at,
         "ratios": {fault: round(ratio, 3) for fault, ratio in row.ratios.items()},
-        "limit": round(limit, 3),
+        "limits": shown,
         "quality": None if row.quality is None else round(row.quality, 3),
     }

@@ -13,7 +13,7 @@ from app.errors import Conflict
 from app.families.documents import MarkerDocument
 from app.formats.spreadsheet import TableWriter
 from app.health import MarkerState
-from app.health.rules import RULES
+from app.health.rules import RULES, TESTED
 from app.registry import audit, maintenance
 from app.registry import health as store
 from app.registry.database import Database
@@ -84,7 +84,8 @@ class Maintenance:
             get_marker(connection, caller.agency_id, marker_id)
             row = store.find_marker_health(connection, caller.agency_id, marker_id)
         month_passes = 0.0 if row is None else MarkerState.from_document(row.state).month_passes
-        return health_document(marker_id, row, RULES.upper(month_passes))
+        limits = {fault: RULES.upper(fault, month_passes) for fault in TESTED}
+        return health_document(marker_id, row, limits)
 
     def approve(
         self, caller: Caller, item_id: str, outcome: Outcome, note: str | None, version: int | None

@@ -181,4 +181,5 @@ def test_a_marker_without_passes_has_no_ratios(owner: httpx.Client) -> None:
     marker = _plate(owner, 15.0)
     health = owner.get(f"/v1/markers/{marker['id']}/health").json()
     assert (health["passes"], health["ratios"], health["last_at"]) == (0, {}, None)
-    assert health["limit"] == pytest.approx(13.122, abs=0.001)
+    assert health["limits"]["missing"] == pytest.approx(13.122, abs=0.001)
+    assert health["limits"]["moved"] == pytest.approx(8.517, abs=0.001)
