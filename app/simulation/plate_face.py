@@ -62,6 +62,10 @@ class PlateWear:
         Number of opaque stains.
     dirt_mm : float
         Typical radius of a stain. [mm]
+    paint_spots : int
+        Number of spots of paint: ellipses as dark as the dark units, as light as the light ones, or grey.
+    paint_mm : tuple of float
+        Least and greatest half axis of a spot. [mm]
     """
 
     contrast_loss: float = 0.0
@@ -69,6 +73,8 @@ class PlateWear:
     patch_mm: float = 60.0
     dirt_blobs: int = 0
     dirt_mm: float = 20.0
+    paint_spots: int = 0
+    paint_mm: tuple[float, float] = (8.0, 30.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,6 +303,8 @@ def _worn(reflectance: FloatArray, wear: PlateWear, side_mm: float, rng: np.rand
         out = out + (dust - out) * amount[..., None]
     for _ in range(wear.dirt_blobs):
         out = _stained(out, wear.dirt_mm * texels_per_mm, dust, rng)
+    for _ in range(wear.paint_spots):
+        out = _painted(out, wear.paint_mm, texels_per_mm, rng)
     return np.ascontiguousarray(out, np.float32)
 
 
@@ -320,3 +328,20 @@ def _stained(face: FloatArray, radius: float, dust: FloatArray, rng: np.random.G
         soft = cv2.GaussianBlur(mask[part], (0, 0), spread) * opacity
         face[part] += (colour - face[part]) * soft[..., None]
     return face
+
+
+def _painted(
+    face: FloatArray, half_axes_mm: tuple[float, float], texels_per_mm: float, rng: np.random.Generator
+) -> FloatArray:
+    """One spot of paint, an ellipse with a sharp edge."""
+    size = face.shape[0]
+    axes = rng.uniform(*half_axes_mm, 2) * texels_per_mm
+    centre = rng.uniform(0.1, 0.9, 2) * size
+    mask = np.zeros((size, size), np.uint8)
+    place, half = (int(centre[0]), int(centre[1])), (max(int(axes[0]), 1), max(int(axes[1]), 1))
+    cv2.ellipse(mask, place, half, float(rng.uniform(0, 180)), 0, 360, 255, -1)
+    cover = cv2.GaussianBlur(mask.astype(np.float32) / 255, (0, 0), 1.0) * np.float32(rng.uniform(0.7, 1.0))
+    tones = ((0.02, 0.12), (0.5, 0.95), (0.15, 0.45))
+    paint = np.float32(rng.uniform(*tones[int(rng.choice(3, p=(0.35, 0.35, 0.3)))]))
+    painted: FloatArray = face + (paint - face) * cover[..., None]
+    return painted

@@ -1,7 +1,7 @@
 """``python -m benchmarks.plates [ITEM ...] [--short] [--seed N] [--seeds M]``: print the tables.
 
-Items: trials, height, false, peers, speed, accuracy, all. The long mode takes three seeds, the short one a part of the
-frames of one seed, which its tables scale up.
+Items: trials, height, false, peers, speed, accuracy, light, all. The long mode takes three seeds, the short one a part
+of the frames of one seed, which its tables scale up.
 """
 
 from __future__ import annotations
@@ -14,20 +14,22 @@ from concurrent.futures import ProcessPoolExecutor
 
 from benchmarks.plates import tables
 from benchmarks.plates.evaluate import Record, evaluate_job
-from benchmarks.plates.sets import MIN_ROWS, RENDERED_ROWS, SETS, Job, read_trials
+from benchmarks.plates.sets import LIGHT, MIN_ROWS, RENDERED_ROWS, SETS, Job, read_trials
 from benchmarks.plates.speed import measure_speed
 
-ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy")
+ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy", "light")
 NEEDS = {
     "trials": ("trial",),
     "height": ("trial", "stress", "night", "thermal", "hidden"),
     "false": ("trial", "stress", "night", "thermal", "hidden", "free"),
     "peers": ("trial", "stress"),
     "accuracy": ("trial",),
+    "light": LIGHT,
 }
 BATCH = 25
 # frames (drives for thermal) a seed: long, short
-COUNTS = {"stress": (400, 24), "night": (50, 6), "thermal": (12, 1), "hidden": (100, 10), "free": (1000, 40)}
+COUNTS = {"stress": (400, 24), "night": (50, 6), "thermal": (12, 1), "hidden": (100, 10), "free": (1000, 40),
+          **dict.fromkeys(LIGHT, (150, 10))}  # fmt: skip
 SHORT_SHARE = 0.08
 MISSED_ROWS = 16
 
@@ -38,7 +40,7 @@ def list_jobs(items: set[str], seeds: list[int], *, short: bool, only: Sequence[
     jobs = []
     for seed in seeds:
         for name in sets:
-            peers = "peers" in items and name in NEEDS["peers"]
+            peers = ("peers" in items and name in NEEDS["peers"]) or name in LIGHT
             if name == "trial":
                 share = SHORT_SHARE if short else 1.0
                 jobs += [Job(name, k, seed, 0, share, peers) for k in range(len(read_trials()))]
@@ -94,6 +96,7 @@ def main() -> None:
     if timings:
         print(f"\n### speed\n\n{len(timings) // 2} decoders take turns on each frame.\n\n{tables.speed_table(timings)}")
     _print("accuracy", items, tables.accuracy_table, records, "Over the frames decoded in the trials.")
+    _print("light", items, tables.light_table, records, _LIGHT_NOTE)
     if wrong := tables.frame_list(r for r in records if r.wrong or r.wrong_known):
         print(f"\nWrong digits:\n{wrong}")
     if args.misses:
@@ -107,6 +110,12 @@ _TRIALS_NOTE = (
     "not processed. Every seed must meet the goal ('minimum')."
 )
 _PEERS_NOTE = "The same scenes with a tag of the plate's footprint, default parameters, one thread."
+
+
+_LIGHT_NOTE = (
+    "Plates of 12 to 90 rows on a fair day but for one thing; position plates without check digits. Stains are one to "
+    "three ellipses of paint with half axes of 8 to 30 mm. The same scenes with tags of the plate's footprint."
+)
 
 
 def _print(

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.sensors.camera import Camera
 from app.simulation.camera import RenderedFrame, render_plate_scene
@@ -23,8 +24,10 @@ from app.simulation.conditions import (
     draw_daylight,
     draw_occluder,
     draw_place,
+    draw_shadow,
     draw_stress,
     draw_thermal,
+    draw_wear,
     scene_under,
 )
 from app.simulation.distractors import draw_distractor_faces, paint_distractors
@@ -39,7 +42,10 @@ HERE = Path(__file__).parent.parent
 GEOMETRY = PlateGeometry()
 MIN_ROWS = 4.0  # below this half a row a unit is left: such frames don't count as having the plate in view
 RENDERED_ROWS = 8.0  # below this frames are counted as not decoded without a look
-SETS = ("trial", "stress", "night", "thermal", "hidden", "free")
+LIGHT = ("shade", "glare", "stains", "stained-shade", "worn")
+"""Plates of a fair day but for one thing: shadows, glare, spots of paint, both, wear."""
+SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT)
+LIGHT_ROWS = (12.0, 90.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +180,7 @@ def shoot(job: Job) -> Iterator[Shot | Unseen]:
     """Frames of a job."""
     makers = {
         "trial": _trial, "stress": _stress, "night": _stress, "thermal": _thermal, "hidden": _hidden, "free": _free,
+        **dict.fromkeys(LIGHT, _light),
     }  # fmt: skip
     return makers[job.set_name](job)
 
@@ -291,6 +298,55 @@ def _pushed_out(scene: PlateScene, rng: np.random.Generator) -> PlateScene:
     shift[axis] = edge - cut[axis]
     moved = replace(camera, cx_px=camera.cx_px + float(shift[0]), cy_px=camera.cy_px + float(shift[1]))
     return replace(scene, camera=moved, faces=scene.faces[:1])
+
+
+# --- light and stains ---------------------------------------------------------------------------------------------
+
+
+def _light(job: Job) -> Iterator[Shot | Unseen]:
+    rng = job.rng
+    for _ in range(job.frames):
+        code, conditions = draw_code(rng), _draw_light(job.set_name, rng)
+        face = plate_face(code, GEOMETRY, conditions.look, conditions.wear, rng)
+        camera, placed = _draw_view(face, rng)
+        scene = scene_under(conditions, camera, (placed,), float(rng.uniform(0, 80)) / 3.6, rng)
+        background = _draw_background(camera, rng)
+        yield _shot(job.set_name, scene, background, code, draw_codebook(code, rng), conditions, rng)
+
+
+def _draw_light(name: str, rng: np.random.Generator) -> Conditions:
+    conditions = draw_daylight(rng)
+    if "shade" in name:
+        shadow = draw_shadow(rng)
+        while shadow.edge_light == 1 and shadow.dapple_light == 1:
+            shadow = draw_shadow(rng)
+        if rng.random() < 0.5:  # deeper
+            shadow = replace(
+                shadow,
+                edge_light=float(rng.uniform(0.12, 0.5)) if shadow.edge_light < 1 else 1.0,
+                dapple_light=float(rng.uniform(0.15, 0.5)) if shadow.dapple_light < 1 else 1.0,
+            )
+        conditions = replace(conditions, shadow=shadow)
+    if name == "glare":
+        at_m = (float(rng.uniform(-0.2, 0.2)), float(rng.uniform(-0.2, 0.2)))
+        size_m = (float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.1, 0.5)))
+        air = Air(glare=float(rng.uniform(0.05, 0.35)), glare_at_m=at_m, glare_size_m=size_m)
+        conditions = replace(conditions, air=air)
+    if "stain" in name:
+        conditions = replace(conditions, wear=replace(conditions.wear, paint_spots=int(rng.integers(1, 4))))
+    if name == "worn":
+        conditions = replace(conditions, wear=replace(draw_wear(rng), dirt_blobs=0))
+    return conditions
+
+
+def _draw_view(face: Face, rng: np.random.Generator) -> tuple[Camera, PlacedFace]:
+    """A camera that sees a plate of the wanted height, and the plate."""
+    while True:
+        camera = _draw_camera(rng)
+        try:
+            return camera, draw_place(camera, face, rng, LIGHT_ROWS)
+        except InvalidParameter:
+            continue
 
 
 # --- heated plates ----------------------------------------------------------------------------------------------------

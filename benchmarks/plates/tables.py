@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from benchmarks.plates.evaluate import Record
 from benchmarks.plates.peers import FAMILIES
-from benchmarks.plates.sets import read_trials
+from benchmarks.plates.sets import LIGHT, read_trials
 from benchmarks.plates.speed import Timing
 
 BINS = ((8, 12, None), (12, 16, 75), (16, 24, 95), (24, math.inf, 99))
@@ -131,6 +131,20 @@ def peers_table(records: Sequence[Record]) -> str:
             ratio = ours / theirs if theirs else math.inf
             rows.append((name, family.name, len(mine), ours, theirs, f"{ratio:.2f}", 1.5, _met(ratio >= 1.5)))
     return table(("set", "peer", "frames", "plate", "peer's tag", "ratio", "goal", "met"), rows)
+
+
+def light_table(records: Sequence[Record]) -> str:
+    """Frames decoded in one kind of light, or with one kind of damage, beside tags in the same scenes."""
+    rows = []
+    for name in LIGHT:
+        mine = [r for r in records if r.set_name == name]
+        if mine:
+            theirs = [sum(r.tags[k] for r in mine if r.tags is not None) for k in range(len(FAMILIES))]
+            alone, known = sum(r.decoded for r in mine), sum(r.decoded_known for r in mine)
+            wrong, wrong_known = sum(len(r.wrong) for r in mine), sum(len(r.wrong_known) for r in mine)
+            rows.append((name, len(mine), alone, wrong, known, wrong_known, *theirs))
+    head = ("set", "frames", "decoded", "wrong", "with codebook", "wrong", *(family.name for family in FAMILIES))
+    return table(head, rows)
 
 
 def _met(yes: bool) -> str:

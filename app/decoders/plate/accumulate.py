@@ -113,8 +113,8 @@ def _largest_agreement(evidence: Sequence[PlateEvidence]) -> list[PlateEvidence]
 
 def read_accumulated(
     evidence: Sequence[PlateEvidence], codebook: Sequence[PlateCode], camera: Camera | None = None
-) -> PlateReading:
-    """The reading that the evidence of several frames gives, placed in the frame that shows the plate largest."""
+) -> tuple[PlateReading, PlateEvidence]:
+    """The reading that several frames give together, in the one that shows the plate largest; and their evidence."""
     joint = accumulate(evidence)
     extent = np.ptp(joint.corners_px, axis=0)
     reading = PlateReading(
@@ -127,9 +127,9 @@ def read_accumulated(
     )
     reading, _decoded = read_evidence(reading, joint, codebook)
     if reading.code is None or camera is None:
-        return reading
+        return reading, joint
     pose = locate_plate(joint.corners_px, joint.corners_covariance_px2, joint.geometry, camera)
-    return replace(reading, pose=pose)
+    return replace(reading, pose=pose), joint
 
 
 def _joint_units(units: Sequence[UnitEvidence], share: float, max_unit_px: float) -> UnitEvidence:

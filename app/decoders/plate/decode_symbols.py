@@ -23,6 +23,9 @@ REGISTERED_CONFIDENCE = 0.9999
 MAX_CODEBOOK_CHANGES, RIVAL_CELLS = 3, 3
 """[cells] by which a registered position plate may differ from what was read, and by how many more every other one
 must. Source: chosen by hand; plates within 500 m share most of their digits."""
+MAX_SPENT_ALONE = 2
+"""[check symbols] that a correction may use without a registry: the others still check the digits. Source: the edge of
+a deep shadow that was taken for dark units became another plate's digits by four corrected cells, with none left."""
 MAX_SPENT_CHECKS = 4
 """[check symbols] that a correction may use. Source: the id scheme's Reed-Solomon code on 8 x 8 has four, two for a
 wrong cell and one for an erased cell."""
@@ -47,17 +50,17 @@ CHANCE_LOG_ODDS = math.log(1e6)
 UNCERTAIN_CELL, CLEAR_CELL, ERASABLE_CELL = 0.99, 0.999, 0.9999
 """[probability] of a cell below which it is uncertain, above which it is clear, and below which it may be erased.
 Source: chosen by hand."""
-CORRECTED_CONFIDENCE, FULLY_CORRECTED_CONFIDENCE = 0.9999, 0.999
-"""[probability] factor on digits after a correction below the capacity and up to it. Source: chosen by hand; any word
-is within two symbols of a codeword with probability 0.23 (decision record 0005, rule 4), letters exclude most of
-them."""
+CORRECTED_CONFIDENCE = 0.9999
+"""[probability] factor on digits after a correction. Source: chosen by hand; any word is within two symbols of a
+codeword with probability 0.23 (decision record 0005, rule 4), letters exclude most of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedSymbols:
     """A code with its probabilities, or the reason why there is none.
 
-    `confirmed` means that a plate with this code is in the codebook.
+    `confirmed` means that a plate with this code is in the codebook; `likely` is the most likely position code where
+    none is sure enough, and nothing but the doubt speaks against it.
     """
 
     code: PlateCode | None
@@ -67,6 +70,7 @@ class DecodedSymbols:
     from_codebook: bool = False
     confirmed: bool = False
     reason: str = ""
+    likely: PlateCode | None = None
 
 
 def decode_symbols(
@@ -108,10 +112,12 @@ def decode_symbols(
     if chosen is not None:
         return chosen
     if read.corrected:
-        return replace(read, code=None, reason="corrected digits of no registered plate near by")
+        return replace(read, code=None, likely=None, reason="corrected digits of no registered plate near by")
     near = min(known, key=lambda code: pattern_cost(evidence, code))
-    if read.code is not None and sum(a != b for a, b in zip(near.digits, read.code.digits, strict=True)) <= n // 2:
-        return replace(read, code=None, reason=f"close to the registered {near.digits}, but not the same")
+    shown = read.code or read.likely
+    if shown is not None and sum(a != b for a, b in zip(near.digits, shown.digits, strict=True)) <= n // 2:
+        reason = f"close to the registered {near.digits}, but not the same" if read.code is not None else read.reason
+        return replace(read, code=None, likely=None, reason=reason)
     return _refuse_damaged(read, evidence, max_damage, min_checked)
 
 
@@ -125,7 +131,8 @@ def _refuse_damaged(
     if read.code is None or evidence.damage <= max_damage:
         return read
     if read.code.scheme is not PlateScheme.ID:
-        return replace(read, code=None, reason="a unit looks stained, and these digits have no check")
+        reason = "a unit looks stained, and these digits have no check"
+        return replace(read, code=None, likely=read.code, reason=reason)
     if read.corrected or min(read.cell_confidence) < min_checked:
         return replace(read, code=None, reason="a unit looks stained, and the check was used up on uncertain cells")
     return read
@@ -181,7 +188,7 @@ def _decode_alone(evidence: UnitEvidence, n: int, min_confidence: float, *, clea
         if digits is not None and confidence >= min_confidence:
             return DecodedSymbols(digits, confidence, _floats(cells))
         uncertain = ", ".join(str(i) for i in np.flatnonzero(cells < 1 - (1 - min_confidence) / len(cells)))
-        return DecodedSymbols(None, confidence, _floats(cells), reason=f"uncertain cells: {uncertain}")
+        return DecodedSymbols(None, confidence, _floats(cells), reason=f"uncertain cells: {uncertain}", likely=digits)
     corrected = _correct(n, any_symbol, cells, evidence.level_residual > MAX_LEVEL_RESIDUAL) if clean else None
     if corrected is not None:
         return corrected
@@ -213,7 +220,7 @@ def _correct(n: int, symbols: tuple[int, ...], cells: Array, damaged: npt.NDArra
     among the cells that it leaves alone: a position plate has none.
     """
     uncertain = [int(i) for i in np.argsort(cells, kind="stable") if cells[i] < ERASABLE_CELL]
-    for erasures in ([], *(uncertain[:k] for k in range(1, min(len(uncertain), MAX_SPENT_CHECKS) + 1))):
+    for erasures in ([], *(uncertain[:k] for k in range(1, min(len(uncertain), MAX_SPENT_ALONE) + 1))):
         fixed = correct_symbols(symbols, n, erasures)
         if fixed is None:
             continue
@@ -223,13 +230,9 @@ def _correct(n: int, symbols: tuple[int, ...], cells: Array, damaged: npt.NDArra
         kept = [i for i in range(len(symbols)) if i not in changed and i not in erasures]
         letters = sum(symbols[i] > 9 and cells[i] > CLEAR_CELL for i in kept)
         unsure = sum(cells[i] < UNCERTAIN_CELL for i in kept)
-        if letters < (1 if spent < MAX_SPENT_CHECKS else 3) or unsure > 0 or damaged[kept].any():
+        if spent > MAX_SPENT_ALONE or letters == 0 or unsure > 0 or damaged[kept].any():
             continue
-        if spent > 2 and not all(damaged[i] or cells[i] < UNCERTAIN_CELL for i in changed):
-            continue  # a full correction of cells that look sound is as likely an accident as damage
-        confidence = float(np.prod(cells[kept])) * (
-            CORRECTED_CONFIDENCE if spent < MAX_SPENT_CHECKS else FULLY_CORRECTED_CONFIDENCE
-        )
+        confidence = float(np.prod(cells[kept])) * CORRECTED_CONFIDENCE
         shown = cells.copy()
         shown[list(changed)] = confidence
         return DecodedSymbols(

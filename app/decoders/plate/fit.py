@@ -66,6 +66,8 @@ class PlateFit:
         Standard deviation of the lens blur [px], length of the motion [plate sides].
     pixels : int
         Number of pixels that were used.
+    model : PlateModel
+        What was fitted.
     """
 
     plate_from_image: Array
@@ -83,6 +85,7 @@ class PlateFit:
     blur_px: float
     motion: float
     pixels: int
+    model: PlateModel
 
     @property
     def unit_px(self) -> float:
@@ -217,4 +220,5 @@ def _result(model: PlateModel, covariance: Array, misfit: Array, quality: FitQua
         blur_px=math.exp(model.pose[BLUR]),
         motion=math.sqrt(model.pose[MOTION]),
         pixels=quality.pixels,
+        model=model,
     )

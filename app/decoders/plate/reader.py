@@ -20,10 +20,11 @@ from app.decoders.plate.evidence import CLEAN_EXPLAINED, PlateEvidence, read_evi
 from app.decoders.plate.fit import PlateFit, fit_plate
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.homography import project
+from app.decoders.plate.judge import Judgement, judge_units
 from app.decoders.plate.layout import marker_centroids, unit_centres
 from app.decoders.plate.marker_colours import MarkerColours, marker_colours
 from app.decoders.plate.pose import locate_plate
-from app.decoders.plate.unit_likelihoods import unit_log_likelihoods
+from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading
@@ -79,6 +80,16 @@ class _Task:
     geometries: Sequence[PlateGeometry]
     fits: list[tuple[PlateGeometry, Array, PlateFit | None]] = field(default_factory=list)
     evidence: list[PlateEvidence] = field(default_factory=list)
+    judgements: list[tuple[PlateFit, str, Judgement | None]] = field(default_factory=list)
+
+    def judge(self, fit: PlateFit, geometry: PlateGeometry, code: PlateCode) -> Judgement | None:
+        """The judgement of a code by the pixels; that of the same fit in an earlier pass serves again."""
+        for known, digits, found in self.judgements:
+            if known is fit and digits == code.digits:
+                return found
+        found = judge_units(self.image, fit, geometry, code_units(code))
+        self.judgements.append((fit, code.digits, found))
+        return found
 
     def fit_candidate(self, signal: MarkerSignal, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
         """Fit of a candidate; that of about the same markers in an earlier pass serves again."""
@@ -312,8 +323,17 @@ def _read_fit(
         units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px,
         float(extent.min()), weakest_marker, thermal=task.image.ndim == 2, missing=missing, colours=colours,
     )  # fmt: skip
-    task.evidence.append(evidence)
-    reading, decoded = read_evidence(reading, evidence, task.codebook)
+
+    judged = False
+
+    def judge(code: PlateCode) -> Judgement | None:
+        nonlocal judged
+        judged = True
+        return task.judge(fit, geometry, code)
+
+    is_colour = task.image.ndim == 3
+    reading, decoded = read_evidence(reading, evidence, task.codebook, judge if is_colour else None)
+    task.evidence.append(replace(evidence, judged=judged and reading.code is not None))
     if reading.code is None:
         return reading
     return replace(reading, grade=grade_plate(fit, units, decoded, weakest_marker), pose=_pose(task, fit, geometry))

@@ -160,7 +160,7 @@ PATTERNS = np.array(list(itertools.product((0, 1), repeat=4)), dtype=float)
 """Dark units of each symbol of a cell, shape (16, 4): row k holds the bits of k."""
 
 
-class _Levels(NamedTuple):
+class LightLevels(NamedTuple):
     """The units' light in symbol order, their covariance, the light of the darkest and the lightest, and the haze."""
 
     values: Array
@@ -181,7 +181,7 @@ def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
     each unit; the second on the light divided by that, where the noise is even.
     """
     n = fit.units.shape[0]
-    levels = _measure_levels(fit)
+    levels = light_levels(fit)
     if levels is None:
         return None
     values = levels.values - levels.haze
@@ -225,7 +225,7 @@ def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
     )
 
 
-def _measure_levels(fit: PlateFit) -> _Levels | None:
+def light_levels(fit: PlateFit) -> LightLevels | None:
     """Light of the units and of the darkest and lightest of them; None when these differ by little more than noise."""
     n = fit.units.shape[0]
     order = _shape_order(n)
@@ -237,7 +237,7 @@ def _measure_levels(fit: PlateFit) -> _Levels | None:
     noise = math.sqrt(float(np.median(np.diag(covariance))))
     if light - dark < MIN_LEVEL_NOISE_RATIO * noise or light < MIN_LIGHT:
         return None
-    return _Levels(values, covariance, dark, light)
+    return LightLevels(values, covariance, dark, light)
 
 
 def _blur_units(fit: PlateFit) -> float:
@@ -318,8 +318,14 @@ def _level_difference(values: Array, dark: Array) -> float:
     return ONE_LEVEL_DIFFERENCE
 
 
+def code_units(code: PlateCode) -> npt.NDArray[np.bool_]:
+    """Dark units of a code in the order of the symbols' units, shape (units,)."""
+    dark: npt.NDArray[np.bool_] = code.units.reshape(-1)[unit_index(code.n).reshape(-1)] > 0
+    return dark
+
+
 def pattern_cost(evidence: UnitEvidence, code: PlateCode) -> float:
     """Cost of a code above the best pattern of all units."""
-    dark = code.units.reshape(-1)[unit_index(code.n).reshape(-1)].astype(float)
+    dark = code_units(code).astype(float)
     delta = evidence.contrast * (dark - evidence.dark)
     return float(delta @ evidence.weight @ (2 * evidence.residual + delta))

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from app.decoders.plate.accumulate import MAX_ODD_UNITS, OUT_OF_VIEW, RESOLVED_UNIT_PX, read_accumulated
 from app.decoders.plate.colour import Planes, coarse_ratio_signal, difference_signal, planes_of, ratio_signal
+from app.decoders.plate.decode_symbols import MAX_DAMAGE
 from app.decoders.plate.detect_quads import MarkerQuad, detect_marker_quads
 from app.decoders.plate.evidence import MIN_EXPLAINED_ALONE, PlateEvidence
 from app.decoders.plate.follow_plate import is_large_enough, predict_corners, view_elsewhere
@@ -216,19 +217,20 @@ class PlateVideoSearch:
         evidence = track.evidence
         if len(evidence) < 2:
             return FoundPlate(best, tuple(seen), alone, speed)
-        joint = _without_guesses(read_accumulated(evidence, self._codebook, self._camera))
+        joint, together = read_accumulated(evidence, self._codebook, self._camera)
+        joint = _without_guesses(joint)
         shown = {one.reading.code.digits for one in seen if one.reading.code is not None}
         if len(shown | ({joint.code.digits} if joint.code else set())) > 1:
             reason = "frames of the plate show different codes"
             refused = [replace(one, reading=_refused(one.reading, reason)) for one in seen]
             return FoundPlate(_refused(joint, reason), tuple(refused), (), speed, tuple(sorted(shown)))
         if joint.code is None:
-            if all(one.reading.code is None or self._stands_alone(one) for one in seen):
-                return FoundPlate(best if best.code is not None else joint, tuple(seen), alone, speed)
-            # a stain that hides in small units shows in large ones
             reason = joint.reason or "the frames together do not show the digits of one of them"
             kept = [
-                one if self._stands_alone(one) else replace(one, reading=_refused(one.reading, reason)) for one in seen
+                one
+                if one.reading.code is None or self._stands(one, together)
+                else replace(one, reading=_refused(one.reading, reason))
+                for one in seen
             ]
             alone = tuple(one.frame for one in kept if one.reading.code is not None)
             best = max((one.reading for one in kept), key=lambda r: (r.code is not None, r.confidence))
@@ -237,13 +239,21 @@ class PlateVideoSearch:
         joint = replace(joint, frames=track.evidence_frames, grade=best.grade)
         return FoundPlate(joint, tuple(_with_code(one, joint) for one in seen), alone, speed)
 
-    def _stands_alone(self, seen: SeenPlate) -> bool:
-        """Whether one frame's code needs no other frame: a check or the registry confirms it, or it hides no stain."""
+    def _stands(self, seen: SeenPlate, together: PlateEvidence) -> bool:
+        """Whether one frame's code stays where all frames together are too unsure to give one.
+
+        It does if a check or the registry confirms it, or if its units are so large that they hide no stain; else if
+        the frames together show the same units, and no stain that small units hide.
+        """
         code = seen.reading.code
         if code is None or seen.evidence is None:
             return False
-        is_resolved = seen.evidence.unit_px >= RESOLVED_UNIT_PX
-        return code.scheme is PlateScheme.ID or code.digits in self._known or is_resolved
+        if code.scheme is PlateScheme.ID or code.digits in self._known or seen.evidence.judged:
+            return True
+        if seen.evidence.unit_px >= RESOLVED_UNIT_PX:
+            return True
+        units = together.units
+        return units.damage <= MAX_DAMAGE and tuple(units.best) == code.symbols
 
 
 def _is_clear(seen: SeenPlate) -> bool:

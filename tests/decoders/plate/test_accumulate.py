@@ -53,7 +53,7 @@ def test_frames_that_are_not_read_alone_are_read_together() -> None:
     noisy = _noisy_frames(85.0, 14)
     refused = [evidence for reading, evidence in noisy if reading.code is None]
     assert len(refused) >= 3
-    together = read_accumulated(refused, (), CAMERA)
+    together, _joint = read_accumulated(refused, (), CAMERA)
     assert together.code == CODE
     assert together.pose is not None
 
@@ -63,7 +63,7 @@ def test_frames_of_two_plates_do_not_make_a_third(noisy: list[tuple[PlateReading
     scene = PlateScene(CAMERA, (PlacedFace(face_of(other), 4.0, 0.2),))
     image = render_plate_scene(scene, None, np.random.default_rng(1)).image
     foreign = [evidence for _reading, evidence in read_plates(image, camera=CAMERA) if evidence is not None]
-    mixed = read_accumulated([foreign[0], *(evidence for _reading, evidence in noisy[:1])], ())
+    mixed, _joint = read_accumulated([foreign[0], *(evidence for _reading, evidence in noisy[:1])], ())
     assert mixed.code in (None, CODE, other)
 
 

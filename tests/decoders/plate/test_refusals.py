@@ -113,7 +113,7 @@ def test_a_stain_that_turns_a_light_unit_dark_is_no_digit(seed: int) -> None:
     readings = read_face(face_of(wear=wear, seed=seed), turn_deg=20.0)
     assert digits_in(readings) == []
     assert [r.outcome for r in readings] == [PlateOutcome.UNSURE]
-    assert "stained" in readings[0].reason
+    assert "stain" in readings[0].reason
 
 
 def test_the_registry_confirms_digits_beside_a_stain() -> None:

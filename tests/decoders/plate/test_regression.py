@@ -31,8 +31,8 @@ def test_no_trial_frame_is_read_wrong(trial_records: list[Record]) -> None:
     assert wrong == []
 
 
-@pytest.mark.parametrize(("name", "frames"), [("free", 20), ("hidden", 8)])
-def test_frames_without_a_whole_plate_are_never_read_wrong(name: str, frames: int) -> None:
+@pytest.mark.parametrize(("name", "frames"), [("free", 20), ("hidden", 8), ("shade", 8), ("stained-shade", 8)])
+def test_hard_frames_are_never_read_wrong(name: str, frames: int) -> None:
     records = evaluate_job(Job(name, 0, seed=11, frames=frames))
     assert len(records) == frames
     assert [(r.number, r.wrong, r.wrong_known) for r in records if r.wrong or r.wrong_known] == []

@@ -6,8 +6,11 @@ import numpy as np
 
 from app.decoders.plate.decode_symbols import MAX_DAMAGE, decode_symbols
 from app.decoders.plate.fit import PlateFit
+from app.decoders.plate.layout import unit_edges, unit_shapes
+from app.decoders.plate.profiles import NORMAL_TABLE
+from app.decoders.plate.synthesis import PlateModel
 from app.decoders.plate.unit_likelihoods import unit_log_likelihoods
-from app.markers.plate import PlateCode
+from app.markers.plate import PlateCode, PlateGeometry
 from tests.decoders.plate.scenes import PAPER
 
 N, SIDE_PX, MIN_CONFIDENCE = 8, 40.0, 0.9995
@@ -36,6 +39,14 @@ def fit_of(
         blur_px=blur_px,
         motion=motion,
         pixels=900,
+        model=PlateModel(
+            unit_edges(PlateGeometry(N)),
+            unit_shapes(N),
+            np.array([0.0, 0.0, 1.0]),
+            np.zeros(10),
+            np.zeros(61),
+            NORMAL_TABLE,
+        ),
     )
 
 
