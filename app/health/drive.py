@@ -32,9 +32,10 @@ RATE_LIMITS = (0.05, 1.0)
 _MAX_PROBABILITY = 0.95  # source: by hand; a truck in front hides a marker in some percent of passes
 MIN_ALIVE = 0.5
 """Readings of other markers, the decaying ones of the last minutes with them, without which a miss is no evidence."""
-LONE_SHARE = 0.5
-"""Factor on the reading probability of the only CERPM on a drive that receives nothing: nothing shows that the receiver
-works, but fog and dirt do not stop it as they stop a camera. Source: by hand; 65 drives find one gone."""
+SILENT_DRIVE_FACTOR = {"cerpm": 0.5}
+"""By family: factor on the reading probability of its only marker on a drive that reads none. Nothing shows that the
+receiver of CERPMs works, but fog and dirt do not stop it as they stop a camera; of other families such a drive is no
+evidence. Source: by hand; 65 drives find a CERPM gone."""
 WRONG_WAY_SHARE = 0.6
 """Share of reversed markers from which the vehicle is on the wrong way. Source: by hand."""
 STATED_PASSES = 4.0
@@ -138,8 +139,9 @@ def _read_probabilities(passes: Sequence[Pass], vehicle: VehicleState) -> Floats
         (reads + record) / (others + recent + DOUBT_PASSES), (all_reads + record) / (all_others + recent + DOUBT_PASSES)
     )
     probability = np.minimum(expected * np.clip(rate, *RATE_LIMITS), _MAX_PROBABILITY)
-    is_lone = (np.array(families) == "cerpm") & (all_others <= 0.0) & (vehicle.expected < MIN_EXPECTED)
-    return np.where(enough, np.where(alive >= MIN_ALIVE, probability, LONE_SHARE * is_lone * probability), 0.0)
+    is_lone = (all_others <= 0.0) & (vehicle.expected < MIN_EXPECTED)
+    silent = np.array([SILENT_DRIVE_FACTOR.get(family, 0.0) for family in families]) * is_lone
+    return np.where(enough, np.where(alive >= MIN_ALIVE, 1.0, silent) * probability, 0.0)
 
 
 def _offsets(passes: Sequence[Pass], vehicle: VehicleState) -> tuple[Floats, Floats, tuple[float, float] | None]:

@@ -49,7 +49,7 @@ class HealthRules:
         What one vehicle adds to a test at most, however often it passes. [nat]
     month_passes : float
         Passes in a month that are assumed at least.
-    moved_begins : float
+    moved_test_starts : float
         Share of the passes of healthy markers with which a test for a displacement begins.
     moved_m : float
         Smallest estimated displacement of a suspect. [m]
@@ -63,7 +63,7 @@ class HealthRules:
     vehicles: int = 3  # source: chosen by hand; two may share a workshop, and so a wrong calibration
     vehicle_bound: float = 5.0  # [nat] source: by hand; at 10,000 passes a month four vehicles are needed, and five do
     month_passes: float = 100.0  # source: chosen by hand, three vehicles a day
-    moved_begins: float = 0.01  # source: the scenes of `python -m benchmarks.health`: 0.6 to 1.2 %, once 2.3 %
+    moved_test_starts: float = 0.01  # source: the scenes of `python -m benchmarks.health`: 0.6 to 1.2 %, once 2.3 %
     moved_m: float = 0.75  # [m] source: `python -m benchmarks.health`, finds 1.0 m in five passes
     disc_m: float = 0.25  # [m] source: by hand, what crews and surveys of roads are good to
 
@@ -77,7 +77,7 @@ class HealthRules:
         alpha is the allowed share over passes and kinds of tests. A test for a displacement starts only with an offset
         that lies outside of the disc.
         """
-        starts = self.moved_begins if fault is Fault.MOVED else 1.0
+        starts = self.moved_test_starts if fault is Fault.MOVED else 1.0
         tests = len(TESTED) * max(month_passes, self.month_passes) * starts
         return math.log(tests / self.false_alarm_share)
 

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from app.decoders.plate.accumulate import MAX_ODD_UNITS
-from app.decoders.plate.unit_likelihoods import LARGE_UNIT_PX
+from app.decoders.plate.unit_likelihoods import LARGE_UNIT_PX, code_units
 from app.decoders.plate.video_search import FoundPlate
 from app.families.plate.frames import DEFAULT_GEOMETRIES, PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.spooled_file import SpooledFile
 from app.formats.video.container import VideoFile, VideoKind
 from app.jobs.video_tasks import decode_segment, index_frames
-from app.markers.plate import PlateCode, unit_index
+from app.markers.plate import PlateCode
 from app.sensors.camera import Camera
 from app.services.decodes.video_task import IndexVideoTask, SegmentTask
 from benchmarks.video.drive import PassedPlate
@@ -123,7 +123,7 @@ def _compare(score: VideoScore, truth: Sequence[PassedPlate], found: Sequence[Fo
 def _correlations(plate: PassedPlate, found: Sequence[FoundPlate]) -> list[float]:
     """How much the residuals of the true units in two frames resemble each other, whitened by the model."""
     code = plate.code
-    dark = code.units.reshape(-1)[unit_index(code.n).reshape(-1)] > 0
+    dark = code_units(code)
     residuals = []
     for seen in (seen for one in found for seen in one.seen if seen.frame in plate.frames):
         evidence = seen.evidence

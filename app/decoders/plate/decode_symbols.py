@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.unit_likelihoods import MAX_LEVEL_RESIDUAL, UnitEvidence, pattern_cost
+from app.decoders.plate.verify_units import UnitVerification
 from app.markers.plate import PlateCode, PlateScheme, correct_symbols, is_codeword
 
 Array = npt.NDArray[Any]
@@ -59,8 +60,24 @@ codeword with probability 0.23 (decision record 0005, rule 4), letters exclude m
 class DecodedSymbols:
     """A code with its probabilities, or the reason why there is none.
 
-    `confirmed` means that a plate with this code is in the codebook; `likely` is the most likely position code where
-    none is sure enough, and nothing but the doubt speaks against it.
+    Attributes
+    ----------
+    code : PlateCode or None
+    confidence : float
+        Probability that the code, or the likely one, is right.
+    cell_confidence : tuple of float
+    corrected : tuple of int
+        Cells that a check or the codebook corrected.
+    from_codebook : bool
+        The codebook decided.
+    confirmed : bool
+        A plate with this code is in the codebook.
+    reason : str
+        Why there is no code.
+    likely : PlateCode or None
+        The most likely code where none is sure enough to be returned.
+    verification : UnitVerification or None
+        Of the code or the likely one, where its pixels were compared.
     """
 
     code: PlateCode | None
@@ -71,6 +88,7 @@ class DecodedSymbols:
     confirmed: bool = False
     reason: str = ""
     likely: PlateCode | None = None
+    verification: UnitVerification | None = None
 
 
 def decode_symbols(
@@ -130,12 +148,12 @@ def _refuse_damaged(
     """
     if read.code is None or evidence.damage <= max_damage:
         return read
-    if read.code.scheme is not PlateScheme.ID:
-        reason = "a unit looks stained, and these digits have no check"
-        return replace(read, code=None, likely=read.code, reason=reason)
-    if read.corrected or min(read.cell_confidence) < min_checked:
-        return replace(read, code=None, reason="a unit looks stained, and the check was used up on uncertain cells")
-    return read
+    reason = "a unit looks stained, and these digits have no check"
+    if read.code.scheme is PlateScheme.ID:
+        if not read.corrected and min(read.cell_confidence) >= min_checked:
+            return read
+        reason = "a unit looks stained, and the check was used up on uncertain cells"
+    return replace(read, code=None, likely=read.code, reason=reason)
 
 
 def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> DecodedSymbols | None:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy.typing as npt
 
 from app.decoders.plate.decode_symbols import MAX_DAMAGE, MIN_CHECKED, DecodedSymbols, decode_symbols
-from app.decoders.plate.judge import Judgement
 from app.decoders.plate.marker_colours import MarkerColours
 from app.decoders.plate.unit_likelihoods import UnitEvidence
+from app.decoders.plate.verify_units import UnitVerification
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlateReading
 
@@ -30,21 +30,23 @@ wrong frame of 5,192 in the trials of `python -m benchmarks.plates trials`, seed
 CLEAN_EXPLAINED = 0.93
 """[1] share of variance from which a word may be corrected without a registry. Source: chosen by hand; effect: `python
 -m benchmarks.plates.thresholds`."""
-MAX_WRONG, MAX_WRONG_REFUSED = 1e-3, 2e-4
-"""[probability] that a unit is wrong, by the pixels, below which digits are returned that the units show surely, and
-that they refuse. Source: trials in shade, under painted stains and in fair light, 690 frames (decision record 0029)."""
+MAX_ERROR, MAX_ERROR_REFUSED = 1e-3, 2e-4
+"""[probability] of an error by the pixels, below which digits are returned that the units show surely, and that they
+refuse. Source: trials in shade, under painted stains and in fair light, 690 frames (decision record 0029)."""
 PLAIN_OUTLIER, PLAIN_RESIDUAL = 3.0, 0.08
 """[1, contrast] `UnitEvidence.outlier_ratio` and `level_residual` below which nothing on a plate is unusual, and its
-pixels are not judged. Source: the same trials; the wrong readings had a residual of 0.096 to 0.127."""
+pixels are not compared. Source: the same trials; the wrong readings had a residual of 0.096 to 0.127."""
 MIN_CHECKED_CELL = 0.5
 """[probability] of a cell by the pixels below which a check that holds does not count. Source: chosen by hand."""
-JUDGED_UNIT_PX = 2.0
-"""[px] size of a unit from which on pixels can refuse digits that the units show surely: smaller ones show no stains.
-Source: the same trials, of 49 plates of 11 to 24 rows that are read without it 36 are left with it; chosen by hand."""
+VERIFIED_UNIT_PX, PLAIN_SMALL_RESIDUAL = 2.0, 0.15
+"""[px, contrast] size of a unit below which pixels show no stain, and the residual that is usual there. Source: the
+same trials: with the residual of larger units 36 of 49 plates of 11 to 24 rows are left, with this one 47."""
 SURE_CELL = 0.9
 """[probability] of each cell above which a refusal is `unsure`, below it `cells-undecodable`. Source: chosen by
 hand."""
 Array = npt.NDArray[Any]
+Verify = Callable[[PlateCode], UnitVerification | None]
+"""Compares the pixels of a plate with a code; None where it has too few."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,8 +75,8 @@ class PlateEvidence:
         Of the markers; None of thermal frames, and of views that were found by following a plate.
     agreeing : int
         Frames of these whose units are about the same.
-    judged : bool
-        The pixels of the frame have confirmed the code, see `judge`.
+    verification : UnitVerification or None
+        Of the code that the units show, where the frame's pixels were compared.
     """
 
     units: UnitEvidence
@@ -90,13 +92,12 @@ class PlateEvidence:
     frames: int = 1
     colours: MarkerColours | None = None
     agreeing: int = 1
-    judged: bool = False
+    verification: UnitVerification | None = None
 
 
 def read_evidence(
-    reading: PlateReading, evidence: PlateEvidence, codebook: Sequence[PlateCode],
-    judge: Callable[[PlateCode], Judgement | None] | None = None,
-) -> tuple[PlateReading, DecodedSymbols]:  # fmt: skip
+    reading: PlateReading, evidence: PlateEvidence, codebook: Sequence[PlateCode], verify: Verify | None = None
+) -> tuple[PlateReading, DecodedSymbols]:
     """Complete a reading by the code that evidence shows, or by the reason why it shows none.
 
     Parameters
@@ -106,79 +107,77 @@ def read_evidence(
     evidence : PlateEvidence
     codebook : sequence of PlateCode
         Codes of the plates registered near by.
-    judge : callable, optional
-        Judges digits that neither a check nor the registry confirms by the frame's pixels, where the units alone leave
-        a doubt.
+    verify : callable, optional
+        Compares the pixels with a code that the registry does not confirm, where something on the plate is unusual;
+        where it cannot, the units decide.
     """
-    geometry, thermal = evidence.geometry, evidence.thermal
+    thermal = evidence.thermal
     decoded = decode_symbols(
-        evidence.units, geometry.n, codebook, MIN_CONFIDENCE,
+        evidence.units, evidence.geometry.n, codebook, MIN_CONFIDENCE,
         clean=evidence.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
         min_checked=MIN_CHECKED if evidence.agreeing < 2 else 0.0,
     )  # fmt: skip
-    if judge is not None and _is_to_be_judged(evidence, decoded):
-        decoded = _judged(decoded, judge)
+    lacking, plain = _find_lacking(evidence, decoded), _is_plain(evidence, decoded)
+    if lacking is None and not plain and not decoded.confirmed and verify is not None:
+        decoded = _verified(decoded, verify)
+    has_check = decoded.code is not None and decoded.code.scheme is PlateScheme.ID
     reading = replace(
         reading,
         confidence=decoded.confidence,
         cell_confidence=decoded.cell_confidence,
         corrected_cells=decoded.corrected,
-        from_codebook=decoded.from_codebook,
+        from_codebook=decoded.from_codebook
+        or (decoded.confirmed and (lacking is not None or not (plain or has_check))),
     )
-    missing = evidence.missing
-    if decoded.code is None:
-        outcome, reason = missing or _undecoded(decoded)
-        return replace(reading, outcome=outcome, reason=reason), decoded
-    min_explained = MIN_EXPLAINED_SMALL if evidence.unit_px < SMALL_UNIT_PX else MIN_EXPLAINED_ALONE
-    weak = missing is not None or evidence.explained < min_explained
-    small = decoded.code.scheme is not PlateScheme.ID and evidence.extent_px < MIN_ROWS_ALONE * geometry.n
-    if small and not weak and not decoded.confirmed:
-        reason = f"a plate of less than {MIN_ROWS_ALONE * geometry.n:g} rows, and these digits have no check"
-        return replace(reading, outcome=PlateOutcome.UNSURE, reason=reason), decoded
-    if weak and not decoded.confirmed:
-        outcome, reason = missing or (PlateOutcome.UNSURE, "the plate's pattern explains too little of the image")
-        return replace(reading, outcome=outcome, reason=reason), decoded
-    read = replace(
-        reading, outcome=PlateOutcome.READ, code=decoded.code, from_codebook=decoded.from_codebook or weak, reason=""
-    )
-    return read, decoded
+    if decoded.code is not None and (lacking is None or decoded.confirmed):
+        return replace(reading, outcome=PlateOutcome.READ, code=decoded.code, reason=""), decoded
+    if lacking is None or (decoded.code is None and evidence.missing is None):
+        lacking = _undecoded(decoded)
+    outcome, reason = lacking
+    return replace(reading, outcome=outcome, reason=reason), decoded
 
 
-def _is_to_be_judged(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
-    """Whether the pixels decide: nothing else confirms or refuses the digits, and the units leave a doubt."""
+def _find_lacking(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOutcome, str] | None:
+    """What a plate lacks whose digits no registry confirms."""
+    if evidence.missing is not None:
+        return evidence.missing
+    if evidence.explained < (MIN_EXPLAINED_SMALL if evidence.unit_px < SMALL_UNIT_PX else MIN_EXPLAINED_ALONE):
+        return PlateOutcome.UNSURE, "the plate's pattern explains too little of the image"
+    code, min_rows = decoded.code or decoded.likely, MIN_ROWS_ALONE * evidence.geometry.n
+    if code is not None and code.scheme is not PlateScheme.ID and evidence.extent_px < min_rows:
+        return PlateOutcome.UNSURE, f"a plate of less than {min_rows:g} rows, and these digits have no check"
+    return None
+
+
+def _is_plain(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
+    """Whether the units show digits surely, and nothing on the plate is unusual."""
+    residual = float(evidence.units.level_residual.max())
+    if evidence.unit_px < VERIFIED_UNIT_PX:
+        return decoded.code is not None and residual < PLAIN_SMALL_RESIDUAL
+    return decoded.code is not None and residual < PLAIN_RESIDUAL and evidence.units.outlier_ratio < PLAIN_OUTLIER
+
+
+def _verified(decoded: DecodedSymbols, verify: Verify) -> DecodedSymbols:
+    """The code where the pixels agree with it, or the refusal with the cells that may be wrong."""
     code = decoded.code or decoded.likely
-    if code is None or decoded.confirmed or evidence.missing is not None:
-        return False
-    small = code.scheme is not PlateScheme.ID and evidence.extent_px < MIN_ROWS_ALONE * evidence.geometry.n
-    min_explained = MIN_EXPLAINED_SMALL if evidence.unit_px < SMALL_UNIT_PX else MIN_EXPLAINED_ALONE
-    if small or evidence.explained < min_explained:
-        return False
-    units = evidence.units
-    is_plain = units.outlier_ratio < PLAIN_OUTLIER and float(units.level_residual.max()) < PLAIN_RESIDUAL
-    return decoded.code is None or (evidence.unit_px >= JUDGED_UNIT_PX and not is_plain)
-
-
-def _judged(decoded: DecodedSymbols, judge: Callable[[PlateCode], Judgement | None]) -> DecodedSymbols:
-    """The code where the pixels leave no doubt, or the refusal with the cells that may be wrong."""
-    code = decoded.code or decoded.likely
-    assert code is not None
-    found = judge(code)
-    if found is None:
-        return replace(decoded, code=None)
-    cells, confidence = found.cell_confidence, 1 - found.wrong
-    if code.scheme is PlateScheme.ID:
+    found = verify(code) if code is not None else None
+    if code is None or found is None:
+        return decoded
+    decoded = replace(decoded, verification=found)
+    cells, confidence = found.cell_confidence, 1 - found.error_probability
+    if decoded.code is not None and code.scheme is PlateScheme.ID:
         # a check holds by accident in deep shade, which looks like dark units: what it did not correct must be there
         against = [i for i, cell in enumerate(cells) if cell < MIN_CHECKED_CELL and i not in decoded.corrected]
         if not against:
             return decoded
-        reason = f"the pixels speak against the cells {', '.join(map(str, against))}, though the check holds"
+        reason = f"the pixels contradict the cells {', '.join(map(str, against))}, though the check holds"
         return replace(decoded, code=None, confidence=0.0, cell_confidence=cells, reason=reason)
-    limit = MAX_WRONG if decoded.code is not None else MAX_WRONG_REFUSED
-    if found.wrong < limit:
+    limit = MAX_ERROR if decoded.code is not None else MAX_ERROR_REFUSED
+    if found.error_probability < limit:
         return replace(decoded, code=code, likely=None, confidence=confidence, cell_confidence=cells, reason="")
-    doubtful = ", ".join(str(i) for i, cell in enumerate(cells) if 1 - cell > limit / len(cells))
-    reason = f"a stain may hide units of the cells {doubtful}, and these digits have no check"
+    unsure = ", ".join(str(i) for i, cell in enumerate(cells) if 1 - cell > limit / len(cells))
+    reason = f"a stain may hide units of the cells {unsure}, and these digits have no check"
     return replace(decoded, code=None, likely=code, confidence=confidence, cell_confidence=cells, reason=reason)
 
 

@@ -20,6 +20,7 @@ from app.decoders.plate.synthesis import (
     blur_on_plate,
     field_light,
     lens_blur,
+    new_row,
     place_pixel,
     set_pose_derivatives,
     synthesize,
@@ -177,7 +178,7 @@ def set_normal_equations(
     shapes = model.values.shape[0]
     along_u = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
     along_v = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
-    row = PixelRow(np.empty(shapes, np.int64), np.zeros(shapes), np.empty(POSE), np.empty(5))
+    row = new_row(shapes)
     lens = lens_blur(model.pose, patch.grid)
     sums = PixelSums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     _clear(equations)

@@ -8,12 +8,11 @@ from app.decoders.compiled import kernel
 from app.decoders.plate.profiles import AxisProfiles, Floats
 from app.decoders.plate.quadrature import blur_quadrature
 from app.decoders.plate.synthesis import (
-    POSE,
-    PixelRow,
     PlateModel,
     PlatePatch,
     blur_on_plate,
     lens_blur,
+    new_row,
     place_pixel,
     synthesize,
 )
@@ -38,7 +37,7 @@ def set_pixel_shares(patch: PlatePatch, model: PlateModel, max_nodes: int, share
     shapes = model.values.shape[0]
     along_u = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
     along_v = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
-    row = PixelRow(np.empty(shapes, np.int64), np.zeros(shapes), np.empty(POSE), np.empty(5))
+    row = new_row(shapes)
     lens = lens_blur(model.pose, patch.grid)
     quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes)
     for y in range(patch.light.shape[0]):

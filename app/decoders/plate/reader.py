@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,11 @@ from app.decoders.plate.evidence import CLEAN_EXPLAINED, PlateEvidence, read_evi
 from app.decoders.plate.fit import PlateFit, fit_plate
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.homography import project
-from app.decoders.plate.judge import Judgement, judge_units
 from app.decoders.plate.layout import marker_centroids, unit_centres
 from app.decoders.plate.marker_colours import MarkerColours, marker_colours
 from app.decoders.plate.pose import locate_plate
 from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
+from app.decoders.plate.verify_units import UnitVerification, verify_units
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading
@@ -80,15 +81,15 @@ class _Task:
     geometries: Sequence[PlateGeometry]
     fits: list[tuple[PlateGeometry, Array, PlateFit | None]] = field(default_factory=list)
     evidence: list[PlateEvidence] = field(default_factory=list)
-    judgements: list[tuple[PlateFit, str, Judgement | None]] = field(default_factory=list)
+    verifications: list[tuple[PlateFit, str, UnitVerification | None]] = field(default_factory=list)
 
-    def judge(self, fit: PlateFit, geometry: PlateGeometry, code: PlateCode) -> Judgement | None:
-        """The judgement of a code by the pixels; that of the same fit in an earlier pass serves again."""
-        for known, digits, found in self.judgements:
+    def verify(self, fit: PlateFit, geometry: PlateGeometry, code: PlateCode) -> UnitVerification | None:
+        """The pixels compared with a code; that of the same fit in an earlier pass serves again."""
+        for known, digits, found in self.verifications:
             if known is fit and digits == code.digits:
                 return found
-        found = judge_units(self.image, fit, geometry, code_units(code))
-        self.judgements.append((fit, code.digits, found))
+        found = verify_units(self.image, fit, geometry, code_units(code))
+        self.verifications.append((fit, code.digits, found))
         return found
 
     def fit_candidate(self, signal: MarkerSignal, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
@@ -323,17 +324,9 @@ def _read_fit(
         units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px,
         float(extent.min()), weakest_marker, thermal=task.image.ndim == 2, missing=missing, colours=colours,
     )  # fmt: skip
-
-    judged = False
-
-    def judge(code: PlateCode) -> Judgement | None:
-        nonlocal judged
-        judged = True
-        return task.judge(fit, geometry, code)
-
-    is_colour = task.image.ndim == 3
-    reading, decoded = read_evidence(reading, evidence, task.codebook, judge if is_colour else None)
-    task.evidence.append(replace(evidence, judged=judged and reading.code is not None))
+    verify = partial(task.verify, fit, geometry) if task.image.ndim == 3 else None
+    reading, decoded = read_evidence(reading, evidence, task.codebook, verify)
+    task.evidence.append(replace(evidence, verification=decoded.verification))
     if reading.code is None:
         return reading
     return replace(reading, grade=grade_plate(fit, units, decoded, weakest_marker), pose=_pose(task, fit, geometry))

@@ -123,6 +123,12 @@ class PixelRow(NamedTuple):
     by: Floats
 
 
+@routine
+def new_row(shapes: int) -> PixelRow:
+    """A row without entries."""
+    return PixelRow(np.empty(shapes, np.int64), np.zeros(shapes), np.empty(POSE), np.empty(5))
+
+
 class Slopes(NamedTuple):
     """Derivatives of a pixel's light by its place, its blur along both axes, the motion's square and the node scale."""
 

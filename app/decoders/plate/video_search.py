@@ -23,7 +23,8 @@ from app.decoders.plate.evidence import MIN_EXPLAINED_ALONE, PlateEvidence
 from app.decoders.plate.follow_plate import is_large_enough, predict_corners, view_elsewhere
 from app.decoders.plate.plate_tracks import PlateTrack, PlateTracker, SeenPlate, place_candidate
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES, MAX_FITS, read_plates
-from app.markers.plate import SIDE_MM, PlateCode, PlateGeometry, PlateScheme, unit_index
+from app.decoders.plate.unit_likelihoods import code_units
+from app.markers.plate import SIDE_MM, PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlateReading
 from app.sensors.camera import Camera
 
@@ -248,7 +249,7 @@ class PlateVideoSearch:
         code = seen.reading.code
         if code is None or seen.evidence is None:
             return False
-        if code.scheme is PlateScheme.ID or code.digits in self._known or seen.evidence.judged:
+        if code.scheme is PlateScheme.ID or code.digits in self._known or seen.evidence.verification is not None:
             return True
         if seen.evidence.unit_px >= RESOLVED_UNIT_PX:
             return True
@@ -290,8 +291,7 @@ def _with_code(seen: SeenPlate, joint: PlateReading) -> SeenPlate:
 def _shows(evidence: PlateEvidence | None, code: PlateCode) -> bool:
     if evidence is None or evidence.geometry.n != code.n or evidence.missing is not None:
         return False
-    dark = code.units.reshape(-1)[unit_index(code.n).reshape(-1)] > 0
-    odd = float((dark != evidence.units.dark).mean())
+    odd = float((code_units(code) != evidence.units.dark).mean())
     return evidence.explained >= MIN_EXPLAINED_ALONE and odd <= MAX_ODD_UNITS
 
 

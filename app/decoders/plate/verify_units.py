@@ -1,14 +1,15 @@
-"""How sure each unit of a fitted plate is: light, paint and stains as competing explanations of its pixels.
+"""The units of a fitted plate verified by its pixels: light, paint and stains as competing explanations.
 
 The light on the plate is a Gaussian process, so that the edge of a shadow is no damage. For each unit the pixels around
-it are compared under these hypotheses, with the light integrated out: the unit as it was read, or the other way round;
-clean, under a smooth stain, or the other way round under a spot of paint that hides it. Whether the plate has stains at
-all follows from all of its units.
+it are compared under these hypotheses, with the light integrated out: the unit as it was read, or flipped, that is dark
+instead of light or light instead of dark; clean, under a smooth stain, or flipped under a spot of paint that hides it.
+Whether the plate has stains at all follows from all of its units.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -17,7 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.fit import PlateFit
-from app.decoders.plate.judge_kernel import MIN_PIXELS, PlatePixels, UnitHypotheses, set_unit_likelihoods
+from app.decoders.plate.hypotheses import (
+    MIN_PIXELS,
+    LightPrior,
+    PlatePattern,
+    PlatePixels,
+    Spots,
+    set_unit_likelihoods,
+)
 from app.decoders.plate.layout import unit_edges, unit_shapes
 from app.decoders.plate.patch import cut_patch
 from app.decoders.plate.pixel_shares import set_pixel_shares
@@ -74,32 +82,45 @@ hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judgement:
-    """What the pixels say of a pattern of units.
+class UnitVerification:
+    """A pattern of units, and how well the pixels of one frame or of several agree with it.
 
     Attributes
     ----------
-    unit_wrong : ndarray, shape (units,)
-        Probability that each unit, in the order of the symbols' units, is the other way round.
+    dark : ndarray of bool, shape (units,)
+        The pattern, in the order of the symbols' units.
+    log_likelihoods : ndarray, shape (units, 5)
+        Of the pixels around each unit: the unit as in the pattern, flipped, the same two under a smooth stain, and
+        flipped under a spot of paint.
+    unit_errors : ndarray, shape (units,)
+        Probability that each unit is flipped.
     """
 
-    unit_wrong: Array
+    dark: npt.NDArray[np.bool_]
+    log_likelihoods: Array
+    unit_errors: Array
 
     @property
-    def wrong(self) -> float:
-        """Probability that any unit is the other way round."""
-        return float(-np.expm1(np.log1p(-np.minimum(self.unit_wrong, 1 - 1e-12)).sum()))
+    def error_probability(self) -> float:
+        """Probability that any unit is flipped."""
+        return float(-np.expm1(np.log1p(-np.minimum(self.unit_errors, 1 - 1e-12)).sum()))
 
     @property
     def cell_confidence(self) -> tuple[float, ...]:
         """Probability that all four units of each cell are right."""
-        return tuple(float(p) for p in (1 - self.unit_wrong).reshape(-1, 4).prod(axis=1))
+        return tuple(float(p) for p in (1 - self.unit_errors).reshape(-1, 4).prod(axis=1))
 
 
-def judge_units(
+def add_up(verifications: Sequence[UnitVerification]) -> UnitVerification:
+    """What several frames of one plate show of one pattern together: log likelihoods are summed, priors count once."""
+    total = np.sum([one.log_likelihoods for one in verifications], axis=0)
+    return UnitVerification(verifications[0].dark, total, _error_probabilities(total))
+
+
+def verify_units(
     image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, dark: npt.NDArray[np.bool_]
-) -> Judgement | None:
-    """Judge a pattern of units by the pixels.
+) -> UnitVerification | None:
+    """Verify a pattern of units by the pixels.
 
     Parameters
     ----------
@@ -113,7 +134,7 @@ def judge_units(
 
     Returns
     -------
-    Judgement or None
+    UnitVerification or None
         None where the plate has too few pixels.
     """
     cut = _cut(image, fit, geometry)
@@ -124,14 +145,18 @@ def judge_units(
     parts = np.column_stack([pixels.units @ pattern, pixels.rest])
     white = pixels.units @ (1 - pattern)
     light, albedo, noise, spread = _fit_light(pixels, knots, white, parts, paints, geometry)
-    hypotheses = UnitHypotheses(
-        pattern, white + parts @ albedo, float(albedo[0]), light, noise, spread, _centres_mm(geometry),
-        REACH_PITCHES * geometry.pitch_mm, INNER_SHARE * geometry.unit_mm / 2, _spots(geometry.pitch_mm), PAINTS,
-        OPACITIES,
-    )  # fmt: skip
     likelihoods = np.empty((len(dark), 5))
-    set_unit_likelihoods(pixels, hypotheses, LIGHT_LENGTH_MM, LEVEL_VARIANCE, likelihoods)
-    return Judgement(_combine(likelihoods))
+    set_unit_likelihoods(
+        pixels,
+        PlatePattern(
+            pattern, white + parts @ albedo, float(albedo[0]), _centres_mm(geometry),
+            REACH_PITCHES * geometry.pitch_mm, INNER_SHARE * geometry.unit_mm / 2,
+        ),
+        LightPrior(light, noise, spread, LIGHT_LENGTH_MM, LEVEL_VARIANCE),
+        Spots(_spot_shapes(geometry.pitch_mm), PAINTS, OPACITIES),
+        likelihoods,
+    )  # fmt: skip
+    return UnitVerification(dark, likelihoods, _error_probabilities(likelihoods))
 
 
 def _cut(
@@ -202,8 +227,8 @@ def _fit_light(
     return light, albedo, noise, spread
 
 
-def _combine(likelihoods: Array) -> Array:
-    """Probability that each unit is the other way round, from the log likelihoods of its hypotheses."""
+def _error_probabilities(likelihoods: Array) -> Array:
+    """Probability that each unit is flipped, from the log likelihoods of its hypotheses."""
     read, flipped, read_stained, flipped_stained, flipped_spot = likelihoods.T
 
     def under(stain: float, spot: float) -> tuple[float, Array]:
@@ -253,7 +278,7 @@ def _centres_mm(geometry: PlateGeometry) -> Array:
 
 
 @lru_cache
-def _spots(pitch_mm: float) -> Array:
+def _spot_shapes(pitch_mm: float) -> Array:
     """Centre [mm], inverse shape xx, xy, yy [1/mm2] and mean radius [mm] of the spots, shape (spots, 6)."""
     found = []
     for long_mm, short_mm, turn_deg in SPOTS_MM:
