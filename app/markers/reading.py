@@ -28,6 +28,13 @@ class PlateOutcome(StrEnum):
     NOT_IN_REGISTRY = "not-in-registry"
 
 
+class Certainty(StrEnum):
+    """How sure digits are. Tentative ones give no position, until another frame or the registry confirms them."""
+
+    SURE = "sure"
+    TENTATIVE = "tentative"
+
+
 @dataclass(frozen=True, slots=True)
 class PlatePose:
     """Pose of a plate in the camera frame (OpenCV: x right, y down, z forward).
@@ -84,8 +91,12 @@ class PlateReading:
         Covariance of the flattened corners. [px2]
     code : PlateCode or None
         The digits with their scheme; only when the outcome is READ.
+    likely_code : PlateCode or None
+        Digits that are likely, but too unsure to be returned as read: a tentative reading. They give no position.
+    doubtful_cells : tuple of int
+        Of a tentative reading, the cells that may be wrong.
     confidence : float
-        Probability that all digits are right, 0 to 1.
+        Probability that all digits, or the likely ones, are right, 0 to 1.
     cell_confidence : tuple of float
         Probability that each cell's symbol is right, in reading order.
     corrected_cells : tuple of int
@@ -102,6 +113,9 @@ class PlateReading:
         Why it was refused, as a sentence.
     frames : tuple of int
         Frames whose evidence the code rests on together; empty where this frame alone shows it.
+    unit_log_likelihoods : ndarray, shape (units, 5), or None
+        Of the hypotheses on each unit under the digits, where the frame's pixels were compared: other frames of the
+        plate are added to them.
     """
 
     family: ClassVar[str] = "plate"
@@ -109,6 +123,8 @@ class PlateReading:
     corners_px: npt.NDArray[np.float64] | None = None
     corners_covariance_px2: npt.NDArray[np.float64] | None = None
     code: PlateCode | None = None
+    likely_code: PlateCode | None = None
+    doubtful_cells: tuple[int, ...] = ()
     confidence: float = 0.0
     cell_confidence: tuple[float, ...] = ()
     corrected_cells: tuple[int, ...] = ()
@@ -120,6 +136,14 @@ class PlateReading:
     width_px: float = 0.0
     reason: str = ""
     frames: tuple[int, ...] = ()
+    unit_log_likelihoods: npt.NDArray[np.float64] | None = None
+
+    @property
+    def certainty(self) -> Certainty | None:
+        """How sure the digits are; None where there are none."""
+        if self.code is not None:
+            return Certainty.SURE
+        return Certainty.TENTATIVE if self.likely_code is not None else None
 
     @property
     def digits(self) -> str | None:

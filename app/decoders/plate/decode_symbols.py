@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.unit_likelihoods import MAX_LEVEL_RESIDUAL, UnitEvidence, pattern_cost
-from app.decoders.plate.verify_units import UnitVerification
+from app.decoders.plate.unit_verification import UnitVerification
 from app.markers.plate import PlateCode, PlateScheme, correct_symbols, is_codeword
 
 Array = npt.NDArray[Any]

@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.decode_symbols import MAX_DAMAGE, MIN_CHECKED, DecodedSymbols, decode_symbols
 from app.decoders.plate.marker_colours import MarkerColours
 from app.decoders.plate.unit_likelihoods import UnitEvidence
-from app.decoders.plate.verify_units import UnitVerification
+from app.decoders.plate.unit_verification import UnitVerification
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlateReading
 
@@ -41,6 +42,9 @@ MIN_CHECKED_CELL = 0.5
 VERIFIED_UNIT_PX, PLAIN_SMALL_RESIDUAL = 2.0, 0.15
 """[px, contrast] size of a unit below which pixels show no stain, and the residual that is usual there. Source: the
 same trials: with the residual of larger units 36 of 49 plates of 11 to 24 rows are left, with this one 47."""
+MAX_TENTATIVE_ERROR = 0.1
+"""[probability] of an error up to which a refused code is returned as tentative. Source: trials of decision record
+0029."""
 SURE_CELL = 0.9
 """[probability] of each cell above which a refusal is `unsure`, below it `cells-undecodable`. Source: chosen by
 hand."""
@@ -118,8 +122,9 @@ def read_evidence(
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
         min_checked=MIN_CHECKED if evidence.agreeing < 2 else 0.0,
     )  # fmt: skip
-    lacking, plain = _find_lacking(evidence, decoded), _is_plain(evidence, decoded)
-    if lacking is None and not plain and not decoded.confirmed and verify is not None:
+    lacking, plain = _find_lacking(evidence), _is_plain(evidence, decoded)
+    small = _is_small(evidence, decoded)
+    if lacking is None and small is None and not plain and not decoded.confirmed and verify is not None:
         decoded = _verified(decoded, verify)
     has_check = decoded.code is not None and decoded.code.scheme is PlateScheme.ID
     reading = replace(
@@ -128,22 +133,44 @@ def read_evidence(
         cell_confidence=decoded.cell_confidence,
         corrected_cells=decoded.corrected,
         from_codebook=decoded.from_codebook
-        or (decoded.confirmed and (lacking is not None or not (plain or has_check))),
+        or (decoded.confirmed and (lacking is not None or small is not None or not (plain or has_check))),
     )
-    if decoded.code is not None and (lacking is None or decoded.confirmed):
-        return replace(reading, outcome=PlateOutcome.READ, code=decoded.code, reason=""), decoded
-    if lacking is None or (decoded.code is None and evidence.missing is None):
+    if decoded.code is not None and (decoded.confirmed or (lacking is None and small is None)):
+        found = decoded.verification
+        likelihoods = found.log_likelihoods if found is not None else None
+        read = replace(reading, outcome=PlateOutcome.READ, code=decoded.code, reason="")
+        return replace(read, unit_log_likelihoods=likelihoods), decoded
+    if lacking is None and not thermal:
+        reading = _tentative(reading, decoded)
+    if decoded.code is None and evidence.missing is None:
         lacking = _undecoded(decoded)
-    outcome, reason = lacking
+    outcome, reason = lacking or small or _undecoded(decoded)
     return replace(reading, outcome=outcome, reason=reason), decoded
 
 
-def _find_lacking(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOutcome, str] | None:
+def _tentative(reading: PlateReading, decoded: DecodedSymbols) -> PlateReading:
+    """The reading with the likely code, if that is as likely as a tentative one must be."""
+    code, cells = decoded.code or decoded.likely, decoded.cell_confidence
+    if code is None or decoded.confidence < 1 - MAX_TENTATIVE_ERROR:
+        return reading
+    share = (1 - decoded.confidence) / len(cells)  # as if the error was spread evenly
+    doubtful = tuple(i for i, cell in enumerate(cells) if 1 - cell >= share) or (int(np.argmin(cells)),)
+    found = decoded.verification
+    likelihoods = found.log_likelihoods if found is not None else None
+    return replace(reading, likely_code=code, doubtful_cells=doubtful, unit_log_likelihoods=likelihoods)
+
+
+def _find_lacking(evidence: PlateEvidence) -> tuple[PlateOutcome, str] | None:
     """What a plate lacks whose digits no registry confirms."""
     if evidence.missing is not None:
         return evidence.missing
     if evidence.explained < (MIN_EXPLAINED_SMALL if evidence.unit_px < SMALL_UNIT_PX else MIN_EXPLAINED_ALONE):
         return PlateOutcome.UNSURE, "the plate's pattern explains too little of the image"
+    return None
+
+
+def _is_small(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOutcome, str] | None:
+    """The refusal of digits without a check where a plate is too small for them."""
     code, min_rows = decoded.code or decoded.likely, MIN_ROWS_ALONE * evidence.geometry.n
     if code is not None and code.scheme is not PlateScheme.ID and evidence.extent_px < min_rows:
         return PlateOutcome.UNSURE, f"a plate of less than {min_rows:g} rows, and these digits have no check"
@@ -152,10 +179,12 @@ def _find_lacking(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[Pla
 
 def _is_plain(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
     """Whether the units show digits surely, and nothing on the plate is unusual."""
+    if decoded.code is None:
+        return False
     residual = float(evidence.units.level_residual.max())
     if evidence.unit_px < VERIFIED_UNIT_PX:
-        return decoded.code is not None and residual < PLAIN_SMALL_RESIDUAL
-    return decoded.code is not None and residual < PLAIN_RESIDUAL and evidence.units.outlier_ratio < PLAIN_OUTLIER
+        return decoded.code.scheme is PlateScheme.ID or residual < PLAIN_SMALL_RESIDUAL
+    return residual < PLAIN_RESIDUAL and evidence.units.outlier_ratio < PLAIN_OUTLIER
 
 
 def _verified(decoded: DecodedSymbols, verify: Verify) -> DecodedSymbols:

@@ -25,7 +25,8 @@ from app.decoders.plate.layout import marker_centroids, unit_centres
 from app.decoders.plate.marker_colours import MarkerColours, marker_colours
 from app.decoders.plate.pose import locate_plate
 from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
-from app.decoders.plate.verify_units import UnitVerification, verify_units
+from app.decoders.plate.unit_verification import UnitVerification
+from app.decoders.plate.verify_units import verify_units
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading

@@ -9,8 +9,6 @@ Whether the plate has stains at all follows from all of its units.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -31,6 +29,7 @@ from app.decoders.plate.patch import cut_patch
 from app.decoders.plate.pixel_shares import set_pixel_shares
 from app.decoders.plate.synthesis import FIRST_GAP, FIRST_ROAD, SINGLES
 from app.decoders.plate.unit_likelihoods import light_levels
+from app.decoders.plate.unit_verification import UnitVerification
 from app.markers.plate import PlateGeometry, unit_index
 
 Array = npt.NDArray[Any]
@@ -73,48 +72,6 @@ SPOTS_MM = ((17, 17, 0), (22, 22, 0), (30, 30, 0), (26, 17, 0), (17, 26, 0), (28
 chosen by hand; smaller ones leave a part of the unit in view."""
 PAINTS, OPACITIES = np.array([0.03, 0.1, 0.2, 0.35, 0.6, 0.85]), np.array([1.0, 0.8])
 """[white, 1] reflectances and opacities of the spots. Source: chosen by hand."""
-CLEAN, STAINED, STAINED_SHARE = (1e-4, 1e-5), (0.1, 0.05), 0.02
-"""[probability] of a smooth stain and of a spot on a unit of a clean and of a stained plate, and of a stained plate.
-Source: chosen by hand."""
-OVERLAP = 4.0
-"""[units] that share most of their pixels: the evidence of all units for stains counts one in so many. Source: by
-hand."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class UnitVerification:
-    """A pattern of units, and how well the pixels of one frame or of several agree with it.
-
-    Attributes
-    ----------
-    dark : ndarray of bool, shape (units,)
-        The pattern, in the order of the symbols' units.
-    log_likelihoods : ndarray, shape (units, 5)
-        Of the pixels around each unit: the unit as in the pattern, flipped, the same two under a smooth stain, and
-        flipped under a spot of paint.
-    unit_errors : ndarray, shape (units,)
-        Probability that each unit is flipped.
-    """
-
-    dark: npt.NDArray[np.bool_]
-    log_likelihoods: Array
-    unit_errors: Array
-
-    @property
-    def error_probability(self) -> float:
-        """Probability that any unit is flipped."""
-        return float(-np.expm1(np.log1p(-np.minimum(self.unit_errors, 1 - 1e-12)).sum()))
-
-    @property
-    def cell_confidence(self) -> tuple[float, ...]:
-        """Probability that all four units of each cell are right."""
-        return tuple(float(p) for p in (1 - self.unit_errors).reshape(-1, 4).prod(axis=1))
-
-
-def add_up(verifications: Sequence[UnitVerification]) -> UnitVerification:
-    """What several frames of one plate show of one pattern together: log likelihoods are summed, priors count once."""
-    total = np.sum([one.log_likelihoods for one in verifications], axis=0)
-    return UnitVerification(verifications[0].dark, total, _error_probabilities(total))
 
 
 def verify_units(
@@ -156,7 +113,7 @@ def verify_units(
         Spots(_spot_shapes(geometry.pitch_mm), PAINTS, OPACITIES),
         likelihoods,
     )  # fmt: skip
-    return UnitVerification(dark, likelihoods, _error_probabilities(likelihoods))
+    return UnitVerification(likelihoods)
 
 
 def _cut(
@@ -225,23 +182,6 @@ def _fit_light(
     seen = white + parts @ albedo
     noise = (NOISE_FACTOR * sigma) ** 2 / pixels.weight + ((MODEL_ERROR * seen) ** 2 + EDGE_ERROR**2) * light**2
     return light, albedo, noise, spread
-
-
-def _error_probabilities(likelihoods: Array) -> Array:
-    """Probability that each unit is flipped, from the log likelihoods of its hypotheses."""
-    read, flipped, read_stained, flipped_stained, flipped_spot = likelihoods.T
-
-    def under(stain: float, spot: float) -> tuple[float, Array]:
-        as_read = np.logaddexp(math.log1p(-stain) + read, math.log(stain) + read_stained)
-        other = np.logaddexp(math.log1p(-stain - spot) + flipped, math.log(stain) + flipped_stained)
-        other = np.logaddexp(other, math.log(spot) + flipped_spot)
-        return float(np.logaddexp(as_read, other).sum()), 1 / (1 + np.exp(np.clip(as_read - other, -700, 700)))
-
-    clean_total, clean = under(*CLEAN)
-    stained_total, stained = under(*STAINED)
-    log_odds = math.log(STAINED_SHARE / (1 - STAINED_SHARE)) + (stained_total - clean_total) / OVERLAP
-    share = 1 / (1 + math.exp(-min(max(log_odds, -700.0), 700.0)))
-    return share * stained + (1 - share) * clean
 
 
 @lru_cache

@@ -78,11 +78,19 @@ class ReadGeometryDocument(TypedDict):
 
 
 class PlateReadingDocument(TypedDict):
-    """A candidate plate in a frame and what was read from it."""
+    """A candidate plate in a frame and what was read from it.
+
+    `certainty` is `sure` with `digits`. It is `tentative` with `likely_digits`, which are too unsure to be matched or
+    to give a position, and `doubtful_cells`, the cells that may be wrong: other frames of an archive, or a registered
+    plate near by, may confirm them. It is null where there are no digits.
+    """
 
     outcome: str
     reason: str | None
+    certainty: str | None
     digits: str | None
+    likely_digits: str | None
+    doubtful_cells: list[int]
     scheme: str | None
     registry_number: int | None
     confidence: float
@@ -223,12 +231,16 @@ def _resolve_unregistered(code: PlateCode, position: ApproximatePosition) -> Mat
 
 
 def _reading_document(reading: PlateReading) -> PlateReadingDocument:
-    code, geometry, grade = reading.code, reading.geometry, reading.grade
+    code, likely, geometry, grade = reading.code, reading.likely_code, reading.geometry, reading.grade
+    shown = code or likely
     return {
         "outcome": str(reading.outcome),
         "reason": reading.reason or None,
+        "certainty": str(reading.certainty) if reading.certainty else None,
         "digits": reading.digits,
-        "scheme": str(code.scheme) if code else None,
+        "likely_digits": likely.digits if likely else None,
+        "doubtful_cells": [int(cell) for cell in reading.doubtful_cells],
+        "scheme": str(shown.scheme) if shown else None,
         "registry_number": code.registry_number if code and code.scheme is PlateScheme.ID else None,
         "confidence": float(reading.confidence),
         "cell_confidence": [round(float(value), 6) for value in reading.cell_confidence],

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 
 import sqlalchemy as sa
 
+from app.decoders.plate.confirm import confirm_frames
+from app.decoders.plate.pose import locate_plate
 from app.errors import WaymarkError
 from app.formats.archives import Member, count_members, is_archive, list_names, read_members
 from app.formats.frame_list import is_beside_frames
 from app.formats.images import ImageHeader
 from app.formats.spooled_file import SpooledFile
 from app.markers.plate import PlateCode
+from app.markers.reading import PlateReading
 from app.registry.database import Database
 from app.sensors.camera import Camera
 from app.services.decoder_processes import DecoderProcesses
@@ -87,6 +90,7 @@ class StartedArchive:
         self._search: tuple[NearbyMarkers, Camera | None, FrameSearch] | None = None
         self._places = FramePlaces(upload.context)
         self._ordinal = 0
+        self._with_plates: dict[int, tuple[ArchiveFrame, FrameResult]] = {}
 
     def result(self) -> ArchiveSignal:
         """Decode all frames."""
@@ -95,6 +99,7 @@ class StartedArchive:
         self._read_lists(file)
         frames = self._frames
         frames.clear()
+        self._with_plates.clear()
         self._upload.report_progress(0, total)
         self._reported_at = self._part_at = self._clock()
         for run in in_runs(self._prepare(m) for m in read_members(file, limits) if not is_beside_frames(m.name)):
@@ -103,6 +108,7 @@ class StartedArchive:
                 self._finish(self._waiting.popleft(), total)
         while self._waiting:
             self._finish(self._waiting.popleft(), total)
+        self._confirm()
         gaps, warnings = find_gaps([(frame.index, frame.captured_at) for frame in frames])
         notes = DriveNotes((*self._places.warnings, *warnings), gaps, receiver=self._places.receiver)
         return ArchiveSignal(frames, len(self._codebook), notes)
@@ -183,10 +189,42 @@ class StartedArchive:
         results = run.results(lambda: self._report(total))
         with self._database.read() as connection:
             self._frames += [self._matched(connection, frame, result) for frame, result in results]
+        self._with_plates |= {
+            frame.index: (replace(frame, picture=None), result)
+            for frame, result in results
+            if isinstance(result, FrameResult) and any(one.certainty is not None for one in _plates(result))
+        }
         self._report(total)
+
+    def _confirm(self) -> None:
+        """Match plates anew that are tentative in single frames, and that several frames confirm together."""
+        places = {frame.index: place for place, frame in enumerate(self._frames)}
+        known = self._with_plates
+        confirmed = confirm_frames([(index, _plates(known[index][1]) if index in known else ()) for index in places])
+        with self._database.read() as connection:
+            for index, plates in confirmed.items():
+                frame, result = known[index]
+                camera = frame.moment.context.camera.camera_for(result.header) if frame.moment.context.camera else None
+                others = tuple(one for one in result.readings if not isinstance(one, PlateReading))
+                readings = (*(_with_pose(one, camera) for one in plates), *others)
+                self._frames[places[index]] = self._matched(connection, frame, replace(result, readings=readings))
 
     def _matched(self, connection: sa.Connection, frame: ArchiveFrame, result: FrameResult | WaymarkError) -> ReadFrame:
         moment = frame.moment
         if isinstance(result, WaymarkError):
             return ReadFrame(frame.index, frame.name, error=result, captured_at=moment.at, pose=moment.pose)
         return read_frame(connection, self._upload, Member(frame.index, frame.name), result, frame.nearby, moment)
+
+
+def _plates(result: FrameResult) -> list[PlateReading]:
+    return [reading for reading in result.readings if isinstance(reading, PlateReading)]
+
+
+def _with_pose(reading: PlateReading, camera: Camera | None) -> PlateReading:
+    """A read plate with its pose; a tentative reading has none."""
+    corners, covariance, geometry = reading.corners_px, reading.corners_covariance_px2, reading.geometry
+    if reading.code is None or reading.pose is not None or camera is None:
+        return reading
+    if corners is None or covariance is None or geometry is None:
+        return reading
+    return replace(reading, pose=locate_plate(corners, covariance, geometry, camera))

@@ -25,7 +25,8 @@ from app.decoders.plate.hypotheses import (
 )
 from app.decoders.plate.layout import marker_centroids
 from app.decoders.plate.unit_likelihoods import code_units
-from app.decoders.plate.verify_units import UnitVerification, verify_units
+from app.decoders.plate.unit_verification import UnitVerification
+from app.decoders.plate.verify_units import verify_units
 from app.markers.plate import PlateGeometry, unit_index
 from app.simulation.plate_face import Face
 from app.simulation.plate_scene import PlacedFace, PlateScene, Shadow
