@@ -29,7 +29,7 @@ NEEDS = {
 BATCH = 25
 # frames (drives for thermal) a seed: long, short
 COUNTS = {"stress": (400, 24), "night": (50, 6), "thermal": (12, 1), "hidden": (100, 10), "free": (1000, 40),
-          **dict.fromkeys(LIGHT, (150, 10))}  # fmt: skip
+          **dict.fromkeys(LIGHT, (300, 10))}  # fmt: skip
 SHORT_SHARE = 0.08
 MISSED_ROWS = 16
 
@@ -113,8 +113,9 @@ _PEERS_NOTE = "The same scenes with a tag of the plate's footprint, default para
 
 
 _LIGHT_NOTE = (
-    "Plates of 12 to 90 rows on a fair day but for one thing; position plates without check digits. Stains are one to "
-    "three ellipses of paint with half axes of 8 to 30 mm. The same scenes with tags of the plate's footprint."
+    "Drives of five frames in which the plate has 12 to 90 rows, on a fair day but for one thing; position plates "
+    "without check digits. Stains are one to three ellipses of paint with half axes of 8 to 30 mm. Tags of the plate's "
+    "footprint in the same scenes. A drive is lost if no frame is read."
 )
 
 

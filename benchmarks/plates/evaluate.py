@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.plate_scene import FaceTruth
 from benchmarks.plates.peers import FAMILIES, reads_tag, tag_face
-from benchmarks.plates.sets import Job, Shot, Unseen, replace_face, shoot
+from benchmarks.plates.sets import LIGHT, Job, Shot, Unseen, replace_face, shoot
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,12 @@ class Record:
         Its digits were read from the frame alone, or with the codebook.
     wrong, wrong_known : tuple of str
         Digits returned as valid that are on no plate in the frame.
+    tentative : bool
+        Its digits were returned as likely, from the frame alone.
+    wrong_tentative : tuple of str
+        Likely digits that are on no plate in the frame.
+    together, wrong_together
+        As `decoded` and `wrong`, with what the frames of its drive confirm together.
     corner_errors_px : tuple of float
         Distance of each corner to the truth, where decoded.
     position_error_m : float
@@ -54,6 +61,10 @@ class Record:
     decoded_known: bool = False
     wrong: tuple[str, ...] = ()
     wrong_known: tuple[str, ...] = ()
+    tentative: bool = False
+    wrong_tentative: tuple[str, ...] = ()
+    together: bool = False
+    wrong_together: tuple[str, ...] = ()
     corner_errors_px: tuple[float, ...] = ()
     position_error_m: float = math.nan
     rolling: bool = False
@@ -63,19 +74,37 @@ class Record:
 def evaluate_job(job: Job) -> list[Record]:
     """Render and evaluate the frames of a job."""
     cv2.setNumThreads(1)
-    return [_evaluate(job, number, shot) for number, shot in enumerate(shoot(job))]
+    frames = [(shot, *_evaluate(job, number, shot)) for number, shot in enumerate(shoot(job))]
+    records = [record for _shot, record, _readings in frames]
+    if job.set_name in LIGHT:
+        for label in dict.fromkeys(record.label for record in records):
+            _add_together([place for place, record in enumerate(records) if record.label == label], frames, records)
+    return records
 
 
-def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> Record:
+def _add_together(
+    drive: list[int], frames: list[tuple[Shot | Unseen, Record, list[PlateReading]]], records: list[Record]
+) -> None:
+    """Complete the records of one drive by what its frames confirm together."""
+    confirmed = confirm_frames([(place, frames[place][2]) for place in drive])
+    for place in drive:
+        shot, record, readings = frames[place]
+        assert isinstance(shot, Shot)
+        hit, wrong = find_right(confirmed.get(place, readings), shot.code, shot.frame.truths[0])
+        records[place] = replace(record, together=hit is not None, wrong_together=wrong)
+
+
+def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> tuple[Record, list[PlateReading]]:
     if isinstance(shot, Unseen):
         tags = (False,) * len(FAMILIES) if job.peers else None
-        return Record(job.set_name, shot.label, job.seed, job.share, job.index, number, shot.height_px, tags=tags)
+        return Record(job.set_name, shot.label, job.seed, job.share, job.index, number, shot.height_px, tags=tags), []
     truth = shot.frame.truths[0] if shot.code is not None else None
     alone = decode_plates(shot.frame.image, camera=shot.camera, thermal=shot.thermal)
     known = decode_plates(shot.frame.image, camera=shot.camera, codebook=shot.codebook, thermal=shot.thermal)
     hit, wrong = find_right(alone, shot.code, truth)
     hit_known, wrong_known = find_right(known, shot.code, truth)
-    return Record(
+    likely = [r.likely_code.digits for r in alone if r.likely_code is not None]
+    record = Record(
         set_name=job.set_name,
         label=shot.label,
         seed=job.seed,
@@ -87,11 +116,14 @@ def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> Record:
         decoded_known=hit_known is not None,
         wrong=wrong,
         wrong_known=wrong_known,
+        tentative=shot.code is not None and hit is None and shot.code.digits in likely,
+        wrong_tentative=tuple(digits for digits in likely if shot.code is None or digits != shot.code.digits),
         corner_errors_px=_corner_errors(hit, truth),
         position_error_m=_position_error(hit, truth),
         rolling=shot.scene is not None and shot.scene.sensor.readout_s > 0,
         tags=_evaluate_tags(job, shot, truth),
     )
+    return record, alone
 
 
 def find_right(

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.sensors.camera import Camera
 from app.simulation.camera import RenderedFrame, render_plate_scene
@@ -46,6 +45,7 @@ LIGHT = ("shade", "glare", "stains", "stained-shade", "worn")
 """Plates of a fair day but for one thing: shadows, glare, spots of paint, both, wear."""
 SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT)
 LIGHT_ROWS = (12.0, 90.0)
+DRIVE_FRAMES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,14 +304,38 @@ def _pushed_out(scene: PlateScene, rng: np.random.Generator) -> PlateScene:
 
 
 def _light(job: Job) -> Iterator[Shot | Unseen]:
+    """Drives of a few frames each, far to near; the label is the drive's."""
     rng = job.rng
-    for _ in range(job.frames):
+    for number in range(job.frames // DRIVE_FRAMES):
         code, conditions = draw_code(rng), _draw_light(job.set_name, rng)
         face = plate_face(code, GEOMETRY, conditions.look, conditions.wear, rng)
-        camera, placed = _draw_view(face, rng)
-        scene = scene_under(conditions, camera, (placed,), float(rng.uniform(0, 80)) / 3.6, rng)
-        background = _draw_background(camera, rng)
-        yield _shot(job.set_name, scene, background, code, draw_codebook(code, rng), conditions, rng)
+        scenes = _draw_scenes(face, conditions, rng)
+        codebook, background = draw_codebook(code, rng), _draw_background(scenes[0].camera, rng)
+        for scene in scenes:
+            yield _shot(f"{job.set_name} {job.index}.{number}", scene, background, code, codebook, conditions, rng)
+
+
+def _draw_scenes(face: Face, conditions: Conditions, rng: np.random.Generator) -> list[PlateScene]:
+    """Views of a plate from a camera that passes it, evenly over those of the wanted heights."""
+    while True:
+        drive = Drive(
+            camera=_draw_camera(rng),
+            face=face,
+            speed_m_s=float(rng.uniform(5, 30)),
+            fps=30.0,
+            exposure_s=conditions.exposure_s,
+            left_m=float(rng.normal(0, 0.4)),
+            rotation_deg=float(rng.normal(0, 8)),
+            far_m=18.0,
+            road_reflectance=conditions.road_reflectance,
+            shadow=conditions.shadow,
+            air=conditions.air,
+            sensor=conditions.sensor,
+        )
+        low, high = LIGHT_ROWS
+        seen = [s for s in drive_over_plate(drive, rng) if low <= face_truth(s, s.faces[0]).height_px <= high]
+        if len(seen) >= DRIVE_FRAMES:
+            return [seen[k] for k in np.linspace(0, len(seen) - 1, DRIVE_FRAMES).round().astype(int)]
 
 
 def _draw_light(name: str, rng: np.random.Generator) -> Conditions:
@@ -337,16 +361,6 @@ def _draw_light(name: str, rng: np.random.Generator) -> Conditions:
     if name == "worn":
         conditions = replace(conditions, wear=replace(draw_wear(rng), dirt_blobs=0))
     return conditions
-
-
-def _draw_view(face: Face, rng: np.random.Generator) -> tuple[Camera, PlacedFace]:
-    """A camera that sees a plate of the wanted height, and the plate."""
-    while True:
-        camera = _draw_camera(rng)
-        try:
-            return camera, draw_place(camera, face, rng, LIGHT_ROWS)
-        except InvalidParameter:
-            continue
 
 
 # --- heated plates ----------------------------------------------------------------------------------------------------

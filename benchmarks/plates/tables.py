@@ -134,16 +134,27 @@ def peers_table(records: Sequence[Record]) -> str:
 
 
 def light_table(records: Sequence[Record]) -> str:
-    """Frames decoded in one kind of light, or with one kind of damage, beside tags in the same scenes."""
+    """Frames and drives in one kind of light, or with one kind of damage, beside tags in the same scenes."""
     rows = []
     for name in LIGHT:
         mine = [r for r in records if r.set_name == name]
-        if mine:
-            theirs = [sum(r.tags[k] for r in mine if r.tags is not None) for k in range(len(FAMILIES))]
-            alone, known = sum(r.decoded for r in mine), sum(r.decoded_known for r in mine)
-            wrong, wrong_known = sum(len(r.wrong) for r in mine), sum(len(r.wrong_known) for r in mine)
-            rows.append((name, len(mine), alone, wrong, known, wrong_known, *theirs))
-    head = ("set", "frames", "decoded", "wrong", "with codebook", "wrong", *(family.name for family in FAMILIES))
+        if not mine:
+            continue
+        drives: dict[tuple[int, str], list[Record]] = {}
+        for record in mine:
+            drives.setdefault((record.seed, record.label), []).append(record)
+        lost = [sum(not any(getattr(r, how) for r in drive) for drive in drives.values())
+                for how in ("decoded", "together", "decoded_known")]  # fmt: skip
+        theirs = [sum(r.tags[k] for r in mine if r.tags is not None) for k in range(len(FAMILIES))]
+        tentative = f"{sum(r.tentative for r in mine)} / {sum(len(r.wrong_tentative) for r in mine)}"
+        read = [
+            f"{sum(getattr(r, how) for r in mine)} / {sum(len(getattr(r, wrong)) for r in mine)}"
+            for how, wrong in (("decoded", "wrong"), ("together", "wrong_together"), ("decoded_known", "wrong_known"))
+        ]
+        rows.append((name, len(mine), read[0], tentative, *read[1:], len(drives), " / ".join(map(str, lost)), *theirs))
+    head = ("set", "frames", "sure / wrong", "tentative / wrong", "with the drive's frames / wrong",
+            "with codebook / wrong", "drives", "lost alone / with the drive's frames / with codebook",
+            *(family.name for family in FAMILIES))  # fmt: skip
     return table(head, rows)
 
 
