@@ -55,7 +55,7 @@ def confirm_frames(frames: Sequence[tuple[int, Sequence[PlateReading]]]) -> dict
         if all(one.code is not None for one in readings) or _is_contradicted(sightings, frames):
             continue
         error_probability = _joint_error(readings)
-        if error_probability >= MAX_JOINT_ERROR:
+        if error_probability is None:
             continue
         numbers = tuple(frames[frame][0] for frame, _place in sightings.places)
         for (frame, place), reading in zip(sightings.places, readings, strict=True):
@@ -94,13 +94,16 @@ def _is_contradicted(sightings: _Sightings, frames: Sequence[tuple[int, Sequence
     )  # fmt: skip
 
 
-def _joint_error(readings: Sequence[PlateReading]) -> float:
-    """Probability that the digits are wrong, by all frames together; 1 where these are too few."""
+def _joint_error(readings: Sequence[PlateReading]) -> float | None:
+    """Probability that the digits are wrong, by all frames together; None where these do not confirm them."""
     sure = [1 - one.confidence for one in readings if one.code is not None]
     if sure:
         return min(sure)
     verified = [one.unit_log_likelihoods for one in readings if one.unit_log_likelihoods is not None]
-    return add_up(verified).error_probability if len(verified) > 1 else 1.0
+    if len(verified) < 2:
+        return None
+    error_probability = add_up(verified).error_probability
+    return error_probability if error_probability < MAX_JOINT_ERROR else None
 
 
 def _read(reading: PlateReading, error_probability: float, frames: tuple[int, ...]) -> PlateReading:

@@ -115,6 +115,8 @@ class UnitEvidence:
         Of the worst unit's pixels, as in `damage`.
     scatter : float
         Mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model.
+    gap : float
+        Light of the gaps between units over that of the light units, the haze taken off.
     span : float
         Light of the light units above the dark ones. [linear, 1 = saturation]
     """
@@ -130,6 +132,7 @@ class UnitEvidence:
     residual: Array
     contrast: float
     scatter: float
+    gap: float
     span: float
 
     @property
@@ -221,6 +224,7 @@ def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
         residual=residual,
         contrast=contrast,
         scatter=scatter / len(residual),
+        gap=(fit.gap - levels.haze) / (levels.light - levels.haze),
         span=levels.light - levels.dark,
     )
 

@@ -70,7 +70,7 @@ NODES = 4
 SPOTS_MM = ((17, 17, 0), (22, 22, 0), (30, 30, 0), (26, 17, 0), (17, 26, 0), (28, 20, 45), (28, 20, 135))
 """[mm, mm, deg] half axes and turns of the spots of paint; each lies at nine places around the unit's centre. Source:
 chosen by hand; smaller ones leave a part of the unit in view."""
-PAINTS, OPACITIES = np.array([0.03, 0.1, 0.2, 0.35, 0.6, 0.85]), np.array([1.0, 0.8])
+PAINTS, OPACITIES = np.array([0.03, 0.1, 0.2, 0.35, 0.6, 0.85, 1.0, 1.15]), np.array([1.0, 0.8])
 """[white, 1] reflectances and opacities of the spots. Source: chosen by hand."""
 
 

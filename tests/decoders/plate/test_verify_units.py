@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy
 
-from app.decoders.plate.evidence import MAX_ERROR_REFUSED
+from app.decoders.plate.evidence import MAX_ERROR
 from app.decoders.plate.fit import fit_plate
 from app.decoders.plate.homography import homography_from_points, project
 from app.decoders.plate.hypotheses import (
@@ -62,7 +62,7 @@ def spotted(row: int, column: int, reflectance: float) -> Face:
 
 
 def test_a_plate_under_the_edge_of_a_shadow_is_as_it_looks() -> None:
-    assert verified(face_of(), change=in_shade).error_probability < MAX_ERROR_REFUSED
+    assert verified(face_of(), change=in_shade).error_probability < MAX_ERROR
 
 
 @pytest.mark.parametrize("unit", [0, 17, 30, 47])
@@ -78,7 +78,7 @@ def test_a_spot_of_paint_over_a_unit_makes_it_unsure(reflectance: float) -> None
     row, column = next((int(r), int(c)) for r, c in np.argwhere(PAPER.units == 0) if 2 <= r <= 5 and 2 <= c <= 5)
     covered = spotted(row, column, reflectance)
     pattern = DARK | (unit_index(8).reshape(-1) == 8 * row + column)  # what the spot makes of it
-    assert verified(covered, pattern).error_probability > MAX_ERROR_REFUSED
+    assert verified(covered, pattern).error_probability > MAX_ERROR
 
 
 def test_the_likelihoods_are_those_of_normal_distributions() -> None:

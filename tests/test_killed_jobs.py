@@ -1,0 +1,86 @@
+"""A server that is killed in the middle of a video, and in the middle of a commit of a plan, and started again."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import httpx
+import pytest
+
+from benchmarks.faults.server import FaultServer
+from tests.api.plans.test_plans import RULES, road, send_road
+from tests.formats.test_video import HEIGHT, WIDTH, video
+from tests.http import created, finished, wait_until
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+FRAMES = 1200
+"""Of the video: enough for several seconds of decoding on a fast machine."""
+KILLED_AFTER_S = (0.0, 0.02, 0.06, 0.12, 0.2)
+"""From the moment at which the commit is sent; commits take about 0.1 s on a slow machine."""
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[FaultServer]:
+    """A server in a process of its own."""
+    running = FaultServer(tmp_path / "var")
+    running.start()
+    yield running
+    running.stop()
+
+
+def test_a_video_whose_server_is_killed_is_decoded_after_the_restart(server: FaultServer) -> None:
+    context = {"camera": {"width_px": WIDTH, "height_px": HEIGHT, "horizontal_fov_deg": 60.0}}
+    with server.client() as client:
+        parts = {"file": ("drive.mp4", video(FRAMES)), "context": (None, json.dumps(context))}
+        answer = client.post("/v1/decodes", files=parts)
+        assert answer.status_code == 202, answer.text
+        path = answer.headers["location"]
+        wait_until(lambda: client.get(path).json()["progress"], "the first frames")
+        assert client.get(path).json()["state"] == "running"
+        server.kill()
+    server.start()
+    with server.client() as client:
+        decode = finished(client, path)
+        assert (decode["state"], decode["attempts"]) == ("done", 2), decode
+        assert decode["summary"]["frames"] == FRAMES
+
+
+@pytest.mark.parametrize("after_s", KILLED_AFTER_S)
+def test_a_plan_whose_server_is_killed_in_its_commit_is_committed_whole_or_not_at_all(
+    server: FaultServer, after_s: float
+) -> None:
+    with server.client() as client:
+        alignment = send_road(client, road(8.0, 47.0)).json()
+        plan = created(client, "/v1/plans", name="killed", alignment_id=alignment["id"], rules=RULES)
+        url = f"/v1/plans/{plan['id']}"
+        other = client.post("/v1/keys", json={"scope": "planner", "label": "approver"}).json()["key"]
+        head = {"If-Match": '"1"', "X-API-Key": other}
+        assert client.post(f"{url}/approve", headers=head).status_code == 200
+        with ThreadPoolExecutor(1) as pool:
+            sent = pool.submit(_commit, client, url)
+            time.sleep(after_s)
+            server.kill()
+            acknowledged = sent.result()
+    server.start()
+    with server.client() as client:
+        is_committed = client.get(url).json()["status"] == "committed"
+        if not is_committed:
+            assert not acknowledged
+            assert client.get("/v1/markers").json()["items"] == []
+            assert _commit(client, url)
+        families = Counter(marker["family"] for marker in client.get("/v1/markers?limit=1000").json()["items"])
+        assert all(families[family] == plan["counts"][family] for family in ("plate", "cerpm")), families
+        assert families["magnet"] > 0
+
+
+def _commit(client: httpx.Client, url: str) -> bool:
+    """Whether the commit was acknowledged."""
+    try:
+        return client.post(f"{url}/commit", headers={"If-Match": '"2"'}).status_code == 201
+    except httpx.TransportError:
+        return False
