@@ -25,19 +25,21 @@ benchmarks.plates.thresholds`."""
 MIN_EXPLAINED_SMALL, SMALL_UNIT_PX = 0.9, 2.5
 """[1, px] the same on units below this size, where a misplaced grid explains nearly as much. Source: chosen by hand;
 effect: `python -m benchmarks.plates.thresholds`."""
-MIN_ROWS_ALONE = 1.5
-"""[px] height of a unit in the image for digits that neither a check of 16 bits nor a registry confirms. Source: one
-wrong frame of 5,192 in the trials of `python -m benchmarks.plates trials`, seeds 71 and 72."""
+MIN_ROWS_ALONE = 1.25
+"""[px] height of a unit in the image for digits that neither a check of 16 bits nor a registry confirms. Source: frames
+of `python -m benchmarks.plates trials` of 10 to 12 rows: below it the units are rarely sure."""
 CLEAN_EXPLAINED = 0.93
 """[1] share of variance from which a word may be corrected without a registry. Source: chosen by hand; effect: `python
 -m benchmarks.plates.thresholds`."""
 MAX_ERROR = 2e-4
 """[probability] of an error by the pixels, below which digits are returned. Source: trials in shade, under painted
 stains and in fair light (decision record 0029)."""
-PLAIN_OUTLIER, PLAIN_RESIDUAL, PLAIN_GAP = 3.0, 0.08, 0.8
-"""[1, contrast, light units] `UnitEvidence.outlier_ratio`, `level_residual` and `gap` below which nothing on a plate is
-unusual, and its pixels are not compared: on gaps as light as the light units no light paint is seen. Source: the same
-trials; the wrong readings had a residual of 0.063 to 0.127."""
+PLAIN_OUTLIER, PLAIN_RESIDUAL = 3.0, 0.08
+"""[1, contrast] `UnitEvidence.outlier_ratio` and `level_residual` below which nothing on a plate is unusual, and its
+pixels are not compared. Source: the same trials; the wrong readings had a residual of 0.063 to 0.127."""
+PLAIN_GAP, GAP_UNIT_PX = 0.8, 3.0
+"""[light units, px] light of gaps above which light paint does not show on them, so that pixels are compared, and size
+of a unit from which on they are: on smaller ones they show too little to confirm anything. Source: the same trials."""
 MIN_CHECKED_CELL = 0.5
 """[probability] of a cell by the pixels below which a check that holds does not count. Source: chosen by hand."""
 VERIFIED_UNIT_PX, PLAIN_SMALL_RESIDUAL = 2.0, 0.15
@@ -191,7 +193,8 @@ def _is_plain(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
         return True
     residual = float(units.level_residual.max())
     level = residual < (PLAIN_SMALL_RESIDUAL if small else PLAIN_RESIDUAL)
-    return level and units.outlier_ratio < PLAIN_OUTLIER and units.gap < PLAIN_GAP
+    hides_paint = units.gap > PLAIN_GAP and evidence.unit_px >= GAP_UNIT_PX
+    return level and units.outlier_ratio < PLAIN_OUTLIER and not hides_paint
 
 
 def _verified(decoded: DecodedSymbols, verify: Verify) -> DecodedSymbols:

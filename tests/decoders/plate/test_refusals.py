@@ -165,7 +165,7 @@ def test_black_or_unreadable_cells_of_a_decimal_plate_are_refused(cells: tuple[i
         assert {r.outcome for r in readings} <= {PlateOutcome.UNSURE, *PAPERS_CASES}
 
 
-@pytest.mark.parametrize(("ahead_m", "turn_deg"), [(6.0, 0.0), (6.0, 4.0), (6.3, 4.0), (6.15, -5.0)])
+@pytest.mark.parametrize(("ahead_m", "turn_deg"), [(6.3, 0.0), (6.3, 4.0), (6.0, 4.0)])
 def test_digits_that_nothing_checks_need_rows_enough(ahead_m: float, turn_deg: float) -> None:
     """A worn unit of a row and a half looks like the other level now and then (one frame in 2,600)."""
 
@@ -175,8 +175,8 @@ def test_digits_that_nothing_checks_need_rows_enough(ahead_m: float, turn_deg: f
         return decode_plates(still.image, codebook=known)[0]
 
     small = read(PAPER)
+    assert 10 < (small.height_px or 0) < 12
     assert small.outcome is PlateOutcome.UNSURE
-    assert 0 < (small.height_px or 0) < 12
-    assert "rows" in small.reason
+    assert "no check" in small.reason
     assert read(PAPER, PAPER).digits == PAPER.digits
     assert read(ID).digits == ID.digits
