@@ -14,22 +14,22 @@ from concurrent.futures import ProcessPoolExecutor
 
 from benchmarks.plates import tables
 from benchmarks.plates.evaluate import Record, evaluate_job
-from benchmarks.plates.sets import LIGHT, MIN_ROWS, RENDERED_ROWS, SETS, Job, read_trials
+from benchmarks.plates.sets import LIGHT, MIN_ROWS, RENDERED_ROWS, SETS, THERMAL_KMH, Job, read_trials
 from benchmarks.plates.speed import measure_speed
 
 ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy", "light")
 NEEDS = {
     "trials": ("trial",),
-    "height": ("trial", "stress", "night", "thermal", "hidden"),
-    "false": ("trial", "stress", "night", "thermal", "hidden", "free"),
+    "height": ("trial", "stress", "night", *THERMAL_KMH, "hidden"),
+    "false": ("trial", "stress", "night", *THERMAL_KMH, "hidden", "free"),
     "peers": ("trial", "stress"),
     "accuracy": ("trial",),
     "light": LIGHT,
 }
 BATCH = 25
 # frames (drives for thermal) a seed: long, short
-COUNTS = {"stress": (400, 24), "night": (50, 6), "thermal": (12, 1), "hidden": (100, 10), "free": (1000, 40),
-          **dict.fromkeys(LIGHT, (300, 10))}  # fmt: skip
+COUNTS = {"stress": (400, 24), "night": (50, 6), "hidden": (100, 10), "free": (1000, 40),
+          **dict.fromkeys(THERMAL_KMH, (12, 1)), **dict.fromkeys(LIGHT, (300, 10))}  # fmt: skip
 SHORT_SHARE = 0.08
 MISSED_ROWS = 16
 
@@ -46,7 +46,7 @@ def list_jobs(items: set[str], seeds: list[int], *, short: bool, only: Sequence[
                 jobs += [Job(name, k, seed, 0, share, peers) for k in range(len(read_trials()))]
                 continue
             count = COUNTS[name][short]
-            if name == "thermal":
+            if name in THERMAL_KMH:
                 jobs += [Job(name, k, seed, 0) for k in range(count)]
             else:
                 sizes = [min(BATCH, count - start) for start in range(0, count, BATCH)]

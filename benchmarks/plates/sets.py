@@ -43,7 +43,8 @@ MIN_ROWS = 4.0  # below this half a row a unit is left: such frames don't count 
 RENDERED_ROWS = 8.0  # below this frames are counted as not decoded without a look
 LIGHT = ("shade", "glare", "stains", "stained-shade", "worn")
 """Plates of a fair day but for one thing: shadows, glare, spots of paint, both, wear."""
-SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT)
+THERMAL_KMH = {"thermal": 10.0, "thermal-20": 20.0, "thermal-30": 30.0}
+SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT, "thermal-20", "thermal-30")
 LIGHT_ROWS = (12.0, 90.0)
 DRIVE_FRAMES = 5
 
@@ -179,8 +180,8 @@ def find_shot(job: Job, number: int) -> Shot | Unseen:
 def shoot(job: Job) -> Iterator[Shot | Unseen]:
     """Frames of a job."""
     makers = {
-        "trial": _trial, "stress": _stress, "night": _stress, "thermal": _thermal, "hidden": _hidden, "free": _free,
-        **dict.fromkeys(LIGHT, _light),
+        "trial": _trial, "stress": _stress, "night": _stress, "hidden": _hidden, "free": _free,
+        **dict.fromkeys(THERMAL_KMH, _thermal), **dict.fromkeys(LIGHT, _light),
     }  # fmt: skip
     return makers[job.set_name](job)
 
@@ -367,19 +368,20 @@ def _draw_light(name: str, rng: np.random.Generator) -> Conditions:
 
 
 def _thermal(job: Job) -> Iterator[Shot | Unseen]:
-    """A drive at 10 km/h with a 640 x 512 thermal camera, from 16 rows on."""
+    """A drive with a 640 x 512 thermal camera, from 16 rows on."""
     rng = job.rng
     camera, code = Camera.from_field_of_view(640, 512, 50.0), draw_code(rng)
     warmth, sensor = draw_thermal(rng)
     turn = float(rng.uniform(0, 360)) if job.index % 2 else float(rng.normal(0, 3))
     drive = Drive(
-        camera, warm_face(code, GEOMETRY, warmth, rng), 10 / 3.6, 30.0, 0.01, float(rng.normal(0, 0.2)), turn, far_m=8.0
-    )
+        camera, warm_face(code, GEOMETRY, warmth, rng), THERMAL_KMH[job.set_name] / 3.6, 30.0, 0.01,
+        float(rng.normal(0, 0.2)), turn, far_m=8.0,
+    )  # fmt: skip
     codebook, background = draw_codebook(code, rng), _draw_background(camera, rng)
     for scene in drive_over_plate(drive, rng):
         if face_truth(scene, scene.faces[0]).height_px >= 16 and rng.random() < job.share:
             frame = render_thermal_scene(scene, sensor, background, rng)
-            yield Shot("thermal", frame, code, codebook, camera, thermal=True)
+            yield Shot(job.set_name, frame, code, codebook, camera, thermal=True)
 
 
 # --- no plate ---------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from benchmarks.plates.evaluate import Record
 from benchmarks.plates.peers import FAMILIES
-from benchmarks.plates.sets import LIGHT, read_trials
+from benchmarks.plates.sets import LIGHT, THERMAL_KMH, read_trials
 from benchmarks.plates.speed import Timing
 
 BINS = ((8, 12, None), (12, 16, 75), (16, 24, 95), (24, math.inf, 99))
@@ -86,9 +86,10 @@ def height_table(records: Sequence[Record]) -> str:
     for name, key, goal in (
         ("stress, 24 rows and more", "stress", 90),
         ("night with LED, 24 rows and more", "night", None),
-        ("thermal at 10 km/h, 16 rows and more", "thermal", 80),
+        *((f"thermal at {speed:.0f} km/h, 16 rows and more", name, 80 if speed == 10 else 60)
+          for name, speed in THERMAL_KMH.items()),
         ("partly hidden or out of view", "hidden", None),
-    ):
+    ):  # fmt: skip
         rows.append(_rate_row(name, [r for r in records if r.set_name == key], goal))
     head = ("set", "frames", "decoded", "rate %", "with codebook %", "goal %", "met")
     return table(head, [row for row in rows if row[1]])

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from app.decoders.plate.detect_thermal import _quad_around
+from app.decoders.plate.detect_thermal import _quad_around, without_trail
 from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
-from benchmarks.plates.sets import Job, Shot, find_shot
+from benchmarks.plates.sets import Job, Shot, find_shot, shoot
 from tests.decoders.plate.scenes import PAPER, THERMAL_CAMERA, shoot_warm
 
 CODES = [PAPER, PlateCode.from_registry_number(0xDEADBEEF)]
@@ -56,3 +56,30 @@ def test_a_warm_triangle_is_no_quadrangle() -> None:
     contour = np.array([*legs[0], *diagonal, *legs[1]], np.int32)[:, None]
     assert len(cv2.convexHull(contour)) == 3
     assert _quad_around(contour) is None
+
+
+def test_a_slow_sensor_s_trail_is_taken_off() -> None:
+    """What a pixel that follows with a lag shows of an edge that moves down is the edge again."""
+    scene, trail_px = np.zeros((60, 8)), 3.0
+    scene[30:] = 1.0
+    seen = scene.copy()
+    for row in range(58, -1, -1):  # the time before is below: the scene moves down
+        seen[row] = (scene[row] + trail_px * seen[row + 1]) / (1 + trail_px)
+    frame = np.round(40 + 160 * seen).astype(np.uint8)
+    sharp = without_trail(frame, trail_px).astype(float)
+    assert np.ptp(sharp[2:29]) < 0.05 * np.ptp(sharp)
+    assert np.ptp(sharp[31:57]) < 0.05 * np.ptp(sharp)
+    assert abs(float(sharp[31:57].mean() - sharp[2:29].mean())) > 0.9 * np.ptp(sharp)
+
+
+@pytest.mark.parametrize("set_name", ["thermal-20", "thermal-30"])
+def test_plates_are_read_at_20_and_30_km_h(set_name: str) -> None:
+    shots = [shot for index in range(4) for shot in shoot(Job(set_name, index, seed=93, frames=0, share=0.25))]
+    read = 0
+    for shot in shots:
+        assert isinstance(shot, Shot)
+        assert shot.code is not None
+        digits = {reading.digits for reading in decode_plates(shot.frame.image, thermal=True) if reading.digits}
+        assert digits <= {shot.code.digits}
+        read += bool(digits)
+    assert read >= len(shots) / 3
