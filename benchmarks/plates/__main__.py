@@ -1,7 +1,7 @@
 """``python -m benchmarks.plates [ITEM ...] [--short] [--seed N] [--seeds M]``: print the tables.
 
-Items: trials, height, false, peers, speed, accuracy, light, all. The long mode takes three seeds, the short one a part
-of the frames of one seed, which its tables scale up.
+Items: trials, height, false, peers, speed, accuracy, light, reliability, all. The long mode takes three seeds, the
+short one a part of the frames of one seed, which its tables scale up.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from benchmarks.plates.evaluate import Record, evaluate_job
 from benchmarks.plates.sets import LIGHT, MIN_ROWS, RENDERED_ROWS, SETS, THERMAL_KMH, Job, read_trials
 from benchmarks.plates.speed import measure_speed
 
-ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy", "light")
+ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy", "light", "reliability")
 NEEDS = {
     "trials": ("trial",),
     "height": ("trial", "stress", "night", *THERMAL_KMH, "hidden"),
@@ -25,6 +25,7 @@ NEEDS = {
     "peers": ("trial", "stress"),
     "accuracy": ("trial",),
     "light": LIGHT,
+    "reliability": (*LIGHT, "trial", "stress"),
 }
 BATCH = 25
 # frames (drives for thermal) a seed: long, short
@@ -97,6 +98,7 @@ def main() -> None:
         print(f"\n### speed\n\n{len(timings) // 2} decoders take turns on each frame.\n\n{tables.speed_table(timings)}")
     _print("accuracy", items, tables.accuracy_table, records, "Over the frames decoded in the trials.")
     _print("light", items, tables.light_table, records, _LIGHT_NOTE)
+    _print("reliability", items, tables.reliability_table, records, _RELIABILITY_NOTE)
     if wrong := tables.frame_list(r for r in records if r.wrong or r.wrong_known):
         print(f"\nWrong digits:\n{wrong}")
     if args.misses:
@@ -116,6 +118,12 @@ _LIGHT_NOTE = (
     "Drives of five frames in which the plate has 12 to 90 rows, on a fair day but for one thing; position plates "
     "without check digits. Stains are one to three ellipses of paint with half axes of 8 to 30 mm. Tags of the plate's "
     "footprint in the same scenes. A drive is lost if no frame is read."
+)
+
+
+_RELIABILITY_NOTE = (
+    "Readings without a registry: the confidence that they report, and the share of them that is right. All plates of "
+    "the stained sets are stained; the decoder assumes that one in fifty is."
 )
 
 

@@ -38,6 +38,9 @@ class Record:
         Its digits were returned as likely, from the frame alone.
     wrong_tentative : tuple of str
         Likely digits that are on no plate in the frame.
+    claims : tuple of (float, bool, bool)
+        Of each reading with digits or likely ones, from the frame alone: its confidence, whether it is sure, and
+        whether it is right.
     together, wrong_together
         As `decoded` and `wrong`, with what the frames of its drive confirm together.
     corner_errors_px : tuple of float
@@ -63,6 +66,7 @@ class Record:
     wrong_known: tuple[str, ...] = ()
     tentative: bool = False
     wrong_tentative: tuple[str, ...] = ()
+    claims: tuple[tuple[float, bool, bool], ...] = ()
     together: bool = False
     wrong_together: tuple[str, ...] = ()
     corner_errors_px: tuple[float, ...] = ()
@@ -116,6 +120,11 @@ def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> tuple[Record, list[
         decoded_known=hit_known is not None,
         wrong=wrong,
         wrong_known=wrong_known,
+        claims=tuple(
+            (one.confidence, one.code is not None, shot.code is not None and shown.digits == shot.code.digits)
+            for one in alone
+            if (shown := one.code or one.likely_code) is not None
+        ),
         tentative=shot.code is not None and hit is None and shot.code.digits in likely,
         wrong_tentative=tuple(digits for digits in likely if shot.code is None or digits != shot.code.digits),
         corner_errors_px=_corner_errors(hit, truth),

@@ -159,6 +159,22 @@ def light_table(records: Sequence[Record]) -> str:
     return table(head, rows)
 
 
+def reliability_table(records: Sequence[Record]) -> str:
+    """Reported confidence beside the share that is right, of sure and of tentative readings."""
+    rows = []
+    for name in (*LIGHT, "trial", "stress"):
+        claims = [claim for r in records if r.set_name == name for claim in r.claims]
+        row: list[object] = [name]
+        for wanted in (True, False):
+            mine = [(confidence, right) for confidence, sure, right in claims if sure is wanted]
+            mean = f"{np.mean([confidence for confidence, _ in mine]):.5f}" if mine else "-"
+            row += [len(mine), mean, f"{np.mean([right for _, right in mine]):.4f}" if mine else "-"]
+        if claims:
+            rows.append(tuple(row))
+    head = ("set", "sure", "mean confidence", "share right", "tentative", "mean confidence", "share right")
+    return table(head, rows)
+
+
 def _met(yes: bool) -> str:
     return "yes" if yes else "**no**"
 
