@@ -30,15 +30,24 @@ Ints = npt.NDArray[np.int64]
 Grey = npt.NDArray[np.uint8]
 Signal = npt.NDArray[np.int16]
 
-MAX_CANDIDATES = 12
+MAX_CANDIDATES = 40
 """[candidates] of one signal. Source: chosen by hand, for speed."""
-MIN_INTERIOR = 2.5
+MIN_RANK = -3.0
+"""[log odds] rank below which a quadruple is no candidate. Source: chosen by hand: the grid between the markers decides
+(`filter_candidates`)."""
+MIN_INTERIOR = 1.0
 """[standard deviations] colour margin of the weakest markers. Source: chosen by hand."""
-MIN_BEST_RANK = -1.0
-"""[log odds] rank that a quadruple could reach at best. Source: chosen by hand, for speed."""
+MAX_MARGIN_LOG = 3.7
+"""[log] colour margin of the best plates: a quadruple that needs more for a rank of 0 is left out. Source: chosen by
+hand, for speed: 40 standard deviations."""
+MAX_RANKED = 400
+"""[quadruples] whose colours are measured, those that need the least margin. Source: chosen by hand, for speed."""
+MARGIN_WEIGHT_COMPLETE, MARGIN_WEIGHT = 1.86, 2.0
+"""[log odds] by which a rank rises with the logarithm of the margin: with all squares seen, with one missing. Source:
+as of `_wanted_margins`."""
 MIN_SAMPLES, MIN_RANGE = 12, 8
 """[points, grey levels] between the markers: inside the frame, and range of their luma. Source: chosen by hand."""
-NO_PLATE = -1.0
+NO_PLATE = -100.0
 """Rank and colour margin of what is no plate. Source: below all limits."""
 SAME_PLACE = 0.25
 """[extent of a quadruple] between the centres of two that overlap. Source: chosen by hand."""
@@ -58,7 +67,7 @@ class MarkerQuad:
     found : int
         Bits 1, 2, 4: which of the three green squares were seen; the others are implied by the affine map.
     rank : float
-        How likely it is a plate: above 0 worth a fit.
+        How likely it is a plate by its markers alone, 0 for even odds.
     size_ratio : float
         Distance between marker centres over the side of a marker; distinguishes 8, 10 and 12 units.
     """
@@ -78,13 +87,18 @@ def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     quads = np.empty((MAX_QUADS, QUAD_COLUMNS))
     found = join_green_triples(blobs, greens, signal.opponent, quads)
     found = join_red_quads(blobs, reds, greens, quads, found)
-    _rank(quads[:found], signal.opponent, signal.planes.luma, signal.scale)
-    order = np.argsort(-quads[:found, RANK], kind="stable")
+    wanted = _wanted_margins(quads[:found], signal.scale)
+    possible = np.flatnonzero(wanted < MAX_MARGIN_LOG)
+    if len(possible) > MAX_RANKED:
+        possible = np.sort(possible[np.argpartition(wanted[possible], MAX_RANKED)[:MAX_RANKED]])
+    likely = quads[possible]
+    _rank(likely, wanted[possible], signal.opponent, signal.planes.luma)
+    order = np.argsort(-likely[:, RANK], kind="stable")
     return [
         MarkerQuad(
             _full_px(row[:8].reshape(4, 2), signal.scale), int(row[FOUND]), float(row[RANK]), float(row[SIZE_RATIO])
         )
-        for row in quads[_suppress(quads, order, MAX_CANDIDATES)]
+        for row in likely[_suppress(likely, order, MAX_CANDIDATES)]
     ]
 
 
@@ -94,28 +108,32 @@ def _full_px(points: Floats, scale: int) -> Floats:
 
 
 @ieee_kernel
-def _rank(quads: Floats, opponent: Signal, luma: Grey, scale: int) -> None:
-    """Set the rank: how likely each quadruple is a plate.
+def _wanted_margins(quads: Floats, scale: int) -> Floats:
+    """Logarithm of the colour margin with which each quadruple's rank is 0.
 
-    With all squares seen it is the logarithm of the odds, by logistic regression over 3,600 candidates in simulated
-    frames, and 2.6; with one missing, hardly any candidate is a plate, and only a strong one counts.
+    With all squares seen the rank is the logarithm of the odds that it is a plate, by logistic regression over 3,600
+    candidates in simulated frames, and 2.6; with one missing, hardly any is a plate, and only a strong one counts.
     """
-    for quad in quads:
-        # the rank with a colour margin and a size of the best plates
-        best = 1.14 * quad[SCORE] - 5.0 if quad[FOUND] == FOUND_ALL else quad[SCORE]
-        quad[RANK] = NO_PLATE
-        if best < MIN_BEST_RANK:
-            continue
-        margin = _colour_margin(opponent, luma, quad)
-        if margin < MIN_INTERIOR:
-            continue
+    wanted = np.empty(quads.shape[0])
+    for k in range(quads.shape[0]):
+        quad = quads[k]
         area = abs((quad[2] - quad[0]) * (quad[7] - quad[1]) - (quad[3] - quad[1]) * (quad[6] - quad[0]))
         size = np.log10(max(area * scale * scale, 1.0))
         if quad[FOUND] == FOUND_ALL:
-            quad[RANK] = 1.14 * quad[SCORE] + 1.86 * np.log(margin) + 1.99 * size - 0.51 * size**2 - 9.4
+            wanted[k] = (9.4 - 1.14 * quad[SCORE] - 1.99 * size + 0.51 * size**2) / MARGIN_WEIGHT_COMPLETE
         else:
-            wanted = min(max(4.5 * size - 5.8, 5.0), 8.7 + max(size - 3.5, 0.0))
-            quad[RANK] = quad[SCORE] + 2.0 * np.log(margin) - wanted
+            wanted[k] = (min(max(4.5 * size - 5.8, 5.0), 8.7 + max(size - 3.5, 0.0)) - quad[SCORE]) / MARGIN_WEIGHT
+    return wanted
+
+
+@ieee_kernel
+def _rank(quads: Floats, wanted: Floats, opponent: Signal, luma: Grey) -> None:
+    """Set the rank: how likely each quadruple is a plate, by how far its colour margin exceeds the wanted one."""
+    for k in range(quads.shape[0]):
+        quad = quads[k]
+        margin = _colour_margin(opponent, luma, quad)
+        weight = MARGIN_WEIGHT_COMPLETE if quad[FOUND] == FOUND_ALL else MARGIN_WEIGHT
+        quad[RANK] = weight * (np.log(margin) - wanted[k]) if margin >= MIN_INTERIOR else NO_PLATE
 
 
 class _Interior(NamedTuple):
@@ -163,7 +181,7 @@ def _sample_interior(opponent: Signal, luma: Grey, quad: Floats) -> _Interior:
 def _colour_margin(opponent: Signal, luma: Grey, quad: Floats) -> float:
     """How far the weakest markers' colours stand out of what lies between the markers, in its standard deviations.
 
-    Between the markers a plate is neutral and has contrast; foliage has colour all over, a road has no contrast: -1.
+    Between the markers a plate is neutral and has contrast; foliage has colour all over; `NO_PLATE` without contrast.
     The second weakest marker counts with a fifth of the weakest: one marker may be worn.
     """
     height, width = opponent.shape
@@ -193,7 +211,7 @@ def _suppress(quads: Floats, order: Ints, max_kept: int) -> Ints:
     count = 0
     for k in order:
         q = quads[k]
-        if q[RANK] <= 0.0 or count == max_kept:
+        if q[RANK] <= MIN_RANK or count == max_kept:
             break
         x = (q[0] + q[2] + q[4] + q[6]) / 4
         y = (q[1] + q[3] + q[5] + q[7]) / 4

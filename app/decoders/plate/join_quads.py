@@ -23,10 +23,10 @@ MAX_REDS = 150
 """[blobs] red ones that are tried, strongest first. Source: chosen by hand, for speed."""
 MAX_GREENS = 160
 """[blobs] green ones that are tried, strongest first. Source: chosen by hand, for speed."""
-MAX_NEAR = 8
+MAX_NEAR = 6
 """[blobs] green ones that are tried around a marker. Source: chosen by hand, for speed."""
-MAX_QUADS = 1000
-"""[quadruples] in all, and at most half of them from three squares. Source: chosen by hand, for speed."""
+MAX_QUADS = MAX_GREENS * MAX_NEAR * (MAX_NEAR - 1) + 3 * MAX_REDS * MAX_NEAR * (MAX_NEAR - 1)
+"""[quadruples] as many as there can be: two squares beside each green one, two in three roles beside each red one."""
 SEARCH_SIDES, SEARCH_PX = 7.0, 10.0
 """[extent of a marker, px] around it where others of its plate may be, their sum. Source: 5.3 sides on 12 x 12
 (`MARKER_RATIO`), the rest chosen by hand."""
@@ -44,22 +44,22 @@ hand."""
 SIZE_RATIO_RANGE = (1.6, 7.5)
 """[1] distance between marker centres over the side of a marker. Source: 3.2 to 5.3 (`MARKER_RATIO`), halved and half
 as much again for blur and wear."""
-MAX_TRIPLE_SHAPE, MAX_PAIR_SHAPE, MAX_FOURTH_SHAPE = 1.8, 2.2, 2.5
-"""[log] shape error of each of three squares, of each of two beside a triangle, of the remaining one. Source: chosen by
-hand."""
+MAX_TRIPLE_SHAPE, MAX_PAIR_SHAPE, MAX_FOURTH_SHAPE = 6.05, 9.03, 12.2
+"""[1] shape ratio of each of three squares, of each of two beside a triangle, of the remaining one. Source: e^1.8,
+e^2.2, e^2.5; chosen by hand."""
 MAX_FOURTH_DISTANCE = 0.3
 """[plate sides] of the fourth marker from where the other three place it. Source: chosen by hand."""
 PALE_RED = 0.1
 """[strongest signal of the squares] red of a triangle below which it is pale, as in worn plates. Source: chosen by
 hand."""
-MAX_PALE_SHAPE, MAX_PALE_AREA_LOG = 1.0, 0.7
-"""[log, log] shape error and ratio of areas of the squares beside a pale triangle. Source: chosen by hand."""
+MAX_PALE_SHAPE, MAX_PALE_AREA_LOG = 2.72, 0.7
+"""[1, log] shape ratio and ratio of areas of the squares beside a pale triangle. Source: chosen by hand."""
 BLUR_VARIANCE = 0.3
 """[px^2 of the signal] that blur adds to a marker's moments. Source: chosen by hand."""
 TRIANGLE_OFFSET = 0.1667
 """[marker sides] of the triangle's centroid from that of a square in its place. Source: 1 / 2 - 1 / 3."""
-NO_SHAPE = 9.0
-"""[log] shape error where there is no positive covariance. Source: above all limits."""
+NO_SHAPE = 1.0e4
+"""[1] shape ratio where there is no positive covariance. Source: above all limits."""
 
 FOUND_ALL = 7
 CENTROIDS, SCORE, FOUND, SIZE_RATIO, RANK = 0, 8, 9, 10, 11
@@ -106,8 +106,8 @@ def _square_moments(sides: _Sides, size_ratio: float) -> _Moments:
 
 
 @ieee_routine
-def _shape_error(blob: Floats, expected: _Moments) -> float:
-    """Largest magnitude of the logarithms of the eigenvalues of inv(expected) measured: 0 where both shapes agree."""
+def _shape_ratio(blob: Floats, expected: _Moments) -> float:
+    """Largest eigenvalue of inv(expected) measured, or of its inverse: 1 where both shapes agree."""
     xx = blob[XX] + BLUR_VARIANCE
     yy = blob[YY] + BLUR_VARIANCE
     xy = blob[XY]
@@ -123,7 +123,7 @@ def _shape_error(blob: Floats, expected: _Moments) -> float:
     high = trace / 2 + root
     if low <= 0:
         return NO_SHAPE
-    return math.log(max(high, 1.0 / low))  # one logarithm has the larger magnitude, on whichever side of 1 both are
+    return max(high, 1.0 / low)
 
 
 @ieee_routine
@@ -185,13 +185,13 @@ def _red_at(opponent: Signal, x: float, y: float, sides: _Sides, size_ratio: flo
 
 
 @step
-def _triple_shape_error(corner: Floats, right: Floats, below: Floats, moments: _Moments) -> float:
-    """Largest shape error of three squares; the first above the limit ends the search."""
-    shape = _shape_error(corner, moments)
+def _triple_shape_ratio(corner: Floats, right: Floats, below: Floats, moments: _Moments) -> float:
+    """Largest shape ratio of three squares; the first above the limit ends the search."""
+    shape = _shape_ratio(corner, moments)
     if shape <= MAX_TRIPLE_SHAPE:
-        shape = max(shape, _shape_error(right, moments))
+        shape = max(shape, _shape_ratio(right, moments))
     if shape <= MAX_TRIPLE_SHAPE:
-        shape = max(shape, _shape_error(below, moments))
+        shape = max(shape, _shape_ratio(below, moments))
     return shape
 
 
@@ -208,7 +208,7 @@ def _add_triple(corner: Floats, right: Floats, below: Floats, opponent: Signal, 
     size_ratio = math.sqrt(cross / (right[AREA] * below[AREA] * corner[AREA]) ** (1.0 / 3.0))
     if size_ratio < SIZE_RATIO_RANGE[0] or size_ratio > SIZE_RATIO_RANGE[1]:
         return found
-    shape = _triple_shape_error(corner, right, below, _square_moments(sides, size_ratio))
+    shape = _triple_shape_ratio(corner, right, below, _square_moments(sides, size_ratio))
     if shape > MAX_TRIPLE_SHAPE:
         return found
     # the triangle's centroid is nearer to the plate's corner than a square's: a third of its side, not a half
@@ -218,11 +218,11 @@ def _add_triple(corner: Floats, right: Floats, below: Floats, opponent: Signal, 
     amplitude = (right[PEAK] * below[PEAK] * corner[PEAK]) ** (1.0 / 3.0)
     pale = red < PALE_RED * amplitude
     area_log = abs(math.log(right[AREA] / below[AREA]))
-    if found >= MAX_QUADS // 2 or (pale and (shape > MAX_PALE_SHAPE or area_log > MAX_PALE_AREA_LOG)):
+    if pale and (shape > MAX_PALE_SHAPE or area_log > MAX_PALE_AREA_LOG):
         return found
     quads[found, SCORE] = (
         4.0
-        - 0.7 * shape
+        - 0.7 * math.log(shape)
         - 0.5 * area_log
         - abs(math.log(right[PEAK] / below[PEAK]))
         + 0.5 * math.log(max(red, PALE_RED * amplitude) * amplitude)
@@ -319,7 +319,7 @@ def _find_fourth(
         ex = blob[X] - x
         ey = blob[Y] - y
         off = max(abs(ex * sides.qy - ey * sides.qx), abs(sides.px * ey - sides.py * ex)) / cross
-        if off < best and _shape_error(blob, moments) < MAX_FOURTH_SHAPE:
+        if off < best and _shape_ratio(blob, moments) < MAX_FOURTH_SHAPE:
             best = off
             fourth = m
     return _Fourth(fourth, best)
@@ -359,21 +359,21 @@ def _add_pair(
     if size_ratio < SIZE_RATIO_RANGE[0] or size_ratio > SIZE_RATIO_RANGE[1]:
         return found, complete_seen
     moments = _square_moments(sides, size_ratio)
-    shape = _shape_error(first, moments)
+    shape = _shape_ratio(first, moments)
     if shape <= MAX_PAIR_SHAPE:
-        shape = max(shape, _shape_error(second, moments))
+        shape = max(shape, _shape_ratio(second, moments))
     if shape > MAX_PAIR_SHAPE:
         return found, complete_seen
     x = red[X] + (sides.px if role != TOP_RIGHT_ROLE else 0.0) + (sides.qx if role != RIGHT_BOTTOM_ROLE else 0.0)
     y = red[Y] + (sides.py if role != TOP_RIGHT_ROLE else 0.0) + (sides.qy if role != RIGHT_BOTTOM_ROLE else 0.0)
     fourth = _find_fourth(blobs, near, i, j, x, y, sides, moments)
     is_complete = fourth.near >= 0
-    if (is_complete and role != TOP_BOTTOM_ROLE) or (not is_complete and complete_seen) or found >= MAX_QUADS:
+    if (is_complete and role != TOP_BOTTOM_ROLE) or (not is_complete and complete_seen):
         return found, complete_seen
     quads[found, SCORE] = (
         (5.5 - 6.0 * fourth.distance if is_complete else 0.0)
-        - 0.7 * shape
-        - 0.3 * _shape_error(red, moments)
+        - 0.7 * math.log(shape)
+        - 0.3 * math.log(_shape_ratio(red, moments))
         - 0.5 * abs(math.log(first[AREA] / second[AREA]))
         + 0.5 * math.log(red[PEAK] * math.sqrt(first[PEAK] * second[PEAK]))
     )

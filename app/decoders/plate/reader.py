@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.colour import MarkerSignal, coarse_ratio_signal, difference_signal, half_planes, ratio_signal
-from app.decoders.plate.detect_quads import MARKER_RATIO, MarkerQuad, detect_marker_quads
+from app.decoders.plate.colour import MarkerSignal, half_planes
+from app.decoders.plate.detect_quads import MarkerQuad
 from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, fit_warm_plates
 from app.decoders.plate.evidence import CLEAN_EXPLAINED, PlateEvidence, read_evidence
+from app.decoders.plate.find_candidates import Candidate, find_candidates
 from app.decoders.plate.fit import PlateFit, fit_plate
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.homography import project
@@ -33,8 +34,6 @@ from app.markers.reading import PlateOutcome, PlatePose, PlateReading
 from app.sensors.camera import Camera
 
 DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
-MAX_FITS = 5
-"""[candidates] that are fitted for one signal. Source: chosen by hand, for speed."""
 MIN_EXPLAINED = 0.6
 """[1] share of the pixels' variance below which a candidate is no plate. Source: chosen by hand."""
 STRONG_RANK = 3.5
@@ -61,9 +60,6 @@ CLEAR_EXPLAINED, CLEAR_MARGIN = 0.93, 8.0
 hand."""
 MAX_CENTROID_SHIFT = (0.15, 1.5)
 """[plate, px] distance of the fitted markers from the detected ones, the sum of both. Source: chosen by hand."""
-SIZE_MISFIT_RANGE, CLOSE_SIZE_MISFIT, WORN_RATIO = (-0.4, 0.55), 0.4, 0.95
-"""[log, log, 1] measured over expected `MARKER_RATIO` of a geometry that is tried, of one that is tried first, and the
-usual ratio. Source: chosen by hand; wear and blur change the size of markers."""
 MIN_SIDE_PX = 24
 """[px] least side of a frame. Source: chosen by hand; no plate that can be read fits in less."""
 SAME_MARKER = 0.03
@@ -177,11 +173,10 @@ def _decode_colour(task: _Task) -> list[PlateReading]:
     image = task.image
     planes = half_planes(image)
     readings: list[PlateReading] = []
-    for signal_of in (difference_signal, ratio_signal, coarse_ratio_signal):
-        signal = signal_of(planes)
-        for quad in detect_marker_quads(signal)[:MAX_FITS]:
-            if not any(_covers(reading, quad) for reading in readings):
-                readings += _read_candidate(task, signal, quad)
+    for signal, candidates in find_candidates(planes, task.geometries):
+        for candidate in candidates:
+            if not any(_covers(reading, candidate.quad) for reading in readings):
+                readings += _read_candidate(task, signal, candidate)
         if any(reading.code for reading in readings):
             break
     return readings
@@ -255,18 +250,11 @@ def _suppress_overlapping(readings: list[PlateReading]) -> Iterator[PlateReading
             yield reading
 
 
-def _likely_geometries(quad: MarkerQuad, geometries: Sequence[PlateGeometry]) -> list[PlateGeometry]:
-    """Geometries whose markers may be as large as the candidate's, close ones first; wear makes markers smaller."""
-    misfit = {g: math.log(quad.size_ratio / (WORN_RATIO * MARKER_RATIO[g.n])) for g in geometries}
-    possible = [g for g in geometries if SIZE_MISFIT_RANGE[0] < misfit[g] < SIZE_MISFIT_RANGE[1]]
-    possible = possible or [min(geometries, key=lambda g: abs(misfit[g]))]
-    return sorted(possible, key=lambda g: abs(misfit[g]) > CLOSE_SIZE_MISFIT)
-
-
-def _read_candidate(task: _Task, signal: MarkerSignal, quad: MarkerQuad) -> list[PlateReading]:
-    """The candidate's best reading under the geometries that fit it; empty when it is no plate."""
+def _read_candidate(task: _Task, signal: MarkerSignal, candidate: Candidate) -> list[PlateReading]:
+    """The candidate's best reading under its geometries; empty when it is no plate."""
     best: PlateReading | None = None
-    for geometry in _likely_geometries(quad, task.geometries):
+    quad = candidate.quad
+    for geometry in candidate.geometries:
         fit = task.fit_candidate(signal, quad, geometry)
         if fit is None or fit.explained < MIN_EXPLAINED:
             if quad.rank < STRONG_RANK:

@@ -7,7 +7,7 @@ plate at its place on the road. What one plate shows in several frames adds up (
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,13 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.accumulate import MAX_ODD_UNITS, OUT_OF_VIEW, RESOLVED_UNIT_PX, read_accumulated
-from app.decoders.plate.colour import Planes, coarse_ratio_signal, difference_signal, planes_of, ratio_signal
+from app.decoders.plate.colour import planes_of
 from app.decoders.plate.decode_symbols import MAX_DAMAGE
-from app.decoders.plate.detect_quads import MarkerQuad, detect_marker_quads
+from app.decoders.plate.detect_quads import MarkerQuad
 from app.decoders.plate.evidence import MIN_EXPLAINED_ALONE, PlateEvidence
+from app.decoders.plate.find_candidates import find_candidates
 from app.decoders.plate.follow_plate import is_large_enough, predict_corners, view_elsewhere
 from app.decoders.plate.plate_tracks import PlateTrack, PlateTracker, SeenPlate, place_candidate
-from app.decoders.plate.reader import DEFAULT_GEOMETRIES, MAX_FITS, read_plates
+from app.decoders.plate.reader import DEFAULT_GEOMETRIES, read_plates
 from app.decoders.plate.unit_likelihoods import code_units
 from app.markers.plate import SIDE_MM, PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlateReading
@@ -110,8 +111,8 @@ class PlateVideoSearch:
     ) -> None:  # fmt: skip
         self._camera, self._codebook = camera, tuple(codebook)
         self._options: dict[str, Any] = {"camera": camera, "codebook": codebook, "thermal": thermal}
-        if geometries:
-            self._options["geometries"] = tuple(geometries)
+        self._geometries = tuple(geometries) or DEFAULT_GEOMETRIES
+        self._options["geometries"] = self._geometries
         self._known = {code.digits for code in codebook}
         self._thermal = thermal
         self._tracker = PlateTracker()
@@ -185,8 +186,11 @@ class PlateVideoSearch:
         return self._waited >= next((step for count, step in FRUITLESS if self._fruitless >= count), 1)
 
     def _has_candidates(self, half: Pixels) -> bool:
-        planes = planes_of(half)
-        return any(self._fits_the_road(quad) for quad in _candidates(planes))
+        return any(
+            self._fits_the_road(candidate.quad)
+            for _signal, candidates in find_candidates(planes_of(half), self._geometries)
+            for candidate in candidates
+        )
 
     def _fits_the_road(self, quad: MarkerQuad) -> bool:
         """Whether a plate at this place on the road would be about as large in the image."""
@@ -269,11 +273,6 @@ def _without_guesses(reading: PlateReading) -> PlateReading:
     if reading.code is None or reading.from_codebook or len(reading.corrected_cells) <= MAX_CORRECTED:
         return reading
     return _refused(reading, "more wrong cells than a check may correct in a video")
-
-
-def _candidates(planes: Planes) -> Iterator[MarkerQuad]:
-    for signal_of in (difference_signal, ratio_signal, coarse_ratio_signal):
-        yield from detect_marker_quads(signal_of(planes))[:MAX_FITS]
 
 
 def _with_code(seen: SeenPlate, joint: PlateReading) -> SeenPlate:

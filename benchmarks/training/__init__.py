@@ -1,0 +1,1 @@
+"""What is trained: coefficients in the code, each with the command that finds it again."""
