@@ -1,4 +1,4 @@
-"""Time a frame: the decoder and cv2.aruco on the same frames, in turns, in one thread."""
+"""Processor time a frame: the decoder and cv2.aruco on the same frames, in turns, in one thread."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Image = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Milliseconds a frame."""
+    """Milliseconds of the processor a frame."""
 
     what: str
     frames: str
@@ -31,15 +31,24 @@ class Timing:
 
 
 def measure_speed(seed: int, frames: int) -> list[Timing]:
-    """Median and mean time a frame of the decoder and the peers.
+    """Median and mean processor time a frame of the decoder and the peers, by what is in view.
 
-    Frames with a plate come from the trials at all distances, and the peers see their tag in the plate's place; frames
-    without one are the plate-free set. Every call is timed by itself, the decoders take turns on each frame.
+    Frames with a plate in clear light come from the trials at all distances, those in shade from the set of that name;
+    the peers see their tag in the plate's place. Frames without one are a fourth each of the plate-free set: roads and
+    photos as they are, and those with many coloured things. Every call is timed by itself, the decoders take turns.
     """
     cv2.setNumThreads(1)
-    plates = [s for s in _trial_shots(seed, frames) if isinstance(s, Shot)]
-    free = [s for s in shoot(Job("free", 0, seed, frames)) if isinstance(s, Shot)]
-    return _measure("with a plate", plates, seed) + _measure("without", free, seed)
+    groups = {
+        "plate in clear light": list(_trial_shots(seed, frames)),
+        "plate in shade": list(shoot(Job("shade", 0, seed, frames))),
+        "no plate": list(shoot(Job("free", 0, seed, 4 * frames)))[0::4],
+        "no plate, clutter": list(shoot(Job("free", 1, seed, 4 * frames)))[3::4],
+    }
+    return [
+        timing
+        for name, shots in groups.items()
+        for timing in _measure(name, [shot for shot in shots if isinstance(shot, Shot)], seed)
+    ]
 
 
 def _trial_shots(seed: int, frames: int) -> list[Shot]:
@@ -65,9 +74,9 @@ def _measure(name: str, shots: list[Shot], seed: int) -> list[Timing]:
     times = np.empty((len(contenders), len(shots)))
     for k in range(len(shots)):
         for row, (_, calls) in enumerate(contenders):
-            start = time.perf_counter()
+            start = time.process_time()
             calls[k]()
-            times[row, k] = 1000 * (time.perf_counter() - start)
+            times[row, k] = 1000 * (time.process_time() - start)
     return [
         Timing(what, name, float(np.median(t)), float(t.mean()), float(t.max()))
         for (what, _), t in zip(contenders, times, strict=True)

@@ -180,7 +180,7 @@ def _met(yes: bool) -> str:
 
 
 def speed_table(timings: Sequence[Timing]) -> str:
-    """Milliseconds a frame."""
+    """Milliseconds of the processor a frame."""
     rows = []
     for t in timings:
         ours = next(o for o in timings if o.what == "decode_plates" and o.frames == t.frames)
@@ -195,7 +195,7 @@ def speed_table(timings: Sequence[Timing]) -> str:
             (f"{t.what}, {t.frames}", f"{t.median_ms:.2f}", f"{t.mean_ms:.2f}", f"{t.worst_ms:.1f}", ratio, goal, met)
         )
     return table(
-        ("1080p, one thread", "median ms", "mean ms", "worst ms", "ratio to decode_plates", "goal", "met"), rows
+        ("1080p, CPU of one thread", "median ms", "mean ms", "worst ms", "ratio to decode_plates", "goal", "met"), rows
     )
 
 

@@ -123,7 +123,8 @@ def _shape_ratio(blob: Floats, expected: _Moments) -> float:
     high = trace / 2 + root
     if low <= 0:
         return NO_SHAPE
-    return max(high, 1.0 / low)
+    ratio: float = max(high, 1.0 / low)
+    return ratio
 
 
 @ieee_routine
