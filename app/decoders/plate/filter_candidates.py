@@ -32,7 +32,8 @@ ROAD_OFFSET = 0.08
 ROAD_POINTS = 6
 """[points] of the road along each side. Source: chosen by hand."""
 WORN_RATIO = 0.95
-"""[1] usual ratio of a marker's size to its size without wear and blur, inverted. Source: chosen by hand."""
+"""[1] usual measured distance of marker centres over a marker's side, over `MARKER_RATIO`. Source: chosen by hand: blur
+makes markers larger."""
 MIN_DEPTH = 1e-9
 """[1] denominator of a homography below which the plate is not in front of the camera. Source: rounding."""
 FEATURES = (
@@ -50,7 +51,7 @@ MAX_RANK, USUAL_SIZE = 12.0, 3.5
 """[log odds, log10 px^2] rank above which none counts more, and size about which the squares are taken. Source: chosen
 by hand."""
 MIN_LOG_ODDS = -5.0
-"""[log odds] below which a candidate is not fitted. Source: as of `WEIGHTS`."""
+"""[log odds] below which a candidate is not fitted. Source: decision record 0032."""
 WEIGHTS = np.array(
     [
         3.004,  # weakest margin
@@ -130,7 +131,7 @@ def candidate_log_odds(signal: MarkerSignal, quads: Sequence[MarkerQuad], geomet
 
 
 def size_misfit(quad: MarkerQuad, geometry: PlateGeometry) -> float:
-    """Logarithm of the measured over the usual ratio of sides of a geometry's markers."""
+    """Logarithm of the measured ratio of sizes (`MarkerQuad.size_ratio`) over the usual one of a geometry."""
     return math.log(quad.size_ratio / (WORN_RATIO * MARKER_RATIO[geometry.n]))
 
 
