@@ -30,7 +30,7 @@ NEEDS = {
 BATCH = 25
 # frames (drives for thermal) a seed: long, short
 COUNTS = {"stress": (400, 24), "night": (50, 6), "hidden": (100, 10), "free": (1000, 40),
-          **dict.fromkeys(THERMAL_KMH, (12, 1)), **dict.fromkeys(LIGHT, (300, 10))}  # fmt: skip
+          **dict.fromkeys(THERMAL_KMH, (12, 1)), **dict.fromkeys(LIGHT, (150, 10))}  # fmt: skip
 SHORT_SHARE = 0.08
 MISSED_ROWS = 16
 
