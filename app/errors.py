@@ -66,6 +66,10 @@ class CalibrationRefused(UnreadableUpload):
     """Photos do not calibrate a camera well enough; begins with the name of the reason, `parts` has the photos."""
 
 
+class PrintNotGraded(UnreadableUpload):
+    """A photo does not show a printed plate well enough to grade it."""
+
+
 class NotFound(WaymarkError):
     """No such thing, or not one that this caller may see."""
 

@@ -30,7 +30,7 @@ from app.api.http.rate_limits import RateLimit
 from app.api.jobs import events, files, webhooks
 from app.api.jobs import jobs as job_routes
 from app.api.jobs.streams import Streams
-from app.api.markers import artwork, bulk, cerpms, codebooks, layouts, markers, observations, searches
+from app.api.markers import artwork, bulk, cerpms, codebooks, layouts, markers, observations, print_grades, searches
 from app.api.ogc import mount_ogc
 from app.api.plans import alignments, packages, plan_jobs, plans, proofs, radio_checks
 from app.api.reprocessing import reprocessings
@@ -57,6 +57,7 @@ ROUTERS = (
     roads.router,
     markers.router,
     artwork.router,
+    print_grades.router,
     layouts.router,
     cerpms.router,
     radio_checks.router,
@@ -198,6 +199,7 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
             "/v1/imports": settings.max_import_bytes,
             "/v1/alignments": settings.max_import_bytes,
             "/v1/calibrations": settings.max_upload_bytes,
+            "/v1/print-grades": settings.max_upload_bytes,
             "/v1/uploads": settings.max_resumable_bytes,
         },
         permissions=Permissions(),

@@ -55,6 +55,7 @@ from app.services.markers.features import Features
 from app.services.markers.layouts import Layouts
 from app.services.markers.markers import Markers
 from app.services.markers.observations import Observations
+from app.services.markers.print_grades import PrintGrades
 from app.services.markers.searches import Searches
 from app.services.plans.alignments import Alignments
 from app.services.plans.making import PlanMaking
@@ -180,6 +181,7 @@ def make_use_cases(settings: Settings, outside: Outside, decode: DecodePlates) -
         "maintenance": Maintenance(database, utc_now, marker_cases),
         "markers": marker_cases,
         "observations": Observations(database),
+        "print_grades": PrintGrades(database, utc_now, pool, rules.images),
         "programs": CerpmPrograms(database, utc_now, secrets),
         "reprocessings": reprocessings,
         "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),

@@ -54,6 +54,12 @@ class PdfFile:
         head = f"<< {entries}{packing}/Length {len(content)} >>\nstream\n".encode()
         return self.add(head + content + b"\nendstream")
 
+    def add_jpeg(self, content: bytes, width_px: int, height_px: int) -> int:
+        """Add a picture in RGB (8.9.5) as the JPEG that it is; returns its number."""
+        entries = f"/Type /XObject /Subtype /Image /Width {width_px} /Height {height_px} /ColorSpace /DeviceRGB "
+        head = f"<< {entries}/BitsPerComponent 8 /Filter /DCTDecode /Length {len(content)} >>\nstream\n".encode()
+        return self.add(head + content + b"\nendstream")
+
     def add_page(self, boxes: Mapping[str, Box], resources: int, content: bytes) -> None:
         """Add a page (7.7.3.3) with its boxes (14.11.2), the number of its resources and its operators."""
         rows = " ".join(f"/{name} [{' '.join(f'{v * POINTS_PER_MM:.4f}' for v in box)}]" for name, box in boxes.items())
@@ -228,6 +234,10 @@ class Canvas:
         """A filled rectangle."""
         sides = " ".join(map(_points, (x, y, width, height)))
         self._pieces.append(f"{_colour(fill)} rg {sides} re f")
+
+    def picture(self, name: str, x: float, y: float, width: float, height: float) -> None:
+        """A picture of the page's resources, in a rectangle."""
+        self._pieces.append(f"q {_points(width)} 0 0 {_points(height)} {_points(x)} {_points(y)} cm /{name} Do Q")
 
     def circle(self, x: float, y: float, radius: float, *, fill: str, outline: str, width_mm: float) -> None:
         """A filled circle with an outline."""

@@ -1,6 +1,6 @@
-"""EXIF of pictures: the orientation, and when the picture was taken.
+"""EXIF of pictures: the orientation, the focal length, and when the picture was taken.
 
-Source: CIPA DC-008 (EXIF 2.32), tags 0x0112, 0x8769, 0x9003, 0x9011 and 0x9291.
+Source: CIPA DC-008 (EXIF 2.32), tags 0x0112, 0x8769, 0x9003, 0x9011, 0x9291 and 0xA405.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 _ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
 _TAKEN, _TAKEN_OFFSET, _TAKEN_FRACTION = 0x9003, 0x9011, 0x9291
+_FOCAL_35MM = 0xA405
 _ASCII, _SHORT, _LONG = 2, 3, 4  # types of values
 _DATE = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)\Z")
 _OFFSET = re.compile(r"[+-]\d\d:\d\d\Z")
@@ -28,10 +29,13 @@ class Exif:
         1 to 8; 1 if there is none or it is invalid.
     taken : str or None
         When the picture was taken, as RFC 3339 writes it; without a zone where the camera states none.
+    focal_35mm : float or None
+        Focal length that gives the same view on film of 36 x 24 mm. [mm]
     """
 
     orientation: int = 1
     taken: str | None = None
+    focal_35mm: float | None = None
 
 
 def read_exif(tiff: bytes) -> Exif:
@@ -47,7 +51,16 @@ def read_exif(tiff: bytes) -> Exif:
                 exif_at = value
             elif 1 <= value <= 8:
                 orientation = value
-    return Exif(orientation, _taken(tiff, order, exif_at) if exif_at is not None else None)
+    if exif_at is None:
+        return Exif(orientation)
+    return Exif(orientation, _taken(tiff, order, exif_at), _focal_35mm(tiff, order, exif_at))
+
+
+def _focal_35mm(tiff: bytes, order: str, directory: int) -> float | None:
+    for tag, kind, count, at in _entries(tiff, order, directory):
+        if tag == _FOCAL_35MM and kind == _SHORT and count == 1:
+            return float(struct.unpack_from(order + "H", tiff, at)[0]) or None  # 0: unknown
+    return None
 
 
 def _taken(tiff: bytes, order: str, directory: int) -> str | None:

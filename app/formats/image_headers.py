@@ -91,6 +91,8 @@ class ImageHeader:
         Bytes after the picture's end, which are ignored.
     taken : str or None
         When it was taken by its EXIF, as RFC 3339 writes it; without a zone where the camera states none.
+    focal_35mm : float or None
+        Focal length by its EXIF, for film of 36 x 24 mm. [mm]
     """
 
     kind: ImageKind
@@ -101,6 +103,7 @@ class ImageHeader:
     orientation: int = 1
     trailing_bytes: int = 0
     taken: str | None = None
+    focal_35mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +232,15 @@ def _scan_jpeg(data: bytes, limits: ImageLimits) -> ScannedImage:
     exif = parts.exif or Exif()
     width, height = _upright(*parts.size_px, exif.orientation)
     header = ImageHeader(
-        ImageKind.JPEG, width, height, parts.components, 8, exif.orientation, len(data) - at, exif.taken
+        ImageKind.JPEG,
+        width,
+        height,
+        parts.components,
+        8,
+        exif.orientation,
+        len(data) - at,
+        exif.taken,
+        exif.focal_35mm,
     )
     return ScannedImage(header, ((0, at),))
 
@@ -311,7 +322,14 @@ def _scan_png(data: bytes, limits: ImageLimits) -> ScannedImage:
     width, height, depth, colour = shape
     upright = _upright(width, height, exif.orientation)
     header = ImageHeader(
-        ImageKind.PNG, *upright, _PNG_CHANNELS[colour], depth, exif.orientation, len(data) - at, exif.taken
+        ImageKind.PNG,
+        *upright,
+        _PNG_CHANNELS[colour],
+        depth,
+        exif.orientation,
+        len(data) - at,
+        exif.taken,
+        exif.focal_35mm,
     )
     return ScannedImage(header, tuple(parts))
 

@@ -13,6 +13,7 @@ from app.jobs.frame_tasks import annotate_frame, decode_run, find_markers, load_
 from app.jobs.package_tasks import list_package_parts, write_package_manifest, write_package_part
 from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
 from app.jobs.plan_tasks import compare_plan, make_plan, summarize_road, write_file_of_plan, write_map
+from app.jobs.print_tasks import grade_photo
 from app.jobs.proof_tasks import list_proof_units, prove_unit, write_proof
 from app.jobs.survey_tasks import read_survey_file
 from app.jobs.trace_tasks import compile_traces, decode_recording
@@ -27,6 +28,7 @@ from app.services.decodes.video_task import IndexVideoTask, SegmentTask
 from app.services.drives.track_task import TrackTask
 from app.services.fleet.calibrations import CalibrationTask
 from app.services.markers.artwork_tasks import DrawPlateTask, WriteSheetsTask
+from app.services.markers.print_task import PrintGradeTask
 from app.services.plans.package_tasks import ListPartsTask, WriteManifestTask, WritePartTask
 from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask
 from app.services.plans.tasks import CompareTask, MakePlanTask, SummarizeRoadTask, WriteMapTask, WritePlanFileTask
@@ -65,6 +67,7 @@ STEPS: dict[type, StepFunction] = {
     DrawPlateTask: draw_plate,
     WriteSheetsTask: write_sheets,
     TrackTask: write_track,
+    PrintGradeTask: grade_photo,
     ProcessIdTask: process_id,
 }
 

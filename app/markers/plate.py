@@ -199,6 +199,12 @@ def plate_capacity(n: int, scheme: PlateScheme, check_digits: int = 1) -> PlateC
     )
 
 
+def codewords_of_cells(n: int, scheme: PlateScheme) -> tuple[int | None, ...]:
+    """Number of the interleaved codeword that each cell belongs to, in reading order; None for spare cells."""
+    lay = _layout(n, scheme, 1)
+    return tuple(i % lay.codewords if i < lay.data + lay.checks else None for i in range(len(code_cells(n))))
+
+
 @lru_cache
 def _reed_solomon(checks: int) -> reedsolo.RSCodec:
     return reedsolo.RSCodec(checks, nsize=15, c_exp=4, prim=0x13)

@@ -45,6 +45,7 @@ EXPENSIVE = frozenset(
         "POST /v1/codebooks",
         "POST /v1/codebooks/{codebook_id}/entries",
         "POST /v1/calibrations",
+        "POST /v1/print-grades",
     }
 )
 """Routes whose largest request takes over a second. Source: `python -m benchmarks.abuse`."""

@@ -56,6 +56,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/markers/{marker_id}/layout.{form}": READERS,
     "GET /v1/markers/{marker_id}/payload.{form}": PLANNERS,  # who has a payload can speak for the marker
     "POST /v1/artwork": READERS,
+    "POST /v1/print-grades": READERS,  # fabricators; nothing is stored
     "POST /v1/programs": PLANNERS,  # with the markers' keys: admins, see app/services/markers/cerpm_programs.py
     "POST /v1/radio-checks": READERS,
     "GET /v1/imports": SURVEYORS,

@@ -63,6 +63,7 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
     errors.CalibrationRefused: ProblemKind(
         422, "calibration-refused", "The camera cannot be calibrated from these photos"
     ),
+    errors.PrintNotGraded: ProblemKind(422, "print-not-graded", "The print cannot be graded from this photo"),
     errors.UnreadableUpload: ProblemKind(422, "unreadable-upload", "The upload cannot be read"),
     errors.VersionRequired: ProblemKind(428, "version-required", "The change must state the version it is based on"),
     errors.TooManyRequests: ProblemKind(429, "too-many-requests", "Too many requests in a short time"),

@@ -54,12 +54,25 @@ def plate_read_rate(
     Frames follow each other at the speed's distance from a first one of any phase. Each is read with the log-odds of
     its unit's height; the pass's own circumstances shift all of them alike (`PlateModel`).
     """
-    model = fitted_models().plate_model(condition)
+    return read_rate_of_model(fitted_models().plate_model(condition), geometry, camera, speed_mps, left_m)
+
+
+def read_rate_of_model(
+    model: PlateModel, geometry: PlateGeometry, camera: CameraRules, speed_mps: float, left_m: float = 0.0
+) -> float:
+    """As `plate_read_rate`, for another model than the fitted ones."""
     ahead = np.arange(_GRID_M, FAR_M, _GRID_M)
     height = unit_heights_px(camera_of(camera), geometry, ahead, left_m)
     exposures = [max(camera.exposure_s, least) for least in model.exposures_s] or [camera.exposure_s]
     rates = [_rate(model, ahead, height, speed_mps, speed_mps * exposure, camera, geometry) for exposure in exposures]
     return float(np.mean(rates))
+
+
+def readable_frames(geometry: PlateGeometry, camera: CameraRules, speed_mps: float) -> float:
+    """Mean number of frames of a pass in which a unit is `MIN_UNIT_PX` high or more, on a flat and straight road."""
+    ahead = np.arange(_GRID_M, FAR_M, _GRID_M)
+    in_reach = unit_heights_px(camera_of(camera), geometry, ahead) >= MIN_UNIT_PX
+    return float(in_reach.sum() * _GRID_M / (speed_mps / camera.frames_per_s))
 
 
 def _rate(

@@ -1,0 +1,279 @@
+"""Photo of a printed plate to the grade of its print: find the plate, refuse what cannot be graded, measure, grade.
+
+The grade of a plate that a vehicle read in traffic is another thing: `grade_plate` of app/decoders/plate/grade.py.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.plate.print_face import CLIPPED_LEVEL, MeasuredFace, is_unit, measure_face
+from app.decoders.plate.print_parameters import PrintEvidence, grade_parameters, reflectance_margins
+from app.decoders.plate.reader import DEFAULT_GEOMETRIES, decode_plates
+from app.errors import PrintNotGraded
+from app.markers.plate import PlateCode, PlateGeometry
+from app.markers.print_grade import PrintGrade, PrintView
+from app.markers.reading import PlateReading
+
+SEARCH_SIDE_PX = 1600
+"""[px] longest side of the reduced photo in which the plate is searched. Source: chosen by hand, for speed: a plate of
+24 rows there is far too small to be graded."""
+MIN_SIDE_PX = 400.0
+"""[px] least side of a plate that is graded. Source: chosen by hand: its gaps of 5 mm then have six pixels."""
+MIN_GAP_PX = 4.0
+"""[px] least width of a gap, which narrow gaps need. Source: chosen by hand."""
+MAX_EDGE_GAPS = 0.8
+"""[gaps] widest edge, from 10 to 90 %: wider ones of neighbours run into each other. Source: chosen by hand."""
+MAX_CLIPPED = 0.05
+"""[1] share of over-exposed pixels on the light units. Source: chosen by hand."""
+MIN_WHITE_LEVEL = 70.0
+"""[grey level] least brightness of the light units. Source: chosen by hand: noise is 3 % of the white there."""
+MAX_LIGHT_RATIO = 2.0
+"""[1] brightest over darkest light on the plate. Source: chosen by hand."""
+MAX_SHADED, SHADED_LEVEL = 0.25, 0.75
+"""[1] share of light units that may be darker than this share of the others, as in a shadow. Source: chosen by hand."""
+MAX_TILT_DEG, MAX_TILT_ASSUMED_DEG = 30.0, 15.0
+"""[deg] greatest tilt with the focal length of the photo's EXIF, and with an assumed one. Source: a focal length that
+is off by 15 % changes the ratio of the axes by 2 % at 15 degrees, a third of grade A's limit."""
+ASSUMED_FOCAL_35MM = 26.0
+"""[mm] focal length on 36 mm film of a phone's main camera, 24 to 28. Source: makers' data sheets."""
+MIN_AGREEMENT = 0.75
+"""[1] share of units as expected in a plate that the decoder cannot read. Source: chosen by hand: of 48 units at
+random, 36 agree once in 2,800 times."""
+_FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_MIN_CHROMA = 12  # [grey levels] of the most colourful hundredth of a photo; source: chosen by hand
+
+Image = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.float64]
+
+
+def grade_print(
+    photo: Image,
+    *,
+    code: PlateCode | None = None,
+    geometry: PlateGeometry | None = None,
+    focal_35mm: float | None = None,
+) -> PrintGrade:
+    """Grade a printed plate by a photo.
+
+    Parameters
+    ----------
+    photo : ndarray of uint8, shape (H, W, 3)
+        Upright and whole; blue, green, red in sRGB.
+    code : PlateCode, optional
+        What the plate should be; without it, it is what the photo shows.
+    geometry : PlateGeometry, optional
+        Of the drawing; without it, units of 35 mm and gaps of 5 mm.
+    focal_35mm : float, optional
+        Focal length on 36 mm film, of the photo's EXIF. [mm]
+
+    Raises
+    ------
+    PrintNotGraded
+        There is no plate, more than one, or the photo does not show it well enough; with the limit and the cure.
+    """
+    reading = _find_plate(photo, code, geometry)
+    drawn = geometry or reading.geometry
+    assert reading.corners_px is not None
+    assert drawn is not None
+    _check_size(photo, reading.corners_px, drawn)
+    face = measure_face(photo, reading.corners_px, drawn)
+    if face is None:
+        raise PrintNotGraded(
+            "fewer than two dark or three light units can be told apart", field="photo",
+            limit="two dark and three light units", cure="grade a plate of another code, or print with more contrast",
+        )  # fmt: skip
+    expected = code or reading.code
+    assert expected is not None
+    _check_agreement(reading, expected, face)
+    _check_light(face)
+    view = _view(photo, face, drawn, focal_35mm)
+    _check_view(view, drawn)
+    axes = _axes(photo, face.image_from_face, drawn, focal_35mm)[0]
+    parameters = grade_parameters(PrintEvidence(face, expected, drawn, axes, reading))
+    return PrintGrade(
+        expected, drawn, code is not None, reading.outcome, reading.digits, view, parameters,
+        reflectance_margins(face, expected), is_unit(drawn.n) & (face.dark != expected.units.astype(bool)),
+        _as_srgb(face.reflectance), face.reflectance,
+    )  # fmt: skip
+
+
+# --- the plate --------------------------------------------------------------------------------------------------------
+
+
+def _find_plate(photo: Image, code: PlateCode | None, geometry: PlateGeometry | None) -> PlateReading:
+    """The plate's reading without a registry, its corners in the photo."""
+    shrink = min(1.0, SEARCH_SIDE_PX / max(photo.shape[:2]))
+    small = photo
+    if shrink < 1:
+        size = (round(photo.shape[1] * shrink), round(photo.shape[0] * shrink))
+        small = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), np.uint8)
+    wanted = (geometry,) if geometry is not None else DEFAULT_GEOMETRIES
+    found = [one for one in decode_plates(small, geometries=wanted) if one.corners_px is not None]
+    read = [one for one in found if one.code is not None]
+    if len(read) > 1:
+        raise PrintNotGraded(
+            f"{len(read)} plates are in the photo", field="photo", limit="one plate", cure="photograph one plate alone"
+        )
+    if not read and (code is None or not found):
+        raise _no_plate(small, found)
+    best = (read or found)[0]
+    if code is None and best.code is None:
+        raise _no_plate(small, found)
+    _check_same_size(best, code)
+    assert best.corners_px is not None
+    scale = np.array([photo.shape[1] / small.shape[1], photo.shape[0] / small.shape[0]])
+    corners_px = (best.corners_px + 0.5) * scale - 0.5
+    if (corners_px < -0.5).any() or (corners_px > np.array(photo.shape[1::-1]) - 0.5).any():
+        raise PrintNotGraded(
+            "a corner of the plate is out of the photo", field="photo", limit="the whole plate",
+            cure="photograph the whole plate with some ground around it",
+        )  # fmt: skip
+    return _moved(best, corners_px)
+
+
+def _moved(reading: PlateReading, corners_px: Array) -> PlateReading:
+    return PlateReading(
+        reading.outcome, corners_px, code=reading.code, confidence=reading.confidence, geometry=reading.geometry,
+        corrected_cells=reading.corrected_cells, reason=reading.reason,
+    )  # fmt: skip
+
+
+def _no_plate(small: Image, found: list[PlateReading]) -> PrintNotGraded:
+    values = small.reshape(-1, 3)
+    chroma = np.percentile(values.max(axis=1).astype(int) - values.min(axis=1), 99)
+    if chroma < _MIN_CHROMA:
+        return PrintNotGraded(
+            "the photo is grey, so the red triangle and the green squares cannot be found", field="photo",
+            limit="a colour photo", cure="photograph in colour, without a monochrome filter",
+        )  # fmt: skip
+    if found:
+        return PrintNotGraded(
+            f"a plate was found but not read: {found[0].reason or found[0].outcome}", field="declaration.code",
+            limit="a plate that can be read, or its digits",
+            cure="declare the code that the plate should have, then a plate that cannot be read is graded too",
+        )  # fmt: skip
+    return PrintNotGraded(
+        "no plate was found in the photo", field="photo", limit="one whole plate of the declared geometry",
+        cure="photograph the whole plate from above, in even light and in focus, and check n, unit_mm and gap_mm; if all "
+            "is so, the red triangle and the green squares are too pale",
+    )  # fmt: skip
+
+
+def _check_same_size(reading: PlateReading, code: PlateCode | None) -> None:
+    if code is not None and reading.geometry is not None and reading.geometry.n != code.n:
+        raise PrintNotGraded(
+            f"the photo shows a plate of {reading.geometry.n} x {reading.geometry.n} units, not {code.n} x {code.n}",
+            field="declaration.geometry.n", limit=f"n = {code.n}", cure="photograph the plate that is declared",
+        )  # fmt: skip
+
+
+def _check_agreement(reading: PlateReading, expected: PlateCode, face: MeasuredFace) -> None:
+    """A candidate that was not read must look like the plate that is expected."""
+    units = is_unit(expected.n)
+    agreement = float((face.dark == expected.units.astype(bool))[units].mean())
+    if reading.code is None and agreement < MIN_AGREEMENT:
+        raise PrintNotGraded(
+            f"the plate cannot be read, and only {agreement:.0%} of its units are as expected",
+            field="declaration.code",
+            limit=f"{MIN_AGREEMENT:.0%} of the units", cure="photograph the plate that is declared, in even light",
+        )  # fmt: skip
+
+
+# --- the photo --------------------------------------------------------------------------------------------------------
+
+
+def _side_px(corners_px: Array) -> float:
+    return float(np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1).mean())
+
+
+def _check_size(photo: Image, corners_px: Array, geometry: PlateGeometry) -> None:
+    side_px = _side_px(corners_px)
+    least_px = max(MIN_SIDE_PX, MIN_GAP_PX * geometry.side_mm / geometry.gap_mm)
+    if side_px < least_px:
+        raise PrintNotGraded(
+            f"the plate covers {side_px:.0f} px of a photo of {photo.shape[1]} x {photo.shape[0]} px", field="photo",
+            limit=f"at least {least_px:.0f} px a side", cure=f"come nearer until the plate covers {least_px:.0f} px",
+        )  # fmt: skip
+
+
+def _check_light(face: MeasuredFace) -> None:
+    if face.clipped > MAX_CLIPPED:
+        raise PrintNotGraded(
+            f"{face.clipped:.0%} of the white is over-exposed", field="photo",
+            limit=f"at most {MAX_CLIPPED:.0%} of the white's pixels at {CLIPPED_LEVEL} of 255 or more",
+            cure="expose less: tap on the plate's white before taking the photo, and avoid direct sun and flash",
+        )  # fmt: skip
+    if face.white_level < MIN_WHITE_LEVEL:
+        raise PrintNotGraded(
+            f"the photo is too dark: the plate's white has the level {face.white_level:.0f} of 255", field="photo",
+            limit=f"at least {MIN_WHITE_LEVEL:.0f}", cure="photograph in daylight, and expose more",
+        )  # fmt: skip
+    units = is_unit(face.dark.shape[0])
+    shaded = float((face.levels[units & ~face.dark] < SHADED_LEVEL).mean())
+    if face.light_ratio > MAX_LIGHT_RATIO or shaded > MAX_SHADED:
+        raise PrintNotGraded(
+            f"the light on the plate is uneven: it varies by the factor {face.light_ratio:.1f}, "
+            f"and {shaded:.0%} of the light units are darker than the others", field="photo",
+            limit=f"a factor of {MAX_LIGHT_RATIO:g}, {MAX_SHADED:.0%} of the light units",
+            cure="photograph in the open shade or under an overcast sky, without a shadow's edge on the plate",
+        )  # fmt: skip
+
+
+def _view(photo: Image, face: MeasuredFace, geometry: PlateGeometry, focal_35mm: float | None) -> PrintView:
+    side = geometry.side_mm
+    square = np.array([[(0.0, 0.0), (side, 0.0), (side, side), (0.0, side)]])
+    corners_px = cv2.perspectiveTransform(square, face.image_from_face)[0]
+    tilt_deg = _axes(photo, face.image_from_face, geometry, focal_35mm)[1]
+    return PrintView(
+        _side_px(corners_px), tilt_deg, face.edge_mm, face.light_ratio, face.white_level, focal_35mm is not None
+    )
+
+
+def _check_view(view: PrintView, geometry: PlateGeometry) -> None:
+    limit_mm = MAX_EDGE_GAPS * geometry.gap_mm
+    if not view.edge_mm <= limit_mm:
+        raise PrintNotGraded(
+            f"the photo is blurred: edges are {view.edge_mm:.1f} mm wide", field="photo",
+            limit=f"at most {limit_mm:.1f} mm from 10 to 90 %, {MAX_EDGE_GAPS:g} of a gap",
+            cure="hold the camera still, focus on the plate, and come nearer; if every photo shows it, the ink bleeds",
+        )  # fmt: skip
+    limit_deg = MAX_TILT_DEG if view.focal_known else MAX_TILT_ASSUMED_DEG
+    if view.tilt_deg > limit_deg:
+        known = "" if view.focal_known else " (30 degrees with the focal length in the photo's EXIF)"
+        raise PrintNotGraded(
+            f"the photo is oblique: the camera is tilted by {view.tilt_deg:.0f} degrees against the plate",
+            field="photo", limit=f"at most {limit_deg:g} degrees{known}",
+            cure="hold the camera parallel to the plate, straight above its centre, and send the photo uncropped",
+        )  # fmt: skip
+
+
+def _axes(
+    photo: Image, image_from_face: Array, geometry: PlateGeometry, focal_35mm: float | None
+) -> tuple[tuple[Array, Array], float]:
+    """The print's own axes, right and down, in the camera's frame at the plate's centre, and the camera's tilt [deg].
+
+    With the camera's matrix K, a homography of a plane is K [r1 r2 t] up to a factor; a print that is stretched or
+    sheared has other columns in place of the orthonormal r1 and r2. The camera has square pixels and its principal
+    point in the middle of the photo.
+    """
+    height, width = photo.shape[:2]
+    focal_px = (focal_35mm or ASSUMED_FOCAL_35MM) / _FILM_DIAGONAL_MM * math.hypot(width, height)
+    camera = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
+    middle = np.array([[1, 0, geometry.side_mm / 2], [0, 1, geometry.side_mm / 2], [0, 0, 1]])
+    columns = np.linalg.solve(camera, image_from_face @ middle)
+    right, down = columns[:, 0], columns[:, 1]
+    normal = np.cross(right, down)
+    tilt = math.degrees(math.acos(min(1.0, abs(float(normal[2])) / float(np.linalg.norm(normal)))))
+    return (right, down), tilt
+
+
+def _as_srgb(reflectance: npt.NDArray[np.float32]) -> Image:
+    """As a picture in which the light units are nearly white."""
+    light = np.clip(reflectance * np.float32(0.88), 0, 1)
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055)
+    return np.asarray(encoded * 255 + 0.5, np.uint8)

@@ -1,0 +1,223 @@
+"""Whether a printed plate will be read at the design speed: its measured face in simulated passes, read by the decoder.
+
+The passes shift the fitted model of plates (`PlateModel`): by how much higher must the image of a unit be than that of
+a faultless plate? The model with this shift gives the probability that a pass reads the plate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.plate.reader import decode_plates
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, position_decimals
+from app.planning.plate_view import camera_of
+from app.planning.predict.models import DAY, PlateModel, fitted_models, normal_quadrature
+from app.planning.predict.rates import FAR_M, MIN_UNIT_PX, read_rate_of_model, readable_frames
+from app.planning.proof.conditions import draw_drive
+from app.planning.proof.terms import Condition
+from app.planning.rules import CameraRules, PredictionRules
+from app.simulation.camera import render_plate_scene
+from app.simulation.conditions import Conditions
+from app.simulation.drive import Drive, drive_over_plate
+from app.simulation.plate_face import Face
+from app.simulation.plate_scene import PlateScene, face_truth
+from app.simulation.road import road_background, road_photos
+
+WHITE_REFLECTANCE = 0.75
+"""[1] assumed for the plate's white, which a photo does not show. Source: `PlateLook.light`."""
+TEXELS_PER_MM = 1.0
+"""[1/mm] of the simulated face. Source: default of `plate_face`."""
+PASSES, FRAMES_PER_PASS = 3, 8
+"""Simulated passes, and frames rendered of each. Source: chosen by hand, for a second and a half of a processor."""
+MAX_SHIFT = math.log(30.0)
+"""[log height] greatest shift of the model. Source: chosen by hand: units of 26 px, which no pass shows."""
+_SHIFTS = np.linspace(0.0, MAX_SHIFT, 35)  # at which the likelihood is computed; source: chosen by hand
+_GRAIN = 0.03  # of the asphalt; source: middle of `_GRAIN` of app/planning/proof/plates.py
+_NEIGHBOURS_DEG = (-0.00036, -0.00018, 0.00018, 0.00036)  # [deg] 20 and 40 m; source: chosen by hand, a dense road
+_NEAR_NUMBERS = (-2, -1, 1, 2)
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class DesignSpeed:
+    """Pass for which a print must be readable.
+
+    Attributes
+    ----------
+    camera : CameraRules
+    speed_mps : float
+        [m/s]
+    """
+
+    camera: CameraRules
+    speed_mps: float
+
+
+@dataclass(frozen=True, slots=True)
+class PrintPrediction:
+    """Predicted reading of a printed plate.
+
+    Attributes
+    ----------
+    readable_frames : float
+        Mean frames of a pass in which a unit is a pixel high or more.
+    passes, frames, read : int
+        Passes and frames that were simulated with the plate's measured face, and frames that were read.
+    read_alone : int
+        Frames that were read without the registry.
+    wrong : int
+        Frames in which other digits were read.
+    height_ratio : float
+        How much higher a unit's image must be than a faultless plate's.
+    read_rate, faultless_read_rate : float
+        Probability that a pass reads this plate, and a faultless one.
+    white_reflectance : float
+        That was assumed.
+    """
+
+    readable_frames: float
+    passes: int
+    frames: int
+    read: int
+    read_alone: int
+    wrong: int
+    height_ratio: float
+    read_rate: float
+    faultless_read_rate: float
+    white_reflectance: float = WHITE_REFLECTANCE
+
+    @property
+    def will_be_read(self) -> bool:
+        """Whether the rate reaches the rate below which plans report a marker."""
+        return self.read_rate >= MIN_READ_RATE
+
+
+MIN_READ_RATE: float = PredictionRules().min_read_rate
+"""[1] least read rate of a plate that counts as readable. Source: default of `PredictionRules.min_read_rate`."""
+
+
+def predict_print(
+    reflectance: npt.NDArray[np.float32], code: PlateCode, geometry: PlateGeometry, design: DesignSpeed, seed: int = 0
+) -> PrintPrediction:
+    """Predict how often passes by day read a printed plate that is registered and new.
+
+    Parameters
+    ----------
+    reflectance : ndarray of float32, shape (H, W, 3)
+        Of the plate's face, relative to its white; blue, green, red.
+    code : PlateCode
+        What the registry has.
+    geometry : PlateGeometry
+    design : DesignSpeed
+    seed : int
+        Draws light, sensor and noise. The same seed gives the same prediction.
+    """
+    cv2.setNumThreads(1)
+    face = _face(reflectance, geometry)
+    codebook = _codebook(code)
+    passes: list[list[tuple[float, bool]]] = []
+    wrong = alone = 0
+    for k in range(PASSES):
+        frames: list[tuple[float, bool]] = []
+        for unit_px, image in _frames(face, geometry, design, np.random.default_rng((seed, k))):
+            digits = _read(image, geometry, codebook)
+            frames.append((unit_px, code.digits in digits))
+            wrong += any(found != code.digits for found in digits)
+            alone += code.digits in _read(image, geometry, ())
+        passes.append(frames)
+    model = fitted_models().plate_model(DAY)
+    blur = design.speed_mps * design.camera.exposure_s / (geometry.pitch_mm / 1000)
+    weight = _posterior(model, passes, blur)
+    rates = [read_rate_of_model(_shifted(model, shift), geometry, design.camera, design.speed_mps) for shift in _SHIFTS]
+    return PrintPrediction(
+        readable_frames(geometry, design.camera, design.speed_mps),
+        len(passes),
+        sum(len(frames) for frames in passes),
+        sum(hit for frames in passes for _px, hit in frames),
+        alone,
+        wrong,
+        float(np.exp((weight * _SHIFTS).sum())),
+        float((weight * rates).sum()),
+        rates[0],
+    )
+
+
+def _read(image: npt.NDArray[np.uint8], geometry: PlateGeometry, codebook: Sequence[PlateCode]) -> list[str]:
+    readings = decode_plates(image, codebook=codebook, geometries=(geometry,))
+    return [one.code.digits for one in readings if one.code is not None]
+
+
+def _shifted(model: PlateModel, shift: float) -> PlateModel:
+    return replace(model, unit_px=model.unit_px * math.exp(shift))
+
+
+def _posterior(model: PlateModel, passes: list[list[tuple[float, bool]]], blur_units: float) -> Floats:
+    """Probability of each shift; all are equally likely before the frames.
+
+    A pass's own circumstances shift the log-odds of all its frames alike, as in `app.planning.predict.rates`.
+    """
+    nodes, weights = normal_quadrature()
+    log = np.zeros(len(_SHIFTS))
+    for k, shift in enumerate(_SHIFTS):
+        shifted = _shifted(model, shift)
+        for frames in passes:
+            if not frames:
+                continue
+            heights, hits = np.array([px for px, _hit in frames]), np.array([hit for _px, hit in frames])
+            odds = shifted.pass_log_odds(heights, blur_units)[:, None] + model.spread * nodes
+            each = -np.logaddexp(0, np.where(hits[:, None], -odds, odds)).sum(axis=0)
+            log[k] += np.log(np.maximum((weights * np.exp(each)).sum(), 1e-300))
+    likelihood = np.exp(log - log.max())
+    return np.asarray(likelihood / likelihood.sum())
+
+
+def _face(reflectance: npt.NDArray[np.float32], geometry: PlateGeometry) -> Face:
+    size = round(geometry.side_mm * TEXELS_PER_MM)
+    texels = cv2.resize(reflectance, (size, size), interpolation=cv2.INTER_AREA)
+    return Face(geometry.side_mm / 1000, np.ascontiguousarray(np.clip(texels * WHITE_REFLECTANCE, 0, 1), np.float32))
+
+
+def _codebook(code: PlateCode) -> list[PlateCode]:
+    """The plate and its neighbours on a dense road, as a vehicle's registry has them."""
+    if code.scheme is PlateScheme.ID:
+        numbers = [code.registry_number + step for step in _NEAR_NUMBERS]
+        return [code, *(PlateCode.from_registry_number(max(number, 0), n=code.n) for number in numbers)]
+    checks = code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else 0
+    lon_places, lat_places = position_decimals(code.n, code.scheme, code.check_digits)
+    lon, lat = code.digits[:lon_places], code.digits[lon_places : lon_places + lat_places]
+    places = [(float(f"0.{lon}") + step, float(f"0.{lat}") + step) for step in _NEIGHBOURS_DEG]
+    return [code, *(PlateCode.from_position(x, y, n=code.n, check_digits=checks) for x, y in places)]
+
+
+def _frames(
+    face: Face, geometry: PlateGeometry, design: DesignSpeed, rng: np.random.Generator
+) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
+    """Height of a unit's image, and the frame, in an even choice of a pass's readable frames. [px]"""
+    conditions = draw_drive(design.camera, frozenset({Condition.DAY}), rng)
+    scenes = [(unit, scene) for unit, scene in _scenes(face, geometry, design, conditions, rng) if unit >= MIN_UNIT_PX]
+    photos = road_photos()
+    photo = photos[int(rng.integers(len(photos)))]
+    background = road_background(photo, camera_of(design.camera), rng, grain=_GRAIN)
+    chosen = np.unique(np.linspace(0, len(scenes) - 1, min(FRAMES_PER_PASS, len(scenes))).round().astype(int))
+    for k in chosen:
+        unit, scene = scenes[k]
+        yield unit, render_plate_scene(scene, background, rng).image
+
+
+def _scenes(
+    face: Face, geometry: PlateGeometry, design: DesignSpeed, conditions: Conditions, rng: np.random.Generator
+) -> Iterator[tuple[float, PlateScene]]:
+    drive = Drive(
+        camera=camera_of(design.camera), face=face, speed_m_s=design.speed_mps, fps=design.camera.frames_per_s,
+        exposure_s=conditions.exposure_s, far_m=FAR_M, road_reflectance=conditions.road_reflectance,
+        air=conditions.air, sensor=conditions.sensor,
+    )  # fmt: skip
+    for scene in drive_over_plate(drive, rng):
+        yield face_truth(scene, scene.faces[0]).height_px / geometry.n, scene
