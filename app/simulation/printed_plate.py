@@ -53,7 +53,7 @@ class PrintFaults:
     growth_mm : float
         Every unit is larger by this on each of its sides; negative: smaller. [mm]
     shifts_mm : mapping of (row, column) to (x, y)
-        Displaced units: to the right and up. [mm]
+        Displaced units: to the right and up; they lie over the others. [mm]
     faded : mapping of (row, column) to float
         Units that moved by this share towards the other paint.
     stains : tuple of Stain
@@ -95,7 +95,7 @@ def printed_face(
     painter.polygon([(-half, half), (half, half), (half, -half), (-half, -half)], look.gap)
     _paint_markers(painter, geometry, look)
     last = geometry.n - 2
-    for row, column in np.ndindex(geometry.n, geometry.n):
+    for row, column in sorted(np.ndindex(geometry.n, geometry.n), key=faults.shifts_mm.__contains__):
         if (row < 2 or row >= last) and (column < 2 or column >= last):
             continue
         own, other = (look.dark, look.light) if code.units[row, column] else (look.light, look.dark)

@@ -1,7 +1,7 @@
 """``python -m benchmarks.plates [ITEM ...] [--short] [--seed N] [--seeds M]``: print the tables.
 
-Items: trials, height, false, peers, speed, accuracy, light, reliability, all. The long mode takes three seeds, the
-short one a part of the frames of one seed, which its tables scale up.
+Items: trials, height, false, peers, speed, accuracy, light, reliability, print, all. The long mode takes three seeds,
+the short one a part of the frames of one seed, which its tables scale up.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from concurrent.futures import ProcessPoolExecutor
 
 from benchmarks.plates import tables
 from benchmarks.plates.evaluate import Record, evaluate_job
+from benchmarks.plates.prints import print_records, prints_table
 from benchmarks.plates.sets import LIGHT, MIN_ROWS, RENDERED_ROWS, SETS, THERMAL_KMH, Job, read_trials
 from benchmarks.plates.speed import measure_speed
 
-ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy", "light", "reliability")
+ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy", "light", "reliability", "print")
 NEEDS = {
     "trials": ("trial",),
     "height": ("trial", "stress", "night", *THERMAL_KMH, "hidden"),
@@ -99,6 +100,10 @@ def main() -> None:
     _print("accuracy", items, tables.accuracy_table, records, "Over the frames decoded in the trials.")
     _print("light", items, tables.light_table, records, _LIGHT_NOTE)
     _print("reliability", items, tables.reliability_table, records, _RELIABILITY_NOTE)
+    if "print" in items:
+        how = {"passes": 1, "step_of_strengths": 3} if args.short else {}
+        prints = [record for seed in seeds for record in print_records(seed, **how)]
+        print(f"\n### print\n\n{_PRINT_NOTE}\n\n{prints_table(prints)}")
     if wrong := tables.frame_list(r for r in records if r.wrong or r.wrong_known):
         print(f"\nWrong digits:\n{wrong}")
     if args.misses:
@@ -121,6 +126,11 @@ _LIGHT_NOTE = (
     "Drives of five frames in which the plate has 12 to 90 rows, on a fair day but for one thing; position plates "
     "without check digits. Stains are one to three ellipses of paint with half axes of 8 to 30 mm. Tags of the plate's "
     "footprint in the same scenes. A drive is lost if no frame is read."
+)
+_PRINT_NOTE = (
+    "Print grades of photos of plates with one fault each, and how the same plates are read in simulated passes by day "
+    "at 60 km/h: frames read with the registry and without it. Values are medians over the seeds; grades are all that "
+    "occurred."
 )
 
 

@@ -55,13 +55,11 @@ class PrintGradeIn(StrictModel):
         """
         if self.marker_id is not None and (self.code is not None or self.geometry is not None):
             raise InvalidParameter(
-                "the declaration names a marker and gives a code or a geometry too", field="declaration.marker_id",
+                "the declaration names a marker and gives a code or a geometry too", field="marker_id",
                 limit="a marker, or a code and a geometry", cure="leave code and geometry out: the marker has them",
             )  # fmt: skip
-        with naming("declaration"):
-            geometry = None if self.geometry is None else self.geometry.geometry()
-            n = 8 if geometry is None else geometry.n
-            code = None if self.code is None else self.code.code(n)
-            if code is not None and geometry is None:
-                geometry = GeometryIn().geometry()
+        geometry = None if self.geometry is None else self.geometry.geometry()
+        code = None if self.code is None else self.code.code(8 if geometry is None else geometry.n)
+        if code is not None and geometry is None:
+            geometry = GeometryIn().geometry()
         return PrintDeclaration(self.marker_id, code, geometry, self.camera, self.speed_kmh)

@@ -30,7 +30,8 @@ _DARK_WEIGHT = 0.2  # of dark units in the light; source: chosen by hand: stray 
 _HUBER = 0.05  # [natural log] residual from which a unit counts less in the light; source: chosen by hand
 _LIGHT_STEPS = 12  # of reweighted least squares; source: chosen by hand, it settles after six
 _MAX_LIGHTS_FOR_LINEAR = 9  # light units up to which the light is linear; source: chosen by hand
-_EDGE_REACH = 1.0  # [gap] beyond the next unit's edge in which an edge is looked for; source: chosen by hand
+_EDGE_REACH = 0.6  # [units] beyond a gap in which an edge is looked for; source: chosen by hand
+_MAX_OFF = 0.55  # [units] of an edge from its place; source: chosen by hand, more leaves the unit's centre uncovered
 _REFINEMENTS = 2  # of the homography by the units' edges; source: chosen by hand
 _MIN_CENTRES = 8  # measured units that refine the homography; source: chosen by hand
 _MAX_OFF_MM = 1.5  # [mm] of a unit that counts as in its place in the homography; source: chosen by hand
@@ -62,11 +63,12 @@ class MeasuredFace:
     clipped : float
         Share of the light units' pixels that are over-exposed.
     offsets_mm : ndarray, shape (n, n, 2)
-        How far units lie right of and below their places, NaN where they were not measured. [mm]
+        How far units lie right of and below their places, by one edge where they touch a neighbour; NaN where they
+        were not measured. [mm]
     widths_mm : ndarray, shape (n, n, 2)
         Widths and heights of units, NaN where they were not measured. [mm]
     merged : float
-        Share of the units that stand out of the gaps whose edges were not found: they touch their neighbours.
+        Share of the units that stand out of the gaps and touch a neighbour.
     edge_mm : float
         Median width of edges from 10 to 90 %, NaN where none was measured. [mm]
     """
@@ -137,7 +139,7 @@ def measure_face(image: npt.NDArray[np.uint8], corners_px: Array, geometry: Plat
         face = _measure(image, image_from_face, geometry)
         if face is None:
             return None
-        correction = _correction(face.offsets_mm, geometry)
+        correction = _correction(face.offsets_mm, face.widths_mm, geometry)
         image_from_face = image_from_face @ correction
     return _measure(image, image_from_face, geometry)
 
@@ -194,7 +196,7 @@ def _measure(image: npt.NDArray[np.uint8], image_from_face: Array, geometry: Pla
     levels = (raw / at_units[..., None] / white) @ _LUMA.astype(np.float64)
     luminance = np.asarray(reflectance @ _LUMA, np.float32)
     gap, dark_level = _gap_level(luminance, geometry), float(np.median(levels[dark]))
-    standing = units & (np.abs(levels - gap) > MIN_EDGE_CONTRAST * (1 - dark_level))
+    standing = units & _stands_out(levels, np.where(dark, dark_level, 1.0), gap, 1 - dark_level)
     offsets, widths, edges = _edges(luminance, levels, standing, gap, geometry)
     lights = [light[window(places[row, column], reach, len(light))].max(axis=-1).ravel()
               for row, column in np.argwhere(units & ~dark)]  # fmt: skip
@@ -251,6 +253,12 @@ def _gap_level(luminance: Floats, geometry: PlateGeometry) -> float:
     return float(np.median([np.median(value) for value in values]))
 
 
+def _stands_out(levels: Array, paints: Array, gap_level: float, contrast: float) -> npt.NDArray[np.bool_]:
+    """Units whose paint differs from the gaps, and that have it."""
+    limit = MIN_EDGE_CONTRAST * contrast
+    return np.asarray((np.abs(paints - gap_level) > limit) & (np.abs(levels - paints) < limit))
+
+
 def _edges(
     luminance: Floats, levels: Array, standing: npt.NDArray[np.bool_], gap_level: float, geometry: PlateGeometry
 ) -> tuple[Array, Array, list[float]]:
@@ -259,39 +267,47 @@ def _edges(
     offsets, widths = np.full((n, n, 2), np.nan), np.full((n, n, 2), np.nan)
     blurs: list[float] = []
     for row, column in np.argwhere(standing):
-        found = [_extent(luminance, places[row, column], levels[row, column], gap_level, geometry, axis)
-                 for axis in (0, 1)]  # fmt: skip
-        if any(one is None for one in found):
-            continue
-        for axis, one in enumerate(found):
-            assert one is not None
-            low, high, blur = one
-            offsets[row, column, axis], widths[row, column, axis] = (low + high) / 2, high - low
-            blurs.append(blur)
+        for axis in (0, 1):
+            profile, at = _profile(luminance, places[row, column], geometry, axis)
+            inside = (profile - gap_level) / (levels[row, column] - gap_level) - 0.5  # positive in the unit
+            found = _find_edges(at, inside, geometry)
+            offsets[row, column, axis] = np.mean([edge for edge, _blur in found]) if found else np.nan
+            if len(found) == 2:
+                widths[row, column, axis] = geometry.unit_mm + found[1][0] - found[0][0]
+                blurs += [blur for _edge, blur in found]
     return offsets, widths, blurs
 
 
-def _extent(
-    luminance: Floats, at_mm: Array, level: float, gap_level: float, geometry: PlateGeometry, axis: int
-) -> tuple[float, float, float] | None:
-    """Lower and upper edge of a unit from its place, and the mean width of the two edges; None without edges. [mm]"""
-    long_mm = geometry.unit_mm / 2 + (1 + _EDGE_REACH) * geometry.gap_mm
+def _profile(luminance: Floats, at_mm: Array, geometry: PlateGeometry, axis: int) -> tuple[Floats, Array]:
+    """Luminance along a line through a unit's place, the median across it, and the places of its samples. [mm]"""
+    long_mm = (0.5 + _EDGE_REACH) * geometry.unit_mm + geometry.gap_mm
     across = CENTRE_SHARE * geometry.unit_mm / 2
     reach = np.array([long_mm, across] if axis == 0 else [across, long_mm])
     rows, columns = window(at_mm, reach, len(luminance))
-    profile = np.median(luminance[rows, columns], axis=axis)
+    profile = np.asarray(np.median(luminance[rows, columns], axis=axis))
     start = (columns if axis == 0 else rows).start
-    at = (np.arange(len(profile)) + start + 0.5) / PX_PER_MM - at_mm[axis]
-    inside = (profile - gap_level) / (level - gap_level) - 0.5  # positive in the unit
+    return profile, (np.arange(len(profile)) + start + 0.5) / PX_PER_MM - at_mm[axis]
+
+
+def _find_edges(at: Array, inside: npt.NDArray[np.floating], geometry: PlateGeometry) -> list[tuple[float, float]]:
+    """How far the lower and the upper edge of a unit are off their places, and their widths from 10 to 90 %. [mm]
+
+    An edge is missing where the unit touches its neighbour.
+    """
     middle = int(np.argmin(np.abs(at)))
     if inside[middle] <= 0:
-        return None
-    slope = float(np.abs(np.diff(inside)).max()) * PX_PER_MM
+        return []
     upper, lower = np.flatnonzero(inside[middle:] <= 0), np.flatnonzero(inside[: middle + 1] <= 0)
-    if not len(upper) or not len(lower):
-        return None
-    low, high = int(lower[-1]), middle + int(upper[0])
-    return _crossing(at, inside, low), _crossing(at, inside, high - 1), 0.8 / max(slope, 1e-6)
+    places = ([(int(lower[-1]), -0.5)] if len(lower) else []) + (
+        [(middle + int(upper[0]) - 1, 0.5)] if len(upper) else []
+    )
+    found = []
+    for k, side in places:
+        off = _crossing(at, inside, k) - side * geometry.unit_mm
+        if abs(off) < _MAX_OFF * geometry.unit_mm:
+            slope = float(np.abs(np.diff(inside[max(k - 2, 0) : k + 4])).max()) * PX_PER_MM
+            found.append((off, 0.8 / max(slope, 1e-6)))
+    return found
 
 
 def _crossing(at: Array, inside: npt.NDArray[np.floating], k: int) -> float:
@@ -300,9 +316,9 @@ def _crossing(at: Array, inside: npt.NDArray[np.floating], k: int) -> float:
     return float(at[k] + (at[k + 1] - at[k]) * a / (a - b))
 
 
-def _correction(offsets_mm: Array, geometry: PlateGeometry) -> Array:
+def _correction(offsets_mm: Array, widths_mm: Array, geometry: PlateGeometry) -> Array:
     """Homography from the face as drawn to the face as it was found; identity where few units were measured."""
-    known = np.isfinite(offsets_mm).all(axis=-1)
+    known = np.isfinite(widths_mm).all(axis=-1)
     if known.sum() < _MIN_CENTRES:
         return np.eye(3)
     drawn = unit_centres_mm(geometry)[known]

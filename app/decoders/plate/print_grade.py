@@ -76,7 +76,7 @@ def grade_print(
     PrintNotGraded
         There is no plate, more than one, or the photo does not show it well enough; with the limit and the cure.
     """
-    reading = _find_plate(photo, code, geometry)
+    reading, with_registry = _find_plate(photo, code, geometry)
     drawn = geometry or reading.geometry
     assert reading.corners_px is not None
     assert drawn is not None
@@ -94,7 +94,7 @@ def grade_print(
     view = _view(photo, face, drawn, focal_35mm)
     _check_view(view, drawn)
     axes = _axes(photo, face.image_from_face, drawn, focal_35mm)[0]
-    parameters = grade_parameters(PrintEvidence(face, expected, drawn, axes, reading))
+    parameters = grade_parameters(PrintEvidence(face, expected, drawn, axes, reading, with_registry))
     return PrintGrade(
         expected, drawn, code is not None, reading.outcome, reading.digits, view, parameters,
         reflectance_margins(face, expected), is_unit(drawn.n) & (face.dark != expected.units.astype(bool)),
@@ -105,8 +105,10 @@ def grade_print(
 # --- the plate --------------------------------------------------------------------------------------------------------
 
 
-def _find_plate(photo: Image, code: PlateCode | None, geometry: PlateGeometry | None) -> PlateReading:
-    """The plate's reading without a registry, its corners in the photo."""
+def _find_plate(
+    photo: Image, code: PlateCode | None, geometry: PlateGeometry | None
+) -> tuple[PlateReading, bool]:  # fmt: skip
+    """The plate's reading without a registry, its corners in the photo, and whether a registry with the code helps."""
     shrink = min(1.0, SEARCH_SIDE_PX / max(photo.shape[:2]))
     small = photo
     if shrink < 1:
@@ -133,7 +135,11 @@ def _find_plate(photo: Image, code: PlateCode | None, geometry: PlateGeometry | 
             "a corner of the plate is out of the photo", field="photo", limit="the whole plate",
             cure="photograph the whole plate with some ground around it",
         )  # fmt: skip
-    return _moved(best, corners_px)
+    with_registry = False
+    if code is not None and best.code is None:
+        known = decode_plates(small, geometries=wanted, codebook=(code,))
+        with_registry = any(one.digits == code.digits for one in known)
+    return _moved(best, corners_px), with_registry
 
 
 def _moved(reading: PlateReading, corners_px: Array) -> PlateReading:
@@ -153,14 +159,14 @@ def _no_plate(small: Image, found: list[PlateReading]) -> PrintNotGraded:
         )  # fmt: skip
     if found:
         return PrintNotGraded(
-            f"a plate was found but not read: {found[0].reason or found[0].outcome}", field="declaration.code",
+            f"a plate was found but not read: {found[0].reason or found[0].outcome}", field="code",
             limit="a plate that can be read, or its digits",
             cure="declare the code that the plate should have, then a plate that cannot be read is graded too",
         )  # fmt: skip
     return PrintNotGraded(
         "no plate was found in the photo", field="photo", limit="one whole plate of the declared geometry",
-        cure="photograph the whole plate from above, in even light and in focus, and check n, unit_mm and gap_mm; if all "
-            "is so, the red triangle and the green squares are too pale",
+        cure="photograph the whole plate from above, in even light and in focus, and check n, unit_mm and gap_mm; "
+            "if all is so, the red triangle and the green squares are too pale",
     )  # fmt: skip
 
 
@@ -168,7 +174,7 @@ def _check_same_size(reading: PlateReading, code: PlateCode | None) -> None:
     if code is not None and reading.geometry is not None and reading.geometry.n != code.n:
         raise PrintNotGraded(
             f"the photo shows a plate of {reading.geometry.n} x {reading.geometry.n} units, not {code.n} x {code.n}",
-            field="declaration.geometry.n", limit=f"n = {code.n}", cure="photograph the plate that is declared",
+            field="geometry.n", limit=f"n = {code.n}", cure="photograph the plate that is declared",
         )  # fmt: skip
 
 
@@ -179,7 +185,7 @@ def _check_agreement(reading: PlateReading, expected: PlateCode, face: MeasuredF
     if reading.code is None and agreement < MIN_AGREEMENT:
         raise PrintNotGraded(
             f"the plate cannot be read, and only {agreement:.0%} of its units are as expected",
-            field="declaration.code",
+            field="code",
             limit=f"{MIN_AGREEMENT:.0%} of the units", cure="photograph the plate that is declared, in even light",
         )  # fmt: skip
 

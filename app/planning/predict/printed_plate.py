@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -119,34 +119,73 @@ def predict_print(
     seed : int
         Draws light, sensor and noise. The same seed gives the same prediction.
     """
-    cv2.setNumThreads(1)
-    face = _face(reflectance, geometry)
-    codebook = _codebook(code)
-    passes: list[list[tuple[float, bool]]] = []
-    wrong = alone = 0
-    for k in range(PASSES):
-        frames: list[tuple[float, bool]] = []
-        for unit_px, image in _frames(face, geometry, design, np.random.default_rng((seed, k))):
-            digits = _read(image, geometry, codebook)
-            frames.append((unit_px, code.digits in digits))
-            wrong += any(found != code.digits for found in digits)
-            alone += code.digits in _read(image, geometry, ())
-        passes.append(frames)
+    found = read_passes(_face(reflectance, geometry), code, geometry, design, seed=seed)
     model = fitted_models().plate_model(DAY)
     blur = design.speed_mps * design.camera.exposure_s / (geometry.pitch_mm / 1000)
-    weight = _posterior(model, passes, blur)
+    weight = _posterior(model, found.passes, blur)
     rates = [read_rate_of_model(_shifted(model, shift), geometry, design.camera, design.speed_mps) for shift in _SHIFTS]
     return PrintPrediction(
         readable_frames(geometry, design.camera, design.speed_mps),
-        len(passes),
-        sum(len(frames) for frames in passes),
-        sum(hit for frames in passes for _px, hit in frames),
-        alone,
-        wrong,
+        len(found.passes),
+        len(found.frames),
+        sum(hit for _px, hit in found.frames),
+        found.alone,
+        found.wrong,
         float(np.exp((weight * _SHIFTS).sum())),
         float((weight * rates).sum()),
         rates[0],
     )
+
+
+@dataclass(slots=True)
+class PassesRead:
+    """Frames of simulated passes.
+
+    Attributes
+    ----------
+    passes : list of list of (float, bool)
+        Of each frame of each pass: height of a unit's image [px], and whether it was read with the registry.
+    alone, wrong : int
+        Frames that were read without the registry, and those in which other digits were read.
+    """
+
+    passes: list[list[tuple[float, bool]]] = field(default_factory=list)
+    alone: int = 0
+    wrong: int = 0
+
+    @property
+    def frames(self) -> list[tuple[float, bool]]:
+        """Of all passes."""
+        return [frame for frames in self.passes for frame in frames]
+
+
+def read_passes(
+    face: Face, code: PlateCode, geometry: PlateGeometry, design: DesignSpeed, *, seed: int, passes: int = PASSES
+) -> PassesRead:
+    """Render frames of passes by day over a face, and decode them as a vehicle does that knows the registry.
+
+    Parameters
+    ----------
+    face : Face
+        Of a plate; a margin around it may be part of the face.
+    code : PlateCode
+        What the registry has.
+    geometry : PlateGeometry
+    design : DesignSpeed
+    seed, passes : int
+        Each pass draws light, sensor and noise of its own.
+    """
+    cv2.setNumThreads(1)
+    codebook, out = _codebook(code), PassesRead()
+    for k in range(passes):
+        frames: list[tuple[float, bool]] = []
+        for unit_px, image in _frames(face, geometry, design, np.random.default_rng((seed, k))):
+            digits = _read(image, geometry, codebook)
+            frames.append((unit_px, code.digits in digits))
+            out.wrong += any(found != code.digits for found in digits)
+            out.alone += code.digits in _read(image, geometry, ())
+        out.passes.append(frames)
+    return out
 
 
 def _read(image: npt.NDArray[np.uint8], geometry: PlateGeometry, codebook: Sequence[PlateCode]) -> list[str]:
@@ -220,4 +259,5 @@ def _scenes(
         air=conditions.air, sensor=conditions.sensor,
     )  # fmt: skip
     for scene in drive_over_plate(drive, rng):
-        yield face_truth(scene, scene.faces[0]).height_px / geometry.n, scene
+        plate_share = geometry.side_mm / 1000 / face.side_m
+        yield plate_share * face_truth(scene, scene.faces[0]).height_px / geometry.n, scene

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from app.errors import InvalidParameter, UploadTooLarge
+from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
 from app.families.plate.plates import PLATE
 from app.families.plate.rows import plate_code, plate_geometry
-from app.formats.image_headers import is_picture, unknown_picture
+from app.formats.image_headers import FIELD, is_picture, unknown_picture
 from app.formats.images import ImageLimits
 from app.formats.spooled_file import SpooledFile
 from app.markers.plate import PlateCode, PlateGeometry
@@ -86,21 +86,27 @@ class PrintGrades:
             code, geometry = self._registered(caller, declared.marker_id)
         head = photo.head(_SIGNATURE_BYTES)
         if head and not is_picture(head):
-            raise unknown_picture(head)
+            error = unknown_picture(head)
+            error.field = "photo"
+            raise error
         if photo.size > self._images.file_bytes:
             raise UploadTooLarge("the photo is too large", field="photo", limit=f"{self._images.file_bytes} bytes")
         task = PrintGradeTask(
             photo, self._clock(), code, geometry, declared.marker_id, declared.camera, declared.speed_kmh, as_pdf,
             self._images,
         )  # fmt: skip
-        return self._processes.submit(task, wait_s=_BUSY_WAIT_S).result()
+        try:
+            return self._processes.submit(task, wait_s=_BUSY_WAIT_S).result()
+        except UnreadableUpload as error:
+            error.field = "photo" if error.field == FIELD else error.field  # the form's name of the file
+            raise
 
     def _registered(self, caller: Caller, marker_id: str) -> tuple[PlateCode, PlateGeometry]:
         with self._database.read() as connection:
             row = store.get_marker(connection, caller.agency_id, marker_id)
         if row.family != PLATE.name:
             raise InvalidParameter(
-                f"the marker {marker_id} is no plate but of the family {row.family}", field="declaration.marker_id",
+                f"the marker {marker_id} is no plate but of the family {row.family}", field="marker_id",
                 limit="the id of a plate", cure="name the plate that was printed",
             )  # fmt: skip
         return plate_code(row), plate_geometry(row)

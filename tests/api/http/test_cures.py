@@ -47,7 +47,8 @@ def test_items_of_bulk_requests_are_not_bare_markers(client: httpx.Client) -> No
 
 
 @pytest.mark.parametrize(
-    ("path", "right"), [("/v1/decodes", "file"), ("/v1/imports", "file"), ("/v1/calibrations", "photos")]
+    ("path", "right"),
+    [("/v1/decodes", "file"), ("/v1/imports", "file"), ("/v1/calibrations", "photos"), ("/v1/print-grades", "photo")],
 )
 def test_a_form_names_its_parts(client: httpx.Client, path: str, right: str) -> None:
     problem = refused(client.post(path, files={"image": ("a.png", b"x")}), 400, field="image")
