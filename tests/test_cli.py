@@ -104,6 +104,25 @@ def test_a_plate_is_written_and_read_back(waymark: Run, tmp_path: Path) -> None:
         assert [reading["digits"] for reading in orjson.loads(line)["readings"]] == ["179203304161"]
 
 
+def test_the_artwork_of_a_plate_is_a_perfect_print(waymark: Run, tmp_path: Path) -> None:
+    place = ("--lon-deg", "114.179203", "--lat-deg", "22.304161")
+    assert waymark("encode", *place, "--format", "png", "--out", str(tmp_path))[0] == 0
+    photo, page = str(tmp_path / "179203304161.png"), tmp_path / "grade.pdf"
+    status, printed, error = waymark("grade-print", photo, "--digits", "179203304161", "--pdf", str(page))
+    assert status == 0, error
+    grade = orjson.loads(printed)
+    assert grade["letter"] == "A", grade["parameters"]
+    values = {one["name"]: one["value"] for one in grade["parameters"]}
+    assert values["axial-nonuniformity"] < 0.003
+    assert values["grid-nonuniformity"] < 0.01
+    assert values["print-growth"] < 0.1
+    assert page.read_bytes().startswith(b"%PDF-")
+    status, printed, error = waymark("grade-print", photo, "--digits", "1792")
+    assert (status, printed) == (1, "")
+    assert "12 digits" in error
+    assert waymark("grade-print", photo, "--scheme", "morse", "--digits", "1")[0] == 1
+
+
 def test_an_id_plate_is_written(waymark: Run, tmp_path: Path) -> None:
     number = ("--registry-number", "3735928559", "--format", "svg")
     status, listed, error = waymark("encode", *number, "--out", str(tmp_path))

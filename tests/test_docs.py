@@ -38,7 +38,7 @@ def test_documented_commands_targets_settings_and_files_exist(document: Path) ->
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M))
     settings = {f"WAYMARK_{name.upper()}" for name in Settings.model_fields}
     settings |= set(re.findall(r"WAYMARK_BENCH_[A-Z_]+[A-Z]", (ROOT / "benchmarks/service/__main__.py").read_text()))
-    assert set(re.findall(r"`waymark ([a-z]+)", text)) <= commands
+    assert set(re.findall(r"`waymark ([a-z]+(?:-[a-z]+)*)", text)) <= commands
     assert set(re.findall(r"(?:`|^ +)make ([a-z]+)", text, re.M)) <= targets
     assert set(re.findall(r"WAYMARK_[A-Z_]+[A-Z]", text)) <= settings
     for path in re.findall(r"`((?:app|docs|tests|migrations|benchmarks|docker)/[\w./-]*)`", text):

@@ -1,7 +1,8 @@
-"""Commands for plates and pictures that need no server: artwork, calibration boards, decoding."""
+"""Commands for plates and pictures that need no server: artwork, calibration boards, decoding, print grades."""
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -86,6 +87,46 @@ def decode(
     for picture in pictures:
         found = decode_picture(picture.name, picture.read_bytes(), decode=decode_plates, limits=limits, thermal=thermal)
         typer.echo(orjson.dumps(found, option=orjson.OPT_SERIALIZE_NUMPY))
+
+
+def grade_print(
+    photo: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="JPEG or PNG of one printed plate.")],
+    digits: Annotated[str | None, typer.Option(help="What the plate should be; without it, what is read.")] = None,
+    scheme: Annotated[str, typer.Option(help="position, position-check or id.")] = "position",
+    n: Annotated[int, typer.Option(help="Units along a side: 8, 10 or 12.")] = 8,
+    unit_mm: Annotated[float, typer.Option(help="Side of a unit. [mm]")] = 35.0,
+    gap_mm: Annotated[float, typer.Option(help="Gap between units. [mm]")] = 5.0,
+    speed_kmh: Annotated[float, typer.Option(min=5.0, max=250.0, help="Design speed. [km/h]")] = 60.0,
+    pdf: Annotated[Path | None, typer.Option(help="Also write the page to this file.")] = None,
+) -> None:
+    """Grade a printed plate by a photo, and print the grade as JSON."""
+    import orjson
+
+    from app.formats.images import ImageLimits
+    from app.formats.spooled_file import SpooledFile
+    from app.jobs.print_tasks import grade_photo
+    from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+    from app.planning.rules import CameraRules
+    from app.services.markers.print_task import PrintGradeTask
+
+    if scheme not in list(PlateScheme):
+        raise InvalidParameter(f"there is no scheme {scheme}", limit=", ".join(PlateScheme))
+    code = None if digits is None else PlateCode(digits, PlateScheme(scheme), n)
+    task = PrintGradeTask(
+        SpooledFile.of(photo.read_bytes()),
+        datetime.now(UTC),
+        code,
+        PlateGeometry(n, unit_mm, gap_mm),
+        None,
+        CameraRules(),
+        speed_kmh,
+        as_pdf=pdf is not None,
+        limits=ImageLimits(pixels=read_settings().max_image_pixels),
+    )
+    graded = grade_photo(task, None)
+    if pdf is not None:
+        pdf.write_bytes(graded.pdf)
+    typer.echo(orjson.dumps(graded.document))
 
 
 def _formats(names: list[str] | tuple[str, ...]) -> list[ArtworkFormat]:

@@ -420,6 +420,15 @@ MENTIONS: dict[str, tuple[str, Callable[[str], dict[str, Any]]]] = {
             "headers": {"Content-Type": "image/png", "Waymark-Context": json.dumps({"vehicle": row})},
         },
     ),
+    "POST /v1/print-grades": (
+        "marker_id",
+        lambda row: {
+            "files": {
+                "photo": ("plate.png", png(corner_frame())),
+                "declaration": (None, json.dumps({"marker_id": row})),
+            }
+        },
+    ),
     "GET /v1/plans": ("alignment_id", lambda row: {"params": {"alignment_id": row}}),
     "GET /v1/maintenance": ("marker_id", lambda row: {"params": {"marker_id": row}}),
     "GET /v1/maintenance.{form}": ("marker_id", lambda row: {"params": {"marker_id": row}}),
