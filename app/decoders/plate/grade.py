@@ -1,4 +1,7 @@
-"""Waymark grade of a read plate, modelled on ISO/IEC 15415 without claiming conformance."""
+"""Waymark grade of a read plate, modelled on ISO/IEC 15415 without claiming conformance.
+
+The grade of a print by a photo is another thing: app/decoders/plate/print_grade.py.
+"""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ FAULTS: list[tuple[str, PlateLook, PrintFaults, set[Name], float]] = [
     ("a displaced unit", WHITE_GAPS, PrintFaults(shifts_mm={DARK_UNIT: (0.0, 16.5)}), {Name.GRID_NONUNIFORMITY}, 3),
     ("ink that bleeds", WHITE_GAPS, PrintFaults(growth_mm=1.5), {Name.PRINT_GROWTH}, 3),
     ("units too small", BLACK_GAPS, PrintFaults(growth_mm=-1.9), {Name.PRINT_GROWTH}, 2),
-    ("pale green", replace(LOOK, green=(0.2, 0.28, 0.17)), PrintFaults(), {Name.COLOUR}, 3),
+    ("pale green", replace(LOOK, green=(0.18, 0.28, 0.15)), PrintFaults(), {Name.COLOUR}, 3),
     ("pale red", replace(LOOK, red=(0.24, 0.24, 0.32)), PrintFaults(), {Name.COLOUR}, 2),
     ("a stain", LOOK, PrintFaults(stains=(Stain(40.0, -40.0, 22.0, (0.3, 0.3, 0.3)),)), {Name.DAMAGE}, 3),
 ]
