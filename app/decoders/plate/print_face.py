@@ -22,6 +22,8 @@ blurred unit still fills it."""
 MIN_EDGE_CONTRAST = 0.25
 """[contrast] of a unit and the gap, below which the edge between them is not measured. Source: chosen by hand: one of
 the two paints always has twice of it."""
+MERGED = 0.5
+"""[1] share of units that touch a neighbour from which the gaps count as closed. Source: chosen by hand."""
 CLIPPED_LEVEL = 251
 """[grey level] from which a pixel counts as over-exposed. Source: chosen by hand: JPEG moves 255 by a few levels."""
 _LUMA = np.array([0.0722, 0.7152, 0.2126], np.float32)
@@ -31,6 +33,7 @@ _HUBER = 0.05  # [natural log] residual from which a unit counts less in the lig
 _LIGHT_STEPS = 12  # of reweighted least squares; source: chosen by hand, it settles after six
 _MAX_LIGHTS_FOR_LINEAR = 9  # light units up to which the light is linear; source: chosen by hand
 _EDGE_REACH = 0.6  # [units] beyond a gap in which an edge is looked for; source: chosen by hand
+_STEEPEST = 99.0  # percentile of the slopes; source: chosen by hand, edges of 0.3 mm cover more than a hundredth
 _MAX_OFF = 0.55  # [units] of an edge from its place; source: chosen by hand, more leaves the unit's centre uncovered
 _REFINEMENTS = 2  # of the homography by the units' edges; source: chosen by hand
 _MIN_CENTRES = 8  # measured units that refine the homography; source: chosen by hand
@@ -70,7 +73,7 @@ class MeasuredFace:
     merged : float
         Share of the units that stand out of the gaps and touch a neighbour.
     edge_mm : float
-        Median width of edges from 10 to 90 %, NaN where none was measured. [mm]
+        Median width of edges from 10 to 90 %; of the steepest ones where the gaps are closed. [mm]
     """
 
     reflectance: Floats
@@ -198,6 +201,7 @@ def _measure(image: npt.NDArray[np.uint8], image_from_face: Array, geometry: Pla
     gap, dark_level = _gap_level(luminance, geometry), float(np.median(levels[dark]))
     standing = units & _stands_out(levels, np.where(dark, dark_level, 1.0), gap, 1 - dark_level)
     offsets, widths, edges = _edges(luminance, levels, standing, gap, geometry)
+    merged = 1 - float(np.isfinite(widths[standing]).all(axis=-1).mean()) if standing.any() else 1.0
     lights = [light[window(places[row, column], reach, len(light))].max(axis=-1).ravel()
               for row, column in np.argwhere(units & ~dark)]  # fmt: skip
     return MeasuredFace(
@@ -205,8 +209,8 @@ def _measure(image: npt.NDArray[np.uint8], image_from_face: Array, geometry: Pla
         white_level=float(np.searchsorted(_LINEAR, np.median(np.concatenate(lights)))),
         clipped=float((np.concatenate(lights) >= _LINEAR[CLIPPED_LEVEL]).mean()),
         offsets_mm=offsets, widths_mm=widths,
-        merged=1 - np.isfinite(widths[standing]).all(axis=-1).mean() if standing.any() else 1.0,
-        edge_mm=float(np.median(edges)) if edges else float("nan"),
+        merged=merged,
+        edge_mm=float(np.median(edges)) if merged <= MERGED else _steepest_edge_mm(luminance, 1 - dark_level),
     )  # fmt: skip
 
 
@@ -276,6 +280,12 @@ def _edges(
                 widths[row, column, axis] = geometry.unit_mm + found[1][0] - found[0][0]
                 blurs += [blur for _edge, blur in found]
     return offsets, widths, blurs
+
+
+def _steepest_edge_mm(luminance: Floats, contrast: float) -> float:
+    """Width of the steepest edges of a face from 10 to 90 %, where the gaps are closed. [mm]"""
+    slopes = np.hypot(*np.gradient(luminance)) * PX_PER_MM
+    return float(0.8 * contrast / max(np.percentile(slopes, _STEEPEST), 1e-6))
 
 
 def _profile(luminance: Floats, at_mm: Array, geometry: PlateGeometry, axis: int) -> tuple[Floats, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.layout import marker_centroids
-from app.decoders.plate.print_face import MeasuredFace, is_unit, unit_centres_mm, window
+from app.decoders.plate.print_face import MERGED, MeasuredFace, is_unit, unit_centres_mm, window
 from app.markers.plate import PlateCode, PlateGeometry, codewords_of_cells, plate_capacity, unit_index
 from app.markers.print_grade import THRESHOLDS, PrintParameter, PrintParameterName
 from app.markers.reading import PlateReading
@@ -195,7 +195,7 @@ def _growth(evidence: PrintEvidence) -> PrintParameter:
         PrintParameterName.PRINT_GROWTH,
         "adjust the ink, the stencil or the cut, so that the gaps have their width",
     )
-    if face.merged > 0.5:
+    if face.merged > MERGED:
         return _graded(name, 1.0, f"{face.merged:.0%} of the units touch a neighbour: the gaps are closed", cure)
     means = []
     for paint, which in (("dark", face.dark), ("light", ~face.dark)):

@@ -62,6 +62,8 @@ FAULTS: list[tuple[str, PlateLook, PrintFaults, set[Name], float]] = [
     ("shortened", LOOK, PrintFaults(stretch=-0.10), {Name.AXIAL_NONUNIFORMITY}, 1),
     ("a displaced unit", WHITE_GAPS, PrintFaults(shifts_mm={DARK_UNIT: (0.0, 16.5)}), {Name.GRID_NONUNIFORMITY}, 3),
     ("ink that bleeds", WHITE_GAPS, PrintFaults(growth_mm=1.5), {Name.PRINT_GROWTH}, 3),
+    ("closed gaps", WHITE_GAPS, PrintFaults(growth_mm=2.8), {Name.PRINT_GROWTH}, 0),
+    ("closed black gaps", BLACK_GAPS, PrintFaults(growth_mm=2.8), {Name.PRINT_GROWTH}, 0),
     ("units too small", BLACK_GAPS, PrintFaults(growth_mm=-1.9), {Name.PRINT_GROWTH}, 2),
     ("pale green", replace(LOOK, green=(0.18, 0.28, 0.15)), PrintFaults(), {Name.COLOUR}, 3),
     ("pale red", replace(LOOK, red=(0.24, 0.24, 0.32)), PrintFaults(), {Name.COLOUR}, 2),
@@ -172,6 +174,12 @@ def test_a_photo_that_shows_the_plate_badly_is_refused(view: dict[str, Any], rea
 def test_a_blurred_photo_is_told_from_one_without_a_plate() -> None:
     with pytest.raises(PrintNotGraded, match="edges are"):
         grade_print(cv2.GaussianBlur(pixels(photo_of()), (0, 0), 5.0), code=CODE, geometry=GEOMETRY)
+
+
+def test_a_blurred_photo_of_closed_gaps_is_refused_too() -> None:
+    image = pixels(photo_of(look=BLACK_GAPS, faults=PrintFaults(growth_mm=2.8)))
+    with pytest.raises(PrintNotGraded, match="blurred"):
+        grade_print(cv2.GaussianBlur(image, (0, 0), 6.0), code=CODE, geometry=GEOMETRY)
 
 
 def test_photos_without_one_whole_plate_are_refused() -> None:
