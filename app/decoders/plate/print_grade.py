@@ -126,19 +126,19 @@ def _find_plate(
     best = (read or found)[0]
     if code is None and best.code is None:
         raise _no_plate(small, found)
+    with_registry, place = False, best
+    if code is not None and best.code is None:
+        known = [one for one in decode_plates(small, geometries=wanted, codebook=(code,)) if one.digits == code.digits]
+        with_registry, place = bool(known), (known or [best])[0]
     _check_same_size(best, code)
-    assert best.corners_px is not None
+    assert place.corners_px is not None
     scale = np.array([photo.shape[1] / small.shape[1], photo.shape[0] / small.shape[0]])
-    corners_px = (best.corners_px + 0.5) * scale - 0.5
+    corners_px = (place.corners_px + 0.5) * scale - 0.5
     if (corners_px < -0.5).any() or (corners_px > np.array(photo.shape[1::-1]) - 0.5).any():
         raise PrintNotGraded(
             "a corner of the plate is out of the photo", field="photo", limit="the whole plate",
             cure="photograph the whole plate with some ground around it",
         )  # fmt: skip
-    with_registry = False
-    if code is not None and best.code is None:
-        known = decode_plates(small, geometries=wanted, codebook=(code,))
-        with_registry = any(one.digits == code.digits for one in known)
     return _moved(best, corners_px), with_registry
 
 
