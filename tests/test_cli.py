@@ -13,6 +13,7 @@ from pydantic import SecretStr
 
 from app import __version__, cli
 from app.main import create_app
+from app.markers.plate import PlateCode, PlateScheme
 from app.settings import Settings
 from tests.conftest import LiveServer
 
@@ -87,21 +88,28 @@ def test_without_a_command_the_commands_are_listed(waymark: Run) -> None:
     assert all(name in out + error for name in ("serve", "migrate", "key"))
 
 
-def test_a_plate_is_written_and_read_back(waymark: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("scheme", "digits"),
+    [
+        ((), PlateCode.from_position(114.179203, 22.304161, n=10, scheme=PlateScheme.POSITION_ROBUST).digits),
+        (("--scheme", "position"), "179203304161"),
+    ],
+)
+def test_a_plate_is_written_and_read_back(waymark: Run, tmp_path: Path, scheme: tuple[str, ...], digits: str) -> None:
     out = tmp_path / "artwork"
-    place = ("--lon-deg", "114.179203", "--lat-deg", "22.304161")
+    place = ("--lon-deg", "114.179203", "--lat-deg", "22.304161", *scheme)
     formats = ("--format", "png", "--format", "svg", "--format", "pdf", "--format", "dxf")
     status, listed, error = waymark("encode", *place, *formats, "--out", str(out))
     assert status == 0, error
-    names = {f"179203304161.{form}" for form in ("png", "svg", "pdf", "dxf")}
+    names = {f"{digits}.{form}" for form in ("png", "svg", "pdf", "dxf")}
     assert {Path(line).name for line in listed.split()} == names == {file.name for file in out.iterdir()}
     seen = tmp_path / "seen.png"
-    drawn = cv2.imread(str(out / "179203304161.png"))
+    drawn = cv2.imread(str(out / f"{digits}.png"))
     cv2.imwrite(str(seen), cv2.resize(drawn, (300, 356), interpolation=cv2.INTER_AREA))
     status, printed, error = waymark("decode", str(seen), str(seen))
     assert status == 0, error
     for line in printed.splitlines():
-        assert [reading["digits"] for reading in orjson.loads(line)["readings"]] == ["179203304161"]
+        assert [reading["digits"] for reading in orjson.loads(line)["readings"]] == [digits]
 
 
 def test_the_artwork_of_a_plate_is_a_perfect_print(waymark: Run, tmp_path: Path) -> None:
@@ -139,6 +147,9 @@ def test_an_id_plate_is_written(waymark: Run, tmp_path: Path) -> None:
         (("--registry-number", "1", "--lon-deg", "1", "--lat-deg", "1"), "one of the two"),
         (("--registry-number", "4294967296"), "4294967295"),
         (("--registry-number", "1", "--n", "9"), "8, 10 or 12"),
+        (("--lon-deg", "1", "--lat-deg", "1", "--n", "8"), "10 or 12"),
+        (("--lon-deg", "1", "--lat-deg", "1", "--scheme", "id"), "position-robust"),
+        (("--lon-deg", "1", "--lat-deg", "1", "--check-digits", "1"), "position-check"),
         (("--registry-number", "1", "--unit-mm", "51"), "2-5 cm"),
         (("--registry-number", "1", "--format", "gif"), "svg, pdf, dxf, png"),
     ],

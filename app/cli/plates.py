@@ -22,24 +22,36 @@ def encode(
     out: OutOption = Path("."),
     lon_deg: Annotated[float | None, typer.Option(help="Longitude of a position plate. [deg]")] = None,
     lat_deg: Annotated[float | None, typer.Option(help="Latitude of a position plate. [deg]")] = None,
-    check_digits: Annotated[int, typer.Option(min=0, max=2, help="Check digits of a position plate.")] = 0,
+    scheme: Annotated[
+        str, typer.Option(help="Of a position plate: position-robust, position-check or position.")
+    ] = "position-robust",
+    check_digits: Annotated[
+        int | None, typer.Option(min=1, max=2, help="Check digits of a position-check plate, 1 by default.")
+    ] = None,
     registry_number: Annotated[int | None, typer.Option(help="Registry number of an id plate.")] = None,
-    n: Annotated[int, typer.Option(help="Units along a side: 8, 10 or 12.")] = 8,
-    unit_mm: Annotated[float, typer.Option(help="Side of a unit. [mm]")] = 35.0,
+    n: Annotated[
+        int | None, typer.Option(help="Units along a side: 8, 10 or 12; by default 10 for position-robust, else 8.")
+    ] = None,
+    unit_mm: Annotated[
+        float | None, typer.Option(help="Side of a unit; by default 27 for position-robust, else 35. [mm]")
+    ] = None,
     gap_mm: Annotated[float, typer.Option(help="Gap between units. [mm]")] = 5.0,
     thickness_mm: Annotated[float, typer.Option(help="Thickness of the base plate. [mm]")] = 20.0,
     form: FormatOption = None,
 ) -> None:
     """Write the artwork of one plate at true size, after the decoder has read it back."""
     from app.decoders.plate.reader import decode_plates
-    from app.markers.plate import PlateGeometry
-    from app.services.markers.plate_files import encode_plate_files, plate_code_for
+    from app.services.markers.plate_files import encode_plate_files, plate_for
 
     formats = _formats(form or ("svg", "pdf"))
     position = (lon_deg, lat_deg) if lon_deg is not None and lat_deg is not None else None
+    code, geometry = plate_for(
+        position, registry_number, scheme=scheme, check_digits=check_digits,
+        n=n, unit_mm=unit_mm, gap_mm=gap_mm, thickness_mm=thickness_mm,
+    )  # fmt: skip
     files = encode_plate_files(
-        plate_code_for(position, registry_number, n=n, check_digits=check_digits),
-        PlateGeometry(n, unit_mm, gap_mm, thickness_mm),
+        code,
+        geometry,
         formats,
         position=position,
         read=lambda image, geometry: decode_plates(image, geometries=(geometry,)),
@@ -92,9 +104,9 @@ def decode(
 def grade_print(
     photo: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="JPEG or PNG of one printed plate.")],
     digits: Annotated[str | None, typer.Option(help="What the plate should be; without it, what is read.")] = None,
-    scheme: Annotated[str, typer.Option(help="position, position-check or id.")] = "position",
-    n: Annotated[int, typer.Option(help="Units along a side: 8, 10 or 12.")] = 8,
-    unit_mm: Annotated[float, typer.Option(help="Side of a unit. [mm]")] = 35.0,
+    scheme: Annotated[str, typer.Option(help="id, position-robust, position-check or position.")] = "id",
+    n: Annotated[int | None, typer.Option(help="Units along a side; that of the scheme if left out.")] = None,
+    unit_mm: Annotated[float | None, typer.Option(help="Side of a unit. [mm]")] = None,
     gap_mm: Annotated[float, typer.Option(help="Gap between units. [mm]")] = 5.0,
     speed_kmh: Annotated[float, typer.Option(min=5.0, max=250.0, help="Design speed. [km/h]")] = 60.0,
     pdf: Annotated[Path | None, typer.Option(help="Also write the page to this file.")] = None,
@@ -105,18 +117,20 @@ def grade_print(
     from app.formats.images import ImageLimits
     from app.formats.spooled_file import SpooledFile
     from app.jobs.print_tasks import grade_photo
-    from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+    from app.markers.plate import PlateCode, PlateScheme
+    from app.markers.recommended_plate import recommended_geometry
     from app.planning.rules import CameraRules
     from app.services.markers.print_task import PrintGradeTask
 
     if scheme not in list(PlateScheme):
         raise InvalidParameter(f"there is no scheme {scheme}", limit=", ".join(PlateScheme))
-    code = None if digits is None else PlateCode(digits, PlateScheme(scheme), n)
+    geometry = recommended_geometry(PlateScheme(scheme), n=n, unit_mm=unit_mm, gap_mm=gap_mm)
+    code = None if digits is None else PlateCode(digits, PlateScheme(scheme), geometry.n)
     task = PrintGradeTask(
         SpooledFile.of(photo.read_bytes()),
         datetime.now(UTC),
         code,
-        PlateGeometry(n, unit_mm, gap_mm),
+        geometry,
         None,
         CameraRules(),
         speed_kmh,

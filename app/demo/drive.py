@@ -12,7 +12,8 @@ import numpy as np
 
 from app.demo.lane import LanePlace, list_lane_places
 from app.geodesy import enu_from_heading, wgs84_from_enu
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import PlateCode, PlateScheme
+from app.markers.recommended_plate import recommended_geometry
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import draw_daylight
@@ -30,16 +31,15 @@ MIN_ROWS = 8.0  # a unit is one pixel high: from here on frames are counted
 SURVEY_RMSE_M = 0.01
 SURVEY_HEADING_RMSE_DEG = 0.1
 COARSE_ERROR_M = (2.0, 5.0)
-GEOMETRY = PlateGeometry()
 _ROAD_HEIGHT_M = 165.0
 _FIRST_M, _SPACING_M = 40.0, 28.0
 _CODES: tuple[dict[str, Any], ...] = (
-    {},
+    {"scheme": "position-robust"},
     {"scheme": "position-check", "check_digits": 2},
-    {"digits": PAPER_DIGITS, "allow_mismatched_digits": True},
-    {},
+    {"scheme": "position", "digits": PAPER_DIGITS, "allow_mismatched_digits": True},
+    {"scheme": "position-robust"},
     {"scheme": "id", "registry_number": 0xC0FFEE42},
-    {},
+    {"scheme": "id", "registry_number": 0x5EEDBEAD},
 )
 
 
@@ -117,7 +117,7 @@ def drive_over(place: LanePlace, code: PlateCode, rng: np.random.Generator) -> I
     background = road_background(photos[int(rng.integers(len(photos)))], CAMERA, rng)
     drive = Drive(
         camera=CAMERA,
-        face=plate_face(code, replace(GEOMETRY, n=code.n), conditions.look, conditions.wear, rng),
+        face=plate_face(code, recommended_geometry(code.scheme, n=code.n), conditions.look, conditions.wear, rng),
         speed_m_s=SPEED_KMH / 3.6,
         fps=FPS,
         exposure_s=conditions.exposure_s,

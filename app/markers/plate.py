@@ -13,6 +13,7 @@ with the red triangle top-left.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import ROUND_HALF_EVEN, Decimal
@@ -21,10 +22,10 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-import reedsolo
 
 from app.errors import CodeMismatch, InvalidParameter
 from app.geodesy import check_lon_lat
+from app.markers.reed_solomon import ReedSolomonWord, coset_mask
 
 SIZES = (8, 10, 12)
 UNIT_MM = (20.0, 50.0)
@@ -41,7 +42,18 @@ class PlateScheme(StrEnum):
 
     POSITION = "position"
     POSITION_CHECK = "position-check"
+    POSITION_ROBUST = "position-robust"
     ID = "id"
+
+    @property
+    def corrects(self) -> bool:
+        """Whether Reed-Solomon check symbols correct wrong cells."""
+        return self in (PlateScheme.POSITION_ROBUST, PlateScheme.ID)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Units along a side for which the scheme exists."""
+        return (10, 12) if self is PlateScheme.POSITION_ROBUST else SIZES
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,28 +167,73 @@ class PlateCapacity:
     correctable_erasures: int
 
 
+_WORDS = {
+    (PlateScheme.ID, 8): ((8, 4),),
+    (PlateScheme.ID, 10): ((6, 4), (6, 4)),
+    (PlateScheme.ID, 12): ((8, 7), (8, 7)),
+    (PlateScheme.POSITION_ROBUST, 10): ((5, 6), (5, 5)),
+    (PlateScheme.POSITION_ROBUST, 12): ((6, 9), (6, 9)),
+}
+"""Data and check symbols of each Reed-Solomon word. The cells alternate between the words in reading order."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """How a scheme divides the symbols: data, checks, interleaved codewords, spare cells (always 0)."""
+    """How a scheme divides the symbols: data, checks, Reed-Solomon words if any, spare cells (always 0)."""
 
     data: int
     checks: int
-    codewords: int
+    words: tuple[ReedSolomonWord, ...]
     spare: int
 
 
-def _layout(n: int, scheme: PlateScheme, check_digits: int) -> _Layout:
-    if n not in SIZES:
+def check_size(n: int, scheme: PlateScheme) -> None:
+    """Raise `InvalidParameter` where a scheme does not exist on ``n`` x ``n`` units."""
+    if n not in scheme.sizes:
+        sizes = " or ".join(", ".join(map(str, scheme.sizes)).rsplit(", ", 1))
         raise InvalidParameter(
-            f"no plate has {n} units along a side", field="n", limit="8, 10 or 12", cure="choose n = 8, 10 or 12"
+            f"a plate of the scheme {scheme} does not have {n} units along a side",
+            field="n",
+            limit=sizes,
+            cure=f"choose n = {sizes}, or another scheme",
         )
+
+
+@lru_cache
+def _layout(n: int, scheme: PlateScheme, check_digits: int) -> _Layout:
+    check_size(n, scheme)
     cells = len(code_cells(n))
-    if scheme is PlateScheme.ID:  # GF(16) codewords hold at most 15 symbols, so larger plates interleave two
-        data, checks, words = {8: (8, 4, 1), 10: (6, 4, 2), 12: (8, 7, 2)}[n]
-        return _Layout(data * words, checks * words, words, cells - (data + checks) * words)
+    if scheme.corrects:
+        words = reed_solomon_words(n, scheme)
+        data, checks = sum(word.data for word in words), sum(word.checks for word in words)
+        return _Layout(data, checks, words, cells - data - checks)
     checks = check_digits if scheme is PlateScheme.POSITION_CHECK else 0
     data = min(cells - checks, 2 * _MAX_DECIMALS)
-    return _Layout(data, checks, 1, cells - checks - data)
+    return _Layout(data, checks, (), cells - checks - data)
+
+
+@lru_cache
+def reed_solomon_words(n: int, scheme: PlateScheme) -> tuple[ReedSolomonWord, ...]:
+    """The Reed-Solomon words of a scheme on an ``n`` x ``n`` plate; none if it has no such checks or no such size.
+
+    Notes
+    -----
+    Words of the position scheme are masked (`coset_mask`): on plates of one size they differ from any word of the id
+    scheme, and so from a blank face, in at least as many cells of each word as an id word has check symbols: 4 on
+    10 x 10, 7 on 12 x 12. The digits of a position alternate between the words, so that both differ between plates
+    that lie more than some metres apart.
+    """
+    words = _WORDS.get((scheme, n), ())
+    total, digits = sum(data + checks for data, checks in words), sum(data for data, _ in words)
+    made = []
+    for k, (data, checks) in enumerate(words):
+        cells, length = tuple(range(k, total, len(words))), data + checks
+        if scheme is PlateScheme.ID:
+            made.append(ReedSolomonWord(cells, tuple(range(k * data, (k + 1) * data)), (0,) * length))
+        else:
+            mask = coset_mask(length, _WORDS[PlateScheme.ID, n][0][1])
+            made.append(ReedSolomonWord(cells, tuple(range(k, digits, len(words))), mask))
+    return tuple(made)
 
 
 def plate_capacity(n: int, scheme: PlateScheme, check_digits: int = 1) -> PlateCapacity:
@@ -184,30 +241,14 @@ def plate_capacity(n: int, scheme: PlateScheme, check_digits: int = 1) -> PlateC
 
     Notes
     -----
-    The id scheme corrects, per codeword, half as many wrong cells as it has check symbols, or all of them unreadable.
+    Schemes with Reed-Solomon words correct, in each word, half as many wrong cells as it has check symbols, or as many
+    unreadable ones; the numbers are those of the word with the fewest checks.
     """
     lay = _layout(n, scheme, check_digits)
-    is_id = scheme is PlateScheme.ID
-    return PlateCapacity(
-        n=n,
-        scheme=scheme,
-        symbols=len(code_cells(n)),
-        data_symbols=lay.data,
-        bits=lay.data * (4.0 if is_id else float(np.log2(10))),
-        correctable_cells=lay.checks // lay.codewords // 2 if is_id else 0,
-        correctable_erasures=lay.checks // lay.codewords if is_id else 0,
-    )
-
-
-def codewords_of_cells(n: int, scheme: PlateScheme) -> tuple[int | None, ...]:
-    """Number of the interleaved codeword that each cell belongs to, in reading order; None for spare cells."""
-    lay = _layout(n, scheme, 1)
-    return tuple(i % lay.codewords if i < lay.data + lay.checks else None for i in range(len(code_cells(n))))
-
-
-@lru_cache
-def _reed_solomon(checks: int) -> reedsolo.RSCodec:
-    return reedsolo.RSCodec(checks, nsize=15, c_exp=4, prim=0x13)
+    checks = min((word.checks for word in lay.words), default=0)
+    digits = sum(position_decimals(n, scheme, check_digits)) if scheme is not PlateScheme.ID else 0
+    bits = float(digits * np.log2(10)) if digits else lay.data * 4.0
+    return PlateCapacity(n, scheme, len(code_cells(n)), lay.data, bits, checks // 2, checks)
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +258,7 @@ class PlateCode:
     Parameters
     ----------
     digits : str
-        One hexadecimal digit a cell in reading order; decimal for the position schemes.
+        One hexadecimal digit a cell in reading order; decimal for the schemes ``position`` and ``position-check``.
     scheme : PlateScheme
     n : int
         Units along a side.
@@ -236,8 +277,7 @@ class PlateCode:
     check_digits: int = 1
 
     def __post_init__(self) -> None:
-        if self.n not in SIZES:
-            raise InvalidParameter(f"no plate has {self.n} units along a side", field="n", limit="8, 10 or 12")
+        _layout(self.n, self.scheme, 1)
         if self.check_digits not in (1, 2):
             raise InvalidParameter("there are one or two check digits", field="check_digits", limit="1 or 2")
         cells = len(code_cells(self.n))
@@ -248,13 +288,13 @@ class PlateCode:
                 limit=f"{cells} digits",
                 cure=f"give {cells} digits, or another size of plate",
             )
-        alphabet = _DIGITS if self.scheme is PlateScheme.ID else _DIGITS[:10]
+        alphabet = _DIGITS if self.scheme.corrects else _DIGITS[:10]
         if any(d not in alphabet for d in self.digits):
             raise CodeMismatch(
                 f"digits of the scheme {self.scheme} are {alphabet[0]}-{alphabet[-1]}",
                 field="digits",
                 limit=f"alphabet {alphabet}",
-                cure="use upper-case hexadecimal digits for id plates, decimal digits for positions",
+                cure="use upper-case hexadecimal digits with id and position-robust, decimal digits with the others",
             )
         if not is_codeword(self.symbols, self.scheme, self.n, self.check_digits):
             raise CodeMismatch(
@@ -279,8 +319,18 @@ class PlateCode:
         """The number that an id plate carries."""
         if self.scheme is not PlateScheme.ID:
             raise CodeMismatch("only id plates carry a registry number", field="scheme")
-        lay = _layout(self.n, self.scheme, self.check_digits)
-        return int("".join(w[: lay.data // lay.codewords] for w in _deinterleave(self.digits, lay)), 16)
+        return _number(self.symbols, self.n, self.scheme)
+
+    @property
+    def decimals(self) -> tuple[str, str]:
+        """Decimals of |longitude| and of |latitude| that a position plate carries."""
+        if self.scheme is PlateScheme.ID:
+            raise CodeMismatch("an id plate carries no position", field="scheme")
+        lon, lat = position_decimals(self.n, self.scheme, self.check_digits)
+        digits = self.digits
+        if self.scheme.corrects:
+            digits = f"{_number(self.symbols, self.n, self.scheme):0{lon + lat}d}"
+        return digits[:lon], digits[lon : lon + lat]
 
     @classmethod
     def from_symbols(cls, symbols: Sequence[int], scheme: PlateScheme, n: int = 8, check_digits: int = 1) -> PlateCode:
@@ -288,8 +338,10 @@ class PlateCode:
         return cls("".join(_DIGITS[s] for s in symbols), scheme, n, check_digits)
 
     @classmethod
-    def from_position(cls, lon_deg: float, lat_deg: float, *, n: int = 8, check_digits: int = 0) -> PlateCode:
-        """Position plate: the decimals of |longitude|, then of |latitude|, then the check digits if any.
+    def from_position(
+        cls, lon_deg: float, lat_deg: float, *, n: int = 8, scheme: PlateScheme | None = None, check_digits: int = 0
+    ) -> PlateCode:
+        """Position plate: the decimals of |longitude|, then of |latitude|, then the checks if any.
 
         Parameters
         ----------
@@ -297,19 +349,24 @@ class PlateCode:
             Position of the plate's centre. [deg]
         n : int
             Units along a side.
+        scheme : PlateScheme, optional
+            Without, ``position``, or ``position-check`` with check digits.
         check_digits : int
-            0 for the scheme ``position``, 1 or 2 for ``position-check``.
+            For ``position-check``: 1 (as with 0) or 2.
 
         Raises
         ------
         InvalidParameter
-            The position is out of range or not finite.
+            The position is out of range or not finite, or the scheme does not exist on this size.
         """
         check_lon_lat(lon_deg, lat_deg)
-        scheme = PlateScheme.POSITION_CHECK if check_digits else PlateScheme.POSITION
-        lay = _layout(n, scheme, check_digits)
-        lon_decimals, lat_decimals = position_decimals(n, scheme, check_digits)
+        if scheme is None:
+            scheme = PlateScheme.POSITION_CHECK if check_digits else PlateScheme.POSITION
+        lay = _layout(n, scheme, check_digits or 1)
+        lon_decimals, lat_decimals = position_decimals(n, scheme, check_digits or 1)
         data = _decimals(lon_deg, lon_decimals) + _decimals(lat_deg, lat_decimals)
+        if scheme.corrects:
+            return cls.from_symbols(encode_number(int(data), n, scheme), scheme, n)
         return cls(data + _digit_sum(data, lay.checks) + "0" * lay.spare, scheme, n, check_digits or 1)
 
     @classmethod
@@ -321,26 +378,41 @@ class PlateCode:
         InvalidParameter
             The number is negative or does not fit (32 bits on 8 x 8, 48 on 10 x 10, 64 on 12 x 12).
         """
-        lay = _layout(n, PlateScheme.ID, 1)
-        if not 0 <= number < 16**lay.data:
+        data = _layout(n, PlateScheme.ID, 1).data
+        if not 0 <= number < 16**data:
             raise InvalidParameter(
                 f"registry number {number} does not fit a {n} x {n} plate",
                 field="registry_number",
-                limit=f"0 to {16**lay.data - 1}",
+                limit=f"0 to {16**data - 1}",
                 cure="choose a smaller number or a larger plate",
             )
-        data = [int(d, 16) for d in f"{number:0{lay.data}X}"]
-        per_word = lay.data // lay.codewords
-        codec = _reed_solomon(lay.checks // lay.codewords)
-        words = [list(codec.encode(data[i * per_word : (i + 1) * per_word])) for i in range(lay.codewords)]
-        woven = [words[i][k] for k in range(len(words[0])) for i in range(lay.codewords)]
-        return cls.from_symbols(woven + [0] * lay.spare, PlateScheme.ID, n)
+        return cls.from_symbols(encode_number(number, n, PlateScheme.ID), PlateScheme.ID, n)
+
+
+def encode_number(number: int, n: int, scheme: PlateScheme) -> list[int]:
+    """Symbols of a number in a scheme with Reed-Solomon words, shape (cells,)."""
+    lay = _layout(n, scheme, 1)
+    data = [int(d, 16) for d in f"{number:0{lay.data}X}"]
+    symbols = [0] * len(code_cells(n))
+    for word in lay.words:
+        for cell, symbol in zip(word.cells, word.encode([data[k] for k in word.digits]), strict=True):
+            symbols[cell] = symbol
+    return symbols
+
+
+def _number(symbols: Sequence[int], n: int, scheme: PlateScheme) -> int:
+    """The number whose symbols these are; they must be a codeword."""
+    found: dict[int, int] = {}
+    for word in reed_solomon_words(n, scheme):
+        found |= dict(zip(word.digits, word.decode(symbols), strict=True))
+    return int("".join(_DIGITS[found[k]] for k in range(len(found))), 16)
 
 
 def position_decimals(n: int, scheme: PlateScheme, check_digits: int = 1) -> tuple[int, int]:
     """Decimals of longitude and of latitude on a plate: six each on 8 x 8 without check digits."""
     data = _layout(n, scheme, check_digits).data
-    return data - data // 2, data // 2
+    digits = math.floor(data * math.log10(16) / 2) * 2 if scheme.corrects else data
+    return digits - digits // 2, digits // 2
 
 
 def _decimals(degrees: float, places: int) -> str:
@@ -353,53 +425,23 @@ def _digit_sum(digits: str, checks: int) -> str:
     return f"{sum(int(d) for d in digits) % 10**checks:0{checks}d}" if checks else ""
 
 
-def _deinterleave(digits: str, lay: _Layout) -> list[str]:
-    woven = digits[: lay.data + lay.checks]
-    return [woven[i :: lay.codewords] for i in range(lay.codewords)]
-
-
 def is_codeword(symbols: Sequence[int], scheme: PlateScheme, n: int = 8, check_digits: int = 1) -> bool:
     """Whether the symbols satisfy every check of the scheme as they are."""
     lay = _layout(n, scheme, check_digits)
     body, spare = symbols[: lay.data + lay.checks], symbols[lay.data + lay.checks :]
     if any(spare):
         return False
-    if scheme is PlateScheme.ID:
-        codec = _reed_solomon(lay.checks // lay.codewords)
-        return all(all(codec.check(list(body[i :: lay.codewords]))) for i in range(lay.codewords))
+    if scheme.corrects:
+        held = all(word.holds(symbols) for word in lay.words)
+        return held and (scheme is PlateScheme.ID or _number(symbols, n, scheme) < numbers(n, scheme))
     if any(s > 9 for s in body):
         return False
     digits = "".join(_DIGITS[s] for s in body)
     return digits[lay.data :] == _digit_sum(digits[: lay.data], lay.checks)
 
 
-def correct_symbols(symbols: Sequence[int], n: int = 8, erasures: Sequence[int] = ()) -> tuple[int, ...] | None:
-    """Nearest codeword of the id scheme, or None beyond the correction capacity.
-
-    Parameters
-    ----------
-    symbols : sequence of int, shape (cells,)
-        As read; the value at an erasure does not matter.
-    n : int
-        Units along a side.
-    erasures : sequence of int
-        Indices of unreadable cells.
-    """
-    lay = _layout(n, PlateScheme.ID, 1)
-    per_word = (lay.data + lay.checks) // lay.codewords
-    codec = _reed_solomon(lay.checks // lay.codewords)
-    fixed = [0] * (lay.data + lay.checks)
-    for i in range(lay.codewords):
-        word = list(symbols[i : lay.data + lay.checks : lay.codewords])
-        erased = [(e - i) // lay.codewords for e in erasures if e % lay.codewords == i and e < len(fixed)]
-        if len(erased) > lay.checks // lay.codewords:
-            return None
-        try:
-            repaired = list(codec.decode(word, erase_pos=erased)[1])
-        except reedsolo.ReedSolomonError:
-            return None
-        if len(repaired) != per_word:
-            return None
-        fixed[i :: lay.codewords] = repaired
-    corrected = (*fixed, *([0] * lay.spare))
-    return corrected if is_codeword(corrected, PlateScheme.ID, n) else None
+def numbers(n: int, scheme: PlateScheme) -> int:
+    """How many plates of a scheme with Reed-Solomon words there are: registry numbers, or positions."""
+    if scheme is PlateScheme.ID:
+        return int(16 ** _layout(n, scheme, 1).data)
+    return int(10 ** sum(position_decimals(n, scheme)))

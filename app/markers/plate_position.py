@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from app.geodesy import check_lon_lat
-from app.markers.plate import PlateCode, position_decimals
+from app.markers.plate import PlateCode
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +37,9 @@ def resolve_position(code: PlateCode, coarse_lon_deg: float, coarse_lat_deg: flo
     integers of both signs are tried and the nearest is taken; longitude wraps at the antimeridian.
     """
     check_lon_lat(coarse_lon_deg, coarse_lat_deg, field="coarse_position")
-    lon_places, lat_places = position_decimals(code.n, code.scheme, code.check_digits)
-    lon, lon_d, lon_next = _nearest_degree(code.digits[:lon_places], coarse_lon_deg, 180.0, wraps=True)
-    lat, lat_d, lat_next = _nearest_degree(
-        code.digits[lon_places : lon_places + lat_places], coarse_lat_deg, 90.0, wraps=False
-    )
+    lon_decimals, lat_decimals = code.decimals
+    lon, lon_d, lon_next = _nearest_degree(lon_decimals, coarse_lon_deg, 180.0, wraps=True)
+    lat, lat_d, lat_next = _nearest_degree(lat_decimals, coarse_lat_deg, 90.0, wraps=False)
     return ResolvedPosition(lon, lat, max(lon_d, lat_d), min(lon_next, lat_next))
 
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from app.formats.alignments.geometry import EventKind
 from app.markers.plate import PlateScheme
+from app.markers.recommended_plate import RECOMMENDED_SCHEME, recommended_geometry
 from app.radio.lorawan import Region
 
 SpeedKmh = Annotated[float, Field(ge=2.0, le=250.0)]
@@ -70,15 +71,30 @@ class DecisionPoints(Ahead):
 class PlateRules(_Part):
     """Plates in the middle of the lane."""
 
-    scheme: PlateScheme = PlateScheme.ID
-    n: Literal[8, 10, 12] = 8
-    unit_mm: float = Field(default=35.0, ge=20.0, le=50.0)
+    scheme: PlateScheme = Field(default=RECOMMENDED_SCHEME, description="`id` unless plates carry their position.")
+    n: Literal[8, 10, 12] = Field(default=8, description="Units along a side; 10 by default for `position-robust`.")
+    unit_mm: float = Field(default=35.0, ge=20.0, le=50.0, description="27 by default for `position-robust`.")
     gap_mm: float = Field(default=5.0, ge=2.0, le=10.0)
     thickness_mm: float = Field(default=20.0, ge=5.0, le=50.0)
     spacing_m: float = Field(default=100.0, ge=5.0, le=5000.0)
     offset_from_centre_m: float = Field(default=0.0, ge=-2.0, le=2.0, description="Left positive.")
     min_frames: int = Field(default=2, ge=1, le=100, description="Frames per pass in which the plate is readable.")
     max_grade: float = Field(default=0.08, ge=0.0, le=0.3, description="Rise per distance on which plates are placed.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _size_of_scheme(cls, rules: object) -> object:
+        if not isinstance(rules, dict) or rules.get("scheme") != PlateScheme.POSITION_ROBUST:
+            return rules
+        usual = recommended_geometry(PlateScheme.POSITION_ROBUST)
+        rules = {"n": usual.n, **rules}
+        return {"unit_mm": usual.unit_mm, **rules} if rules["n"] == usual.n else rules
+
+    @model_validator(mode="after")
+    def _size_exists(self) -> PlateRules:
+        if self.n not in self.scheme.sizes:
+            raise ValueError(f"{self.scheme} has {' or '.join(map(str, self.scheme.sizes))} units along a side: set n")
+        return self
 
 
 class LineRules(_Part):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from app.markers.plate import (
     PlateGeometry,
     PlateScheme,
     code_cells,
-    correct_symbols,
+    encode_number,
     is_codeword,
     plate_capacity,
     position_decimals,
@@ -139,6 +139,11 @@ def test_the_limits_themselves_are_allowed(dimensions: tuple[int, float, float, 
         (lambda: PlateCode("F9E8D7C6B5A4965269BC1", PlateScheme.ID, 10), "digits", None),  # a spare cell is not 0
         (lambda: PlateCode("123456789012", PlateScheme.POSITION_CHECK), "digits", None),
         (lambda: PlateCode("0" * 12, n=7), "n", "8, 10 or 12"),
+        (lambda: PlateCode("0" * 12, PlateScheme.POSITION_ROBUST, 8), "n", "10 or 12"),
+        (lambda: PlateCode.from_position(8, 49, scheme=PlateScheme.POSITION_ROBUST), "n", "10 or 12"),
+        (lambda: PlateCode("0" * 21, PlateScheme.POSITION_ROBUST, 10), "digits", None),  # a blank face
+        (lambda: PlateCode("F" * 21, PlateScheme.POSITION_ROBUST, 10), "digits", None),  # a dark one
+        (lambda: PlateCode("289ab1fbd8f7489f3d7d4", PlateScheme.POSITION_ROBUST, 10), "digits", None),
         (lambda: PlateCode("0" * 12, PlateScheme.POSITION_CHECK, check_digits=3), "check_digits", "1 or 2"),
         (lambda: PlateCode.from_registry_number(-1), "registry_number", "0 to 4294967295"),
         (lambda: PlateCode.from_registry_number(2**32), "registry_number", "0 to 4294967295"),
@@ -172,6 +177,8 @@ def test_a_code_that_does_not_fit_is_refused_by_name(make: object, field: str, l
         (10, PlateScheme.ID, 1, 12, 48, 2, 4),
         (12, PlateScheme.POSITION, 1, 18, 59.79, 0, 0),
         (12, PlateScheme.ID, 1, 16, 64, 3, 7),
+        (10, PlateScheme.POSITION_ROBUST, 1, 10, 39.86, 2, 5),
+        (12, PlateScheme.POSITION_ROBUST, 1, 12, 46.51, 4, 9),
     ],
 )
 def test_capacity(n: int, scheme: PlateScheme, checks: int, data: int, bits: float, wrong: int, erased: int) -> None:
@@ -238,72 +245,46 @@ def test_id_words_are_roots_of_the_generator(number: int) -> None:
     assert syndromes([int(d, 16) for d in digits], 4) == [0, 0, 0, 0]
 
 
-def _damaged(symbols: tuple[int, ...], at: tuple[int, ...], by: list[int]) -> list[int]:
-    out = list(symbols)
-    for k, change in zip(at, by, strict=True):
-        out[k] ^= change
-    return out
-
-
-@st.composite
-def damages(draw: st.DrawFn, count: int) -> tuple[PlateCode, tuple[int, ...], list[int]]:
-    code = PlateCode.from_registry_number(draw(st.integers(0, 2**32 - 1)))
-    at = tuple(draw(st.permutations(range(12)))[:count])
-    return code, at, draw(st.lists(st.integers(1, 15), min_size=count, max_size=count))
-
-
-@given(damages(2))
+@given(st.integers(0, 2**32 - 1), st.integers(0, 11), st.integers(1, 15))
 @settings(max_examples=100, deadline=None)
-def test_two_wrong_cells_are_corrected(damage: tuple[PlateCode, tuple[int, ...], list[int]]) -> None:
-    code, at, by = damage
-    assert correct_symbols(_damaged(code.symbols, at, by)) == code.symbols
-    assert correct_symbols(_damaged(code.symbols, at[:1], by[:1])) == code.symbols
+def test_a_wrong_cell_is_no_codeword(number: int, cell: int, change: int) -> None:
+    symbols = list(PlateCode.from_registry_number(number).symbols)
+    symbols[cell] ^= change
+    assert not is_codeword(symbols, PlateScheme.ID)
 
 
-@given(damages(4))
-@settings(max_examples=100, deadline=None)
-def test_four_unreadable_cells_are_filled_in(damage: tuple[PlateCode, tuple[int, ...], list[int]]) -> None:
-    code, at, by = damage
-    assert correct_symbols(_damaged(code.symbols, at, by), erasures=at) == code.symbols
+# made with reedsolo.rs_encode_msg as above; the masks are the generator polynomials of 3 and of 6 checks
+ROBUST_MASKS = {10: [1, 7, 14, 8], 12: [1, 10, 15, 2, 4, 3, 1]}
 
 
-@given(damages(3))
-@settings(max_examples=100, deadline=None)
-def test_one_wrong_cell_beside_two_unreadable_ones_is_corrected(
-    damage: tuple[PlateCode, tuple[int, ...], list[int]],
-) -> None:
-    code, at, by = damage
-    assert correct_symbols(_damaged(code.symbols, at, by), erasures=at[:2]) == code.symbols
+@pytest.mark.parametrize("n", [10, 12])
+@given(position=st.tuples(st.floats(-180, 180), st.floats(-90, 90)))
+@settings(max_examples=50, deadline=None)
+def test_robust_positions_are_two_masked_words(n: int, position: tuple[float, float]) -> None:
+    """Without its mask each word is a root of its generator, and its data are every other digit of the position."""
+    code = PlateCode.from_position(*position, n=n, scheme=PlateScheme.POSITION_ROBUST)
+    places = {10: 6, 12: 7}[n]
+    checks = {10: (6, 5), 12: (9, 9)}[n]
+    words = [list(code.symbols[k : sum(checks) + 2 * places - 2 : 2]) for k in (0, 1)]
+    data = ["", ""]
+    for k, word in enumerate(words):
+        mask = ROBUST_MASKS[n]
+        plain = [*word[: -len(mask)], *(a ^ b for a, b in zip(word[-len(mask) :], mask, strict=True))]
+        assert syndromes(plain, checks[k]) == [0] * checks[k]
+        assert any(syndromes(word, checks[k]))
+        data[k] = "".join(f"{symbol:X}" for symbol in plain[: len(word) - checks[k]])
+    number = int("".join(a + b for a, b in zip(*data, strict=True)), 16)
+    assert f"{number:0{2 * places}d}" == "".join(code.decimals)
+    for degrees, decimals in zip(position, code.decimals, strict=True):
+        assert decimals == f"{abs(Decimal(degrees)).quantize(Decimal(1).scaleb(-places)):f}".partition(".")[2]
+    assert PlateCode(code.digits, PlateScheme.POSITION_ROBUST, n) == code
 
 
-@given(damages(3))
-@settings(max_examples=200, deadline=None)
-def test_three_wrong_cells_never_pass_for_the_original(
-    damage: tuple[PlateCode, tuple[int, ...], list[int]],
-) -> None:
-    code, at, by = damage
-    read = _damaged(code.symbols, at, by)
-    assert not is_codeword(read, PlateScheme.ID)
-    fixed = correct_symbols(read)
-    assert fixed != code.symbols
-    if fixed is not None:  # another codeword is within reach: then it is a codeword, and within two cells
-        assert is_codeword(fixed, PlateScheme.ID)
-        assert sum(a != b for a, b in zip(read, fixed, strict=True)) <= 2
-
-
-def test_five_unreadable_cells_are_refused() -> None:
-    code = PlateCode.from_registry_number(0xDEADBEEF)
-    for at in itertools.combinations(range(12), 5):
-        assert correct_symbols(code.symbols, erasures=at) is None
-
-
-@pytest.mark.parametrize(("n", "number", "each"), [(10, 0xFEDCBA987654, 2), (12, 0xFEDCBA9876543210, 3)])
-def test_larger_plates_correct_in_each_of_their_words(n: int, number: int, each: int) -> None:
-    code = PlateCode.from_registry_number(number, n=n)
-    at = tuple(range(2 * each))  # side by side on the plate, so half of them in either word
-    assert correct_symbols(_damaged(code.symbols, at, [9] * len(at)), n) == code.symbols
-    more = (*at, 2 * each, 2 * each + 1)
-    assert correct_symbols(_damaged(code.symbols, more, [9] * len(more)), n) != code.symbols
+def test_numbers_beyond_all_positions_are_no_codewords() -> None:
+    """Ten hexadecimal digits hold 10^12 positions and more; the rest is refused."""
+    beyond = encode_number(10**12, 10, PlateScheme.POSITION_ROBUST)
+    assert not is_codeword(beyond, PlateScheme.POSITION_ROBUST, 10)
+    assert is_codeword(encode_number(10**12 - 1, 10, PlateScheme.POSITION_ROBUST), PlateScheme.POSITION_ROBUST, 10)
 
 
 @pytest.mark.parametrize(
@@ -381,6 +362,14 @@ def axis_positions(draw: st.DrawFn, bound: int) -> float:
     return min(max(whole + offset, -bound), bound)
 
 
+CARRIERS = [
+    (PlateScheme.POSITION, 8),
+    (PlateScheme.POSITION, 10),
+    (PlateScheme.POSITION_ROBUST, 10),
+    (PlateScheme.POSITION_ROBUST, 12),
+]
+
+
 def reach_deg(degrees: float, wraps_at: float | None) -> float:
     """How wrong a coarse position may be: half the way to the next place with the same decimals."""
     reach = min(0.5, abs(degrees))  # the next degree; the same magnitude across zero
@@ -388,17 +377,18 @@ def reach_deg(degrees: float, wraps_at: float | None) -> float:
 
 
 @given(
-    axis_positions(180), axis_positions(90), st.floats(-0.98, 0.98), st.floats(-0.98, 0.98), st.sampled_from([8, 10])
+    axis_positions(180), axis_positions(90), st.floats(-0.98, 0.98), st.floats(-0.98, 0.98), st.sampled_from(CARRIERS)
 )
-@example(180.0, 0.0, 0.0, 0.0, 8)
-@example(-180.0, -90.0, 0.0, 0.0, 8)
-@example(12.9999997, -12.9999997, 0.9, 0.9, 8)
+@example(180.0, 0.0, 0.0, 0.0, CARRIERS[0])
+@example(-180.0, -90.0, 0.0, 0.0, CARRIERS[2])
+@example(12.9999997, -12.9999997, 0.9, 0.9, CARRIERS[2])
 @settings(max_examples=400, deadline=None)
 def test_a_coarse_position_within_reach_gives_the_place_back(
-    lon: float, lat: float, lon_error: float, lat_error: float, n: int
+    lon: float, lat: float, lon_error: float, lat_error: float, carrier: tuple[PlateScheme, int]
 ) -> None:
-    code = PlateCode.from_position(lon, lat, n=n)
-    half_digit = 0.51 * 10.0 ** -position_decimals(n, PlateScheme.POSITION)[1]
+    scheme, n = carrier
+    code = PlateCode.from_position(lon, lat, n=n, scheme=scheme)
+    half_digit = 0.51 * 10.0 ** -position_decimals(n, scheme)[1]
     # on a line of its own (0, 180) or within rounding of it both sides are the same place
     lon_reach, lat_reach = reach_deg(lon, 180.0), reach_deg(lat, None)
     coarse_lon = lon + lon_error * (lon_reach if lon_reach > 2e-6 else 0.4)

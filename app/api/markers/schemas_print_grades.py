@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.dependencies import Identifier, Number, Text
 from app.errors import InvalidParameter, naming
 from app.families.inputs import StrictModel
-from app.families.plate.inputs import GeometryIn
+from app.families.plate.inputs import RECOMMENDED_SCHEME_NAME, SCHEME_DESCRIPTION, GeometryIn, SchemeName
 from app.markers.plate import PlateCode, PlateScheme
+from app.markers.recommended_plate import RECOMMENDED_SCHEME, recommended_geometry
 from app.planning.rules import CameraRules
 from app.services.markers.print_grades import PrintDeclaration
 
@@ -24,7 +25,7 @@ PRINT_EXAMPLE: dict[str, JsonValue] = {
 class PrintCodeIn(StrictModel):
     """The code that the plate should have."""
 
-    scheme: Literal["position", "position-check", "id"] = "position"
+    scheme: SchemeName = Field(RECOMMENDED_SCHEME_NAME, description=SCHEME_DESCRIPTION)
     digits: Text = Field(min_length=1, max_length=64, description="One hexadecimal digit a cell, row by row.")
     check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] = Field(1, description="For `position-check`.")
 
@@ -41,7 +42,7 @@ class PrintGradeIn(StrictModel):
 
     marker_id: Identifier | None = Field(None, description="The registered plate; in place of `code` and `geometry`.")
     code: PrintCodeIn | None = None
-    geometry: GeometryIn | None = Field(None, description="Of the drawing; 35 mm and 5 mm if left out.")
+    geometry: GeometryIn | None = Field(None, description="Of the drawing; that of the scheme if left out.")
     camera: CameraRules = Field(default_factory=CameraRules, description="Camera of the vehicles.")
     speed_kmh: Number = Field(60.0, ge=5.0, le=250.0, description="Design speed. [km/h]")
 
@@ -58,8 +59,9 @@ class PrintGradeIn(StrictModel):
                 "the declaration names a marker and gives a code or a geometry too", field="marker_id",
                 limit="a marker, or a code and a geometry", cure="leave code and geometry out: the marker has them",
             )  # fmt: skip
-        geometry = None if self.geometry is None else self.geometry.geometry()
-        code = None if self.code is None else self.code.code(8 if geometry is None else geometry.n)
-        if code is not None and geometry is None:
-            geometry = GeometryIn().geometry()
+        scheme = PlateScheme(self.code.scheme) if self.code is not None else RECOMMENDED_SCHEME
+        geometry = None if self.geometry is None else self.geometry.geometry(scheme)
+        if self.code is not None and geometry is None:
+            geometry = recommended_geometry(scheme)
+        code = None if self.code is None or geometry is None else self.code.code(geometry.n)
         return PrintDeclaration(self.marker_id, code, geometry, self.camera, self.speed_kmh)

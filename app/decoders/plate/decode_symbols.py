@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from app.decoders.plate.likely_words import LikelyCodeword, likely_codeword
 from app.decoders.plate.unit_likelihoods import MAX_LEVEL_RESIDUAL, UnitEvidence, pattern_cost
 from app.decoders.plate.unit_verification import UnitVerification
-from app.markers.plate import PlateCode, PlateScheme, correct_symbols, is_codeword
+from app.markers.plate import PlateCode, PlateScheme, is_codeword, position_decimals
 
 Array = npt.NDArray[Any]
 
@@ -24,36 +25,31 @@ REGISTERED_CONFIDENCE = 0.9999
 MAX_CODEBOOK_CHANGES, RIVAL_CELLS = 3, 3
 """[cells] by which a registered position plate may differ from what was read, and by how many more every other one
 must. Source: chosen by hand; plates within 500 m share most of their digits."""
-MAX_SPENT_ALONE = 2
-"""[check symbols] that a correction may use without a registry: the others still check the digits. Source: the edge of
-a deep shadow that was taken for dark units became another plate's digits by four corrected cells, with none left."""
-MAX_SPENT_CHECKS = 4
-"""[check symbols] that a correction may use. Source: the id scheme's Reed-Solomon code on 8 x 8 has four, two for a
-wrong cell and one for an erased cell."""
+RISK_RESIDUALS = (0.025, 0.075, 0.125, 0.175, 0.215, 0.265, 0.35, 0.45)
+CELL_RISKS = (0.002, 0.013, 0.038, 0.07, 0.16, 0.17, 0.3, 0.4)
+"""[contrast, probability] `UnitEvidence.level_residual` of a cell, and how often such a cell shows another symbol than
+was built. Source: plates with Reed-Solomon checks in shade, glare, dirt and wear, 1560 frames of the seeds 601 and 602
+of `python -m benchmarks.plates schemes`."""
+RANDOM_PRIOR, UNCLEAN_RANDOM_PRIOR = 0.01, 1.0
+"""[1] odds that a plate's symbols are random against that they are a codeword of a given scheme: on a plate whose image
+looks clean, and on others. Source: chosen by hand; no wrong reading in the same frames up to a confidence of 0.98."""
+MAX_CHECKED_ERROR = 1e-4
+"""[probability] of an error, random symbols being as likely as a codeword, below which checks confirm the digits
+whatever else the plate lacks. Source: the same frames, without a wrong reading up to 0.02; chosen by hand."""
 OUTLIER_CONFIDENCE = 0.97
 """[probability] factor on a cell with an outlier among its units. Source: chosen by hand, so that one such cell alone
 falls below `MIN_CONFIDENCE`."""
 MAX_DAMAGE = 0.25
 """[contrast x ratio] `UnitEvidence.damage` up to which digits without a check are returned. Source: chosen by hand;
 effect: `python -m benchmarks.plates.thresholds`."""
-MIN_CODEWORD = 0.05
-"""[probability] of the symbols as read, from which a check that holds is no accident. Source: a check of 16 bits holds
-by accident once in 65,536 times; chosen by hand."""
-MIN_CHECKED = 0.99
-"""[probability] of each cell from which a check confirms digits beside a stain. Source: chosen by hand."""
-ACCIDENTS, CHECK_FACTOR = 65_536, 10
-"""[words, 1] of which a check of 16 bits holds for one by accident, and the factor by which that is discounted, as
-errors of neighbouring cells are not independent. Source: the id scheme on 8 x 8; chosen by hand."""
 MAX_DECIMAL_COST = 12.0
 """[cost] of reading letters as digits up to which a plate may be a decimal one. Source: chosen by hand."""
 CHANCE_LOG_ODDS = math.log(1e6)
 """[log] number of look-alikes that a match with the codebook must beat. Source: decision record 0005, rule 5."""
-UNCERTAIN_CELL, CLEAR_CELL, ERASABLE_CELL = 0.99, 0.999, 0.9999
-"""[probability] of a cell below which it is uncertain, above which it is clear, and below which it may be erased.
-Source: chosen by hand."""
-CORRECTED_CONFIDENCE = 0.9999
-"""[probability] factor on digits after a correction. Source: chosen by hand; any word is within two symbols of a
-codeword with probability 0.23 (decision record 0005, rule 4), letters exclude most of them."""
+MIN_LIKELY = 0.5
+"""[probability] from which an unsure codeword is the likely one. Source: it is likelier than all others together."""
+UNCERTAIN_CELL = 0.99
+"""[probability] of a cell below which it is uncertain. Source: chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +68,8 @@ class DecodedSymbols:
         The codebook decided.
     confirmed : bool
         A plate with this code is in the codebook.
+    checked : bool
+        Reed-Solomon checks confirm the code by themselves, whatever else the plate lacks.
     reason : str
         Why there is no code.
     likely : PlateCode or None
@@ -86,6 +84,7 @@ class DecodedSymbols:
     corrected: tuple[int, ...] = ()
     from_codebook: bool = False
     confirmed: bool = False
+    checked: bool = False
     reason: str = ""
     likely: PlateCode | None = None
     verification: UnitVerification | None = None
@@ -99,7 +98,6 @@ def decode_symbols(
     *,
     clean: bool = True,
     max_damage: float = MAX_DAMAGE,
-    min_checked: float = MIN_CHECKED,
 ) -> DecodedSymbols:
     """Most likely code: read as it is, corrected, or taken from the codebook, in this order.
 
@@ -115,17 +113,17 @@ def decode_symbols(
     clean : bool
         The image looks so much like a plate that wrong cells may be corrected without a registry.
     max_damage : float
-        Of digits that neither a check nor the registry confirms.
-    min_checked : float
-        Probability of each cell from which a check confirms digits beside a stain.
+        Of digits that neither Reed-Solomon checks nor the registry confirm.
     """
     read = _decode_alone(evidence, n, min_confidence, clean=clean)
     known = [code for code in codebook if code.n == n]
     if not known:
-        return _refuse_damaged(read, evidence, max_damage, min_checked)
+        return _refuse_damaged(read, evidence, max_damage)
     same = next((code for code in known if read.code is not None and code.digits == read.code.digits), None)
     if same is not None:
         return replace(read, code=same, confirmed=True)
+    if read.checked:
+        return read
     chosen = _decode_with_codebook(evidence, known, min_confidence) or _correct_to_registered(evidence, known)
     if chosen is not None:
         return chosen
@@ -136,43 +134,34 @@ def decode_symbols(
     if shown is not None and sum(a != b for a, b in zip(near.digits, shown.digits, strict=True)) <= n // 2:
         reason = f"close to the registered {near.digits}, but not the same" if read.code is not None else read.reason
         return replace(read, code=None, likely=None, reason=reason)
-    return _refuse_damaged(read, evidence, max_damage, min_checked)
+    return _refuse_damaged(read, evidence, max_damage)
 
 
-def _refuse_damaged(
-    read: DecodedSymbols, evidence: UnitEvidence, max_damage: float, min_checked: float
-) -> DecodedSymbols:
-    """Refuse digits that neither a check nor the registry confirms where a unit looks stained.
-
-    A check confirms only cells that are certain: damaged position plates come near words of the id scheme.
-    """
-    if read.code is None or evidence.damage <= max_damage:
+def _refuse_damaged(read: DecodedSymbols, evidence: UnitEvidence, max_damage: float) -> DecodedSymbols:
+    """Refuse digits that neither Reed-Solomon checks nor the registry confirm where a unit looks stained."""
+    if read.code is None or read.code.scheme.corrects or evidence.damage <= max_damage:
         return read
     reason = "a unit looks stained, and these digits have no check"
-    if read.code.scheme is PlateScheme.ID:
-        if not read.corrected and min(read.cell_confidence) >= min_checked:
-            return read
-        reason = "a unit looks stained, and the check was used up on uncertain cells"
     return replace(read, code=None, likely=read.code, reason=reason)
 
 
 def _correct_to_registered(evidence: UnitEvidence, known: list[PlateCode]) -> DecodedSymbols | None:
     """The registered plate that differs from what was read only where the plate is damaged.
 
-    An id plate may differ within its correction capacity, in two wrong cells or four uncertain ones. On 8 x 8, with 12
-    cells of 16 values, a random word comes so near to one plate with probability 5.3e-11 by two cells, 2.3e-10 by four
-    given cells that are uncertain, and 9.2e-8 by any four; among K id plates near by with K times that. A position
-    plate's neighbours share most of its digits: it may differ in three cells, each of which is uncertain or shows what
-    no digit looks like, and no other registered plate may be nearly as near.
+    A plate with Reed-Solomon checks differs from others in many cells, so its symbols need only be likelier than random
+    ones, by `CHANCE_LOG_ODDS` and the number of registered plates. A plain position plate's neighbours share most of
+    its digits: it may differ in three cells, each of which is uncertain or shows what no digit looks like, and no other
+    registered plate may be nearly as near.
     """
     cells = _softmax_confidence(evidence.cell_costs, evidence.best.tolist())
-    uncertain = (cells < UNCERTAIN_CELL) | (evidence.level_residual > MAX_LEVEL_RESIDUAL) | evidence.disputed
+    damaged = (cells < UNCERTAIN_CELL) | _outliers(evidence) | (evidence.best > 9)
+    scores = np.log(16 * _symbol_probabilities(evidence))
     changes = np.array([np.asarray(code.symbols) != evidence.best for code in known])
     for code, changed in zip(known, changes, strict=True):
-        if code.scheme is PlateScheme.ID:
-            near = 2 * int((changed & ~uncertain).sum()) + int((changed & uncertain).sum()) <= MAX_SPENT_CHECKS
+        if code.scheme.corrects:
+            score = float(scores[np.arange(len(scores)), code.symbols].sum())
+            near = score - math.log(len(known)) >= CHANCE_LOG_ODDS
         else:
-            damaged = uncertain | (evidence.best > 9)
             rivals = int((changes.sum(axis=1) < changed.sum() + RIVAL_CELLS).sum()) - 1
             near = changed.sum() <= MAX_CODEBOOK_CHANGES and not (changed & ~damaged).any() and rivals == 0
         if near:
@@ -192,12 +181,10 @@ def _softmax_confidence(costs: Array, chosen: Sequence[int]) -> Array:
 
 def _decode_alone(evidence: UnitEvidence, n: int, min_confidence: float, *, clean: bool) -> DecodedSymbols:
     costs = evidence.cell_costs
-    any_symbol = tuple(int(s) for s in evidence.best)
-    factor = np.where((evidence.level_residual > MAX_LEVEL_RESIDUAL) | evidence.disputed, OUTLIER_CONFIDENCE, 1.0)
-    cells = _softmax_confidence(costs, any_symbol) * factor
-    if is_codeword(any_symbol, PlateScheme.ID, n) and float(np.prod(cells)) >= MIN_CODEWORD:
-        code = PlateCode.from_symbols(any_symbol, PlateScheme.ID, n)
-        return DecodedSymbols(code, _checked(float(np.prod(cells)), min_confidence), _floats(cells))
+    checked = _decode_checked(evidence, n, clean=clean)
+    if checked.code is not None and checked.confidence >= min_confidence:
+        return checked
+    factor = np.where(_outliers(evidence), OUTLIER_CONFIDENCE, 1.0)
     decimal = np.argmin(costs[:, :10], axis=1)
     if float(costs[np.arange(len(costs)), decimal].sum()) < MAX_DECIMAL_COST:
         cells = _softmax_confidence(costs[:, :10], decimal) * factor
@@ -207,9 +194,10 @@ def _decode_alone(evidence: UnitEvidence, n: int, min_confidence: float, *, clea
             return DecodedSymbols(digits, confidence, _floats(cells))
         uncertain = ", ".join(str(i) for i in np.flatnonzero(cells < 1 - (1 - min_confidence) / len(cells)))
         return DecodedSymbols(None, confidence, _floats(cells), reason=f"uncertain cells: {uncertain}", likely=digits)
-    corrected = _correct(n, any_symbol, cells, evidence.level_residual > MAX_LEVEL_RESIDUAL) if clean else None
-    if corrected is not None:
-        return corrected
+    if checked.code is not None and checked.confidence >= MIN_LIKELY:
+        reason = f"the checks leave an error probability of {1 - checked.confidence:.1e}"
+        return replace(checked, code=None, likely=checked.code, reason=reason)
+    cells = _softmax_confidence(costs, evidence.best.tolist()) * factor
     return DecodedSymbols(None, float(np.prod(cells)), _floats(cells), reason="no scheme has these symbols")
 
 
@@ -225,38 +213,54 @@ def _floats(values: Array) -> tuple[float, ...]:
     return tuple(float(v) for v in values)
 
 
-def _checked(confidence: float, min_confidence: float) -> float:
-    """Confidence in symbols that satisfy a check of 16 bits: wrong ones do by accident once in 65,536 times."""
-    checked = 1 - (1 - confidence) * CHECK_FACTOR / ACCIDENTS
-    return max(confidence, min(checked, 1.0), min_confidence)
+def _outliers(evidence: UnitEvidence) -> npt.NDArray[np.bool_]:
+    """Cells with an outlier among their units, shape (cells,)."""
+    found: npt.NDArray[np.bool_] = (evidence.level_residual > MAX_LEVEL_RESIDUAL) | evidence.disputed
+    return found
 
 
-def _correct(n: int, symbols: tuple[int, ...], cells: Array, damaged: npt.NDArray[np.bool_]) -> DecodedSymbols | None:
-    """Reed-Solomon on the symbols as read, then with the most uncertain cells erased.
+def _symbol_probabilities(evidence: UnitEvidence) -> Array:
+    """Probability of each symbol of each cell, shape (cells, 16): by its units, unless damage hides what was built."""
+    likelihood = np.exp(-0.5 * TEMPER * evidence.cell_costs)
+    risk = np.interp(evidence.level_residual, RISK_RESIDUALS, CELL_RISKS)[:, None]
+    probabilities: Array = (1 - risk) * likelihood / likelihood.sum(axis=1, keepdims=True) + risk / 16
+    return probabilities
 
-    Any word is within two symbols of a codeword with probability 0.23, so a correction counts only when letters remain
-    among the cells that it leaves alone: a position plate has none.
+
+def _decode_checked(evidence: UnitEvidence, n: int, *, clean: bool) -> DecodedSymbols:
+    """The likeliest codeword of a scheme with Reed-Solomon checks, and its probability.
+
+    The error probability is that of another codeword of the scheme, of another scheme, or of random symbols, such as
+    those of a plate that is stained all over. Random symbols get a confidence of c with a probability of (1 - c) / c /
+    `RANDOM_PRIOR` at most (`LikelyCodeword.log_evidence`): 1/20 at `MIN_CONFIDENCE`.
     """
-    uncertain = [int(i) for i in np.argsort(cells, kind="stable") if cells[i] < ERASABLE_CELL]
-    for erasures in ([], *(uncertain[:k] for k in range(1, min(len(uncertain), MAX_SPENT_ALONE) + 1))):
-        fixed = correct_symbols(symbols, n, erasures)
-        if fixed is None:
-            continue
-        changed = tuple(i for i, (a, b) in enumerate(zip(symbols, fixed, strict=True)) if a != b)
-        wrong = [i for i in changed if i not in erasures]
-        spent = 2 * len(wrong) + len(erasures)
-        kept = [i for i in range(len(symbols)) if i not in changed and i not in erasures]
-        letters = sum(symbols[i] > 9 and cells[i] > CLEAR_CELL for i in kept)
-        unsure = sum(cells[i] < UNCERTAIN_CELL for i in kept)
-        if spent > MAX_SPENT_ALONE or letters == 0 or unsure > 0 or damaged[kept].any():
-            continue
-        confidence = float(np.prod(cells[kept])) * CORRECTED_CONFIDENCE
-        shown = cells.copy()
-        shown[list(changed)] = confidence
-        return DecodedSymbols(
-            PlateCode.from_symbols(fixed, PlateScheme.ID, n), confidence, tuple(float(c) for c in shown), changed
-        )
-    return None
+    probabilities = _symbol_probabilities(evidence)
+    found = [(scheme, likely_codeword(probabilities, n, scheme)) for scheme in PlateScheme if scheme.corrects]
+    rivals: list[tuple[PlateScheme, LikelyCodeword]] = [(s, word) for s, word in found if word is not None]
+    if not rivals:
+        return DecodedSymbols(None, 0.0, ())
+    scheme, best = max(rivals, key=lambda rival: rival[1].log_evidence)
+    others = [word.log_evidence for _, word in rivals if word is not best]
+    others.append(_decimal_evidence(probabilities, n))
+
+    def confidence_given(random_prior: float) -> float:
+        rival = float(np.logaddexp.reduce([*others, math.log(random_prior)]))
+        return (1 - best.wrong) / (1 + math.exp(min(rival - best.log_evidence, 700.0)))
+
+    confidence = confidence_given(RANDOM_PRIOR if clean else UNCLEAN_RANDOM_PRIOR)
+    is_checked = confidence_given(1.0) > 1 - MAX_CHECKED_ERROR
+    changed = tuple(i for i, (a, b) in enumerate(zip(evidence.best, best.symbols, strict=True)) if a != b)
+    cells = _softmax_confidence(evidence.cell_costs, best.symbols)
+    cells[list(changed)] = confidence
+    code = PlateCode.from_symbols(best.symbols, scheme, n)
+    return DecodedSymbols(code, confidence, _floats(cells), changed, checked=is_checked)
+
+
+def _decimal_evidence(probabilities: Array, n: int) -> float:
+    """Log evidence of the scheme `position` against random symbols, as `LikelyCodeword.log_evidence`."""
+    decimals = sum(position_decimals(n, PlateScheme.POSITION))
+    digits = np.log(1.6 * probabilities[:decimals, :10].sum(axis=1)).sum()
+    return float(digits + np.log(16 * probabilities[decimals:, 0]).sum())
 
 
 def _decode_with_codebook(

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.decode_symbols import MAX_DAMAGE, MIN_CHECKED, DecodedSymbols, decode_symbols
+from app.decoders.plate.decode_symbols import MAX_DAMAGE, DecodedSymbols, decode_symbols
 from app.decoders.plate.marker_colours import MarkerColours
 from app.decoders.plate.unit_likelihoods import UnitEvidence
 from app.decoders.plate.unit_verification import UnitVerification
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading
 
 MIN_CONFIDENCE = 0.9995
@@ -124,22 +124,26 @@ def read_evidence(
         evidence.units, evidence.geometry.n, codebook, MIN_CONFIDENCE,
         clean=evidence.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
-        min_checked=MIN_CHECKED if evidence.agreeing < 2 else 0.0,
     )  # fmt: skip
     lacking, plain = _find_lacking(evidence), _is_plain(evidence, decoded)
     small = _is_small(evidence, decoded)
-    if lacking is None and small is None and not plain and not decoded.confirmed and verify is not None:
+    settled = decoded.confirmed or decoded.checked
+    if lacking is None and small is None and not plain and not settled and verify is not None:
         decoded = _verified(decoded, verify)
-    has_check = decoded.code is not None and decoded.code.scheme is PlateScheme.ID
+    has_check = decoded.code is not None and decoded.code.scheme.corrects
     reading = replace(
         reading,
         confidence=decoded.confidence,
         cell_confidence=decoded.cell_confidence,
         corrected_cells=decoded.corrected,
         from_codebook=decoded.from_codebook
-        or (decoded.confirmed and (lacking is not None or small is not None or not (plain or has_check))),
+        or (
+            decoded.confirmed
+            and not decoded.checked
+            and (lacking is not None or small is not None or not (plain or has_check))
+        ),
     )
-    if decoded.code is not None and (decoded.confirmed or (lacking is None and small is None)):
+    if decoded.code is not None and (settled or (lacking is None and small is None)):
         found = decoded.verification
         likelihoods = found.log_likelihoods if found is not None else None
         read = replace(reading, outcome=PlateOutcome.READ, code=decoded.code, reason="")
@@ -179,7 +183,7 @@ def _find_lacking(evidence: PlateEvidence) -> tuple[PlateOutcome, str] | None:
 def _is_small(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOutcome, str] | None:
     """The refusal of digits without a check where a plate is too small for them."""
     code, min_rows = decoded.code or decoded.likely, MIN_ROWS_ALONE * evidence.geometry.n
-    if code is not None and code.scheme is not PlateScheme.ID and evidence.extent_px < min_rows:
+    if code is not None and not code.scheme.corrects and evidence.extent_px < min_rows:
         return PlateOutcome.UNSURE, f"a plate of less than {min_rows:g} rows, and these digits have no check"
     return None
 
@@ -189,7 +193,7 @@ def _is_plain(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
     if decoded.code is None:
         return False
     units, small = evidence.units, evidence.unit_px < VERIFIED_UNIT_PX
-    if small and decoded.code.scheme is PlateScheme.ID:
+    if small and decoded.code.scheme.corrects:
         return True
     residual = float(units.level_residual.max())
     level = residual < (PLAIN_SMALL_RESIDUAL if small else PLAIN_RESIDUAL)
@@ -205,7 +209,7 @@ def _verified(decoded: DecodedSymbols, verify: Verify) -> DecodedSymbols:
         return decoded
     decoded = replace(decoded, verification=found)
     cells, confidence = found.cell_confidence, 1 - found.error_probability
-    if decoded.code is not None and code.scheme is PlateScheme.ID:
+    if decoded.code is not None and code.scheme.corrects:
         # a check holds by accident in deep shade, which looks like dark units: what it did not correct must be there
         against = [i for i, cell in enumerate(cells) if cell < MIN_CHECKED_CELL and i not in decoded.corrected]
         if not against:
@@ -215,7 +219,8 @@ def _verified(decoded: DecodedSymbols, verify: Verify) -> DecodedSymbols:
     if found.error_probability < MAX_ERROR:
         return replace(decoded, code=code, likely=None, confidence=confidence, cell_confidence=cells, reason="")
     unsure = ", ".join(str(i) for i, cell in enumerate(cells) if 1 - cell > MAX_ERROR / len(cells))
-    reason = f"a stain may hide units of the cells {unsure}, and these digits have no check"
+    check = "the checks do not settle them" if code.scheme.corrects else "these digits have no check"
+    reason = f"a stain may hide units of the cells {unsure}, and {check}"
     return replace(decoded, code=None, likely=code, confidence=confidence, cell_confidence=cells, reason=reason)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from app.decoders.plate.decode_symbols import DecodedSymbols
 from app.decoders.plate.fit import PlateFit
 from app.decoders.plate.unit_likelihoods import UnitEvidence
-from app.markers.plate import PlateScheme, plate_capacity
+from app.markers.plate import plate_capacity
 from app.markers.reading import PlateGrade
 
 _CONTRAST = (0.20, 0.40, 0.55, 0.70)
@@ -52,8 +52,8 @@ def grade_plate(fit: PlateFit, evidence: UnitEvidence, decoded: DecodedSymbols, 
     sides = np.linalg.norm(np.roll(fit.corners_px, -1, axis=0) - fit.corners_px, axis=1)
     axial = float(min(sides[0] + sides[2], sides[1] + sides[3]) / max(sides[0] + sides[2], sides[1] + sides[3]))
     unused = 1.0
-    if decoded.code is not None and decoded.code.scheme is PlateScheme.ID:
-        capacity = plate_capacity(decoded.code.n, PlateScheme.ID).correctable_cells
+    if decoded.code is not None and decoded.code.scheme.corrects:
+        capacity = plate_capacity(decoded.code.n, decoded.code.scheme).correctable_cells
         unused = max(0.0, 1 - len(decoded.corrected) / capacity)
     elif decoded.corrected:
         unused = 0.0

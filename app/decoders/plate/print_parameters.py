@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from app.decoders.plate.layout import marker_centroids
 from app.decoders.plate.print_face import MERGED, MeasuredFace, is_unit, unit_centres_mm, window
-from app.markers.plate import PlateCode, PlateGeometry, codewords_of_cells, plate_capacity, unit_index
+from app.markers.plate import PlateCode, PlateGeometry, reed_solomon_words, unit_index
 from app.markers.print_grade import THRESHOLDS, PrintParameter, PrintParameterName
 from app.markers.reading import PlateReading
 
@@ -67,7 +67,7 @@ def grade_parameters(evidence: PrintEvidence) -> tuple[PrintParameter, ...]:
         _contrast(evidence), _modulation(evidence), _margin(evidence), _axial(evidence), _grid(evidence),
         _growth(evidence), _colour(evidence), _damage(evidence),
     ]  # fmt: skip
-    if _corrects(evidence.code):
+    if evidence.code.scheme.corrects:
         parameters.append(_unused(evidence))
     return (*parameters, _decode(evidence))
 
@@ -91,10 +91,6 @@ def _graded(
     value = round(float(value), 4)
     found = THRESHOLDS[name].grade(value) if grade is None else grade
     return PrintParameter(name, value, found, finding, cure if found < 4 else "", unit_at)
-
-
-def _corrects(code: PlateCode) -> bool:
-    return plate_capacity(code.n, code.scheme).correctable_cells > 0
 
 
 # --- reflectance ------------------------------------------------------------------------------------------------------
@@ -130,7 +126,7 @@ def _by_unit(evidence: PrintEvidence, name: PrintParameterName, values: Array, c
         f"{max(evidence.face.levels[row, column], 0.0):.0%} of the white; the threshold is "
         f"{(1 + evidence.face.dark_level) / 2:.0%}"
     )
-    grade = _with_correction(evidence.code, values, name) if _corrects(evidence.code) else None
+    grade = _with_correction(evidence.code, values, name) if evidence.code.scheme.corrects else None
     return _graded(name, 100 * values[row, column], finding, cure, at, grade)
 
 
@@ -147,10 +143,8 @@ def _with_correction(code: PlateCode, values: Array, name: PrintParameterName) -
 
 def _unused_share(code: PlateCode, wrong: npt.NDArray[np.bool_]) -> float:
     """Least error correction that a codeword has left with these cells wrong."""
-    words = codewords_of_cells(code.n, code.scheme)
-    checks = plate_capacity(code.n, code.scheme).correctable_erasures
-    count = [sum(bool(w) for w, word in zip(wrong, words, strict=True) if word == k) for k in {*words} - {None}]
-    return max(0.0, 1 - 2 * max(count) / checks)
+    words = reed_solomon_words(code.n, code.scheme)
+    return max(0.0, min(1 - 2 * int(wrong[list(word.cells)].sum()) / word.checks for word in words))
 
 
 # --- geometry ---------------------------------------------------------------------------------------------------------
@@ -254,7 +248,7 @@ def _damage(evidence: PrintEvidence) -> PrintParameter:
     else:
         finding = f"{stained:.1f} % of the units' area is stained or worn"
         at = (int(row) + 1, int(column) + 1)
-    grade = 0.0 if len(wrong) and not _corrects(code) else None
+    grade = 0.0 if len(wrong) and not code.scheme.corrects else None
     return _graded(
         PrintParameterName.DAMAGE, stained, finding, "clean or repaint the units named; print again what is wrong",
         at if len(wrong) or stained >= 0.1 else None, grade,

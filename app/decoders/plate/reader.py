@@ -31,9 +31,10 @@ from app.decoders.plate.verify_units import verify_units
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlatePose, PlateReading
+from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.sensors.camera import Camera
 
-DEFAULT_GEOMETRIES = (PlateGeometry(8), PlateGeometry(10), PlateGeometry(12))
+DEFAULT_GEOMETRIES = EXPECTED_GEOMETRIES
 MIN_EXPLAINED = 0.6
 """[1] share of the pixels' variance below which a candidate is no plate. Source: chosen by hand."""
 STRONG_RANK = 3.5

@@ -25,7 +25,7 @@ from app.decoders.plate.follow_plate import is_large_enough, predict_corners, vi
 from app.decoders.plate.plate_tracks import PlateTrack, PlateTracker, SeenPlate, place_candidate
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES, read_plates
 from app.decoders.plate.unit_likelihoods import code_units
-from app.markers.plate import SIDE_MM, PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import SIDE_MM, PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading
 from app.sensors.camera import Camera
 
@@ -253,7 +253,7 @@ class PlateVideoSearch:
         code = seen.reading.code
         if code is None or seen.evidence is None:
             return False
-        if code.scheme is PlateScheme.ID or code.digits in self._known or seen.evidence.verification is not None:
+        if code.scheme.corrects or code.digits in self._known or seen.evidence.verification is not None:
             return True
         if seen.evidence.unit_px >= RESOLVED_UNIT_PX:
             return True

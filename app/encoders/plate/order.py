@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from app.errors import CodeMismatch, InvalidParameter
 from app.geodesy import check_lon_lat
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import PlateCode, PlateGeometry
 
 MAX_ID_LENGTH = 64
 MAX_NOTE_LENGTH = 80
@@ -84,7 +84,7 @@ class PlateOrder:
     def grouped_digits(self) -> str:
         """The code for people: longitude and latitude apart, or groups of four."""
         digits = self.code.digits
-        size = 6 if self.code.n == 8 and self.code.scheme is not PlateScheme.ID else 4
+        size = 6 if self.code.n == 8 and not self.code.scheme.corrects else 4
         return " ".join(digits[i : i + size] for i in range(0, len(digits), size))
 
 

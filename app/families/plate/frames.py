@@ -27,13 +27,13 @@ from app.families.plate.rows import plate_code, plate_geometry
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.plate_position import resolve_position
 from app.markers.reading import PlateReading
+from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.registry import markers as store
 from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter
 from app.registry.spatial import distance_m
 from app.sensors.camera import Camera
 
-DEFAULT_GEOMETRIES = tuple(PlateGeometry(n=n) for n in (8, 10, 12))
 _MAX_ELSEWHERE = 500
 _M_PER_DEG = 111_000.0
 
@@ -130,7 +130,7 @@ class PlateFrames(FrameReader[PlateReading, PlateSearch]):
 
     def search(self, nearby: Nearby, camera: Camera | None) -> PlateSearch:
         """The codes near by, and their dimensions beside the usual ones."""
-        geometries = _distinct([*DEFAULT_GEOMETRIES, *(plate_geometry(row) for row in nearby.rows)])
+        geometries = _distinct([*EXPECTED_GEOMETRIES, *(plate_geometry(row) for row in nearby.rows)])
         return PlateSearch(camera, plate_codebook(nearby), geometries)
 
     def read(self, pixels: Pixels, search: PlateSearch, *, thermal: bool) -> Sequence[PlateReading]:

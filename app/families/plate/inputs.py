@@ -10,12 +10,20 @@ from app.errors import naming
 from app.families.inputs import POSITION_EXAMPLE, Headed, MarkerIn, Number, PositionIn, StrictModel, Text, Whole
 from app.families.plate.registration import CodeInput, NewPlate
 from app.markers.plate import PlateGeometry, PlateScheme
+from app.markers.recommended_plate import RECOMMENDED_SCHEME, recommended_geometry
+
+SchemeName = Literal["id", "position-robust", "position-check", "position"]
+RECOMMENDED_SCHEME_NAME: SchemeName = RECOMMENDED_SCHEME.value
+SCHEME_DESCRIPTION = (
+    "`id`: a registry number; `position-robust`: the position, on 10 x 10 or 12 x 12 units; both correct wrong cells. "
+    "`position-check` and `position` correct none."
+)
 
 
 class CodeIn(StrictModel):
     """The plate's code; without digits they follow from the position or the registry number."""
 
-    scheme: Literal["position", "position-check", "id"] = "position"
+    scheme: SchemeName = Field(RECOMMENDED_SCHEME_NAME, description=SCHEME_DESCRIPTION)
     digits: Text | None = Field(None, min_length=1, max_length=64, description="Digits to use instead of derived ones.")
     check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] | None = Field(
         None, description="For `position-check`: 1 (default) or 2."
@@ -31,22 +39,31 @@ class CodeIn(StrictModel):
 class GeometryIn(StrictModel):
     """Dimensions of the plate."""
 
-    n: Whole = Field(8, description="Units along a side: 8, 10 or 12.")
-    unit_mm: Number = Field(35.0, description="Side of a unit, 20 to 50. [mm]")
+    n: Whole | None = Field(
+        None, description="Units along a side: 8, 10 or 12. Without: 10 for the scheme `position-robust`, else 8."
+    )
+    unit_mm: Number | None = Field(
+        None, description="Side of a unit, 20 to 50. Without: 27 for `position-robust` on 10 x 10, else 35. [mm]"
+    )
     gap_mm: Number = Field(5.0, description="Gap between units and round the border, 2 to 10. [mm]")
     thickness_mm: Number = Field(20.0, description="Thickness of the base plate, 5 to 50. [mm]")
 
-    def geometry(self) -> PlateGeometry:
-        """The dimensions as the core knows them."""
+    def geometry(self, scheme: PlateScheme) -> PlateGeometry:
+        """The dimensions as the core knows them, of a plate of a scheme."""
         with naming("geometry"):
-            return PlateGeometry(self.n, self.unit_mm, self.gap_mm, self.thickness_mm)
+            return recommended_geometry(
+                scheme, n=self.n, unit_mm=self.unit_mm, gap_mm=self.gap_mm, thickness_mm=self.thickness_mm
+            )
 
 
 PLATE_EXAMPLES: list[JsonValue] = [
     {"position": POSITION_EXAMPLE, "heading_deg": 78.5, "status": "surveyed", "road": "Cheong Wan Road"},
+    {"position": POSITION_EXAMPLE, "code": {"scheme": "position-robust"}},
     {"position": POSITION_EXAMPLE, "code": {"scheme": "position-check", "check_digits": 2}, "geometry": {"n": 10}},
-    {"position": POSITION_EXAMPLE, "code": {"scheme": "id"}},
-    {"position": POSITION_EXAMPLE, "code": {"digits": "023792168411", "allow_mismatched_digits": True}},
+    {
+        "position": POSITION_EXAMPLE,
+        "code": {"scheme": "position", "digits": "023792168411", "allow_mismatched_digits": True},
+    },
 ]
 
 
@@ -72,7 +89,7 @@ class PlateIn(Headed, MarkerIn):
                 code.registry_number,
                 code.allow_mismatched_digits,
             ),
-            geometry=self.geometry.geometry(),
+            geometry=self.geometry.geometry(PlateScheme(code.scheme)),
             heading_deg=self.heading_deg,
             **self.shared(),
         )

@@ -231,5 +231,4 @@ def _check_code_request(wanted: CodeInput) -> None:
 
 
 def _position_code(lon_deg: float, lat_deg: float, n: int, scheme: PlateScheme, check_digits: int | None) -> PlateCode:
-    checks = (check_digits or 1) if scheme is PlateScheme.POSITION_CHECK else 0
-    return PlateCode.from_position(lon_deg, lat_deg, n=n, check_digits=checks)
+    return PlateCode.from_position(lon_deg, lat_deg, n=n, scheme=scheme, check_digits=check_digits or 0)

@@ -8,13 +8,14 @@ from typing import ClassVar
 from app.families.inputs import PositionIn
 from app.families.new_marker import NewMarker
 from app.markers.plate import PlateGeometry, PlateScheme
+from app.markers.recommended_plate import RECOMMENDED_SCHEME
 
 
 @dataclass(frozen=True, slots=True)
 class CodeInput:
     """The code that a plate is to have."""
 
-    scheme: PlateScheme = PlateScheme.POSITION
+    scheme: PlateScheme = RECOMMENDED_SCHEME
     digits: str | None = None
     check_digits: int | None = None
     registry_number: int | None = None

@@ -5,19 +5,20 @@ from __future__ import annotations
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, Field
 
-from app.errors import InvalidParameter, WaymarkError
-from app.families.plate.inputs import GeometryIn
+from app.errors import InvalidParameter, WaymarkError, naming
+from app.families.plate.inputs import RECOMMENDED_SCHEME_NAME, SCHEME_DESCRIPTION, GeometryIn, SchemeName
 from app.families.rules import RETIRED, MarkerRules
 from app.families.surveys import Flags, RowCodes, Rows, SurveyImport, listed_codes
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, code_cells
 from app.markers.plate_digits import id_digits, position_digits, registry_number_bits
+from app.markers.recommended_plate import RECOMMENDED_SCHEME, recommended_geometry
 from app.registry.columns import Columns
 from app.registry.marker_rows import CodeRow
 from app.registry.spatial import distance_m
@@ -31,7 +32,7 @@ _REDRAWS = 20
 class PlateSurveyIn(BaseModel):
     """Members of a survey's declaration that plates have."""
 
-    scheme: Literal["position", "position-check", "id"] = Field("position", description="Of plates.")
+    scheme: SchemeName = Field(RECOMMENDED_SCHEME_NAME, description=f"Of plates. {SCHEME_DESCRIPTION}")
     check_digits: Annotated[int, Field(strict=True, ge=1, le=2)] | None = None
     geometry: GeometryIn = Field(default_factory=GeometryIn, description="Of plates.")
 
@@ -40,7 +41,7 @@ class PlateSurveyIn(BaseModel):
 class PlateDefaults:
     """What a survey's plates have in common."""
 
-    scheme: PlateScheme = PlateScheme.POSITION
+    scheme: PlateScheme = RECOMMENDED_SCHEME
     check_digits: int | None = None
     geometry: PlateGeometry = field(default_factory=PlateGeometry)
 
@@ -57,12 +58,14 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
 
     def defaults(self, declared: Mapping[str, Any]) -> PlateDefaults:
         """Scheme, check digits and dimensions."""
-        checks, scheme = declared.get("check_digits"), declared.get("scheme", "position")
-        if checks is not None and scheme != "position-check":
+        checks, scheme = declared.get("check_digits"), PlateScheme(declared.get("scheme", RECOMMENDED_SCHEME))
+        if checks is not None and scheme is not PlateScheme.POSITION_CHECK:
             raise InvalidParameter(
                 "check_digits means nothing in this scheme", field="check_digits", limit="position-check"
             )
-        return PlateDefaults(PlateScheme(scheme), checks, PlateGeometry(**declared.get("geometry", {})))
+        with naming("geometry"):
+            geometry = recommended_geometry(scheme, **declared.get("geometry", {}))
+        return PlateDefaults(scheme, checks, geometry)
 
     def code_form(self, defaults: PlateDefaults, *, compare: bool) -> CodeForm:
         """Digits of the declared size and scheme, or registry numbers; digits of any plate in comparisons."""
@@ -72,7 +75,8 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
         if defaults.scheme is PlateScheme.ID:
             pattern = f"[0-9A-F]{{{cells}}}|[0-9]{{1,{cells - 1}}}"
             return CodeForm(pattern, True, f"{cells} digits of an id plate, or its registry number")
-        return CodeForm(f"[0-9]{{{cells}}}", True, f"{cells} digits of a plate")
+        digits = "[0-9A-F]" if defaults.scheme.corrects else "[0-9]"
+        return CodeForm(f"{digits}{{{cells}}}", True, f"{cells} digits of a plate")
 
     def read_codes(
         self, survey: GeoreferencedSurvey, rows: Rows, defaults: PlateDefaults
@@ -80,7 +84,7 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
         """Digits by the scheme."""
         if defaults.scheme is PlateScheme.ID:
             return _read_id_codes(survey, rows, defaults.geometry)
-        return _read_position_codes(survey, rows, defaults.geometry, defaults.checks)
+        return _read_position_codes(survey, rows, defaults)
 
     def is_unique(self, codes: RowCodes) -> bool:
         """A registry number names one plate."""
@@ -119,11 +123,17 @@ class PlateSurvey(SurveyImport[PlateDefaults]):
 
 
 def _read_position_codes(
-    survey: GeoreferencedSurvey, rows: Rows, geometry: PlateGeometry, check_digits: int
+    survey: GeoreferencedSurvey, rows: Rows, defaults: PlateDefaults
 ) -> tuple[RowCodes, list[Fault]]:
     """Digits of position plates; a row whose digits are not those of its place is refused."""
     placed = survey.placed
-    digits = position_digits(placed.lon_deg[rows], placed.lat_deg[rows], n=geometry.n, check_digits=check_digits)
+    digits = position_digits(
+        placed.lon_deg[rows],
+        placed.lat_deg[rows],
+        n=defaults.geometry.n,
+        scheme=defaults.scheme,
+        check_digits=defaults.checks,
+    )
     good = np.ones(len(rows), dtype=bool)
     faults: list[Fault] = []
     for k, text in listed_codes(survey, rows):
@@ -134,8 +144,7 @@ def _read_position_codes(
                 "leave the digits out, correct the position, or declare compare if this measures a plate that is built"
             )
             faults.append(Fault(int(rows[k]) + 1, "code", "not_a_marker", message, cure))
-    scheme = PlateScheme.POSITION_CHECK if check_digits else PlateScheme.POSITION
-    return RowCodes(rows, digits, np.zeros(len(rows), dtype=bool), str(scheme)).of(good), faults
+    return RowCodes(rows, digits, np.zeros(len(rows), dtype=bool), str(defaults.scheme)).of(good), faults
 
 
 def _read_id_codes(survey: GeoreferencedSurvey, rows: Rows, geometry: PlateGeometry) -> tuple[RowCodes, list[Fault]]:

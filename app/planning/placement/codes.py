@@ -42,9 +42,8 @@ def plate_codes(
     """Codes of plates at positions: their decimals, or registry numbers."""
     if rules.scheme is PlateScheme.ID:
         return [PlateCode.from_registry_number(number, n=rules.n) for number in numbers(len(lon_deg))]
-    checks = 1 if rules.scheme is PlateScheme.POSITION_CHECK else 0
     return [
-        PlateCode.from_position(lon, lat, n=rules.n, check_digits=checks)
+        PlateCode.from_position(lon, lat, n=rules.n, scheme=rules.scheme)
         for lon, lat in zip(lon_deg, lat_deg, strict=True)
     ]
 

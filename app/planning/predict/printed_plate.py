@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.reader import decode_plates
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, position_decimals
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.planning.plate_view import camera_of
 from app.planning.predict.models import DAY, PlateModel, fitted_models, normal_quadrature
 from app.planning.predict.rates import FAR_M, MIN_UNIT_PX, read_rate_of_model, readable_frames
@@ -231,11 +232,10 @@ def _codebook(code: PlateCode) -> list[PlateCode]:
     if code.scheme is PlateScheme.ID:
         numbers = [code.registry_number + step for step in _NEAR_NUMBERS]
         return [code, *(PlateCode.from_registry_number(max(number, 0), n=code.n) for number in numbers)]
-    checks = code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else 0
-    lon_places, lat_places = position_decimals(code.n, code.scheme, code.check_digits)
-    lon, lat = code.digits[:lon_places], code.digits[lon_places : lon_places + lat_places]
+    lon, lat = code.decimals
     places = [(float(f"0.{lon}") + step, float(f"0.{lat}") + step) for step in _NEIGHBOURS_DEG]
-    return [code, *(PlateCode.from_position(x, y, n=code.n, check_digits=checks) for x, y in places)]
+    of_position = partial(PlateCode.from_position, n=code.n, scheme=code.scheme, check_digits=code.check_digits)
+    return [code, *(of_position(x, y) for x, y in places)]
 
 
 def _frames(

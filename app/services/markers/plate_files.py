@@ -9,40 +9,70 @@ from app.encoders.plate import ArtworkFormat, ArtworkOptions, PlateOrder, PlateR
 from app.encoders.plate import encode_plate as draw_plate
 from app.errors import InvalidParameter
 from app.formats.images import ImageLimits, load_image
-from app.markers.plate import PlateCode, PlateGeometry
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateReading
+from app.markers.recommended_plate import RECOMMENDED_POSITION_SCHEME, recommended_geometry
 from app.services.decodes.frame_documents import FramesResult, ReadFrame, ReadMarker, frames_result
 
 
-def plate_code_for(
-    position: tuple[float, float] | None, registry_number: int | None, *, n: int, check_digits: int = 0
-) -> PlateCode:
-    """The code of a plate that is asked for by position or by registry number.
+def plate_for(
+    position: tuple[float, float] | None,
+    registry_number: int | None,
+    *,
+    scheme: str = RECOMMENDED_POSITION_SCHEME,
+    check_digits: int | None = None,
+    n: int | None = None,
+    unit_mm: float | None = None,
+    gap_mm: float = 5.0,
+    thickness_mm: float = 20.0,
+) -> tuple[PlateCode, PlateGeometry]:
+    """Code and dimensions of a plate that is asked for by position or by registry number.
 
     Parameters
     ----------
     position : (float, float) or None
         Longitude, latitude. [deg]
     registry_number : int or None
-    n : int
-        Units along a side.
-    check_digits : int
-        For positions: 0, 1 or 2.
+    scheme : str
+        Of positions.
+    check_digits : int, optional
+        Of the scheme ``position-check``: 1 or 2.
+    n, unit_mm, gap_mm, thickness_mm
+        As in `recommended_geometry`.
 
     Raises
     ------
     InvalidParameter
-        Both are given, or none.
+        Both position and number are given, or none; the scheme is none of positions, or has no check digits.
     """
-    if position is not None and registry_number is None:
-        return PlateCode.from_position(*position, n=n, check_digits=check_digits)
-    if registry_number is not None and position is None:
-        return PlateCode.from_registry_number(registry_number, n=n)
-    raise InvalidParameter(
-        "a plate carries a position or a registry number",
-        limit="one of the two",
-        cure="give --lon-deg and --lat-deg, or --registry-number",
-    )
+    if (position is None) == (registry_number is None):
+        raise InvalidParameter(
+            "a plate carries a position or a registry number",
+            limit="one of the two",
+            cure="give --lon-deg and --lat-deg, or --registry-number",
+        )
+    of_positions = [str(one) for one in PlateScheme if one is not PlateScheme.ID]
+    if scheme not in of_positions:
+        raise InvalidParameter(
+            f"positions have no scheme {scheme}",
+            field="scheme",
+            limit=", ".join(of_positions),
+            cure="choose one of them",
+        )
+    if check_digits is not None and scheme != PlateScheme.POSITION_CHECK:
+        raise InvalidParameter(
+            f"the scheme {scheme} has no check digits",
+            field="check_digits",
+            limit=PlateScheme.POSITION_CHECK,
+            cure=f"choose the scheme {PlateScheme.POSITION_CHECK}, or leave the check digits out",
+        )
+    wanted = PlateScheme(scheme) if position is not None else PlateScheme.ID
+    geometry = recommended_geometry(wanted, n=n, unit_mm=unit_mm, gap_mm=gap_mm, thickness_mm=thickness_mm)
+    if position is not None:
+        code = PlateCode.from_position(*position, n=geometry.n, scheme=wanted, check_digits=check_digits or 0)
+        return code, geometry
+    assert registry_number is not None
+    return PlateCode.from_registry_number(registry_number, n=geometry.n), geometry
 
 
 def encode_plate_files(

@@ -47,13 +47,13 @@ def test_markers_of_several_families_are_registered_and_changed_together(client:
 
 def _mixed(client: httpx.Client, place: Place) -> list[Any]:
     """Good items at 0, 4 and 6; every other has a fault of its own kind."""
-    taken = client.post("/v1/markers", json={"position": place()}).json()
+    taken = client.post("/v1/markers", json={"position": place(), "code": {"scheme": "position"}}).json()
     spot = {name: taken["position"][name] for name in ("lon_deg", "lat_deg")}
     known = {"id": taken["id"], "change": {"heading_deg": 5.0}}
     return [
         _create(place),
         {"create": {"position": {"lon_deg": 8, "lat_deg": 91}}},
-        {"create": {"position": spot}},
+        {"create": {"position": spot, "code": {"scheme": "position"}}},
         {"create": {"position": place(), "colour": "red"}},
         {"update": {**known, "version": 1}},
         {"update": {**known, "version": 1}},
@@ -124,7 +124,8 @@ def test_a_dry_run_says_the_same_and_stores_nothing(client: httpx.Client, place:
 
 def test_the_same_code_twice_in_one_request_is_taken_the_second_time(client: httpx.Client, place: Place) -> None:
     spot = place()
-    report = _bulk(client, {"create": {"position": spot}}, {"create": {"position": spot}}, mode="good").json()
+    item = {"create": {"position": spot, "code": {"scheme": "position"}}}
+    report = _bulk(client, item, item, mode="good").json()
     assert [result["status"] for result in report["results"]] == [201, 409]
     assert report["results"][1]["problem"]["type"] == "urn:waymark:problem:code-taken"
 

@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from app.markers.plate import PlateCode, PlateScheme
 from app.services.access.access import Scope
 from tests.conftest import LiveServer
 from tests.http import created, refused
@@ -19,12 +20,45 @@ pytestmark = pytest.mark.both_databases
 Place = Callable[[], dict[str, Any]]
 
 
+PLAIN, ROBUST = {"scheme": "position"}, {"scheme": "position-robust"}
+
 # --- register -----------------------------------------------------------------------------------------------------
 
 
-def test_a_position_alone_makes_a_position_plate(client: httpx.Client, place: Place) -> None:
+def test_a_position_alone_makes_a_plate_with_a_registry_number(client: httpx.Client, place: Place) -> None:
+    marker = created(client, "/v1/markers", position=place())
+    assert marker["code"]["scheme"] == "id"
+    assert PlateCode(marker["code"]["digits"], PlateScheme.ID).registry_number == marker["code"]["registry_number"]
+    assert marker["code"]["digits_match_position"] is None
+    assert marker["geometry"] == {"n": 8, "unit_mm": 35.0, "gap_mm": 5.0, "thickness_mm": 20.0, "side_mm": 325.0}
+
+
+def test_a_robust_position_is_carried_on_a_plate_of_the_same_size(client: httpx.Client, place: Place) -> None:
+    spot = place()
+    marker = created(client, "/v1/markers", position=spot, code=ROBUST)
+    assert marker["geometry"] == {"n": 10, "unit_mm": 27.0, "gap_mm": 5.0, "thickness_mm": 20.0, "side_mm": 325.0}
+    assert marker["code"]["scheme"] == "position-robust"
+    assert marker["code"]["digits_match_position"] is True
+    decimals = PlateCode(marker["code"]["digits"], PlateScheme.POSITION_ROBUST, 10).decimals
+    assert decimals == tuple(f"{abs(spot[name]):.6f}".split(".")[1] for name in ("lon_deg", "lat_deg"))
+    same = {"position": spot, "code": ROBUST | {"digits": marker["code"]["digits"]}}
+    refused(client.post("/v1/markers", json=same), 409, "code-taken")
+    path = f"/v1/markers/{marker['id']}"
+    moved = client.patch(path, json={"position": place()}, headers={"If-Match": '"1"'}).json()
+    assert moved["code"]["digits"] != marker["code"]["digits"]
+    assert moved["code"]["digits_match_position"] is True
+
+
+@pytest.mark.parametrize("geometry", [{"n": 8}, {"n": 8, "unit_mm": 27}])
+def test_a_robust_position_needs_ten_units(client: httpx.Client, place: Place, geometry: dict[str, Any]) -> None:
+    body = {"position": place(), "code": ROBUST, "geometry": geometry}
+    problem = refused(client.post("/v1/markers", json=body), 422, field="geometry.n")
+    assert problem["limit"] == "10 or 12"
+
+
+def test_a_plain_position_plate(client: httpx.Client, place: Place) -> None:
     spot = {"lon_deg": -0.1275004, "lat_deg": place()["lat_deg"]}
-    response = client.post("/v1/markers", json={"position": spot})
+    response = client.post("/v1/markers", json={"position": spot, "code": PLAIN})
     marker = response.json()
     assert response.status_code == 201
     assert response.headers["location"] == f"/v1/markers/{marker['id']}"
@@ -94,7 +128,7 @@ def test_larger_plates(client: httpx.Client, place: Place, n: int, digits: int) 
 
 
 def test_digits_that_do_not_fit_the_position(client: httpx.Client) -> None:
-    code: dict[str, Any] = {"digits": "023792168411"}
+    code: dict[str, Any] = PLAIN | {"digits": "023792168411"}
     body = {"position": {"lon_deg": 114.179203, "lat_deg": 22.304161}, "code": code}
     problem = refused(client.post("/v1/markers", json=body), 422, "code-mismatch")
     assert problem["field"] == "code.digits"
@@ -111,7 +145,7 @@ def test_digits_that_do_not_fit_the_position(client: httpx.Client) -> None:
 
 def test_digits_that_fit_are_accepted(client: httpx.Client) -> None:
     marker = created(
-        client, "/v1/markers", position={"lon_deg": 14.5, "lat_deg": -22.25}, code={"digits": "500000250000"}
+        client, "/v1/markers", position={"lon_deg": 14.5, "lat_deg": -22.25}, code=PLAIN | {"digits": "500000250000"}
     )
     assert marker["code"]["digits_match_position"] is True
 
@@ -127,34 +161,36 @@ def test_digits_that_fit_are_accepted(client: httpx.Client) -> None:
     ],
 )
 def test_rounding_at_whole_degrees(client: httpx.Client, lon: float, lat: float, digits: str) -> None:
-    assert created(client, "/v1/markers", position={"lon_deg": lon, "lat_deg": lat})["code"]["digits"] == digits
+    position = {"lon_deg": lon, "lat_deg": lat}
+    assert created(client, "/v1/markers", position=position, code=PLAIN)["code"]["digits"] == digits
 
 
 def test_the_same_position_twice_is_a_conflict(client: httpx.Client, server: LiveServer, place: Place) -> None:
     spot = place()
-    first = created(client, "/v1/markers", position=spot)
-    problem = refused(client.post("/v1/markers", json={"position": spot}), 409, "code-taken")
+    body = {"position": spot, "code": PLAIN}
+    first = created(client, "/v1/markers", **body)
+    problem = refused(client.post("/v1/markers", json=body), 409, "code-taken")
     assert first["id"] in problem["detail"]
     assert problem["limit"] == "no two plates with the same digits within 1000 m"
     with server.agency("a stranger at the same place") as stranger:
-        secret = refused(stranger.post("/v1/markers", json={"position": spot}), 409, "code-taken")
+        secret = refused(stranger.post("/v1/markers", json=body), 409, "code-taken")
     assert first["id"] not in str(secret)
     assert "another agency" in secret["detail"]
     client.patch(f"/v1/markers/{first['id']}", json={"status": "retired"}, headers={"If-Match": '"1"'})
-    created(client, "/v1/markers", position=spot)
+    created(client, "/v1/markers", **body)
     back = client.patch(f"/v1/markers/{first['id']}", json={"status": "active"}, headers={"If-Match": '"2"'})
     refused(back, 409, "code-taken")
 
 
 def test_mirrored_positions_across_the_equator_are_a_conflict(client: httpx.Client) -> None:
-    created(client, "/v1/markers", position={"lon_deg": 31.234567, "lat_deg": 0.000321})
-    mirrored = {"position": {"lon_deg": 31.234567, "lat_deg": -0.000321}}
+    created(client, "/v1/markers", position={"lon_deg": 31.234567, "lat_deg": 0.000321}, code=PLAIN)
+    mirrored = {"position": {"lon_deg": 31.234567, "lat_deg": -0.000321}, "code": PLAIN}
     refused(client.post("/v1/markers", json=mirrored), 409, "code-taken")
-    created(client, "/v1/markers", position={"lon_deg": 31.234567, "lat_deg": -1.000321})
+    created(client, "/v1/markers", position={"lon_deg": 31.234567, "lat_deg": -1.000321}, code=PLAIN)
 
 
 def test_given_digits_are_kept_apart_by_twenty_kilometres(client: httpx.Client) -> None:
-    code = {"digits": "111122223333", "allow_mismatched_digits": True}
+    code = PLAIN | {"digits": "111122223333", "allow_mismatched_digits": True}
     created(client, "/v1/markers", position={"lon_deg": 60.0, "lat_deg": 40.0}, code=code)
     near = {"position": {"lon_deg": 60.2, "lat_deg": 40.0}, "code": code}
     problem = refused(client.post("/v1/markers", json=near), 409, "code-taken")
@@ -164,15 +200,15 @@ def test_given_digits_are_kept_apart_by_twenty_kilometres(client: httpx.Client) 
 
 
 def test_derived_digits_keep_clear_of_given_ones(client: httpx.Client) -> None:
-    code = {"digits": "123456654321", "allow_mismatched_digits": True}
+    code = PLAIN | {"digits": "123456654321", "allow_mismatched_digits": True}
     created(client, "/v1/markers", position={"lon_deg": 61.2, "lat_deg": 41.7}, code=code)
-    derived = {"position": {"lon_deg": 61.123456, "lat_deg": 41.654321}}
+    derived = {"position": {"lon_deg": 61.123456, "lat_deg": 41.654321}, "code": PLAIN}
     refused(client.post("/v1/markers", json=derived), 409, "code-taken")
-    created(client, "/v1/markers", position={"lon_deg": 62.123456, "lat_deg": 41.654321})
+    created(client, "/v1/markers", position={"lon_deg": 62.123456, "lat_deg": 41.654321}, code=PLAIN)
 
 
 def test_of_many_requests_for_one_place_one_wins(client: httpx.Client, place: Place) -> None:
-    body = {"position": place()}
+    body = {"position": place(), "code": PLAIN}
     with ThreadPoolExecutor(8) as threads:
         answers = list(threads.map(lambda _: client.post("/v1/markers", json=body).status_code, range(16)))
     assert sorted(answers) == [201] + [409] * 15
@@ -248,7 +284,7 @@ def test_nad83_is_transformed_and_kept_as_it_came(client: httpx.Client) -> None:
 
 def test_nad83_with_an_epoch_is_transformed(client: httpx.Client) -> None:
     given = {"lon_deg": -84.5, "lat_deg": 42.75, "crs": "urn:ogc:def:crs:EPSG::6318", "epoch": 2025.0}
-    marker = created(client, "/v1/markers", position=given)
+    marker = created(client, "/v1/markers", position=given, code=PLAIN)
     assert (marker["position"]["transform_accuracy_m"], marker["position"]["realization"]) == (0.0, "ITRF2014")
     assert 84.500010 < -marker["position"]["lon_deg"] < 84.500012
     assert marker["code"]["digits"].startswith("500011")
@@ -367,7 +403,7 @@ def test_the_history_holds_every_version(client: httpx.Client, place: Place) -> 
 
 
 def test_planned_digits_follow_the_position_built_ones_stay(client: httpx.Client, place: Place) -> None:
-    marker = created(client, "/v1/markers", position=place())
+    marker = created(client, "/v1/markers", position=place(), code=PLAIN)
     path = f"/v1/markers/{marker['id']}"
     replanned = client.patch(path, json={"position": place()}, headers={"If-Match": '"1"'}).json()
     assert replanned["code"]["digits"] != marker["code"]["digits"]

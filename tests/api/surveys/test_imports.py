@@ -14,6 +14,7 @@ import httpx
 import pytest
 
 from app.main import create_app
+from app.markers.plate import PlateCode, PlateScheme
 from app.settings import Settings
 from tests.api.surveys import survey_files
 from tests.api.surveys.survey_files import LAT, LON, STEP
@@ -111,12 +112,24 @@ def test_a_repeated_request_gets_the_first_answer(client: httpx.Client) -> None:
     assert len(_markers(client)) == 8
 
 
-def test_plates_get_the_digits_of_their_places(client: httpx.Client) -> None:
+def test_plates_get_registry_numbers_where_no_scheme_is_declared(client: httpx.Client) -> None:
     declared = {"crs": "EPSG:4326", "columns": {"point": "number"}, "area_deg": DEGREES["area_deg"]}
     assert _send(client, _csv(), declared).status_code == 201
+    codes = [PlateCode(one["code"]["digits"], PlateScheme.ID) for one in _markers(client)]
+    assert len({code.registry_number for code in codes}) == 8
+
+
+def test_plates_get_the_digits_of_their_places(client: httpx.Client) -> None:
+    declared = {"crs": "EPSG:4326", "columns": {"point": "number"}, "area_deg": DEGREES["area_deg"]}
+    assert _send(client, _csv(), {**declared, "scheme": "position"}).status_code == 201
     plate = _markers(client)[0]
     assert plate["code"]["digits"] == "416562005100"
     assert plate["position"]["original"]["point"] == "1"
+    robust = _send(client, _csv(), {**declared, "scheme": "position-robust", "duplicates": "store"})
+    assert robust.status_code == 201, robust.text
+    stored = next(one for one in _markers(client) if one["code"]["scheme"] == "position-robust")
+    assert stored["geometry"]["n"] == 10
+    assert PlateCode(stored["code"]["digits"], PlateScheme.POSITION_ROBUST, 10).decimals == ("416562", "005100")
     ids = _send(
         client,
         _csv(),
