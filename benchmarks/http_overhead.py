@@ -30,10 +30,10 @@ import numpy as np
 
 from app.decoders.plate.reader import decode_plates
 from app.demo.free_ports import free_ports
-from app.families.plate.frames import DEFAULT_GEOMETRIES
 from app.formats.images import load_image
 from app.jobs.decoder_process import keep_memory
 from app.markers.plate import PlateCode
+from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.sensors.camera import Camera
 
 KEY = "benchmark-key-that-is-long-enough"
@@ -154,7 +154,7 @@ def measure(folder: Path, frames: int, registered: int) -> dict[str, list[float]
     print(f"{frames} frames of {len(pictures[0]) // 1024} KiB, {registered} plates registered")
 
     def decode_bare(data: bytes) -> None:
-        decode_plates(load_image(data).pixels, codebook=codebook, camera=CAMERA, geometries=DEFAULT_GEOMETRIES)
+        decode_plates(load_image(data).pixels, codebook=codebook, camera=CAMERA, geometries=EXPECTED_GEOMETRIES)
 
     decode_bare(pictures[0])  # compiles the kernels, if need be, before the server waits for a request
     durable, times = Durable(folder), defaultdict(list)

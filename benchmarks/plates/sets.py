@@ -186,7 +186,8 @@ def shoot(job: Job) -> Iterator[Shot | Unseen]:
     return makers[job.set_name](job)
 
 
-def _draw_background(camera: Camera, rng: np.random.Generator) -> Image:
+def draw_background(camera: Camera, rng: np.random.Generator) -> Image:
+    """A road photo seen by the camera."""
     photos = read_photos()
     return road_background(photos[int(rng.integers(len(photos)))], camera, rng, grain=float(rng.uniform(0.01, 0.05)))
 
@@ -231,7 +232,7 @@ def trial_drive(trial: Trial, rng: np.random.Generator) -> tuple[Drive, PlateCod
 def _trial(job: Job) -> Iterator[Shot | Unseen]:
     rng, trial = job.rng, read_trials()[job.index]
     drive, code, conditions = trial_drive(trial, rng)
-    codebook, background = draw_codebook(code, rng), _draw_background(drive.camera, rng)
+    codebook, background = draw_codebook(code, rng), draw_background(drive.camera, rng)
     label = f"{trial.figure}/{trial.trial}"
     for scene in drive_over_plate(drive, rng):
         height = face_truth(scene, scene.faces[0]).height_px
@@ -264,7 +265,7 @@ def _draw_stress_scene(job: Job, rng: np.random.Generator) -> tuple[PlateScene, 
     face = plate_face(code, GEOMETRY, conditions.look, conditions.wear, rng)
     placed = draw_place(camera, face, rng, (24.0, 140.0))
     extra = draw_distractor_faces(camera, rng, int(rng.integers(0, 4)), (placed,))
-    background = paint_distractors(_draw_background(camera, rng), rng, int(rng.integers(0, 6)))
+    background = paint_distractors(draw_background(camera, rng), rng, int(rng.integers(0, 6)))
     scene = scene_under(conditions, camera, (placed, *extra), float(rng.uniform(0, 80)) / 3.6, rng)
     return scene, background, code, conditions
 
@@ -308,15 +309,15 @@ def _light(job: Job) -> Iterator[Shot | Unseen]:
     """Drives of a few frames each, far to near; the label is the drive's."""
     rng = job.rng
     for number in range(job.frames // DRIVE_FRAMES):
-        code, conditions = draw_code(rng), _draw_light(job.set_name, rng)
+        code, conditions = draw_code(rng), draw_light(job.set_name, rng)
         face = plate_face(code, GEOMETRY, conditions.look, conditions.wear, rng)
-        scenes = _draw_scenes(face, conditions, rng)
-        codebook, background = draw_codebook(code, rng), _draw_background(scenes[0].camera, rng)
+        scenes = draw_scenes(face, conditions, rng)
+        codebook, background = draw_codebook(code, rng), draw_background(scenes[0].camera, rng)
         for scene in scenes:
             yield _shot(f"{job.set_name} {job.index}.{number}", scene, background, code, codebook, conditions, rng)
 
 
-def _draw_scenes(face: Face, conditions: Conditions, rng: np.random.Generator) -> list[PlateScene]:
+def draw_scenes(face: Face, conditions: Conditions, rng: np.random.Generator) -> list[PlateScene]:
     """Views of a plate from a camera that passes it, evenly over those of the wanted heights."""
     while True:
         drive = Drive(
@@ -339,7 +340,8 @@ def _draw_scenes(face: Face, conditions: Conditions, rng: np.random.Generator) -
             return [seen[k] for k in np.linspace(0, len(seen) - 1, DRIVE_FRAMES).round().astype(int)]
 
 
-def _draw_light(name: str, rng: np.random.Generator) -> Conditions:
+def draw_light(name: str, rng: np.random.Generator) -> Conditions:
+    """A fair day but for what the set is named after."""
     conditions = draw_daylight(rng)
     if "shade" in name:
         shadow = draw_shadow(rng)
@@ -377,7 +379,7 @@ def _thermal(job: Job) -> Iterator[Shot | Unseen]:
         camera, warm_face(code, GEOMETRY, warmth, rng), THERMAL_KMH[job.set_name] / 3.6, 30.0, 0.01,
         float(rng.normal(0, 0.2)), turn, far_m=8.0,
     )  # fmt: skip
-    codebook, background = draw_codebook(code, rng), _draw_background(camera, rng)
+    codebook, background = draw_codebook(code, rng), draw_background(camera, rng)
     for scene in drive_over_plate(drive, rng):
         if face_truth(scene, scene.faces[0]).height_px >= 16 and rng.random() < job.share:
             frame = render_thermal_scene(scene, sensor, background, rng)
@@ -392,7 +394,7 @@ def _free(job: Job) -> Iterator[Shot | Unseen]:
     rng = job.rng
     for k in range(job.frames):
         camera = _draw_camera(rng)
-        background = _draw_background(camera, rng) if k % 3 == 0 else _draw_crop(camera, rng)
+        background = draw_background(camera, rng) if k % 3 == 0 else _draw_crop(camera, rng)
         if k % 2:
             background = paint_distractors(background, rng, int(rng.integers(3, 25)))
         faces: tuple[PlacedFace, ...] = ()

@@ -30,12 +30,12 @@ import httpx
 import numpy as np
 
 from app.decoders.plate.reader import decode_plates
-from app.families.plate.frames import DEFAULT_GEOMETRIES
 from app.formats.images import load_image
 from app.formats.spooled_file import SpooledFile
 from app.jobs.decoder_process import ONE_THREAD, keep_memory
 from app.jobs.trace_tasks import decode_recording
 from app.markers.plate import PlateCode
+from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.sensors.camera import Camera
 from app.services.decodes.trace_task import TraceTask
 from benchmarks.faults.server import FaultServer
@@ -106,7 +106,7 @@ def _bare_frames(files: Sequence[bytes]) -> Callable[[bytes], object]:
 
     def decode(data: bytes) -> object:
         pixels = load_image(data).pixels
-        return decode_plates(pixels, codebook=codebook, camera=camera, geometries=DEFAULT_GEOMETRIES)
+        return decode_plates(pixels, codebook=codebook, camera=camera, geometries=EXPECTED_GEOMETRIES)
 
     for data in files:
         decode(data)

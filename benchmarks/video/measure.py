@@ -13,12 +13,13 @@ import numpy as np
 from app.decoders.plate.accumulate import MAX_ODD_UNITS
 from app.decoders.plate.unit_likelihoods import LARGE_UNIT_PX, code_units
 from app.decoders.plate.video_search import FoundPlate
-from app.families.plate.frames import DEFAULT_GEOMETRIES, PlateSearch
+from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.spooled_file import SpooledFile
 from app.formats.video.container import VideoFile, VideoKind
 from app.jobs.video_tasks import decode_segment, index_frames
 from app.markers.plate import PlateCode
+from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.sensors.camera import Camera
 from app.services.decodes.video_task import IndexVideoTask, SegmentTask
 from benchmarks.video.drive import PassedPlate
@@ -74,7 +75,7 @@ def measure_video(
     index = index_frames(IndexVideoTask(VideoFile(SpooledFile.at(path), VideoKind.MP4)), None)
     score = VideoScore(frames=len(index.stamps))
     found: list[FoundPlate] = []
-    wanted = {PLATE.name: PlateSearch(camera, tuple(codebook), DEFAULT_GEOMETRIES)}
+    wanted = {PLATE.name: PlateSearch(camera, tuple(codebook), EXPECTED_GEOMETRIES)}
     for number in range(len(index.segments)):
         result = decode_segment(SegmentTask(index, number, wanted), None)
         score.decoded += result.decoded

@@ -11,6 +11,7 @@ from app.errors import InvalidParameter
 from app.formats.images import load_image
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlateReading
+from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.sensors.camera import Camera
 from app.simulation.plate_scene import PlacedFace
 from tests.decoders.plate.scenes import BACKGROUNDS, CAMERA, PAPER, face_of, photo, road, shoot, shoot_plate
@@ -54,20 +55,25 @@ def test_a_plate_is_read_at_any_turn(turn_deg: int) -> None:
         PlateCode.from_position(*HK, n=10, check_digits=2),
         PlateCode.from_registry_number(0xFEDCBA987654, n=10),
         PlateCode.from_position(*HK, n=12),
+        PlateCode.from_position(*HK, n=10, scheme=PlateScheme.POSITION_ROBUST),
+        PlateCode.from_position(*HK, n=12, scheme=PlateScheme.POSITION_ROBUST),
         PlateCode.from_position(*HK, n=12, check_digits=2),
         PlateCode.from_registry_number(0xFEDCBA9876543210, n=12),
     ],
     ids=lambda code: f"{code.n}-{code.scheme}-{code.digits[:8]}",
 )
 def test_every_size_and_scheme_is_read(code: PlateCode) -> None:
-    frame = shoot_plate(code, ahead_m=2.4, turn_deg=8.0)
+    geometry = next(one for one in EXPECTED_GEOMETRIES if one.n == code.n)
+    frame = shoot(PlacedFace(face_of(code, geometry), 2.4, 0.0, 8.0))
     reading = only(decode_plates(frame.image))
     assert reading.digits == code.digits
-    assert reading.geometry == PlateGeometry(code.n)
+    assert reading.geometry == geometry
     assert corner_errors(reading, frame.truths[0].corners_px).max() < CORNER_LIMIT_PX
     assert reading.code is not None
     if code.scheme is PlateScheme.ID:
         assert reading.code.registry_number == code.registry_number
+    if code.scheme.corrects:
+        assert reading.code == code  # without a word about its scheme
     assert reading.confidence > 0.99
     assert len(reading.cell_confidence) == len(code.digits)
     assert reading.grade is not None
