@@ -78,13 +78,18 @@ def test_a_plate_is_registered_and_its_artwork_shown(page: Browser) -> None:
     page.click("a[href='#register']")
     page.fill("[name='position.lon_deg']", "12.345678")
     page.fill("[name='position.lat_deg']", "45.678912")
+    scheme = "document.querySelector(\"[name='code.scheme']\")"
+    for wanted, unit_mm in (("position-robust", "27"), ("id", "35")):
+        page.run(f"{scheme}.value = '{wanted}', {scheme}.dispatchEvent(new Event('change', {{bubbles: true}})), 0")
+        assert page.run("document.querySelector(\"[name='geometry.unit_mm']\").value") == unit_mm
+        assert page.run("document.querySelector('#side').textContent") == "325 mm"
     page.fill("[name='geometry.gap_mm']", "6")
     assert page.run("document.querySelector('#side').textContent") == "334 mm"
     page.click("#register-form button")
     detail = page.until(
         "/Read back/.test(document.querySelector('#detail').innerText) && document.querySelector('#detail').innerText"
     )
-    assert "345678678912" in detail
+    assert "id, number" in detail
     assert "334 mm square" in detail
     assert page.until("document.querySelector('.preview').naturalWidth") > 100
     assert page.run("document.querySelectorAll('#map .marker').length") >= 1
