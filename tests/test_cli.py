@@ -114,9 +114,10 @@ def test_a_plate_is_written_and_read_back(waymark: Run, tmp_path: Path, scheme: 
 
 def test_the_artwork_of_a_plate_is_a_perfect_print(waymark: Run, tmp_path: Path) -> None:
     place = ("--lon-deg", "114.179203", "--lat-deg", "22.304161")
-    assert waymark("encode", *place, "--format", "png", "--out", str(tmp_path))[0] == 0
+    scheme = ("--scheme", "position")
+    assert waymark("encode", *place, *scheme, "--format", "png", "--out", str(tmp_path))[0] == 0
     photo, page = str(tmp_path / "179203304161.png"), tmp_path / "grade.pdf"
-    status, printed, error = waymark("grade-print", photo, "--digits", "179203304161", "--pdf", str(page))
+    status, printed, error = waymark("grade-print", photo, *scheme, "--digits", "179203304161", "--pdf", str(page))
     assert status == 0, error
     grade = orjson.loads(printed)
     assert grade["letter"] == "A", grade["parameters"]

@@ -38,7 +38,7 @@ def test_the_demo_reads_every_plate_and_tag(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from app.cli import main; main()", "demo", "--out", str(tmp_path / "out")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WITHIN_S)
     assert done.returncode == 0, done.stdout + done.stderr
-    rows = re.findall(r"^\d +[\w-]+ +\w{12} +(\d+) +(\d+) +(\d+) +(\d+) +([\d.]+)", done.stdout, re.MULTILINE)
+    rows = re.findall(r"^\d +[\w-]+ +\w+ +(\d+) +(\d+) +(\d+) +(\d+) +([\d.]+)", done.stdout, re.MULTILINE)
     assert len(rows) == 6
     for in_view, decoded, wrong, matched, error_cm in rows:
         assert int(in_view) >= int(decoded) == int(matched) >= 4

@@ -73,7 +73,7 @@ def test_uploads_wait_for_a_broker_that_is_away(
     archive = pack({"0.png": png(standin.frame_that(standin.OBEY))})
     with LiveServer(create_app(settings, decode=standin.decode)) as server, server.client() as client:
         answers = [post_frame(client, archive, name="drive.zip")]
-        wait_until(lambda: _messages(broker) == 1, "the message")
+        wait_until(lambda: _messages(broker) >= 1, "the message")  # unfinished jobs are sent again
         broker.kill()
         answers.append(post_frame(client, archive, name="drive.zip"))
         assert client.get("/readyz").status_code == 200

@@ -27,7 +27,7 @@ NEEDS = {
     "peers": ("trial", "stress"),
     "accuracy": ("trial",),
     "light": LIGHT,
-    "reliability": (*LIGHT, "trial", "stress"),
+    "reliability": (*LIGHT, "stress"),
 }
 BATCH = 25
 # frames (drives for thermal) a seed: long, short

@@ -162,7 +162,7 @@ def light_table(records: Sequence[Record]) -> str:
 def reliability_table(records: Sequence[Record]) -> str:
     """Reported confidence beside the share that is right, of sure and of tentative readings."""
     rows = []
-    for name in (*LIGHT, "trial", "stress"):
+    for name in (*LIGHT, "stress"):
         claims = [claim for r in records if r.set_name == name for claim in r.claims]
         row: list[object] = [name]
         for wanted in (True, False):

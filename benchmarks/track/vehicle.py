@@ -25,7 +25,7 @@ from app.encoders.cerpm.payload import encode_message
 from app.geodesy import enu_from_wgs84, wgs84_from_enu
 from app.markers.cerpm import LaneSide
 from app.markers.magnet import InformationTag, parse_tag
-from app.markers.plate import PlateCode, PlateGeometry
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.planning.cerpm_placement import place_markers
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
@@ -112,8 +112,7 @@ def install(client: httpx.Client, origin: tuple[float, float, float], rng: np.ra
         lon, lat = built.place(at_m, PLATE_LEFT_M)
         position = {"lon_deg": lon, "lat_deg": lat, "height_m": origin[2], **_POSITION}
         plate = _registered(client, {"position": position, "heading_deg": 30.0, "status": "surveyed"})
-        built.plates.append(PlateCode.from_position(lon, lat, check_digits=plate["code"]["check_digits"]))
-        assert built.plates[-1].digits == plate["code"]["digits"]
+        built.plates.append(PlateCode(plate["code"]["digits"], PlateScheme(plate["code"]["scheme"])))
     line = {"type": "LineString", "coordinates": [built.place(s) for s in np.arange(0.0, LENGTH_M + 1, 10.0)]}
     for code, at_m in TAGS:
         survey = {name: value for name, value in _POSITION.items() if name != "vertical_rmse_m"}

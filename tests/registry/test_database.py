@@ -14,7 +14,8 @@ from alembic.runtime.migration import MigrationContext
 
 from app.errors import CodeTaken, Unavailable
 from app.families.inputs import PositionIn
-from app.families.plate.registration import NewPlate
+from app.families.plate.registration import CodeInput, NewPlate
+from app.markers.plate import PlateScheme
 from app.registry import agencies
 from app.registry.database import Database, head_revision
 from app.registry.tables import metadata
@@ -28,7 +29,7 @@ NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 
 def _register(database: Database, lon_deg: float) -> dict[str, object]:
     caller = Caller(_agency(database), "key", "tester", Scope.PLANNER)
-    plate = NewPlate(PositionIn(lon_deg=lon_deg, lat_deg=1.0))
+    plate = NewPlate(PositionIn(lon_deg=lon_deg, lat_deg=1.0), CodeInput(PlateScheme.POSITION))
     return Markers(database, lambda: NOW).register(caller, plate)[0]
 
 

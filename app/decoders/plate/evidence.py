@@ -125,8 +125,9 @@ def read_evidence(
         clean=evidence.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
     )  # fmt: skip
-    lacking, plain = _find_lacking(evidence), _is_plain(evidence, decoded)
-    small = _is_small(evidence, decoded)
+    lacking, small = _find_lacking(evidence), _is_small(evidence, decoded)
+    usual = _is_usual(evidence, decoded)
+    plain = usual and not _hides_paint(evidence)
     settled = decoded.confirmed or decoded.checked
     if lacking is None and small is None and not plain and not settled and verify is not None:
         decoded = _verified(decoded, verify)
@@ -140,7 +141,7 @@ def read_evidence(
         or (
             decoded.confirmed
             and not decoded.checked
-            and (lacking is not None or small is not None or not (plain or has_check))
+            and (lacking is not None or small is not None or not (usual or has_check))
         ),
     )
     if decoded.code is not None and (settled or (lacking is None and small is None)):
@@ -188,17 +189,20 @@ def _is_small(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOu
     return None
 
 
-def _is_plain(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
-    """Whether the units show digits surely, and nothing on the plate is unusual."""
+def _is_usual(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
+    """Whether the units show digits surely, and none of them is unusual."""
     if decoded.code is None:
         return False
     units, small = evidence.units, evidence.unit_px < VERIFIED_UNIT_PX
     if small and decoded.code.scheme.corrects:
         return True
     residual = float(units.level_residual.max())
-    level = residual < (PLAIN_SMALL_RESIDUAL if small else PLAIN_RESIDUAL)
-    hides_paint = units.gap > PLAIN_GAP and evidence.unit_px >= GAP_UNIT_PX
-    return level and units.outlier_ratio < PLAIN_OUTLIER and not hides_paint
+    return residual < (PLAIN_SMALL_RESIDUAL if small else PLAIN_RESIDUAL) and units.outlier_ratio < PLAIN_OUTLIER
+
+
+def _hides_paint(evidence: PlateEvidence) -> bool:
+    """Whether light paint over a dark unit may not show on the gaps beside it."""
+    return evidence.units.gap > PLAIN_GAP and evidence.unit_px >= GAP_UNIT_PX
 
 
 def _verified(decoded: DecodedSymbols, verify: Verify) -> DecodedSymbols:

@@ -29,7 +29,7 @@ from tests.http import created, refused
 pytestmark = pytest.mark.both_databases
 
 _AGENCIES = itertools.count(1)
-DECLARED = {"code": {"digits": CODE.digits}, "speed_kmh": 50.0}
+DECLARED = {"code": {"scheme": "position", "digits": CODE.digits}, "speed_kmh": 50.0}
 
 
 @pytest.fixture
