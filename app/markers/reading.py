@@ -102,7 +102,7 @@ class PlateReading:
     corrected_cells : tuple of int
         Cells whose symbol came from error correction or from the codebook.
     from_codebook : bool
-        The codebook decided; the frame alone would have been refused.
+        The codebook decided, or confirmed digits that the frame alone may have been too unsure to give.
     geometry : PlateGeometry or None
     grade : PlateGrade or None
     pose : PlatePose or None
