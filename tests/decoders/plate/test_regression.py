@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from app.decoders.plate.reader import decode_plates
+from app.markers.reading import PlateOutcome
 from benchmarks.plates.evaluate import Record, evaluate_job
-from benchmarks.plates.sets import Job, read_trials
+from benchmarks.plates.sets import Job, Shot, find_shot, read_trials
 
 TRIALS = (2, 5, 9, 14, 16, 20, 22, 24, 25)  # of the paper's 26, in figures 10, 12 and 13
 MIN_ROWS = 16.0
@@ -36,3 +38,11 @@ def test_hard_frames_are_never_read_wrong(name: str, frames: int) -> None:
     records = evaluate_job(Job(name, 0, seed=11, frames=frames))
     assert len(records) == frames
     assert [(r.number, r.wrong, r.wrong_known) for r in records if r.wrong or r.wrong_known] == []
+
+
+def test_a_look_alike_beside_a_red_sign_is_not_read() -> None:
+    shot = find_shot(Job("free", 11, seed=930, frames=25), 19)
+    assert isinstance(shot, Shot)
+    readings = decode_plates(shot.frame.image)
+    assert [reading.digits for reading in readings if reading.digits] == []
+    assert PlateOutcome.RED_MARKER_MISSING in {reading.outcome for reading in readings}
