@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.evidence import PlateEvidence, read_evidence
-from app.decoders.plate.pose import locate_plate
+from app.decoders.plate.pose import with_pose
 from app.decoders.plate.reader import MIN_MARGIN, wrong_colours
 from app.decoders.plate.unit_likelihoods import (
     LARGE_UNIT_PX,
@@ -95,6 +95,7 @@ def accumulate(evidence: Sequence[PlateEvidence]) -> PlateEvidence:
         missing=_usual_missing(coloured),
         frames=len(used),
         agreeing=len(agreeing),
+        verification=None,  # of one frame alone
     )
 
 
@@ -126,10 +127,7 @@ def read_accumulated(
         height_px=float(extent[1]),
     )
     reading, _decoded = read_evidence(reading, joint, codebook)
-    if reading.code is None or camera is None:
-        return reading, joint
-    pose = locate_plate(joint.corners_px, joint.corners_covariance_px2, joint.geometry, camera)
-    return replace(reading, pose=pose), joint
+    return with_pose(reading, camera), joint
 
 
 def _joint_units(units: Sequence[UnitEvidence], share: float, max_unit_px: float) -> UnitEvidence:

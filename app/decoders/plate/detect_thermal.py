@@ -55,31 +55,54 @@ MIN_MISFIT_RATIO = 1.3
 four wrong frames of one drive in `python -m benchmarks.plates --sets thermal`, seed 75 (docs/benchmarks.md)."""
 
 
-def fit_warm_plates(image: Frame, geometry: PlateGeometry) -> Iterator[tuple[list[PlateFit], float]]:
-    """Fits of each warm quadrangle on the inverted frame, best orientation first, with the evidence for that one.
+class WarmFrame:
+    """A thermal frame, and by the place of each trail the frame without it and its warm quadrangles, made once."""
+
+    def __init__(self, image: Frame) -> None:
+        self._image = image
+        self._inverted: dict[int, Frame] = {}
+        self._quads: dict[int, list[Array]] = {}
+
+    def inverted(self, trail: int) -> Frame:
+        """The frame without a trail, bright where it was cool."""
+        if trail not in self._inverted:
+            self._inverted[trail] = cv2.bitwise_not(without_trail(self._image, TRAILS_PX[trail]))
+        return self._inverted[trail]
+
+    def quads(self, trail: int) -> list[Array]:
+        """Warm quadrangles in the frame without a trail."""
+        if trail not in self._quads:
+            self._quads[trail] = detect_warm_quads(cv2.bitwise_not(self.inverted(trail)))
+        return self._quads[trail]
+
+
+def fit_warm_plates(frame: WarmFrame, geometry: PlateGeometry) -> Iterator[list[PlateFit]]:
+    """Fits of each warm quadrangle on the inverted frame, one per orientation, the best first.
 
     The sensor's trail is taken off by as much as explains most of the pixels around the quadrangle.
     """
-    sharp = [without_trail(image, trail_px) for trail_px in TRAILS_PX]
-    inverted = [cv2.bitwise_not(frame) for frame in sharp]
     clear: list[Array] = []
     for trail in FIRST_TRAILS:
-        for corners in detect_warm_quads(sharp[trail]):
-            if any(
-                cv2.pointPolygonTest(known, corners.mean(axis=0).tolist(), measureDist=False) > 0 for known in clear
-            ):
+        for corners in frame.quads(trail):
+            centre = corners.mean(axis=0).tolist()
+            if any(cv2.pointPolygonTest(known, centre, measureDist=False) > 0 for known in clear):
                 continue
-            fits = _fit_turned(inverted[trail], corners, geometry)
+            fits = _fit_turned(frame.inverted(trail), corners, geometry)
             if not fits:
                 continue
-            better = _best_trail(inverted, trail, fits[0], geometry)
+            better = _best_trail(frame, trail, fits[0], geometry)
             if better != trail:
-                fits = _fit_turned(inverted[better], fits[0].corners_px, geometry) or fits
-            second = fits[1].explained if len(fits) > 1 else 0.0
-            ratio = (1 - second) / max(1 - fits[0].explained, 1e-6)
+                fits = _fit_turned(frame.inverted(better), fits[0].corners_px, geometry) or fits
             if fits[0].explained > CLEAR_EXPLAINED:
                 clear.append(fits[0].corners_px.astype(np.float32))
-            yield fits, 0.5 * fits[0].pixels * float(np.log(ratio)) if ratio >= MIN_MISFIT_RATIO else 0.0
+            yield fits
+
+
+def orientation_evidence(fits: Sequence[PlateFit]) -> float:
+    """Log likelihood by which the best orientation exceeds the next; 0 where their misfits are about the same."""
+    second = fits[1].explained if len(fits) > 1 else 0.0
+    ratio = (1 - second) / max(1 - fits[0].explained, 1e-6)
+    return 0.5 * fits[0].pixels * float(np.log(ratio)) if ratio >= MIN_MISFIT_RATIO else 0.0
 
 
 def _fit_turned(inverted: Frame, corners: Array, geometry: PlateGeometry) -> list[PlateFit]:
@@ -89,13 +112,13 @@ def _fit_turned(inverted: Frame, corners: Array, geometry: PlateGeometry) -> lis
     return sorted((fit for fit in turned if fit is not None), key=lambda fit: -fit.explained)
 
 
-def _best_trail(inverted: Sequence[Frame], trail: int, fit: PlateFit, geometry: PlateGeometry) -> int:
+def _best_trail(frame: WarmFrame, trail: int, fit: PlateFit, geometry: PlateGeometry) -> int:
     """The trail beside the given one, by its place, that explains most of a plate in the orientation of its fit."""
     centroids = _centroids(fit.corners_px, geometry)
     explained = fit.explained
     for step in (1, -1):
-        while 0 <= trail + step < len(inverted):
-            other = fit_plate(inverted[trail + step], centroids, geometry, linear=True)
+        while 0 <= trail + step < len(TRAILS_PX):
+            other = fit_plate(frame.inverted(trail + step), centroids, geometry, linear=True)
             if other is None or other.explained <= explained:
                 break
             trail, explained = trail + step, other.explained
@@ -113,8 +136,9 @@ def without_trail(image: Frame, trail_px: float) -> Frame:
 
     Notes
     -----
-    A bolometer's pixel follows the scene S by t dT/ds = S - T; of a scene that moves down by v pixels a second, S = T -
-    t v dT/dy. The result is stretched over the 256 levels.
+    The temperature T of a bolometer's pixel follows the scene S with the time constant tau: tau dT/dt = S - T. In the
+    image of a scene that moves down by v pixels a second, dT/dt = -v dT/dy, so that S = T - tau v dT/dy. The result is
+    stretched over the 256 levels.
     """
     if trail_px == 0:
         return image

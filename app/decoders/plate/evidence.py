@@ -125,35 +125,30 @@ def read_evidence(
         clean=evidence.explained > CLEAN_EXPLAINED and not thermal,  # no colours confirm its orientation
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
     )  # fmt: skip
-    lacking, small = _find_lacking(evidence), _is_small(evidence, decoded)
-    usual = _is_usual(evidence, decoded)
+    lacking = _find_lacking(evidence)
+    refusal = lacking or _is_small(evidence, decoded)
+    usual, settled = _is_usual(evidence, decoded), decoded.confirmed or decoded.checked
     plain = usual and not _hides_paint(evidence)
-    settled = decoded.confirmed or decoded.checked
-    if lacking is None and small is None and not plain and not settled and verify is not None:
+    if refusal is None and not plain and not settled and verify is not None:
         decoded = _verified(decoded, verify)
     has_check = decoded.code is not None and decoded.code.scheme.corrects
+    is_unsure_alone = refusal is not None or not (usual or has_check)
+    found = decoded.verification
     reading = replace(
         reading,
         confidence=decoded.confidence,
         cell_confidence=decoded.cell_confidence,
         corrected_cells=decoded.corrected,
-        from_codebook=decoded.from_codebook
-        or (
-            decoded.confirmed
-            and not decoded.checked
-            and (lacking is not None or small is not None or not (usual or has_check))
-        ),
+        from_codebook=decoded.from_codebook or (decoded.confirmed and not decoded.checked and is_unsure_alone),
+        unit_log_likelihoods=found.log_likelihoods if found is not None else None,
     )
-    if decoded.code is not None and (settled or (lacking is None and small is None)):
-        found = decoded.verification
-        likelihoods = found.log_likelihoods if found is not None else None
-        read = replace(reading, outcome=PlateOutcome.READ, code=decoded.code, reason="")
-        return replace(read, unit_log_likelihoods=likelihoods), decoded
+    if decoded.code is not None and (settled or refusal is None):
+        return replace(reading, outcome=PlateOutcome.READ, code=decoded.code, reason=""), decoded
     if lacking is None and not thermal:
         reading = _tentative(reading, decoded)
-    if decoded.code is None and evidence.missing is None:
-        lacking = _undecoded(decoded)
-    outcome, reason = lacking or small or _undecoded(decoded)
+    if decoded.code is None or refusal is None:
+        refusal = evidence.missing or _undecoded(decoded)
+    outcome, reason = refusal
     return replace(reading, outcome=outcome, reason=reason), decoded
 
 
@@ -164,12 +159,8 @@ def _tentative(reading: PlateReading, decoded: DecodedSymbols) -> PlateReading:
         return reading
     share = (1 - decoded.confidence) / len(cells)  # as if the error was spread evenly
     doubtful = tuple(i for i, cell in enumerate(cells) if 1 - cell >= share) or (int(np.argmin(cells)),)
-    found = decoded.verification
-    likelihoods = found.log_likelihoods if found is not None else None
-    return replace(
-        reading, likely_code=code, doubtful_cells=doubtful, unit_log_likelihoods=likelihoods,
-        confidence=min(decoded.confidence, TENTATIVE_CONFIDENCE),
-    )  # fmt: skip
+    confidence = min(decoded.confidence, TENTATIVE_CONFIDENCE)
+    return replace(reading, likely_code=code, doubtful_cells=doubtful, confidence=confidence)
 
 
 def _find_lacking(evidence: PlateEvidence) -> tuple[PlateOutcome, str] | None:

@@ -7,7 +7,7 @@ weight the corners by their covariance, and the mount's height and level by how 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from app.geodesy import enu_from_heading, wgs84_from_enu
 from app.markers.plate import PlateGeometry
-from app.markers.reading import PlatePose
+from app.markers.reading import PlatePose, PlateReading
 from app.sensors.camera import Camera
 
 Array = npt.NDArray[Any]
@@ -99,6 +99,16 @@ def locate_plate(corners_px: Array, covariance_px2: Array, geometry: PlateGeomet
         covariance=np.linalg.inv(information),
         reprojection_rms_px=float(np.sqrt(np.mean(np.sum((projected - corners_px) ** 2, axis=1)))),
     )
+
+
+def with_pose(reading: PlateReading, camera: Camera | None) -> PlateReading:
+    """A read plate with its pose; as it is where it has one or no digits, or where no camera is known."""
+    corners, covariance, geometry = reading.corners_px, reading.corners_covariance_px2, reading.geometry
+    if reading.code is None or reading.pose is not None or camera is None:
+        return reading
+    if corners is None or covariance is None or geometry is None:
+        return reading
+    return replace(reading, pose=locate_plate(corners, covariance, geometry, camera))
 
 
 def _refine(

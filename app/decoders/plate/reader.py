@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from app.decoders.plate.colour import MarkerSignal, half_planes
 from app.decoders.plate.detect_quads import MarkerQuad
-from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, fit_warm_plates
+from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, WarmFrame, fit_warm_plates, orientation_evidence
 from app.decoders.plate.evidence import CLEAN_EXPLAINED, PlateEvidence, read_evidence
 from app.decoders.plate.find_candidates import Candidate, find_candidates
 from app.decoders.plate.fit import PlateFit, fit_plate
@@ -24,13 +24,13 @@ from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.homography import project
 from app.decoders.plate.layout import marker_centroids, unit_centres
 from app.decoders.plate.marker_colours import MarkerColours, marker_colours
-from app.decoders.plate.pose import locate_plate
+from app.decoders.plate.pose import with_pose
 from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
 from app.decoders.plate.unit_verification import UnitVerification
 from app.decoders.plate.verify_units import verify_units
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
-from app.markers.reading import PlateOutcome, PlatePose, PlateReading
+from app.markers.reading import PlateOutcome, PlateReading
 from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.sensors.camera import Camera
 
@@ -189,20 +189,22 @@ def _decode_colour(task: _Task) -> list[PlateReading]:
 
 def _decode_thermal(task: _Task) -> list[PlateReading]:
     readings: list[PlateReading] = []
+    frame = WarmFrame(task.image)
     for geometry in task.geometries:
-        for fits, evidence in fit_warm_plates(task.image, geometry):
+        for fits in fit_warm_plates(frame, geometry):
             centre = fits[0].corners_px.mean(axis=0)
             if fits[0].explained >= MIN_EXPLAINED and not any(_inside(centre, r) for r in readings):
-                readings.append(_read_orientations(task, fits, geometry, evidence))
+                readings.append(_read_orientations(task, fits, geometry))
         if any(reading.code for reading in readings):
             break
     return readings
 
 
-def _read_orientations(task: _Task, fits: list[PlateFit], geometry: PlateGeometry, evidence: float) -> PlateReading:
+def _read_orientations(task: _Task, fits: list[PlateFit], geometry: PlateGeometry) -> PlateReading:
     """Reading of the likeliest orientation; of another one only where the codebook confirms it."""
     unsure = PlateOutcome.RED_MARKER_MISSING, "the triangle cannot be distinguished from the squares"
     first: PlateReading | None = None
+    evidence = orientation_evidence(fits)
     for fit in fits:
         missing = _out_of_view(task.image.shape, fit)
         if missing is None and (first is not None or evidence < ORIENTATION_EVIDENCE):
@@ -323,7 +325,7 @@ def _read_fit(
     task.evidence.append(replace(evidence, verification=decoded.verification))
     if reading.code is None:
         return reading
-    return replace(reading, grade=grade_plate(fit, units, decoded, weakest_marker), pose=_pose(task, fit, geometry))
+    return with_pose(replace(reading, grade=grade_plate(fit, units, decoded, weakest_marker)), task.camera)
 
 
 def _missing_parts(
@@ -360,9 +362,3 @@ def _out_of_view(shape: tuple[int, ...], fit: PlateFit) -> tuple[PlateOutcome, s
     if (fit.corners_px < -0.5).any() or (fit.corners_px > np.array([shape[1], shape[0]]) - 0.5).any():
         return PlateOutcome.FEWER_THAN_FOUR_VERTICES, "a corner is out of view"
     return None
-
-
-def _pose(task: _Task, fit: PlateFit, geometry: PlateGeometry) -> PlatePose | None:
-    if task.camera is None:
-        return None
-    return locate_plate(fit.corners_px, fit.corners_covariance_px2, geometry, task.camera)

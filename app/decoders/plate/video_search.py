@@ -282,7 +282,8 @@ def _with_code(seen: SeenPlate, joint: PlateReading) -> SeenPlate:
     reading = replace(
         seen.reading, outcome=PlateOutcome.READ, code=joint.code, confidence=joint.confidence,
         cell_confidence=joint.cell_confidence, corrected_cells=joint.corrected_cells,
-        from_codebook=joint.from_codebook, pose=seen.pose, reason="", frames=joint.frames,
+        from_codebook=joint.from_codebook, pose=seen.pose, reason="", frames=joint.frames, likely_code=None,
+        doubtful_cells=(),
     )  # fmt: skip
     return replace(seen, reading=reading)
 
@@ -295,4 +296,7 @@ def _shows(evidence: PlateEvidence | None, code: PlateCode) -> bool:
 
 
 def _refused(reading: PlateReading, reason: str) -> PlateReading:
-    return replace(reading, outcome=PlateOutcome.UNSURE, code=None, pose=None, grade=None, reason=reason)
+    return replace(
+        reading, outcome=PlateOutcome.UNSURE, code=None, likely_code=None, doubtful_cells=(), pose=None, grade=None,
+        reason=reason,
+    )  # fmt: skip

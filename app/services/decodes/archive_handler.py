@@ -9,7 +9,7 @@ from datetime import timedelta
 import sqlalchemy as sa
 
 from app.decoders.plate.confirm import confirm_frames
-from app.decoders.plate.pose import locate_plate
+from app.decoders.plate.pose import with_pose
 from app.errors import WaymarkError
 from app.formats.archives import Member, count_members, is_archive, list_names, read_members
 from app.formats.frame_list import is_beside_frames
@@ -206,7 +206,7 @@ class StartedArchive:
                 frame, result = known[index]
                 camera = frame.moment.context.camera.camera_for(result.header) if frame.moment.context.camera else None
                 others = tuple(one for one in result.readings if not isinstance(one, PlateReading))
-                readings = (*(_with_pose(one, camera) for one in plates), *others)
+                readings = (*(with_pose(one, camera) for one in plates), *others)
                 self._frames[places[index]] = self._matched(connection, frame, replace(result, readings=readings))
 
     def _matched(self, connection: sa.Connection, frame: ArchiveFrame, result: FrameResult | WaymarkError) -> ReadFrame:
@@ -218,13 +218,3 @@ class StartedArchive:
 
 def _plates(result: FrameResult) -> list[PlateReading]:
     return [reading for reading in result.readings if isinstance(reading, PlateReading)]
-
-
-def _with_pose(reading: PlateReading, camera: Camera | None) -> PlateReading:
-    """A read plate with its pose; a tentative reading has none."""
-    corners, covariance, geometry = reading.corners_px, reading.corners_covariance_px2, reading.geometry
-    if reading.code is None or reading.pose is not None or camera is None:
-        return reading
-    if corners is None or covariance is None or geometry is None:
-        return reading
-    return replace(reading, pose=locate_plate(corners, covariance, geometry, camera))
