@@ -1,7 +1,7 @@
 """Schemes of plates in the same scenes, under the same light and the same stains, and tags beside them.
 
-A drive is one plate, with its stains and its light, in frames from far to near. Every scheme, and every tag, lies in
-the same place in the same size, and gets the same stains.
+A drive is one plate, with its stains and its light, in frames from far to near; under stress, in frames of different
+cameras. Every scheme, and every tag, lies in the same place in the same size, and gets the same stains.
 """
 
 from __future__ import annotations
@@ -12,17 +12,21 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.reading import PlateReading
 from app.markers.recommended_plate import recommended_geometry
 from app.simulation.camera import render_plate_scene
+from app.simulation.conditions import draw_stress
 from app.simulation.plate_face import Face, plate_face
-from app.simulation.plate_scene import PlateScene, face_truth
+from app.simulation.plate_scene import FaceTruth, PlateScene, face_truth
 from benchmarks.plates.evaluate import find_right
 from benchmarks.plates.peers import FAMILIES, reads_tag, tag_face
-from benchmarks.plates.sets import LIGHT, SETS, draw_background, draw_light, draw_scenes
+from benchmarks.plates.sets import LIGHT, draw_background, draw_light, draw_scenes, draw_stress_views
 from benchmarks.plates.tables import table
 
+SCHEME_SETS = ("fair", *LIGHT, "stress")
 NEIGHBOURS = 20
 """[plates] of the registry within about 500 m of the plate, the plate among them."""
 
@@ -70,48 +74,65 @@ class SchemeDrive:
 
 
 @dataclass(frozen=True, slots=True)
-class SchemeRecord:
-    """What one scheme, or one tag, gave on one drive: frames read and wrong readings, alone and with the registry."""
+class Counts:
+    """Frames of a drive that were read in one way, and the wrong readings in them."""
 
-    set_name: str
-    index: int
-    seed: int
+    read: int = 0
+    wrong: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SchemeRecord:
+    """What one scheme, or one tag, gave on one drive.
+
+    Attributes
+    ----------
+    drive : SchemeDrive
+    name : str
+    frames : int
+    alone, together, known : Counts
+        From each frame alone, from the drive's frames together, and with the registry; tags have only the first.
+    tentative : Counts
+        Frames whose digits were returned as likely, from the frame alone.
+    is_tag : bool
+    """
+
+    drive: SchemeDrive
     name: str
     frames: int
-    read: int
-    wrong: tuple[str, ...] = ()
-    read_known: int = 0
-    wrong_known: tuple[str, ...] = ()
+    alone: Counts
+    tentative: Counts = Counts()
+    together: Counts = Counts()
+    known: Counts = Counts()
     is_tag: bool = False
 
 
-def list_drives(seeds: Sequence[int], drives: int) -> list[SchemeDrive]:
-    """Drives of all sets of light and dirt."""
-    return [SchemeDrive(name, k, seed) for seed in seeds for name in LIGHT for k in range(drives)]
+def list_drives(seeds: Sequence[int], drives: int, only: Sequence[str]) -> list[SchemeDrive]:
+    """Drives of a fair day, of all sets of light and dirt, and of stress, of the sets in ``only``."""
+    names = [name for name in SCHEME_SETS if name in only]
+    return [SchemeDrive(name, k, seed) for seed in seeds for name in names for k in range(drives)]
 
 
 def evaluate_drive(drive: SchemeDrive) -> list[SchemeRecord]:
     """Render and read the frames of a drive with every scheme and every tag."""
     cv2.setNumThreads(1)
-    rng = np.random.default_rng([drive.seed, 7, SETS.index(drive.set_name), drive.index])
-    conditions = draw_light(drive.set_name, rng)
+    rng = np.random.default_rng([drive.seed, 7, SCHEME_SETS.index(drive.set_name), drive.index])
+    under_stress = drive.set_name == "stress"
+    conditions = draw_stress(rng) if under_stress else draw_light(drive.set_name, rng)
     stains = int(rng.integers(1 << 31))
-    lon, lat, number = float(rng.uniform(-180, 180)), float(rng.uniform(-85, 85)), int(rng.integers(1 << 32))
-    places = [(lon, lat, number)] + [
-        (lon + float(x), lat + float(y), int(v))
-        for x, y, v in zip(
-            *rng.uniform(-0.005, 0.005, (2, NEIGHBOURS - 1)), rng.integers(1 << 32, size=NEIGHBOURS - 1), strict=True
-        )
-    ]
-    places = [((x + 180) % 360 - 180, y, v) for x, y, v in places]
+    places = _draw_places(rng)
     blank = Face(PlateGeometry().side_mm / 1000, np.zeros((2, 2, 3), np.float32))
-    views = draw_scenes(blank, conditions, rng)
-    background = draw_background(views[0].camera, rng)
+    if under_stress:
+        views = draw_stress_views(blank, conditions, rng)
+    else:
+        scenes = draw_scenes(blank, conditions, rng)
+        background = draw_background(scenes[0].camera, rng)
+        views = [(scene, background) for scene in scenes]
     noise = [int(s) for s in rng.integers(1 << 31, size=len(views))]
 
     def frames(face: Face) -> Iterator[tuple[PlateScene, np.ndarray]]:
-        for scene, seed in zip(views, noise, strict=True):
-            placed = replace(scene, faces=(replace(scene.faces[0], face=face),))
+        for (scene, background), seed in zip(views, noise, strict=True):
+            placed = replace(scene, faces=(replace(scene.faces[0], face=face), *scene.faces[1:]))
             yield placed, render_plate_scene(placed, background, np.random.default_rng(seed)).image
 
     records = []
@@ -123,51 +144,78 @@ def evaluate_drive(drive: SchemeDrive) -> list[SchemeRecord]:
         tag = int(np.random.default_rng([stains, family.modules]).integers(50))
         face = tag_face(family, tag, conditions, np.random.default_rng(stains))
         hits = [reads_tag(family, tag, image, face_truth(scene, scene.faces[0])) for scene, image in frames(face)]
-        records.append(
-            SchemeRecord(drive.set_name, drive.index, drive.seed, family.name, len(hits), sum(hits), is_tag=True)
-        )
+        records.append(SchemeRecord(drive, family.name, len(hits), Counts(sum(hits)), is_tag=True))
     return records
+
+
+def _draw_places(rng: np.random.Generator) -> list[tuple[float, float, int]]:
+    """Longitude, latitude [deg] and number of a plate and of its neighbours."""
+    lon, lat, number = float(rng.uniform(-180, 180)), float(rng.uniform(-85, 85)), int(rng.integers(1 << 32))
+    moves = rng.uniform(-0.005, 0.005, (2, NEIGHBOURS - 1))
+    numbers = rng.integers(1 << 32, size=NEIGHBOURS - 1)
+    near = [(lon + float(x), lat + float(y), int(v)) for x, y, v in zip(*moves, numbers, strict=True)]
+    return [((x + 180) % 360 - 180, y, v) for x, y, v in [(lon, lat, number), *near]]
 
 
 def _read(
     drive: SchemeDrive, name: str, frames: Iterator[tuple[PlateScene, np.ndarray]], codes: Sequence[PlateCode]
 ) -> SchemeRecord:
-    count, hits, wrong = 0, [0, 0], [list[str](), list[str]()]
+    truths, alone, known = [], [], []
     for scene, image in frames:
-        count += 1
-        truth = face_truth(scene, scene.faces[0])
-        for k, codebook in enumerate(((), tuple(codes))):
-            found = decode_plates(image, camera=scene.camera, codebook=codebook)
-            hit, others = find_right(found, codes[0], truth)
-            hits[k] += hit is not None
-            wrong[k] += others
+        truths.append(face_truth(scene, scene.faces[0]))
+        alone.append(decode_plates(image, camera=scene.camera))
+        known.append(decode_plates(image, camera=scene.camera, codebook=tuple(codes)))
+    confirmed = confirm_frames(list(enumerate(alone)))
+    together = [confirmed.get(k, readings) for k, readings in enumerate(alone)]
+    likely = [[one.likely_code.digits for one in readings if one.likely_code is not None] for readings in alone]
+    tentative = Counts(
+        sum(codes[0].digits in shown for shown in likely),
+        tuple(digits for shown in likely for digits in shown if digits != codes[0].digits),
+    )
     return SchemeRecord(
-        drive.set_name, drive.index, drive.seed, name, count, hits[0], tuple(wrong[0]), hits[1], tuple(wrong[1])
+        drive, name, len(truths), _count(alone, codes[0], truths), tentative, _count(together, codes[0], truths),
+        _count(known, codes[0], truths),
+    )  # fmt: skip
+
+
+def _count(frames: Sequence[list[PlateReading]], code: PlateCode, truths: Sequence[FaceTruth]) -> Counts:
+    found = [find_right(readings, code, truth) for readings, truth in zip(frames, truths, strict=True)]
+    return Counts(
+        sum(hit is not None for hit, _wrong in found), tuple(digits for _hit, wrong in found for digits in wrong)
     )
 
 
 def schemes_table(records: Sequence[SchemeRecord]) -> str:
     """Frames read and wrong readings of each scheme under each kind of light and dirt, and the worst drives."""
     rows = []
-    for name in (*LIGHT, "all"):
-        mine = [r for r in records if name in (r.set_name, "all")]
+    for name in (*SCHEME_SETS, "all"):
+        mine = [r for r in records if name in (r.drive.set_name, "all")]
         for scheme in dict.fromkeys(r.name for r in mine):
             own = [r for r in mine if r.name == scheme]
-            lost = sum(r.read == 0 for r in own)
-            worst = min(own, key=lambda r: r.read)
-            known: tuple[object, ...] = ("", "", "")
-            if not own[0].is_tag:
-                known = (
-                    sum(r.read_known for r in own), sum(len(r.wrong_known) for r in own),
-                    sum(r.read_known == 0 for r in own),
-                )  # fmt: skip
-            wrong = "" if own[0].is_tag else sum(len(r.wrong) for r in own)
-            rows.append((
-                name, scheme, sum(r.frames for r in own), sum(r.read for r in own), wrong,
-                f"{worst.read} of {worst.frames}", f"{lost} of {len(own)}", *known,
-            ))  # fmt: skip
+            alone = [r.alone for r in own]
+            worst = min(own, key=lambda r: r.alone.read)
+            place = f"{worst.alone.read} of {worst.frames}"
+            head = (name, scheme, sum(r.frames for r in own))
+            if own[0].is_tag:
+                rows.append((*head, sum(one.read for one in alone), "", "", "", place, _lost(alone)))
+                continue
+            ways = (alone, [r.tentative for r in own], [r.together for r in own], [r.known for r in own])
+            shown = (f"{sum(one.read for one in way)} / {sum(len(one.wrong) for one in way)}" for way in ways)
+            lost = " / ".join(_lost(ways[k]) for k in (0, 2, 3))
+            rows.append((*head, *shown, place, lost))
     head = (
-        "set", "scheme", "frames", "read alone", "wrong", "worst drive", "drives lost", "with registry", "wrong",
-        "drives lost",
+        "set", "scheme", "frames", "alone / wrong", "tentative / wrong", "with the drive's frames / wrong",
+        "with registry / wrong", "worst drive alone", "drives lost alone / with its frames / with registry",
     )  # fmt: skip
     return table(head, rows)
+
+
+def wrong_readings(records: Sequence[SchemeRecord]) -> Iterator[str]:
+    """Sure readings that are on no plate, and where they were read."""
+    for record in records:
+        for digits in (*record.alone.wrong, *record.together.wrong, *record.known.wrong):
+            yield f"{digits} of {record.name}, {record.drive}"
+
+
+def _lost(drives: Sequence[Counts]) -> str:
+    return str(sum(one.read == 0 for one in drives))

@@ -41,11 +41,12 @@ HERE = Path(__file__).parent.parent
 GEOMETRY = PlateGeometry()
 MIN_ROWS = 4.0  # below this half a row a unit is left: such frames don't count as having the plate in view
 RENDERED_ROWS = 8.0  # below this frames are counted as not decoded without a look
-LIGHT = ("shade", "glare", "stains", "stained-shade", "worn")
-"""Plates of a fair day but for one thing: shadows, glare, spots of paint, both, wear."""
+LIGHT = ("shadow-edge", "dapple", "glare", "stains", "stained-shade", "worn")
+"""Plates of a fair day but for one thing: the edge of a shadow, leaves' shadows, glare, spots of paint, both spots and
+a shadow, wear."""
 THERMAL_KMH = {"thermal": 10.0, "thermal-20": 20.0, "thermal-30": 30.0}
 SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT, "thermal-20", "thermal-30")
-LIGHT_ROWS = (12.0, 90.0)
+LIGHT_ROWS, STRESS_ROWS = (12.0, 90.0), (24.0, 140.0)
 DRIVE_FRAMES = 5
 
 
@@ -263,11 +264,21 @@ def _draw_stress_scene(job: Job, rng: np.random.Generator) -> tuple[PlateScene, 
     camera, code = _draw_camera(rng), draw_code(rng)
     conditions = draw_stress(rng, night=job.set_name == "night")
     face = plate_face(code, GEOMETRY, conditions.look, conditions.wear, rng)
-    placed = draw_place(camera, face, rng, (24.0, 140.0))
+    return *_draw_stress_view(camera, face, conditions, rng), code, conditions
+
+
+def _draw_stress_view(
+    camera: Camera, face: Face, conditions: Conditions, rng: np.random.Generator
+) -> tuple[PlateScene, Image]:
+    placed = draw_place(camera, face, rng, STRESS_ROWS)
     extra = draw_distractor_faces(camera, rng, int(rng.integers(0, 4)), (placed,))
     background = paint_distractors(draw_background(camera, rng), rng, int(rng.integers(0, 6)))
-    scene = scene_under(conditions, camera, (placed, *extra), float(rng.uniform(0, 80)) / 3.6, rng)
-    return scene, background, code, conditions
+    return scene_under(conditions, camera, (placed, *extra), float(rng.uniform(0, 80)) / 3.6, rng), background
+
+
+def draw_stress_views(face: Face, conditions: Conditions, rng: np.random.Generator) -> list[tuple[PlateScene, Image]]:
+    """Views of a plate through different cameras, at different places beside different things."""
+    return [_draw_stress_view(_draw_camera(rng), face, conditions, rng) for _ in range(DRIVE_FRAMES)]
 
 
 def _stress(job: Job) -> Iterator[Shot | Unseen]:
@@ -343,16 +354,18 @@ def draw_scenes(face: Face, conditions: Conditions, rng: np.random.Generator) ->
 def draw_light(name: str, rng: np.random.Generator) -> Conditions:
     """A fair day but for what the set is named after."""
     conditions = draw_daylight(rng)
-    if "shade" in name:
+    if name in {"shadow-edge", "dapple", "stained-shade"}:
         shadow = draw_shadow(rng)
-        while shadow.edge_light == 1 and shadow.dapple_light == 1:
+        while (shadow.edge_light == 1 or name == "dapple") and (shadow.dapple_light == 1 or name == "shadow-edge"):
             shadow = draw_shadow(rng)
+        edge_light, dapple_light = shadow.edge_light, shadow.dapple_light
         if rng.random() < 0.5:  # deeper
-            shadow = replace(
-                shadow,
-                edge_light=float(rng.uniform(0.12, 0.5)) if shadow.edge_light < 1 else 1.0,
-                dapple_light=float(rng.uniform(0.15, 0.5)) if shadow.dapple_light < 1 else 1.0,
-            )
+            edge_light, dapple_light = float(rng.uniform(0.12, 0.5)), float(rng.uniform(0.15, 0.5))
+        shadow = replace(
+            shadow,
+            edge_light=edge_light if shadow.edge_light < 1 and name != "dapple" else 1.0,
+            dapple_light=dapple_light if shadow.dapple_light < 1 and name != "shadow-edge" else 1.0,
+        )
         conditions = replace(conditions, shadow=shadow)
     if name == "glare":
         at_m = (float(rng.uniform(-0.2, 0.2)), float(rng.uniform(-0.2, 0.2)))

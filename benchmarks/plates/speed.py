@@ -33,14 +33,14 @@ class Timing:
 def measure_speed(seed: int, frames: int) -> list[Timing]:
     """Median and mean processor time a frame of the decoder and the peers, by what is in view.
 
-    Frames with a plate in clear light come from the trials at all distances, those in shade from the set of that name;
+    Frames with a plate in clear light come from the trials at all distances, those in shade from drives under leaves;
     the peers see their tag in the plate's place. Frames without one are a fourth each of the plate-free set: roads and
     photos as they are, and those with many coloured things. Every call is timed by itself, the decoders take turns.
     """
     cv2.setNumThreads(1)
     groups = {
         "plate in clear light": list(_trial_shots(seed, frames)),
-        "plate in shade": list(shoot(Job("shade", 0, seed, frames))),
+        "plate in shade": list(shoot(Job("dapple", 0, seed, frames))),
         "no plate": list(shoot(Job("free", 0, seed, 4 * frames)))[0::4],
         "no plate, clutter": list(shoot(Job("free", 1, seed, 4 * frames)))[3::4],
     }

@@ -33,7 +33,7 @@ def test_no_trial_frame_is_read_wrong(trial_records: list[Record]) -> None:
     assert wrong == []
 
 
-@pytest.mark.parametrize(("name", "frames"), [("free", 20), ("hidden", 8), ("shade", 10), ("stained-shade", 10)])
+@pytest.mark.parametrize(("name", "frames"), [("free", 20), ("hidden", 8), ("shadow-edge", 10), ("stained-shade", 10)])
 def test_hard_frames_are_never_read_wrong(name: str, frames: int) -> None:
     records = evaluate_job(Job(name, 0, seed=11, frames=frames))
     assert len(records) == frames
