@@ -26,10 +26,14 @@ Source: chosen by hand; wear and blur change the size of markers."""
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Quadruple of markers that may be a plate's, and the geometries under which it may, the likeliest first."""
+    """Quadruple of markers that may be a plate's, the geometries under which it may, and the log odds of the first.
+
+    The likeliest geometry is the first.
+    """
 
     quad: MarkerQuad
     geometries: tuple[PlateGeometry, ...]
+    log_odds: float
 
 
 def find_candidates(
@@ -57,9 +61,9 @@ def _likely_candidates(
     for k, (quad, _odds) in enumerate(near):
         possible = [g for g in possible_geometries(quad, geometries) if log_odds[g][k] >= MIN_LOG_ODDS]
         if possible:
-            likely.append((max(float(log_odds[g][k]) for g in possible), Candidate(quad, tuple(possible))))
-    likely.sort(key=lambda odds_of: -odds_of[0])
-    return [candidate for _odds, candidate in likely[:MAX_FITS]]
+            possible.sort(key=lambda g: -log_odds[g][k])
+            likely.append(Candidate(quad, tuple(possible), float(log_odds[possible[0]][k])))
+    return sorted(likely, key=lambda candidate: -candidate.log_odds)[:MAX_FITS]
 
 
 def possible_geometries(quad: MarkerQuad, geometries: Sequence[PlateGeometry]) -> list[PlateGeometry]:

@@ -26,7 +26,7 @@ MIN_UNIT_SHARE, MOST_UNITS = 0.003, 9
 """[1, units] share of a unit in a pixel below which it is left out, and units of a pixel at most. Source: by hand."""
 EDGE_SLOPE = 1.702
 """[1] slope of the logistic function that is nearest to the normal distribution's."""
-MAX_EXPONENT = 40.0
+MAX_EXPONENT = 15.0
 """[1] beyond which a logistic function is 0 or 1. Source: chosen by hand."""
 
 
@@ -189,7 +189,9 @@ def _cover(spot: Floats, x_mm: float, y_mm: float, blur_mm: float) -> float:
     y = y_mm - spot[1]
     radius = math.sqrt(spot[2] * x * x + 2.0 * spot[3] * x * y + spot[4] * y * y)
     inside = EDGE_SLOPE * (1.0 - radius) * spot[5] / blur_mm
-    cover: float = 1.0 / (1.0 + math.exp(min(max(-inside, -MAX_EXPONENT), MAX_EXPONENT)))
+    cover = 1.0 if inside > 0.0 else 0.0
+    if abs(inside) < MAX_EXPONENT:
+        cover = 1.0 / (1.0 + math.exp(-inside))
     return cover
 
 
@@ -257,11 +259,11 @@ def _set_covariances(
             covariance[h, i, i] += light.noise[p]
 
 
-@step
+@routine
 def _set_covered(
-    pixels: PlatePixels, pattern: PlatePattern, around: Around, spot: Floats, covered: Floats, hidden: Floats
+    pixels: PlatePixels, pattern: PlatePattern, around: Around, spots: Floats, covered: Floats, hidden: Floats
 ) -> None:
-    """Set the light that a white spot would send to each pixel, and the light of what it hides."""
+    """Set the light that each white spot would send to each pixel, and the light of what it hides, a column a spot."""
     unit = around.unit
     unit_albedo = 1.0 if pattern.dark[unit] > 0.5 else pattern.dark_albedo  # of the unit flipped
     inner = pattern.inner_mm
@@ -270,12 +272,38 @@ def _set_covered(
         share = pixels.units[p, unit]
         x = pixels.places_mm[p, 0] - pattern.centres_mm[unit, 0]
         y = pixels.places_mm[p, 1] - pattern.centres_mm[unit, 1]
-        beside = _cover(spot, x, y, pixels.blur_mm)
         # what a pixel beside the unit sees of it is the part that is nearest
-        on_unit = _cover(spot, min(max(x, -inner), inner), min(max(y, -inner), inner), pixels.blur_mm)
+        nearest_x = min(max(x, -inner), inner)
+        nearest_y = min(max(y, -inner), inner)
+        shows_elsewhere = share > MIN_UNIT_SHARE and (nearest_x != x or nearest_y != y)
         others = pattern.seen[p] + around.change * share - share * unit_albedo
-        covered[i] = around.light * ((1.0 - share) * beside + share * on_unit)
-        hidden[i] = around.light * (beside * others + on_unit * share * unit_albedo)
+        for g in range(spots.shape[0]):
+            beside = _cover(spots[g], x, y, pixels.blur_mm)
+            on_unit = beside
+            if shows_elsewhere:
+                on_unit = _cover(spots[g], nearest_x, nearest_y, pixels.blur_mm)
+            covered[i, g] = around.light * ((1.0 - share) * beside + share * on_unit)
+            hidden[i, g] = around.light * (beside * others + on_unit * share * unit_albedo)
+
+
+@routine
+def _substitute_columns(factor: Floats, columns: Floats, size: int) -> None:
+    """Forward substitution of all columns in place."""
+    for i in range(size):
+        row = columns[i]
+        j = 0
+        while j + 4 <= i:  # four rows at a time, so that the row is loaded and stored a fourth as often
+            a, b, c, d = factor[i, j], factor[i, j + 1], factor[i, j + 2], factor[i, j + 3]
+            for k in range(row.size):
+                row[k] -= a * columns[j, k] + b * columns[j + 1, k] + c * columns[j + 2, k] + d * columns[j + 3, k]
+            j += 4
+        while j < i:
+            for k in range(row.size):
+                row[k] -= factor[i, j] * columns[j, k]
+            j += 1
+        scale = 1.0 / factor[i, i]
+        for k in range(row.size):
+            row[k] *= scale
 
 
 @step
@@ -286,22 +314,26 @@ def _spot_likelihood(
 
     `factor` is that of the unit as read: a spot that hides a unit looks like what was read, so its light varies alike.
     """
-    size = around.pixels.size
-    covered = np.empty(size)
-    hidden = np.empty(size)
+    size, count = around.pixels.size, spots.shapes.shape[0]
+    covered = np.empty((size, count))
+    hidden = np.empty((size, count))
     _substitute(factor, residual, size)
     square = _dot(residual, residual, size)
+    _set_covered(pixels, pattern, around, spots.shapes, covered, hidden)
+    _substitute_columns(factor, covered, size)
+    _substitute_columns(factor, hidden, size)
+    sums = np.zeros((5, count))
+    for i in range(size):
+        for g in range(count):
+            sums[0, g] += residual[i] * covered[i, g]
+            sums[1, g] += residual[i] * hidden[i, g]
+            sums[2, g] += covered[i, g] * covered[i, g]
+            sums[3, g] += covered[i, g] * hidden[i, g]
+            sums[4, g] += hidden[i, g] * hidden[i, g]
     top = -1e300
     total = 0.0
-    for g in range(spots.shapes.shape[0]):
-        _set_covered(pixels, pattern, around, spots.shapes[g], covered, hidden)
-        _substitute(factor, covered, size)
-        _substitute(factor, hidden, size)
-        by_cover = _dot(residual, covered, size)
-        by_hidden = _dot(residual, hidden, size)
-        cover2 = _dot(covered, covered, size)
-        both = _dot(covered, hidden, size)
-        hidden2 = _dot(hidden, hidden, size)
+    for g in range(count):
+        by_cover, by_hidden, cover2, both, hidden2 = sums[0, g], sums[1, g], sums[2, g], sums[3, g], sums[4, g]
         for o in spots.opacities:
             for b in spots.paints:
                 added = o * o * (b * b * cover2 - 2.0 * b * both + hidden2) - 2.0 * o * (b * by_cover - by_hidden)
@@ -311,7 +343,7 @@ def _spot_likelihood(
                     top = value
                 else:
                     total += math.exp(max(value - top, -700.0))
-    return top + math.log(total / (spots.shapes.shape[0] * spots.paints.shape[0] * spots.opacities.shape[0]))
+    return top + math.log(total / (count * spots.paints.shape[0] * spots.opacities.shape[0]))
 
 
 @kernel

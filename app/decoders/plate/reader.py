@@ -37,9 +37,9 @@ from app.sensors.camera import Camera
 DEFAULT_GEOMETRIES = EXPECTED_GEOMETRIES
 MIN_EXPLAINED = 0.6
 """[1] share of the pixels' variance below which a candidate is no plate. Source: chosen by hand."""
-STRONG_RANK = 3.5
-"""[log odds] rank of a candidate that gets a second geometry when the first explains nothing. Source: chosen by
-hand."""
+MIN_SECOND_LOG_ODDS = -3.0
+"""[log odds] of a candidate that gets a second geometry when the first explains nothing. Source: chosen by hand, for
+speed."""
 MIN_MARGIN = 1.0
 """[standard deviations] colour margin of a marker that is there. Source: chosen by hand."""
 MIN_MARGIN_ALONE = 2.2
@@ -60,6 +60,9 @@ COARSE_MARGIN, COARSE_TINT, COARSE_CAST = 1.5, 0.4, (0.74, 1.35)
 Source: chosen by hand, for speed."""
 COARSE_WEAKEST = (1.0, 0.3)
 """Margin and tint of the weakest marker, the same. Source: chosen by hand, for speed."""
+COARSE_LOSS = 0.04
+"""[1] by which a coarse fit may explain less than the best fit under another geometry, and be refined. Source: chosen
+by hand, for speed."""
 CLEAR_EXPLAINED, CLEAR_MARGIN = 0.93, 8.0
 """Share of variance, or margin of the second weakest marker, with which the weakest may be missing. Source: chosen by
 hand."""
@@ -94,12 +97,19 @@ class _Task:
         self.verifications.append((fit, code.digits, found))
         return found
 
-    def fit_candidate(self, signal: MarkerSignal, quad: MarkerQuad, geometry: PlateGeometry) -> PlateFit | None:
-        """Fit of a candidate; that of about the same markers in an earlier pass serves again."""
+    def fit_candidate(
+        self, signal: MarkerSignal, quad: MarkerQuad, geometry: PlateGeometry, other_explained: float
+    ) -> PlateFit | None:
+        """Fit of a candidate, if it may explain more than that under another geometry.
+
+        The fit of about the same markers in an earlier pass serves again.
+        """
         has_colours = True
 
         def promising(plate_from_image: Array, explained: float) -> bool:
             nonlocal has_colours
+            if explained < other_explained - COARSE_LOSS:
+                return False
             colours = marker_colours(signal, plate_from_image, marker_centroids(geometry), unit_centres(geometry))
             has_colours = _is_promising(colours, explained)
             return has_colours
@@ -258,25 +268,20 @@ def _suppress_overlapping(readings: list[PlateReading]) -> Iterator[PlateReading
 
 
 def _read_candidate(task: _Task, signal: MarkerSignal, candidate: Candidate) -> list[PlateReading]:
-    """The candidate's best reading under its geometries; empty when it is no plate."""
+    """The candidate's reading under the geometry that explains most of it; empty when it is no plate."""
     best: PlateReading | None = None
-    quad = candidate.quad
+    quad, most_explained = candidate.quad, MIN_EXPLAINED
     for geometry in candidate.geometries:
-        fit = task.fit_candidate(signal, quad, geometry)
-        if fit is None or fit.explained < MIN_EXPLAINED:
-            if quad.rank < STRONG_RANK:
-                break
-            continue
-        colours = marker_colours(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
-        if np.sort(colours.margins)[1] < MIN_MARGIN:
-            continue
-        missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins) or wrong_colours(colours)
-        reading = _read_fit(task, fit, geometry, missing, colours)
-        if reading.code is not None:
-            return [reading]
-        if best is None or reading.confidence > best.confidence:
-            best = reading
-        if fit.explained > CLEAN_EXPLAINED or quad.rank < STRONG_RANK:
+        fit = task.fit_candidate(signal, quad, geometry, most_explained)
+        if fit is not None and fit.explained >= most_explained:
+            most_explained = fit.explained
+            colours = marker_colours(signal, fit.plate_from_image, marker_centroids(geometry), unit_centres(geometry))
+            if np.sort(colours.margins)[1] >= MIN_MARGIN:
+                missing = _missing_parts(task.image.shape, quad, fit, geometry, colours.margins)
+                best = _read_fit(task, fit, geometry, missing or wrong_colours(colours), colours)
+                if best.code is not None:
+                    break
+        if candidate.log_odds < MIN_SECOND_LOG_ODDS:
             break
     return [best] if best else []
 

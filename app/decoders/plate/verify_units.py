@@ -25,6 +25,7 @@ from app.decoders.plate.hypotheses import (
     set_unit_likelihoods,
 )
 from app.decoders.plate.layout import unit_edges, unit_shapes
+from app.decoders.plate.light_field import LEVEL_VARIANCE, LIGHT_LENGTH_MM, fit_light
 from app.decoders.plate.patch import cut_patch
 from app.decoders.plate.pixel_shares import set_pixel_shares
 from app.decoders.plate.synthesis import FIRST_GAP, FIRST_ROAD, SINGLES
@@ -42,23 +43,6 @@ REACH_PITCHES = 1.25
 neighbours. Source: chosen by hand, for speed."""
 INNER_SHARE = 0.7
 """[unit] part of a unit's half side within which lies what the pixels around it see of it. Source: chosen by hand."""
-KNOT_MM = 20.0
-"""[mm] distance of the knots between which the light is linear. Source: chosen by hand."""
-LIGHT_LENGTH_MM, LEVEL_VARIANCE = 120.0, 0.25
-"""[mm, 1] distance over which the correlation of the light falls to 1/e, and the variance of its mean, relative.
-Source: chosen by hand."""
-LIGHT_SPREAD, SPREAD_FACTOR = (0.15, 0.45), 1.6
-"""[1] least and greatest standard deviation of the light over a plate, relative, and the factor on that of the fitted
-light. Source: chosen by hand."""
-MODEL_ERROR, NOISE_FACTOR = 0.04, 1.0
-"""[1] error of the model relative to the light, and factor on the pixels' noise. Source: trials; the squared residuals
-over the variance are then 0.4 to 1 in shade, and up to 1.6 under stains."""
-EDGE_ERROR = 0.03
-"""[white] error of the model where reflectances meet, whose blur is not known to less. Source: chosen by hand."""
-FIRST_NOISE = 0.03
-"""[light] noise that the first of the rounds assumes. Source: chosen by hand."""
-ROUNDS = 3
-"""Rounds of the light and the paints in turn. Source: chosen by hand."""
 MAX_ROAD_SHARE, MIN_SHARE = 0.05, 0.9
 """[1] share of the road in a pixel up to which it is compared, and of all shapes from which on. Source: by hand."""
 ALBEDO = (0.01, 1.3)
@@ -97,19 +81,19 @@ def verify_units(
     cut = _cut(image, fit, geometry)
     if cut is None:
         return None
-    pixels, knots, paints = cut
+    pixels, paints = cut
     pattern = dark.astype(float)
     parts = np.column_stack([pixels.units @ pattern, pixels.rest])
     white = pixels.units @ (1 - pattern)
-    light, albedo, noise, spread = _fit_light(pixels, knots, white, parts, paints, geometry)
+    field = fit_light(pixels, white, parts, paints, geometry.side_mm)
     likelihoods = np.empty((len(dark), 5))
     set_unit_likelihoods(
         pixels,
         PlatePattern(
-            pattern, white + parts @ albedo, float(albedo[0]), _centres_mm(geometry),
+            pattern, white + parts @ field.albedo, float(field.albedo[0]), _centres_mm(geometry),
             REACH_PITCHES * geometry.pitch_mm, INNER_SHARE * geometry.unit_mm / 2,
         ),
-        LightPrior(light, noise, spread, LIGHT_LENGTH_MM, LEVEL_VARIANCE),
+        LightPrior(field.light, field.noise, field.spread, LIGHT_LENGTH_MM, LEVEL_VARIANCE),
         Spots(_spot_shapes(geometry.pitch_mm), PAINTS, OPACITIES),
         likelihoods,
     )  # fmt: skip
@@ -118,8 +102,8 @@ def verify_units(
 
 def _cut(
     image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry
-) -> tuple[PlatePixels, Array, Array] | None:
-    """The pixels on the plate, their weights of the light's knots, and the first reflectances of the parts."""
+) -> tuple[PlatePixels, Array] | None:
+    """The pixels on the plate, and the reflectances of its parts to begin with."""
     n, side_mm = geometry.n, geometry.side_mm
     patch = cut_patch(image, fit.corners_px, n * UNIT_PX, linear=False)
     levels = light_levels(fit)
@@ -149,64 +133,7 @@ def _cut(
         max(mm_per_px * blur_px, MIN_BLUR_MM),
     )
     first = np.array([levels.dark, fit.gap, *fit.markers]) - levels.haze
-    return pixels, _knot_weights(places[used], _knots(side_mm)[0]), np.clip(first / level, *ALBEDO)
-
-
-def _fit_light(
-    pixels: PlatePixels, knots: Array, white: Array, parts: Array, albedo: Array, geometry: PlateGeometry
-) -> tuple[Array, Array, Array, float]:
-    """Light on each pixel, reflectances of the parts, noise variance of each pixel, and the light's spread.
-
-    White is 1; light and reflectances are solved in turns.
-    """
-    level, kernel, spread = pixels.level, _knots(geometry.side_mm)[1], LIGHT_SPREAD[1]
-    sigma, light = FIRST_NOISE * level, np.full(len(white), level)
-    for _ in range(ROUNDS):
-        seen = white + parts @ albedo
-        prior = level**2 * (spread**2 * kernel + LEVEL_VARIANCE)
-        noise = (NOISE_FACTOR * sigma) ** 2 / pixels.weight + ((MODEL_ERROR * seen) ** 2 + EDGE_ERROR**2) * light**2
-        design = knots * seen[:, None]
-        weighted = design / noise[:, None]
-        # (1 / prior + design' / noise design) ^ -1, without the inverse of the prior
-        system = weighted.T @ design @ prior + np.eye(len(prior))
-        shift = prior @ np.linalg.solve(system, weighted.T @ (pixels.light - seen * level))
-        light = np.maximum(level + knots @ shift, 0.02 * level)
-        lit = parts * light[:, None]
-        ridge = np.eye(len(albedo)) * 0.05 * float(np.median(1 / noise)) * level**2
-        matrix = lit.T @ (lit / noise[:, None]) + ridge
-        albedo = np.linalg.solve(matrix, lit.T @ ((pixels.light - white * light) / noise) + ridge @ albedo)
-        albedo = np.clip(albedo, 0.0, 1.4)
-        residual = pixels.light - (white + parts @ albedo) * light
-        sigma = max(1.4826 * float(np.median(np.abs(residual) * np.sqrt(pixels.weight))), 1e-4)
-        spread = float(np.clip(SPREAD_FACTOR * light.std() / light.mean(), *LIGHT_SPREAD))
-    seen = white + parts @ albedo
-    noise = (NOISE_FACTOR * sigma) ** 2 / pixels.weight + ((MODEL_ERROR * seen) ** 2 + EDGE_ERROR**2) * light**2
-    return light, albedo, noise, spread
-
-
-@lru_cache
-def _knots(side_mm: float) -> tuple[int, Array]:
-    """Knots along a side, and the correlation of the light between all of them."""
-    count = math.ceil(side_mm / KNOT_MM) + 1
-    along = np.linspace(0.0, side_mm, count)
-    places = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
-    return count, np.exp(-np.linalg.norm(places[:, None] - places[None], axis=2) / LIGHT_LENGTH_MM)
-
-
-def _knot_weights(places: Array, count: int) -> Array:
-    """Weights of the knots at each place, bilinear, shape (P, count * count)."""
-    along = np.clip(places, 0, 1) * (count - 1)
-    low = np.minimum(along.astype(int), count - 2)
-    part = along - low
-    weights = np.zeros((len(places), count * count))
-    rows = np.arange(len(places))
-    for down in (0, 1):
-        for right in (0, 1):
-            across = part[:, 0] if right else 1 - part[:, 0]
-            weights[rows, (low[:, 1] + down) * count + low[:, 0] + right] += across * (
-                part[:, 1] if down else 1 - part[:, 1]
-            )
-    return weights
+    return pixels, np.clip(first / level, *ALBEDO)
 
 
 @lru_cache
