@@ -42,7 +42,7 @@ PLAIN_GAP, GAP_UNIT_PX = 0.8, 3.0
 of a unit from which on they are: on smaller ones they show too little to confirm anything. Source: the same trials."""
 MIN_CHECKED_CELL = 0.5
 """[probability] of a cell by the pixels below which a check that holds does not count. Source: chosen by hand."""
-VERIFIED_UNIT_PX, PLAIN_SMALL_RESIDUAL = 2.0, 0.15
+VERIFIED_UNIT_PX, PLAIN_SMALL_RESIDUAL = 2.0, 0.12
 """[px, contrast] size of a unit below which pixels show no stain, and the residual that is usual there. Source: the
 same trials: with the residual of larger units 36 of 49 plates of 11 to 24 rows are left, with this one 47."""
 MAX_TENTATIVE_ERROR, TENTATIVE_CONFIDENCE = 0.1, 0.9

@@ -19,9 +19,9 @@ MAX_FITS = 5
 LOG_ODDS_RANGE = 4.0
 """[log odds] by which a candidate may miss the limit under the first geometry, so that the others are tried. Source:
 chosen by hand, for speed: the colours are the same under all of them."""
-SIZE_MISFIT_RANGE, CLOSE_SIZE_MISFIT = (-0.4, 0.55), 0.4
-"""[log, log] measured over usual size of the markers of a geometry that is tried, and of one that is tried first.
-Source: chosen by hand; wear and blur change the size of markers."""
+SIZE_MISFIT_RANGE = (-0.4, 0.55)
+"""[log] measured over usual size of the markers of a geometry that is tried. Source: chosen by hand; wear and blur
+change the size of markers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +67,10 @@ def _likely_candidates(
 
 
 def possible_geometries(quad: MarkerQuad, geometries: Sequence[PlateGeometry]) -> list[PlateGeometry]:
-    """Geometries under which a candidate is tried, those with markers of about its size first; 8 x 8 always.
+    """Geometries whose markers have about a candidate's size; 8 x 8 always.
 
     Stains make markers smaller, and blur makes them larger.
     """
     misfit = {g: size_misfit(quad, g) for g in geometries}
     possible = [g for g in geometries if SIZE_MISFIT_RANGE[0] < misfit[g] < SIZE_MISFIT_RANGE[1] or g.n == SIZES[0]]
-    possible = possible or [min(geometries, key=lambda g: abs(misfit[g]))]
-    return sorted(possible, key=lambda g: abs(misfit[g]) > CLOSE_SIZE_MISFIT)
+    return possible or [min(geometries, key=lambda g: abs(misfit[g]))]

@@ -11,7 +11,7 @@ from app.decoders.plate.colour import difference_signal, half_planes
 from app.decoders.plate.detect_blobs import AREA, COLUMNS, PEAK, SIGN, WEIGHT, X0, X1, XX, Y0, Y1, YY, X, Y
 from app.decoders.plate.detect_quads import MARKER_RATIO, MarkerQuad
 from app.decoders.plate.filter_candidates import FEATURES, MIN_LOG_ODDS, candidate_features, candidate_log_odds
-from app.decoders.plate.find_candidates import possible_geometries
+from app.decoders.plate.find_candidates import Candidate, find_candidates, possible_geometries
 from app.decoders.plate.homography import homography_from_points, project
 from app.decoders.plate.join_quads import (
     MAX_GREENS,
@@ -22,7 +22,7 @@ from app.decoders.plate.join_quads import (
     join_red_quads,
 )
 from app.decoders.plate.layout import marker_centroids
-from app.decoders.plate.reader import DEFAULT_GEOMETRIES
+from app.decoders.plate.reader import DEFAULT_GEOMETRIES, MIN_SECOND_LOG_ODDS, _read_candidate, _Task
 from app.markers.plate import PlateCode, PlateGeometry
 from app.simulation.plate_scene import PlacedFace
 from tests.decoders.plate.scenes import AHEAD_M, face_of, road, shoot, shoot_plate
@@ -85,7 +85,24 @@ def test_eight_by_eight_is_always_tried() -> None:
     """Stained squares look small: their distance over their side is that of 12 x 12."""
     quad = MarkerQuad(np.zeros((4, 2)), 7, 1.0, 1.2 * MARKER_RATIO[12])
     assert GEOMETRY in possible_geometries(quad, DEFAULT_GEOMETRIES)
-    assert possible_geometries(quad, DEFAULT_GEOMETRIES)[0] == PlateGeometry(12)
+
+
+@pytest.mark.parametrize("n", [8, 10, 12])
+def test_the_likeliest_geometry_is_tried_first(n: int) -> None:
+    frame = shoot(PlacedFace(face_of(PlateCode.from_position(8.4, 49.0, n=n)), AHEAD_M, 0.0, 0.0))
+    _signal, candidates = next(find_candidates(half_planes(frame.image), DEFAULT_GEOMETRIES))
+    assert candidates[0].geometries[0].n == n
+    assert candidates[0].log_odds == max(candidate.log_odds for candidate in candidates)
+
+
+@pytest.mark.parametrize(("log_odds", "found"), [(MIN_SECOND_LOG_ODDS, [10]), (MIN_SECOND_LOG_ODDS - 0.1, [])])
+def test_a_poor_fit_of_one_geometry_gives_up_an_unlikely_candidate_only(log_odds: float, found: list[int]) -> None:
+    frame = shoot(PlacedFace(face_of(PlateCode.from_position(8.4, 49.0, n=10)), AHEAD_M, 0.0, 0.0))
+    quad = true_quad(frame.truths[0].corners_px, PlateGeometry(10))
+    candidate = Candidate(quad, (PlateGeometry(12), PlateGeometry(10)), log_odds)
+    task = _Task(frame.image, None, (), DEFAULT_GEOMETRIES)
+    readings = _read_candidate(task, difference_signal(half_planes(frame.image)), candidate)
+    assert [reading.code.n for reading in readings if reading.code] == found
 
 
 def test_the_grid_between_the_markers_counts() -> None:
