@@ -46,6 +46,11 @@ class Veil(NamedTuple):
     light: Array
     level: float
 
+    @property
+    def is_even(self) -> bool:
+        """Whether it is the same everywhere: haze, not glare."""
+        return bool(np.ptp(self.light) == 0)
+
 
 def uniform_haze(dark: float, light: float, n: int) -> Veil:
     """The veil that is the same everywhere, from the light of the darkest and the lightest units."""

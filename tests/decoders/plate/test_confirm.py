@@ -23,11 +23,16 @@ def likelihoods(spot: float = -3.0) -> np.ndarray:
     return found
 
 
-def tentative(code: PlateCode = CODE, spot: float = 1.0) -> PlateReading:
+def tentative(code: PlateCode = CODE, spot: float = 1.0, height_px: float = 30.0) -> PlateReading:
     return PlateReading(
-        PlateOutcome.UNSURE, likely_code=code, doubtful_cells=(0,), confidence=0.9,
+        PlateOutcome.UNSURE, likely_code=code, doubtful_cells=(0,), confidence=0.9, height_px=height_px,
         unit_log_likelihoods=likelihoods(spot), reason="a stain may hide units",
     )  # fmt: skip
+
+
+def approached(spot: float, number: int) -> PlateReading:
+    """A tentative reading from the nearer, the greater the number of the frame."""
+    return tentative(spot=spot, height_px=30.0 * 1.2**number)
 
 
 def sure(code: PlateCode = CODE) -> PlateReading:
@@ -43,7 +48,7 @@ def test_the_certainty_follows_from_the_digits() -> None:
 def test_evidence_that_is_too_weak_in_one_frame_adds_up_over_three() -> None:
     alone = UnitVerification(likelihoods(-3.0)).error_probability
     assert alone > MAX_JOINT_ERROR
-    frames = [(k, [tentative(spot=-3.0)]) for k in (4, 7, 8)]
+    frames = [(k, [approached(-3.0, k)]) for k in (4, 7, 8)]
     confirmed = confirm_frames(frames)
     assert sorted(confirmed) == [4, 7, 8]
     for [reading] in confirmed.values():
@@ -55,7 +60,13 @@ def test_evidence_that_is_too_weak_in_one_frame_adds_up_over_three() -> None:
 
 def test_a_spot_that_is_in_every_frame_adds_up_too() -> None:
     assert MAX_ERROR < UnitVerification(likelihoods(4.0)).error_probability < MAX_TENTATIVE_ERROR
-    assert confirm_frames([(k, [tentative(spot=4.0)]) for k in range(4)]) == {}
+    assert confirm_frames([(k, [approached(4.0, k)]) for k in range(4)]) == {}
+
+
+def test_frames_of_a_standing_vehicle_count_as_one() -> None:
+    assert confirm_frames([(k, [tentative(spot=-3.0)]) for k in range(20)]) == {}
+    both = [(0, [tentative(spot=-3.0)]), (1, [tentative(spot=-3.0)]), (2, [approached(-3.0, 2)])]
+    assert sorted(confirm_frames(both)) == [0, 1, 2]
 
 
 def test_a_sure_frame_confirms_a_tentative_one() -> None:
@@ -66,18 +77,17 @@ def test_a_sure_frame_confirms_a_tentative_one() -> None:
 
 @pytest.mark.parametrize("between", [tentative(OTHER), sure(OTHER)])
 def test_frames_that_show_about_the_same_digits_confirm_nothing(between: PlateReading) -> None:
-    seen = [(0, [tentative(spot=-3.0)]), (1, [between]), (2, [tentative(spot=-3.0)])]
+    seen = [(0, [tentative(spot=-3.0)]), (1, [between]), (2, [approached(-3.0, 2)])]
     assert confirm_frames(seen) == {}
     apart = [(0, [tentative(spot=-3.0)]), (1, [replace(between, code=None, likely_code=ELSEWHERE)]),
-             (2, [tentative(spot=-3.0)])]  # fmt: skip
+             (2, [approached(-3.0, 2)])]  # fmt: skip
     assert sorted(confirm_frames(apart)) == [0, 2]
 
 
 def test_one_frame_and_frames_far_apart_confirm_nothing() -> None:
     assert confirm_frames([(0, [tentative(spot=-3.0)])]) == {}
     assert (
-        confirm_frames([(0, [tentative(spot=-3.0)]), *((k, []) for k in range(1, 6)), (6, [tentative(spot=-3.0)])])
-        == {}
+        confirm_frames([(0, [tentative(spot=-3.0)]), *((k, []) for k in range(1, 6)), (6, [approached(-3.0, 6)])]) == {}
     )
 
 
