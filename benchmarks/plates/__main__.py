@@ -90,9 +90,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="first seed")
     parser.add_argument("--seeds", type=int, default=3, help="how many seeds the long mode takes")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument(
-        "--sets", nargs="+", choices=ALL_SETS, default=ALL_SETS, help="leave the other sets out"
-    )
+    parser.add_argument("--sets", nargs="+", choices=ALL_SETS, default=ALL_SETS, help="leave the other sets out")
     parser.add_argument("--misses", action="store_true", help="name the frames that were not decoded")
     args = parser.parse_args()
     items = set(ITEMS) if "all" in args.items else set(args.items)

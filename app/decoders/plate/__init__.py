@@ -1,3 +1,3 @@
 """Camera frame to readings of coded plates: `reader.decode_plates`."""
 
-DECODER_VERSION = "plate/2"
+DECODER_VERSION = "plate/3"

@@ -170,7 +170,6 @@ def _joint_units(units: Sequence[UnitEvidence], share: float, max_unit_px: float
         scatter=float(np.median([one.scatter for one in units])),
         gap=float(np.median([one.gap for one in units])),
         span=float(np.median([one.span for one in units])),
-        veil=units[0].veil,
     )
 
 

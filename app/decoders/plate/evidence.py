@@ -185,8 +185,6 @@ def _is_usual(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
     if decoded.code is None:
         return False
     units, small = evidence.units, evidence.unit_px < VERIFIED_UNIT_PX
-    if not units.veil.is_even:
-        return False
     if small and decoded.code.scheme.corrects:
         return True
     residual = float(units.level_residual.max())

@@ -20,7 +20,6 @@ from app.decoders.plate.fit import PlateFit
 from app.decoders.plate.layout import unit_shapes
 from app.decoders.plate.linear import invert
 from app.decoders.plate.unit_patterns import cell_costs, minimize_pattern
-from app.decoders.plate.veil import Veil, estimate_glare, uniform_haze
 from app.markers.plate import PlateCode, unit_index
 
 Array = npt.NDArray[Any]
@@ -44,9 +43,9 @@ LEVELLED_CONTRAST_SPREAD = 0.3
 """[contrast] standard deviation of the levelled contrast. Source: chosen by hand."""
 LOG_FLOOR = 0.05
 """[light level] added before the logarithm, so that noise around black stays small. Source: chosen by hand."""
-MIN_GLARE_RESIDUAL, GLARE_SCATTER = 0.08, 0.8
-"""[contrast, 1] level residual under even haze from which on glare is looked for, and the scatter under glare over that
-under haze below which there is glare. Source: chosen by hand."""
+DARK_SHARE = 0.12
+"""[light level] light of dark units without haze: what they have beyond it is taken for haze. Source: chosen by hand;
+the simulated plates (`simulation.plate_face.draw_look`) have 0.02 to 0.2."""
 MIN_LEVEL_NOISE_RATIO = 4.0
 """[standard deviations] by which the lightest units must stand above the darkest. Source: chosen by hand."""
 MIN_LIGHT = 1e-4
@@ -120,8 +119,6 @@ class UnitEvidence:
         Light of the gaps between units over that of the light units, the haze taken off.
     span : float
         Light of the light units above the dark ones. [linear, 1 = saturation]
-    veil : Veil
-        Light that the plate does not send.
     """
 
     cell_costs: Array
@@ -137,7 +134,6 @@ class UnitEvidence:
     scatter: float
     gap: float
     span: float
-    veil: Veil
 
     @property
     def cell_margin(self) -> Array:
@@ -167,43 +163,32 @@ PATTERNS = np.array(list(itertools.product((0, 1), repeat=4)), dtype=float)
 """Dark units of each symbol of a cell, shape (16, 4): row k holds the bits of k."""
 
 
-class _LightLevels(NamedTuple):
-    """The units' light in symbol order, their covariance, and the light of the darkest and the lightest."""
+class LightLevels(NamedTuple):
+    """The units' light in symbol order, their covariance, the light of the darkest and the lightest, and the haze."""
 
     values: Array
     covariance: Array
     dark: float
     light: float
 
+    @property
+    def haze(self) -> float:
+        """Light that dark units have beyond what their material sends back."""
+        return max(0.0, (self.dark - DARK_SHARE * self.light) / (1 - DARK_SHARE))
+
 
 def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
     """Costs of all symbols; None when the units do not differ by more than their noise, or show one level only.
-
-    Under haze that is the same everywhere, or under glare where that explains the units much better.
-    """
-    levels = _light_levels(fit)
-    if levels is None:
-        return None
-    n = fit.units.shape[0]
-    hazy = _under_veil(fit, levels, uniform_haze(levels.dark, levels.light, n))
-    if hazy is not None and hazy.level_residual.max() < MIN_GLARE_RESIDUAL:
-        return hazy
-    glare = estimate_glare(levels.values, levels.covariance, levels.light - levels.dark, n)
-    glaring = _under_veil(fit, levels, glare)
-    if hazy is None or (glaring is not None and glaring.scatter < GLARE_SCATTER * hazy.scatter):
-        return glaring
-    return hazy
-
-
-def _under_veil(fit: PlateFit, levels: _LightLevels, veil: Veil) -> UnitEvidence | None:
-    """Costs of all symbols once a veil is taken off.
 
     Two classifiers in turn: the first on logarithms, where any illumination is a sum, gives the light that falls on
     each unit; the second on the light divided by that, where the noise is even.
     """
     n = fit.units.shape[0]
-    values = levels.values - veil.light.reshape(-1)[unit_index(n).reshape(-1)]
-    light, first = _estimate_illumination(values, levels.covariance, veil.level, n)
+    levels = light_levels(fit)
+    if levels is None:
+        return None
+    values = levels.values - levels.haze
+    light, first = _estimate_illumination(values, levels.covariance, levels.light - levels.haze, n)
     levelled = values / light
     total = _smooth(n, LEVELLED_LIGHT_SPREAD) + levels.covariance / np.outer(light, light)
     total[np.diag_indices_from(total)] += LEVELLED_WEAR**2
@@ -239,13 +224,12 @@ def _under_veil(fit: PlateFit, levels: _LightLevels, veil: Veil) -> UnitEvidence
         residual=residual,
         contrast=contrast,
         scatter=scatter / len(residual),
-        gap=(fit.gap - float(veil.light.mean())) / veil.level,
+        gap=(fit.gap - levels.haze) / (levels.light - levels.haze),
         span=levels.light - levels.dark,
-        veil=veil,
     )
 
 
-def _light_levels(fit: PlateFit) -> _LightLevels | None:
+def light_levels(fit: PlateFit) -> LightLevels | None:
     """Light of the units and of the darkest and lightest of them; None when these differ by little more than noise."""
     n = fit.units.shape[0]
     order = _shape_order(n)
@@ -257,7 +241,7 @@ def _light_levels(fit: PlateFit) -> _LightLevels | None:
     noise = math.sqrt(float(np.median(np.diag(covariance))))
     if light - dark < MIN_LEVEL_NOISE_RATIO * noise or light < MIN_LIGHT:
         return None
-    return _LightLevels(values, covariance, dark, light)
+    return LightLevels(values, covariance, dark, light)
 
 
 def _blur_units(fit: PlateFit) -> float:

@@ -12,7 +12,6 @@ import math
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -30,8 +29,8 @@ from app.decoders.plate.light_field import LEVEL_VARIANCE, LIGHT_LENGTH_MM, fit_
 from app.decoders.plate.patch import cut_patch
 from app.decoders.plate.pixel_shares import set_pixel_shares
 from app.decoders.plate.synthesis import FIRST_GAP, FIRST_ROAD, SINGLES
+from app.decoders.plate.unit_likelihoods import light_levels
 from app.decoders.plate.unit_verification import UnitVerification
-from app.decoders.plate.veil import DARK_SHARE, Veil
 from app.markers.plate import PlateGeometry, unit_index
 
 Array = npt.NDArray[Any]
@@ -60,7 +59,7 @@ PAINTS, OPACITIES = np.array([0.03, 0.1, 0.2, 0.35, 0.6, 0.85, 1.0, 1.15]), np.a
 
 
 def verify_units(
-    image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, veil: Veil, dark: npt.NDArray[np.bool_]
+    image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, dark: npt.NDArray[np.bool_]
 ) -> UnitVerification | None:
     """Verify a pattern of units by the pixels.
 
@@ -71,8 +70,6 @@ def verify_units(
     fit : PlateFit
         Of the plate in it.
     geometry : PlateGeometry
-    veil : Veil
-        Light that the plate does not send.
     dark : ndarray of bool, shape (units,)
         The pattern, in the order of the symbols' units.
 
@@ -81,7 +78,7 @@ def verify_units(
     UnitVerification or None
         None where the plate has too few pixels.
     """
-    cut = _cut(image, fit, geometry, veil)
+    cut = _cut(image, fit, geometry)
     if cut is None:
         return None
     pixels, paints = cut
@@ -103,13 +100,12 @@ def verify_units(
     return UnitVerification(likelihoods)
 
 
-def _cut(
-    image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, veil: Veil
-) -> tuple[PlatePixels, Array] | None:
+def _cut(image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry) -> tuple[PlatePixels, Array] | None:
     """The pixels on the plate, and the reflectances of its parts to begin with."""
     n, side_mm = geometry.n, geometry.side_mm
     patch = cut_patch(image, fit.corners_px, n * UNIT_PX, linear=False)
-    if patch is None:
+    levels = light_levels(fit)
+    if patch is None or levels is None:
         return None
     shapes = len(fit.model.values)
     shares, places = np.empty((*patch.light.shape, shapes)), np.empty((*patch.light.shape, 2))
@@ -124,21 +120,18 @@ def _cut(
     right, down = np.diff(fit.corners_px[:3], axis=0)
     mm_per_px = side_mm / math.sqrt(max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0))
     blur_px = math.sqrt(fit.blur_px**2 + patch.grid[2] * patch.grid[3] / 12)
-    across, along = (places[used].T * n - 0.5).astype(np.float32)
-    veiled = cv2.remap(veil.light.astype(np.float32), across, along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    at_cells = veil.light.reshape(n // 2, 2, n // 2, 2).mean(axis=(1, 3))
+    level = levels.light - levels.haze
     pixels = PlatePixels(
-        patch.light[used].astype(float) - np.asarray(veiled, float).reshape(-1),
+        patch.light[used].astype(float) - levels.haze,
         patch.weights[used] / float(patch.weights[used].mean()),
         np.ascontiguousarray(shares[used][:, in_symbols]),
         np.column_stack([gap, singles[used][:, :FIRST_GAP]]),
         places[used] * side_mm,
-        veil.level,
+        level,
         max(mm_per_px * blur_px, MIN_BLUR_MM),
     )
-    markers = fit.markers - at_cells[[0, 0, 0, -1, -1], [0, 0, -1, -1, 0]]
-    first = np.array([DARK_SHARE * veil.level, fit.gap - veil.light.mean(), *markers])
-    return pixels, np.clip(first / veil.level, *ALBEDO)
+    first = np.array([levels.dark, fit.gap, *fit.markers]) - levels.haze
+    return pixels, np.clip(first / level, *ALBEDO)
 
 
 @lru_cache
