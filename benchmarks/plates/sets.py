@@ -41,9 +41,9 @@ HERE = Path(__file__).parent.parent
 GEOMETRY = PlateGeometry()
 MIN_ROWS = 4.0  # below this half a row a unit is left: such frames don't count as having the plate in view
 RENDERED_ROWS = 8.0  # below this frames are counted as not decoded without a look
-LIGHT = ("shadow-edge", "dapple", "glare", "stains", "stained-shade", "worn")
-"""Plates of a fair day but for one thing: the edge of a shadow, leaves' shadows, glare, spots of paint, both spots and
-a shadow, wear."""
+LIGHT = ("shadow-edge", "glare", "stains", "stained-shade", "worn", "dapple")
+"""Plates of a fair day but for one thing: the edge of a shadow, glare, spots of paint, both spots and a shadow, wear,
+leaves' shadows."""
 THERMAL_KMH = {"thermal": 10.0, "thermal-20": 20.0, "thermal-30": 30.0}
 SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT, "thermal-20", "thermal-30")
 LIGHT_ROWS, STRESS_ROWS = (12.0, 90.0), (24.0, 140.0)
