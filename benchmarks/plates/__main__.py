@@ -30,7 +30,7 @@ ITEMS = ("trials", "height", "false", "peers", "speed", "accuracy", "light", "re
 NEEDS = {
     "trials": ("trial",),
     "height": ("trial", "stress", "night", *THERMAL_KMH, "hidden"),
-    "false": ("trial", "stress", "night", *THERMAL_KMH, "hidden", "free"),
+    "false": SETS,
     "peers": ("trial", "stress"),
     "accuracy": ("trial",),
     "light": LIGHT,
@@ -40,7 +40,7 @@ ALL_SETS = tuple(dict.fromkeys([*SETS, *SCHEME_SETS]))
 BATCH = 25
 # frames (drives for thermal) a seed: long, short
 COUNTS = {"stress": (400, 24), "night": (50, 6), "hidden": (100, 10), "free": (1000, 40),
-          **dict.fromkeys(THERMAL_KMH, (12, 1)), **dict.fromkeys(LIGHT, (150, 10))}  # fmt: skip
+          "look-alikes": (1000, 40), **dict.fromkeys(THERMAL_KMH, (12, 1)), **dict.fromkeys(LIGHT, (150, 10))}  # fmt: skip
 SCHEME_DRIVES = (5, 1)  # of each set and seed: long, short
 SHORT_SHARE = 0.08
 MISSED_ROWS = 16
@@ -52,7 +52,7 @@ def list_jobs(items: set[str], seeds: list[int], *, short: bool, only: Sequence[
     jobs = []
     for seed in seeds:
         for name in sets:
-            peers = ("peers" in items and name in NEEDS["peers"]) or name in LIGHT
+            peers = any(item in items and name in NEEDS[item] for item in ("peers", "light"))
             if name == "trial":
                 share = SHORT_SHARE if short else 1.0
                 jobs += [Job(name, k, seed, 0, share, peers) for k in range(len(read_trials()))]

@@ -35,6 +35,7 @@ from app.simulation.plate_face import Face, plate_face, warm_face
 from app.simulation.plate_scene import Air, PlacedFace, PlateScene, face_truth
 from app.simulation.road import road_background
 from app.simulation.thermal import render_thermal_scene
+from benchmarks.plates.lookalikes import draw_flat, paint_upright
 
 Image = npt.NDArray[np.uint8]
 HERE = Path(__file__).parent.parent
@@ -45,7 +46,9 @@ LIGHT = ("shadow-edge", "glare", "stains", "stained-shade", "worn", "dapple")
 """Plates of a fair day but for one thing: the edge of a shadow, glare, spots of paint, both spots and a shadow, wear,
 leaves' shadows."""
 THERMAL_KMH = {"thermal": 10.0, "thermal-20": 20.0, "thermal-30": 30.0}
-SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT, "thermal-20", "thermal-30")
+SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT, "thermal-20", "thermal-30", "look-alikes")
+WITHOUT_PLATE = ("free", "look-alikes")
+WITH_PLATE = tuple(name for name in SETS if name not in WITHOUT_PLATE)
 LIGHT_ROWS, STRESS_ROWS = (12.0, 90.0), (24.0, 140.0)
 DRIVE_FRAMES = 5
 
@@ -182,7 +185,7 @@ def shoot(job: Job) -> Iterator[Shot | Unseen]:
     """Frames of a job."""
     makers = {
         "trial": _trial, "stress": _stress, "night": _stress, "hidden": _hidden, "free": _free,
-        **dict.fromkeys(THERMAL_KMH, _thermal), **dict.fromkeys(LIGHT, _light),
+        "look-alikes": _look_alikes, **dict.fromkeys(THERMAL_KMH, _thermal), **dict.fromkeys(LIGHT, _light),
     }  # fmt: skip
     return makers[job.set_name](job)
 
@@ -416,6 +419,19 @@ def _free(job: Job) -> Iterator[Shot | Unseen]:
         conditions = draw_stress(rng) if rng.random() < 0.5 else draw_daylight(rng)
         scene = scene_under(conditions, camera, faces, float(rng.uniform(0, 80)) / 3.6, rng)
         yield _shot("free", scene, background, None, draw_codebook(draw_code(rng), rng), conditions, rng)
+
+
+def _look_alikes(job: Job) -> Iterator[Shot | Unseen]:
+    """Roads without a plate, full of what resembles one: QR codes, tiles, chessboards, signs, markings, decoys."""
+    rng = job.rng
+    for _ in range(job.frames):
+        camera = _draw_camera(rng)
+        background = draw_background(camera, rng) if rng.random() < 0.5 else _draw_crop(camera, rng)
+        background = paint_upright(background, rng, int(rng.integers(0, 9)))
+        faces = draw_flat(camera, rng, int(rng.integers(1, 8)))
+        conditions = draw_stress(rng) if rng.random() < 0.5 else draw_daylight(rng)
+        scene = scene_under(conditions, camera, faces, float(rng.uniform(0, 80)) / 3.6, rng)
+        yield _shot("look-alikes", scene, background, None, draw_codebook(draw_code(rng), rng), conditions, rng)
 
 
 def _draw_crop(camera: Camera, rng: np.random.Generator) -> Image:
