@@ -74,7 +74,9 @@ def _draw_face(rng: np.random.Generator, wear: PlateWear) -> Face:
 
 def _draw_cells(rng: np.random.Generator) -> Floats:
     """Reflectances of one look-alike, shape (TEXELS, TEXELS, 3)."""
-    kinds = (_qr_code, _tiles, _chessboard, _warning_sign, _round_sign, _direction_sign, _marking, _bicycle_lane)
+    kinds = (
+        _qr_code, _tiles, _chessboard, _panel, _warning_sign, _round_sign, _direction_sign, _marking, _bicycle_lane,
+    )  # fmt: skip
     return kinds[int(rng.integers(len(kinds)))](rng)
 
 
@@ -96,8 +98,8 @@ def _qr_code(rng: np.random.Generator) -> Floats:
     cells = np.where(dark[..., None], np.array(ink), np.array(WHITE))
     if rng.random() < 0.4:
         corner, last = 8, len(dark) - 8
-        for rows, columns in ((slice(0, corner), slice(0, corner)), (slice(0, corner), slice(last, None)),
-                              (slice(last, None), slice(0, corner)), (slice(last, None), slice(last, None))):  # fmt: skip
+        near, far = slice(0, corner), slice(last, None)
+        for rows, columns in ((near, near), (near, far), (far, near), (far, far)):
             tint = np.array(_pick(rng, (RED, GREEN, GREEN)))
             cells[rows, columns] = np.where(dark[rows, columns, None], tint, cells[rows, columns])
     return _resized(cells)
@@ -125,6 +127,21 @@ def _chessboard(rng: np.random.Generator) -> Floats:
         for row in (slice(0, 2), slice(-2, None)):
             for column in (slice(0, 2), slice(-2, None)):
                 cells[row, column] = _pick(rng, (RED, GREEN, GREEN, WHITE))
+    return _resized(cells)
+
+
+def _panel(rng: np.random.Generator) -> Floats:
+    """A board of one or two tones with coloured corners: mostly red and green squares as a plate has them."""
+    count = int(rng.choice((8, 10, 12)))
+    tones = np.array([_pick(rng, (WHITE, BLACK, ASPHALT)) for _ in range(int(rng.integers(1, 3)))])
+    cells = tones[rng.integers(0, len(tones), (count, count))]
+    corners = [RED, GREEN, GREEN, GREEN]
+    if rng.random() < 0.4:
+        rng.shuffle(corners)
+    places = ((slice(0, 2), slice(0, 2)), (slice(0, 2), slice(-2, None)),
+              (slice(-2, None), slice(-2, None)), (slice(-2, None), slice(0, 2)))  # fmt: skip
+    for place, colour in zip(places, corners, strict=True):
+        cells[place] = colour
     return _resized(cells)
 
 

@@ -189,5 +189,6 @@ def _usual_missing(evidence: Sequence[PlateEvidence]) -> tuple[PlateOutcome, str
         margins=gain * np.mean([one.margins for one in colours], axis=0),
         tints=np.mean([one.tints for one in colours], axis=0),
         cast=np.mean([one.cast for one in colours], axis=0),
+        rest=float(np.median([one.rest for one in colours])),
     )
     return usual if joint.margins.min() < MIN_MARGIN else wrong_colours(joint)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from app.decoders.compiled import ieee_kernel
 from app.decoders.plate.colour import MarkerSignal
+from app.decoders.plate.homography import project
+from app.decoders.plate.layout import unit_edges
+from app.markers.plate import PlateGeometry
 
 Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
@@ -18,6 +22,10 @@ SPOT_PITCH = 0.03
 """[plate sides] between the 3 x 3 points that are sampled on a marker. Source: chosen by hand; half a marker is 0.115
 on 8 x 8, 0.077 on 12 x 12."""
 _SPOTS = np.array([(x, y) for x in (-SPOT_PITCH, 0.0, SPOT_PITCH) for y in (-SPOT_PITCH, 0.0, SPOT_PITCH)])
+
+TRIANGLE_SPOT, REST_SPOT, CORNER_REACH = 0.28, 0.75, 0.09
+"""[sides of the triangle's cell] along its diagonal to a spot in the triangle and to one in the other half, and half
+the side of both spots. Source: chosen by hand: as far from the hypotenuse as the edges of the cell allow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +41,40 @@ class MarkerColours:
         being the units' colour. A black square in the dark has none, whatever the ratio of its few grey levels.
     cast : ndarray, shape (2,)
         Blue and red of the units as shares of their green.
+    rest : float
+        Red of the other half of the triangle's cell over the triangle's own: near 1 where the marker is a square.
     """
 
     margins: Floats
     tints: Floats
     cast: Floats
+    rest: float = 0.0
+
+
+def triangle_rest(
+    image: npt.NDArray[np.uint8], plate_from_image: Floats, geometry: PlateGeometry, cast: Floats
+) -> float:
+    """Red of the other half of the triangle's cell over the triangle's own (`MarkerColours.rest`).
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (H, W, 3)
+    plate_from_image : ndarray, shape (3, 3)
+    geometry : PlateGeometry
+    cast : ndarray, shape (2,)
+        Blue and red of the units as shares of their green.
+    """
+    edges = unit_edges(geometry)
+    low, side = float(edges[0, 0]), float(edges[1, 1] - edges[0, 0])
+    reach = CORNER_REACH * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    points: Floats = low + side * np.concatenate([TRIANGLE_SPOT + reach, REST_SPOT + reach])
+    at_px = project(np.asarray(np.linalg.inv(plate_from_image), float), points).astype(np.float32)
+    seen: npt.NDArray[Any] = cv2.remap(
+        image, at_px[None, :, 0], at_px[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )[0]
+    blue, green, red = seen.astype(float).reshape(2, len(reach), 3).mean(axis=1).T
+    tints = red / cast[1] - np.maximum(green, blue / cast[0])
+    return float(tints[1] / max(tints[0], 1.0))
 
 
 def marker_colours(signal: MarkerSignal, plate_from_image: Floats, centroids: Floats, units: Floats) -> MarkerColours:

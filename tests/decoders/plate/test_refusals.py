@@ -70,6 +70,19 @@ def test_a_red_marker_painted_over_is_missing(colour: tuple[float, float, float]
     assert all(r.digits is None and r.reason for r in readings)
 
 
+@pytest.mark.parametrize("ahead_m", [2.6, 3.4])
+def test_a_red_square_is_no_triangle(ahead_m: float) -> None:
+    """A chessboard with coloured corners has a plate's grid and colours; only its red corner is of another shape."""
+    red = (0.05, 0.05, 0.5)
+    face = painted(face_of(PlateCode("999999999999")), dict.fromkeys(marker_units("top-left"), red))
+    image = shoot(PlacedFace(face, ahead_m, 0.1)).image
+    readings = decode_plates(image)
+    assert digits_in(readings) == []
+    assert PlateOutcome.RED_MARKER_MISSING in {r.outcome for r in readings}
+    assert any("square" in r.reason for r in readings)
+    assert digits_in(decode_plates(image, codebook=(PlateCode("999999999999"), PAPER))) == ["999999999999"]
+
+
 @pytest.mark.parametrize("corner", ["top-left", "bottom-right"])
 def test_the_registry_vouches_for_a_plate_without_a_marker(corner: str) -> None:
     face = painted(face_of(), dict.fromkeys(marker_units(corner), GREY))
