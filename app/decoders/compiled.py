@@ -16,6 +16,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba as nb
+from llvmlite import ir
+from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -52,3 +54,13 @@ def step(function: F) -> F:
     """Mark a function as a part of the one kernel that calls it; it takes over that kernel's arithmetic."""
     inlined: F = _njit(nogil=True, error_model="numpy", inline="always")(function)
     return inlined
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def trailing_zeros(_context: Any, word: Any) -> Any:
+    """Number of zero bits below the lowest bit that is set, of an unsigned 64-bit word that is not 0."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return nb.types.int64(nb.types.uint64), generate

@@ -85,9 +85,9 @@ def planes_of(image: Array) -> Planes:
 
 def difference_signal(planes: Planes) -> MarkerSignal:
     """How far red exceeds green and blue, or green exceeds red and blue: saturated colours."""
-    red_above = cv2.subtract(planes.red, cv2.max(planes.green, planes.blue))
-    green_above = cv2.subtract(planes.green, cv2.max(planes.red, planes.blue))
-    return _signal(cv2.subtract(red_above, green_above, dtype=cv2.CV_16S), planes, DIFFERENCE_LEVELS)
+    opponent: Array = np.empty(planes.red.shape, np.int16)
+    _difference(planes.blue.reshape(-1), planes.green.reshape(-1), planes.red.reshape(-1), opponent.reshape(-1))
+    return _signal(opponent, planes, DIFFERENCE_LEVELS)
 
 
 def ratio_signal(planes: Planes) -> MarkerSignal:
@@ -126,6 +126,16 @@ def _signal(opponent: Array, planes: Planes, levels: tuple[tuple[int, int], ...]
     return MarkerSignal(opponent, planes, peak, _thresholds(rough), levels)
 
 
+@ieee_kernel
+def _difference(blue: Grey, green: Grey, red: Grey, opponent: Signal) -> None:
+    """Set how far red exceeds both others, or minus how far green does; shape (pixels,) each."""
+    for k in range(opponent.shape[0]):
+        b = np.int16(blue[k])
+        g = np.int16(green[k])
+        r = np.int16(red[k])
+        opponent[k] = max(r - max(g, b), 0) - max(g - max(r, b), 0)
+
+
 @kernel
 def _ratio(green: Grey, red: Grey, opponent: Signal) -> None:
     """Set 256 (r - g) / (r + g + 24), the ratio's logarithm times 128 where both are bright; shape (pixels,) each."""
@@ -137,23 +147,25 @@ def _ratio(green: Grey, red: Grey, opponent: Signal) -> None:
 
 @ieee_kernel
 def _block_means(signal: Signal, means: Signal) -> None:
-    """Set the means of about equal blocks of a signal; sums of rows, so that the blocks of a row share memory."""
+    """Set the means of about equal blocks of a signal: sums of columns first, which are compiled to vectors."""
     height, width = signal.shape
     rows, columns = means.shape
-    total = np.empty(columns, np.int32)
+    total = np.empty(width, np.int32)
     for r in range(rows):
         y0 = r * height // rows
         y1 = (r + 1) * height // rows
         total[:] = 0
         for y in range(y0, y1):
-            for c in range(columns):
-                row = np.int32(0)
-                for x in range(c * width // columns, (c + 1) * width // columns):
-                    row += signal[y, x]
-                total[c] += row
+            for x in range(width):
+                total[x] += signal[y, x]
         for c in range(columns):
-            area = (y1 - y0) * ((c + 1) * width // columns - c * width // columns)
-            means[r, c] = np.int16(np.rint(total[c] / area))
+            x0 = c * width // columns
+            x1 = (c + 1) * width // columns
+            area = (y1 - y0) * (x1 - x0)
+            block = np.int64(0)
+            for x in range(x0, x1):
+                block += total[x]
+            means[r, c] = np.int16(np.rint(block / area))
 
 
 @ieee_kernel

@@ -7,17 +7,23 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel, step
+from app.decoders.compiled import ieee_kernel, routine, step, trailing_zeros
 from app.decoders.plate.colour import BLOCK, MarkerSignal
 
 Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 Signal = npt.NDArray[np.int16]
+Runs = npt.NDArray[np.int16]
+Ints = npt.NDArray[np.int32]
+Sums = npt.NDArray[np.int64]
+Marks = npt.NDArray[np.int8]
 
 MAX_BLOBS = 6000
 """[blobs] of all levels; more are left out. Source: chosen by hand, for speed."""
 MAX_RUNS = 60_000
 """[runs] of one level; more are left out. Source: chosen by hand, for speed."""
+WORD = 8
+"""[pixels] that are looked at in one step where they are all alike: bytes of an unsigned 64-bit word."""
 MIN_AREA = 2
 """[pixels of the signal] of a blob. Source: chosen by hand."""
 PIXEL_VARIANCE = 1.0 / 12
@@ -26,7 +32,9 @@ PIXEL_VARIANCE = 1.0 / 12
 SIGN, WEIGHT, X, Y, XX, XY, YY, AREA, X0, X1, Y0, Y1, PEAK = range(13)
 """Columns of a blob: +1 red or -1 green; weight, centroid, central moments; area; extent; strongest signal."""
 COLUMNS = 13
-_W, _WX, _WY, _WXX, _WXY, _WYY, _AREA, _X0, _X1, _Y0, _Y1, _PEAK = range(12)  # columns of a run's sums
+_W, _WX, _WY, _WXX, _WXY, _WYY, _AREA, _X0, _X1, _Y0, _Y1, _PEAK = range(12)  # columns of a part's sums
+BYTE = np.uint64(8)
+"""[bits] of a mark."""
 
 
 class _Level(NamedTuple):
@@ -40,167 +48,223 @@ class _Level(NamedTuple):
     slack: int
 
 
-class _Runs(NamedTuple):
-    """Runs found so far.
-
-    Attributes
-    ----------
-    parent : ndarray of int32, shape (MAX_RUNS,)
-        Another run of the same blob, itself for the blob's first run.
-    sums : ndarray, shape (MAX_RUNS, 12)
-        Weighted sums of a blob's runs at its first run: w, wx, wy, wxx, wxy, wyy, area, x0, x1, y0, y1, peak.
-    sign : ndarray of int8; first, last : ndarray of int32, shape (MAX_RUNS,)
-        Colour; first and last column.
-    """
-
-    parent: npt.NDArray[np.int32]
-    sums: Floats
-    sign: npt.NDArray[np.int8]
-    first: npt.NDArray[np.int32]
-    last: npt.NDArray[np.int32]
-
-
 def find_blobs(signal: MarkerSignal) -> Floats:
-    """Blobs at all the signal's levels, shape (B, 13), columns `SIGN` to `PEAK`."""
+    """Blobs at all the signal's levels, moments weighted by the signal, shape (B, 13), columns `SIGN` to `PEAK`."""
     blobs, count = np.empty((MAX_BLOBS, COLUMNS)), 0
+    runs = np.empty((MAX_RUNS, 4), np.int16)
+    parent, sums, sign = np.empty(MAX_RUNS, np.int32), np.empty((MAX_RUNS, 12), np.int64), np.empty(MAX_RUNS, np.int8)
     for floor, slack in signal.levels:
         level = _Level(signal.opponent, signal.planes.luma, signal.peak, signal.threshold, floor, slack)
-        count = _add_blobs(level, blobs, count)
+        found = _find_runs(level, runs)
+        parts = _join_runs(signal.opponent, runs[:found], parent, sums, sign)
+        count = _write_blobs(parent[:parts], sums[:parts], sign, blobs, count)
     return blobs[:count]
 
 
 @step
-def _run_start(level: _Level, y: int, x: int) -> int:
-    """First column from x on whose signal exceeds the level; the width where there is none."""
-    width: int = level.opponent.shape[1]
-    while x < width:
-        block = x // BLOCK
-        stop = min(width, (block + 1) * BLOCK)
-        high = max(int(level.threshold[y // BLOCK, block]), level.floor)
-        if level.peak[y, block] <= high:  # nothing in this block of the row
-            x = stop
+def _mark(v: int, luma: int, high: int, slack: int) -> int:
+    """+1, -1 or 0 for red, green or neither."""
+    strength = abs(v)
+    exceeds = (strength > high) & ((strength << 5) > slack * luma)
+    return np.int8((1 if v > 0 else -1) if exceeds else 0)
+
+
+@step
+def _mark_row(level: _Level, y: int, high: Signal, marks: Marks) -> None:
+    """Mark red and green in the blocks of a row that have a signal above their threshold, `high`.
+
+    Indices are unsigned: those that may be negative keep a loop from being compiled to vector instructions.
+    """
+    width = level.opponent.shape[1]
+    slack = np.int32(level.slack)
+    for block in range(high.size):
+        if level.peak[y, block] <= high[block]:
             continue
-        while x < stop:
-            v = abs(int(level.opponent[y, x]))
-            if v > high and (v << 5) > level.slack * int(level.luma[y, x]):
-                return x
-            x += 1
-    return width
+        at_least = np.int32(high[block])
+        if BLOCK * block + BLOCK <= width:
+            for k in range(BLOCK):
+                x = np.uint64(BLOCK * block) + np.uint64(k)
+                marks[x] = _mark(np.int32(level.opponent[y, x]), np.int32(level.luma[y, x]), at_least, slack)
+        else:
+            for x in range(BLOCK * block, width):
+                marks[x] = _mark(np.int32(level.opponent[y, x]), np.int32(level.luma[y, x]), at_least, slack)
 
 
-@step
-def _measure_run(level: _Level, y: int, start: int, sign: int, sums: Floats) -> int:
-    """Set the sums of the run of one colour that starts here; returns the column after its last one."""
-    width: int = level.opponent.shape[1]
-    w = 0.0
-    wx = 0.0
-    wxx = 0.0
-    top = 0.0
-    x = start
-    while x < width:
-        v = sign * int(level.opponent[y, x])
-        high = max(int(level.threshold[y // BLOCK, x // BLOCK]), level.floor)
-        if v <= high or (v << 5) <= level.slack * int(level.luma[y, x]):
+@ieee_kernel
+def _find_runs(level: _Level, runs: Runs) -> int:
+    """List runs of one colour, row by row: row, first column, column after the last one, sign; returns their number.
+
+    The bytes of a word in which a run begins or ends differ from the byte before: the rest is not looked at. Every
+    such place writes a run, which counts only where one ends, so that there is no branch to mispredict.
+    """
+    blocks = level.peak.shape[1]
+    words = np.zeros(blocks * BLOCK // WORD, np.uint64)  # marks of a row; those beyond the frame stay empty
+    marks = words.view(np.int8)
+    high = np.empty(blocks, np.int16)
+    count = 0
+    for y in range(level.opponent.shape[0]):
+        if count + BLOCK * blocks >= runs.shape[0]:
             break
-        d = np.float64(v)
-        w += d
-        wx += d * x
-        wxx += d * x * x
-        top = max(top, d)
-        x += 1
-    sums[_W] = w
-    sums[_WX] = wx
-    sums[_WY] = w * y
-    sums[_WXX] = wxx
-    sums[_WXY] = wx * y
-    sums[_WYY] = w * y * y
-    sums[_AREA] = x - start
-    sums[_X0] = start
-    sums[_X1] = x - 1
-    sums[_Y0] = y
-    sums[_Y1] = y
-    sums[_PEAK] = top
-    return x
+        if y % BLOCK == 0:
+            for block in range(blocks):
+                high[block] = max(level.threshold[y // BLOCK, block], level.floor)
+        _mark_row(level, y, high, marks)
+        sign = np.int64(0)
+        start = 0
+        for block in range(blocks):
+            if level.peak[y, block] <= high[block]:  # a run ends with the last block
+                runs[count, 0], runs[count, 1], runs[count, 2], runs[count, 3] = y, start, BLOCK * block, sign
+                count += sign != 0
+                sign = np.int64(0)
+                continue
+            for w in range(BLOCK // WORD * block, BLOCK // WORD * (block + 1)):
+                word = words[w]
+                changes = word ^ ((word << BYTE) | np.uint64(sign & 0xFF))
+                while changes != 0:
+                    shift = np.uint64(trailing_zeros(changes)) & ~np.uint64(7)
+                    x = WORD * w + np.int64(shift >> np.uint64(3))
+                    runs[count, 0], runs[count, 1], runs[count, 2], runs[count, 3] = y, start, x, sign
+                    count += sign != 0
+                    sign = np.int64(marks[x])
+                    start = x
+                    changes &= ~(np.uint64(0xFF) << shift)
+        if sign != 0:
+            runs[count, 0], runs[count, 1], runs[count, 2], runs[count, 3] = y, start, level.opponent.shape[1], sign
+            count += 1
+    return count
+
+
+@routine
+def _first_part(parent: Ints, part: int) -> int:
+    """First part of the blob that a part belongs to; shortens the way to it."""
+    while parent[part] != part:
+        parent[part] = parent[parent[part]]
+        part = parent[part]
+    return part
+
+
+@routine
+def _join(parent: Ints, sums: Sums, first: int, second: int) -> int:
+    """Make one blob of two, given by their first parts; returns its first part."""
+    into = min(first, second)
+    other = max(first, second)
+    parent[other] = into
+    for m in range(_AREA + 1):
+        sums[into, m] += sums[other, m]
+    for m in (_X0, _Y0):
+        sums[into, m] = min(sums[into, m], sums[other, m])
+    for m in (_X1, _Y1, _PEAK):
+        sums[into, m] = max(sums[into, m], sums[other, m])
+    return into
+
+
+@routine
+def _add_run(opponent: Signal, y: int, start: int, size: int, at: int, is_new: bool, sums: Sums) -> None:
+    """Add a run to the sums of its part. Sums of integers are exact in any order."""
+    w = np.int64(0)
+    wx = np.int64(0)
+    wxx = np.int64(0)
+    top = np.int64(0)
+    for k in range(size):
+        v = abs(np.int64(opponent[y, np.uint64(start) + np.uint64(k)]))
+        w += v
+        wx += v * k
+        wxx += v * k * k
+        top = max(top, v)
+    wxx += start * (2 * wx + start * w)
+    wx += start * w
+    if is_new:
+        sums[at, _W], sums[at, _WX], sums[at, _WY] = w, wx, w * y
+        sums[at, _WXX], sums[at, _WXY], sums[at, _WYY] = wxx, wx * y, w * y * y
+        sums[at, _AREA], sums[at, _PEAK] = size, top
+        sums[at, _X0], sums[at, _X1], sums[at, _Y0], sums[at, _Y1] = start, start + size - 1, y, y
+    else:
+        sums[at, _W] += w
+        sums[at, _WX] += wx
+        sums[at, _WY] += w * y
+        sums[at, _WXX] += wxx
+        sums[at, _WXY] += wx * y
+        sums[at, _WYY] += w * y * y
+        sums[at, _AREA] += size
+        sums[at, _X0] = min(sums[at, _X0], start)
+        sums[at, _X1] = max(sums[at, _X1], start + size - 1)
+        sums[at, _Y1] = y
+        sums[at, _PEAK] = max(sums[at, _PEAK], top)
+
+
+@ieee_kernel
+def _join_runs(opponent: Signal, runs: Runs, parent: Ints, sums: Sums, sign: Marks) -> int:
+    """Join runs that touch, diagonals included, to parts of blobs; returns the number of parts.
+
+    Parameters
+    ----------
+    opponent : ndarray of int16, shape (H, W)
+        The signal, whose strength is the weight.
+    runs : ndarray of int16, shape (R, 4)
+        Of `_find_runs`.
+    parent : ndarray of int32, shape (R,)
+        Set to another part of the same blob, itself for the blob's first part.
+    sums : ndarray of int64, shape (R, 12)
+        Set to weighted sums of a blob's runs at its first part: w, wx, wy, wxx, wxy, wyy, area, x0, x1, y0, y1, peak.
+    sign : ndarray of int8, shape (R,)
+        Set to the colour of each part.
+    """
+    part_of = np.empty(runs.shape[0], np.int32)
+    parts = 0
+    begin = 0  # first run of the row
+    above = 0  # first run of the row above that may touch this one or a later one
+    row = -2
+    for r in range(runs.shape[0]):
+        y, start, stop, colour = np.int64(runs[r, 0]), np.int64(runs[r, 1]), np.int64(runs[r, 2]), runs[r, 3]
+        if y != row:
+            above = begin if y == row + 1 else r
+            begin = r
+            row = y
+        while above < begin and runs[above, 2] < start:
+            above += 1
+        part = -1
+        k = above
+        while k < begin and runs[k, 1] <= stop:
+            if runs[k, 3] == colour:
+                touched = _first_part(parent, part_of[k])
+                if part < 0:
+                    part = touched
+                elif part != touched:
+                    part = _join(parent, sums, part, touched)
+            k += 1
+        is_new = part < 0
+        if is_new:
+            part = parts
+            parent[part] = part
+            sign[part] = colour
+            parts += 1
+        _add_run(opponent, y, start, stop - start, part, is_new, sums)
+        part_of[r] = part
+    return parts
 
 
 @step
-def _first_run(parent: npt.NDArray[np.int32], run: int) -> int:
-    """First run of the blob that a run belongs to; shortens the way to it."""
-    while parent[run] != run:
-        parent[run] = parent[parent[run]]
-        run = parent[run]
-    return run
-
-
-@step
-def _join(runs: _Runs, a: int, b: int) -> None:
-    """Make one blob of the two that these runs belong to."""
-    first = _first_run(runs.parent, a)
-    second = _first_run(runs.parent, b)
-    if first != second:
-        into = min(first, second)
-        other = max(first, second)
-        runs.parent[other] = into
-        for m in range(_AREA + 1):
-            runs.sums[into, m] += runs.sums[other, m]
-        for m in (_X0, _Y0):
-            runs.sums[into, m] = min(runs.sums[into, m], runs.sums[other, m])
-        for m in (_X1, _Y1, _PEAK):
-            runs.sums[into, m] = max(runs.sums[into, m], runs.sums[other, m])
-
-
-@step
-def _write_blob(sums: Floats, sign: float, blob: Floats) -> None:
+def _write_blob(sums: Sums, sign: float, blob: Floats) -> None:
     """Centroid and central moments from sums; the variance of a pixel's own square is added to the moments."""
-    mean_x = sums[_WX] / sums[_W]
-    mean_y = sums[_WY] / sums[_W]
+    weight = np.float64(sums[_W])
+    mean_x = sums[_WX] / weight
+    mean_y = sums[_WY] / weight
     blob[SIGN] = sign
-    blob[WEIGHT] = sums[_W]
+    blob[WEIGHT] = weight
     blob[X] = mean_x
     blob[Y] = mean_y
-    blob[XX] = sums[_WXX] / sums[_W] - mean_x * mean_x + PIXEL_VARIANCE
-    blob[XY] = sums[_WXY] / sums[_W] - mean_x * mean_y
-    blob[YY] = sums[_WYY] / sums[_W] - mean_y * mean_y + PIXEL_VARIANCE
+    blob[XX] = sums[_WXX] / weight - mean_x * mean_x + PIXEL_VARIANCE
+    blob[XY] = sums[_WXY] / weight - mean_x * mean_y
+    blob[YY] = sums[_WYY] / weight - mean_y * mean_y + PIXEL_VARIANCE
     for m in range(AREA, COLUMNS):
         blob[m] = sums[m - 1]
 
 
 @ieee_kernel
-def _add_blobs(level: _Level, blobs: Floats, count: int) -> int:
-    """Add the blobs at one level, moments weighted by the signal; returns how many there are then."""
-    height, width = level.opponent.shape
-    runs = _Runs(
-        np.empty(MAX_RUNS, np.int32), np.empty((MAX_RUNS, 12)), np.empty(MAX_RUNS, np.int8),
-        np.empty(MAX_RUNS, np.int32), np.empty(MAX_RUNS, np.int32),
-    )  # fmt: skip
-    found = 0
-    above = 0  # first run of the row above
-    for y in range(height):
-        begin = found
-        x = 0
-        while found < MAX_RUNS:
-            x = _run_start(level, y, x)
-            if x >= width:
-                break
-            start = x
-            sign = 1 if level.opponent[y, x] > 0 else -1
-            x = _measure_run(level, y, start, sign, runs.sums[found])
-            runs.parent[found] = found
-            runs.sign[found] = sign
-            runs.first[found] = start
-            runs.last[found] = x - 1
-            # runs of the row above that touch this one, diagonals included
-            while above < begin and runs.last[above] < start - 1:
-                above += 1
-            k = above
-            while k < begin and runs.first[k] <= x:
-                if runs.sign[k] == sign:
-                    _join(runs, k, found)
-                k += 1
-            found += 1
-        above = begin
-    for i in range(found):
-        if runs.parent[i] == i and runs.sums[i, _AREA] >= MIN_AREA and count < MAX_BLOBS:
-            _write_blob(runs.sums[i], runs.sign[i], blobs[count])
+def _write_blobs(parent: Ints, sums: Sums, sign: Marks, blobs: Floats, count: int) -> int:
+    """Add the blobs that parts make; returns how many there are then."""
+    for i in range(parent.size):
+        if parent[i] == i and sums[i, _AREA] >= MIN_AREA and count < MAX_BLOBS:
+            _write_blob(sums[i], sign[i], blobs[count])
             count += 1
     return count

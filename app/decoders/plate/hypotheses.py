@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from app.decoders.compiled import kernel, routine, step
 from app.decoders.plate.profiles import Floats, Ints
@@ -26,8 +27,11 @@ MIN_UNIT_SHARE, MOST_UNITS = 0.003, 9
 """[1, units] share of a unit in a pixel below which it is left out, and units of a pixel at most. Source: by hand."""
 EDGE_SLOPE = 1.702
 """[1] slope of the logistic function that is nearest to the normal distribution's."""
-MAX_EXPONENT = 15.0
-"""[1] beyond which a logistic function is 0 or 1. Source: chosen by hand."""
+MAX_DECAY = 40.0
+"""[1] exponent beyond which an exponential counts as that of this. Source: chosen by hand."""
+MIN_PIVOT = 1e-7
+"""[1] square of a diagonal entry of a factor at least, relative to the light. Source: rounding of single precision."""
+Singles = npt.NDArray[np.float32]
 
 
 class PlatePixels(NamedTuple):
@@ -108,7 +112,7 @@ class Spots(NamedTuple):
 
     Attributes
     ----------
-    shapes : ndarray, shape (spots, 6)
+    shapes : ndarray, shape (6, spots)
         Centre around the unit's, inverse shape xx, xy, yy, mean radius. [mm]
     paints, opacities : ndarray
         Reflectances [white] and shares of the light that the paint hides.
@@ -149,30 +153,65 @@ class Around(NamedTuple):
 
 
 @routine
-def _dot(x: Floats, y: Floats, size: int) -> float:
+def _subtract_rows(row: Singles, a: Singles, b: Singles, c: Singles, d: Singles, by: Singles) -> None:
+    """Subtract multiples of four rows from one."""
+    p, q, r, s = by[0], by[1], by[2], by[3]
+    for k in range(row.size):
+        row[k] -= p * a[k] + q * b[k] + r * c[k] + s * d[k]
+
+
+@routine
+def _factorize(matrix: Singles) -> float:
+    """Replace the upper triangle of the first columns by the transposed Cholesky factor, the others by forward
+    substitution; returns half the logarithm of the determinant.
+
+    Rows are subtracted from rows, four at a time, so that the loop over columns is compiled to vector instructions.
+    """
     total = 0.0
-    for k in range(size):
-        total += x[k] * y[k]
+    by = np.empty(4, np.float32)
+    for i in range(matrix.shape[0]):
+        row = matrix[i, i:]
+        for block in range(i // 4):
+            j = 4 * block
+            for k in range(4):
+                by[k] = matrix[j + k, i]
+            _subtract_rows(row, matrix[j, i:], matrix[j + 1, i:], matrix[j + 2, i:], matrix[j + 3, i:], by)
+        for j in range(i // 4 * 4, i):
+            factor = matrix[j, i]
+            other = matrix[j, i:]
+            for k in range(row.size):
+                row[k] -= factor * other[k]
+        pivot = max(np.float64(row[0]), MIN_PIVOT)
+        total += math.log(pivot)
+        scale = np.float32(1.0 / math.sqrt(pivot))
+        for k in range(row.size):
+            row[k] *= scale
+    return 0.5 * total
+
+
+@routine
+def _column_square(matrix: Singles, column: int) -> float:
+    """Sum of the squares of a column."""
+    total = 0.0
+    for i in range(matrix.shape[0]):
+        total += np.float64(matrix[i, column]) * matrix[i, column]
     return total
 
 
 @routine
-def _factorize(matrix: Floats, size: int) -> float:
-    """Replace the lower triangle by its Cholesky factor; returns half the logarithm of the determinant."""
-    total = 0.0
-    for i in range(size):
-        for j in range(i):
-            matrix[i, j] = (matrix[i, j] - _dot(matrix[i], matrix[j], j)) / matrix[j, j]
-        matrix[i, i] = math.sqrt(max(matrix[i, i] - _dot(matrix[i], matrix[i], i), 1e-12))
-        total += math.log(matrix[i, i])
-    return total
-
-
-@routine
-def _substitute(factor: Floats, values: Floats, size: int) -> None:
-    """Forward substitution in place."""
-    for i in range(size):
-        values[i] = (values[i] - _dot(factor[i], values, i)) / factor[i, i]
+def _exp_down(x: float) -> float:
+    """exp(-x) for x of 0 to 40 to a relative 1e-5, without branches: a series at x / 256, squared eight times."""
+    y = min(x, MAX_DECAY) * (-1.0 / 256.0)
+    value = 1.0 + y * (1.0 + y * (1.0 / 2.0 + y * (1.0 / 6.0 + y * (1.0 / 24.0 + y * (1.0 / 120.0)))))
+    value *= value
+    value *= value
+    value *= value
+    value *= value
+    value *= value
+    value *= value
+    value *= value
+    value *= value
+    return value
 
 
 @step
@@ -182,17 +221,16 @@ def _distance2(places_mm: Floats, p: int, x_mm: float, y_mm: float) -> float:
     return right * right + down * down
 
 
-@step
-def _cover(spot: Floats, x_mm: float, y_mm: float, blur_mm: float) -> float:
-    """Share of a blurred point beside a unit's centre that a spot covers."""
-    x = x_mm - spot[0]
-    y = y_mm - spot[1]
-    radius = math.sqrt(spot[2] * x * x + 2.0 * spot[3] * x * y + spot[4] * y * y)
-    inside = EDGE_SLOPE * (1.0 - radius) * spot[5] / blur_mm
-    cover = 1.0 if inside > 0.0 else 0.0
-    if abs(inside) < MAX_EXPONENT:
-        cover = 1.0 / (1.0 + math.exp(-inside))
-    return cover
+@routine
+def _set_cover(spots: Floats, x_mm: float, y_mm: float, blur_mm: float, cover: Floats) -> None:
+    """Set the share of a blurred point beside a unit's centre that each spot covers; `spots` has a row a property."""
+    for g in range(cover.size):
+        x = x_mm - spots[0, g]
+        y = y_mm - spots[1, g]
+        radius = math.sqrt(spots[2, g] * x * x + 2.0 * spots[3, g] * x * y + spots[4, g] * y * y)
+        inside = EDGE_SLOPE * (1.0 - radius) * spots[5, g] / blur_mm
+        away = 1.0 / (1.0 + _exp_down(abs(inside)))
+        cover[g] = away if inside > 0.0 else 1.0 - away
 
 
 @step
@@ -223,113 +261,155 @@ def _find_around(pixels: PlatePixels, pattern: PlatePattern, field: Floats, unit
     return Around(unit, near[:size].copy(), light / max(size, 1), sign * (1.0 - pattern.dark_albedo), own)
 
 
+class Local(NamedTuple):
+    """The pixels around one unit, their light and covariances relative to the mean light.
+
+    Attributes
+    ----------
+    x_mm, y_mm : ndarray, shape (size,)
+        From the unit's centre.
+    seen, flipped, share : ndarray, shape (size,)
+        Reflectance that each pixel sees of the pattern, and with the unit flipped; share of the unit.
+    reach : ndarray, shape (size,)
+        What the distance from the unit takes off a smooth stain.
+    noise : ndarray, shape (size,)
+    units : ndarray, shape (units, size)
+        Shares of all units.
+    paint : ndarray, shape (size,)
+        Memory for a row of the paints' covariance.
+    """
+
+    x_mm: Floats
+    y_mm: Floats
+    seen: Floats
+    flipped: Floats
+    share: Floats
+    reach: Floats
+    noise: Floats
+    units: Floats
+    paint: Floats
+
+
 @step
-def _set_covariances(
-    pixels: PlatePixels, pattern: PlatePattern, light: LightPrior, shown: ShownUnits, around: Around, covariance: Floats
-) -> None:
-    """Set the lower triangles of the covariances of the unit as read, flipped, and the two under a smooth stain."""
-    units, places_mm, unit = pixels.units, pixels.places_mm, around.unit
-    x_mm, y_mm = pattern.centres_mm[unit, 0], pattern.centres_mm[unit, 1]
-    scale = around.light * around.light
-    for i in range(around.pixels.size):
+def _look_around(
+    pixels: PlatePixels, pattern: PlatePattern, light: LightPrior, by_unit: Floats, around: Around
+) -> Local:
+    """Gather what is known of the pixels around a unit, so that what follows runs over neighbours in memory."""
+    size, unit = around.pixels.size, around.unit
+    local = Local(
+        np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size),
+        np.empty((by_unit.shape[0], size)), np.empty(size),
+    )  # fmt: skip
+    for i in range(size):
         p = around.pixels[i]
-        as_read = pattern.seen[p]
-        flipped = as_read + around.change * units[p, unit]
-        from_unit2 = _distance2(places_mm, p, x_mm, y_mm)
-        for j in range(i + 1):
-            q = around.pixels[j]
-            apart2 = _distance2(places_mm, p, places_mm[q, 0], places_mm[q, 1])
-            smooth = light.spread * light.spread * math.exp(-math.sqrt(apart2) / light.length_mm) + light.level_variance
-            paint = 0.0
-            for k in range(shown.lengths[p]):
-                other = shown.listed[p, k]
-                spread = DARK_SPREAD if pattern.dark[other] > 0.5 else WHITE_SPREAD
-                paint += spread * spread * units[p, other] * units[q, other]
-            reach2 = (from_unit2 + _distance2(places_mm, q, x_mm, y_mm)) / (STAIN_REACH_MM * STAIN_REACH_MM)
-            length2 = apart2 / (STAIN_LENGTH_MM * STAIN_LENGTH_MM)
-            stain = STAIN_SPREAD * STAIN_SPREAD * math.exp(-0.5 * (reach2 + length2))
-            other_flipped = pattern.seen[q] + around.change * units[q, unit]
-            read_term = smooth * as_read * pattern.seen[q] + paint
-            flip_term = smooth * flipped * other_flipped + paint + around.own * units[p, unit] * units[q, unit]
-            covariance[0, i, j] = scale * read_term
-            covariance[1, i, j] = scale * flip_term
-            covariance[2, i, j] = scale * (read_term + stain)
-            covariance[3, i, j] = scale * (flip_term + stain)
-        for h in range(4):
-            covariance[h, i, i] += light.noise[p]
+        local.x_mm[i] = pixels.places_mm[p, 0] - pattern.centres_mm[unit, 0]
+        local.y_mm[i] = pixels.places_mm[p, 1] - pattern.centres_mm[unit, 1]
+        from_unit2 = local.x_mm[i] * local.x_mm[i] + local.y_mm[i] * local.y_mm[i]
+        local.reach[i] = STAIN_SPREAD * math.exp(-0.5 * from_unit2 / (STAIN_REACH_MM * STAIN_REACH_MM))
+        local.share[i] = by_unit[unit, p]
+        local.seen[i] = pattern.seen[p]
+        local.flipped[i] = pattern.seen[p] + around.change * by_unit[unit, p]
+        local.noise[i] = light.noise[p] / (around.light * around.light)
+    for u in range(by_unit.shape[0]):
+        for i in range(size):
+            local.units[u, i] = by_unit[u, around.pixels[i]]
+    return local
+
+
+@step
+def _set_paint(pattern: PlatePattern, shown: ShownUnits, around: Around, local: Local, i: int) -> None:
+    """Set a row of the covariance that the units' own reflectances give, from pixel i on."""
+    paint = local.paint[i:]
+    paint[:] = 0.0
+    p = around.pixels[i]
+    for k in range(shown.lengths[p]):
+        other = shown.listed[p, k]
+        spread = DARK_SPREAD if pattern.dark[other] > 0.5 else WHITE_SPREAD
+        weight = spread * spread * local.units[other, i]
+        shares = local.units[other, i:]
+        for j in range(paint.size):
+            paint[j] += weight * shares[j]
+
+
+@routine
+def _set_row(
+    light: LightPrior, local: Local, own: float, i: int, read: Singles, flip: Singles, stained: Singles, both: Singles
+) -> None:
+    """Set a row of the four covariances from pixel i on: as read, flipped, and the two under a smooth stain."""
+    x_mm, y_mm, seen, flipped = local.x_mm[i:], local.y_mm[i:], local.seen[i:], local.flipped[i:]
+    share, reach, paint = local.share[i:], local.reach[i:], local.paint[i:]
+    x0, y0, seen0, flipped0, reach0 = x_mm[0], y_mm[0], seen[0], flipped[0], reach[0]
+    own0 = own * share[0]
+    for j in range(x_mm.size):
+        right = x_mm[j] - x0
+        down = y_mm[j] - y0
+        apart2 = right * right + down * down
+        smooth = light.spread * light.spread * _exp_down(math.sqrt(apart2) / light.length_mm) + light.level_variance
+        stain = reach0 * reach[j] * _exp_down(0.5 * apart2 / (STAIN_LENGTH_MM * STAIN_LENGTH_MM))
+        read_term = smooth * seen0 * seen[j] + paint[j]
+        flip_term = smooth * flipped0 * flipped[j] + paint[j] + own0 * share[j]
+        read[j] = read_term
+        flip[j] = flip_term
+        stained[j] = read_term + stain
+        both[j] = flip_term + stain
+    noise = local.noise[i]
+    read[0] += noise
+    flip[0] += noise
+    stained[0] += noise
+    both[0] += noise
 
 
 @routine
 def _set_covered(
-    pixels: PlatePixels, pattern: PlatePattern, around: Around, spots: Floats, covered: Floats, hidden: Floats
+    pixels: PlatePixels, pattern: PlatePattern, around: Around, local: Local, spots: Floats, columns: Singles
 ) -> None:
-    """Set the light that each white spot would send to each pixel, and the light of what it hides, a column a spot."""
-    unit = around.unit
-    unit_albedo = 1.0 if pattern.dark[unit] > 0.5 else pattern.dark_albedo  # of the unit flipped
+    """Set the light that each white spot would send to each pixel, then that of what it hides, a column a spot."""
+    count = spots.shape[1]
+    beside = np.empty(count)
+    on_unit = np.empty(count)
+    unit_albedo = 1.0 if pattern.dark[around.unit] > 0.5 else pattern.dark_albedo  # of the unit flipped
     inner = pattern.inner_mm
     for i in range(around.pixels.size):
-        p = around.pixels[i]
-        share = pixels.units[p, unit]
-        x = pixels.places_mm[p, 0] - pattern.centres_mm[unit, 0]
-        y = pixels.places_mm[p, 1] - pattern.centres_mm[unit, 1]
+        share = local.share[i]
+        x = local.x_mm[i]
+        y = local.y_mm[i]
         # what a pixel beside the unit sees of it is the part that is nearest
         nearest_x = min(max(x, -inner), inner)
         nearest_y = min(max(y, -inner), inner)
-        shows_elsewhere = share > MIN_UNIT_SHARE and (nearest_x != x or nearest_y != y)
-        others = pattern.seen[p] + around.change * share - share * unit_albedo
-        for g in range(spots.shape[0]):
-            beside = _cover(spots[g], x, y, pixels.blur_mm)
-            on_unit = beside
-            if shows_elsewhere:
-                on_unit = _cover(spots[g], nearest_x, nearest_y, pixels.blur_mm)
-            covered[i, g] = around.light * ((1.0 - share) * beside + share * on_unit)
-            hidden[i, g] = around.light * (beside * others + on_unit * share * unit_albedo)
-
-
-@routine
-def _substitute_columns(factor: Floats, columns: Floats, size: int) -> None:
-    """Forward substitution of all columns in place."""
-    for i in range(size):
-        row = columns[i]
-        j = 0
-        while j + 4 <= i:  # four rows at a time, so that the row is loaded and stored a fourth as often
-            a, b, c, d = factor[i, j], factor[i, j + 1], factor[i, j + 2], factor[i, j + 3]
-            for k in range(row.size):
-                row[k] -= a * columns[j, k] + b * columns[j + 1, k] + c * columns[j + 2, k] + d * columns[j + 3, k]
-            j += 4
-        while j < i:
-            for k in range(row.size):
-                row[k] -= factor[i, j] * columns[j, k]
-            j += 1
-        scale = 1.0 / factor[i, i]
-        for k in range(row.size):
-            row[k] *= scale
+        own, others = share, local.flipped[i] - share * unit_albedo
+        _set_cover(spots, x, y, pixels.blur_mm, beside)
+        if share > MIN_UNIT_SHARE and (nearest_x != x or nearest_y != y):
+            _set_cover(spots, nearest_x, nearest_y, pixels.blur_mm, on_unit)
+        else:
+            on_unit[:] = beside
+        covered = columns[i, :count]
+        hidden = columns[i, count:]
+        for g in range(count):
+            covered[g] = (1.0 - own) * beside[g] + own * on_unit[g]
+            hidden[g] = beside[g] * others + on_unit[g] * own * unit_albedo
 
 
 @step
-def _spot_likelihood(
-    pixels: PlatePixels, pattern: PlatePattern, around: Around, spots: Spots, factor: Floats, residual: Floats
-) -> float:
+def _spot_likelihood(spots: Spots, matrix: Singles, first: int) -> float:
     """Mean likelihood of the spots, as a logarithm without the determinant.
 
-    `factor` is that of the unit as read: a spot that hides a unit looks like what was read, so its light varies alike.
+    `matrix` is factorized with the covariance of the unit as read: a spot that hides a unit looks like what was read,
+    so its light varies alike. From column `first` on: residual of the unit flipped, covered, hidden.
     """
-    size, count = around.pixels.size, spots.shapes.shape[0]
-    covered = np.empty((size, count))
-    hidden = np.empty((size, count))
-    _substitute(factor, residual, size)
-    square = _dot(residual, residual, size)
-    _set_covered(pixels, pattern, around, spots.shapes, covered, hidden)
-    _substitute_columns(factor, covered, size)
-    _substitute_columns(factor, hidden, size)
+    count = spots.shapes.shape[1]
     sums = np.zeros((5, count))
-    for i in range(size):
+    square = 0.0
+    for i in range(matrix.shape[0]):
+        residual = np.float64(matrix[i, first])
+        square += residual * residual
+        covered = matrix[i, first + 1 : first + 1 + count]
+        hidden = matrix[i, first + 1 + count :]
         for g in range(count):
-            sums[0, g] += residual[i] * covered[i, g]
-            sums[1, g] += residual[i] * hidden[i, g]
-            sums[2, g] += covered[i, g] * covered[i, g]
-            sums[3, g] += covered[i, g] * hidden[i, g]
-            sums[4, g] += hidden[i, g] * hidden[i, g]
+            sums[0, g] += residual * covered[g]
+            sums[1, g] += residual * hidden[g]
+            sums[2, g] += covered[g] * covered[g]
+            sums[3, g] += covered[g] * hidden[g]
+            sums[4, g] += hidden[g] * hidden[g]
     top = -1e300
     total = 0.0
     for g in range(count):
@@ -341,9 +421,41 @@ def _spot_likelihood(
                 if value > top:
                     total = total * math.exp(max(top - value, -700.0)) + 1.0
                     top = value
-                else:
-                    total += math.exp(max(value - top, -700.0))
+                elif value > top - MAX_DECAY:
+                    total += math.exp(value - top)
     return top + math.log(total / (count * spots.paints.shape[0] * spots.opacities.shape[0]))
+
+
+@step
+def _compare_unit(
+    pixels: PlatePixels, pattern: PlatePattern, light: LightPrior, spots: Spots, by_unit: Floats, shown: ShownUnits,
+    around: Around, likelihoods: Floats,
+) -> None:  # fmt: skip
+    """Set the log likelihoods of the pixels around one unit. All light is relative to the mean around it."""
+    size, count = around.pixels.size, spots.shapes.shape[1]
+    local = _look_around(pixels, pattern, light, by_unit, around)
+    as_read = np.empty((size, size + 2 + 2 * count), np.float32)
+    others = np.empty((3, size, size + 1), np.float32)
+    for i in range(size):
+        _set_paint(pattern, shown, around, local, i)
+        _set_row(
+            light, local, around.own, i,
+            as_read[i, i:size], others[0, i, i:size], others[1, i, i:size], others[2, i, i:size],
+        )  # fmt: skip
+        level = pixels.light[around.pixels[i]] / around.light
+        as_read[i, size] = level - local.seen[i]
+        as_read[i, size + 1] = level - local.flipped[i]
+        others[0, i, size] = level - local.flipped[i]
+        others[1, i, size] = level - local.seen[i]
+        others[2, i, size] = level - local.flipped[i]
+    _set_covered(pixels, pattern, around, local, spots.shapes, as_read[:, size + 2 :])
+    scale = size * math.log(around.light)
+    half = _factorize(as_read) + scale
+    likelihoods[0] = -0.5 * _column_square(as_read, size) - half
+    likelihoods[4] = _spot_likelihood(spots, as_read, size + 1) - half
+    for h in range(3):
+        half = _factorize(others[h]) + scale
+        likelihoods[h + 1] = -0.5 * _column_square(others[h], size) - half
 
 
 @kernel
@@ -363,28 +475,10 @@ def set_unit_likelihoods(
         of paint, on average over the spots.
     """
     shown = _list_units(pixels.units)
+    by_unit = pixels.units.T.copy()
     for u in range(pixels.units.shape[1]):
         around = _find_around(pixels, pattern, light.field, u)
-        size = around.pixels.size
-        if size < MIN_PIXELS:
+        if around.pixels.size < MIN_PIXELS:
             likelihoods[u] = 0.0
-            continue
-        covariance = np.empty((4, size, size))
-        _set_covariances(pixels, pattern, light, shown, around, covariance)
-        residual = np.empty((5, size))
-        for i in range(size):
-            p = around.pixels[i]
-            residual[0, i] = pixels.light[p] - around.light * pattern.seen[p]
-            residual[1, i] = residual[0, i] - around.light * around.change * pixels.units[p, u]
-            residual[2, i] = residual[0, i]
-            residual[3, i] = residual[1, i]
-            residual[4, i] = residual[1, i]
-        half_determinant = 0.0
-        for h in range(4):
-            half = _factorize(covariance[h], size)
-            _substitute(covariance[h], residual[h], size)
-            likelihoods[u, h] = -0.5 * _dot(residual[h], residual[h], size) - half
-            if h == 0:
-                half_determinant = half
-        spotted = _spot_likelihood(pixels, pattern, around, spots, covariance[0], residual[4])
-        likelihoods[u, 4] = spotted - half_determinant
+        else:
+            _compare_unit(pixels, pattern, light, spots, by_unit, shown, around, likelihoods[u])

@@ -44,6 +44,8 @@ hand."""
 SIZE_RATIO_RANGE = (1.6, 7.5)
 """[1] distance between marker centres over the side of a marker. Source: 3.2 to 5.3 (`MARKER_RATIO`), halved and half
 as much again for blur and wear."""
+SIZE6_RANGE = (0.999 * SIZE_RATIO_RANGE[0] ** 6, 1.001 * SIZE_RATIO_RANGE[1] ** 6)
+"""[1] sixth power of the same, for a test without roots, with room for rounding."""
 MAX_TRIPLE_SHAPE, MAX_PAIR_SHAPE, MAX_FOURTH_SHAPE = 6.05, 9.03, 12.2
 """[1] shape ratio of each of three squares, of each of two beside a triangle, of the remaining one. Source: e^1.8,
 e^2.2, e^2.5; chosen by hand."""
@@ -106,11 +108,11 @@ def _square_moments(sides: _Sides, size_ratio: float) -> _Moments:
 
 
 @ieee_routine
-def _shape_ratio(blob: Floats, expected: _Moments) -> float:
+def _shape_ratio(blobs: Floats, k: int, expected: _Moments) -> float:
     """Largest eigenvalue of inv(expected) measured, or of its inverse: 1 where both shapes agree."""
-    xx = blob[XX] + BLUR_VARIANCE
-    yy = blob[YY] + BLUR_VARIANCE
-    xy = blob[XY]
+    xx = blobs[k, XX] + BLUR_VARIANCE
+    yy = blobs[k, YY] + BLUR_VARIANCE
+    xy = blobs[k, XY]
     det = expected.xx * expected.yy - expected.xy * expected.xy
     if det <= 0:
         return NO_SHAPE
@@ -128,9 +130,9 @@ def _shape_ratio(blob: Floats, expected: _Moments) -> float:
 
 
 @ieee_routine
-def _reach_px(blob: Floats) -> float:
+def _reach_px(blobs: Floats, k: int) -> float:
     """How far from a marker another one of its plate may be."""
-    extent: float = max(blob[X1] - blob[X0], blob[Y1] - blob[Y0])
+    extent: float = max(blobs[k, X1] - blobs[k, X0], blobs[k, Y1] - blobs[k, Y0])
     return SEARCH_SIDES * extent + SEARCH_PX
 
 
@@ -155,19 +157,18 @@ def _keep_nearest(near: Ints, misfits: Floats, count: int, blob: int, misfit: fl
 @step
 def _squares_near(blobs: Floats, greens: Ints, a: int, near: Ints, misfits: Floats) -> int:
     """The green blobs around a green one that may be squares of its plate, the most alike first; how many."""
-    corner = blobs[greens[a]]
-    reach = _reach_px(corner)
+    corner = greens[a]
+    x, y, area, peak = blobs[corner, X], blobs[corner, Y], blobs[corner, AREA], blobs[corner, PEAK]
+    reach = _reach_px(blobs, corner)
     count = 0
     for b in range(greens.shape[0]):
-        other = blobs[greens[b]]
-        if b == a or abs(other[X] - corner[X]) > reach or abs(other[Y] - corner[Y]) > reach:
+        other = greens[b]
+        if b == a or abs(blobs[other, X] - x) > reach or abs(blobs[other, Y] - y) > reach:
             continue
-        ratio = max(other[AREA] / corner[AREA], corner[AREA] / other[AREA])
-        if ratio > MAX_SQUARE_RATIO or max(other[PEAK], corner[PEAK]) > MAX_SQUARE_RATIO * min(
-            other[PEAK], corner[PEAK]
-        ):
+        ratio = max(blobs[other, AREA] / area, area / blobs[other, AREA])
+        if ratio > MAX_SQUARE_RATIO or max(blobs[other, PEAK], peak) > MAX_SQUARE_RATIO * min(blobs[other, PEAK], peak):
             continue
-        count = _keep_nearest(near, misfits, count, greens[b], ratio)
+        count = _keep_nearest(near, misfits, count, other, ratio)
     return count
 
 
@@ -186,50 +187,59 @@ def _red_at(opponent: Signal, x: float, y: float, sides: _Sides, size_ratio: flo
 
 
 @step
-def _triple_shape_ratio(corner: Floats, right: Floats, below: Floats, moments: _Moments) -> float:
+def _triple_shape_ratio(blobs: Floats, corner: int, right: int, below: int, moments: _Moments) -> float:
     """Largest shape ratio of three squares; the first above the limit ends the search."""
-    shape = _shape_ratio(corner, moments)
+    shape = _shape_ratio(blobs, corner, moments)
     if shape <= MAX_TRIPLE_SHAPE:
-        shape = max(shape, _shape_ratio(right, moments))
+        shape = max(shape, _shape_ratio(blobs, right, moments))
     if shape <= MAX_TRIPLE_SHAPE:
-        shape = max(shape, _shape_ratio(below, moments))
+        shape = max(shape, _shape_ratio(blobs, below, moments))
     return shape
 
 
 @step
-def _add_triple(corner: Floats, right: Floats, below: Floats, opponent: Signal, quads: Floats, found: int) -> int:
+def _add_triple(
+    blobs: Floats, corner: int, right: int, below: int, opponent: Signal, quads: Floats, found: int
+) -> int:
     """Add the quadruple of three green squares, where there is something red in the triangle's place.
 
     `corner` is the square opposite the triangle, `right` the one above it and `below` the one to its left.
     """
-    sides = _Sides(corner[X] - below[X], corner[Y] - below[Y], corner[X] - right[X], corner[Y] - right[Y])
+    xc, yc, xr, yr, xb, yb = (
+        blobs[corner, X], blobs[corner, Y], blobs[right, X], blobs[right, Y], blobs[below, X], blobs[below, Y]
+    )  # fmt: skip
+    sides = _Sides(xc - xb, yc - yb, xc - xr, yc - yr)
     cross = sides.px * sides.qy - sides.py * sides.qx
     if cross < MIN_CROSS_PX2:
         return found
-    size_ratio = math.sqrt(cross / (right[AREA] * below[AREA] * corner[AREA]) ** (1.0 / 3.0))
+    area_right, area_below = blobs[right, AREA], blobs[below, AREA]
+    areas = area_right * area_below * blobs[corner, AREA]
+    if not SIZE6_RANGE[0] * areas < cross * cross * cross < SIZE6_RANGE[1] * areas:
+        return found
+    size_ratio = math.sqrt(cross / areas ** (1.0 / 3.0))
     if size_ratio < SIZE_RATIO_RANGE[0] or size_ratio > SIZE_RATIO_RANGE[1]:
         return found
-    shape = _triple_shape_ratio(corner, right, below, _square_moments(sides, size_ratio))
+    shape = _triple_shape_ratio(blobs, corner, right, below, _square_moments(sides, size_ratio))
     if shape > MAX_TRIPLE_SHAPE:
         return found
     # the triangle's centroid is nearer to the plate's corner than a square's: a third of its side, not a half
-    x = right[X] + below[X] - corner[X] - (sides.px + sides.qx) * (TRIANGLE_OFFSET / size_ratio)
-    y = right[Y] + below[Y] - corner[Y] - (sides.py + sides.qy) * (TRIANGLE_OFFSET / size_ratio)
+    x = xr + xb - xc - (sides.px + sides.qx) * (TRIANGLE_OFFSET / size_ratio)
+    y = yr + yb - yc - (sides.py + sides.qy) * (TRIANGLE_OFFSET / size_ratio)
     red = _red_at(opponent, x, y, sides, size_ratio)
-    amplitude = (right[PEAK] * below[PEAK] * corner[PEAK]) ** (1.0 / 3.0)
+    amplitude = (blobs[right, PEAK] * blobs[below, PEAK] * blobs[corner, PEAK]) ** (1.0 / 3.0)
     pale = red < PALE_RED * amplitude
-    area_log = abs(math.log(right[AREA] / below[AREA]))
+    area_log = abs(math.log(area_right / area_below))
     if pale and (shape > MAX_PALE_SHAPE or area_log > MAX_PALE_AREA_LOG):
         return found
     quads[found, SCORE] = (
         4.0
         - 0.7 * math.log(shape)
         - 0.5 * area_log
-        - abs(math.log(right[PEAK] / below[PEAK]))
+        - abs(math.log(blobs[right, PEAK] / blobs[below, PEAK]))
         + 0.5 * math.log(max(red, PALE_RED * amplitude) * amplitude)
         - (3.5 if pale else 0.5)
     )
-    _set_centroids(quads[found], x, y, right[X], right[Y], corner[X], corner[Y], below[X], below[Y])
+    _set_centroids(quads, found, x, y, xr, yr, xc, yc, xb, yb)
     quads[found, FOUND] = FOUND_ALL
     quads[found, SIZE_RATIO] = size_ratio
     return found + 1
@@ -237,10 +247,10 @@ def _add_triple(corner: Floats, right: Floats, below: Floats, opponent: Signal, 
 
 @ieee_routine
 def _set_centroids(
-    quad: Floats, x0: float, y0: float, x1: float, y1: float, x2: float, y2: float, x3: float, y3: float
+    quads: Floats, k: int, x0: float, y0: float, x1: float, y1: float, x2: float, y2: float, x3: float, y3: float
 ) -> None:
-    quad[0], quad[1], quad[2], quad[3] = x0, y0, x1, y1
-    quad[4], quad[5], quad[6], quad[7] = x2, y2, x3, y3
+    quads[k, 0], quads[k, 1], quads[k, 2], quads[k, 3] = x0, y0, x1, y1
+    quads[k, 4], quads[k, 5], quads[k, 6], quads[k, 7] = x2, y2, x3, y3
 
 
 @ieee_kernel
@@ -266,9 +276,7 @@ def join_green_triples(blobs: Floats, greens: Ints, opponent: Signal, quads: Flo
         for i in range(count):
             for j in range(count):
                 if i != j:
-                    found = _add_triple(
-                        blobs[greens[a]], blobs[near[i]], blobs[near[j]], opponent, quads, found
-                    )  # fmt: skip
+                    found = _add_triple(blobs, greens[a], near[i], near[j], opponent, quads, found)
     return found
 
 
@@ -276,33 +284,35 @@ def join_green_triples(blobs: Floats, greens: Ints, opponent: Signal, quads: Flo
 
 
 @step
-def _near_greens(blobs: Floats, greens: Ints, red: Floats, near: Ints, misfits: Floats) -> int:
+def _near_greens(blobs: Floats, greens: Ints, red: int, near: Ints, misfits: Floats) -> int:
     """The green blobs around a red one that may be squares of its plate, the likeliest first; how many."""
-    reach = _reach_px(red)
+    x, y, area, peak = blobs[red, X], blobs[red, Y], blobs[red, AREA], blobs[red, PEAK]
+    reach = _reach_px(blobs, red)
     count = 0
     for g in greens:
-        green = blobs[g]
-        if abs(green[X] - red[X]) > reach or abs(green[Y] - red[Y]) > reach:
+        if abs(blobs[g, X] - x) > reach or abs(blobs[g, Y] - y) > reach:
             continue
-        ratio = green[AREA] / red[AREA]
+        ratio = blobs[g, AREA] / area
         if ratio < SQUARE_OF_RED_AREA[0] or ratio > SQUARE_OF_RED_AREA[1]:
             continue
-        if green[PEAK] < MIN_SQUARE_OF_RED_PEAK * red[PEAK]:
+        if blobs[g, PEAK] < MIN_SQUARE_OF_RED_PEAK * peak:
             continue
-        misfit = abs(math.log(ratio / 2.0)) - 0.5 * math.log(green[PEAK])  # a square has twice the triangle's area
+        misfit = abs(math.log(ratio / 2.0)) - 0.5 * math.log(blobs[g, PEAK])  # a square has twice the triangle's area
         count = _keep_nearest(near, misfits, count, g, misfit)
     return count
 
 
 @step
-def _sides_of(role: int, red: Floats, first: Floats, second: Floats) -> _Sides:
+def _sides_of(role: int, blobs: Floats, red: int, first: int, second: int) -> _Sides:
     """Sides that a triangle and two squares imply, by the squares that these are."""
+    x0, y0, x1, y1, x2, y2 = (
+        blobs[red, X], blobs[red, Y], blobs[first, X], blobs[first, Y], blobs[second, X], blobs[second, Y]
+    )  # fmt: skip
     if role == TOP_BOTTOM_ROLE:  # top right and bottom left
-        return _Sides(first[X] - red[X], first[Y] - red[Y], second[X] - red[X], second[Y] - red[Y])
+        return _Sides(x1 - x0, y1 - y0, x2 - x0, y2 - y0)
     if role == TOP_RIGHT_ROLE:  # top right and bottom right
-        return _Sides(first[X] - red[X], first[Y] - red[Y], second[X] - first[X], second[Y] - first[Y])
-    # bottom right and bottom left
-    return _Sides(first[X] - second[X], first[Y] - second[Y], second[X] - red[X], second[Y] - red[Y])
+        return _Sides(x1 - x0, y1 - y0, x2 - x1, y2 - y1)
+    return _Sides(x1 - x2, y1 - y2, x2 - x0, y2 - y0)  # bottom right and bottom left
 
 
 @step
@@ -316,11 +326,10 @@ def _find_fourth(
     for m in range(near.shape[0]):
         if m in (i, j):
             continue
-        blob = blobs[near[m]]
-        ex = blob[X] - x
-        ey = blob[Y] - y
+        ex = blobs[near[m], X] - x
+        ey = blobs[near[m], Y] - y
         off = max(abs(ex * sides.qy - ey * sides.qx), abs(sides.px * ey - sides.py * ex)) / cross
-        if off < best and _shape_ratio(blob, moments) < MAX_FOURTH_SHAPE:
+        if off < best and _shape_ratio(blobs, near[m], moments) < MAX_FOURTH_SHAPE:
             best = off
             fourth = m
     return _Fourth(fourth, best)
@@ -328,45 +337,49 @@ def _find_fourth(
 
 @step
 def _write_quad(
-    role: int, red: Floats, first: Floats, second: Floats, x: float, y: float, is_complete: bool, quad: Floats
-) -> None:
+    role: int, blobs: Floats, red: int, first: int, second: int, x: float, y: float, is_complete: bool, quads: Floats,
+    k: int,
+) -> None:  # fmt: skip
     """Set the centroids and what was found; the remaining square is at x, y."""
+    x0, y0, x1, y1, x2, y2 = (
+        blobs[red, X], blobs[red, Y], blobs[first, X], blobs[first, Y], blobs[second, X], blobs[second, Y]
+    )  # fmt: skip
     if role == TOP_BOTTOM_ROLE:
-        _set_centroids(quad, red[X], red[Y], first[X], first[Y], x, y, second[X], second[Y])
+        _set_centroids(quads, k, x0, y0, x1, y1, x, y, x2, y2)
     elif role == TOP_RIGHT_ROLE:
-        _set_centroids(quad, red[X], red[Y], first[X], first[Y], second[X], second[Y], x, y)
+        _set_centroids(quads, k, x0, y0, x1, y1, x2, y2, x, y)
     else:
-        _set_centroids(quad, red[X], red[Y], x, y, first[X], first[Y], second[X], second[Y])
-    quad[FOUND] = FOUND_ALL if is_complete else _FOUND_BITS[role]
+        _set_centroids(quads, k, x0, y0, x, y, x1, y1, x2, y2)
+    quads[k, FOUND] = FOUND_ALL if is_complete else _FOUND_BITS[role]
 
 
 @step
 def _add_pair(
-    blobs: Floats, red: Floats, near: Ints, i: int, j: int, role: int, complete_seen: bool, quads: Floats, found: int
+    blobs: Floats, red: int, near: Ints, i: int, j: int, role: int, complete_seen: bool, quads: Floats, found: int
 ) -> tuple[int, bool]:
     """Add the quadruple of a red triangle and two squares, with the third where it is found.
 
     Returns how many quadruples there are then, and whether a complete one was seen: after one, incomplete ones of the
     same triangle are left out. Complete ones come once, in the first role.
     """
-    first = blobs[near[i]]
-    second = blobs[near[j]]
-    sides = _sides_of(role, red, first, second)
+    first = near[i]
+    second = near[j]
+    sides = _sides_of(role, blobs, red, first, second)
     cross = sides.px * sides.qy - sides.py * sides.qx
     if cross < MIN_CROSS_PX2:
         return found, complete_seen
     # from the areas in pixels; blur makes small blobs larger
-    size_ratio = math.sqrt(cross / math.sqrt(first[AREA] * second[AREA]))
+    size_ratio = math.sqrt(cross / math.sqrt(blobs[first, AREA] * blobs[second, AREA]))
     if size_ratio < SIZE_RATIO_RANGE[0] or size_ratio > SIZE_RATIO_RANGE[1]:
         return found, complete_seen
     moments = _square_moments(sides, size_ratio)
-    shape = _shape_ratio(first, moments)
+    shape = _shape_ratio(blobs, first, moments)
     if shape <= MAX_PAIR_SHAPE:
-        shape = max(shape, _shape_ratio(second, moments))
+        shape = max(shape, _shape_ratio(blobs, second, moments))
     if shape > MAX_PAIR_SHAPE:
         return found, complete_seen
-    x = red[X] + (sides.px if role != TOP_RIGHT_ROLE else 0.0) + (sides.qx if role != RIGHT_BOTTOM_ROLE else 0.0)
-    y = red[Y] + (sides.py if role != TOP_RIGHT_ROLE else 0.0) + (sides.qy if role != RIGHT_BOTTOM_ROLE else 0.0)
+    x = blobs[red, X] + (sides.px if role != TOP_RIGHT_ROLE else 0.0) + (sides.qx if role != RIGHT_BOTTOM_ROLE else 0.0)
+    y = blobs[red, Y] + (sides.py if role != TOP_RIGHT_ROLE else 0.0) + (sides.qy if role != RIGHT_BOTTOM_ROLE else 0.0)
     fourth = _find_fourth(blobs, near, i, j, x, y, sides, moments)
     is_complete = fourth.near >= 0
     if (is_complete and role != TOP_BOTTOM_ROLE) or (not is_complete and complete_seen):
@@ -374,15 +387,15 @@ def _add_pair(
     quads[found, SCORE] = (
         (5.5 - 6.0 * fourth.distance if is_complete else 0.0)
         - 0.7 * math.log(shape)
-        - 0.3 * math.log(_shape_ratio(red, moments))
-        - 0.5 * abs(math.log(first[AREA] / second[AREA]))
-        + 0.5 * math.log(red[PEAK] * math.sqrt(first[PEAK] * second[PEAK]))
+        - 0.3 * math.log(_shape_ratio(blobs, red, moments))
+        - 0.5 * abs(math.log(blobs[first, AREA] / blobs[second, AREA]))
+        + 0.5 * math.log(blobs[red, PEAK] * math.sqrt(blobs[first, PEAK] * blobs[second, PEAK]))
     )
     quads[found, SIZE_RATIO] = size_ratio
     if is_complete:
         x = blobs[near[fourth.near], X]
         y = blobs[near[fourth.near], Y]
-    _write_quad(role, red, first, second, x, y, is_complete, quads[found])
+    _write_quad(role, blobs, red, first, second, x, y, is_complete, quads, found)
     return found + 1, complete_seen or is_complete
 
 
@@ -394,8 +407,7 @@ def join_red_quads(blobs: Floats, reds: Ints, greens: Ints, quads: Floats, found
     """
     near = np.empty(MAX_NEAR, np.int64)
     misfits = np.empty(MAX_NEAR)
-    for r in reds:
-        red = blobs[r]
+    for red in reds:
         count = _near_greens(blobs, greens, red, near, misfits)
         complete_seen = False
         for i in range(count):

@@ -144,7 +144,7 @@ def _centres_mm(geometry: PlateGeometry) -> Array:
 
 @lru_cache
 def _spot_shapes(pitch_mm: float) -> Array:
-    """Centre [mm], inverse shape xx, xy, yy [1/mm2] and mean radius [mm] of the spots, shape (spots, 6)."""
+    """Centre [mm], inverse shape xx, xy, yy [1/mm2] and mean radius [mm] of the spots, shape (6, spots)."""
     found = []
     for long_mm, short_mm, turn_deg in SPOTS_MM:
         cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
@@ -154,4 +154,4 @@ def _spot_shapes(pitch_mm: float) -> Array:
         for x in (-pitch_mm / 3, 0.0, pitch_mm / 3):
             for y in (-pitch_mm / 3, 0.0, pitch_mm / 3):
                 found.append((x, y, form[0, 0], form[0, 1], form[1, 1], radius_mm))
-    return np.array(found)
+    return np.ascontiguousarray(np.array(found).T)
