@@ -92,8 +92,11 @@ class PlateFit:
         """Size of a unit in the image across its shorter direction. [px]"""
         right = (self.corners_px[1] + self.corners_px[2] - self.corners_px[0] - self.corners_px[3]) / 2
         down = (self.corners_px[2] + self.corners_px[3] - self.corners_px[0] - self.corners_px[1]) / 2
-        shorter = np.linalg.svd(np.stack([right, down]), compute_uv=False)[1]
-        return float(shorter) / len(self.units)
+        # the smaller singular value of the two vectors, from the sum and the product of both squares
+        half_sum = (float(right @ right) + float(down @ down)) / 2
+        product = float(right[0] * down[1] - right[1] * down[0]) ** 2
+        larger = half_sum + math.sqrt(max(half_sum**2 - product, 0.0))
+        return math.sqrt(product / max(larger, 1e-300)) / len(self.units)
 
 
 @dataclass(frozen=True, slots=True)

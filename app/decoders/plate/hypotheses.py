@@ -153,39 +153,38 @@ class Around(NamedTuple):
 
 
 @routine
-def _subtract_rows(row: Singles, a: Singles, b: Singles, c: Singles, d: Singles, by: Singles) -> None:
-    """Subtract multiples of four rows from one."""
-    p, q, r, s = by[0], by[1], by[2], by[3]
-    for k in range(row.size):
-        row[k] -= p * a[k] + q * b[k] + r * c[k] + s * d[k]
-
-
-@routine
 def _factorize(matrix: Singles) -> float:
     """Replace the upper triangle of the first columns by the transposed Cholesky factor, the others by forward
     substitution; returns half the logarithm of the determinant.
 
-    Rows are subtracted from rows, four at a time, so that the loop over columns is compiled to vector instructions.
+    Rows are subtracted from rows, four at a time. Indices are unsigned, and there are no views of rows: the loops over
+    columns are then compiled to vector instructions, and cost no reference counts.
     """
+    rows, columns = matrix.shape
+    flat = matrix.reshape(-1)
     total = 0.0
-    by = np.empty(4, np.float32)
-    for i in range(matrix.shape[0]):
-        row = matrix[i, i:]
+    for i in range(rows):
+        row = np.uint64(i * columns + i)
+        size = columns - i
         for block in range(i // 4):
-            j = 4 * block
-            for k in range(4):
-                by[k] = matrix[j + k, i]
-            _subtract_rows(row, matrix[j, i:], matrix[j + 1, i:], matrix[j + 2, i:], matrix[j + 3, i:], by)
+            first = 4 * block * columns + i
+            p, q = np.uint64(first), np.uint64(first + columns)
+            r, s = np.uint64(first + 2 * columns), np.uint64(first + 3 * columns)
+            a, b, c, d = flat[p], flat[q], flat[r], flat[s]
+            for column in range(size):
+                k = np.uint64(column)
+                flat[row + k] -= a * flat[p + k] + b * flat[q + k] + c * flat[r + k] + d * flat[s + k]
         for j in range(i // 4 * 4, i):
-            factor = matrix[j, i]
-            other = matrix[j, i:]
-            for k in range(row.size):
-                row[k] -= factor * other[k]
-        pivot = max(np.float64(row[0]), MIN_PIVOT)
+            p = np.uint64(j * columns + i)
+            a = flat[p]
+            for column in range(size):
+                k = np.uint64(column)
+                flat[row + k] -= a * flat[p + k]
+        pivot = max(np.float64(flat[row]), MIN_PIVOT)
         total += math.log(pivot)
         scale = np.float32(1.0 / math.sqrt(pivot))
-        for k in range(row.size):
-            row[k] *= scale
+        for column in range(size):
+            flat[row + np.uint64(column)] *= scale
     return 0.5 * total
 
 
@@ -316,77 +315,75 @@ def _look_around(
     return local
 
 
-@step
-def _set_paint(pattern: PlatePattern, shown: ShownUnits, around: Around, local: Local, i: int) -> None:
+@routine
+def _set_paint(dark: Floats, shown: Ints, units: Floats, i: int, paint: Floats) -> None:
     """Set a row of the covariance that the units' own reflectances give, from pixel i on."""
-    paint = local.paint[i:]
-    paint[:] = 0.0
-    p = around.pixels[i]
-    for k in range(shown.lengths[p]):
-        other = shown.listed[p, k]
-        spread = DARK_SPREAD if pattern.dark[other] > 0.5 else WHITE_SPREAD
-        weight = spread * spread * local.units[other, i]
-        shares = local.units[other, i:]
-        for j in range(paint.size):
-            paint[j] += weight * shares[j]
+    size = paint.size - i
+    for k in range(size):
+        paint[np.uint64(i + k)] = 0.0
+    for other in shown:
+        spread = DARK_SPREAD if dark[other] > 0.5 else WHITE_SPREAD
+        weight = spread * spread * units[other, i]
+        for k in range(size):
+            paint[np.uint64(i + k)] += weight * units[other, np.uint64(i + k)]
 
 
 @routine
-def _set_row(
-    light: LightPrior, local: Local, own: float, i: int, read: Singles, flip: Singles, stained: Singles, both: Singles
-) -> None:
-    """Set a row of the four covariances from pixel i on: as read, flipped, and the two under a smooth stain."""
-    x_mm, y_mm, seen, flipped = local.x_mm[i:], local.y_mm[i:], local.seen[i:], local.flipped[i:]
-    share, reach, paint = local.share[i:], local.reach[i:], local.paint[i:]
-    x0, y0, seen0, flipped0, reach0 = x_mm[0], y_mm[0], seen[0], flipped[0], reach[0]
-    own0 = own * share[0]
-    for j in range(x_mm.size):
+def _set_row(light: LightPrior, local: Local, own: float, i: int, read: Singles, others: Singles) -> None:
+    """Set row i of the covariances of the unit as read, and of it flipped and both under a smooth stain."""
+    x_mm, y_mm, seen, flipped = local.x_mm, local.y_mm, local.seen, local.flipped
+    share, reach, paint = local.share, local.reach, local.paint
+    x0, y0, seen0, flipped0, reach0 = x_mm[i], y_mm[i], seen[i], flipped[i], reach[i]
+    own0 = own * share[i]
+    variance, level_variance = light.spread * light.spread, light.level_variance
+    by_length = 1.0 / light.length_mm
+    by_stain = 0.5 / (STAIN_LENGTH_MM * STAIN_LENGTH_MM)
+    for k in range(x_mm.size - i):
+        j = np.uint64(i + k)
         right = x_mm[j] - x0
         down = y_mm[j] - y0
         apart2 = right * right + down * down
-        smooth = light.spread * light.spread * _exp_down(math.sqrt(apart2) / light.length_mm) + light.level_variance
-        stain = reach0 * reach[j] * _exp_down(0.5 * apart2 / (STAIN_LENGTH_MM * STAIN_LENGTH_MM))
+        smooth = variance * _exp_down(math.sqrt(apart2) * by_length) + level_variance
+        stain = reach0 * reach[j] * _exp_down(apart2 * by_stain)
         read_term = smooth * seen0 * seen[j] + paint[j]
         flip_term = smooth * flipped0 * flipped[j] + paint[j] + own0 * share[j]
-        read[j] = read_term
-        flip[j] = flip_term
-        stained[j] = read_term + stain
-        both[j] = flip_term + stain
-    noise = local.noise[i]
-    read[0] += noise
-    flip[0] += noise
-    stained[0] += noise
-    both[0] += noise
+        read[i, j] = read_term
+        others[0, i, j] = flip_term
+        others[1, i, j] = read_term + stain
+        others[2, i, j] = flip_term + stain
+    read[i, i] += local.noise[i]
+    for h in range(3):
+        others[h, i, i] += local.noise[i]
 
 
 @routine
 def _set_covered(
-    pixels: PlatePixels, pattern: PlatePattern, around: Around, local: Local, spots: Floats, columns: Singles
+    pattern: PlatePattern, blur_mm: float, unit: int, local: Local, spots: Floats, first: int, columns: Singles
 ) -> None:
     """Set the light that each white spot would send to each pixel, then that of what it hides, a column a spot."""
     count = spots.shape[1]
     beside = np.empty(count)
     on_unit = np.empty(count)
-    unit_albedo = 1.0 if pattern.dark[around.unit] > 0.5 else pattern.dark_albedo  # of the unit flipped
+    unit_albedo = 1.0 if pattern.dark[unit] > 0.5 else pattern.dark_albedo  # of the unit flipped
     inner = pattern.inner_mm
-    for i in range(around.pixels.size):
-        share = local.share[i]
+    covered, hidden = np.uint64(first), np.uint64(first + count)
+    for i in range(local.x_mm.size):
+        own = local.share[i]
         x = local.x_mm[i]
         y = local.y_mm[i]
         # what a pixel beside the unit sees of it is the part that is nearest
         nearest_x = min(max(x, -inner), inner)
         nearest_y = min(max(y, -inner), inner)
-        own, others = share, local.flipped[i] - share * unit_albedo
-        _set_cover(spots, x, y, pixels.blur_mm, beside)
-        if share > MIN_UNIT_SHARE and (nearest_x != x or nearest_y != y):
-            _set_cover(spots, nearest_x, nearest_y, pixels.blur_mm, on_unit)
+        others = local.flipped[i] - own * unit_albedo
+        _set_cover(spots, x, y, blur_mm, beside)
+        if own > MIN_UNIT_SHARE and (nearest_x != x or nearest_y != y):
+            _set_cover(spots, nearest_x, nearest_y, blur_mm, on_unit)
         else:
             on_unit[:] = beside
-        covered = columns[i, :count]
-        hidden = columns[i, count:]
-        for g in range(count):
-            covered[g] = (1.0 - own) * beside[g] + own * on_unit[g]
-            hidden[g] = beside[g] * others + on_unit[g] * own * unit_albedo
+        for spot in range(count):
+            g = np.uint64(spot)
+            columns[i, covered + g] = (1.0 - own) * beside[g] + own * on_unit[g]
+            columns[i, hidden + g] = beside[g] * others + on_unit[g] * own * unit_albedo
 
 
 @step
@@ -402,14 +399,15 @@ def _spot_likelihood(spots: Spots, matrix: Singles, first: int) -> float:
     for i in range(matrix.shape[0]):
         residual = np.float64(matrix[i, first])
         square += residual * residual
-        covered = matrix[i, first + 1 : first + 1 + count]
-        hidden = matrix[i, first + 1 + count :]
-        for g in range(count):
-            sums[0, g] += residual * covered[g]
-            sums[1, g] += residual * hidden[g]
-            sums[2, g] += covered[g] * covered[g]
-            sums[3, g] += covered[g] * hidden[g]
-            sums[4, g] += hidden[g] * hidden[g]
+        for spot in range(count):
+            g = np.uint64(spot)
+            covered = np.float64(matrix[i, np.uint64(first + 1) + g])
+            hidden = np.float64(matrix[i, np.uint64(first + 1 + count) + g])
+            sums[0, g] += residual * covered
+            sums[1, g] += residual * hidden
+            sums[2, g] += covered * covered
+            sums[3, g] += covered * hidden
+            sums[4, g] += hidden * hidden
     top = -1e300
     total = 0.0
     for g in range(count):
@@ -437,18 +435,16 @@ def _compare_unit(
     as_read = np.empty((size, size + 2 + 2 * count), np.float32)
     others = np.empty((3, size, size + 1), np.float32)
     for i in range(size):
-        _set_paint(pattern, shown, around, local, i)
-        _set_row(
-            light, local, around.own, i,
-            as_read[i, i:size], others[0, i, i:size], others[1, i, i:size], others[2, i, i:size],
-        )  # fmt: skip
-        level = pixels.light[around.pixels[i]] / around.light
+        p = around.pixels[i]
+        _set_paint(pattern.dark, shown.listed[p, : shown.lengths[p]], local.units, i, local.paint)
+        _set_row(light, local, around.own, i, as_read, others)
+        level = pixels.light[p] / around.light
         as_read[i, size] = level - local.seen[i]
         as_read[i, size + 1] = level - local.flipped[i]
         others[0, i, size] = level - local.flipped[i]
         others[1, i, size] = level - local.seen[i]
         others[2, i, size] = level - local.flipped[i]
-    _set_covered(pixels, pattern, around, local, spots.shapes, as_read[:, size + 2 :])
+    _set_covered(pattern, pixels.blur_mm, around.unit, local, spots.shapes, size + 2, as_read)
     scale = size * math.log(around.light)
     half = _factorize(as_read) + scale
     likelihoods[0] = -0.5 * _column_square(as_read, size) - half

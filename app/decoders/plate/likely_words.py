@@ -12,19 +12,21 @@ Trans. Inf. Theory 41 (1995), here of order 2 and over GF(16).
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from app.decoders.compiled import ieee_kernel
 from app.markers.plate import PlateScheme, code_cells, is_codeword, numbers, reed_solomon_words
 from app.markers.reed_solomon import ReedSolomonWord, gf16_products
 
 Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float64]
+Symbols = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,42 +98,89 @@ def _best_word(scores: Array, word: ReedSolomonWord) -> tuple[Array, float, floa
     length, data = len(mask), word.data
     plain = scores[np.arange(length)[:, None], np.arange(16) ^ mask[:, None]]
     order = np.argsort(-plain.max(axis=1), kind="stable")
-    first_cells, second_cells = order[:data], np.roll(order, -data)[:data]
-    found = _patterns(plain, word, first_cells, pairs=True)
-    second = _patterns(plain, word, second_cells, pairs=False)
-    is_new = (second[:, first_cells] != plain[first_cells].argmax(axis=1)).sum(axis=1) > 2
-    found = np.concatenate([found, second[is_new]])
-    score = plain[np.arange(length), found].sum(axis=1)
-    first = int(score.argmax())
-    listed = float(np.logaddexp.reduce(score))
-    missed = _log_unlisted(plain[first_cells])
-    return found[first] ^ mask, float(score[first]), float(np.logaddexp(listed, missed))
+    likeliest = plain.argmax(axis=1)
+    certain = _Listing(*_information(plain, word, order[:data]), order[:data], likeliest, is_second=False)
+    best = np.empty(length, np.uint8)
+    score, listed = _list_words(plain, certain, best, -np.inf, 0.0)
+    second = np.roll(order, -data)[:data]
+    others = _Listing(*_information(plain, word, second), order[:data], likeliest, is_second=True)
+    score, listed = _list_words(plain, others, best, score, listed)
+    missed = _log_unlisted(plain[order[:data]])
+    return best ^ mask, score, float(np.logaddexp(score + math.log(listed), missed))
 
 
-def _patterns(scores: Array, word: ReedSolomonWord, cells: Array, *, pairs: bool) -> Array:
-    """Words whose symbols in the given cells are the most likely ones, but for one or two, shape (words, length).
+def _information(scores: Array, word: ReedSolomonWord, cells: Array) -> tuple[Array, Array]:
+    """What each value of each of these cells adds to a word, and the word whose symbols there are the likeliest."""
+    information = tuple(sorted(cells.tolist()))
+    rows = _systematic(word, information)
+    start = scores[list(information)].argmax(axis=1)
+    return rows, np.bitwise_xor.reduce(rows[np.arange(len(rows)), start], axis=0)
+
+
+class _Listing(NamedTuple):
+    """Words to list.
+
+    Attributes
+    ----------
+    rows : ndarray of uint8, shape (data, 16, length)
+        What each value of the cells that determine the others adds to a word.
+    base : ndarray of uint8, shape (length,)
+        The word whose symbols in these cells are the likeliest.
+    certain : ndarray of int, shape (data,)
+        The most certain cells.
+    likeliest : ndarray of int, shape (length,)
+        Likeliest symbol of each cell.
+    is_second : bool
+        One of the cells is changed, not two, and words that differ in at most two of the certain cells are left out:
+        they were listed before.
+    """
+
+    rows: Symbols
+    base: Symbols
+    certain: npt.NDArray[np.intp]
+    likeliest: npt.NDArray[np.intp]
+    is_second: bool
+
+
+@ieee_kernel
+def _list_words(scores: Floats, words: _Listing, best: Symbols, top: float, total: float) -> tuple[float, float]:
+    """Set the best word with none, one or two of its information symbols changed.
 
     Parameters
     ----------
     scores : ndarray, shape (length, 16)
-    word : ReedSolomonWord
-    cells : ndarray of int, shape (data,)
-        Which determine the others.
-    pairs : bool
-        Whether two may be changed.
+    words : _Listing
+    best : ndarray of uint8, shape (length,)
+        The best word so far.
+    top, total : float
+        Its score, and the sum of all words' exponentials over that of the best; the new ones are returned.
     """
-    information = tuple(sorted(int(k) for k in cells))
-    rows = _systematic(word, information)
-    data, _, length = rows.shape
-    start = scores[list(information)].argmax(axis=1)
-    base = np.bitwise_xor.reduce(rows[np.arange(data), start], axis=0)
-    changes = rows[:, 1:]
-    parts = [np.zeros((1, length), np.uint8), changes.reshape(-1, length)]
-    if pairs:
-        a, b = np.array(list(itertools.combinations(range(data), 2))).T
-        parts.append((changes[a, :, None, :] ^ changes[b, None, :, :]).reshape(-1, length))
-    result: Array = np.concatenate(parts) ^ base
-    return result
+    rows, base, certain, likeliest = words.rows, words.base, words.certain, words.likeliest
+    data, values, length = rows.shape
+    word = np.empty(length, np.uint8)
+    for a in range(data):
+        for first in range(values if a == 0 else values - 1):
+            u = first if a == 0 else first + 1  # no change, which is a value of 0, once
+            for b in range(a, data if u > 0 and not words.is_second else a + 1):
+                for second in range(1 if b == a else values - 1):
+                    v = 0 if b == a else second + 1
+                    score = 0.0
+                    for k in range(length):
+                        word[k] = base[k] ^ rows[a, u, k] ^ rows[b, v, k]
+                        score += scores[k, word[k]]
+                    if words.is_second:
+                        changed = 0
+                        for k in certain:
+                            changed += word[k] != likeliest[k]
+                        if changed <= 2:
+                            continue
+                    if score > top:
+                        total = total * math.exp(top - score) + 1.0
+                        top = score
+                        best[:] = word
+                    else:
+                        total += math.exp(score - top)
+    return top, total
 
 
 def _log_unlisted(scores: Array) -> float:

@@ -108,7 +108,7 @@ def marker_colours(signal: MarkerSignal, plate_from_image: Floats, centroids: Fl
     )
     tints = np.where(sign > 0, red - np.maximum(green, blue), green - np.maximum(red, blue))
     return MarkerColours(sign * (inside - between.mean()) / (between.std() + 1.0),
-                         tints / max(float(np.median(tints[1:])), 1.0), cast[[0, 2]])  # fmt: skip
+                         tints / max(float(np.sort(tints[1:])[1]), 1.0), cast[[0, 2]])  # fmt: skip
 
 
 class _Signal(NamedTuple):

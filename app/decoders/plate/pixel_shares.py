@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from app.decoders.compiled import kernel
-from app.decoders.plate.profiles import AxisProfiles, Floats
+from app.decoders.plate.profiles import AxisProfiles, Floats, Ints
 from app.decoders.plate.quadrature import blur_quadrature
 from app.decoders.plate.synthesis import (
+    FIRST_GAP,
+    FIRST_ROAD,
+    SINGLES,
     PlateModel,
     PlatePatch,
     blur_on_plate,
@@ -55,3 +58,48 @@ def set_pixel_shares(patch: PlatePatch, model: PlateModel, max_nodes: int, share
             for e in range(entries):
                 shares[y, x, row.shape[e]] = row.share[row.shape[e]]
                 row.share[row.shape[e]] = 0.0
+
+
+@kernel
+def gather_shares(
+    shares: Floats, order: Ints, min_share: float, max_road: float, used: Ints, units: Floats, rest: Floats
+) -> int:
+    """Gather the shares in the pixels on a plate; returns their number.
+
+    Parameters
+    ----------
+    shares : ndarray, shape (pixels, shapes)
+        Of `set_pixel_shares`.
+    order : ndarray of int, shape (units,)
+        Shapes of the units that are wanted.
+    min_share, max_road : float
+        Share of all shapes in a pixel from which on, and of the road up to which it is on the plate.
+    used : ndarray of int, shape (pixels,)
+        Set to the numbers of these pixels.
+    units : ndarray, shape (pixels, units)
+        Set to the shares of the units in them.
+    rest : ndarray, shape (pixels, 1 + FIRST_GAP)
+        Set to those of the gaps with what the pixel has of the road, and of the markers' parts.
+    """
+    shapes = shares.shape[1]
+    base = shapes - SINGLES
+    count = 0
+    for p in range(shares.shape[0]):
+        total = 0.0
+        for k in range(shapes):
+            total += shares[p, k]
+        road = 0.0
+        for k in range(base + FIRST_ROAD, shapes):
+            road += shares[p, k]
+        if total <= min_share or road >= max_road:
+            continue
+        used[count] = p
+        rest[count, 0] = road
+        for k in range(FIRST_GAP, FIRST_ROAD):
+            rest[count, 0] += shares[p, base + k]
+        for k in range(FIRST_GAP):
+            rest[count, 1 + k] = shares[p, base + k]
+        for k in range(order.size):
+            units[count, k] = shares[p, order[k]]
+        count += 1
+    return count

@@ -27,8 +27,8 @@ from app.decoders.plate.hypotheses import (
 from app.decoders.plate.layout import unit_edges, unit_shapes
 from app.decoders.plate.light_field import LEVEL_VARIANCE, LIGHT_LENGTH_MM, fit_light
 from app.decoders.plate.patch import cut_patch
-from app.decoders.plate.pixel_shares import set_pixel_shares
-from app.decoders.plate.synthesis import FIRST_GAP, FIRST_ROAD, SINGLES
+from app.decoders.plate.pixel_shares import gather_shares, set_pixel_shares
+from app.decoders.plate.synthesis import FIRST_GAP
 from app.decoders.plate.unit_likelihoods import light_levels
 from app.decoders.plate.unit_verification import UnitVerification
 from app.markers.plate import PlateGeometry, unit_index
@@ -110,23 +110,22 @@ def _cut(image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry) -
     shapes = len(fit.model.values)
     shares, places = np.empty((*patch.light.shape, shapes)), np.empty((*patch.light.shape, 2))
     set_pixel_shares(patch, fit.model, NODES, shares, places)
-    singles = shares[..., shapes - SINGLES :]
-    road = singles[..., FIRST_ROAD:].sum(axis=-1)
-    used = (shares.sum(axis=-1) > MIN_SHARE) & (road < MAX_ROAD_SHARE)
-    if used.sum() < MIN_PIXELS * n:
+    in_symbols, size = unit_shapes(n).reshape(-1)[unit_index(n).reshape(-1)], patch.light.size
+    listed, units, rest = np.empty(size, np.int64), np.empty((size, len(in_symbols))), np.empty((size, 1 + FIRST_GAP))
+    count = gather_shares(shares.reshape(size, -1), in_symbols, MIN_SHARE, MAX_ROAD_SHARE, listed, units, rest)
+    if count < MIN_PIXELS * n:
         return None
-    in_symbols = unit_shapes(n).reshape(-1)[unit_index(n).reshape(-1)]
-    gap = singles[used][:, FIRST_GAP:FIRST_ROAD].sum(axis=1) + road[used]
+    used, weights = listed[:count], patch.weights.reshape(-1)[listed[:count]]
     right, down = np.diff(fit.corners_px[:3], axis=0)
     mm_per_px = side_mm / math.sqrt(max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0))
     blur_px = math.sqrt(fit.blur_px**2 + patch.grid[2] * patch.grid[3] / 12)
     level = levels.light - levels.haze
     pixels = PlatePixels(
-        patch.light[used].astype(float) - levels.haze,
-        patch.weights[used] / float(patch.weights[used].mean()),
-        np.ascontiguousarray(shares[used][:, in_symbols]),
-        np.column_stack([gap, singles[used][:, :FIRST_GAP]]),
-        places[used] * side_mm,
+        patch.light.reshape(-1)[used].astype(float) - levels.haze,
+        weights / float(weights.mean()),
+        units[:count],
+        rest[:count],
+        places.reshape(size, 2)[used] * side_mm,
         level,
         max(mm_per_px * blur_px, MIN_BLUR_MM),
     )
