@@ -127,11 +127,11 @@ def _add_row(row: PixelRow, entries: int, light: float, weight: float, equations
     """Add a pixel's row to the normal equations and clear its shares."""
     shapes = equations.cross.shape[0]
     for e in range(entries):
-        j = row.shape[e]
+        j = np.uint64(row.shape[e])
         b = weight * row.share[j]
         equations.rhs[j] += b * light
         for f in range(e + 1):
-            i = row.shape[f]
+            i = np.uint64(row.shape[f])
             equations.matrix[max(i, j), min(i, j)] += b * row.share[i]
         for p in range(POSE):
             equations.cross[j, p] += b * row.by_pose[p]
