@@ -44,6 +44,32 @@ def routine(function: F) -> F:
     return compiled
 
 
+def loop(function: F) -> F:
+    """Compile a routine with a loop that is all of the work: as `routine`, but it counts no references to arrays.
+
+    It must not allocate, nor call what allocates or is no `loop`. Counting the references to a `NamedTuple` of arrays at
+    every call of a step takes as long as the step.
+    """
+    compiled: F = _njit(
+        nogil=True, fastmath=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
+    )(function)
+    return compiled
+
+
+def ieee_loop(function: F) -> F:
+    """Compile a loop as `loop` does, with IEEE 754 arithmetic in the order written."""
+    compiled: F = _njit(
+        nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
+    )(function)
+    return compiled
+
+
+def ieee_loop_kernel(function: F) -> F:
+    """Compile a loop that Python calls, which counts no references (`loop`), with IEEE 754 arithmetic as written."""
+    compiled: F = _njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)(function)
+    return compiled
+
+
 def ieee_routine(function: F) -> F:
     """Compile a function that kernels call from several places, with IEEE 754 arithmetic in the order written."""
     compiled: F = _njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel, routine, step, trailing_zeros
+from app.decoders.compiled import ieee_loop, ieee_loop_kernel, step, trailing_zeros
 from app.decoders.plate.colour import BLOCK, MarkerSignal
 
 Floats = npt.NDArray[np.float64]
@@ -17,6 +17,7 @@ Runs = npt.NDArray[np.int16]
 Ints = npt.NDArray[np.int32]
 Sums = npt.NDArray[np.int64]
 Marks = npt.NDArray[np.int8]
+Words = npt.NDArray[np.uint64]
 
 MAX_BLOBS = 6000
 """[blobs] of all levels; more are left out. Source: chosen by hand, for speed."""
@@ -51,12 +52,14 @@ class _Level(NamedTuple):
 def find_blobs(signal: MarkerSignal) -> Floats:
     """Blobs at all the signal's levels, moments weighted by the signal, shape (B, 13), columns `SIGN` to `PEAK`."""
     blobs, count = np.empty((MAX_BLOBS, COLUMNS)), 0
-    runs = np.empty((MAX_RUNS, 4), np.int16)
+    blocks = signal.peak.shape[1]
+    words, high = np.zeros(blocks * BLOCK // WORD, np.uint64), np.empty(blocks, np.int16)
+    runs, part_of = np.empty((MAX_RUNS, 4), np.int16), np.empty(MAX_RUNS, np.int32)
     parent, sums, sign = np.empty(MAX_RUNS, np.int32), np.empty((MAX_RUNS, 12), np.int64), np.empty(MAX_RUNS, np.int8)
     for floor, slack in signal.levels:
         level = _Level(signal.opponent, signal.planes.luma, signal.peak, signal.threshold, floor, slack)
-        found = _find_runs(level, runs)
-        parts = _join_runs(signal.opponent, runs[:found], parent, sums, sign)
+        found = _find_runs(level, words, words.view(np.int8), high, runs)
+        parts = _join_runs(signal.opponent, runs[:found], part_of, parent, sums, sign)
         count = _write_blobs(parent[:parts], sums[:parts], sign, blobs, count)
     return blobs[:count]
 
@@ -90,17 +93,24 @@ def _mark_row(level: _Level, y: int, high: Signal, marks: Marks) -> None:
                 marks[x] = _mark(np.int32(level.opponent[y, x]), np.int32(level.luma[y, x]), at_least, slack)
 
 
-@ieee_kernel
-def _find_runs(level: _Level, runs: Runs) -> int:
+@ieee_loop_kernel
+def _find_runs(level: _Level, words: Words, marks: Marks, high: Signal, runs: Runs) -> int:
     """List runs of one colour, row by row: row, first column, column after the last one, sign; returns their number.
 
     The bytes of a word in which a run begins or ends differ from the byte before: the rest is not looked at. Every
     such place writes a run, which counts only where one ends, so that there is no branch to mispredict.
+
+    Parameters
+    ----------
+    level : _Level
+    words, marks : ndarray of uint64 and of int8
+        One memory for the marks of a row, all zero: those beyond the frame stay so.
+    high : ndarray of int16, shape (blocks,)
+        Memory for the thresholds of a row of blocks.
+    runs : ndarray of int16, shape (MAX_RUNS, 4)
+        Set.
     """
     blocks = level.peak.shape[1]
-    words = np.zeros(blocks * BLOCK // WORD, np.uint64)  # marks of a row; those beyond the frame stay empty
-    marks = words.view(np.int8)
-    high = np.empty(blocks, np.int16)
     count = 0
     for y in range(level.opponent.shape[0]):
         if count + BLOCK * blocks >= runs.shape[0]:
@@ -134,7 +144,7 @@ def _find_runs(level: _Level, runs: Runs) -> int:
     return count
 
 
-@routine
+@ieee_loop
 def _first_part(parent: Ints, part: int) -> int:
     """First part of the blob that a part belongs to; shortens the way to it."""
     while parent[part] != part:
@@ -143,7 +153,7 @@ def _first_part(parent: Ints, part: int) -> int:
     return part
 
 
-@routine
+@ieee_loop
 def _join(parent: Ints, sums: Sums, first: int, second: int) -> int:
     """Make one blob of two, given by their first parts; returns its first part."""
     into = min(first, second)
@@ -158,7 +168,7 @@ def _join(parent: Ints, sums: Sums, first: int, second: int) -> int:
     return into
 
 
-@routine
+@ieee_loop
 def _add_run(opponent: Signal, y: int, start: int, size: int, at: int, is_new: bool, sums: Sums) -> None:
     """Add a run to the sums of its part. Sums of integers are exact in any order."""
     w = np.int64(0)
@@ -192,8 +202,8 @@ def _add_run(opponent: Signal, y: int, start: int, size: int, at: int, is_new: b
         sums[at, _PEAK] = max(sums[at, _PEAK], top)
 
 
-@ieee_kernel
-def _join_runs(opponent: Signal, runs: Runs, parent: Ints, sums: Sums, sign: Marks) -> int:
+@ieee_loop_kernel
+def _join_runs(opponent: Signal, runs: Runs, part_of: Ints, parent: Ints, sums: Sums, sign: Marks) -> int:
     """Join runs that touch, diagonals included, to parts of blobs; returns the number of parts.
 
     Parameters
@@ -202,6 +212,8 @@ def _join_runs(opponent: Signal, runs: Runs, parent: Ints, sums: Sums, sign: Mar
         The signal, whose strength is the weight.
     runs : ndarray of int16, shape (R, 4)
         Of `_find_runs`.
+    part_of : ndarray of int32, shape (R,)
+        Set to the part of each run.
     parent : ndarray of int32, shape (R,)
         Set to another part of the same blob, itself for the blob's first part.
     sums : ndarray of int64, shape (R, 12)
@@ -209,7 +221,6 @@ def _join_runs(opponent: Signal, runs: Runs, parent: Ints, sums: Sums, sign: Mar
     sign : ndarray of int8, shape (R,)
         Set to the colour of each part.
     """
-    part_of = np.empty(runs.shape[0], np.int32)
     parts = 0
     begin = 0  # first run of the row
     above = 0  # first run of the row above that may touch this one or a later one
@@ -244,27 +255,27 @@ def _join_runs(opponent: Signal, runs: Runs, parent: Ints, sums: Sums, sign: Mar
 
 
 @step
-def _write_blob(sums: Sums, sign: float, blob: Floats) -> None:
+def _write_blob(sums: Sums, sign: Marks, part: int, blobs: Floats, k: int) -> None:
     """Centroid and central moments from sums; the variance of a pixel's own square is added to the moments."""
-    weight = np.float64(sums[_W])
-    mean_x = sums[_WX] / weight
-    mean_y = sums[_WY] / weight
-    blob[SIGN] = sign
-    blob[WEIGHT] = weight
-    blob[X] = mean_x
-    blob[Y] = mean_y
-    blob[XX] = sums[_WXX] / weight - mean_x * mean_x + PIXEL_VARIANCE
-    blob[XY] = sums[_WXY] / weight - mean_x * mean_y
-    blob[YY] = sums[_WYY] / weight - mean_y * mean_y + PIXEL_VARIANCE
+    weight = np.float64(sums[part, _W])
+    mean_x = sums[part, _WX] / weight
+    mean_y = sums[part, _WY] / weight
+    blobs[k, SIGN] = sign[part]
+    blobs[k, WEIGHT] = weight
+    blobs[k, X] = mean_x
+    blobs[k, Y] = mean_y
+    blobs[k, XX] = sums[part, _WXX] / weight - mean_x * mean_x + PIXEL_VARIANCE
+    blobs[k, XY] = sums[part, _WXY] / weight - mean_x * mean_y
+    blobs[k, YY] = sums[part, _WYY] / weight - mean_y * mean_y + PIXEL_VARIANCE
     for m in range(AREA, COLUMNS):
-        blob[m] = sums[m - 1]
+        blobs[k, m] = sums[part, m - 1]
 
 
-@ieee_kernel
+@ieee_loop_kernel
 def _write_blobs(parent: Ints, sums: Sums, sign: Marks, blobs: Floats, count: int) -> int:
     """Add the blobs that parts make; returns how many there are then."""
     for i in range(parent.size):
         if parent[i] == i and sums[i, _AREA] >= MIN_AREA and count < MAX_BLOBS:
-            _write_blob(sums[i], sign[i], blobs[count])
+            _write_blob(sums, sign, i, blobs, count)
             count += 1
     return count

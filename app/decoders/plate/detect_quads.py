@@ -23,6 +23,7 @@ from app.decoders.plate.join_quads import (
     SIZE_RATIO,
     join_green_triples,
     join_red_quads,
+    new_nearest,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -84,9 +85,9 @@ def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     by_strength = np.argsort(-blobs[:, PEAK] * np.sqrt(blobs[:, AREA]), kind="stable")
     reds = by_strength[blobs[by_strength, SIGN] > 0][:MAX_REDS]
     greens = by_strength[blobs[by_strength, SIGN] < 0][:MAX_GREENS]
-    quads = np.empty((MAX_QUADS, QUAD_COLUMNS))
-    found = join_green_triples(blobs, greens, signal.opponent, quads)
-    found = join_red_quads(blobs, reds, greens, quads, found)
+    quads, nearest = np.empty((MAX_QUADS, QUAD_COLUMNS)), new_nearest()
+    found = join_green_triples(blobs, greens, signal.opponent, nearest, quads)
+    found = join_red_quads(blobs, reds, greens, nearest, quads, found)
     wanted = _wanted_margins(quads[:found], signal.scale)
     possible = np.flatnonzero(wanted < MAX_MARGIN_LOG)
     if len(possible) > MAX_RANKED:

@@ -17,7 +17,7 @@ from app.decoders.plate.linear import factorize, solve_factorized, substitute
 from app.decoders.plate.normal_equations import NormalEquations, PatchArea, PixelSums, set_normal_equations
 from app.decoders.plate.profiles import Floats
 from app.decoders.plate.quadrature import blur_quadrature
-from app.decoders.plate.synthesis import BLUR, MOTION, POSE, SINGLES, PlateModel, PlatePatch
+from app.decoders.plate.synthesis import BLUR, MOTION, POSE, SINGLES, PlateModel, PlatePatch, new_scratch
 
 BLUR_PRIOR = (math.log(0.7), 0.35)
 """[log px] mean and standard deviation of the lens blur's logarithm. Source: chosen by hand; the simulated cameras have
@@ -212,6 +212,7 @@ def minimize(
     corners = np.empty((4, 2))
     moved = np.empty((4, 2))
     start = np.empty(POSE)
+    scratch = new_scratch(shapes, model.edges.shape[0])
     area = PatchArea(np.empty(4, np.int64), np.empty(2), np.empty(2))
     quality = FitQuality(False, 0.0, 0.0, 0)
     for k in range(steps):
@@ -219,7 +220,7 @@ def minimize(
         if not set_corners(model.pose, model.frame, corners) or not _set_area(corners, patch, area):
             return quality
         quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes)
-        sums = set_normal_equations(patch, area, model, quadrature, equations)
+        sums = set_normal_equations(patch, area, model, quadrature, scratch, equations)
         if sums.pixels < shapes:
             return FitQuality(False, quality.variance, quality.explained, int(sums.pixels))
         residual2 = sums.inside_residual2 / max(sums.inside, 1.0)

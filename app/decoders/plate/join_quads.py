@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel, ieee_routine, step
+from app.decoders.compiled import ieee_loop, ieee_loop_kernel, step
 from app.decoders.plate.detect_blobs import AREA, PEAK, X0, X1, XX, XY, Y0, Y1, YY, X, Y
 
 Floats = npt.NDArray[np.float64]
@@ -72,6 +72,18 @@ TOP_BOTTOM_ROLE, TOP_RIGHT_ROLE, RIGHT_BOTTOM_ROLE = 0, 1, 2
 _FOUND_BITS = (5, 3, 6)  # by role: top right 1, bottom right 2, bottom left 4
 
 
+class Nearest(NamedTuple):
+    """Memory for the blobs around one, shape (MAX_NEAR,): their numbers, and how much they differ from its like."""
+
+    near: Ints
+    misfits: Floats
+
+
+def new_nearest() -> Nearest:
+    """Memory for the blobs around one."""
+    return Nearest(np.empty(MAX_NEAR, np.int64), np.empty(MAX_NEAR))
+
+
 class _Sides(NamedTuple):
     """Vectors between marker centres along the plate's rows, to the right (p), and along its columns, down (q). [px]"""
 
@@ -96,7 +108,7 @@ class _Fourth(NamedTuple):
     distance: float
 
 
-@ieee_routine
+@ieee_loop
 def _square_moments(sides: _Sides, size_ratio: float) -> _Moments:
     """Moments of a square: a twelfth of the squared side in each direction, and the blur of the image."""
     scale = 1.0 / (12.0 * size_ratio * size_ratio)
@@ -107,7 +119,7 @@ def _square_moments(sides: _Sides, size_ratio: float) -> _Moments:
     )
 
 
-@ieee_routine
+@ieee_loop
 def _shape_ratio(blobs: Floats, k: int, expected: _Moments) -> float:
     """Largest eigenvalue of inv(expected) measured, or of its inverse: 1 where both shapes agree."""
     xx = blobs[k, XX] + BLUR_VARIANCE
@@ -129,14 +141,14 @@ def _shape_ratio(blobs: Floats, k: int, expected: _Moments) -> float:
     return ratio
 
 
-@ieee_routine
+@ieee_loop
 def _reach_px(blobs: Floats, k: int) -> float:
     """How far from a marker another one of its plate may be."""
     extent: float = max(blobs[k, X1] - blobs[k, X0], blobs[k, Y1] - blobs[k, Y0])
     return SEARCH_SIDES * extent + SEARCH_PX
 
 
-@ieee_routine
+@ieee_loop
 def _keep_nearest(near: Ints, misfits: Floats, count: int, blob: int, misfit: float) -> int:
     """Insert a blob into the list of the best, lowest misfit first; returns how many it holds."""
     j = min(count, MAX_NEAR - 1)
@@ -245,7 +257,7 @@ def _add_triple(
     return found + 1
 
 
-@ieee_routine
+@ieee_loop
 def _set_centroids(
     quads: Floats, k: int, x0: float, y0: float, x1: float, y1: float, x2: float, y2: float, x3: float, y3: float
 ) -> None:
@@ -253,8 +265,8 @@ def _set_centroids(
     quads[k, 4], quads[k, 5], quads[k, 6], quads[k, 7] = x2, y2, x3, y3
 
 
-@ieee_kernel
-def join_green_triples(blobs: Floats, greens: Ints, opponent: Signal, quads: Floats) -> int:
+@ieee_loop_kernel
+def join_green_triples(blobs: Floats, greens: Ints, opponent: Signal, nearest: Nearest, quads: Floats) -> int:
     """Fill quadruples from three green squares with something red where the triangle should be; how many.
 
     Parameters
@@ -265,12 +277,13 @@ def join_green_triples(blobs: Floats, greens: Ints, opponent: Signal, quads: Flo
         The green ones among them, strongest first.
     opponent : ndarray of int16, shape (H, W)
         The signal that they were found in.
+    nearest : Nearest
+        Memory.
     quads : ndarray, shape (MAX_QUADS, 12)
         Set: columns as named by `CENTROIDS` to `RANK`.
     """
     found = 0
-    near = np.empty(MAX_NEAR, np.int64)
-    misfits = np.empty(MAX_NEAR)
+    near, misfits = nearest
     for a in range(greens.shape[0]):
         count = _squares_near(blobs, greens, a, near, misfits)
         for i in range(count):
@@ -317,14 +330,14 @@ def _sides_of(role: int, blobs: Floats, red: int, first: int, second: int) -> _S
 
 @step
 def _find_fourth(
-    blobs: Floats, near: Ints, i: int, j: int, x: float, y: float, sides: _Sides, moments: _Moments
+    blobs: Floats, near: Ints, count: int, i: int, j: int, x: float, y: float, sides: _Sides, moments: _Moments
 ) -> _Fourth:
     """The blob of the remaining square, expected at x, y."""
     cross = sides.px * sides.qy - sides.py * sides.qx
     best = MAX_FOURTH_DISTANCE
     fourth = -1
-    for m in range(near.shape[0]):
-        if m in (i, j):
+    for m in range(count):
+        if m == i or m == j:
             continue
         ex = blobs[near[m], X] - x
         ey = blobs[near[m], Y] - y
@@ -355,7 +368,8 @@ def _write_quad(
 
 @step
 def _add_pair(
-    blobs: Floats, red: int, near: Ints, i: int, j: int, role: int, complete_seen: bool, quads: Floats, found: int
+    blobs: Floats, red: int, near: Ints, count: int, i: int, j: int, role: int, complete_seen: bool, quads: Floats,
+    found: int,
 ) -> tuple[int, bool]:
     """Add the quadruple of a red triangle and two squares, with the third where it is found.
 
@@ -380,7 +394,7 @@ def _add_pair(
         return found, complete_seen
     x = blobs[red, X] + (sides.px if role != TOP_RIGHT_ROLE else 0.0) + (sides.qx if role != RIGHT_BOTTOM_ROLE else 0.0)
     y = blobs[red, Y] + (sides.py if role != TOP_RIGHT_ROLE else 0.0) + (sides.qy if role != RIGHT_BOTTOM_ROLE else 0.0)
-    fourth = _find_fourth(blobs, near, i, j, x, y, sides, moments)
+    fourth = _find_fourth(blobs, near, count, i, j, x, y, sides, moments)
     is_complete = fourth.near >= 0
     if (is_complete and role != TOP_BOTTOM_ROLE) or (not is_complete and complete_seen):
         return found, complete_seen
@@ -399,14 +413,13 @@ def _add_pair(
     return found + 1, complete_seen or is_complete
 
 
-@ieee_kernel
-def join_red_quads(blobs: Floats, reds: Ints, greens: Ints, quads: Floats, found: int) -> int:
+@ieee_loop_kernel
+def join_red_quads(blobs: Floats, reds: Ints, greens: Ints, nearest: Nearest, quads: Floats, found: int) -> int:
     """Add quadruples of a red triangle and two or three of the green squares near it; returns how many there are then.
 
     Parameters as of `join_green_triples`; `reds` are the red blobs, strongest first.
     """
-    near = np.empty(MAX_NEAR, np.int64)
-    misfits = np.empty(MAX_NEAR)
+    near, misfits = nearest
     for red in reds:
         count = _near_greens(blobs, greens, red, near, misfits)
         complete_seen = False
@@ -418,6 +431,6 @@ def join_red_quads(blobs: Floats, reds: Ints, greens: Ints, quads: Floats, found
                     continue
                 for role in range(3):
                     found, complete_seen = _add_pair(
-                        blobs, red, near[:count], i, j, role, complete_seen, quads, found
+                        blobs, red, near, count, i, j, role, complete_seen, quads, found
                     )  # fmt: skip
     return found

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.decoders.compiled import routine, step
-from app.decoders.plate.profiles import AxisProfiles, Floats, Ints
+from app.decoders.compiled import loop, step
+from app.decoders.plate.profiles import Floats, Ints
 from app.decoders.plate.quadrature import Quadrature
 from app.decoders.plate.synthesis import (
     FIRST_GAP,
@@ -17,10 +17,10 @@ from app.decoders.plate.synthesis import (
     PixelRow,
     PlateModel,
     PlatePatch,
+    Scratch,
     blur_on_plate,
     field_light,
     lens_blur,
-    new_row,
     place_pixel,
     set_pose_derivatives,
     synthesize,
@@ -164,9 +164,10 @@ def _join_blocks(equations: NormalEquations) -> None:
             equations.matrix[shapes + p, shapes + q] = equations.pose[p, q]
 
 
-@routine
+@loop
 def set_normal_equations(
-    patch: PlatePatch, area: PatchArea, model: PlateModel, quadrature: Quadrature, equations: NormalEquations
+    patch: PlatePatch, area: PatchArea, model: PlateModel, quadrature: Quadrature, scratch: Scratch,
+    equations: NormalEquations,
 ) -> PixelSums:
     """Set the normal equations of the shapes' values and the pose from every pixel in an area.
 
@@ -174,11 +175,7 @@ def set_normal_equations(
     are taken at the model's present values. Each pixel adds w d d^T to the matrix and w d light to the right side,
     where d are its shares and its derivatives by the pose.
     """
-    n = model.edges.shape[0]
-    shapes = model.values.shape[0]
-    along_u = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
-    along_v = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
-    row = new_row(shapes)
+    row, along_u, along_v = scratch
     lens = lens_blur(model.pose, patch.grid)
     sums = PixelSums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     _clear(equations)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.decoders.compiled import kernel
-from app.decoders.plate.profiles import AxisProfiles, Floats, Ints
-from app.decoders.plate.quadrature import blur_quadrature
+from app.decoders.compiled import kernel, loop
+from app.decoders.plate.profiles import Floats, Ints
+from app.decoders.plate.quadrature import Quadrature, blur_quadrature
 from app.decoders.plate.synthesis import (
     FIRST_GAP,
     FIRST_ROAD,
     SINGLES,
     PlateModel,
     PlatePatch,
+    Scratch,
     blur_on_plate,
     lens_blur,
-    new_row,
+    new_scratch,
     place_pixel,
     synthesize,
 )
@@ -36,17 +37,23 @@ def set_pixel_shares(patch: PlatePatch, model: PlateModel, max_nodes: int, share
     places : ndarray, shape (h, w, 2)
         Set to the pixel's place. [plate sides]
     """
-    n = model.edges.shape[0]
-    shapes = model.values.shape[0]
-    along_u = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
-    along_v = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
-    row = new_row(shapes)
-    lens = lens_blur(model.pose, patch.grid)
     quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes)
+    scratch = new_scratch(model.values.shape[0], model.edges.shape[0])
+    _set_all(patch, model, quadrature, scratch, shares, places)
+
+
+@loop
+def _set_all(
+    patch: PlatePatch, model: PlateModel, quadrature: Quadrature, scratch: Scratch, shares: Floats, places: Floats
+) -> None:
+    """Set the shares and the places of all pixels."""
+    row, along_u, along_v = scratch
+    lens = lens_blur(model.pose, patch.grid)
     for y in range(patch.light.shape[0]):
         for x in range(patch.light.shape[1]):
             pixel = place_pixel(model.pose, model.frame, patch.grid, x, y)
-            shares[y, x] = 0.0
+            for k in range(shares.shape[2]):
+                shares[y, x, k] = 0.0
             places[y, x, 0] = pixel.u
             places[y, x, 1] = pixel.v
             if pixel.inverse_depth <= 0.0 or not (-0.2 < pixel.u < 1.2 and -0.2 < pixel.v < 1.2):

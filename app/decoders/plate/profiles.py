@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import routine
+from app.decoders.compiled import loop
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -62,7 +62,7 @@ class AxisBlur(NamedTuple):
     motion: float
 
 
-@routine
+@loop
 def normal(z: float, table: Floats) -> tuple[float, float]:
     """Cumulative distribution and density of the standard normal distribution, from the table."""
     if z >= NORMAL_REACH:
@@ -75,7 +75,7 @@ def normal(z: float, table: Floats) -> tuple[float, float]:
     return table[i, 0] + f * (table[i + 1, 0] - table[i, 0]), table[i, 1] + f * (table[i + 1, 1] - table[i, 1])
 
 
-@routine
+@loop
 def _moved_step(x: float, blur: AxisBlur, table: Floats) -> tuple[float, float, float, float]:
     """Blurred unit step at x: value and its derivatives by x, by the spread and by the motion's square."""
     a = (x + 0.5 * blur.motion) / blur.spread
@@ -87,7 +87,7 @@ def _moved_step(x: float, blur: AxisBlur, table: Floats) -> tuple[float, float, 
     return value, (ca - cb) / motion, (pa - pb) / motion, (0.5 * (ca + cb) - value) / (2.0 * motion * motion)
 
 
-@routine
+@loop
 def _set_box(x: float, low: float, high: float, blur: AxisBlur, table: Floats, out: Floats, row: int) -> None:
     """Set a row of the profiles to the blurred box from `low` to `high`, at x."""
     if blur.motion < SHORT_MOTION * blur.spread:
@@ -110,7 +110,7 @@ def _set_box(x: float, low: float, high: float, blur: AxisBlur, table: Floats, o
         out[row, 3] = first[3] - last[3]
 
 
-@routine
+@loop
 def set_profiles(x: float, blur: AxisBlur, edges: Floats, table: Floats, out: AxisProfiles) -> None:
     """Set the profiles of all boxes along one axis at x; `edges` are those of the units, shape (n, 2)."""
     n = edges.shape[0]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import routine, step
+from app.decoders.compiled import loop, routine, step
 from app.decoders.plate.profiles import AxisBlur, AxisProfiles, Floats, Ints, normal, set_profiles
 from app.decoders.plate.quadrature import Quadrature
 
@@ -129,6 +129,24 @@ def new_row(shapes: int) -> PixelRow:
     return PixelRow(np.empty(shapes, np.int64), np.zeros(shapes), np.empty(POSE), np.empty(5))
 
 
+class Scratch(NamedTuple):
+    """Memory that serves one pixel after the other: the row of the pixel, and the profiles along both axes."""
+
+    row: PixelRow
+    along_u: AxisProfiles
+    along_v: AxisProfiles
+
+
+@routine
+def new_scratch(shapes: int, n: int) -> Scratch:
+    """Memory for plates of n x n units."""
+    return Scratch(
+        new_row(shapes),
+        AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64)),
+        AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64)),
+    )
+
+
 class Slopes(NamedTuple):
     """Derivatives of a pixel's light by its place, its blur along both axes, the motion's square and the node scale."""
 
@@ -176,13 +194,13 @@ def blur_on_plate(pixel: PixelPlace, lens: LensBlur, is_turned: bool) -> tuple[f
     return a, d
 
 
-@routine
+@loop
 def bilinear(corner: int, u: float, v: float) -> float:
     """Weight of one of the four corner values of the gaps and of the road."""
     return (u if corner % 2 else 1.0 - u) * (v if corner >= 2 else 1.0 - v)
 
 
-@routine
+@loop
 def _add_share(row: PixelRow, entries: int, shape: int, amount: float) -> int:
     """Add to a shape's share of the pixel; returns the number of shapes in the pixel."""
     if row.share[shape] == 0.0:
