@@ -25,7 +25,7 @@ from app.decoders.plate.homography import project
 from app.decoders.plate.layout import marker_centroids, unit_centres
 from app.decoders.plate.marker_colours import MarkerColours, marker_colours, triangle_rest
 from app.decoders.plate.pose import with_pose
-from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
+from app.decoders.plate.unit_likelihoods import UnitEvidence, code_units, unit_log_likelihoods
 from app.decoders.plate.unit_verification import UnitVerification
 from app.decoders.plate.verify_units import verify_units
 from app.errors import InvalidParameter
@@ -90,6 +90,7 @@ class _Task:
     geometries: Sequence[PlateGeometry]
     fits: list[tuple[PlateGeometry, Array, PlateFit | None]] = field(default_factory=list)
     evidence: list[PlateEvidence] = field(default_factory=list)
+    units: list[tuple[PlateFit, UnitEvidence | None]] = field(default_factory=list)
     verifications: list[tuple[PlateFit, str, UnitVerification | None]] = field(default_factory=list)
 
     def verify(self, fit: PlateFit, geometry: PlateGeometry, code: PlateCode) -> UnitVerification | None:
@@ -100,6 +101,19 @@ class _Task:
         found = verify_units(self.image, fit, geometry, code_units(code))
         self.verifications.append((fit, code.digits, found))
         return found
+
+    def is_clear(self) -> bool:
+        """Whether a plate with all of its markers was seen clearly: other signals show the same units."""
+        return any(one.missing is None and one.explained > CLEAN_EXPLAINED for one in self.evidence)
+
+    def unit_evidence(self, fit: PlateFit) -> UnitEvidence | None:
+        """Evidence of a fit about its units; that of an earlier pass serves again."""
+        for known, found in self.units:
+            if known is fit:
+                return found
+        evidence = unit_log_likelihoods(fit)
+        self.units.append((fit, evidence))
+        return evidence
 
     def fit_candidate(
         self, signal: MarkerSignal, quad: MarkerQuad, geometry: PlateGeometry, other_explained: float
@@ -196,7 +210,7 @@ def _decode_colour(task: _Task) -> list[PlateReading]:
         for candidate in candidates:
             if not any(_covers(reading, candidate.quad) for reading in readings):
                 readings += _read_candidate(task, signal, candidate)
-        if any(reading.code for reading in readings):
+        if any(reading.code for reading in readings) or task.is_clear():
             break
     return readings
 
@@ -322,7 +336,7 @@ def _read_fit(
         width_px=float(extent[0]),
         height_px=float(extent[1]),
     )
-    units = unit_log_likelihoods(fit)
+    units = task.unit_evidence(fit)
     if units is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
         return replace(reading, outcome=outcome, reason=reason)
