@@ -94,6 +94,8 @@ class LightPrior(NamedTuple):
         Standard deviation of the light, relative.
     length_mm, level_variance : float
         Distance over which the correlation of the light falls to 1/e, and the variance of its mean, relative.
+    veil_variance, veil_length_mm : float
+        Variance of the error of light that the plate does not send, and length over which that changes.
     """
 
     field: Floats
@@ -101,6 +103,8 @@ class LightPrior(NamedTuple):
     spread: float
     length_mm: float
     level_variance: float
+    veil_variance: float = 0.0
+    veil_length_mm: float = 1.0
 
 
 class Spots(NamedTuple):
@@ -241,6 +245,8 @@ def _set_covariances(
             apart2 = _distance2(places_mm, p, places_mm[q, 0], places_mm[q, 1])
             smooth = light.spread * light.spread * math.exp(-math.sqrt(apart2) / light.length_mm) + light.level_variance
             paint = 0.0
+            if light.veil_variance > 0.0:
+                paint = light.veil_variance * math.exp(-0.5 * apart2 / light.veil_length_mm**2) / scale
             for k in range(shown.lengths[p]):
                 other = shown.listed[p, k]
                 spread = DARK_SPREAD if pattern.dark[other] > 0.5 else WHITE_SPREAD

@@ -25,7 +25,7 @@ from app.decoders.plate.homography import project
 from app.decoders.plate.layout import marker_centroids, unit_centres
 from app.decoders.plate.marker_colours import MarkerColours, marker_colours
 from app.decoders.plate.pose import with_pose
-from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
+from app.decoders.plate.unit_likelihoods import UnitEvidence, code_units, unit_log_likelihoods
 from app.decoders.plate.unit_verification import UnitVerification
 from app.decoders.plate.verify_units import verify_units
 from app.errors import InvalidParameter
@@ -88,12 +88,14 @@ class _Task:
     evidence: list[PlateEvidence] = field(default_factory=list)
     verifications: list[tuple[PlateFit, str, UnitVerification | None]] = field(default_factory=list)
 
-    def verify(self, fit: PlateFit, geometry: PlateGeometry, code: PlateCode) -> UnitVerification | None:
+    def verify(
+        self, fit: PlateFit, geometry: PlateGeometry, units: UnitEvidence, code: PlateCode
+    ) -> UnitVerification | None:
         """The pixels compared with a code; that of the same fit in an earlier pass serves again."""
         for known, digits, found in self.verifications:
             if known is fit and digits == code.digits:
                 return found
-        found = verify_units(self.image, fit, geometry, code_units(code))
+        found = verify_units(self.image, fit, geometry, code_units(code), units.veils, units.veil_log_odds)
         self.verifications.append((fit, code.digits, found))
         return found
 
@@ -325,7 +327,7 @@ def _read_fit(
         units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px,
         float(extent.min()), weakest_marker, thermal=task.image.ndim == 2, missing=missing, colours=colours,
     )  # fmt: skip
-    verify = partial(task.verify, fit, geometry) if task.image.ndim == 3 else None
+    verify = partial(task.verify, fit, geometry, units) if task.image.ndim == 3 else None
     reading, decoded = read_evidence(reading, evidence, task.codebook, verify)
     task.evidence.append(replace(evidence, verification=decoded.verification))
     if reading.code is None:

@@ -24,7 +24,7 @@ from app.decoders.plate.hypotheses import (
     set_unit_likelihoods,
 )
 from app.decoders.plate.layout import marker_centroids
-from app.decoders.plate.unit_likelihoods import code_units
+from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
 from app.decoders.plate.unit_verification import UnitVerification
 from app.decoders.plate.verify_units import verify_units
 from app.markers.plate import PlateGeometry, unit_index
@@ -43,7 +43,9 @@ def verified(face: Face, pattern: np.ndarray = DARK, **options: Any) -> UnitVeri
     to_image = np.append(homography_from_points(CORNERS, shot.truths[0].corners_px), 1.0).reshape(3, 3)
     fit = fit_plate(shot.image, project(to_image, marker_centroids(GEOMETRY)), GEOMETRY)
     assert fit is not None
-    found = verify_units(shot.image, fit, GEOMETRY, pattern)
+    units = unit_log_likelihoods(fit)
+    assert units is not None
+    found = verify_units(shot.image, fit, GEOMETRY, pattern, units.veils, units.veil_log_odds)
     assert found is not None
     return found
 
