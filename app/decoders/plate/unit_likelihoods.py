@@ -48,8 +48,8 @@ MAX_LOG_ODDS = 12.0
 """[log odds] of a veil against even haze, or the reverse, beyond which the other one does not count. Source: 6e-6, far
 below `evidence.MAX_ERROR`."""
 MIN_VEILED_RESIDUAL = 0.08
-"""[contrast] level residual under even haze from which on a veil of glare is compared. Source: chosen by hand, for speed;
-as `evidence.PLAIN_RESIDUAL`."""
+"""[contrast] level residual under even haze from which on a veil of glare is compared. Source: chosen by hand, for
+speed, as `evidence.PLAIN_RESIDUAL`."""
 MIN_LEVEL_NOISE_RATIO = 4.0
 """[standard deviations] by which the lightest units must stand above the darkest. Source: chosen by hand."""
 MIN_LIGHT = 1e-4
