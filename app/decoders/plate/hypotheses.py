@@ -1,8 +1,9 @@
 """Log likelihoods of the pixels around each unit, under each hypothesis about it.
 
-The light of pixel i is l a_i (1 + g_i) + e_i: the mean light l around the unit, the reflectance a_i that the pixel
-sees, a Gaussian process g of the light, and errors e of the pixels and of the units' paint. All is normal, so the light
-is integrated out: the likelihood is that of a normal distribution with mean l a and a full covariance.
+The light of pixel i is l a_i (1 + g_i) + v_i + e_i: the mean light l around the unit, the reflectance a_i that the
+pixel sees, a Gaussian process g of the light, another one v of what is left of a veil of glare, and errors e of the
+pixels and of the units' paint. All is normal, so the light is integrated out: the likelihood is that of a normal
+distribution with mean l a and a full covariance.
 """
 
 from __future__ import annotations
@@ -245,8 +246,9 @@ def _set_covariances(
             apart2 = _distance2(places_mm, p, places_mm[q, 0], places_mm[q, 1])
             smooth = light.spread * light.spread * math.exp(-math.sqrt(apart2) / light.length_mm) + light.level_variance
             paint = 0.0
+            veil = 0.0
             if light.veil_variance > 0.0:
-                paint = light.veil_variance * math.exp(-0.5 * apart2 / light.veil_length_mm**2) / scale
+                veil = light.veil_variance * math.exp(-0.5 * apart2 / (light.veil_length_mm * light.veil_length_mm))
             for k in range(shown.lengths[p]):
                 other = shown.listed[p, k]
                 spread = DARK_SPREAD if pattern.dark[other] > 0.5 else WHITE_SPREAD
@@ -257,10 +259,10 @@ def _set_covariances(
             other_flipped = pattern.seen[q] + around.change * units[q, unit]
             read_term = smooth * as_read * pattern.seen[q] + paint
             flip_term = smooth * flipped * other_flipped + paint + around.own * units[p, unit] * units[q, unit]
-            covariance[0, i, j] = scale * read_term
-            covariance[1, i, j] = scale * flip_term
-            covariance[2, i, j] = scale * (read_term + stain)
-            covariance[3, i, j] = scale * (flip_term + stain)
+            covariance[0, i, j] = scale * read_term + veil
+            covariance[1, i, j] = scale * flip_term + veil
+            covariance[2, i, j] = scale * (read_term + stain) + veil
+            covariance[3, i, j] = scale * (flip_term + stain) + veil
         for h in range(4):
             covariance[h, i, i] += light.noise[p]
 

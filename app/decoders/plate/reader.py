@@ -318,7 +318,7 @@ def _read_fit(
         width_px=float(extent[0]),
         height_px=float(extent[1]),
     )
-    units = unit_log_likelihoods(fit)
+    units = unit_log_likelihoods(fit, thermal=task.image.ndim == 2)
     if units is None:
         outcome, reason = missing or (PlateOutcome.CELLS_UNDECODABLE, "the units do not stand out of the noise")
         return replace(reading, outcome=outcome, reason=reason)

@@ -182,10 +182,11 @@ class LightLevels(NamedTuple):
     light: float
 
 
-def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
+def unit_log_likelihoods(fit: PlateFit, *, thermal: bool = False) -> UnitEvidence | None:
     """Costs of all symbols; None when the units do not differ by more than their noise, or show one level only.
 
-    Under even haze, or under a veil of glare where that is the likelier explanation of the units' light.
+    Under even haze, or under a veil of glare where that is the likelier explanation of the units' light; a thermal
+    frame has no glare.
     """
     levels = light_levels(fit)
     if levels is None:
@@ -193,7 +194,7 @@ def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
     n = fit.units.shape[0]
     haze = uniform_haze(levels.dark, levels.light, n)
     hazy = _under_veil(fit, levels, haze)
-    if hazy is not None and hazy.level_residual.max() < MIN_VEILED_RESIDUAL:
+    if thermal or (hazy is not None and hazy.level_residual.max() < MIN_VEILED_RESIDUAL):
         return hazy
     veil, dark = estimate_veil(levels.values, levels.covariance, levels.light - levels.dark, n)
     patterns = [dark] if hazy is None or (hazy.dark == dark).all() else [dark, hazy.dark]

@@ -83,7 +83,8 @@ def test_a_spot_of_paint_over_a_unit_makes_it_unsure(reflectance: float) -> None
     assert verified(covered, pattern).error_probability > MAX_ERROR
 
 
-def test_the_likelihoods_are_those_of_normal_distributions() -> None:
+@pytest.mark.parametrize("veil", [0.0, 0.004])
+def test_the_likelihoods_are_those_of_normal_distributions(veil: float) -> None:
     rng = np.random.default_rng(4)
     count = 30
     places = rng.uniform(0, 30, (count, 2))
@@ -95,12 +96,13 @@ def test_the_likelihoods_are_those_of_normal_distributions() -> None:
     seen, light = rng.uniform(0.2, 1.0, count), np.full(count, 0.5)
     noise = rng.uniform(1e-4, 4e-4, count)
     pattern = PlatePattern(dark, seen, albedo, np.array([[15.0, 15.0]] * 2), 100.0, 5.0)
-    prior = LightPrior(light, noise, spread, length_mm, level)
+    prior = LightPrior(light, noise, spread, length_mm, level, veil, 80.0)
     spots = Spots(np.array([[0, 0, 1, 0, 1, 1.0]]), np.array([0.5]), np.array([0.0]))
     found = np.empty((2, 5))
     set_unit_likelihoods(pixels, pattern, prior, spots, found)
     apart = np.linalg.norm(places[:, None] - places[None], axis=2)
     smooth = spread**2 * np.exp(-apart / length_mm) + level
+    added = veil * np.exp(-0.5 * (apart / 80.0) ** 2) + np.diag(noise)
     constant = 0.5 * count * math.log(2 * math.pi)
     for unit, (change, spreads) in enumerate(
         [(1 - albedo, (WHITE_SPREAD, WHITE_SPREAD)), (albedo - 1, (DARK_SPREAD, DARK_SPREAD))]
@@ -109,12 +111,12 @@ def test_the_likelihoods_are_those_of_normal_distributions() -> None:
             [(seen, (DARK_SPREAD, WHITE_SPREAD)), (seen + change * units[:, unit], spreads)]
         ):
             paint = (units * np.square(own)) @ units.T
-            covariance = 0.25 * (smooth * np.outer(mean, mean) + paint) + np.diag(noise)
+            covariance = 0.25 * (smooth * np.outer(mean, mean) + paint) + added
             expected = scipy.stats.multivariate_normal(0.5 * mean, covariance).logpdf(pixels.light)
             assert found[unit, column] == pytest.approx(expected + constant, abs=1e-6)
     # a spot without opacity is no spot: the flipped unit, under the covariance of the unit as read
     residual = pixels.light - 0.5 * (seen + (1 - albedo) * units[:, 0])
     paint = (units * np.square((DARK_SPREAD, WHITE_SPREAD))) @ units.T
-    covariance = 0.25 * (smooth * np.outer(seen, seen) + paint) + np.diag(noise)
+    covariance = 0.25 * (smooth * np.outer(seen, seen) + paint) + added
     expected = scipy.stats.multivariate_normal(np.zeros(count), covariance).logpdf(residual)
     assert found[0, 4] == pytest.approx(expected + constant, abs=1e-6)
