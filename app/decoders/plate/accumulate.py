@@ -170,6 +170,8 @@ def _joint_units(units: Sequence[UnitEvidence], share: float, max_unit_px: float
         scatter=float(np.median([one.scatter for one in units])),
         gap=float(np.median([one.gap for one in units])),
         span=float(np.median([one.span for one in units])),
+        veils=units[0].veils,
+        veil_log_odds=units[0].veil_log_odds,
     )
 
 

@@ -88,7 +88,7 @@ def view_elsewhere(known: PlateEvidence, image: Array, other: Array, corners_px:
         return None
     if (fit.corners_px < 0).any() or (fit.corners_px > np.array([other.shape[1], other.shape[0]]) - 1).any():
         return None
-    units = unit_log_likelihoods(fit)
+    units = unit_log_likelihoods(fit, thermal=known.thermal)
     if units is None:
         return None
     extent_px = float(np.ptp(fit.corners_px, axis=0).min())

@@ -1,8 +1,9 @@
 """Log likelihoods of the pixels around each unit, under each hypothesis about it.
 
-The light of pixel i is l a_i (1 + g_i) + e_i: the mean light l around the unit, the reflectance a_i that the pixel
-sees, a Gaussian process g of the light, and errors e of the pixels and of the units' paint. All is normal, so the light
-is integrated out: the likelihood is that of a normal distribution with mean l a and a full covariance.
+The light of pixel i is l a_i (1 + g_i) + v_i + e_i: the mean light l around the unit, the reflectance a_i that the
+pixel sees, a Gaussian process g of the light, another one v of what is left of a veil of glare, and errors e of the
+pixels and of the units' paint. All is normal, so the light is integrated out: the likelihood is that of a normal
+distribution with mean l a and a full covariance.
 """
 
 from __future__ import annotations
@@ -98,6 +99,8 @@ class LightPrior(NamedTuple):
         Standard deviation of the light, relative.
     length_mm, level_variance : float
         Distance over which the correlation of the light falls to 1/e, and the variance of its mean, relative.
+    veil_variance, veil_length_mm : float
+        Variance of the error of light that the plate does not send, and length over which that changes.
     """
 
     field: Floats
@@ -105,6 +108,8 @@ class LightPrior(NamedTuple):
     spread: float
     length_mm: float
     level_variance: float
+    veil_variance: float = 0.0
+    veil_length_mm: float = 1.0
 
 
 class Spots(NamedTuple):
@@ -329,6 +334,18 @@ def _set_paint(dark: Floats, shown: Ints, units: Floats, i: int, paint: Floats) 
 
 
 @routine
+def _add_veil(variance: float, length_mm: float, local: Local, i: int) -> None:
+    """Add what is left of a veil of glare to a row of the paints' covariance, from pixel i on."""
+    x0, y0 = local.x_mm[i], local.y_mm[i]
+    by_length = 0.5 / (length_mm * length_mm)
+    for k in range(local.x_mm.size - i):
+        j = np.uint64(i + k)
+        right = local.x_mm[j] - x0
+        down = local.y_mm[j] - y0
+        local.paint[j] += variance * _exp_down((right * right + down * down) * by_length)
+
+
+@routine
 def _set_row(light: LightPrior, local: Local, own: float, i: int, read: Singles, others: Singles) -> None:
     """Set row i of the covariances of the unit as read, and of it flipped and both under a smooth stain."""
     x_mm, y_mm, seen, flipped = local.x_mm, local.y_mm, local.seen, local.flipped
@@ -437,6 +454,8 @@ def _compare_unit(
     for i in range(size):
         p = around.pixels[i]
         _set_paint(pattern.dark, shown.listed[p, : shown.lengths[p]], local.units, i, local.paint)
+        if light.veil_variance > 0.0:
+            _add_veil(light.veil_variance / (around.light * around.light), light.veil_length_mm, local, i)
         _set_row(light, local, around.own, i, as_read, others)
         level = pixels.light[p] / around.light
         as_read[i, size] = level - local.seen[i]

@@ -93,12 +93,14 @@ class _Task:
     units: list[tuple[PlateFit, UnitEvidence | None]] = field(default_factory=list)
     verifications: list[tuple[PlateFit, str, UnitVerification | None]] = field(default_factory=list)
 
-    def verify(self, fit: PlateFit, geometry: PlateGeometry, code: PlateCode) -> UnitVerification | None:
+    def verify(
+        self, fit: PlateFit, geometry: PlateGeometry, units: UnitEvidence, code: PlateCode
+    ) -> UnitVerification | None:
         """The pixels compared with a code; that of the same fit in an earlier pass serves again."""
         for known, digits, found in self.verifications:
             if known is fit and digits == code.digits:
                 return found
-        found = verify_units(self.image, fit, geometry, code_units(code))
+        found = verify_units(self.image, fit, geometry, code_units(code), units.veils, units.veil_log_odds)
         self.verifications.append((fit, code.digits, found))
         return found
 
@@ -111,7 +113,7 @@ class _Task:
         for known, found in self.units:
             if known is fit:
                 return found
-        evidence = unit_log_likelihoods(fit)
+        evidence = unit_log_likelihoods(fit, thermal=self.image.ndim == 2)
         self.units.append((fit, evidence))
         return evidence
 
@@ -345,7 +347,7 @@ def _read_fit(
         units, geometry, fit.corners_px, fit.corners_covariance_px2, fit.explained, fit.unit_px,
         float(extent.min()), weakest_marker, thermal=task.image.ndim == 2, missing=missing, colours=colours,
     )  # fmt: skip
-    verify = partial(task.verify, fit, geometry) if task.image.ndim == 3 else None
+    verify = partial(task.verify, fit, geometry, units) if task.image.ndim == 3 else None
     reading, decoded = read_evidence(reading, evidence, task.codebook, verify)
     task.evidence.append(replace(evidence, verification=decoded.verification))
     if reading.code is None:

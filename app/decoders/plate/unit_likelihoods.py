@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -20,13 +20,14 @@ from app.decoders.plate.fit import PlateFit
 from app.decoders.plate.layout import unit_shapes
 from app.decoders.plate.linear import invert
 from app.decoders.plate.unit_patterns import cell_costs, minimize_pattern
+from app.decoders.plate.veil import Veil, estimate_veil, uniform_haze, veil_log_odds
 from app.markers.plate import PlateCode, unit_index
 
 Array = npt.NDArray[Any]
 
 CONTRAST = 2.0
 """[log light] expected difference of light and dark units once haze is taken off. Source: chosen by hand, near ln(1 /
-DARK_SHARE) = 2.1."""
+veil.DARK_SHARE) = 2.1."""
 CONTRAST_SPREAD = 0.4
 """[log light] standard deviation of that difference. Source: chosen by hand."""
 LIGHT_SPREAD = 0.45
@@ -43,9 +44,12 @@ LEVELLED_CONTRAST_SPREAD = 0.3
 """[contrast] standard deviation of the levelled contrast. Source: chosen by hand."""
 LOG_FLOOR = 0.05
 """[light level] added before the logarithm, so that noise around black stays small. Source: chosen by hand."""
-DARK_SHARE = 0.12
-"""[light level] light of dark units without haze: what they have beyond it is taken for haze. Source: chosen by hand;
-the simulated plates (`simulation.plate_face.draw_look`) have 0.02 to 0.2."""
+MAX_LOG_ODDS = 12.0
+"""[log odds] of a veil against even haze, or the reverse, beyond which the other one does not count. Source: 6e-6, far
+below `evidence.MAX_ERROR`."""
+MIN_VEILED_RESIDUAL = 0.08
+"""[contrast] level residual under even haze from which on a veil of glare is compared. Source: chosen by hand, for
+speed, as `evidence.PLAIN_RESIDUAL`."""
 MIN_LEVEL_NOISE_RATIO = 4.0
 """[standard deviations] by which the lightest units must stand above the darkest. Source: chosen by hand."""
 MIN_LIGHT = 1e-4
@@ -119,6 +123,10 @@ class UnitEvidence:
         Light of the gaps between units over that of the light units, the haze taken off.
     span : float
         Light of the light units above the dark ones. [linear, 1 = saturation]
+    veils : tuple of Veil
+        Light that the plate does not send: what was taken off, and the other explanation if it is not much less likely.
+    veil_log_odds : float
+        Of the first against the other.
     """
 
     cell_costs: Array
@@ -134,6 +142,8 @@ class UnitEvidence:
     scatter: float
     gap: float
     span: float
+    veils: tuple[Veil, ...]
+    veil_log_odds: float = math.inf
 
     @property
     def cell_margin(self) -> Array:
@@ -164,31 +174,47 @@ PATTERNS = np.array(list(itertools.product((0, 1), repeat=4)), dtype=float)
 
 
 class LightLevels(NamedTuple):
-    """The units' light in symbol order, their covariance, the light of the darkest and the lightest, and the haze."""
+    """The units' light in symbol order, their covariance, and the light of the darkest and the lightest."""
 
     values: Array
     covariance: Array
     dark: float
     light: float
 
-    @property
-    def haze(self) -> float:
-        """Light that dark units have beyond what their material sends back."""
-        return max(0.0, (self.dark - DARK_SHARE * self.light) / (1 - DARK_SHARE))
 
-
-def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
+def unit_log_likelihoods(fit: PlateFit, *, thermal: bool = False) -> UnitEvidence | None:
     """Costs of all symbols; None when the units do not differ by more than their noise, or show one level only.
+
+    Under even haze, or under a veil of glare where that is the likelier explanation of the units' light; a thermal
+    frame has no glare.
+    """
+    levels = light_levels(fit)
+    if levels is None:
+        return None
+    n = fit.units.shape[0]
+    haze = uniform_haze(levels.dark, levels.light, n)
+    hazy = _under_veil(fit, levels, haze)
+    if thermal or (hazy is not None and hazy.level_residual.max() < MIN_VEILED_RESIDUAL):
+        return hazy
+    veil, dark = estimate_veil(levels.values, levels.covariance, levels.light - levels.dark, n)
+    patterns = [dark] if hazy is None or (hazy.dark == dark).all() else [dark, hazy.dark]
+    log_odds = veil_log_odds(levels.values, levels.covariance, haze, patterns, n)
+    veiled = _under_veil(fit, levels, veil) if log_odds > 0 or hazy is None else None
+    found, veils = (hazy, (haze, veil)) if veiled is None else (veiled, (veil, haze))
+    if found is None or abs(log_odds) > MAX_LOG_ODDS:
+        return found
+    return replace(found, veils=veils, veil_log_odds=log_odds if found is veiled else -log_odds)
+
+
+def _under_veil(fit: PlateFit, levels: LightLevels, veil: Veil) -> UnitEvidence | None:
+    """Costs of all symbols once a veil is taken off.
 
     Two classifiers in turn: the first on logarithms, where any illumination is a sum, gives the light that falls on
     each unit; the second on the light divided by that, where the noise is even.
     """
     n = fit.units.shape[0]
-    levels = light_levels(fit)
-    if levels is None:
-        return None
-    values = levels.values - levels.haze
-    light, first = _estimate_illumination(values, levels.covariance, levels.light - levels.haze, n)
+    values = levels.values - veil.light.reshape(-1)[unit_index(n).reshape(-1)]
+    light, first = _estimate_illumination(values, levels.covariance, veil.level, n)
     levelled = values / light
     total = _smooth(n, LEVELLED_LIGHT_SPREAD) + levels.covariance / np.outer(light, light)
     total[np.diag_indices_from(total)] += LEVELLED_WEAR**2
@@ -224,8 +250,9 @@ def unit_log_likelihoods(fit: PlateFit) -> UnitEvidence | None:
         residual=residual,
         contrast=contrast,
         scatter=scatter / len(residual),
-        gap=(fit.gap - levels.haze) / (levels.light - levels.haze),
+        gap=(fit.gap - float(veil.light.mean())) / veil.level,
         span=levels.light - levels.dark,
+        veils=(veil,),
     )
 
 

@@ -9,9 +9,11 @@ Whether the plate has stains at all follows from all of its units.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -29,8 +31,8 @@ from app.decoders.plate.light_field import LEVEL_VARIANCE, LIGHT_LENGTH_MM, fit_
 from app.decoders.plate.patch import cut_patch
 from app.decoders.plate.pixel_shares import gather_shares, set_pixel_shares
 from app.decoders.plate.synthesis import FIRST_GAP
-from app.decoders.plate.unit_likelihoods import light_levels
 from app.decoders.plate.unit_verification import UnitVerification
+from app.decoders.plate.veil import DARK_SHARE, VEIL_LENGTH, Veil
 from app.markers.plate import PlateGeometry, unit_index
 
 Array = npt.NDArray[Any]
@@ -51,6 +53,9 @@ MIN_BLUR_MM = 2.0
 """[mm] width of the edge of a spot of paint at least. Source: chosen by hand."""
 NODES = 4
 """Quadrature nodes on each side of the middle at most, as the fit has."""
+VEIL_ERROR = 0.05
+"""[light level] standard deviation of the error of a veil of glare. Source: chosen by hand; with none, 51 of 100
+frames in glare are read in place of 52 (decision record 0029)."""
 SPOTS_MM = ((17, 17, 0), (22, 22, 0), (30, 30, 0), (26, 17, 0), (17, 26, 0), (28, 20, 45), (28, 20, 135))
 """[mm, mm, deg] half axes and turns of the spots of paint; each lies at nine places around the unit's centre. Source:
 chosen by hand; smaller ones leave a part of the unit in view."""
@@ -59,7 +64,12 @@ PAINTS, OPACITIES = np.array([0.03, 0.1, 0.2, 0.35, 0.6, 0.85, 1.0, 1.15]), np.a
 
 
 def verify_units(
-    image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, dark: npt.NDArray[np.bool_]
+    image: npt.NDArray[np.uint8],
+    fit: PlateFit,
+    geometry: PlateGeometry,
+    dark: npt.NDArray[np.bool_],
+    veils: Sequence[Veil],
+    log_odds: float = math.inf,
 ) -> UnitVerification | None:
     """Verify a pattern of units by the pixels.
 
@@ -72,13 +82,31 @@ def verify_units(
     geometry : PlateGeometry
     dark : ndarray of bool, shape (units,)
         The pattern, in the order of the symbols' units.
+    veils : sequence of Veil
+        Light that the plate does not send, in one or two explanations.
+    log_odds : float
+        Of the first explanation against the other.
 
     Returns
     -------
     UnitVerification or None
         None where the plate has too few pixels.
     """
-    cut = _cut(image, fit, geometry)
+    found = [_likelihoods(image, fit, geometry, dark, veil) for veil in veils]
+    first = found[0]
+    if first is None:
+        return None
+    for other in found[1:]:
+        if other is not None:
+            first = np.logaddexp(first - np.logaddexp(0.0, -log_odds), other - np.logaddexp(0.0, log_odds))
+    return UnitVerification(first)
+
+
+def _likelihoods(
+    image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, dark: npt.NDArray[np.bool_], veil: Veil
+) -> Array | None:
+    """Log likelihoods of the hypotheses about each unit under a veil; None where the plate has too few pixels."""
+    cut = _cut(image, fit, geometry, veil)
     if cut is None:
         return None
     pixels, paints = cut
@@ -93,19 +121,23 @@ def verify_units(
             pattern, white + parts @ field.albedo, float(field.albedo[0]), _centres_mm(geometry),
             REACH_PITCHES * geometry.pitch_mm, INNER_SHARE * geometry.unit_mm / 2,
         ),
-        LightPrior(field.light, field.noise, field.spread, LIGHT_LENGTH_MM, LEVEL_VARIANCE),
+        LightPrior(
+            field.light, field.noise, field.spread, LIGHT_LENGTH_MM, LEVEL_VARIANCE,
+            0.0 if veil.is_even else (VEIL_ERROR * veil.level) ** 2, VEIL_LENGTH * geometry.side_mm / 8,
+        ),
         Spots(_spot_shapes(geometry.pitch_mm), PAINTS, OPACITIES),
         likelihoods,
     )  # fmt: skip
-    return UnitVerification(likelihoods)
+    return likelihoods
 
 
-def _cut(image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry) -> tuple[PlatePixels, Array] | None:
+def _cut(
+    image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, veil: Veil
+) -> tuple[PlatePixels, Array] | None:
     """The pixels on the plate, and the reflectances of its parts to begin with."""
     n, side_mm = geometry.n, geometry.side_mm
     patch = cut_patch(image, fit.corners_px, n * UNIT_PX, linear=False)
-    levels = light_levels(fit)
-    if patch is None or levels is None:
+    if patch is None:
         return None
     shapes = len(fit.model.values)
     shares, places = np.empty((*patch.light.shape, shapes)), np.empty((*patch.light.shape, 2))
@@ -120,18 +152,21 @@ def _cut(image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry) -
     right, down = np.diff(fit.corners_px[:3], axis=0)
     mm_per_px = side_mm / math.sqrt(max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0))
     blur_px = math.sqrt(fit.blur_px**2 + patch.grid[2] * patch.grid[3] / 12)
-    level = levels.light - levels.haze
+    across, along = (places.reshape(size, 2)[used].T * n - 0.5).astype(np.float32)
+    veiled = cv2.remap(veil.light.astype(np.float32), across, along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    at_cells = veil.light.reshape(n // 2, 2, n // 2, 2).mean(axis=(1, 3))
     pixels = PlatePixels(
-        patch.light.reshape(-1)[used].astype(float) - levels.haze,
+        patch.light.reshape(-1)[used].astype(float) - np.asarray(veiled, float).reshape(-1),
         weights / float(weights.mean()),
         units[:count],
         rest[:count],
         places.reshape(size, 2)[used] * side_mm,
-        level,
+        veil.level,
         max(mm_per_px * blur_px, MIN_BLUR_MM),
     )
-    first = np.array([levels.dark, fit.gap, *fit.markers]) - levels.haze
-    return pixels, np.clip(first / level, *ALBEDO)
+    markers = fit.markers - at_cells[[0, 0, 0, -1, -1], [0, 0, -1, -1, 0]]
+    first = np.array([DARK_SHARE * veil.level, fit.gap - float(veil.light.mean()), *markers])
+    return pixels, np.clip(first / veil.level, *ALBEDO)
 
 
 @lru_cache

@@ -28,7 +28,7 @@ from app.decoders.plate.hypotheses import (
 )
 from app.decoders.plate.layout import marker_centroids
 from app.decoders.plate.reader import decode_plates
-from app.decoders.plate.unit_likelihoods import code_units
+from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
 from app.decoders.plate.unit_verification import UnitVerification
 from app.decoders.plate.verify_units import verify_units
 from app.markers.plate import PlateGeometry, unit_index
@@ -47,7 +47,9 @@ def verified(face: Face, pattern: np.ndarray = DARK, **options: Any) -> UnitVeri
     to_image = np.append(homography_from_points(CORNERS, shot.truths[0].corners_px), 1.0).reshape(3, 3)
     fit = fit_plate(shot.image, project(to_image, marker_centroids(GEOMETRY)), GEOMETRY)
     assert fit is not None
-    found = verify_units(shot.image, fit, GEOMETRY, pattern)
+    units = unit_log_likelihoods(fit)
+    assert units is not None
+    found = verify_units(shot.image, fit, GEOMETRY, pattern, units.veils, units.veil_log_odds)
     assert found is not None
     return found
 
@@ -105,7 +107,8 @@ def test_a_plate_that_is_seen_clearly_ends_the_search(monkeypatch: pytest.Monkey
     assert searched[1:] == ["difference_signal", "ratio_signal", "coarse_ratio_signal"]
 
 
-def test_the_likelihoods_are_those_of_normal_distributions() -> None:
+@pytest.mark.parametrize("veil", [0.0, 0.004])
+def test_the_likelihoods_are_those_of_normal_distributions(veil: float) -> None:
     rng = np.random.default_rng(4)
     count = 30
     places = rng.uniform(0, 30, (count, 2))
@@ -117,12 +120,13 @@ def test_the_likelihoods_are_those_of_normal_distributions() -> None:
     seen, light = rng.uniform(0.2, 1.0, count), np.full(count, 0.5)
     noise = rng.uniform(1e-4, 4e-4, count)
     pattern = PlatePattern(dark, seen, albedo, np.array([[15.0, 15.0]] * 2), 100.0, 5.0)
-    prior = LightPrior(light, noise, spread, length_mm, level)
+    prior = LightPrior(light, noise, spread, length_mm, level, veil, 80.0)
     spots = Spots(np.array([[0, 0, 1, 0, 1, 1.0]]).T.copy(), np.array([0.5]), np.array([0.0]))
     found = np.empty((2, 5))
     set_unit_likelihoods(pixels, pattern, prior, spots, found)
     apart = np.linalg.norm(places[:, None] - places[None], axis=2)
     smooth = spread**2 * np.exp(-apart / length_mm) + level
+    added = veil * np.exp(-0.5 * (apart / 80.0) ** 2) + np.diag(noise)
     constant = 0.5 * count * math.log(2 * math.pi)
     for unit, (change, spreads) in enumerate(
         [(1 - albedo, (WHITE_SPREAD, WHITE_SPREAD)), (albedo - 1, (DARK_SPREAD, DARK_SPREAD))]
@@ -131,12 +135,12 @@ def test_the_likelihoods_are_those_of_normal_distributions() -> None:
             [(seen, (DARK_SPREAD, WHITE_SPREAD)), (seen + change * units[:, unit], spreads)]
         ):
             paint = (units * np.square(own)) @ units.T
-            covariance = 0.25 * (smooth * np.outer(mean, mean) + paint) + np.diag(noise)
+            covariance = 0.25 * (smooth * np.outer(mean, mean) + paint) + added
             expected = scipy.stats.multivariate_normal(0.5 * mean, covariance).logpdf(pixels.light)
             assert found[unit, column] == pytest.approx(expected + constant, rel=1e-4, abs=0.01)
     # a spot without opacity is no spot: the flipped unit, under the covariance of the unit as read
     residual = pixels.light - 0.5 * (seen + (1 - albedo) * units[:, 0])
     paint = (units * np.square((DARK_SPREAD, WHITE_SPREAD))) @ units.T
-    covariance = 0.25 * (smooth * np.outer(seen, seen) + paint) + np.diag(noise)
+    covariance = 0.25 * (smooth * np.outer(seen, seen) + paint) + added
     expected = scipy.stats.multivariate_normal(np.zeros(count), covariance).logpdf(residual)
     assert found[0, 4] == pytest.approx(expected + constant, rel=1e-4, abs=0.01)  # single precision
