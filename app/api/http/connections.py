@@ -67,8 +67,8 @@ class LimitedConnection(HttpToolsProtocol):
     """One connection of a client; `limited_connections` makes a subclass with limits.
 
     A check each second ends it when its headers are late or when it does not read. A connection between two requests is
-    ended by uvicorn. One whose request is answered before the whole body has come is ended unless the rest, which is not
-    read and does not count as headers, comes soon.
+    ended by uvicorn. One whose request is answered before the whole body has come is ended unless the rest comes soon;
+    it is not read and does not count as headers.
     """
 
     limits = ConnectionLimits()

@@ -39,7 +39,7 @@ def set_pixel_shares(patch: PlatePatch, model: PlateModel, max_nodes: int, share
     along_v = AxisProfiles(np.zeros((n + 3, 4)), np.zeros(2, np.int64))
     row = new_row(shapes)
     lens = lens_blur(model.pose, patch.grid)
-    quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes)
+    quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes, False)
     for y in range(patch.light.shape[0]):
         for x in range(patch.light.shape[1]):
             pixel = place_pixel(model.pose, model.frame, patch.grid, x, y)
@@ -48,7 +48,7 @@ def set_pixel_shares(patch: PlatePatch, model: PlateModel, max_nodes: int, share
             places[y, x, 1] = pixel.v
             if pixel.inverse_depth <= 0.0 or not (-0.2 < pixel.u < 1.2 and -0.2 < pixel.v < 1.2):
                 continue
-            variance_u, variance_v = blur_on_plate(pixel, lens, quadrature.nodes.shape[0] > 1)
+            variance_u, variance_v = blur_on_plate(pixel, lens, quadrature)
             entries, _slopes = synthesize(
                 pixel, variance_u, variance_v, model, quadrature, 0.0, 0.0, row, along_u, along_v
             )
