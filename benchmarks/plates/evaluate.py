@@ -10,12 +10,35 @@ import cv2
 import numpy as np
 
 from app.decoders.plate.confirm import confirm_frames
+from app.decoders.plate.fit import FINE_CORNER_SCATTER
+from app.decoders.plate.pose import camera_position_m
 from app.decoders.plate.reader import decode_plates
+from app.decoders.plate.rolling_shutter import locate_moving_plate
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.plate_scene import FaceTruth
 from benchmarks.plates.peers import FAMILIES, reads_tag, tag_face
 from benchmarks.plates.sets import LIGHT, Job, Shot, Unseen, replace_face, shoot
+
+
+@dataclass(frozen=True, slots=True)
+class PositionAccuracy:
+    """Errors of a camera's position at the time of the frame, with the speed known where the shutter rolls.
+
+    Attributes
+    ----------
+    error_m : float
+        Distance to the truth. [m]
+    within_2_sigma : tuple of bool
+        Across, along and up in the plate frame: the error is below two reported standard deviations.
+    noise_error_m : float
+        Distance to the truth of the position from true corners with errors as if those of the pixels were independent.
+        [m]
+    """
+
+    error_m: float
+    within_2_sigma: tuple[bool, ...]
+    noise_error_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +72,8 @@ class Record:
         Distance of the camera's position to the truth, where decoded; else NaN.
     rolling : bool
         The camera has a rolling shutter.
+    accuracy : PositionAccuracy or None
+        Of the camera's position, where decoded in a trial.
     tags : tuple of bool or None
         Whether each peer's tag was read in the same scene.
     """
@@ -72,6 +97,7 @@ class Record:
     corner_errors_px: tuple[float, ...] = ()
     position_error_m: float = math.nan
     rolling: bool = False
+    accuracy: PositionAccuracy | None = None
     tags: tuple[bool, ...] | None = None
 
 
@@ -130,6 +156,7 @@ def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> tuple[Record, list[
         corner_errors_px=_corner_errors(hit, truth),
         position_error_m=_position_error(hit, truth),
         rolling=shot.scene is not None and shot.scene.sensor.readout_s > 0,
+        accuracy=_position_accuracy(hit, shot, np.random.default_rng([job.seed, job.index, number])),
         tags=_evaluate_tags(job, shot, truth),
     )
     return record, alone
@@ -167,8 +194,37 @@ def _corner_errors(hit: PlateReading | None, truth: FaceTruth | None) -> tuple[f
 def _position_error(hit: PlateReading | None, truth: FaceTruth | None) -> float:
     if hit is None or hit.pose is None or truth is None:
         return math.nan
-    position_m = -hit.pose.rotation.T @ hit.pose.translation_m
-    return float(np.linalg.norm(position_m - truth.camera_position_m))
+    return float(np.linalg.norm(camera_position_m(hit.pose) - truth.camera_position_m))
+
+
+def _position_accuracy(
+    hit: PlateReading | None, shot: Shot | Unseen, rng: np.random.Generator
+) -> PositionAccuracy | None:
+    if isinstance(shot, Unseen) or hit is None or hit.pose is None or shot.scene is None:
+        return None
+    assert hit.corners_px is not None
+    assert hit.corners_covariance_px2 is not None
+    assert hit.geometry is not None
+    scene, placed = shot.scene, shot.scene.faces[0]
+    camera, geometry = replace(shot.camera, readout_s=scene.sensor.readout_s), hit.geometry
+    from_face_m = np.array([-placed.ahead_m, -placed.left_m, camera.height_m])
+    truth_m = placed.ground_from_face.T @ from_face_m  # at the middle row's time
+    drawn = rng.multivariate_normal(np.zeros(8), hit.corners_covariance_px2 / FINE_CORNER_SCATTER).reshape(4, 2)
+    pose, at_limit = (
+        locate_moving_plate(corners_px, hit.corners_covariance_px2, geometry, camera, scene.speed_m_s)
+        for corners_px in (hit.corners_px, shot.frame.truths[0].corners_px + drawn)
+    )
+    if pose is None or at_limit is None:
+        return None
+    error_m = camera_position_m(pose) - truth_m
+    x, y, z = pose.translation_m
+    by_pose = np.hstack([np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.eye(3)])  # of the negative position
+    covariance = pose.rotation.T @ by_pose @ pose.covariance @ by_pose.T @ pose.rotation
+    return PositionAccuracy(
+        float(np.linalg.norm(error_m)),
+        tuple(bool(v) for v in np.abs(error_m) < 2 * np.sqrt(np.diag(covariance))),
+        float(np.linalg.norm(camera_position_m(at_limit) - truth_m)),
+    )
 
 
 def _evaluate_tags(job: Job, shot: Shot, truth: FaceTruth | None) -> tuple[bool, ...] | None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.plates.evaluate import Record
+from benchmarks.plates.evaluate import PositionAccuracy, Record
 from benchmarks.plates.peers import FAMILIES
 from benchmarks.plates.sets import LIGHT, RENDERED_ROWS, THERMAL_KMH, WITH_PLATE, WITHOUT_PLATE, read_trials
 from benchmarks.plates.speed import StageTiming, Timing
 
+ACCURACY_ROWS = (8.0, 12.0, 16.0, 24.0, 48.0)
 BINS = ((8, 10, None), (10, 12, 25), (12, 16, 75), (16, 24, 95), (24, math.inf, 99))
 
 
@@ -224,7 +226,30 @@ def accuracy_table(records: Sequence[Record]) -> str:
     ):
         errors = np.array([1000 * r.position_error_m for r in mine if r.rolling is rolling])
         rows.append(_error_row(name, errors[np.isfinite(errors)], 1, goals))
-    return table(("error", "values", "median", "goal", "95 %", "goal", "met"), rows)
+    located = [(r.height_px, r.accuracy, r.rolling) for r in mine if r.accuracy is not None]
+    moving = np.array([1000 * found.error_m for _rows, found, rolling in located if rolling])
+    rows.append(_error_row("camera position, rolling shutter, compensated with the speed [mm]", moving, 1, (6, 20)))
+    errors_table = table(("error", "values", "median", "goal", "95 %", "goal", "met"), rows)
+    return f"{errors_table}\n\n{_accuracy_by_rows([(rows_px, found) for rows_px, found, _rolling in located])}"
+
+
+def _accuracy_by_rows(located: Sequence[tuple[float, PositionAccuracy]]) -> str:
+    rows = []
+    for low, high in itertools.pairwise((*ACCURACY_ROWS, math.inf)):
+        found = [one for rows_px, one in located if low <= rows_px < high]
+        if not found:
+            continue
+        errors, limits = (
+            np.array([1000 * getattr(one, name) for one in found]) for name in ("error_m", "noise_error_m")
+        )
+        median, high_mm = np.percentile(errors, (50, 95))
+        within = np.mean([one.within_2_sigma for one in found])
+        rows.append(
+            (f"{low:g}-{high:g}" if math.isfinite(high) else f"{low:g} and more", len(found), f"{median:.1f}",
+             f"{high_mm:.1f}", f"{np.percentile(limits, 95):.1f}", f"{np.mean(errors <= 20):.1%}", f"{within:.1%}")
+        )  # fmt: skip
+    head = ("rows", "frames", "median mm", "95 % mm", "95 % at the limit", "within 20 mm", "within 2 sigma")
+    return table(head, rows)
 
 
 def _error_row(

@@ -17,6 +17,7 @@ from app.markers.plate import (
     PlateGeometry,
     PlateScheme,
     code_cells,
+    decimal_codes,
     encode_number,
     is_codeword,
     plate_capacity,
@@ -424,3 +425,18 @@ def test_check_digits_cost_decimals_not_truth(checks: int, places: tuple[int, in
 
 def test_the_antimeridian_has_one_name() -> None:
     assert resolve_position(PlateCode.from_position(-180.0, 10.0), -179.9, 10.0).lon_deg == 180.0
+
+
+def test_digits_are_named_under_every_scheme_whose_check_they_satisfy() -> None:
+    def schemes(digits: str) -> list[tuple[PlateScheme, int]]:
+        return [(code.scheme, code.check_digits) for code in decimal_codes([int(d) for d in digits])]
+
+    plain = (PlateScheme.POSITION, 1)
+    assert schemes("023792168411") == [plain]
+    assert schemes("023792168413") == [plain, (PlateScheme.POSITION_CHECK, 1)]  # 2+3+7+9+2+1+6+8+4+1 = 43
+    assert schemes("023792168442") == [plain, (PlateScheme.POSITION_CHECK, 2)]  # 2+3+7+9+2+1+6+8+4 = 42
+    rng = np.random.default_rng(0)
+    found = [schemes("".join(str(d) for d in rng.integers(0, 10, 12))) for _ in range(2000)]
+    assert 0.08 < np.mean([(PlateScheme.POSITION_CHECK, 1) in one for one in found]) < 0.12
+    assert 0.005 < np.mean([(PlateScheme.POSITION_CHECK, 2) in one for one in found]) < 0.018
+    assert not decimal_codes([10] + 11 * [0])

@@ -9,9 +9,9 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from app.api.fleet.schemas_calibrations import DECLARATION_EXAMPLE, CalibrationIn
-from app.api.http.bodies import SpooledPart, received_form
+from app.api.http.bodies import SpooledPart
 from app.api.http.dependencies import Caller, Identifier, LastId, use_cases
-from app.api.http.forms import FORM, check_parts, form_body, idempotency_of, media_type_of, read_declaration, read_text
+from app.api.http.forms import DeclaredForm, form_body, idempotency_of, read_declaration
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
@@ -25,7 +25,7 @@ from app.api.http.responses import (
 from app.api.http.strict_json import StrictRoute
 from app.encoders.calibration_board import encode_board
 from app.encoders.plate import ArtworkFormat, write_artwork
-from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.errors import UnreadableUpload
 from app.formats.spooled_file import SpooledFile
 from app.sensors.calibration_board import CalibrationBoard
 from app.services.fleet.calibrations import MAX_PHOTOS, Calibrations
@@ -36,6 +36,7 @@ router = APIRouter(prefix="/v1", tags=["fleet"], route_class=StrictRoute)
 
 MAX_DECLARATION_BYTES = 16 * 1024
 _CURE = "send multipart/form-data with several parts photos, or one ZIP of them, and a part declaration"
+_FORM = DeclaredForm("a calibration", "photos", MAX_DECLARATION_BYTES, _CURE, max_files=MAX_PHOTOS)
 _BODY = form_body(
     {
         "photos": {
@@ -69,11 +70,7 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
     MalformedRequest
         The form or the declaration's JSON cannot be read.
     """
-    if media_type_of(request) != FORM:
-        raise UnsupportedUpload("a calibration is a form", field="Content-Type", limit=FORM, cure=_CURE)
-    form_limits = {"max_files": MAX_PHOTOS + 1, "max_fields": 2, "max_part_size": MAX_DECLARATION_BYTES}
-    async with received_form(request, **form_limits) as form:
-        check_parts(form, "photos", "declaration")
+    async with _FORM.received(request) as (form, text):
         files = form.getlist("photos")
         if not files or not all(isinstance(file, SpooledPart) for file in files):
             raise UnreadableUpload("there is no photo in the form", field="photos", limit="files", cure=_CURE)
@@ -82,9 +79,6 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
             for k, file in enumerate(files)
             if isinstance(file, SpooledPart)
         ]
-        text = await read_text(form, "declaration", MAX_DECLARATION_BYTES)
-        if len(text) > MAX_DECLARATION_BYTES:
-            raise MalformedRequest("the declaration is too long", field="declaration", limit="16 KiB", cure=_CURE)
         key = idempotency_of(request, idempotency_key, text, *(file for _name, file in photos))
         yield _Asked(tuple(photos), await read_declaration(CalibrationIn, text, "declaration"), key)
 

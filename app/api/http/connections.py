@@ -67,7 +67,8 @@ class LimitedConnection(HttpToolsProtocol):
     """One connection of a client; `limited_connections` makes a subclass with limits.
 
     A check each second ends it when its headers are late or when it does not read. A connection between two requests is
-    ended by uvicorn, and one whose request is answered before the whole body has come is ended at once.
+    ended by uvicorn. One whose request is answered before the whole body has come is ended unless the rest comes soon;
+    it is not read and does not count as headers.
     """
 
     limits = ConnectionLimits()
@@ -100,7 +101,7 @@ class LimitedConnection(HttpToolsProtocol):
         """Parse what came, unless the connection is closing."""
         if self.transport.is_closing():
             return
-        if self._headers_since_s is None and self._is_idle:
+        if self._headers_since_s is None and self._is_idle and not self._sends_body:
             self._begin_headers()
         self._header_bytes += len(data)
         super().data_received(data)

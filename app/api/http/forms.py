@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
 
@@ -10,15 +13,66 @@ from fastapi import Request
 from pydantic import BaseModel, TypeAdapter
 from starlette.datastructures import FormData, UploadFile
 
+from app.api.http.bodies import received_form
 from app.api.http.components import reference
 from app.api.http.dependencies import caller_of, checked_idempotency_key
 from app.api.http.strict_json import in_thread_if_large, parse_json, validated
-from app.errors import MalformedRequest
+from app.errors import MalformedRequest, UnsupportedUpload
 from app.formats.spooled_file import SpooledFile
 from app.services.idempotency import IdempotencyKey
 
 FORM = "multipart/form-data"
 ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredForm:
+    """A form with files and the part `declaration`.
+
+    Attributes
+    ----------
+    what : str
+        The request, in a sentence such as "an import is a form".
+    part : str
+        Name of the part with the file, or of those with files.
+    max_declaration_bytes : int
+        [byte]
+    cure : str
+        Of a request that is another one.
+    max_files : int
+        In `part`.
+    """
+
+    what: str
+    part: str
+    max_declaration_bytes: int
+    cure: str
+    max_files: int = 1
+
+    @asynccontextmanager
+    async def received(self, request: Request) -> AsyncIterator[tuple[FormData, bytes]]:
+        """The form in a request and the text of its declaration; its files are deleted at the end of the block.
+
+        Raises
+        ------
+        UnsupportedUpload
+            The request is no form.
+        MalformedRequest
+            It has other parts, or a declaration that is too long.
+        """
+        if media_type_of(request) != FORM:
+            raise UnsupportedUpload(f"{self.what} is a form", field="Content-Type", limit=FORM, cure=self.cure)
+        limit = self.max_declaration_bytes
+        async with received_form(request, max_files=self.max_files + 1, max_fields=2, max_part_size=limit) as form:
+            if self.max_files > 1:
+                check_parts(form, self.part, "declaration")
+            else:
+                check_parts(form, None, self.part, "declaration")
+            text = await read_text(form, "declaration", limit)
+            if len(text) > limit:
+                shown = f"{limit // 1024} KiB"
+                raise MalformedRequest("the declaration is too long", field="declaration", limit=shown, cure=self.cure)
+            yield form, text
 
 
 def media_type_of(request: Request) -> str:

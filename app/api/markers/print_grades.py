@@ -9,14 +9,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from app.api.http.bodies import SpooledPart, received_form
+from app.api.http.bodies import SpooledPart
 from app.api.http.dependencies import Caller, use_cases
-from app.api.http.forms import FORM, check_parts, form_body, media_type_of, read_declaration, read_text
+from app.api.http.forms import DeclaredForm, form_body, read_declaration
 from app.api.http.problems import problem_responses
 from app.api.http.responses import BINARY, file_response, json_response
 from app.api.http.strict_json import StrictRoute
 from app.api.markers.schemas_print_grades import PRINT_EXAMPLE, PrintGradeIn
-from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.errors import UnreadableUpload
 from app.formats.spooled_file import SpooledFile
 from app.services.markers.print_documents import PrintGradeDocument
 from app.services.markers.print_grades import PrintDeclaration, PrintGrades
@@ -25,6 +25,7 @@ router = APIRouter(prefix="/v1", tags=["artwork"], route_class=StrictRoute)
 
 MAX_DECLARATION_BYTES = 16 * 1024
 _CURE = "send multipart/form-data with a file in the part photo, and a part declaration"
+_FORM = DeclaredForm("the request for a print grade", "photo", MAX_DECLARATION_BYTES, _CURE)
 _BODY = form_body(
     {"photo": {**BINARY, "description": "JPEG or PNG of one printed plate, whole, from straight above, uncropped."}},
     "declaration",
@@ -58,16 +59,10 @@ async def get_asked(request: Request) -> AsyncIterator[_Asked]:
     MalformedRequest
         The form or the declaration's JSON cannot be read.
     """
-    if media_type_of(request) != FORM:
-        raise UnsupportedUpload("a print grade is asked for by a form", field="Content-Type", limit=FORM, cure=_CURE)
-    async with received_form(request, max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
-        check_parts(form, None, "photo", "declaration")
+    async with _FORM.received(request) as (form, text):
         photo = form.get("photo")
         if not isinstance(photo, SpooledPart):
             raise UnreadableUpload("there is no photo in the form", field="photo", limit="one file", cure=_CURE)
-        text = await read_text(form, "declaration", MAX_DECLARATION_BYTES)
-        if len(text) > MAX_DECLARATION_BYTES:
-            raise MalformedRequest("the declaration is too long", field="declaration", limit="16 KiB", cure=_CURE)
         yield _Asked(photo.spooled, (await read_declaration(PrintGradeIn, text, "declaration")).given())
 
 

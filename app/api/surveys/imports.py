@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Request, Response
 
-from app.api.http.bodies import SpooledPart, received_form
+from app.api.http.bodies import SpooledPart
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
-from app.api.http.forms import FORM, check_parts, form_body, idempotency_of, media_type_of, read_declaration, read_text
+from app.api.http.forms import DeclaredForm, form_body, idempotency_of, read_declaration
 from app.api.http.problems import FieldError, Problem, problem_responses, report_problem
 from app.api.http.responses import (
     BINARY,
@@ -24,7 +24,7 @@ from app.api.http.responses import (
 )
 from app.api.http.strict_json import StrictRoute
 from app.api.surveys.schemas import DECLARATION_EXAMPLE, DeclarationIn
-from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, UnsupportedUpload
+from app.errors import InvalidParameter, UnreadableUpload
 from app.registry.jobs import JobState
 from app.services.idempotency import IdempotencyKey
 from app.services.surveys.declarations import import_input
@@ -37,6 +37,7 @@ router = APIRouter(prefix="/v1/imports", tags=["imports"], route_class=StrictRou
 
 MAX_DECLARATION_BYTES = 64 * 1024
 _CURE = "send multipart/form-data with the parts file and declaration"
+_FORM = DeclaredForm("an import", "file", MAX_DECLARATION_BYTES, _CURE)
 _BODY = form_body(
     {"file": {**BINARY, "description": "The survey."}},
     "declaration",
@@ -73,19 +74,13 @@ async def get_asked(
     MalformedRequest
         The form or the declaration's JSON cannot be read.
     """
-    if media_type_of(request) != FORM:
-        raise UnsupportedUpload("an import is a form", field="Content-Type", limit=FORM, cure=_CURE)
-    async with received_form(request, max_files=2, max_fields=2, max_part_size=MAX_DECLARATION_BYTES) as form:
-        check_parts(form, None, "file", "declaration")
+    async with _FORM.received(request) as (form, text):
         part = form.get("file")
         if not isinstance(part, SpooledPart):
             raise UnreadableUpload("there is no file in the form", field="file", limit="a part file", cure=_CURE)
         file = part.spooled
-        text = await read_text(form, "declaration", MAX_DECLARATION_BYTES)
         if not file.size:
             raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
-        if len(text) > MAX_DECLARATION_BYTES:
-            raise MalformedRequest("the declaration is too long", field="declaration", limit="64 KiB", cure=_CURE)
         declared = (await read_declaration(DeclarationIn, text, "body", "declaration")).declared()
         as_job = wants_job(prefer) or takes_long(file)
         key = idempotency_of(request, idempotency_key, text, file)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from app.decoders.plate.likely_words import LikelyCodeword, likely_codeword
 from app.decoders.plate.unit_likelihoods import MAX_LEVEL_RESIDUAL, UnitEvidence, pattern_cost
 from app.decoders.plate.unit_verification import UnitVerification
-from app.markers.plate import PlateCode, PlateScheme, is_codeword, position_decimals
+from app.markers.plate import PlateCode, PlateScheme, decimal_codes, position_decimals
 
 Array = npt.NDArray[Any]
 
@@ -189,7 +189,7 @@ def _decode_alone(evidence: UnitEvidence, n: int, min_confidence: float, *, clea
     if float(costs[np.arange(len(costs)), decimal].sum()) < MAX_DECIMAL_COST:
         cells = _softmax_confidence(costs[:, :10], decimal) * factor
         confidence = float(np.prod(cells))
-        digits = _decimal_code(tuple(int(s) for s in decimal), n)
+        digits = next(iter(decimal_codes(tuple(int(s) for s in decimal), n)), None)
         if digits is not None and confidence >= min_confidence:
             return DecodedSymbols(digits, confidence, _floats(cells))
         uncertain = ", ".join(str(i) for i in np.flatnonzero(cells < 1 - (1 - min_confidence) / len(cells)))
@@ -199,14 +199,6 @@ def _decode_alone(evidence: UnitEvidence, n: int, min_confidence: float, *, clea
         return replace(checked, code=None, likely=checked.code, reason=reason)
     cells = _softmax_confidence(costs, evidence.best.tolist()) * factor
     return DecodedSymbols(None, float(np.prod(cells)), _floats(cells), reason="no scheme has these symbols")
-
-
-def _decimal_code(symbols: tuple[int, ...], n: int) -> PlateCode | None:
-    """The position code that has these digits; without check digits where both are possible."""
-    for scheme, checks in ((PlateScheme.POSITION, 1), (PlateScheme.POSITION_CHECK, 1), (PlateScheme.POSITION_CHECK, 2)):
-        if is_codeword(symbols, scheme, n, checks):
-            return PlateCode.from_symbols(symbols, scheme, n, checks)
-    return None
 
 
 def _floats(values: Array) -> tuple[float, ...]:

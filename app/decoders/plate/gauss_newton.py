@@ -187,8 +187,9 @@ def _reachable_share(sums: PixelSums, half: Floats, shapes: int) -> float:
 
 @kernel
 def minimize(
-    patch: PlatePatch, model: PlateModel, equations: NormalEquations, max_nodes: int, steps: int, is_coarse: bool
-) -> FitQuality:
+    patch: PlatePatch, model: PlateModel, equations: NormalEquations, max_nodes: int, steps: int, is_coarse: bool,
+    is_skewed: bool,
+) -> FitQuality:  # fmt: skip
     """Move pose and values, which change in place, until the corners rest.
 
     Parameters
@@ -203,6 +204,8 @@ def minimize(
         At most.
     is_coarse : bool
         First stage: the first step finds the values alone, and what is no plate ends early.
+    is_skewed : bool
+        The blur of an upright plate may be skewed against its rows and columns; it takes longer.
 
     Returns
     -------
@@ -219,7 +222,7 @@ def minimize(
         # the normal equations at the present pose, and what the present values explain
         if not set_corners(model.pose, model.frame, corners) or not _set_area(corners, patch, area):
             return quality
-        quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes)
+        quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes, is_skewed)
         sums = set_normal_equations(patch, area, model, quadrature, scratch, equations)
         if sums.pixels < shapes:
             return FitQuality(False, quality.variance, quality.explained, int(sums.pixels))

@@ -188,7 +188,7 @@ def set_normal_equations(
             pixel = place_pixel(model.pose, model.frame, patch.grid, x, y)
             if not _is_used(pixel, area.margin):
                 continue
-            variance_u, variance_v = blur_on_plate(pixel, lens, quadrature.nodes.shape[0] > 1)
+            variance_u, variance_v = blur_on_plate(pixel, lens, quadrature)
             u = min(max(pixel.u, 0.0), 1.0)
             v = min(max(pixel.v, 0.0), 1.0)
             gap_light = field_light(model, FIRST_GAP, u, v)

@@ -35,7 +35,7 @@ def set_pixel_shares(patch: PlatePatch, model: PlateModel, max_nodes: int, share
     places : ndarray, shape (h, w, 2)
         Set to the pixel's place. [plate sides]
     """
-    quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes)
+    quadrature = blur_quadrature(model.pose, model.frame, patch.grid, max_nodes, False)
     scratch = new_scratch(model.values.shape[0], model.edges.shape[0])
     _set_all(patch, model, quadrature, scratch, shares, places)
 
@@ -56,7 +56,7 @@ def _set_all(
             places[y, x, 1] = pixel.v
             if pixel.inverse_depth <= 0.0 or not (-0.2 < pixel.u < 1.2 and -0.2 < pixel.v < 1.2):
                 continue
-            variance_u, variance_v = blur_on_plate(pixel, lens, quadrature.nodes.shape[0] > 1)
+            variance_u, variance_v = blur_on_plate(pixel, lens, quadrature)
             entries, _slopes = synthesize(
                 pixel, variance_u, variance_v, model, quadrature, 0.0, 0.0, row, along_u, along_v
             )

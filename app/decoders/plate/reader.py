@@ -19,7 +19,7 @@ from app.decoders.plate.detect_quads import MarkerQuad
 from app.decoders.plate.detect_thermal import ORIENTATION_EVIDENCE, WarmFrame, fit_warm_plates, orientation_evidence
 from app.decoders.plate.evidence import CLEAN_EXPLAINED, PlateEvidence, read_evidence
 from app.decoders.plate.find_candidates import Candidate, find_candidates
-from app.decoders.plate.fit import PlateFit, fit_plate
+from app.decoders.plate.fit import PlateFit, fit_plate, refine_corners
 from app.decoders.plate.grade import grade_plate
 from app.decoders.plate.homography import project
 from app.decoders.plate.layout import marker_centroids, unit_centres
@@ -349,10 +349,27 @@ def _read_fit(
     )  # fmt: skip
     verify = partial(task.verify, fit, geometry, units) if task.image.ndim == 3 else None
     reading, decoded = read_evidence(reading, evidence, task.codebook, verify)
-    task.evidence.append(replace(evidence, verification=decoded.verification))
+    evidence = replace(evidence, verification=decoded.verification)
+    if task.camera is not None and task.image.ndim == 3 and (reading.code or reading.likely_code):
+        reading, evidence = _refine(task.image, fit, geometry, reading, evidence)
+    task.evidence.append(evidence)
     if reading.code is None:
         return reading
     return with_pose(replace(reading, grade=grade_plate(fit, units, decoded, weakest_marker)), task.camera)
+
+
+def _refine(
+    image: Frame, fit: PlateFit, geometry: PlateGeometry, reading: PlateReading, evidence: PlateEvidence
+) -> tuple[PlateReading, PlateEvidence]:
+    """A reading and its evidence with the corners that a pose needs; as they are where these are not found."""
+    refined = refine_corners(image, fit, geometry)
+    if refined is None:
+        return reading, evidence
+    corners_px, covariance_px2 = refined
+    return (
+        replace(reading, corners_px=corners_px, corners_covariance_px2=covariance_px2),
+        replace(evidence, corners_px=corners_px, corners_covariance_px2=covariance_px2),
+    )
 
 
 def _missing_parts(

@@ -183,15 +183,15 @@ def place_pixel(pose: Floats, frame: Floats, grid: Floats, column: int, row: int
 
 
 @step
-def blur_on_plate(pixel: PixelPlace, lens: LensBlur, is_turned: bool) -> tuple[float, float]:
-    """Variances of the blur along u and v; with a quadrature both are that of the ellipse's short axis."""
+def blur_on_plate(pixel: PixelPlace, lens: LensBlur, quadrature: Quadrature) -> tuple[float, float]:
+    """Variances of the blur along u and v that are left to the profiles by the quadrature."""
     a = pixel.u_x * pixel.u_x * lens.x + pixel.u_y * pixel.u_y * lens.y
     d = pixel.v_x * pixel.v_x * lens.x + pixel.v_y * pixel.v_y * lens.y
-    if is_turned:
+    if quadrature.is_turned:
         b = pixel.u_x * pixel.v_x * lens.x + pixel.u_y * pixel.v_y * lens.y
         short = 0.5 * (a + d - math.sqrt((a - d) * (a - d) + 4.0 * b * b))
         return short, short
-    return a, d
+    return quadrature.share * a, quadrature.share * d
 
 
 @loop
@@ -318,7 +318,7 @@ def synthesize(
     The pixel is a mean over the quadrature's nodes; at each node the shares are products of the profiles along u and v.
     """
     n = model.edges.shape[0]
-    motion = 0.0 if quadrature.nodes.shape[0] > 1 else math.sqrt(model.pose[MOTION])
+    motion = 0.0 if quadrature.is_turned else math.sqrt(model.pose[MOTION])
     blur_u = AxisBlur(math.sqrt(variance_u), 0.0)
     blur_v = AxisBlur(math.sqrt(variance_v), motion)
     diagonal_spread = math.sqrt(variance_u + variance_v + motion * motion / 12.0)
@@ -381,7 +381,7 @@ def set_pose_derivatives(
     by_pose[5] = by_v
     by_pose[6] = by_depth * pixel.x
     by_pose[7] = by_depth * pixel.y
-    if quadrature.nodes.shape[0] > 1:
+    if quadrature.is_turned:
         averaged = 0.5 * (lens.x + lens.y)
         by_round = (slopes.blur_u + slopes.blur_v) * math.sqrt(variance_u) * lens.round / averaged
         by_pose[BLUR] = by_round + slopes.nodes * quadrature.by_spread[0]
@@ -389,7 +389,6 @@ def set_pose_derivatives(
     else:
         u2 = pixel.u_x * pixel.u_x + pixel.u_y * pixel.u_y
         v2 = pixel.v_x * pixel.v_x + pixel.v_y * pixel.v_y
-        by_pose[BLUR] = (
-            slopes.blur_u * u2 / math.sqrt(variance_u) + slopes.blur_v * v2 / math.sqrt(variance_v)
-        ) * lens.round
+        by_axes = slopes.blur_u * u2 / math.sqrt(variance_u) + slopes.blur_v * v2 / math.sqrt(variance_v)
+        by_pose[BLUR] = by_axes * lens.round * quadrature.share + slopes.nodes * quadrature.by_spread[0]
         by_pose[MOTION] = slopes.motion

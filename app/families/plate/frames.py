@@ -24,7 +24,7 @@ from app.families.frames import (
     nearest_match,
 )
 from app.families.plate.rows import plate_code, plate_geometry
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, decimal_codes
 from app.markers.plate_position import resolve_position
 from app.markers.reading import PlateReading
 from app.markers.recommended_plate import EXPECTED_GEOMETRIES
@@ -77,12 +77,23 @@ class ReadGeometryDocument(TypedDict):
     gap_mm: float
 
 
+class PossibleSchemeDocument(TypedDict):
+    """A scheme whose checks the digits of a plate satisfy; `check_digits` of `position-check`."""
+
+    scheme: str
+    check_digits: int | None
+
+
 class PlateReadingDocument(TypedDict):
     """A candidate plate in a frame and what was read from it.
 
     `certainty` is `sure` with `digits`. It is `tentative` with `likely_digits`, which are too unsure to be matched or
     to give a position, and `doubtful_cells`, the cells that may be wrong: other frames of an archive, or a registered
     plate near by, may confirm them. It is null where there are no digits.
+
+    `scheme` is that of the registered plate near by with these digits. Without one, `possible_schemes` has all schemes
+    whose checks the digits satisfy: one check digit holds by accident for one `position` plate in ten, two for one in a
+    hundred.
     """
 
     outcome: str
@@ -92,6 +103,7 @@ class PlateReadingDocument(TypedDict):
     likely_digits: str | None
     doubtful_cells: list[int]
     scheme: str | None
+    possible_schemes: list[PossibleSchemeDocument]
     registry_number: int | None
     confidence: float
     cell_confidence: list[float]
@@ -215,7 +227,19 @@ def _match_elsewhere(
     return Match(row, row.lon_deg, row.lat_deg, distance_to_row(row, position), False, (), note)
 
 
+def _possible_codes(code: PlateCode) -> tuple[PlateCode, ...]:
+    """The code under each scheme that it may be of: Reed-Solomon checks leave no doubt."""
+    return (code,) if code.scheme.corrects else decimal_codes(code.symbols, code.n)
+
+
 def _resolve_unregistered(code: PlateCode, position: ApproximatePosition) -> Match:
+    """Where the digits place a plate: under the scheme with most check digits of those that place it within reach."""
+    matches = [_resolve_code(possible, position) for possible in _possible_codes(code)]
+    plausible = [match for match in matches if match.plausible]
+    return plausible[-1] if plausible else matches[0]
+
+
+def _resolve_code(code: PlateCode, position: ApproximatePosition) -> Match:
     resolved = resolve_position(code, position.lon_deg, position.lat_deg)
     away_m = distance_m(position.lon_deg, position.lat_deg, resolved.lon_deg, resolved.lat_deg)
     next_m = resolved.next_distance_deg * _M_PER_DEG * math.cos(math.radians(position.lat_deg))
@@ -225,6 +249,8 @@ def _resolve_unregistered(code: PlateCode, position: ApproximatePosition) -> Mat
         note = "the digits say a place out of reach of the coarse position: not a position plate, or a misread"
     elif fits_two:
         note = "ambiguous: the decimals fit two places within reach of the coarse position"
+    elif code.scheme is PlateScheme.POSITION_CHECK:
+        note = f"not registered; the position is what its digits say if {code.check_digits} of them are check digits"
     else:
         note = "not registered; the position is what its digits say"
     return Match(None, resolved.lon_deg, resolved.lat_deg, away_m, plausible, (), note, fits_two)
@@ -241,6 +267,13 @@ def _reading_document(reading: PlateReading) -> PlateReadingDocument:
         "likely_digits": likely.digits if likely else None,
         "doubtful_cells": [int(cell) for cell in reading.doubtful_cells],
         "scheme": str(shown.scheme) if shown else None,
+        "possible_schemes": [
+            {
+                "scheme": str(one.scheme),
+                "check_digits": one.check_digits if one.scheme is PlateScheme.POSITION_CHECK else None,
+            }
+            for one in (_possible_codes(shown) if shown else ())
+        ],
         "registry_number": code.registry_number if code and code.scheme is PlateScheme.ID else None,
         "confidence": float(reading.confidence),
         "cell_confidence": [round(float(value), 6) for value in reading.cell_confidence],

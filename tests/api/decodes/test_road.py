@@ -184,6 +184,25 @@ def test_an_unregistered_position_plate_says_its_place(real_client: httpx.Client
     assert decode["fix"] is None
 
 
+@pytest.mark.parametrize("check_digits", [1, 2])
+def test_an_unregistered_plate_with_check_digits_says_its_place(
+    real_client: httpx.Client, place: Place, check_digits: int
+) -> None:
+    road = Road(real_client, place(), (5.0, 0.0, 0.0))
+    lon, lat, _height = wgs84_from_enu(from_vehicle_m(5.0, 0.0), road.origin)
+    code = PlateCode.from_position(lon, lat, check_digits=check_digits)
+    decode = post_frame(real_client, road.frame([code]), road.context()).json()
+    [reading] = [r for r in decode["readings"] if r["outcome"] == "read"]
+    assert reading["scheme"] == "position"  # nothing says that these are check digits
+    assert {"scheme": "position-check", "check_digits": check_digits} in reading["possible_schemes"]
+    match = reading["match"]
+    assert (match["registered"], match["plausible"]) == (False, True)
+    assert "check digits" in match["note"]
+    lon_decimals, lat_decimals = map(len, code.decimals)
+    assert match["lon_deg"] == pytest.approx(lon, abs=0.6 * 10**-lon_decimals)
+    assert match["lat_deg"] == pytest.approx(lat, abs=0.6 * 10**-lat_decimals)
+
+
 def test_an_id_plate_far_from_its_place_is_named(real_server: LiveServer, place: Place) -> None:
     with real_server.agency("movers") as client:
         road = Road(client, place(), (5.0, 0.0, 0.0)).register(code={"scheme": "id"})

@@ -125,6 +125,17 @@ def test_a_body_that_nobody_reads_ends_the_connection(start: Start) -> None:
     assert read_all(client).endswith(b"hello")
 
 
+def test_a_body_that_comes_after_its_answer_is_no_header(start: Start) -> None:
+    body = bytes(16 * MAX_HEADER_BYTES)  # more than one read takes
+    head = f"POST / HTTP/1.1\r\nHost: x\r\nContent-Type: image/jpeg\r\nContent-Length: {len(body)}\r\n\r\n"
+    client = connect(start(ConnectionLimits()), head.encode() + body[:1])
+    assert client.recv(65536).endswith(b"hello")
+    client.sendall(body[1:] + b"GET / HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+    answers = read_all(client)
+    assert answers.startswith(b"HTTP/1.1 200")
+    assert answers.count(b"HTTP/1.1") == 1
+
+
 def test_a_response_that_is_not_read_is_given_up(start: Start) -> None:
     client = connect(start(QUICK), b"GET /large HTTP/1.1\r\nHost: x\r\n\r\n")
     # the server ends it, and the kernel drops what waits: this client learns that without reading

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.decoders.plate.fit import fit_plate
+from app.decoders.plate.fit import fit_plate, refine_corners
 from app.decoders.plate.homography import project
 from app.decoders.plate.layout import marker_centroids
 from app.markers.plate import PlateGeometry
@@ -50,3 +50,22 @@ def test_the_residual_stands_out_where_a_unit_is_stained() -> None:
     assert row == 3
     assert column in (4, 5)
     assert fit.unit_misfit.max() > 4 * np.median(fit.unit_misfit)
+
+
+@pytest.mark.parametrize("turn_deg", [-14.0, 8.0, 15.0])
+def test_refined_corners_are_not_skewed_by_an_oblique_blur(turn_deg: float) -> None:
+    coarse_px, refined_px = [], []
+    for seed in range(4):
+        frame = shoot(PlacedFace(face_of(), 4.6 + 0.2 * seed, 0.3, turn_deg), seed=seed)
+        truth_px = frame.truths[0].corners_px
+        fit = fit_plate(frame.image, centroids_px(truth_px), GEOMETRY)
+        assert fit is not None
+        before_px = fit.corners_px.copy()
+        refined = refine_corners(frame.image, fit, GEOMETRY)
+        assert refined is not None
+        np.testing.assert_array_equal(fit.corners_px, before_px)
+        coarse_px.append(before_px - truth_px)
+        refined_px.append(refined[0] - truth_px)
+        assert np.linalg.eigvalsh(refined[1]).min() > 0
+    coarse, fine = (float(np.sqrt(np.mean(np.square(errors)))) for errors in (coarse_px, refined_px))
+    assert fine < 0.75 * coarse

@@ -137,6 +137,20 @@ def test_exact_corners_give_the_pose_back(turn_deg: float, distortion: tuple[flo
     assert np.linalg.eigvalsh(pose.covariance).min() > 0
 
 
+def test_corners_of_no_square_widen_the_covariance() -> None:
+    truth = seen_from(CAMERA, -0.4, -2.8, 0.0, 0.0)
+    geometry = PlateGeometry()
+    corners_m = np.column_stack([geometry.corners_mm / 1000, np.zeros(4)]) @ truth.rotation.T + truth.translation_m
+    corners_px = cv2.projectPoints(corners_m, np.zeros(3), np.zeros(3), CAMERA.matrix, np.zeros(4))[0][:, 0]
+    warped_px = corners_px + np.array([(1.5, 0), (-1.5, 0), (1.5, 0), (-1.5, 0)])
+    square, warped = (locate_plate(seen_px, 0.01 * np.eye(8), geometry, CAMERA) for seen_px in (corners_px, warped_px))
+    assert square is not None
+    assert warped is not None
+    assert np.linalg.norm(camera_position_m(warped) - camera_position_m(square)) > 0.003
+    wider = np.sqrt(np.trace(warped.covariance) / np.trace(square.covariance))
+    assert wider > 5  # residuals of 15 standard deviations
+
+
 # --- from frames ------------------------------------------------------------------------------------------------------
 
 
