@@ -95,12 +95,13 @@ def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:
     likely = quads[possible]
     _rank(likely, wanted[possible], signal.opponent, signal.planes.luma)
     order = np.argsort(-likely[:, RANK], kind="stable")
+    kept = likely[_suppress(likely, order, MAX_CANDIDATES)]
+    centroids_px = _full_px(kept[:, :8].reshape(-1, 4, 2), signal.scale)
     return [
-        MarkerQuad(
-            _full_px(row[:8].reshape(4, 2), signal.scale), int(row[FOUND]), float(row[RANK]), float(row[SIZE_RATIO])
-        )
-        for row in likely[_suppress(likely, order, MAX_CANDIDATES)]
-    ]
+        MarkerQuad(*row)
+        for row in zip(centroids_px, kept[:, FOUND].astype(int).tolist(), kept[:, RANK].tolist(),
+                       kept[:, SIZE_RATIO].tolist(), strict=True)
+    ]  # fmt: skip
 
 
 def _full_px(points: Floats, scale: int) -> Floats:

@@ -112,10 +112,9 @@ def candidate_features(signal: MarkerSignal, quads: Sequence[MarkerQuad], geomet
     view = _View(signal.opponent, planes.blue, planes.green, planes.red, planes.luma, signal.scale)
     layout = _Layout(marker_centroids(geometry), unit_centres(geometry), geometry.unit_mm / geometry.side_mm)
     features = np.empty((len(quads), len(FEATURES)))
-    for quad, row in zip(quads, features, strict=True):
-        row[RANK] = min(quad.rank, MAX_RANK)
-        row[SIDE_RATIO] = size_misfit(quad, geometry) ** 2
-        row[ALL_SQUARES] = quad.found == FOUND_ALL
+    features[:, RANK] = [min(quad.rank, MAX_RANK) for quad in quads]
+    features[:, SIDE_RATIO] = [size_misfit(quad, geometry) ** 2 for quad in quads]
+    features[:, ALL_SQUARES] = [quad.found == FOUND_ALL for quad in quads]
     _set_features(view, layout, np.array([quad.centroids_px for quad in quads]).reshape(-1, 4, 2), features)
     return features
 

@@ -19,6 +19,7 @@ from app.decoders.plate.join_quads import (
     MAX_REDS,
     QUAD_COLUMNS,
     join_green_triples,
+    new_nearest,
     join_red_quads,
 )
 from app.decoders.plate.layout import marker_centroids
@@ -145,7 +146,7 @@ def test_no_quadruple_is_dropped_for_its_place_in_the_list() -> None:
     assert len(reds) <= MAX_REDS
     assert len(greens) <= MAX_GREENS
     quads = np.empty((MAX_QUADS, QUAD_COLUMNS))
-    found = join_green_triples(blobs, greens, np.zeros((400, 600), np.int16), quads)
+    found = join_green_triples(blobs, greens, np.zeros((400, 600), np.int16), new_nearest(), quads)
     found = join_red_quads(blobs, reds, greens, quads, found)
     assert found > 1000
     centroids = np.array([blob[[X, Y]] for blob in plate]).reshape(-1)
