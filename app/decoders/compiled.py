@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba as nb
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., object])
@@ -47,8 +47,8 @@ def routine(function: F) -> F:
 def loop(function: F) -> F:
     """Compile a routine with a loop that is all of the work: as `routine`, but it counts no references to arrays.
 
-    It must not allocate, nor call what allocates or is no `loop`. Counting the references to a `NamedTuple` of arrays at
-    every call of a step takes as long as the step.
+    It must not allocate, nor call what allocates or is no `loop`. Counting the references to a `NamedTuple` of arrays
+    at every call of a step takes as long as the step.
     """
     compiled: F = _njit(
         nogil=True, fastmath=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
@@ -58,9 +58,9 @@ def loop(function: F) -> F:
 
 def ieee_loop(function: F) -> F:
     """Compile a loop as `loop` does, with IEEE 754 arithmetic in the order written."""
-    compiled: F = _njit(
-        nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
-    )(function)
+    compiled: F = _njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)(
+        function
+    )
     return compiled
 
 
@@ -82,11 +82,13 @@ def step(function: F) -> F:
     return inlined
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def trailing_zeros(_context: Any, word: Any) -> Any:
+def _trailing_zeros(_context: Any, word: Any) -> Any:
     """Number of zero bits below the lowest bit that is set, of an unsigned 64-bit word that is not 0."""
 
     def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
 
-    return nb.types.int64(nb.types.uint64), generate
+    return nb.types.int64(word), generate
+
+
+trailing_zeros: Any = intrinsic(_trailing_zeros)

@@ -98,7 +98,7 @@ def main() -> None:
     items = set(ITEMS) if "all" in args.items else set(args.items)
     seeds = [args.seed + k for k in range(1 if args.short else args.seeds)]
     start = time.monotonic()
-    timings = measure_speed(args.seed, 12 if args.short else 100) if "speed" in items else []
+    timings, stages = measure_speed(args.seed, 12 if args.short else 100) if "speed" in items else ([], [])
     records = run_jobs(list_jobs(items, seeds, short=args.short, only=args.sets), args.processes)
     print(f"Seeds {', '.join(map(str, seeds))}; {len(records)} frames evaluated; {time.monotonic() - start:.0f} s.")
     if args.short:
@@ -109,6 +109,7 @@ def main() -> None:
     _print("peers", items, tables.peers_table, records, _PEERS_NOTE)
     if timings:
         print(f"\n### speed\n\n{_SPEED_NOTE}\n\n{tables.speed_table(timings)}")
+        print(f"\n{_STAGES_NOTE}\n\n{tables.stages_table(stages)}")
     _print("accuracy", items, tables.accuracy_table, records, "Over the frames decoded in the trials.")
     _print("light", items, tables.light_table, records, _LIGHT_NOTE)
     _print("reliability", items, tables.reliability_table, records, _RELIABILITY_NOTE)
@@ -134,6 +135,7 @@ _PEERS_NOTE = "The same scenes with a tag of the plate's footprint, default para
 
 
 _SPEED_NOTE = "Processor time, not wall time. The decoders take turns on each frame."
+_STAGES_NOTE = "Mean milliseconds of each stage of the decoder, in a second run of the same frames."
 
 
 _LIGHT_NOTE = (

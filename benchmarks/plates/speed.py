@@ -15,6 +15,7 @@ from app.decoders.plate.reader import decode_plates
 from app.formats.images import load_image
 from benchmarks.plates.peers import FAMILIES, TagFamily, detector, tag_face
 from benchmarks.plates.sets import Job, Shot, replace_face, shoot
+from benchmarks.plates.stages import measure_stages
 
 Image = npt.NDArray[np.uint8]
 
@@ -30,12 +31,22 @@ class Timing:
     worst_ms: float
 
 
-def measure_speed(seed: int, frames: int) -> list[Timing]:
+@dataclass(frozen=True, slots=True)
+class StageTiming:
+    """Mean milliseconds of the processor that a stage of the decoder takes of a frame, in one group of frames."""
+
+    stage: str
+    frames: str
+    mean_ms: float
+
+
+def measure_speed(seed: int, frames: int) -> tuple[list[Timing], list[StageTiming]]:
     """Median and mean processor time a frame of the decoder and the peers, by what is in view.
 
     Frames with a plate in clear light come from the trials at all distances, those in shade from drives under leaves;
     the peers see their tag in the plate's place. Frames without one are a fourth each of the plate-free set: roads and
     photos as they are, and those with many coloured things. Every call is timed by itself, the decoders take turns.
+    The times of the decoder's stages are of a second run of the same frames.
     """
     cv2.setNumThreads(1)
     groups = {
@@ -44,11 +55,13 @@ def measure_speed(seed: int, frames: int) -> list[Timing]:
         "no plate": list(shoot(Job("free", 0, seed, 4 * frames)))[0::4],
         "no plate, clutter": list(shoot(Job("free", 1, seed, 4 * frames)))[3::4],
     }
-    return [
-        timing
-        for name, shots in groups.items()
-        for timing in _measure(name, [shot for shot in shots if isinstance(shot, Shot)], seed)
-    ]
+    timings, stages = [], []
+    for name, shots in groups.items():
+        seen = [shot for shot in shots if isinstance(shot, Shot)]
+        timings += _measure(name, seen, seed)
+        found = measure_stages([shot.frame.image for shot in seen])
+        stages += [StageTiming(stage, name, mean_ms) for stage, mean_ms in found.items()]
+    return timings, stages
 
 
 def _trial_shots(seed: int, frames: int) -> list[Shot]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from benchmarks.plates.evaluate import Record
 from benchmarks.plates.peers import FAMILIES
 from benchmarks.plates.sets import LIGHT, RENDERED_ROWS, THERMAL_KMH, WITH_PLATE, WITHOUT_PLATE, read_trials
-from benchmarks.plates.speed import Timing
+from benchmarks.plates.speed import StageTiming, Timing
 
 BINS = ((8, 10, None), (10, 12, 25), (12, 16, 75), (16, 24, 95), (24, math.inf, 99))
 
@@ -200,6 +200,17 @@ def speed_table(timings: Sequence[Timing]) -> str:
     return table(
         ("1080p, CPU of one thread", "median ms", "mean ms", "worst ms", "ratio to decode_plates", "goal", "met"), rows
     )
+
+
+def stages_table(timings: Sequence[StageTiming]) -> str:
+    """Mean milliseconds of the processor by stage and group of frames, the longest stage of all first."""
+    groups = list(dict.fromkeys(t.frames for t in timings))
+    by_stage: dict[str, dict[str, float]] = {}
+    for t in timings:
+        by_stage.setdefault(t.stage, {})[t.frames] = t.mean_ms
+    order = sorted(by_stage, key=lambda stage: -sum(by_stage[stage].values()))
+    rows = [(stage, *(f"{by_stage[stage].get(group, 0.0):.2f}" for group in groups)) for stage in order]
+    return table(("stage, mean ms", *groups), rows)
 
 
 def accuracy_table(records: Sequence[Record]) -> str:

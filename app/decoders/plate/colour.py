@@ -133,7 +133,7 @@ def _difference(blue: Grey, green: Grey, red: Grey, opponent: Signal) -> None:
         b = np.int16(blue[k])
         g = np.int16(green[k])
         r = np.int16(red[k])
-        opponent[k] = max(r - max(g, b), 0) - max(g - max(r, b), 0)
+        opponent[k] = np.int16(max(r - max(g, b), 0)) - np.int16(max(g - max(r, b), 0))
 
 
 @kernel

@@ -65,7 +65,7 @@ def find_blobs(signal: MarkerSignal) -> Floats:
 
 
 @step
-def _mark(v: int, luma: int, high: int, slack: int) -> int:
+def _mark(v: np.int32, luma: np.int32, high: np.int32, slack: np.int32) -> np.int8:
     """+1, -1 or 0 for red, green or neither."""
     strength = abs(v)
     exceeds = (strength > high) & ((strength << 5) > slack * luma)
@@ -89,8 +89,9 @@ def _mark_row(level: _Level, y: int, high: Signal, marks: Marks) -> None:
                 x = np.uint64(BLOCK * block) + np.uint64(k)
                 marks[x] = _mark(np.int32(level.opponent[y, x]), np.int32(level.luma[y, x]), at_least, slack)
         else:
-            for x in range(BLOCK * block, width):
-                marks[x] = _mark(np.int32(level.opponent[y, x]), np.int32(level.luma[y, x]), at_least, slack)
+            for column in range(BLOCK * block, width):
+                v, luma = np.int32(level.opponent[y, column]), np.int32(level.luma[y, column])
+                marks[column] = _mark(v, luma, at_least, slack)
 
 
 @ieee_loop_kernel
@@ -226,7 +227,7 @@ def _join_runs(opponent: Signal, runs: Runs, part_of: Ints, parent: Ints, sums: 
     above = 0  # first run of the row above that may touch this one or a later one
     row = -2
     for r in range(runs.shape[0]):
-        y, start, stop, colour = np.int64(runs[r, 0]), np.int64(runs[r, 1]), np.int64(runs[r, 2]), runs[r, 3]
+        y, start, stop, colour = int(runs[r, 0]), int(runs[r, 1]), int(runs[r, 2]), runs[r, 3]
         if y != row:
             above = begin if y == row + 1 else r
             begin = r

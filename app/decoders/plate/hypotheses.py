@@ -400,14 +400,14 @@ def _spot_likelihood(spots: Spots, matrix: Singles, first: int) -> float:
         residual = np.float64(matrix[i, first])
         square += residual * residual
         for spot in range(count):
-            g = np.uint64(spot)
-            covered = np.float64(matrix[i, np.uint64(first + 1) + g])
-            hidden = np.float64(matrix[i, np.uint64(first + 1 + count) + g])
-            sums[0, g] += residual * covered
-            sums[1, g] += residual * hidden
-            sums[2, g] += covered * covered
-            sums[3, g] += covered * hidden
-            sums[4, g] += hidden * hidden
+            k = np.uint64(spot)
+            covered = np.float64(matrix[i, np.uint64(first + 1) + k])
+            hidden = np.float64(matrix[i, np.uint64(first + 1 + count) + k])
+            sums[0, k] += residual * covered
+            sums[1, k] += residual * hidden
+            sums[2, k] += covered * covered
+            sums[3, k] += covered * hidden
+            sums[4, k] += hidden * hidden
     top = -1e300
     total = 0.0
     for g in range(count):

@@ -210,9 +210,7 @@ def _triple_shape_ratio(blobs: Floats, corner: int, right: int, below: int, mome
 
 
 @step
-def _add_triple(
-    blobs: Floats, corner: int, right: int, below: int, opponent: Signal, quads: Floats, found: int
-) -> int:
+def _add_triple(blobs: Floats, corner: int, right: int, below: int, opponent: Signal, quads: Floats, found: int) -> int:
     """Add the quadruple of three green squares, where there is something red in the triangle's place.
 
     `corner` is the square opposite the triangle, `right` the one above it and `below` the one to its left.
@@ -337,7 +335,7 @@ def _find_fourth(
     best = MAX_FOURTH_DISTANCE
     fourth = -1
     for m in range(count):
-        if m == i or m == j:
+        if m in (i, j):
             continue
         ex = blobs[near[m], X] - x
         ey = blobs[near[m], Y] - y
@@ -368,7 +366,15 @@ def _write_quad(
 
 @step
 def _add_pair(
-    blobs: Floats, red: int, near: Ints, count: int, i: int, j: int, role: int, complete_seen: bool, quads: Floats,
+    blobs: Floats,
+    red: int,
+    near: Ints,
+    count: int,
+    i: int,
+    j: int,
+    role: int,
+    complete_seen: bool,
+    quads: Floats,
     found: int,
 ) -> tuple[int, bool]:
     """Add the quadruple of a red triangle and two squares, with the third where it is found.

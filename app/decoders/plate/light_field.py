@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import kernel, loop, routine, step
+from app.decoders.compiled import kernel, loop, step
 from app.decoders.plate.hypotheses import PlatePixels
 from app.decoders.plate.linear import factorize, solve_factorized, substitute
 from app.decoders.plate.profiles import Floats, Ints
@@ -79,8 +79,8 @@ class Knots(NamedTuple):
 
     Attributes
     ----------
-    count : int
-        Along a side.
+    along : int
+        Knots along a side.
     side_mm : float
         Of the plate. [mm]
     precision : ndarray, shape (K, band + ROWS)
@@ -88,7 +88,7 @@ class Knots(NamedTuple):
         zeros.
     """
 
-    count: int
+    along: int
     side_mm: float
     precision: Floats
 
@@ -256,7 +256,7 @@ def _fit_knots(pixels: PlatePixels, knots: Knots, spread: float, field: _Field) 
 @loop
 def _set_knots(places_mm: Floats, p: int, knots: Knots, near: Ints, weights: Floats) -> None:
     """Set the four knots around a pixel, in ascending order, and their weights."""
-    count = knots.count
+    count = knots.along
     x = min(max(places_mm[p, 0] / knots.side_mm, 0.0), 1.0) * (count - 1)
     y = min(max(places_mm[p, 1] / knots.side_mm, 0.0), 1.0) * (count - 1)
     column = min(int(x), count - 2)

@@ -166,7 +166,11 @@ def _join_blocks(equations: NormalEquations) -> None:
 
 @loop
 def set_normal_equations(
-    patch: PlatePatch, area: PatchArea, model: PlateModel, quadrature: Quadrature, scratch: Scratch,
+    patch: PlatePatch,
+    area: PatchArea,
+    model: PlateModel,
+    quadrature: Quadrature,
+    scratch: Scratch,
     equations: NormalEquations,
 ) -> PixelSums:
     """Set the normal equations of the shapes' values and the pose from every pixel in an area.

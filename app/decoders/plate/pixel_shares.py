@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from app.decoders.compiled import kernel, loop
 from app.decoders.plate.profiles import Floats, Ints
 from app.decoders.plate.quadrature import Quadrature, blur_quadrature

@@ -115,7 +115,8 @@ def _cut(image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry) -
     count = gather_shares(shares.reshape(size, -1), in_symbols, MIN_SHARE, MAX_ROAD_SHARE, listed, units, rest)
     if count < MIN_PIXELS * n:
         return None
-    used, weights = listed[:count], patch.weights.reshape(-1)[listed[:count]]
+    used = listed[:count]
+    weights: Array = patch.weights.reshape(-1)[used]
     right, down = np.diff(fit.corners_px[:3], axis=0)
     mm_per_px = side_mm / math.sqrt(max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0))
     blur_px = math.sqrt(fit.blur_px**2 + patch.grid[2] * patch.grid[3] / 12)

@@ -19,8 +19,8 @@ from app.decoders.plate.join_quads import (
     MAX_REDS,
     QUAD_COLUMNS,
     join_green_triples,
-    new_nearest,
     join_red_quads,
+    new_nearest,
 )
 from app.decoders.plate.layout import marker_centroids
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES, MIN_SECOND_LOG_ODDS, _read_candidate, _Task
@@ -147,7 +147,7 @@ def test_no_quadruple_is_dropped_for_its_place_in_the_list() -> None:
     assert len(greens) <= MAX_GREENS
     quads = np.empty((MAX_QUADS, QUAD_COLUMNS))
     found = join_green_triples(blobs, greens, np.zeros((400, 600), np.int16), new_nearest(), quads)
-    found = join_red_quads(blobs, reds, greens, quads, found)
+    found = join_red_quads(blobs, reds, greens, new_nearest(), quads, found)
     assert found > 1000
     centroids = np.array([blob[[X, Y]] for blob in plate]).reshape(-1)
     assert any((np.abs(row[:8] - centroids) < 1e-9).all() for row in quads[:found])
