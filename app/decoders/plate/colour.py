@@ -129,11 +129,12 @@ def _signal(opponent: Array, planes: Planes, levels: tuple[tuple[int, int], ...]
 @ieee_kernel
 def _difference(blue: Grey, green: Grey, red: Grey, opponent: Signal) -> None:
     """Set how far red exceeds both others, or minus how far green does; shape (pixels,) each."""
+    zero = np.int16(0)
     for k in range(opponent.shape[0]):
         b = np.int16(blue[k])
         g = np.int16(green[k])
         r = np.int16(red[k])
-        opponent[k] = np.int16(max(r - max(g, b), 0)) - np.int16(max(g - max(r, b), 0))
+        opponent[k] = max(r - max(g, b), zero) - max(g - max(r, b), zero)
 
 
 @kernel

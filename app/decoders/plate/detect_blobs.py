@@ -121,7 +121,7 @@ def _find_runs(level: _Level, words: Words, marks: Marks, high: Signal, runs: Ru
                 high[block] = max(level.threshold[y // BLOCK, block], level.floor)
         _mark_row(level, y, high, marks)
         sign = np.int64(0)
-        start = 0
+        start = np.int64(0)
         for block in range(blocks):
             if level.peak[y, block] <= high[block]:  # a run ends with the last block
                 runs[count, 0], runs[count, 1], runs[count, 2], runs[count, 3] = y, start, BLOCK * block, sign
