@@ -131,18 +131,19 @@ def _knots(side_mm: float) -> Knots:
     places = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     correlation = np.exp(-np.linalg.norm(places[:, None] - places[None], axis=2) / LIGHT_LENGTH_MM)
     band, size = NEAR_KNOTS * count + NEAR_KNOTS, count * count
-    precision = np.zeros((size, band + ROWS))
+    conditional = np.eye(size)  # rows: a knot less what is expected of it by those near it, over its deviation
     for i in range(size):
         before = np.arange(max(i - band, 0), i)
-        near = before[(np.abs(before // count - i // count) <= NEAR_KNOTS)
-                      & (np.abs(before % count - i % count) <= NEAR_KNOTS)]  # fmt: skip
+        near = before[
+            (np.abs(before // count - i // count) <= NEAR_KNOTS) & (np.abs(before % count - i % count) <= NEAR_KNOTS)
+        ]
         factors = np.linalg.solve(correlation[np.ix_(near, near)], correlation[near, i])
-        variance = 1.0 - float(factors @ correlation[near, i])
-        listed, weights = [*near.tolist(), i], [*(-factors).tolist(), 1.0]
-        for a, first in zip(listed, weights, strict=True):
-            for b, second in zip(listed, weights, strict=True):
-                if b >= a:
-                    precision[a, b - a] += first * second / variance
+        conditional[i, near] = -factors
+        conditional[i] /= math.sqrt(1.0 - float(factors @ correlation[near, i]))
+    whole = conditional.T @ conditional
+    precision = np.zeros((size, band + ROWS))
+    for offset in range(band + 1):
+        precision[: size - offset, offset] = np.diagonal(whole, offset)
     return Knots(count, side_mm, precision)
 
 
