@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.decoders.plate.evidence import MAX_VEILED_ERROR
+from app.decoders.plate.decode_symbols import DecodedSymbols
+from app.decoders.plate.evidence import MAX_TENTATIVE_ERROR, MAX_VEILED_ERROR, TENTATIVE_CONFIDENCE, _tentative
 from app.decoders.plate.fit import PlateFit, fit_plate
 from app.decoders.plate.homography import homography_from_points, project
 from app.decoders.plate.layout import marker_centroids
@@ -15,6 +16,7 @@ from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
 from app.decoders.plate.veil import DARK_SHARE, estimate_veil, uniform_haze, veil_log_odds
 from app.decoders.plate.verify_units import verify_units
 from app.markers.plate import PlateGeometry, unit_index
+from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.camera import RenderedFrame
 from app.simulation.plate_scene import Air, PlacedFace, PlateScene, Sensor
 from tests.decoders.plate.scenes import AHEAD_M, PAPER, face_of, shoot
@@ -92,3 +94,23 @@ def test_a_plate_in_glare_is_as_it_looks() -> None:
     wrong = verify_units(shot.image, fit, GEOMETRY, flipped, units.veils, units.veil_log_odds)
     assert wrong is not None
     assert wrong.unit_errors[20] > 0.99
+
+
+def test_a_thermal_frame_has_no_glare() -> None:
+    _shot, fit = shot_in_glare(0.35)
+    units = unit_log_likelihoods(fit, thermal=True)
+    assert units is not None
+    assert [veil.is_even for veil in units.veils] == [True]
+
+
+def test_the_confidence_of_tentative_readings_falls_with_the_error() -> None:
+    reading = PlateReading(PlateOutcome.UNSURE)
+    shown = [
+        _tentative(reading, DecodedSymbols(None, 1 - error, (1 - error,) * 12, likely=PAPER))
+        for error in (2e-4, 0.01, 0.05, MAX_TENTATIVE_ERROR)
+    ]
+    assert all(one.likely_code == PAPER for one in shown)
+    found = [one.confidence for one in shown]
+    assert TENTATIVE_CONFIDENCE > found[0] > found[1] > found[2] > found[3] > 0.7
+    refused = _tentative(reading, DecodedSymbols(None, 0.89, (0.89,) * 12, likely=PAPER))
+    assert refused.likely_code is None
