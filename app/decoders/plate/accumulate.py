@@ -192,5 +192,6 @@ def _usual_missing(evidence: Sequence[PlateEvidence]) -> tuple[PlateOutcome, str
         tints=np.mean([one.tints for one in colours], axis=0),
         cast=np.mean([one.cast for one in colours], axis=0),
         rest=float(np.median([one.rest for one in colours])),
+        beside=float(np.median([one.beside for one in colours])),
     )
     return usual if joint.margins.min() < MIN_MARGIN else wrong_colours(joint)

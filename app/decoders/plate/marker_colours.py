@@ -23,9 +23,14 @@ SPOT_PITCH = 0.03
 on 8 x 8, 0.077 on 12 x 12."""
 _SPOTS = np.array([(x, y) for x in (-SPOT_PITCH, 0.0, SPOT_PITCH) for y in (-SPOT_PITCH, 0.0, SPOT_PITCH)])
 
-TRIANGLE_SPOT, REST_SPOT, CORNER_REACH = 0.28, 0.75, 0.09
-"""[sides of the triangle's cell] along its diagonal to a spot in the triangle and to one in the other half, and half
-the side of both spots. Source: chosen by hand: as far from the hypotenuse as the edges of the cell allow."""
+TRIANGLE_SPOT, REST_SPOT, BESIDE_SPOTS, SPOT_REACH = (
+    (0.28, 0.28),
+    (0.75, 0.75),
+    ((-0.45, 0.3), (0.3, -0.45), (-0.45, -0.45)),
+    0.09,
+)
+"""[sides of the triangle's cell] from its outer corner: a spot in the triangle, one in the other half, three beside the
+plate, and half the side of all. Source: chosen by hand: as far from the edges as the cell allows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,18 +48,21 @@ class MarkerColours:
         Blue and red of the units as shares of their green.
     rest : float
         Red of the other half of the triangle's cell over the triangle's own: near 1 where the marker is a square.
+    beside : float
+        The same of the reddest spot beside the plate: above 1 where red spreads from there into a dark corner.
     """
 
     margins: Floats
     tints: Floats
     cast: Floats
     rest: float = 0.0
+    beside: float = 0.0
 
 
-def triangle_rest(
+def red_around_triangle(
     image: npt.NDArray[np.uint8], plate_from_image: Floats, geometry: PlateGeometry, cast: Floats
-) -> float:
-    """Red of the other half of the triangle's cell over the triangle's own (`MarkerColours.rest`).
+) -> tuple[float, float]:
+    """Red of the other half of the triangle's cell and beside the plate, over the triangle's own.
 
     Parameters
     ----------
@@ -63,18 +71,25 @@ def triangle_rest(
     geometry : PlateGeometry
     cast : ndarray, shape (2,)
         Blue and red of the units as shares of their green.
+
+    Returns
+    -------
+    rest, beside : float
+        As of `MarkerColours`.
     """
     edges = unit_edges(geometry)
     low, side = float(edges[0, 0]), float(edges[1, 1] - edges[0, 0])
-    reach = CORNER_REACH * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    points: Floats = low + side * np.concatenate([TRIANGLE_SPOT + reach, REST_SPOT + reach])
+    spots = np.array([TRIANGLE_SPOT, REST_SPOT, *BESIDE_SPOTS])
+    reach = SPOT_REACH * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    points: Floats = low + side * (spots[:, None] + reach).reshape(-1, 2)
     at_px = project(np.asarray(np.linalg.inv(plate_from_image), float), points).astype(np.float32)
     seen: npt.NDArray[Any] = cv2.remap(
         image, at_px[None, :, 0], at_px[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )[0]
-    blue, green, red = seen.astype(float).reshape(2, len(reach), 3).mean(axis=1).T
+    blue, green, red = seen.astype(float).reshape(len(spots), len(reach), 3).mean(axis=1).T
     tints = red / cast[1] - np.maximum(green, blue / cast[0])
-    return float(tints[1] / max(tints[0], 1.0))
+    shares = tints[1:] / max(float(tints[0]), 1.0)
+    return float(shares[0]), float(shares[1:].max())
 
 
 def marker_colours(signal: MarkerSignal, plate_from_image: Floats, centroids: Floats, units: Floats) -> MarkerColours:
