@@ -440,20 +440,6 @@ def is_codeword(symbols: Sequence[int], scheme: PlateScheme, n: int = 8, check_d
     return digits[lay.data :] == _digit_sum(digits[: lay.data], lay.checks)
 
 
-def decimal_codes(symbols: Sequence[int], n: int = 8) -> tuple[PlateCode, ...]:
-    """Codes of the schemes without Reed-Solomon checks that show these symbols, the one with fewest check digits first.
-
-    The plate does not say which it is: one check digit holds by accident for one plain position in ten, two for one in
-    a hundred.
-    """
-    kinds = ((PlateScheme.POSITION, 1), (PlateScheme.POSITION_CHECK, 1), (PlateScheme.POSITION_CHECK, 2))
-    return tuple(
-        PlateCode.from_symbols(symbols, scheme, n, checks)
-        for scheme, checks in kinds
-        if is_codeword(symbols, scheme, n, checks)
-    )
-
-
 def numbers(n: int, scheme: PlateScheme) -> int:
     """How many plates of a scheme with Reed-Solomon words there are: registry numbers, or positions."""
     if scheme is PlateScheme.ID:

@@ -1,11 +1,12 @@
-"""Full coordinates of a position plate, whose code holds the decimals only."""
+"""Full coordinates of a position plate, whose code holds the decimals only, and the schemes that digits may have."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from app.geodesy import check_lon_lat
-from app.markers.plate import PlateCode
+from app.markers.plate import PlateCode, PlateScheme, is_codeword
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,3 +58,17 @@ def _nearest_degree(decimals: str, coarse_deg: float, bound: float, *, wraps: bo
             candidates[value + 0.0] = min(difference, 360.0 - difference) if wraps else difference
     ranked = sorted(candidates.items(), key=lambda item: item[1])
     return ranked[0][0], ranked[0][1], ranked[1][1] if len(ranked) > 1 else float("inf")
+
+
+def decimal_codes(symbols: Sequence[int], n: int = 8) -> tuple[PlateCode, ...]:
+    """Codes of the schemes without Reed-Solomon checks that show these symbols, the one with fewest check digits first.
+
+    The plate does not say which it is: one check digit holds by accident for one plain position in ten, two for one in
+    a hundred.
+    """
+    kinds = ((PlateScheme.POSITION, 1), (PlateScheme.POSITION_CHECK, 1), (PlateScheme.POSITION_CHECK, 2))
+    return tuple(
+        PlateCode.from_symbols(symbols, scheme, n, checks)
+        for scheme, checks in kinds
+        if is_codeword(symbols, scheme, n, checks)
+    )

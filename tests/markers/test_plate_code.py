@@ -17,7 +17,6 @@ from app.markers.plate import (
     PlateGeometry,
     PlateScheme,
     code_cells,
-    decimal_codes,
     encode_number,
     is_codeword,
     plate_capacity,
@@ -25,7 +24,7 @@ from app.markers.plate import (
     unit_index,
     units_from_symbols,
 )
-from app.markers.plate_position import resolve_position
+from app.markers.plate_position import decimal_codes, resolve_position
 
 # --- layout -----------------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from app.decoders.plate.likely_words import LikelyCodeword, likely_codeword
 from app.decoders.plate.unit_likelihoods import MAX_LEVEL_RESIDUAL, UnitEvidence, pattern_cost
 from app.decoders.plate.unit_verification import UnitVerification
-from app.markers.plate import PlateCode, PlateScheme, decimal_codes, position_decimals
+from app.markers.plate import PlateCode, PlateScheme, position_decimals
+from app.markers.plate_position import decimal_codes
 
 Array = npt.NDArray[Any]
 

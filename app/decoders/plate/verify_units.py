@@ -18,18 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.fit import PlateFit
-from app.decoders.plate.hypotheses import (
-    MIN_PIXELS,
-    LightPrior,
-    PlatePattern,
-    PlatePixels,
-    Spots,
-    set_unit_likelihoods,
-)
+from app.decoders.plate.hypotheses import MIN_PIXELS, set_unit_likelihoods
 from app.decoders.plate.layout import unit_edges, unit_shapes
 from app.decoders.plate.light_field import LEVEL_VARIANCE, LIGHT_LENGTH_MM, fit_light
 from app.decoders.plate.patch import cut_patch
 from app.decoders.plate.pixel_shares import gather_shares, set_pixel_shares
+from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
 from app.decoders.plate.synthesis import FIRST_GAP
 from app.decoders.plate.unit_verification import UnitVerification
 from app.decoders.plate.veil import DARK_SHARE, VEIL_LENGTH, Veil

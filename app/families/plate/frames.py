@@ -24,8 +24,8 @@ from app.families.frames import (
     nearest_match,
 )
 from app.families.plate.rows import plate_code, plate_geometry
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, decimal_codes
-from app.markers.plate_position import resolve_position
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate_position import decimal_codes, resolve_position
 from app.markers.reading import PlateReading
 from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.registry import markers as store

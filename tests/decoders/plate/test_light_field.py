@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.decoders.plate.hypotheses import PlatePixels
 from app.decoders.plate.light_field import (
     ALBEDO_WEIGHT,
     EDGE_ERROR,
@@ -20,6 +19,7 @@ from app.decoders.plate.light_field import (
     fit_light,
 )
 from app.decoders.plate.linear import invert
+from app.decoders.plate.plate_pixels import PlatePixels
 
 SIDE_MM = 325.0
 

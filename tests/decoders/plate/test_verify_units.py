@@ -17,16 +17,9 @@ from app.decoders.plate.colour import MarkerSignal, Planes
 from app.decoders.plate.evidence import MAX_ERROR
 from app.decoders.plate.fit import fit_plate
 from app.decoders.plate.homography import homography_from_points, project
-from app.decoders.plate.hypotheses import (
-    DARK_SPREAD,
-    WHITE_SPREAD,
-    LightPrior,
-    PlatePattern,
-    PlatePixels,
-    Spots,
-    set_unit_likelihoods,
-)
+from app.decoders.plate.hypotheses import DARK_SPREAD, WHITE_SPREAD, set_unit_likelihoods
 from app.decoders.plate.layout import marker_centroids
+from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
 from app.decoders.plate.reader import decode_plates
 from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
 from app.decoders.plate.unit_verification import UnitVerification
