@@ -10,6 +10,7 @@ import numpy.typing as npt
 from app.decoders.magnet.decoder import VERSION, decode_trace
 from app.decoders.magnet.identify import TagCandidates
 from app.decoders.magnet.readings import Finding
+from app.decoders.magnet.recording_check import find_mistakes
 from app.formats.traces.read import read_trace
 from app.formats.traces.series import NEAR_S
 from app.jobs.memory_limit import memory_is_the_limit
@@ -17,6 +18,7 @@ from app.markers.magnet import InformationTag, parse_tag
 from app.plots.trace import plot_trace
 from app.sensors.magnetometer_bar import MagnetTrace
 from app.services.decodes.trace_task import (
+    METHODS,
     CompileTracesTask,
     TraceMotion,
     TraceResult,
@@ -58,6 +60,9 @@ def _decode_recording(task: TraceTask) -> TraceResult:
     loaded = time.perf_counter()
     trace = file.trace
     findings, version = _decode(task, terms, trace)
+    if terms.method == METHODS[0]:
+        for mistake in find_mistakes(trace, terms.bar, findings):
+            file.report.warn(mistake.text)
     decoded = time.perf_counter()
     return TraceResult(
         tuple(findings),

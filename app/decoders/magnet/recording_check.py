@@ -1,0 +1,215 @@
+"""Whether units and axes of a recording can be what was declared, and the mistake that is likely if not.
+
+Two invariants are used. The horizontal field of the earth turns with the heading of the vehicle, whatever offsets the
+sensors have: its size shows the unit, its sense and its phase the axes. And magnets are dipoles: a speed or a field
+in a wrong unit distorts them, so that none is read; in the right unit they are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.magnet.decoder import decode_trace
+from app.decoders.magnet.identify import TagCandidates
+from app.decoders.magnet.readings import Finding, MagnetReading
+from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
+
+Floats = npt.NDArray[np.float64]
+
+SURE_CONFIDENCE = 0.99
+"""[probability] of a magnet that counts. Source: chosen by hand."""
+MIN_MAGNETS, MIN_RATIO = 4, 4.0
+"""[magnets, 1] that another unit must give, and over those that the declared one gives. Source: chosen by hand: a tag
+has three magnets or more, and iron gives one now and then."""
+PIECE_S = 30.0
+"""[s] of the liveliest piece of a recording that is decoded again. Source: chosen by hand, for speed: thirteen decodes
+take one to three seconds of one core."""
+LIVELY_BLOCK_S = 1.0
+"""[s] of the blocks by whose changes the liveliest piece is found. Source: chosen by hand."""
+SPEED_FACTORS = {
+    "km/h where m/s was declared": 1 / 3.6, "mph where m/s was declared": 0.44704,
+    "m/s where km/h was declared": 3.6, "mph where km/h was declared": 1.609344,
+    "m/s where mph was declared": 1 / 0.44704, "km/h where mph was declared": 1 / 1.609344,
+}  # fmt: skip
+"""Speeds, over those that a wrong unit gives. Source: definitions of the units."""
+FIELD_FACTORS = {"ten times as large": 10.0, "a tenth as large": 0.1, "100 times as large": 100.0}
+"""Fields, over those that a wrong unit gives. Source: mG, uT, 10 nT and mT are powers of ten apart."""
+AXES = {
+    "FRD where FLU was declared or the other way round (or a stream that runs backwards)": ((0, 1, 2), (1, -1, -1)),
+    "that exchange x and y": ((1, 0, 2), (1, 1, 1)),
+    "that exchange x and z": ((2, 1, 0), (1, 1, 1)),
+    "that exchange y and z": ((0, 2, 1), (1, 1, 1)),
+}
+"""Axis that each vehicle axis is taken from, and its sign."""
+EARTH_HORIZONTAL_UT = (8.0, 60.0)
+"""[uT] amplitude with which the earth's horizontal field turns. Source: it is 10 to 42 uT below 65 degrees of latitude
+(World Magnetic Model); a third of margin for the iron of a vehicle."""
+MIN_TURN_DEG, RATE_HZ = 60.0, 5.0
+"""[deg, Hz] change of heading from which on the earth's field is compared, and rate at which. Source: by hand."""
+MAX_RESIDUAL = 0.5
+"""[amplitude] root mean square of what the turning field leaves, above which nothing is concluded. Source: by hand."""
+MAX_PHASE_DEG = 60.0
+"""[deg] between the heading and the field's direction. Source: magnetic declination is below 30 degrees in inhabited
+regions (World Magnetic Model), and iron adds some."""
+MIRRORED = 2.0
+"""[1] amplitude of the field that turns the other way over that of the one that turns as it must. Source: by hand."""
+
+
+@dataclass(frozen=True, slots=True)
+class LikelyMistake:
+    """A declaration that the recording contradicts.
+
+    Attributes
+    ----------
+    field : str
+        Of the declaration.
+    reason : str
+        What does not fit, with figures.
+    cure : str
+        What to declare.
+    """
+
+    field: str
+    reason: str
+    cure: str
+
+    @property
+    def text(self) -> str:
+        """Reason and cure in one sentence."""
+        return f"{self.reason}: {self.cure}"
+
+
+def find_mistakes(
+    trace: MagnetTrace, bar: MagnetometerBar, findings: Sequence[Finding], candidates: TagCandidates | None = None
+) -> list[LikelyMistake]:
+    """Mistakes in units and axes that a recording shows.
+
+    Parameters
+    ----------
+    trace : MagnetTrace
+        As it was declared.
+    bar : MagnetometerBar
+    findings : sequence of Finding
+        What was read in it.
+    candidates : TagCandidates, optional
+        Tags that may be on the road.
+    """
+    mistakes = [mistake] if (mistake := compare_with_earth(trace, bar)) is not None else []
+    magnets = sum(isinstance(one, MagnetReading) and one.confidence > SURE_CONFIDENCE for one in findings)
+    if magnets < MIN_MAGNETS and (mistake := compare_with_dipoles(trace, bar, candidates)) is not None:
+        mistakes.append(mistake)
+    return mistakes
+
+
+def compare_with_earth(trace: MagnetTrace, bar: MagnetometerBar) -> LikelyMistake | None:
+    """The mistake that the earth's horizontal field shows while the vehicle turns, if there is one.
+
+    With x forward, y left and the heading h clockwise from north, x + iy of the earth's field is H exp(i (h - D)) and
+    constant offsets, where D is the declination. One more term, in exp(-ih), is left where an axis is mirrored.
+    """
+    if trace.heading_t_s is None or trace.heading_deg is None or not len(trace.heading_t_s):
+        return None
+    step = max(round(trace.rate_hz / RATE_HZ), 1)
+    field: Floats = np.nanmedian(trace.field_ut[::step][:, bar.array], axis=1).astype(float)
+    heading = np.interp(trace.t_s[::step], trace.heading_t_s, np.unwrap(np.radians(trace.heading_deg)))
+    known = np.isfinite(field).all(axis=1)
+    if known.sum() < 20 or np.ptp(heading[known]) < np.radians(MIN_TURN_DEG):
+        return None
+    turning, seen = np.exp(1j * heading[known]), field[known, 0] + 1j * field[known, 1]
+    shape = np.stack([turning, turning.conj(), np.ones_like(turning)], axis=1)
+    (along, against, _offset), *_rest = np.linalg.lstsq(shape, seen, rcond=None)
+    left = seen - shape @ np.linalg.lstsq(shape, seen, rcond=None)[0]
+    amplitude = max(abs(along), abs(against))
+    if float(np.sqrt(np.mean(np.abs(left) ** 2))) > MAX_RESIDUAL * amplitude:
+        return None
+    if abs(against) > MIRRORED * abs(along):
+        return LikelyMistake(
+            "axes",
+            "the earth's field turns against the heading",
+            "the axes look like y right and z down where y left and z up was declared, or the other way round; "
+            "declare the other of FRD and FLU",
+        )
+    phase_deg = float(np.degrees(np.angle(along)))
+    if abs(phase_deg) > MAX_PHASE_DEG and abs(along) > MIRRORED * abs(against):
+        turned = (
+            "all signs look inverted" if abs(phase_deg) > 135 else f"the axes look turned by {phase_deg:.0f} degrees"
+        )
+        return LikelyMistake(
+            "axes",
+            f"the earth's field points {abs(phase_deg):.0f} degrees away from north",
+            f"{turned}; declare the rotation of the sensors, or check the headings",
+        )
+    low, high = EARTH_HORIZONTAL_UT
+    if not low <= amplitude <= high:
+        return LikelyMistake(
+            "unit",
+            f"the field turns by {amplitude:.3g} uT with the vehicle, the earth's horizontal field is 10 to 42 uT",
+            "check the unit of the field and the calibration of the sensors",
+        )
+    return None
+
+
+def compare_with_dipoles(
+    trace: MagnetTrace, bar: MagnetometerBar, candidates: TagCandidates | None = None
+) -> LikelyMistake | None:
+    """The unit or the axes with which a recording has magnets, where it has hardly any as it was declared."""
+    piece = _liveliest_piece(trace, bar)
+    declared = _count_magnets(piece, bar, candidates)
+    best, best_count = None, max(MIN_MAGNETS - 1, int(MIN_RATIO * declared))
+    for mistake, changed in _alternatives(piece):
+        count = _count_magnets(changed, bar, candidates)
+        if count > best_count:
+            best, best_count = mistake(count, declared), count
+    return best
+
+
+def _alternatives(piece: MagnetTrace) -> list[tuple[Callable[[int, int], LikelyMistake], MagnetTrace]]:
+    """What may have been meant, with the recording as it would then be."""
+
+    def named(field: str, what: str) -> Callable[[int, int], LikelyMistake]:
+        def mistake(count: int, declared: int) -> LikelyMistake:
+            reason = f"the liveliest {PIECE_S:g} s show {declared} magnets as declared, and {count} with {what}"
+            return LikelyMistake(field, reason, f"check `{field}` of the declaration, and decode the recording again")
+
+        return mistake
+
+    found = [
+        (named("speed_unit", f"speeds in {name}"), replace(piece, speed_m_s=piece.speed_m_s * factor))
+        for name, factor in SPEED_FACTORS.items()
+    ]
+    found += [
+        (named("unit", f"a field that is {name}"), replace(piece, field_ut=piece.field_ut * np.float32(factor)))
+        for name, factor in FIELD_FACTORS.items()
+    ]
+    found += [
+        (
+            named("axes", f"axes {name}"),
+            replace(piece, field_ut=np.ascontiguousarray(piece.field_ut[..., order] * np.array(signs, np.float32))),
+        )
+        for name, (order, signs) in AXES.items()
+    ]
+    return found
+
+
+def _count_magnets(trace: MagnetTrace, bar: MagnetometerBar, candidates: TagCandidates | None) -> int:
+    findings = decode_trace(trace, bar, candidates=candidates)
+    return sum(isinstance(one, MagnetReading) and one.confidence > SURE_CONFIDENCE for one in findings)
+
+
+def _liveliest_piece(trace: MagnetTrace, bar: MagnetometerBar) -> MagnetTrace:
+    """The part of a recording in which the field changes most."""
+    duration_s = float(trace.t_s[-1] - trace.t_s[0]) if len(trace.t_s) else 0.0
+    if duration_s <= PIECE_S:
+        return trace
+    blocks = ((trace.t_s - trace.t_s[0]) / LIVELY_BLOCK_S).astype(int)
+    change = np.nan_to_num(np.abs(np.diff(trace.field_ut[:, bar.array], axis=0)).max(axis=(1, 2)))
+    strongest = np.zeros(int(blocks[-1]) + 1)
+    np.maximum.at(strongest, blocks[1:], change)
+    # what a magnet changes within a sample, not what a car changes that is passed slowly
+    total = np.convolve(np.minimum(strongest, np.quantile(strongest, 0.99)), np.ones(int(PIECE_S)), mode="valid")
+    start_s = float(trace.t_s[0]) + LIVELY_BLOCK_S * int(np.argmax(total))
+    return trace.between(start_s, start_s + PIECE_S)
