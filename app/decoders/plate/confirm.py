@@ -54,7 +54,8 @@ def confirm_frames(frames: Sequence[tuple[int, Sequence[PlateReading]]]) -> dict
     -----
     Log likelihoods of the units' hypotheses are summed, the priors of stains and spots count once. Frames of the same
     view, as a standing vehicle takes them, count as one. Frames that show about the same digits, but not the same,
-    confirm nothing: one of them is wrong, and a stain is in every frame.
+    confirm nothing: one of them is wrong, and a stain is in every frame. A sure reading alone confirms only those of
+    frames that show the plate smaller: a larger view that is not sure of the digits shows what the small one did not.
     """
     changed: dict[int, list[PlateReading]] = {}
     for sightings in _find_sightings(frames):
@@ -103,9 +104,10 @@ def _is_contradicted(sightings: _Sightings, frames: Sequence[tuple[int, Sequence
 
 def _joint_error(readings: Sequence[PlateReading]) -> float | None:
     """Probability that the digits are wrong, by all frames together; None where these do not confirm them."""
-    sure = [1 - one.confidence for one in readings if one.code is not None]
-    if sure:
-        return min(sure)
+    largest_px = max(one.height_px for one in readings)
+    near = [1 - one.confidence for one in readings if one.code and SAME_VIEW * one.height_px >= largest_px]
+    if near:
+        return min(near)
     views = _views(readings)
     if len(views) < 2:
         return None

@@ -35,8 +35,8 @@ def approached(spot: float, number: int) -> PlateReading:
     return tentative(spot=spot, height_px=30.0 * 1.2**number)
 
 
-def sure(code: PlateCode = CODE) -> PlateReading:
-    return PlateReading(PlateOutcome.READ, code=code, confidence=0.9999)
+def sure(code: PlateCode = CODE, height_px: float = 36.0) -> PlateReading:
+    return PlateReading(PlateOutcome.READ, code=code, confidence=0.9999, height_px=height_px)
 
 
 def test_the_certainty_follows_from_the_digits() -> None:
@@ -73,6 +73,14 @@ def test_a_sure_frame_confirms_a_tentative_one() -> None:
     confirmed = confirm_frames([(0, [tentative()]), (1, [sure()])])
     assert [reading.code for reading in confirmed[0]] == [CODE]
     assert 1 not in confirmed
+
+
+def test_a_sure_frame_does_not_confirm_a_larger_one_that_is_unsure() -> None:
+    """A far plate hides a stain that a near one shows."""
+    far = sure(height_px=15.0)
+    assert confirm_frames([(0, [far]), (1, [tentative(height_px=30.0)])]) == {}
+    near = sure(height_px=60.0)
+    assert set(confirm_frames([(0, [far]), (1, [tentative(height_px=30.0)]), (2, [near])])) == {1}
 
 
 @pytest.mark.parametrize("between", [tentative(OTHER), sure(OTHER)])
