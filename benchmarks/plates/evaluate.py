@@ -104,24 +104,27 @@ class Record:
 def evaluate_job(job: Job) -> list[Record]:
     """Render and evaluate the frames of a job."""
     cv2.setNumThreads(1)
-    frames = [(shot, *_evaluate(job, number, shot)) for number, shot in enumerate(shoot(job))]
-    records = [record for _shot, record, _readings in frames]
-    if job.set_name in LIGHT:
+    records, frames = [], []
+    for number, shot in enumerate(shoot(job)):
+        record, readings = _evaluate(job, number, shot)
+        records.append(record)
+        if job.set_name in LIGHT and isinstance(shot, Shot):
+            frames.append((shot.code, shot.frame.truths[0], readings))
+    if frames:
         for label in dict.fromkeys(record.label for record in records):
             _add_together([place for place, record in enumerate(records) if record.label == label], frames, records)
     return records
 
 
 def _add_together(
-    drive: list[int], frames: list[tuple[Shot | Unseen, Record, list[PlateReading]]], records: list[Record]
+    drive: list[int], frames: list[tuple[PlateCode | None, FaceTruth, list[PlateReading]]], records: list[Record]
 ) -> None:
     """Complete the records of one drive by what its frames confirm together."""
     confirmed = confirm_frames([(place, frames[place][2]) for place in drive])
     for place in drive:
-        shot, record, readings = frames[place]
-        assert isinstance(shot, Shot)
-        hit, wrong = find_right(confirmed.get(place, readings), shot.code, shot.frame.truths[0])
-        records[place] = replace(record, together=hit is not None, wrong_together=wrong)
+        code, truth, readings = frames[place]
+        hit, wrong = find_right(confirmed.get(place, readings), code, truth)
+        records[place] = replace(records[place], together=hit is not None, wrong_together=wrong)
 
 
 def _evaluate(job: Job, number: int, shot: Shot | Unseen) -> tuple[Record, list[PlateReading]]:
