@@ -35,9 +35,9 @@ MAX_ERROR = 2e-4
 """[probability] of an error by the pixels, below which digits are returned. Source: trials in shade, under painted
 stains and in fair light (decision record 0029)."""
 MAX_VEILED_ERROR = 2e-5
-"""[probability] the same under a veil of glare, which is one unknown field more. Source: ten times as sure, so that the
-spots of paint that were laid over a unit on purpose give no more sure readings in glare than without the veil (decision
-record 0029)."""
+"""[probability] the same under a veil of glare, which is one unknown field more. Source: a
+tenth of `MAX_ERROR`, with which test plates in glare with paint over one whole unit are misread no more often than
+without the veil (decision record 0029)."""
 PLAIN_OUTLIER, PLAIN_RESIDUAL = 3.0, 0.08
 """[1, contrast] `UnitEvidence.outlier_ratio` and `level_residual` below which nothing on a plate is unusual, and its
 pixels are not compared. Source: the same trials; the wrong readings had a residual of 0.063 to 0.127."""

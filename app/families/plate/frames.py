@@ -228,7 +228,7 @@ def _match_elsewhere(
 
 
 def _possible_codes(code: PlateCode) -> tuple[PlateCode, ...]:
-    """The code under each scheme that it may be of: Reed-Solomon checks leave no doubt."""
+    """The code under each scheme whose checks its digits satisfy; one code where it has Reed-Solomon checks."""
     return (code,) if code.scheme.corrects else decimal_codes(code.symbols, code.n)
 
 
