@@ -7,7 +7,7 @@ in a wrong unit distorts them, so that none is read; in the right unit they are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -121,10 +121,10 @@ def compare_with_earth(trace: MagnetTrace, bar: MagnetometerBar) -> LikelyMistak
         return None
     turning, seen = np.exp(1j * heading[known]), field[known, 0] + 1j * field[known, 1]
     shape = np.stack([turning, turning.conj(), np.ones_like(turning)], axis=1)
-    (along, against, _offset), *_rest = np.linalg.lstsq(shape, seen, rcond=None)
-    left = seen - shape @ np.linalg.lstsq(shape, seen, rcond=None)[0]
+    fitted = np.linalg.lstsq(shape, seen, rcond=None)[0]
+    along, against, _offset = fitted
     amplitude = max(abs(along), abs(against))
-    if float(np.sqrt(np.mean(np.abs(left) ** 2))) > MAX_RESIDUAL * amplitude:
+    if float(np.sqrt(np.mean(np.abs(seen - shape @ fitted) ** 2))) > MAX_RESIDUAL * amplitude:
         return None
     if abs(against) > MIRRORED * abs(along):
         return LikelyMistake(
@@ -160,39 +160,24 @@ def compare_with_dipoles(
     piece = _liveliest_piece(trace, bar)
     declared = _count_magnets(piece, bar, candidates)
     best, best_count = None, max(MIN_MAGNETS - 1, int(MIN_RATIO * declared))
-    for mistake, changed in _alternatives(piece):
+    for field, what, changed in _alternatives(piece):
         count = _count_magnets(changed, bar, candidates)
         if count > best_count:
-            best, best_count = mistake(count, declared), count
+            reason = f"the liveliest {PIECE_S:g} s show {declared} magnets as declared, and {count} with {what}"
+            cure = f"check `{field}` of the declaration, and decode the recording again"
+            best, best_count = LikelyMistake(field, reason, cure), count
     return best
 
 
-def _alternatives(piece: MagnetTrace) -> list[tuple[Callable[[int, int], LikelyMistake], MagnetTrace]]:
-    """What may have been meant, with the recording as it would then be."""
-
-    def named(field: str, what: str) -> Callable[[int, int], LikelyMistake]:
-        def mistake(count: int, declared: int) -> LikelyMistake:
-            reason = f"the liveliest {PIECE_S:g} s show {declared} magnets as declared, and {count} with {what}"
-            return LikelyMistake(field, reason, f"check `{field}` of the declaration, and decode the recording again")
-
-        return mistake
-
-    found = [
-        (named("speed_unit", f"speeds in {name}"), replace(piece, speed_m_s=piece.speed_m_s * factor))
-        for name, factor in SPEED_FACTORS.items()
-    ]
-    found += [
-        (named("unit", f"a field that is {name}"), replace(piece, field_ut=piece.field_ut * np.float32(factor)))
-        for name, factor in FIELD_FACTORS.items()
-    ]
-    found += [
-        (
-            named("axes", f"axes {name}"),
-            replace(piece, field_ut=np.ascontiguousarray(piece.field_ut[..., order] * np.array(signs, np.float32))),
-        )
-        for name, (order, signs) in AXES.items()
-    ]
-    return found
+def _alternatives(piece: MagnetTrace) -> Iterator[tuple[str, str, MagnetTrace]]:
+    """Fields of the declaration, what they may have meant, and the recording as it would then be."""
+    for name, factor in SPEED_FACTORS.items():
+        yield "speed_unit", f"speeds in {name}", replace(piece, speed_m_s=piece.speed_m_s * factor)
+    for name, factor in FIELD_FACTORS.items():
+        yield "unit", f"a field that is {name}", replace(piece, field_ut=piece.field_ut * np.float32(factor))
+    for name, (order, signs) in AXES.items():
+        turned = np.ascontiguousarray(piece.field_ut[..., order] * np.array(signs, np.float32))
+        yield "axes", f"axes {name}", replace(piece, field_ut=turned)
 
 
 def _count_magnets(trace: MagnetTrace, bar: MagnetometerBar, candidates: TagCandidates | None) -> int:
@@ -209,7 +194,7 @@ def _liveliest_piece(trace: MagnetTrace, bar: MagnetometerBar) -> MagnetTrace:
     change = np.nan_to_num(np.abs(np.diff(trace.field_ut[:, bar.array], axis=0)).max(axis=(1, 2)))
     strongest = np.zeros(int(blocks[-1]) + 1)
     np.maximum.at(strongest, blocks[1:], change)
-    # what a magnet changes within a sample, not what a car changes that is passed slowly
+    # magnets are many and alike, so one car that is passed slowly does not decide
     total = np.convolve(np.minimum(strongest, np.quantile(strongest, 0.99)), np.ones(int(PIECE_S)), mode="valid")
     start_s = float(trace.t_s[0]) + LIVELY_BLOCK_S * int(np.argmax(total))
     return trace.between(start_s, start_s + PIECE_S)

@@ -105,11 +105,13 @@ class PlateFit:
 
 @dataclass(frozen=True, slots=True)
 class _Stage:
-    """Pixels a unit, where the image has more; quadrature nodes on each side of the middle; most steps."""
+    """Pixels a unit, where the image has more; quadrature nodes on each side of the middle; most steps; whether the
+    blur may be skewed against rows and columns (`quadrature`)."""
 
     unit_px: float
     nodes: int
     steps: int
+    is_skewed: bool = False
 
 
 _QUICK = (_Stage(1.8, 1, 6), _Stage(2.8, 4, 4))
@@ -118,7 +120,7 @@ hand."""
 _THOROUGH = (_Stage(2.4, 2, 6), _Stage(3.5, 4, 4))
 """Stages of thermal frames, whose plates are few and faint. Source: chosen by hand."""
 
-_FINE = _Stage(4.5, 4, 2)
+_FINE = _Stage(4.5, 4, 2, is_skewed=True)
 """Stage of the corners of read plates. Source: decision record 0033; 6 px a unit take 0.7 ms more, and only plates of
 48 rows and more gain by it."""
 
@@ -165,7 +167,7 @@ def fit_plate(
             return None
         if is_coarse:
             model.values[:] = patch.light.mean()
-        quality = minimize(patch, model, equations, stage.nodes, stage.steps, is_coarse, False)
+        quality = minimize(patch, model, equations, stage.nodes, stage.steps, is_coarse, stage.is_skewed)
         if not quality.is_plate:
             return None
         if not is_coarse or promising is None:
@@ -200,7 +202,7 @@ def refine_corners(image: npt.NDArray[Any], fit: PlateFit, geometry: PlateGeomet
     patch = cut_patch(image, fit.corners_px, geometry.n * _FINE.unit_px, linear=False)
     if patch is None:
         return None
-    quality = minimize(patch, model, equations, _FINE.nodes, _FINE.steps, False, True)
+    quality = minimize(patch, model, equations, _FINE.nodes, _FINE.steps, False, _FINE.is_skewed)
     covariance = invert(equations.matrix) * quality.variance
     if not quality.is_plate or not covariance.size:
         return None

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.compiled import kernel, routine, step
+from app.decoders.plate.linear import subtract_rows
 from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
 from app.decoders.plate.profiles import Floats, Ints
 
@@ -69,34 +70,17 @@ class Around(NamedTuple):
 def _factorize(matrix: Singles) -> float:
     """Replace the upper triangle of the first columns by the transposed Cholesky factor, the others by forward
     substitution; returns half the logarithm of the determinant.
-
-    Rows are subtracted from rows, four at a time. Indices are unsigned, and there are no views of rows: the loops over
-    columns are then compiled to vector instructions, and cost no reference counts.
     """
     rows, columns = matrix.shape
     flat = matrix.reshape(-1)
     total = 0.0
     for i in range(rows):
+        subtract_rows(flat, i, columns)
         row = np.uint64(i * columns + i)
-        size = columns - i
-        for block in range(i // 4):
-            first = 4 * block * columns + i
-            p, q = np.uint64(first), np.uint64(first + columns)
-            r, s = np.uint64(first + 2 * columns), np.uint64(first + 3 * columns)
-            a, b, c, d = flat[p], flat[q], flat[r], flat[s]
-            for column in range(size):
-                k = np.uint64(column)
-                flat[row + k] -= a * flat[p + k] + b * flat[q + k] + c * flat[r + k] + d * flat[s + k]
-        for j in range(i // 4 * 4, i):
-            p = np.uint64(j * columns + i)
-            a = flat[p]
-            for column in range(size):
-                k = np.uint64(column)
-                flat[row + k] -= a * flat[p + k]
         pivot = max(np.float64(flat[row]), MIN_PIVOT)
         total += math.log(pivot)
         scale = np.float32(1.0 / math.sqrt(pivot))
-        for column in range(size):
+        for column in range(columns - i):
             flat[row + np.uint64(column)] *= scale
     return 0.5 * total
 

@@ -6,6 +6,7 @@ LAPACK would do, but its threads cost more than they give at this size, and a ca
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,37 +17,45 @@ Array = npt.NDArray[np.float64]
 
 
 @routine
-def factorize(matrix: Array) -> Array:
-    """Cholesky factor of the symmetric matrix with this lower triangle; empty if it is not positive.
+def subtract_rows(flat: npt.NDArray[Any], i: int, columns: int) -> None:
+    """Subtract the rows before row i of a transposed Cholesky factor from it, four at a time, from column i on.
 
-    Rows of the transposed factor are subtracted from rows, four at a time. Indices are unsigned, and there are no views
-    of rows: the loops over columns are then compiled to vector instructions, and cost no reference counts.
+    `flat` has the rows one after the other, of `columns` each. Indices are unsigned, and there are no views of rows:
+    the loops over columns are then compiled to vector instructions, and cost no reference counts.
     """
+    row = np.uint64(i * columns + i)
+    size = columns - i
+    for block in range(i // 4):
+        first = 4 * block * columns + i
+        p, q = np.uint64(first), np.uint64(first + columns)
+        r, s = np.uint64(first + 2 * columns), np.uint64(first + 3 * columns)
+        a, b, c, d = flat[p], flat[q], flat[r], flat[s]
+        for column in range(size):
+            k = np.uint64(column)
+            flat[row + k] -= a * flat[p + k] + b * flat[q + k] + c * flat[r + k] + d * flat[s + k]
+    for j in range(i // 4 * 4, i):
+        p = np.uint64(j * columns + i)
+        a = flat[p]
+        for column in range(size):
+            k = np.uint64(column)
+            flat[row + k] -= a * flat[p + k]
+
+
+@routine
+def factorize(matrix: Array) -> Array:
+    """Cholesky factor of the symmetric matrix with this lower triangle; empty if it is not positive."""
     n = matrix.shape[0]
     upper = np.empty(n * n)
     for i in range(n):
         for j in range(i + 1):
             upper[np.uint64(j * n + i)] = matrix[i, j]
     for i in range(n):
+        subtract_rows(upper, i, n)
         row = np.uint64(i * n + i)
-        size = n - i
-        for block in range(i // 4):
-            first = 4 * block * n + i
-            p, q, r, s = np.uint64(first), np.uint64(first + n), np.uint64(first + 2 * n), np.uint64(first + 3 * n)
-            a, b, c, d = upper[p], upper[q], upper[r], upper[s]
-            for column in range(size):
-                k = np.uint64(column)
-                upper[row + k] -= a * upper[p + k] + b * upper[q + k] + c * upper[r + k] + d * upper[s + k]
-        for j in range(i // 4 * 4, i):
-            p = np.uint64(j * n + i)
-            a = upper[p]
-            for column in range(size):
-                k = np.uint64(column)
-                upper[row + k] -= a * upper[p + k]
         if not upper[row] > 0.0:
             return np.empty((0, 0))
         scale = 1.0 / math.sqrt(upper[row])
-        for column in range(size):
+        for column in range(n - i):
             upper[row + np.uint64(column)] *= scale
     factor = np.zeros((n, n))
     for i in range(n):

@@ -86,24 +86,21 @@ def verify_units(
     UnitVerification or None
         None where the plate has too few pixels.
     """
-    found = [_likelihoods(image, fit, geometry, dark, veil) for veil in veils]
-    first = found[0]
-    if first is None:
+    pixels = _cut(image, fit, geometry)
+    if pixels is None:
         return None
-    for other in found[1:]:
-        if other is not None:
-            first = np.logaddexp(first - np.logaddexp(0.0, -log_odds), other - np.logaddexp(0.0, log_odds))
-    return UnitVerification(first)
+    found = [_likelihoods(pixels, fit, geometry, dark, veil) for veil in veils]
+    if len(found) == 1:
+        return UnitVerification(found[0])
+    first, other = found
+    return UnitVerification(np.logaddexp(first - np.logaddexp(0.0, -log_odds), other - np.logaddexp(0.0, log_odds)))
 
 
 def _likelihoods(
-    image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, dark: npt.NDArray[np.bool_], veil: Veil
-) -> Array | None:
-    """Log likelihoods of the hypotheses about each unit under a veil; None where the plate has too few pixels."""
-    cut = _cut(image, fit, geometry, veil)
-    if cut is None:
-        return None
-    pixels, paints = cut
+    seen: PlatePixels, fit: PlateFit, geometry: PlateGeometry, dark: npt.NDArray[np.bool_], veil: Veil
+) -> Array:
+    """Log likelihoods of the hypotheses about each unit under a veil, shape (units, 5)."""
+    pixels, paints = _unveiled(seen, fit, geometry, veil)
     pattern = dark.astype(float)
     parts = np.column_stack([pixels.units @ pattern, pixels.rest])
     white = pixels.units @ (1 - pattern)
@@ -125,10 +122,8 @@ def _likelihoods(
     return likelihoods
 
 
-def _cut(
-    image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry, veil: Veil
-) -> tuple[PlatePixels, Array] | None:
-    """The pixels on the plate, and the reflectances of its parts to begin with."""
+def _cut(image: npt.NDArray[np.uint8], fit: PlateFit, geometry: PlateGeometry) -> PlatePixels | None:
+    """The pixels on the plate as the camera sees them; None where it has too few."""
     n, side_mm = geometry.n, geometry.side_mm
     patch = cut_patch(image, fit.corners_px, n * UNIT_PX, linear=False)
     if patch is None:
@@ -146,18 +141,24 @@ def _cut(
     right, down = np.diff(fit.corners_px[:3], axis=0)
     mm_per_px = side_mm / math.sqrt(max(abs(float(right[0] * down[1] - right[1] * down[0])), 1.0))
     blur_px = math.sqrt(fit.blur_px**2 + patch.grid[2] * patch.grid[3] / 12)
-    across, along = (places.reshape(size, 2)[used].T * n - 0.5).astype(np.float32)
-    veiled = cv2.remap(veil.light.astype(np.float32), across, along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    at_cells = veil.light.reshape(n // 2, 2, n // 2, 2).mean(axis=(1, 3))
-    pixels = PlatePixels(
-        patch.light.reshape(-1)[used].astype(float) - np.asarray(veiled, float).reshape(-1),
+    return PlatePixels(
+        patch.light.reshape(-1)[used].astype(float),
         weights / float(weights.mean()),
         units[:count],
         rest[:count],
         places.reshape(size, 2)[used] * side_mm,
-        veil.level,
+        math.nan,  # known once a veil is taken off
         max(mm_per_px * blur_px, MIN_BLUR_MM),
     )
+
+
+def _unveiled(seen: PlatePixels, fit: PlateFit, geometry: PlateGeometry, veil: Veil) -> tuple[PlatePixels, Array]:
+    """The pixels without a veil, and the reflectances of the plate's parts to begin with."""
+    n = geometry.n
+    across, along = (seen.places_mm.T / geometry.side_mm * n - 0.5).astype(np.float32)
+    veiled = cv2.remap(veil.light.astype(np.float32), across, along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    pixels = seen._replace(light=seen.light - np.asarray(veiled, float).reshape(-1), level=veil.level)
+    at_cells = veil.light.reshape(n // 2, 2, n // 2, 2).mean(axis=(1, 3))
     markers = fit.markers - at_cells[[0, 0, 0, -1, -1], [0, 0, -1, -1, 0]]
     first = np.array([DARK_SHARE * veil.level, fit.gap - float(veil.light.mean()), *markers])
     return pixels, np.clip(first / veil.level, *ALBEDO)

@@ -27,6 +27,10 @@ from app.decoders.plate.detect_blobs import (
 )
 
 
+def sorted_blobs(blobs: np.ndarray) -> np.ndarray:
+    return blobs[np.lexsort(np.round(blobs[:, [WEIGHT, Y0, X0, SIGN]], 6).T)]
+
+
 def spotted(height: int, width: int) -> np.ndarray:
     """A grey frame with noise and coloured discs, some of which touch, some at the edges."""
     rng = np.random.default_rng(3)
@@ -68,6 +72,4 @@ def test_blobs_are_those_of_scipy(signal_of, size: tuple[int, int]) -> None:
                 expected.append(row)
     found = find_blobs(signal)
     assert len(found) == len(expected) > 50
-    by = lambda blobs: np.lexsort(np.round(blobs[:, [WEIGHT, Y0, X0, SIGN]], 6).T)  # noqa: E731
-    wanted = np.array(expected)
-    np.testing.assert_allclose(found[by(found)], wanted[by(wanted)], atol=1e-6)
+    np.testing.assert_allclose(sorted_blobs(found), sorted_blobs(np.array(expected)), atol=1e-6)
