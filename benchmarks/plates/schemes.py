@@ -23,8 +23,9 @@ from app.simulation.plate_face import Face, plate_face
 from app.simulation.plate_scene import FaceTruth, PlateScene, face_truth
 from benchmarks.plates.evaluate import find_right
 from benchmarks.plates.peers import FAMILIES, reads_tag, tag_face
-from benchmarks.plates.sets import draw_background, draw_light, draw_scenes, draw_stress_views
+from benchmarks.plates.sets import draw_light, draw_scenes, draw_stress_views
 from benchmarks.plates.tables import table
+from benchmarks.plates.views import draw_background
 
 SCHEME_SETS = ("fair", "shadow-edge", "dapple", "glare", "stains", "stained-shade", "worn", "stress")
 NEIGHBOURS = 20

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -32,10 +31,10 @@ from app.simulation.conditions import (
 from app.simulation.distractors import draw_distractor_faces, paint_distractors
 from app.simulation.drive import Drive, drive_over_plate
 from app.simulation.plate_face import Face, plate_face, warm_face
-from app.simulation.plate_scene import Air, PlacedFace, PlateScene, face_truth
-from app.simulation.road import road_background
+from app.simulation.plate_scene import Air, PlateScene, face_truth
 from app.simulation.thermal import render_thermal_scene
-from benchmarks.plates.lookalikes import draw_flat, paint_upright
+from benchmarks.plates.views import draw_background, draw_camera
+from benchmarks.plates.without_plate import DRAW_WITHOUT_PLATE
 
 Image = npt.NDArray[np.uint8]
 HERE = Path(__file__).parent.parent
@@ -47,7 +46,7 @@ LIGHT = ("shadow-edge", "glare", "stains", "stained-shade", "worn", "dapple")
 leaves' shadows."""
 THERMAL_KMH = {"thermal": 10.0, "thermal-20": 20.0, "thermal-30": 30.0}
 SETS = ("trial", "stress", "night", "thermal", "hidden", "free", *LIGHT, "thermal-20", "thermal-30", "look-alikes")
-WITHOUT_PLATE = ("free", "look-alikes")
+WITHOUT_PLATE = tuple(DRAW_WITHOUT_PLATE)
 WITH_PLATE = tuple(name for name in SETS if name not in WITHOUT_PLATE)
 LIGHT_ROWS, STRESS_ROWS = (12.0, 90.0), (24.0, 140.0)
 DRIVE_FRAMES = 5
@@ -154,13 +153,6 @@ def read_trials() -> tuple[Trial, ...]:
         )  # fmt: skip
 
 
-@lru_cache(maxsize=1)
-def read_photos() -> tuple[Image, ...]:
-    """Real road photos."""
-    paths = sorted((HERE / "backgrounds").glob("*.jpg"))
-    return tuple(np.asarray(cv2.imread(str(path)), np.uint8) for path in paths)
-
-
 def draw_code(rng: np.random.Generator) -> PlateCode:
     """Any twelve digits: a plain position plate."""
     return PlateCode("".join(str(d) for d in rng.integers(0, 10, 12)))
@@ -184,16 +176,11 @@ def find_shot(job: Job, number: int) -> Shot | Unseen:
 def shoot(job: Job) -> Iterator[Shot | Unseen]:
     """Frames of a job."""
     makers = {
-        "trial": _trial, "stress": _stress, "night": _stress, "hidden": _hidden, "free": _free,
-        "look-alikes": _look_alikes, **dict.fromkeys(THERMAL_KMH, _thermal), **dict.fromkeys(LIGHT, _light),
+        "trial": _trial, "stress": _stress, "night": _stress, "hidden": _hidden,
+        **dict.fromkeys(WITHOUT_PLATE, _without_plate), **dict.fromkeys(THERMAL_KMH, _thermal),
+        **dict.fromkeys(LIGHT, _light),
     }  # fmt: skip
     return makers[job.set_name](job)
-
-
-def draw_background(camera: Camera, rng: np.random.Generator) -> Image:
-    """A road photo seen by the camera."""
-    photos = read_photos()
-    return road_background(photos[int(rng.integers(len(photos)))], camera, rng, grain=float(rng.uniform(0.01, 0.05)))
 
 
 def _shot(
@@ -251,20 +238,8 @@ def _trial(job: Job) -> Iterator[Shot | Unseen]:
 # --- stress -----------------------------------------------------------------------------------------------------------
 
 
-def _draw_camera(rng: np.random.Generator) -> Camera:
-    return Camera.from_field_of_view(
-        1920,
-        1080,
-        float(rng.uniform(60, 90)),
-        height_m=float(rng.uniform(1.2, 2.0)),
-        depression_deg=float(rng.uniform(12, 45)),
-        azimuth_deg=float(rng.normal(0, 8)),
-        roll_deg=float(rng.normal(0, 1)),
-    )
-
-
 def _draw_stress_scene(job: Job, rng: np.random.Generator) -> tuple[PlateScene, Image, PlateCode, Conditions]:
-    camera, code = _draw_camera(rng), draw_code(rng)
+    camera, code = draw_camera(rng), draw_code(rng)
     conditions = draw_stress(rng, night=job.set_name == "night")
     face = plate_face(code, GEOMETRY, conditions.look, conditions.wear, rng)
     return *_draw_stress_view(camera, face, conditions, rng), code, conditions
@@ -281,7 +256,7 @@ def _draw_stress_view(
 
 def draw_stress_views(face: Face, conditions: Conditions, rng: np.random.Generator) -> list[tuple[PlateScene, Image]]:
     """Views of a plate through different cameras, at different places beside different things."""
-    return [_draw_stress_view(_draw_camera(rng), face, conditions, rng) for _ in range(DRIVE_FRAMES)]
+    return [_draw_stress_view(draw_camera(rng), face, conditions, rng) for _ in range(DRIVE_FRAMES)]
 
 
 def _stress(job: Job) -> Iterator[Shot | Unseen]:
@@ -335,7 +310,7 @@ def draw_scenes(face: Face, conditions: Conditions, rng: np.random.Generator) ->
     """Views of a plate from a camera that passes it, evenly over those of the wanted heights."""
     while True:
         drive = Drive(
-            camera=_draw_camera(rng),
+            camera=draw_camera(rng),
             face=face,
             speed_m_s=float(rng.uniform(5, 30)),
             fps=30.0,
@@ -405,51 +380,12 @@ def _thermal(job: Job) -> Iterator[Shot | Unseen]:
 # --- no plate ---------------------------------------------------------------------------------------------------------
 
 
-def _free(job: Job) -> Iterator[Shot | Unseen]:
-    """Roads without a plate: crops of photos as they are, mirrored, in other colours, and with distractors."""
+def _without_plate(job: Job) -> Iterator[Shot | Unseen]:
+    """Roads without a plate, with a codebook of plates that are not there."""
     rng = job.rng
-    for k in range(job.frames):
-        camera = _draw_camera(rng)
-        background = draw_background(camera, rng) if k % 3 == 0 else _draw_crop(camera, rng)
-        if k % 2:
-            background = paint_distractors(background, rng, int(rng.integers(3, 25)))
-        faces: tuple[PlacedFace, ...] = ()
-        if k % 4 >= 2:
-            faces = draw_distractor_faces(camera, rng, int(rng.integers(1, 7)))
-        conditions = draw_stress(rng) if rng.random() < 0.5 else draw_daylight(rng)
-        scene = scene_under(conditions, camera, faces, float(rng.uniform(0, 80)) / 3.6, rng)
-        yield _shot("free", scene, background, None, draw_codebook(draw_code(rng), rng), conditions, rng)
-
-
-def _look_alikes(job: Job) -> Iterator[Shot | Unseen]:
-    """Roads without a plate, full of what resembles one: QR codes, tiles, chessboards, signs, markings, decoys."""
-    rng = job.rng
-    for _ in range(job.frames):
-        camera = _draw_camera(rng)
-        background = draw_background(camera, rng) if rng.random() < 0.5 else _draw_crop(camera, rng)
-        background = paint_upright(background, rng, int(rng.integers(0, 9)))
-        faces = draw_flat(camera, rng, int(rng.integers(1, 8)))
-        conditions = draw_stress(rng) if rng.random() < 0.5 else draw_daylight(rng)
-        scene = scene_under(conditions, camera, faces, float(rng.uniform(0, 80)) / 3.6, rng)
-        yield _shot("look-alikes", scene, background, None, draw_codebook(draw_code(rng), rng), conditions, rng)
-
-
-def _draw_crop(camera: Camera, rng: np.random.Generator) -> Image:
-    """Part of a photo at the frame's size, perhaps mirrored, with its colours changed."""
-    photos = read_photos()
-    photo = photos[int(rng.integers(len(photos)))]
-    share = float(rng.uniform(0.35, 1.0))
-    height, width = int(photo.shape[0] * share), int(photo.shape[1] * share)
-    top, left = (int(rng.integers(0, n - m + 1)) for n, m in zip(photo.shape[:2], (height, width), strict=True))
-    part = photo[top : top + height, left : left + width]
-    if rng.random() < 0.5:
-        part = part[:, ::-1]
-    part = cv2.resize(np.ascontiguousarray(part), (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR)
-    gain = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.6, 1.3)
-    table = np.clip(np.arange(256)[:, None] * gain + rng.uniform(-20, 20), 0, 255).astype(np.uint8)
-    hsv = cv2.cvtColor(cv2.LUT(part, table[:, None, :].reshape(256, 1, 3)), cv2.COLOR_BGR2HSV)
-    hsv[..., 1] = cv2.convertScaleAbs(hsv[..., 1], alpha=float(rng.uniform(0.3, 2.0)))
-    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR), np.uint8)
+    for number in range(job.frames):
+        scene, background, conditions = DRAW_WITHOUT_PLATE[job.set_name](number, rng)
+        yield _shot(job.set_name, scene, background, None, draw_codebook(draw_code(rng), rng), conditions, rng)
 
 
 def replace_face(shot: Shot, face: Face) -> RenderedFrame:

@@ -30,8 +30,9 @@ from app.simulation.conditions import Conditions, draw_daylight, draw_place, dra
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import FaceTruth
 from app.simulation.road import road_background
-from benchmarks.plates.sets import Job, Shot, read_photos, shoot
+from benchmarks.plates.sets import Job, Shot, shoot
 from benchmarks.plates.tables import table
+from benchmarks.plates.views import read_photos
 
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
