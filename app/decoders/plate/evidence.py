@@ -31,9 +31,12 @@ of `python -m benchmarks.plates trials` of 10 to 12 rows: below it the units are
 CLEAN_EXPLAINED = 0.93
 """[1] share of variance from which a word may be corrected without a registry. Source: chosen by hand; effect: `python
 -m benchmarks.plates.thresholds`."""
-MAX_ERROR = 2e-4
+MAX_ERROR = 1e-4
 """[probability] of an error by the pixels, below which digits are returned. Source: trials in shade, under painted
 stains and in fair light (decision record 0029)."""
+MAX_SMALL_ERROR = 1e-3
+"""[probability] the same on units below `VERIFIED_UNIT_PX` that look usual: what is unusual there is refused. Source:
+the same trials, and plates under painted stains (decision record 0029)."""
 MAX_VEILED_ERROR = 2e-5
 """[probability] the same under a veil of glare, which is one unknown field more. Source: a
 tenth of `MAX_ERROR`, with which test plates in glare with paint over one whole unit are misread no more often than
@@ -47,7 +50,7 @@ of a unit from which on they are: on smaller ones they show too little to confir
 MIN_CHECKED_CELL = 0.5
 """[probability] of a cell by the pixels below which a check that holds does not count. Source: chosen by hand."""
 VERIFIED_UNIT_PX, PLAIN_SMALL_RESIDUAL = 2.0, 0.12
-"""[px, contrast] size of a unit below which pixels show no stain, and the residual that is usual there. Source: the
+"""[px, contrast] size of a unit below which pixels show few stains, and the residual that is usual there. Source: the
 same trials: with the residual of larger units 36 of 49 plates of 11 to 24 rows are left, with this one 47."""
 MAX_TENTATIVE_ERROR, TENTATIVE_CONFIDENCE, TENTATIVE_EXPONENT = 0.1, 0.9, 2.0
 """[probability, probability, 1] of an error by the pixels up to which a refused code is returned as tentative, the most
@@ -132,9 +135,8 @@ def read_evidence(
     lacking = _find_lacking(evidence)
     refusal = lacking or _is_small(evidence, decoded)
     usual, settled = _is_usual(evidence, decoded), decoded.confirmed or decoded.checked
-    plain = usual and not _hides_paint(evidence)
-    if refusal is None and not plain and not settled and verify is not None:
-        decoded = _verified(decoded, verify, MAX_ERROR if evidence.units.veils[0].is_even else MAX_VEILED_ERROR)
+    if refusal is None and not settled and verify is not None and not (usual and _shows_paint(evidence, decoded)):
+        decoded = _verified(decoded, verify, _max_error(evidence, usual))
     has_check = decoded.code is not None and decoded.code.scheme.corrects
     is_unsure_alone = refusal is not None or not (usual or has_check)
     found = decoded.verification
@@ -197,9 +199,18 @@ def _is_usual(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
     return residual < (PLAIN_SMALL_RESIDUAL if small else PLAIN_RESIDUAL) and units.outlier_ratio < PLAIN_OUTLIER
 
 
-def _hides_paint(evidence: PlateEvidence) -> bool:
-    """Whether light paint over a dark unit may not show on the gaps beside it."""
-    return evidence.units.gap > PLAIN_GAP and evidence.unit_px >= GAP_UNIT_PX
+def _shows_paint(evidence: PlateEvidence, decoded: DecodedSymbols) -> bool:
+    """Whether paint over a unit would make it unusual, or where it does not, a check would show it."""
+    if evidence.unit_px < VERIFIED_UNIT_PX:
+        return decoded.code is not None and decoded.code.scheme.corrects
+    return evidence.units.gap <= PLAIN_GAP or evidence.unit_px < GAP_UNIT_PX
+
+
+def _max_error(evidence: PlateEvidence, usual: bool) -> float:
+    """Error probability by the pixels from which on digits are refused."""
+    if not evidence.units.veils[0].is_even:
+        return MAX_VEILED_ERROR
+    return MAX_SMALL_ERROR if usual and evidence.unit_px < VERIFIED_UNIT_PX else MAX_ERROR
 
 
 def _verified(decoded: DecodedSymbols, verify: Verify, max_error: float) -> DecodedSymbols:

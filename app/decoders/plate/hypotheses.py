@@ -19,8 +19,6 @@ from app.decoders.plate.linear import subtract_rows
 from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
 from app.decoders.plate.profiles import Floats, Ints
 
-WHITE_SPREAD, DARK_SPREAD = 0.09, 0.05
-"""[white] standard deviations of the reflectances of light and of dark units, each unit's own. Source: by hand."""
 STAIN_LENGTH_MM, STAIN_REACH_MM, STAIN_SPREAD = 12.0, 27.0, 0.45
 """[mm, mm, 1] length over which a smooth stain changes, how far around the unit's centre it reaches, and its standard
 deviation relative to the light. Source: chosen by hand."""
@@ -153,7 +151,7 @@ def _find_around(pixels: PlatePixels, pattern: PlatePattern, field: Floats, unit
             light += field[p]
             size += 1
     sign = 1.0 if pattern.dark[unit] > 0.5 else -1.0
-    own = sign * (WHITE_SPREAD * WHITE_SPREAD - DARK_SPREAD * DARK_SPREAD)
+    own = sign * (pattern.white_spread * pattern.white_spread - pattern.dark_spread * pattern.dark_spread)
     return Around(unit, near[:size].copy(), light / max(size, 1), sign * (1.0 - pattern.dark_albedo), own)
 
 
@@ -213,13 +211,13 @@ def _look_around(
 
 
 @routine
-def _set_paint(dark: Floats, shown: Ints, units: Floats, i: int, paint: Floats) -> None:
+def _set_paint(pattern: PlatePattern, shown: Ints, units: Floats, i: int, paint: Floats) -> None:
     """Set a row of the covariance that the units' own reflectances give, from pixel i on."""
     size = paint.size - i
     for k in range(size):
         paint[np.uint64(i + k)] = 0.0
     for other in shown:
-        spread = DARK_SPREAD if dark[other] > 0.5 else WHITE_SPREAD
+        spread = pattern.dark_spread if pattern.dark[other] > 0.5 else pattern.white_spread
         weight = spread * spread * units[other, i]
         for k in range(size):
             paint[np.uint64(i + k)] += weight * units[other, np.uint64(i + k)]
@@ -345,7 +343,7 @@ def _compare_unit(
     others = np.empty((3, size, size + 1), np.float32)
     for i in range(size):
         p = around.pixels[i]
-        _set_paint(pattern.dark, shown.listed[p, : shown.lengths[p]], local.units, i, local.paint)
+        _set_paint(pattern, shown.listed[p, : shown.lengths[p]], local.units, i, local.paint)
         if light.veil_variance > 0.0:
             _add_veil(light.veil_variance / (around.light * around.light), light.veil_length_mm, local, i)
         _set_row(light, local, around.own, i, as_read, others)

@@ -47,6 +47,8 @@ class PlatePattern(NamedTuple):
         Reflectance that each pixel sees of the pattern; white is 1.
     dark_albedo : float
         Reflectance of dark units.
+    white_spread, dark_spread : float
+        Standard deviations of the reflectances of light and of dark units, each unit's own. [white]
     centres_mm : ndarray, shape (units, 2)
     reach_mm, inner_mm : float
         Around a unit's centre, within which pixels are compared, and within which lies what pixels see of it.
@@ -55,6 +57,8 @@ class PlatePattern(NamedTuple):
     dark: Floats
     seen: Floats
     dark_albedo: float
+    white_spread: float
+    dark_spread: float
     centres_mm: Floats
     reach_mm: float
     inner_mm: float

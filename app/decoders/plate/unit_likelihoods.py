@@ -50,6 +50,8 @@ below `evidence.MAX_ERROR`."""
 MIN_VEILED_RESIDUAL = 0.08
 """[contrast] level residual under even haze from which on a veil of glare is compared. Source: chosen by hand, for
 speed, as `evidence.PLAIN_RESIDUAL`."""
+RESIDUAL_TO_SPREAD = 1.4826
+"""[1] standard deviation of a normal distribution over the median of its absolute values."""
 MIN_LEVEL_NOISE_RATIO = 4.0
 """[standard deviations] by which the lightest units must stand above the darkest. Source: chosen by hand."""
 MIN_LIGHT = 1e-4
@@ -150,6 +152,11 @@ class UnitEvidence:
         """Cost of the second best symbol of each cell, shape (cells,)."""
         margin: Array = np.partition(self.cell_costs, 1, axis=1)[:, 1]
         return margin
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of what units differ by on this plate, by the median of the cells. [contrast]"""
+        return RESIDUAL_TO_SPREAD * float(np.median(np.abs(self.level_residual)))
 
 
 @lru_cache

@@ -36,7 +36,7 @@ LEVEL_SPREAD, HAZE_SPREAD = 0.5, 0.3
 Source: chosen by hand."""
 LIGHT_WEAR, DARK_WEAR = 0.09, 0.05
 """[light level] standard deviations of what light and dark units differ by themselves. Source: as
-`hypotheses.WHITE_SPREAD`."""
+`verify_units.WHITE_SPREAD`."""
 VEIL_PRIOR = 0.05
 """[probability] of a veil. Source: chosen by hand."""
 SEARCH_SPREAD, SEARCH_WEAR = 0.3, 0.12

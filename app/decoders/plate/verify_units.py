@@ -9,7 +9,6 @@ Whether the plate has stains at all follows from all of its units.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -25,6 +24,7 @@ from app.decoders.plate.patch import cut_patch
 from app.decoders.plate.pixel_shares import gather_shares, set_pixel_shares
 from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
 from app.decoders.plate.synthesis import FIRST_GAP
+from app.decoders.plate.unit_likelihoods import UnitEvidence
 from app.decoders.plate.unit_verification import UnitVerification
 from app.decoders.plate.veil import DARK_SHARE, VEIL_LENGTH, Veil
 from app.markers.plate import PlateGeometry, unit_index
@@ -47,6 +47,10 @@ MIN_BLUR_MM = 2.0
 """[mm] width of the edge of a spot of paint at least. Source: chosen by hand."""
 NODES = 4
 """Quadrature nodes on each side of the middle at most, as the fit has."""
+WHITE_SPREAD, SPREAD_FACTOR, DARK_SHARE_OF_SPREAD = (0.03, 0.09), 2.0, 0.55
+"""[white, 1, 1] least and greatest standard deviation of light units' own reflectances, the same over
+`UnitEvidence.spread`, and that of dark units over it: where units are even, a spot of paint stands out. Source: plates
+under painted stains (decision record 0029)."""
 VEIL_ERROR = 0.05
 """[light level] standard deviation of the error of a veil of glare. Source: chosen by hand; with none, 51 of 100
 frames in glare are read in place of 52 (decision record 0029)."""
@@ -62,8 +66,7 @@ def verify_units(
     fit: PlateFit,
     geometry: PlateGeometry,
     dark: npt.NDArray[np.bool_],
-    veils: Sequence[Veil],
-    log_odds: float = math.inf,
+    units: UnitEvidence,
 ) -> UnitVerification | None:
     """Verify a pattern of units by the pixels.
 
@@ -76,10 +79,8 @@ def verify_units(
     geometry : PlateGeometry
     dark : ndarray of bool, shape (units,)
         The pattern, in the order of the symbols' units.
-    veils : sequence of Veil
-        Light that the plate does not send, in one or two explanations.
-    log_odds : float
-        Of the first explanation against the other.
+    units : UnitEvidence
+        Of the fit: the explanations of its light, and how much its units differ.
 
     Returns
     -------
@@ -89,15 +90,20 @@ def verify_units(
     pixels = _cut(image, fit, geometry)
     if pixels is None:
         return None
-    found = [_likelihoods(pixels, fit, geometry, dark, veil) for veil in veils]
+    found = [_likelihoods(pixels, fit, geometry, dark, veil, units.spread) for veil in units.veils]
     if len(found) == 1:
         return UnitVerification(found[0])
-    first, other = found
+    first, other, log_odds = *found, units.veil_log_odds
     return UnitVerification(np.logaddexp(first - np.logaddexp(0.0, -log_odds), other - np.logaddexp(0.0, log_odds)))
 
 
 def _likelihoods(
-    seen: PlatePixels, fit: PlateFit, geometry: PlateGeometry, dark: npt.NDArray[np.bool_], veil: Veil
+    seen: PlatePixels,
+    fit: PlateFit,
+    geometry: PlateGeometry,
+    dark: npt.NDArray[np.bool_],
+    veil: Veil,
+    unit_spread: float,
 ) -> Array:
     """Log likelihoods of the hypotheses about each unit under a veil, shape (units, 5)."""
     pixels, paints = _unveiled(seen, fit, geometry, veil)
@@ -106,10 +112,12 @@ def _likelihoods(
     white = pixels.units @ (1 - pattern)
     field = fit_light(pixels, white, parts, paints, geometry.side_mm)
     likelihoods = np.empty((len(dark), 5))
+    white_spread = min(max(SPREAD_FACTOR * unit_spread, WHITE_SPREAD[0]), WHITE_SPREAD[1])
     set_unit_likelihoods(
         pixels,
         PlatePattern(
-            pattern, white + parts @ field.albedo, float(field.albedo[0]), _centres_mm(geometry),
+            pattern, white + parts @ field.albedo, float(field.albedo[0]),
+            white_spread, DARK_SHARE_OF_SPREAD * white_spread, _centres_mm(geometry),
             REACH_PITCHES * geometry.pitch_mm, INNER_SHARE * geometry.unit_mm / 2,
         ),
         LightPrior(

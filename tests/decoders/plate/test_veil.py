@@ -86,12 +86,12 @@ def test_a_plate_in_glare_is_as_it_looks() -> None:
     assert units is not None
     assert not units.veils[0].is_even
     assert (units.dark == DARK).all()
-    found = verify_units(shot.image, fit, GEOMETRY, DARK, units.veils, units.veil_log_odds)
+    found = verify_units(shot.image, fit, GEOMETRY, DARK, units)
     assert found is not None
     assert found.error_probability < MAX_VEILED_ERROR
     flipped = DARK.copy()
     flipped[20] = not flipped[20]
-    wrong = verify_units(shot.image, fit, GEOMETRY, flipped, units.veils, units.veil_log_odds)
+    wrong = verify_units(shot.image, fit, GEOMETRY, flipped, units)
     assert wrong is not None
     assert wrong.unit_errors[20] > 0.99
 

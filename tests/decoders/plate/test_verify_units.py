@@ -16,14 +16,14 @@ from app.decoders.plate.evidence import MAX_ERROR
 from app.decoders.plate.find_candidates import find_candidates
 from app.decoders.plate.fit import fit_plate
 from app.decoders.plate.homography import homography_from_points, project
-from app.decoders.plate.hypotheses import DARK_SPREAD, WHITE_SPREAD, set_unit_likelihoods
+from app.decoders.plate.hypotheses import set_unit_likelihoods
 from app.decoders.plate.layout import marker_centroids
 from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
-from app.decoders.plate.reader import DEFAULT_GEOMETRIES, _decode_colour, _Task
+from app.decoders.plate.reader import DEFAULT_GEOMETRIES, _decode_colour, _Task, decode_plates
 from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
 from app.decoders.plate.unit_verification import UnitVerification
 from app.decoders.plate.verify_units import verify_units
-from app.markers.plate import PlateGeometry, unit_index
+from app.markers.plate import PlateCode, PlateGeometry, unit_index
 from app.simulation.plate_face import Face
 from app.simulation.plate_scene import PlacedFace, PlateScene, Shadow
 from tests.decoders.plate.scenes import AHEAD_M, PAPER, face_of, shoot
@@ -31,6 +31,12 @@ from tests.decoders.plate.scenes import AHEAD_M, PAPER, face_of, shoot
 GEOMETRY = PlateGeometry()
 CORNERS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 DARK = code_units(PAPER)
+WHITE_SPREAD, DARK_SPREAD = 0.09, 0.05
+FAR_AHEAD_M = 5.2  # units of 1.8 px
+SMALL_SPOTTED = [
+    ("359902935234", 2, 4, 0.1), ("980261340179", 5, 1, 0.85), ("357408481825", 1, 3, 0.85),
+    ("258063891625", 3, 3, 0.1), ("518752852870", 4, 5, 0.1),
+]  # fmt: skip
 
 
 def verified(face: Face, pattern: np.ndarray = DARK, **options: Any) -> UnitVerification:
@@ -41,7 +47,7 @@ def verified(face: Face, pattern: np.ndarray = DARK, **options: Any) -> UnitVeri
     assert fit is not None
     units = unit_log_likelihoods(fit)
     assert units is not None
-    found = verify_units(shot.image, fit, GEOMETRY, pattern, units.veils, units.veil_log_odds)
+    found = verify_units(shot.image, fit, GEOMETRY, pattern, units)
     assert found is not None
     return found
 
@@ -50,12 +56,12 @@ def in_shade(scene: PlateScene) -> PlateScene:
     return replace(scene, shadow=Shadow(edge_light=0.35, edge_angle_deg=50.0, edge_offset_m=0.02, penumbra_m=0.03))
 
 
-def spotted(row: int, column: int, reflectance: float) -> Face:
-    """A face with a round spot of paint, 44 mm wide, over a unit."""
-    face = face_of()
+def spotted(row: int, column: int, reflectance: float, code: PlateCode = PAPER, radius_mm: int = 22) -> Face:
+    """A face with a round spot of paint over a unit."""
+    face = face_of(code)
     spot = face.reflectance.copy()
     centre = [round(GEOMETRY.gap_mm + (k + 0.45) * GEOMETRY.pitch_mm) for k in (column, row)]
-    cv2.circle(spot, (centre[0], centre[1]), 22, (reflectance,) * 3, -1, cv2.LINE_AA)
+    cv2.circle(spot, (centre[0], centre[1]), radius_mm, (reflectance,) * 3, -1, cv2.LINE_AA)
     return replace(face, reflectance=spot)
 
 
@@ -77,6 +83,17 @@ def test_a_spot_of_paint_over_a_unit_makes_it_unsure(reflectance: float) -> None
     covered = spotted(row, column, reflectance)
     pattern = DARK | (unit_index(8).reshape(-1) == 8 * row + column)  # what the spot makes of it
     assert verified(covered, pattern).error_probability > MAX_ERROR
+
+
+@pytest.mark.parametrize(("digits", "row", "column", "reflectance"), SMALL_SPOTTED)
+def test_small_digits_without_a_check_are_compared_by_their_pixels(
+    digits: str, row: int, column: int, reflectance: float
+) -> None:
+    code = PlateCode(digits)
+    covered = spotted(row, column, reflectance, code, radius_mm=18)
+    (reading,) = decode_plates(shoot(PlacedFace(covered, FAR_AHEAD_M)).image)
+    assert reading.code is None
+    assert "a stain may hide units" in reading.reason
 
 
 def test_a_plate_that_is_seen_clearly_ends_the_search() -> None:
@@ -102,7 +119,7 @@ def test_the_likelihoods_are_those_of_normal_distributions(veil: float) -> None:
     dark, albedo, spread, length_mm, level = np.array([1.0, 0.0]), 0.15, 0.3, 120.0, 0.25
     seen, light = rng.uniform(0.2, 1.0, count), np.full(count, 0.5)
     noise = rng.uniform(1e-4, 4e-4, count)
-    pattern = PlatePattern(dark, seen, albedo, np.array([[15.0, 15.0]] * 2), 100.0, 5.0)
+    pattern = PlatePattern(dark, seen, albedo, WHITE_SPREAD, DARK_SPREAD, np.array([[15.0, 15.0]] * 2), 100.0, 5.0)
     prior = LightPrior(light, noise, spread, length_mm, level, veil, 80.0)
     spots = Spots(np.array([[0, 0, 1, 0, 1, 1.0]]).T.copy(), np.array([0.5]), np.array([0.0]))
     found = np.empty((2, 5))
