@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -45,7 +46,7 @@ class Tally:
 
 
 def score_magnets(drive: SimulatedDrive, findings: Sequence[Finding], only: Orientation | None = None) -> Tally:
-    """Readings matched to the nearest magnet along the road; with `only`, magnets of that kind and readings of it."""
+    """Readings matched to the nearest magnet within `REACH_M`; with `only`, magnets of that kind and readings of it."""
     readings = sorted((r for r in findings if isinstance(r, MagnetReading)), key=lambda r: r.t_s)
     times = np.array([r.t_s for r in readings])
     used: set[int] = set()
@@ -77,8 +78,15 @@ def score_magnets(drive: SimulatedDrive, findings: Sequence[Finding], only: Orie
 def _nearest(magnet: TrueMagnet, readings: Sequence[MagnetReading], times: np.ndarray, used: set[int]) -> int | None:
     reach = REACH_M / magnet.speed_m_s
     low, high = np.searchsorted(times, (magnet.t_s - reach, magnet.t_s + reach))
-    near = [k for k in range(low, high) if k not in used]
-    return min(near, key=lambda k: abs(readings[k].t_s - magnet.t_s), default=None)
+    apart_m = {
+        k: math.hypot(
+            (readings[k].t_s - magnet.t_s) * magnet.speed_m_s, (readings[k].lateral_cm - magnet.lateral_cm) / 100
+        )
+        for k in range(low, high)
+        if k not in used
+    }
+    near = [k for k in apart_m if apart_m[k] < REACH_M]
+    return min(near, key=lambda k: apart_m[k], default=None)
 
 
 @dataclass

@@ -1,9 +1,8 @@
-"""Classification of fitted dipoles as magnets, or the reason of their rejection; estimation of the clearance."""
+"""Classification of fitted dipoles as magnets, or the reason of their rejection."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from app.decoders.magnet.dipole_fit import UPRIGHT, MagnetPrior
 from app.decoders.magnet.ferrous import BEYOND_M, ferrous_reason
-from app.decoders.magnet.fit_window import MAX_MISFIT, Dipole, magnet_prior
+from app.decoders.magnet.fit_window import MAX_MISFIT, Dipole
 from app.decoders.magnet.readings import NoiseKind
 from app.markers.magnet import Orientation, Polarity
 
@@ -34,18 +33,6 @@ MAX_SHAPE_COST = 8.0
 chi-squared with three degrees of freedom."""
 MIN_MOMENT_RATIO, MAX_MOMENT_RATIO = 0.5, 1.7
 """Moment of a magnet over the expected one. Source: chosen by hand, no measurement kept."""
-SURE_ENERGY, SURE_MISFIT, SURE_MOMENT = 150.0, 0.06, 0.3
-"""Smallest energy, largest misfit and largest relative error of the moment of a magnet from which the clearance is
-estimated. Source: chosen by hand, stricter than the limits of a magnet."""
-LEARNT_MAGNETS, FIRST_MAGNETS, TRACKED_MAGNETS = 25, 3, 6
-"""Magnets in the median of the clearance: at most, from which on it is used, and from which on its spread is. Source:
-chosen by hand."""
-MIN_CLEARANCE_STD_M, MAX_CLEARANCE_STD_M = 0.025, 0.04
-"""Limits of the estimated clearance's standard deviation. [m] Source: chosen by hand; springs move the bar by some
-centimetres."""
-SPREAD_FACTOR, MAD_STD = 1.5, 0.6745
-"""Safety factor on the estimated spread (by hand), and median absolute deviation over standard deviation. Source:
-normal distribution."""
 CONFIDENT_SNR, PRIOR_ERROR, MISFIT_ERROR = 4.5, 0.02, 0.2
 """Terms of the probability of error: the snr up to which it is 1, and what a prior cost at its limit and a misfit of 1
 add. Source: chosen by hand, no measurement kept."""
@@ -54,30 +41,6 @@ MIN_CONFIDENCE, MAX_CONFIDENCE = 0.05, 0.9999
 SKEW_DEG = 8.0
 """Angle that weighs as much as a standard deviation when the reason of a rejection is chosen. [deg] Source:
 `YAW_SPREAD`."""
-
-
-class ClearanceTracker:
-    """Median clearance of the last sure magnets: a vehicle has one clearance, but for its springs."""
-
-    def __init__(self, moment_am2: float) -> None:
-        self._moment = moment_am2
-        self._seen: deque[float] = deque(maxlen=LEARNT_MAGNETS)
-
-    @property
-    def prior(self) -> MagnetPrior:
-        """What the next magnet is expected to be like."""
-        if len(self._seen) < FIRST_MAGNETS:
-            return magnet_prior(self._moment)
-        clearance = float(np.median(self._seen))
-        if len(self._seen) < TRACKED_MAGNETS:
-            return magnet_prior(self._moment, clearance, MAX_CLEARANCE_STD_M)
-        deviation = float(np.median(np.abs(np.array(self._seen) - clearance)))
-        spread = SPREAD_FACTOR * deviation / MAD_STD
-        return magnet_prior(self._moment, clearance, min(max(spread, MIN_CLEARANCE_STD_M), MAX_CLEARANCE_STD_M))
-
-    def learn(self, dipole: Dipole) -> None:
-        """Add the clearance of a sure magnet."""
-        self._seen.append(float(dipole.params[2]))
 
 
 class Accepted(NamedTuple):
@@ -173,11 +136,15 @@ def _rejection(dipole: Dipole, prior: MagnetPrior) -> Rejected:
     )
 
 
-def is_sure(dipole: Dipole, prior: MagnetPrior) -> bool:
-    """Whether a dipole is sure enough to estimate the clearance from it."""
-    size = float(np.linalg.norm(dipole.params[3:]))
+def shows_clearance(dipole: Dipole, prior: MagnetPrior, half_width_m: float) -> bool:
+    """Whether a dipole looks like a magnet but for its depth, so that it shows the clearance."""
+    off_height = (float(dipole.params[2]) - prior.clearance_m) / prior.clearance_std_m
+    size = float(np.linalg.norm(dipole.params[3:])) / prior.moment_am2
     return (
-        dipole.explained > SURE_ENERGY
-        and dipole.misfit < SURE_MISFIT
-        and abs(size / prior.moment_am2 - 1) < SURE_MOMENT
+        dipole.explained > MIN_ENERGY
+        and abs(float(dipole.params[1])) < half_width_m + BEYOND_M  # what lies beside the bar may be a wheel
+        and dipole.misfit < MAX_MISFIT
+        and dipole.margin > MIN_MARGIN
+        and dipole.prior_cost - off_height**2 < MAX_SHAPE_COST
+        and MIN_MOMENT_RATIO < size < MAX_MOMENT_RATIO
     )

@@ -6,10 +6,13 @@ The stages in order: `preprocess`, `wheel_noise`, `resample`, `matched_filter` (
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from app.decoders.magnet.assemble import TagAssembler
-from app.decoders.magnet.classify import Classification, ClearanceTracker, Rejected, classify_dipoles, is_sure
+from app.decoders.magnet.classify import Classification, Rejected, classify_dipoles, shows_clearance
+from app.decoders.magnet.clearance import ClearanceEstimate
 from app.decoders.magnet.detect_dipoles import DipoleDetector
 from app.decoders.magnet.ferrous import FORGET_M
 from app.decoders.magnet.fit_window import WINDOW_M, Dipole, Region, SensorArray
@@ -27,14 +30,22 @@ from app.decoders.magnet.matched_filter import (
     scan_bins,
 )
 from app.decoders.magnet.preprocess import Blocks, Preprocessor
-from app.decoders.magnet.readings import Finding, MagnetReading, NoiseFinding, PlacedMagnet
+from app.decoders.magnet.readings import (
+    Finding,
+    LineCrossing,
+    MagnetReading,
+    NoiseFinding,
+    NoiseKind,
+    PlacedMagnet,
+    TagReading,
+)
 from app.decoders.magnet.resample import FieldBins
 from app.decoders.magnet.vehicle_path import VehiclePath
 from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
-VERSION = "matched-2"
+VERSION = "matched-3"
 """Kept with every decode; to be raised when findings change."""
 FIRST_VARIANCE = 2.0
 """Variance of the matched filters' noise that is assumed at first. [uT2] Source: a chip's noise of 1.5 uT."""
@@ -59,10 +70,22 @@ class MagnetDecoder:
         Tags that may be on the road.
     moment_am2 : float
         Of the magnets on the road. [A m2]
+    clearance : ClearanceEstimate, optional
+        What is known of the bar's clearance before the trace.
+
+    Attributes
+    ----------
+    clearance : ClearanceEstimate
+        With what the magnets so far have shown.
     """
 
     def __init__(
-        self, bar: MagnetometerBar, *, candidates: TagCandidates | None = None, moment_am2: float = MOMENT_AM2
+        self,
+        bar: MagnetometerBar,
+        *,
+        candidates: TagCandidates | None = None,
+        moment_am2: float = MOMENT_AM2,
+        clearance: ClearanceEstimate | None = None,
     ) -> None:
         self.bar = bar
         positions = bar.positions_m[bar.array].copy()
@@ -72,12 +95,12 @@ class MagnetDecoder:
         positions[:, 2] -= np.median(positions[:, 2])
         self._array = SensorArray(positions, bar.array, bar.axis_delay_s)
         self._preprocessor = Preprocessor(bar)
-        self._wheels = WheelNoiseCanceller(bar.references, bar.sensor_count)
+        self._wheels = WheelNoiseCanceller(bar.references, bar.positions_m)
         self._blocks = Blocks(bar.sensor_count)
         self._bins = FieldBins(positions)
         self._bank = make_filter_bank(positions)
         self._detector = DipoleDetector(self._bank, self._array)
-        self._clearance = ClearanceTracker(moment_am2)
+        self.clearance = clearance or ClearanceEstimate(moment_am2)
         self._assembler = TagAssembler(candidates or TagCandidates())
         self._variance = np.full((self._bank.taps.size, 3), FIRST_VARIANCE, np.float32)
         self._state = np.zeros(4, np.int64)  # of `scan_bins`
@@ -101,9 +124,9 @@ class MagnetDecoder:
         count = self._blocks.s.size
         self._preprocessor.take(self._blocks, final=final)
         s, t, x = self._blocks.s[count:], self._blocks.t[count:], self._blocks.x[count:]
-        self._wheels.cancel(s, x)
+        yaw = self._path.append(s, t, self._preprocessor.headings, final=final)
+        self._wheels.cancel(s, yaw, x)
         self._bins.append(s, np.ascontiguousarray(x[:, self.bar.array]))
-        self._path.append(s, t, self._preprocessor.headings, final=final)
         self._preprocessor.headings = np.empty((0, 2))
         self._search(final)
         self._report_up_to(np.inf if final else (self._next - self._region_bins - 5) * BIN_M, final)
@@ -142,7 +165,7 @@ class MagnetDecoder:
         last = self._next - quiet + REGION_MARGIN_BINS - 1
         self._report_up_to(first * BIN_M, final=False)
         region = self._make_region(first, last)
-        prior = self._clearance.prior
+        prior = self.clearance.prior
         dipoles = self._detector.detect(self._blocks, region, prior)
         dipoles.sort(key=lambda d: float(d.params[0]))
         classes = classify_dipoles(dipoles, self._before, prior, self._array.half_width_m)
@@ -153,8 +176,8 @@ class MagnetDecoder:
             self._findings.append(reading)
             if isinstance(reading, MagnetReading):
                 self._unplaced.append(reading)
-                if is_sure(dipole, prior):
-                    self._clearance.learn(dipole)
+            if shows_clearance(dipole, prior, self._array.half_width_m) and not _is_iron(classification):
+                self.clearance.learn(dipole, prior)
         self._assemble()
 
     def _make_region(self, first: int, last: int) -> Region:
@@ -220,11 +243,43 @@ class MagnetDecoder:
             self._score_start += drop
 
 
+def _is_iron(classification: Classification) -> bool:
+    return isinstance(classification, Rejected) and classification.kind is NoiseKind.FERROUS
+
+
 def decode_trace(trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCandidates | None = None) -> list[Finding]:
-    """Findings of a whole trace."""
+    """Findings of a whole trace.
+
+    It is decoded from its beginning again as soon as its magnets have shown the clearance, so that all of it is judged
+    by that. Where they never do, no magnet is reported: iron would look like one at some clearance.
+    """
     decoder = MagnetDecoder(bar, candidates=candidates)
     found: list[Finding] = []
-    for i in range(0, len(trace.t_s), CHUNK_SAMPLES):
-        end = trace.t_s[i + CHUNK_SAMPLES] if i + CHUNK_SAMPLES < len(trace.t_s) else np.inf
-        found += decoder.feed(trace.between(trace.t_s[i] if i else -np.inf, end))
+    for chunk in _chunks(trace):
+        found += decoder.feed(chunk)
+        if decoder.clearance.is_sure:
+            break
+    else:
+        found += decoder.finish()
+    if not decoder.clearance.is_known:
+        return [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, _OF_MAGNETS)]
+    decoder = MagnetDecoder(bar, candidates=candidates, clearance=decoder.clearance)
+    found = [finding for chunk in _chunks(trace) for finding in decoder.feed(chunk)]
     return found + decoder.finish()
+
+
+_OF_MAGNETS = (TagReading, LineCrossing)
+"""Findings that follow from several magnets."""
+
+
+def _chunks(trace: MagnetTrace) -> Iterator[MagnetTrace]:
+    """A trace in pieces of `CHUNK_SAMPLES`."""
+    starts = [-np.inf, *trace.t_s[CHUNK_SAMPLES::CHUNK_SAMPLES].tolist()]
+    for start, end in zip(starts, [*starts[1:], np.inf], strict=True):
+        yield trace.between(start, end)
+
+
+def _unsure(magnet: MagnetReading) -> NoiseFinding:
+    """A magnet of a recording that does not show the clearance."""
+    reason = f"would be a magnet at a clearance of {magnet.clearance_cm:.0f} cm, but no three magnets show that it is"
+    return NoiseFinding(magnet.t_s, magnet.odometer_m, magnet.lateral_cm, NoiseKind.UNKNOWN_CLEARANCE, reason)

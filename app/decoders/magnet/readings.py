@@ -24,6 +24,7 @@ class NoiseKind(StrEnum):
     FERROUS = "ferrous-object"
     WRONG_MOMENT = "moment-unlike-a-magnet"
     WRONG_HEIGHT = "not-on-the-road-surface"
+    UNKNOWN_CLEARANCE = "clearance-not-known"
     SKEW = "neither-upright-nor-forward"
     WEAK = "too-weak-to-be-sure"
     BESIDE = "beside-the-bar"

@@ -13,7 +13,7 @@ from app.decoders.magnet.readings import Finding, LineCrossing, MagnetReading, N
 from app.errors import InvalidParameter
 from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
-from app.simulation.magnetic.clutter import town_clutter
+from app.simulation.magnetic.clutter import ferrous_clutter, town_clutter
 from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
 from app.simulation.magnetic.readout import Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, line_magnets
@@ -71,11 +71,49 @@ def test_town_iron_is_named_not_read() -> None:
     assert all("%" in f.reason or "cm" in f.reason for f in iron)
 
 
+def test_iron_alone_shows_no_clearance_and_no_magnet() -> None:
+    rng = np.random.default_rng([5, 0, 0])  # a drive that had eight magnets at clearances of 26 to 52 cm
+    vehicle = Vehicle.compact(clearance_m=0.24)
+    scene = Scene(Road(1500), vehicle, Course(12.0, weave_m=0.15), clutter=ferrous_clutter(120, 1500, 20, rng))
+    drive = simulate_drive(scene, rng)
+    findings = decode_trace(drive.trace, BAR)
+    assert not [f for f in findings if isinstance(f, MagnetReading)]
+    unsure = [f for f in findings if isinstance(f, NoiseFinding) and f.kind is NoiseKind.UNKNOWN_CLEARANCE]
+    assert unsure
+    assert "no three magnets show" in unsure[0].reason
+
+
+def test_magnets_under_a_truck_are_read_from_the_beginning() -> None:
+    rng = np.random.default_rng(8)
+    orientations = (Orientation.UP, Orientation.FORWARD)
+    magnets = [
+        RoadMagnet(15 + 3.0 * i, float(rng.uniform(-0.6, 0.6)), Polarity.N, orientations[i % 2]) for i in range(24)
+    ]
+    scene = Scene(Road(110), Vehicle.compact(clearance_m=0.4), Course(22.0), lines=magnets)
+    drive = simulate_drive(scene, rng)
+    right, other = right_and_other(drive, decode_trace(drive.trace, BAR))
+    assert right >= 23
+    assert other == 0
+
+
+def test_a_line_passes_half_a_metre_beside_the_tags() -> None:
+    tag = InformationTag.from_gaps("SNS", 1.0, (1, 3))
+    tags = [PlacedTag(tag, 20.0 + 15 * i, 0.0) for i in range(6)]
+    lines = line_magnets(20, 105, 2, 0.6, Polarity.N)
+    scene = Scene(Road(120), Vehicle.compact(clearance_m=0.18), Course(15.0), tags=tags, lines=lines)
+    drive = simulate_drive(scene, np.random.default_rng(3))
+    findings = decode_trace(drive.trace, BAR, candidates=TagCandidates(formats=[TagFormat()]))
+    read = [f.tag for f in findings if isinstance(f, TagReading) and f.tag is not None]
+    assert read == [tag] * len(read)
+    assert len(read) >= 4
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_any_chunking_gives_the_same(seed: int) -> None:
     drive = tags_drive(14, [InformationTag.from_gaps("SNS", 1.0, (1, 3))] * 3, 25.0)
     candidates = TagCandidates(formats=[TagFormat()])
-    whole = decode_trace(drive.trace, BAR, candidates=candidates)
+    at_once = MagnetDecoder(BAR, candidates=candidates)
+    whole = at_once.feed(drive.trace) + at_once.finish()
     rng = np.random.default_rng(seed)
     decoder = MagnetDecoder(BAR, candidates=candidates)
     pieces: list[Finding] = []

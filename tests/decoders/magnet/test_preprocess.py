@@ -55,29 +55,66 @@ def test_a_fast_magnet_is_no_spike() -> None:
     assert blocks_of(field).w.min() == 1
 
 
+PLACES_M = np.array([(3.2, 0.3, 0.0), (3.2, 0.5, 0.0), (3.2, 0.7, 0.0), (2.6, 0.72, 0.5)])
+LENGTH_M = 1.95
+
+
+def wheel_noise(turns: np.ndarray, rng: np.random.Generator, size: float = 8.0) -> np.ndarray:
+    """Field of a wheel at four sensors, the last one its reference, by its turns."""
+    noise = np.zeros((turns.size, 4, 3))
+    for h, share in ((1, 1.0), (2, 0.5), (3, 0.25)):
+        phase = rng.uniform(0, 2 * np.pi, (4, 3))
+        noise += size * share * np.cos(2 * np.pi * h * turns[:, None, None] + phase)
+    noise[:, 3] *= 5
+    return noise
+
+
+def cancelled(s: np.ndarray, x: np.ndarray, yaw: np.ndarray | None = None) -> np.ndarray:
+    out = x.copy()
+    WheelNoiseCanceller(np.array([3]), PLACES_M).cancel(s, np.zeros(s.size) if yaw is None else yaw, out)
+    return out
+
+
 def test_wheel_noise_is_learnt_and_taken_out_but_not_a_magnet() -> None:
     rng = np.random.default_rng(2)
     s = np.arange(0, 200, 0.03)
-    turns = s / 1.95
-    noise = np.zeros((s.size, 4, 3))
-    for h, size in ((1, 8.0), (2, 4.0), (3, 2.0)):
-        phase = rng.uniform(0, 2 * np.pi, (4, 3))
-        noise += size * np.cos(2 * np.pi * h * turns[:, None, None] + phase)
-    noise[:, 3] *= 5  # the reference
+    noise = wheel_noise(s / LENGTH_M, rng)
     x = noise + rng.normal(0, 0.5, noise.shape)
     bump = 40 * np.exp(-(((s - 150) / 0.15) ** 2))
     x[:, :3, 2] += bump[:, None]
-    WheelNoiseCanceller(np.array([3]), 4).cancel(s, x)
+    x = cancelled(s, x)
     late = (s > 80) & (abs(s - 150) > 1)
     assert x[late][:, :3].std(axis=0).max() < 0.25 * noise[late][:, :3].std(axis=0).min()
     near = abs(s - 150) < 0.2
     np.testing.assert_allclose(x[near][:, :3, 2], np.repeat(bump[near][:, None], 3, 1), atol=6)
 
 
+def test_weak_wheel_noise_is_taken_out_and_none_is_put_in() -> None:
+    rng = np.random.default_rng(5)
+    s = np.arange(0, 200, 0.03)
+    noise = wheel_noise(s / LENGTH_M, rng, size=0.8)
+    chip = rng.normal(0, 1.5, noise.shape)
+    late = s > 80
+    left = cancelled(s, noise + chip) - chip
+    assert left[late][:, :3].std() < 0.5 * noise[late][:, :3].std()
+    np.testing.assert_array_equal(cancelled(s, chip), chip)
+
+
+def test_a_wheel_rolls_less_on_the_inside_of_a_bend() -> None:
+    rng = np.random.default_rng(7)
+    s = np.arange(0, 200, 0.03)
+    yaw = np.asarray(0.4 * np.sin(s / 12), np.float64)  # radii of 30 m to the left and right
+    noise = wheel_noise((s - PLACES_M[3, 1] * yaw) / LENGTH_M, rng)
+    x = noise + rng.normal(0, 0.5, noise.shape)
+    late = s > 80
+    assert cancelled(s, x, yaw)[late][:, :3].std() < 0.25 * noise[:, :3].std()
+    assert cancelled(s, x)[late][:, :3].std() > 0.35 * noise[:, :3].std()
+
+
 def test_without_references_nothing_is_changed() -> None:
     x = np.random.default_rng(3).normal(0, 5, (400, 4, 3))
     kept = x.copy()
-    WheelNoiseCanceller(np.empty(0, np.intp), 4).cancel(np.arange(400) * 0.03, x)
+    WheelNoiseCanceller(np.empty(0, np.intp), PLACES_M).cancel(np.arange(400) * 0.03, np.zeros(400), x)
     np.testing.assert_array_equal(x, kept)
 
 
