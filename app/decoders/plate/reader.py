@@ -46,8 +46,8 @@ MIN_MARGIN_ALONE = 2.2
 """[standard deviations] the same without a registry. Source: a board with three green corners was read with 1.5 (set
 `look-alikes` of `python -m benchmarks.plates false --seed 2712`)."""
 MIN_TINT_ALONE, MIN_TRIANGLE_TINT_ALONE = 0.35, 0.5
-"""[median square] green of a square and red of the triangle, without a registry. Source: for the squares by hand; boards
-with red fringes on dark corners have 0.39 and 0.48 (the same, seeds 2711 and 2712)."""
+"""[median square] green of a square and red of the triangle, without a registry. Source: for the squares by hand;
+boards with red fringes on dark corners have 0.39 and 0.48 (the same, seeds 2711 and 2712)."""
 MAX_REST_ALONE = 0.65
 """[1] red of the other half of the triangle's cell over the triangle's, without a registry. Source: 144 plates that
 were read have at most 0.60 below 1.5 px a unit, 0.53 below 2 and 0.35 above; red squares have 0.7 to 1.2 (set
