@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from app.decoders.magnet.identify import TagFormat
-from app.markers.magnet import Orientation, Polarity
+from app.markers.magnet import Polarity
 from app.simulation.magnetic.clutter import ferrous_clutter, town_clutter
 from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
-from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, line_magnets
+from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
 from app.simulation.magnetic.vehicle import MPH, Course, Vehicle
-from benchmarks.magnets.scenes import LEAD_M, random_tag
+from benchmarks.magnets.scenes import LEAD_M, random_magnets, random_tag
 
 WHEEL_MOMENTS_AM2 = (0.01, 1.0)
 """Of a belt's dipoles, evenly drawn as logarithms. [A m2] Source: `Wheel` has 0.15; Table 1 of METRO needs about 1."""
@@ -59,14 +59,7 @@ def draw_course(rng: np.random.Generator) -> Course:
 def draw_magnets_drive(rng: np.random.Generator, clearance_m: float, *, count: int = 40) -> SimulatedDrive:
     """Single magnets of both kinds and polarities, 2 to 6 m apart, anywhere under the bar."""
     spacing_m = float(rng.uniform(2, 6))
-    magnets = [
-        RoadMagnet(
-            LEAD_M + i * spacing_m + float(rng.uniform(-0.5, 0.5)), float(rng.uniform(-0.8, 0.8)),
-            Polarity.N if rng.random() < 0.5 else Polarity.S,
-            Orientation.UP if rng.random() < 0.5 else Orientation.FORWARD,
-        )
-        for i in range(count)
-    ]  # fmt: skip
+    magnets = random_magnets(rng, count, spacing_m)
     length_m = LEAD_M + count * spacing_m + 20
     bends = []
     if rng.random() < 0.5:

@@ -18,11 +18,9 @@ LEAD_M = 60.0
 """Without a magnet: the paper's thresholds are set there."""
 
 
-def magnets_drive(
-    rng: np.random.Generator, *, clearance_m: float, speed_mph: float, count: int, spacing_m: float = 3.0
-) -> SimulatedDrive:
-    """Single magnets of both kinds and polarities, anywhere under the bar."""
-    magnets = [
+def random_magnets(rng: np.random.Generator, count: int, spacing_m: float) -> list[RoadMagnet]:
+    """Single magnets of both kinds and polarities, one after the other, anywhere under the bar."""
+    return [
         RoadMagnet(
             LEAD_M + i * spacing_m + float(rng.uniform(-0.5, 0.5)), float(rng.uniform(-0.8, 0.8)),
             Polarity.N if rng.random() < 0.5 else Polarity.S,
@@ -30,6 +28,13 @@ def magnets_drive(
         )
         for i in range(count)
     ]  # fmt: skip
+
+
+def magnets_drive(
+    rng: np.random.Generator, *, clearance_m: float, speed_mph: float, count: int, spacing_m: float = 3.0
+) -> SimulatedDrive:
+    """Single magnets of both kinds and polarities, anywhere under the bar."""
+    magnets = random_magnets(rng, count, spacing_m)
     road = Road(LEAD_M + count * spacing_m + 20)
     course = Course(speed_m_s=speed_mph * MPH, weave_m=0.03)
     vehicle = Vehicle.compact(clearance_m=clearance_m)

@@ -49,6 +49,7 @@ THRESHOLDS = (
     Threshold(reader, "CLEAN_EXPLAINED", 0.0),
     Threshold(reader, "MIN_MARGIN_ALONE", -math.inf),
     Threshold(reader, "MIN_TINT_ALONE", -math.inf),
+    Threshold(reader, "MIN_TRIANGLE_TINT_ALONE", -math.inf),
     Threshold(reader, "CAST_ALONE", ANY),
     Threshold(unit_likelihoods, "FULL_WEIGHT_PX", 1e-9),
     Threshold(unit_likelihoods, "MAX_BLUR_UNITS", math.inf),

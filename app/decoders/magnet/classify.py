@@ -113,11 +113,20 @@ def _classify(dipole: Dipole, prior: MagnetPrior, half_width_m: float) -> Classi
 
 
 def _is_unlike(dipole: Dipole, prior: MagnetPrior) -> bool:
-    off_height = (float(dipole.params[2]) - prior.clearance_m) / prior.clearance_std_m
-    if dipole.prior_cost > (MAX_PRIOR_COST_DEEP if off_height > 0 else MAX_PRIOR_COST):
-        return True
+    max_cost = MAX_PRIOR_COST_DEEP if _off_height(dipole, prior) > 0 else MAX_PRIOR_COST
+    return dipole.prior_cost > max_cost or not _has_moment(dipole, prior)
+
+
+def _off_height(dipole: Dipole, prior: MagnetPrior) -> float:
+    """Depth below the expected one, in standard deviations."""
+    return (float(dipole.params[2]) - prior.clearance_m) / prior.clearance_std_m
+
+
+def _has_moment(dipole: Dipole, prior: MagnetPrior) -> bool:
+    """Whether the size and the axis of the moment are a magnet's, whatever the depth."""
     size = float(np.linalg.norm(dipole.params[3:])) / prior.moment_am2
-    return dipole.prior_cost - off_height**2 > MAX_SHAPE_COST or not MIN_MOMENT_RATIO < size < MAX_MOMENT_RATIO
+    shape_cost = dipole.prior_cost - _off_height(dipole, prior) ** 2
+    return shape_cost <= MAX_SHAPE_COST and MIN_MOMENT_RATIO < size < MAX_MOMENT_RATIO
 
 
 def _rejection(dipole: Dipole, prior: MagnetPrior) -> Rejected:
@@ -138,13 +147,10 @@ def _rejection(dipole: Dipole, prior: MagnetPrior) -> Rejected:
 
 def shows_clearance(dipole: Dipole, prior: MagnetPrior, half_width_m: float) -> bool:
     """Whether a dipole looks like a magnet but for its depth, so that it shows the clearance."""
-    off_height = (float(dipole.params[2]) - prior.clearance_m) / prior.clearance_std_m
-    size = float(np.linalg.norm(dipole.params[3:])) / prior.moment_am2
     return (
         dipole.explained > MIN_ENERGY
         and abs(float(dipole.params[1])) < half_width_m + BEYOND_M  # what lies beside the bar may be a wheel
         and dipole.misfit < MAX_MISFIT
         and dipole.margin > MIN_MARGIN
-        and dipole.prior_cost - off_height**2 < MAX_SHAPE_COST
-        and MIN_MOMENT_RATIO < size < MAX_MOMENT_RATIO
+        and _has_moment(dipole, prior)
     )

@@ -55,6 +55,8 @@ SPARE_BINS = 40
 """Bins that are kept longer than any region needs them: 2 m. Source: chosen by hand."""
 FORGET_SCORES = 400
 """Bins after which old scores are dropped. Source: chosen by hand, speed only."""
+OF_MAGNETS = (TagReading, LineCrossing)
+"""Findings that follow from several magnets."""
 CHUNK_SAMPLES = 4096
 """Samples of a whole trace that are decoded at a time. Source: chosen by hand, bounds the memory."""
 
@@ -262,14 +264,10 @@ def decode_trace(trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCan
     else:
         found += decoder.finish()
     if not decoder.clearance.is_known:
-        return [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, _OF_MAGNETS)]
+        return [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, OF_MAGNETS)]
     decoder = MagnetDecoder(bar, candidates=candidates, clearance=decoder.clearance)
     found = [finding for chunk in _chunks(trace) for finding in decoder.feed(chunk)]
     return found + decoder.finish()
-
-
-_OF_MAGNETS = (TagReading, LineCrossing)
-"""Findings that follow from several magnets."""
 
 
 def _chunks(trace: MagnetTrace) -> Iterator[MagnetTrace]:

@@ -35,8 +35,8 @@ MAX_ERROR = 1e-4
 """[probability] of an error by the pixels, below which digits are returned. Source: trials in shade, under painted
 stains and in fair light (decision record 0029)."""
 MAX_SMALL_ERROR = 1e-3
-"""[probability] the same on units below `VERIFIED_UNIT_PX` that look usual: what is unusual there is refused. Source:
-the same trials, and plates under painted stains (decision record 0029)."""
+"""[probability] the same on units below `VERIFIED_UNIT_PX` that look usual; others have `MAX_ERROR`. Source: the same
+trials, and plates under painted stains (decision record 0029)."""
 MAX_VEILED_ERROR = 2e-5
 """[probability] the same under a veil of glare, which is one unknown field more. Source: a
 tenth of `MAX_ERROR`, with which test plates in glare with paint over one whole unit are misread no more often than

@@ -40,9 +40,18 @@ def test_hard_frames_are_never_read_wrong(name: str, frames: int) -> None:
     assert [(r.number, r.wrong, r.wrong_known) for r in records if r.wrong or r.wrong_known] == []
 
 
-def test_a_look_alike_beside_a_red_sign_is_not_read() -> None:
-    shot = find_shot(Job("free", 11, seed=930, frames=25), 19)
+@pytest.mark.parametrize(
+    ("name", "index", "seed", "number", "outcome"),
+    [
+        ("free", 11, 930, 19, PlateOutcome.RED_MARKER_MISSING),  # beside a red sign
+        ("look-alikes", 14, 2711, 21, PlateOutcome.RED_MARKER_MISSING),  # a red fringe on a dark corner
+        ("look-alikes", 16, 2712, 17, PlateOutcome.RED_MARKER_MISSING),  # the same
+        ("look-alikes", 26, 2712, 16, PlateOutcome.GREEN_MARKER_MISSING),  # two green corners and a white one
+    ],
+)
+def test_a_look_alike_is_not_read(name: str, index: int, seed: int, number: int, outcome: PlateOutcome) -> None:
+    shot = find_shot(Job(name, index, seed=seed, frames=25), number)
     assert isinstance(shot, Shot)
     readings = decode_plates(shot.frame.image)
     assert [reading.digits for reading in readings if reading.digits] == []
-    assert PlateOutcome.RED_MARKER_MISSING in {reading.outcome for reading in readings}
+    assert outcome in {reading.outcome for reading in readings}
