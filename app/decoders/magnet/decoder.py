@@ -97,7 +97,7 @@ class MagnetDecoder:
         positions[:, 2] -= np.median(positions[:, 2])
         self._array = SensorArray(positions, bar.array, bar.axis_delay_s)
         self._preprocessor = Preprocessor(bar)
-        self._wheels = WheelNoiseCanceller(bar.references, bar.positions_m)
+        self._wheels = WheelNoiseCanceller(bar.references, bar.sensor_count)
         self._blocks = Blocks(bar.sensor_count)
         self._bins = FieldBins(positions)
         self._bank = make_filter_bank(positions)
@@ -126,9 +126,9 @@ class MagnetDecoder:
         count = self._blocks.s.size
         self._preprocessor.take(self._blocks, final=final)
         s, t, x = self._blocks.s[count:], self._blocks.t[count:], self._blocks.x[count:]
-        yaw = self._path.append(s, t, self._preprocessor.headings, final=final)
-        self._wheels.cancel(s, yaw, x)
+        self._wheels.cancel(s, x)
         self._bins.append(s, np.ascontiguousarray(x[:, self.bar.array]))
+        self._path.append(s, t, self._preprocessor.headings, final=final)
         self._preprocessor.headings = np.empty((0, 2))
         self._search(final)
         self._report_up_to(np.inf if final else (self._next - self._region_bins - 5) * BIN_M, final)

@@ -28,20 +28,19 @@ class VehiclePath:
         """Odometer up to which it is known."""
         return float(self._rows[-1, 0]) if len(self._rows) else -1.0
 
-    def append(self, s: Floats, t: Floats, headings: Floats, *, final: bool = False) -> Floats:
-        """Add blocks (odometer and time), and rows of time and heading in degrees; returns the blocks' latest yaw."""
+    def append(self, s: Floats, t: Floats, headings: Floats, *, final: bool = False) -> None:
+        """Add blocks (odometer and time), and rows of time and heading in degrees."""
         if len(headings):
             yaw = -np.radians(headings[:, 1])
             before = self._headings[-1:, 1]
             yaw = np.unwrap(np.concatenate((before, yaw)))[len(before) :]
             self._headings = np.concatenate((self._headings, np.stack([headings[:, 0], yaw], 1)))
-        latest = self._latest_yaw(t)
         self._waiting = np.concatenate((self._waiting, np.stack([s, t], 1)))
         known = len(self._waiting)
         if len(self._headings) and not final:
             known = int(np.searchsorted(self._waiting[:, 1], self._headings[-1, 0], side="right"))
         if not known:
-            return latest
+            return
         now, self._waiting = self._waiting[:known], self._waiting[known:]
         yaw = np.interp(now[:, 1], *self._headings.T) if len(self._headings) else np.zeros(known)
         last = self._rows[-1] if len(self._rows) else np.array([now[0, 0], yaw[0], 0.0, 0.0])
@@ -53,14 +52,6 @@ class VehiclePath:
         if len(self._headings) > 4000:
             oldest = self._waiting[0, 1] if len(self._waiting) else now[-1, 1]
             self._headings = self._headings[max(int(np.searchsorted(self._headings[:, 0], oldest)) - 2, 0) :].copy()
-        return latest
-
-    def _latest_yaw(self, t: Floats) -> Floats:
-        """Yaw that was known at times, whatever followed. [rad]"""
-        if not len(self._headings):
-            return np.zeros(t.size)
-        yaw: Floats = self._headings[np.maximum(np.searchsorted(self._headings[:, 0], t, side="right") - 1, 0), 1]
-        return yaw
 
     def forget(self, before_m: float) -> None:
         """Drop what lies before a distance, in large pieces."""

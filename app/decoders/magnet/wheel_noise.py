@@ -78,7 +78,6 @@ class _Turns(NamedTuple):
     """The rotation of the wheels, as the references see it."""
 
     references: Integers  # (W,) reference sensors
-    left_m: Floats  # (W,) places of the wheels, left positive
     lengths_m: Floats  # (L,) trial lengths
     bank: Complexes  # (W, L, H, 3) running correlations with each trial length
     power: Floats  # (W, 3) running signal power [uT2 m]
@@ -107,15 +106,14 @@ class WheelNoiseCanceller:
     ----------
     references : ndarray of int
         Reference sensors, one for each wheel; without any, nothing is changed.
-    positions_m : ndarray, shape (S, 3)
-        Of all sensors in the vehicle frame. [m]
+    sensors : int
+        All sensors.
     """
 
-    def __init__(self, references: npt.NDArray[np.intp], positions_m: Floats) -> None:
-        sensors, wheels, regressors = len(positions_m), len(references), 2 * len(references) * HARMONICS
+    def __init__(self, references: npt.NDArray[np.intp], sensors: int) -> None:
+        wheels, regressors = len(references), 2 * len(references) * HARMONICS
         self._turns = _Turns(
             references.astype(np.int64),
-            positions_m[references, 1],
             CIRCUMFERENCES_M.copy(),
             np.zeros((wheels, CIRCUMFERENCES_M.size, BANK_HARMONICS, 3), np.complex128),
             np.zeros((wheels, 3)),
@@ -133,32 +131,30 @@ class WheelNoiseCanceller:
             np.zeros((sensors, 3)),
             np.zeros(regressors),
         )
-        self._drive = np.zeros(4)  # 1 once begun, s and yaw of the newest block, distance driven
+        self._drive = np.zeros(3)  # 1 once begun, s of the newest block, distance driven
 
-    def cancel(self, s: Floats, yaw: Floats, x: Floats) -> None:
-        """Take the noise out of blocks at odometers and yaws s, yaw (N,) [m, rad]: x (N, S, 3), in place."""
+    def cancel(self, s: Floats, x: Floats) -> None:
+        """Take the noise out of blocks at odometers s (N,): x (N, S, 3), in place."""
         if self._turns.references.size and s.size:
-            _cancel(s, yaw, x, self._turns, self._channels, self._drive)
+            _cancel(s, x, self._turns, self._channels, self._drive)
 
 
 @entry
-def _cancel(s: Floats, yaw: Floats, x: Floats, turns: _Turns, channels: _Channels, drive: Floats) -> None:
+def _cancel(s: Floats, x: Floats, turns: _Turns, channels: _Channels, drive: Floats) -> None:
     """Follow the turns, take the noise out of each block and learn from what is left."""
     for i in range(s.size):
         if drive[0] == 0:
-            drive[0], drive[1], drive[2] = 1.0, s[i], yaw[i]
+            drive[0], drive[1] = 1.0, s[i]
             _track_offset(x[i], 1.0, channels)
             continue
         step = min(max(s[i] - drive[1], 0.0), MAX_STEP_M)
-        turned = yaw[i] - drive[2]
-        drive[1], drive[2] = s[i], yaw[i]
-        drive[3] += step
+        drive[1] = s[i]
+        drive[2] += step
         if step <= 0:
             continue
-        _track_offset(x[i], min(step / min(OFFSET_M, FIRST_OFFSET_M + drive[3]), 1.0), channels)
+        _track_offset(x[i], min(step / min(OFFSET_M, FIRST_OFFSET_M + drive[2]), 1.0), channels)
         for w in range(turns.references.size):
-            left = turns.left_m[w]
-            _follow_turn(w, s[i] - left * yaw[i], step - left * turned, drive[3], x[i], turns, channels)
+            _follow_turn(w, s[i], step, drive[2], x[i], turns, channels)
         locked_m = turns.locked_m.max()
         if locked_m > 0:
             outliers = _subtract_noise(x[i], step, locked_m, channels)
@@ -177,10 +173,7 @@ def _track_offset(x: Floats, rate: float, channels: _Channels) -> None:
 
 @step
 def _follow_turn(w: int, s: float, step: float, driven_m: float, x: Floats, turns: _Turns, channels: _Channels) -> None:
-    """Advance a wheel's phase by a block (S, 3), and set its regressors: 0 unless the wheel is noisy.
-
-    The odometer and the step are the wheel's own: in a bend the outer one rolls further.
-    """
+    """Advance a wheel's phase by a block (S, 3), and set its regressors: 0 unless the wheel is noisy."""
     reference, pending = turns.references[w], turns.pending[w]
     pending[0] += step
     for axis in range(3):
