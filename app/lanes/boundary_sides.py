@@ -16,14 +16,9 @@ _OUTLIER_COST = 12.0  # squared sigmas, for a marker on no boundary; source: by 
 _WRONG_SIDE_COST = 8.0  # squared sigmas, on the other side than sent; source: by hand, sensitivity 1.00, 1.00
 _TRACK_COST = 0.02  # [1/m^2] per marker: drivers stay in the lane; source: by hand, sensitivity 1.00, 1.00
 _CLEAR_BAND_M = 0.8  # [m] half width of a band of markers with an obvious side; source: by hand, sensitivity 1.00, 1.00
-_WIDTHS_M = (
-    2.5,
-    2.8,
-    3.1,
-    3.4,
-    3.8,
-    4.3,
-)  # [m] 8 to 14 ft; source: by hand about the 9 to 12 ft of AASHTO Green Book, 4.3
+_WIDTHS_M = (2.5, 2.8, 3.1, 3.4, 3.8, 4.3, 4.8, 5.3, 5.8, 6.3, 6.8, 7.3)  # [m] source: by hand: 8 ft to two lanes
+_USUAL_WIDTHS_M = (2.5, 4.3)  # [m] 8 to 14 ft; source: by hand about the 9 to 12 ft of AASHTO Green Book, 4.3
+_OPENING_COST = 5.0  # [1/m] of a width that changes, in squared sigmas; source: by hand
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +84,8 @@ def assign_sides(station_m: Floats, left_m: Floats, named: Ints, *, wander: floa
     unary = np.minimum(np.minimum(errors.left_cost, errors.right_cost), _OUTLIER_COST)
     if near_track:
         unary = unary + _TRACK_COST * grid**2
-    state, width = _cheapest_course(unary, grid, np.diff(station_m[order]), wander)
-    found = _assign_beside(offset - grid[state], label, float(widths[width]))
+    state, width = _cheapest_course(unary, grid, widths, np.diff(station_m[order]), wander)
+    found = _assign_beside(offset - grid[state], label, widths[width])
     back = np.empty(len(order), np.int64)
     back[order] = np.arange(len(order))
     return SideAssignment(found.side[back], found.off_m[back], found.contradicts[back], found.width_m)
@@ -104,7 +99,7 @@ def _errors_of(from_centre_m: Floats, label: Ints, width_m: Floats | float) -> _
     return _BoundaryErrors(left, right, left_cost, right_cost)
 
 
-def _assign_beside(from_centre_m: Floats, label: Ints, width_m: float) -> SideAssignment:
+def _assign_beside(from_centre_m: Floats, label: Ints, width_m: Floats) -> SideAssignment:
     """Sides of markers whose offset from the lane's centre is known."""
     errors = _errors_of(from_centre_m, label, width_m)
     side = np.where(errors.left_cost <= errors.right_cost, LEFT, RIGHT)
@@ -114,7 +109,7 @@ def _assign_beside(from_centre_m: Floats, label: Ints, width_m: float) -> SideAs
     contradicts = (label != UNKNOWN) & (label != nearer) & (np.abs(off) < 4 * _MARKER_SIGMA_M)
     named_off = np.where(label == LEFT, np.abs(errors.left_m), np.abs(errors.right_m))
     contradicts &= named_off > 4 * _MARKER_SIGMA_M
-    return SideAssignment(np.where(outlier | contradicts, UNKNOWN, side), off, contradicts, width_m)
+    return SideAssignment(np.where(outlier | contradicts, UNKNOWN, side), off, contradicts, float(np.median(width_m)))
 
 
 def _obvious_sides(left_m: Floats, named: Ints) -> SideAssignment | None:
@@ -125,13 +120,15 @@ def _obvious_sides(left_m: Floats, named: Ints) -> SideAssignment | None:
     middle = np.array([np.median(left_m[side == which]) for which in (LEFT, RIGHT)])
     width = float(middle[0] - middle[1])
     off = left_m - np.where(side == LEFT, middle[0], middle[1])
-    if not _WIDTHS_M[0] < width < _WIDTHS_M[-1] or np.abs(off).max() > _CLEAR_BAND_M:
+    if not _USUAL_WIDTHS_M[0] < width < _USUAL_WIDTHS_M[1] or np.abs(off).max() > _CLEAR_BAND_M:
         return None
     return SideAssignment(side, off, np.zeros(len(side), bool), width)
 
 
-def _cheapest_course(unary: Floats, grid: Floats, ahead_m: Floats, wander: float) -> tuple[Ints, int]:
-    """Cheapest course through the grid (Viterbi algorithm), and the index of its width.
+def _cheapest_course(
+    unary: Floats, grid: Floats, widths_m: Floats, ahead_m: Floats, wander: float
+) -> tuple[Ints, Ints]:
+    """Cheapest course through the grid (Viterbi algorithm): indices of the offset and of the width at each marker.
 
     Parameters
     ----------
@@ -146,16 +143,21 @@ def _cheapest_course(unary: Floats, grid: Floats, ahead_m: Floats, wander: float
     """
     count, kinds, size = unary.shape
     square = (grid[:, None] - grid) ** 2 / 2
-    came = np.empty((count, kinds, size), np.int16)
+    opening = _OPENING_COST * np.abs(widths_m[:, None] - widths_m)
+    came_offset = np.empty((count, kinds, size), np.int16)
+    came_width = np.empty((count, kinds, size), np.int16)
     total = unary[0]
     for i in range(1, count):
-        move = square / (wander**2 * max(ahead_m[i - 1], 1.0))
-        sums = total[:, None, :] + np.minimum(move, 2 * _OUTLIER_COST)
-        came[i] = sums.argmin(2)
-        total = np.take_along_axis(sums, came[i][:, :, None].astype(np.int64), 2)[:, :, 0] + unary[i]
-    best = int(total.min(1).argmin())
-    state = np.empty(count, np.int64)
-    state[-1] = int(total[best].argmin())
+        move = np.minimum(square / (wander**2 * max(ahead_m[i - 1], 1.0)), 2 * _OUTLIER_COST)
+        sums = total[:, None, :] + move
+        came_offset[i] = sums.argmin(2)
+        moved = np.take_along_axis(sums, came_offset[i][:, :, None].astype(np.int64), 2)[:, :, 0]
+        opened = moved[None] + opening[:, :, None]
+        came_width[i] = opened.argmin(1)
+        total = np.take_along_axis(opened, came_width[i][:, None].astype(np.int64), 1)[:, 0] + unary[i]
+    width, state = np.empty(count, np.int64), np.empty(count, np.int64)
+    width[-1], state[-1] = np.unravel_index(int(total.argmin()), total.shape)
     for i in range(count - 1, 0, -1):
-        state[i - 1] = came[i, best, state[i]]
-    return state, best
+        width[i - 1] = came_width[i, width[i], state[i]]
+        state[i - 1] = came_offset[i, width[i - 1], state[i]]
+    return state, width

@@ -9,7 +9,7 @@ import numpy as np
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.lanes.driven_line import TRUSTED_TRACK_M, DrivenLine, driven_line_from_track
-from app.lanes.initial_line import fit_initial_line, largest_group
+from app.lanes.initial_line import fit_initial_line, is_single_row, largest_group
 from app.lanes.lane_fit import LaneFit
 from app.lanes.lane_path import path_from_fit, path_from_splines, refused_path
 from app.lanes.local_plane import plane_from_wgs84
@@ -38,10 +38,6 @@ _PRECISE_TRACK_M = (
     0.1  # [m] noise of a track that shows sides by itself; source: by hand: between RTK and other receivers
 )
 _MAX_BESIDE_TRACK_M = 4.0  # [m] such sides are of markers at most a lane's width away; source: by hand
-_MIN_SIDE_CHANGES = (
-    0.35  # share of markers after one of the other side, below it they are one row; source: by hand: of pairs
-)
-# half or more change
 
 
 def fit_lane(
@@ -174,7 +170,7 @@ def _fit_by_least_squares(
         notes.left_out.append(LeftOut(int(observations.row[k]), int(observations.number[k]), reason, off))
     if not found:
         return refused(f"the markers share no line: {len(fit.left_out)} of them lie off it")
-    if _is_row_of_unknown_side(fit, observations, drive):
+    if _is_row_of_unknown_side(fit, observations, taken, drive):
         return refused("one row of markers, and nothing shows on which side of the lane it is")
     _warn_of_guessed_sides(fit, observations, drive, notes)
     lane = path_from_fit(fit, observations, rules, notes)
@@ -191,18 +187,14 @@ def _fit_by_splines(observations: LaneObservations, taken: Bools, line: SmoothLi
     return path_from_splines(bounds, observations, taken, notes)
 
 
-def _is_row_of_unknown_side(fit: LaneFit, observations: LaneObservations, drive: DrivenLine | None) -> bool:
+def _is_row_of_unknown_side(
+    fit: LaneFit, observations: LaneObservations, taken: Bools, drive: DrivenLine | None
+) -> bool:
     """Whether the markers are one row, and neither a message nor an accurate track shows its side."""
     accurate = drive is not None and drive.accuracy_m < TRUSTED_TRACK_M
     if accurate or bool((observations.side[fit.used] != UNKNOWN).any()):
         return False
-    return len(_sides_found(fit)) == 1 or _is_single_row(fit)
-
-
-def _is_single_row(fit: LaneFit) -> bool:
-    """Whether sides hardly ever change from marker to marker: a row that an inaccurate track cuts into two sides."""
-    side = fit.side[fit.used][np.argsort(fit.station_m[fit.used], kind="stable")]
-    return float(np.mean(side[1:] != side[:-1])) < _MIN_SIDE_CHANGES
+    return len(_sides_found(fit)) == 1 or is_single_row(observations.point_m[taken], fit.station_m[taken])
 
 
 def _warn_of_guessed_sides(

@@ -55,7 +55,7 @@ def fit_initial_line(points_m: Floats, side: Ints, half_width_m: float) -> Smoot
     near = far < _MAX_BESIDE_M
     sided = side if (side != UNKNOWN).sum() > 1 else np.zeros_like(side)
     line = _smooth(points_m[near], along[nearest[near]], _UNSIDED_SIGMA_M)
-    if line is None or (not sided.any() and _is_single_row(points_m[near], along[nearest[near]])):
+    if line is None or (not sided.any() and is_single_row(points_m[near], along[nearest[near]])):
         return None
     return _centred(line, points_m, sided, near, half_width_m)
 
@@ -82,7 +82,7 @@ def _centred(line: SmoothLine, points_m: Floats, side: Ints, near: Bools, half_w
     return line
 
 
-def _is_single_row(points_m: Floats, station_m: Floats) -> bool:
+def is_single_row(points_m: Floats, station_m: Floats) -> bool:
     """Whether one smooth line runs through all markers: nothing shows on which side of it the lane is."""
     line = _smooth(points_m, station_m, _SIDED_SIGMA_M)
     return line is None or float(np.median(np.abs(line.project(points_m)[1]))) < _SINGLE_ROW_M

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from app.lanes.driven_line import TRUSTED_TRACK_M, DrivenLine
 from app.lanes.even_spacing import NO_KNOWN_LENGTHS, find_known_lengths
 from app.lanes.least_squares import (
     OFFSET_MODELS,
+    WIDTH_MODELS,
     Hyperparameters,
     LaneProblem,
     LaneSolution,
@@ -42,7 +44,7 @@ _FIX_SIGMAS, _MIN_FIX_REACH_M = (
     8.0,
     6.0,
 )  # [1, m] fixes further from the track's median offset are not used; source: by hand
-_UNKNOWN_WIDTH = {"width_sd_m": 0.4, "width_length_m": 400.0}  # of a lane with one known side; source: by hand
+_UNKNOWN_WIDTH = Hyperparameters(width_sd_m=0.4, width_length_m=400.0)  # of a lane with one known side; source: by hand
 
 
 class FixOffsets(NamedTuple):
@@ -97,7 +99,7 @@ class LaneFit:
         self.line, self._observations, self._drive, self._rules = line, observations, drive, rules
         half = rules.usual_width_m / 2
         self.station_m, self._left_m = line.project_markers(observations.point_m, observations.side, half)
-        named = _sides_along_track(self._left_m, observations, taken, drive, notes)
+        named = _sides_along_track(self.station_m, self._left_m, observations, taken, drive, notes)
         if named is not observations.side:
             self.station_m, self._left_m = line.project_markers(observations.point_m, named, half)
         sides = _assign_taken_sides(self.station_m, self._left_m, named, taken, drive)
@@ -137,12 +139,16 @@ class LaneFit:
 
     def _solve(self, turn: int, *, nearly_converged: bool) -> None:
         """Solve beside one line, leaving out outliers until there are none; not beside a nearly converged line."""
-        offset_models = _offset_models(self.side[self.used], self._drive)
+        side = self.side[self.used]
+        offset_models = _offset_models(side, self._drive)
+        width_models = WIDTH_MODELS if len(np.unique(side)) == 2 else ()
         choosing = turn < (1 if self._drive is not None else 2)
         for left in range(_MAX_REJECTIONS, -1, -1):
             self.problem = self._problem(turn)
             if choosing:
-                self._hyperparameters = choose_hyperparameters(self.problem, self._hyperparameters, offset_models)
+                self._hyperparameters = choose_hyperparameters(
+                    self.problem, self._hyperparameters, offset_models, width_models
+                )
             self.solution = self.problem.solve(self._hyperparameters)
             residual = self.solution.residuals()
             if nearly_converged or not left:
@@ -213,19 +219,30 @@ class LaneFit:
 
 
 def _sides_along_track(
-    left: Floats, observations: LaneObservations, taken: Bools, drive: DrivenLine | None, notes: Notes
+    station: Floats, left: Floats, observations: LaneObservations, taken: Bools, drive: DrivenLine | None, notes: Notes
 ) -> Ints:
     """Sides sent by the markers, exchanged where the track runs in the other direction of travel."""
     named = observations.side
-    nearest, farthest = _SIDE_OFFSETS_M
-    clear = taken & (named != UNKNOWN) & (np.abs(left) > nearest) & (np.abs(left) < farthest)
-    if drive is None or clear.sum() < _MIN_SIDED_MARKERS:
-        return named
-    agreeing = np.mean((left[clear] > 0) == (named[clear] == LEFT))
-    if agreeing >= _OPPOSITE_SHARE:
+    if drive is None or _share_agreeing(station[taken], left[taken], named[taken]) >= _OPPOSITE_SHARE:
         return named
     notes.warn("the sides sent by the markers are those of the other direction of travel: the path follows the track")
     return np.where(named == LEFT, RIGHT, np.where(named == RIGHT, LEFT, UNKNOWN))
+
+
+def _share_agreeing(station: Floats, left: Floats, named: Ints) -> float:
+    """Share of markers whose side agrees with the track; 1 where too few show it.
+
+    Where both sides are named, a left marker must be left of the right one next to it, whatever the track's error.
+    """
+    on_left, on_right = np.flatnonzero(named == LEFT), np.flatnonzero(named == RIGHT)
+    if min(len(on_left), len(on_right)) >= _MIN_SIDED_MARKERS:
+        beside = np.abs(station[on_left, None] - station[on_right]).argmin(1)
+        return float(np.mean(left[on_left] > left[on_right[beside]]))
+    nearest, farthest = _SIDE_OFFSETS_M
+    clear = (named != UNKNOWN) & (np.abs(left) > nearest) & (np.abs(left) < farthest)
+    if clear.sum() < _MIN_SIDED_MARKERS:
+        return 1.0
+    return float(np.mean((left[clear] > 0) == (named[clear] == LEFT)))
 
 
 def _assign_taken_sides(
@@ -246,7 +263,7 @@ def _initial_hyperparameters(sides: SideAssignment, used: Bools, rules: LaneRule
     both = (sides.side[used] == LEFT).any() and (sides.side[used] == RIGHT).any()
     if both:
         return Hyperparameters(width_m=sides.width_m)
-    return Hyperparameters(width_m=rules.usual_width_m, **_UNKNOWN_WIDTH)
+    return replace(_UNKNOWN_WIDTH, width_m=rules.usual_width_m)
 
 
 def _offset_models(side: Ints, drive: DrivenLine | None) -> tuple[OffsetModel, ...]:

@@ -21,6 +21,7 @@ _SAME_STATION_M = (
 )
 _MIN_OTHER_ROW = 3  # so many outliers, and; source: by hand, two may be chance
 _MIN_OTHER_ROW_SHARE = 0.08  # such a share of all markers may be a row that the path should follow; source: by hand
+_OTHER_ROW_REACH_M = 40.0  # [m] within which so many are close together; source: by hand, three spacings of 12.2 m
 _OTHER_ROW_SIGMA_M = 0.6  # [m] added then; source: by hand: the path's confidence falls below one half
 _MIN_SIGMA_M = 1e-6  # [m] keeps the confidence finite; source: below every survey, above rounding
 
@@ -40,7 +41,7 @@ def path_from_fit(fit: LaneFit, observations: LaneObservations, rules: LaneRules
     markers_at = np.interp(fit.station_m, problem.station_m, along)
     inner = markers_at[fit.used]
     keep = _accurate_stations(at, sigma, inner.min(), inner.max(), rules.max_end_sigma_m)
-    sigma = _sigma_with_other_row(sigma, fit, notes)
+    sigma = _sigma_with_other_row(sigma, at, markers_at, fit, notes)
     left, right = (
         np.where(
             (known < _MAX_BOUNDARY_SIGMA_M)[:, None],
@@ -151,13 +152,27 @@ def _accurate_stations(at: Floats, sigma: Floats, first: float, last: float, max
     return slice(int(low[-1]) + 1 if len(low) else 0, int(high[0]) if len(high) else len(at))
 
 
-def _sigma_with_other_row(sigma: Floats, fit: LaneFit, notes: Notes) -> Floats:
+def _sigma_with_other_row(sigma: Floats, at: Floats, markers_at: Floats, fit: LaneFit, notes: Notes) -> Floats:
     """Standard deviations, larger where outliers may be a row of markers that the path should follow."""
-    if len(fit.left_out) < _MIN_OTHER_ROW or fit.outlier_ratio <= _MIN_OTHER_ROW_SHARE:
-        return sigma
     out, count = len(fit.left_out), len(fit.left_out) + int(fit.used.sum())
-    notes.warn(f"{out} of {count} markers lie off the line: another lane's row, or a lane that merges or splits")
-    return np.hypot(sigma, _OTHER_ROW_SIGMA_M)
+    if out < _MIN_OTHER_ROW:
+        return sigma
+    doubtful = np.full(len(at), fit.outlier_ratio > _MIN_OTHER_ROW_SHARE)
+    if doubtful.any():
+        notes.warn(f"{out} of {count} markers lie off the line: another lane's row, or a lane that merges or splits")
+    else:
+        place = np.sort(markers_at[list(fit.left_out)])
+        ends = np.stack([place - _OTHER_ROW_REACH_M, place + _OTHER_ROW_REACH_M])
+        for low, high in ends.T:
+            inside = (place >= low) & (place <= high)
+            if inside.sum() >= _MIN_OTHER_ROW:
+                doubtful |= (at >= low) & (at <= high)
+        if doubtful.any():
+            notes.warn(
+                f"{out} of {count} markers lie off the line, {_MIN_OTHER_ROW} or more of them close together: the path "
+                "may be another one there"
+            )
+    return np.where(doubtful, np.hypot(sigma, _OTHER_ROW_SIGMA_M), sigma)
 
 
 def _speed_limits(at: Floats, station: Floats, limit: Floats, notes: Notes) -> Floats:

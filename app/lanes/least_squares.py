@@ -15,7 +15,9 @@ Without a track the third field sums up the length of the centre on stretches of
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +60,8 @@ class Hyperparameters:
         Of the receiver's slow error, which replaces the wander if not 0: growth [m/sqrt(m)], and size. [m]
     width_m, width_sd_m, width_length_m : float
         Of the lane's width: mean, standard deviation, correlation length. [m]
+    opens : bool
+        The width is Matern 3/2 noise, as of a lane that opens or merges over tapers.
     """
 
     bend: float = 0.003  # source: middle of `_BENDS`
@@ -68,6 +72,7 @@ class Hyperparameters:
     width_m: float = 3.3  # source: `LaneRules.usual_width_m`
     width_sd_m: float = 0.25  # source: by hand, sensitivity 1.42, 0.96
     width_length_m: float = 60.0  # source: by hand, sensitivity 1.03, 1.00
+    opens: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,9 +232,10 @@ class LaneProblem:
 
     def matrix(self, s: Hyperparameters) -> tuple[Floats, Floats, float]:
         """Normal matrix, right-hand side, and the sum of squares at zero."""
-        width = _ornstein_weights(s.width_sd_m, s.width_length_m)
+        width = _width_weights(s)
         total = self.data + self.bend / s.bend**2
-        total += width[0] * self.smooth[0][0] + width[1] * self.smooth[0][1]
+        for order, weight in enumerate(width):
+            total += weight * self.smooth[0][order]
         right = self.right + self.bend_right / s.bend**2
         mean_width = width[0] * self.smooth[0][0][0] * s.width_m
         right = right + mean_width
@@ -241,17 +247,19 @@ class LaneProblem:
         return total, right, energy
 
     def log_likelihood(self, s: Hyperparameters) -> float:
-        """Log likelihood of the measurements, without terms that do not depend on bend and vehicle offset."""
+        """Log likelihood of the measurements, without terms that do not depend on the hyperparameters."""
         total, right, energy = self.matrix(s)
         cholesky = factor(total)
         x = solve(cholesky, right)
         fit = energy - float(right @ x)
         value = -0.5 * (fit + log_determinant(cholesky)) - (self.count - 3) * float(np.log(s.bend))
-        return value + (0.5 * self._offset_log_prior(_offset_weights(s)) if self.tracked else 0.0)
+        value += 0.5 * self._log_prior(1, _width_weights(s))
+        return value + (0.5 * self._log_prior(2, _offset_weights(s)) if self.tracked else 0.0)
 
-    def _offset_log_prior(self, weights: list[float]) -> float:
-        """Log determinant of the prior precision of the vehicle's offset."""
-        own = sum(weight * self.smooth[1][order][:7:3, 2::3] for order, weight in enumerate(weights))
+    def _log_prior(self, field: int, weights: list[float]) -> float:
+        """Log determinant of the prior precision of the width (field 1) or of the vehicle's offset (field 2)."""
+        step = self.fields
+        own = sum(w * self.smooth[field - 1][k][: 2 * step + 1 : step, field::step] for k, w in enumerate(weights))
         return log_determinant(factor(np.asarray(own)))
 
     def solve(self, s: Hyperparameters) -> LaneSolution:
@@ -313,21 +321,30 @@ def _independent_groups(station_m: Floats) -> tuple[Ints, int]:
     return group, groups
 
 
-def _ornstein_weights(sd: float, length: float) -> tuple[float, float]:
+def _ornstein_weights(sd: float, length: float) -> list[float]:
     """Weights of the squared value and slope of an Ornstein-Uhlenbeck process: precision (k^2 + w^2) / (2 sd^2 k)."""
     k = 1 / length
-    return k / (2 * sd**2), 1 / (2 * sd**2 * k)
+    return [k / (2 * sd**2), 1 / (2 * sd**2 * k)]
+
+
+def _matern_weights(sd: float, length: float) -> list[float]:
+    """Weights of the squared value, slope and second derivative of Matern 3/2 noise.
+
+    It has the precision (k^2 + w^2)^2 / (4 sd^2 k^3), k = 1 / length.
+    """
+    k = 1 / length
+    return [k / (4 * sd**2), 1 / (2 * k * sd**2), 1 / (4 * k**3 * sd**2)]
+
+
+def _width_weights(s: Hyperparameters) -> list[float]:
+    return (_matern_weights if s.opens else _ornstein_weights)(s.width_sd_m, s.width_length_m)
 
 
 def _offset_weights(s: Hyperparameters) -> list[float]:
-    """Weights of the squared value, slope and second derivative of the vehicle's offset.
-
-    Matern 3/2 noise has the precision (k^2 + w^2)^2 / (4 sd^2 k^3), k = 1 / length.
-    """
+    """Weights of the squared value, slope and second derivative of the vehicle's offset."""
     if s.drift:
         return [s.drift**2 / (4 * s.slow_m**4), s.drift**-2.0, 0.0]
-    k = 1 / s.wander_length_m
-    return [k / (4 * s.wander_m**2), 1 / (2 * k * s.wander_m**2), 1 / (4 * k**3 * s.wander_m**2)]
+    return _matern_weights(s.wander_m, s.wander_length_m)
 
 
 OffsetModel = dict[str, float]
@@ -337,24 +354,36 @@ OFFSET_MODELS: tuple[OffsetModel, ...] = (
 )  # fmt: skip
 """Candidates for the vehicle's offset: calm and lively drivers, receivers of 0.05 to 0.4 m/sqrt(m). Source: chosen by
 hand to span a driver's 0.18 m RMS and receivers of 0.5 to 4 m over 100 m; the likelihood decides for each drive."""
+WidthModel = dict[str, float | bool]
+WIDTH_MODELS: tuple[WidthModel, ...] = (
+    {"width_sd_m": 0.25, "width_length_m": 60.0, "opens": False},
+    {"width_sd_m": 1.0, "width_length_m": 40.0, "opens": True},
+    {"width_sd_m": 2.5, "width_length_m": 40.0, "opens": True},
+)  # fmt: skip
+"""Candidates for the width of a lane with two known sides: as painted, or with lanes that open and merge."""
 _BENDS = (0.0005, 0.0015, 0.003, 0.006, 0.015)
 """Candidates for `Hyperparameters.bend`. Source: by hand, factors of two to three apart; the likelihood decides for
 each drive. [1/(m^2 sqrt(m))]"""
 
 
 def choose_hyperparameters(
-    problem: LaneProblem, start: Hyperparameters, offset_models: tuple[OffsetModel, ...]
+    problem: LaneProblem,
+    start: Hyperparameters,
+    offset_models: tuple[OffsetModel, ...],
+    width_models: tuple[WidthModel, ...],
 ) -> Hyperparameters:
-    """The most likely of the candidates: first for the vehicle's offset, then for the lane's bends."""
+    """The most likely of the candidates: for the width, then for the vehicle's offset, then for the lane's bends."""
     best = start
+    if width_models:
+        best = _most_likely(problem, [best] * len(width_models), width_models)
     if problem.tracked and offset_models:
-        bases = [replace(start, drift=0.0) if "drift" not in model else start for model in offset_models]
+        bases = [replace(best, drift=0.0) if "drift" not in model else best for model in offset_models]
         best = _most_likely(problem, bases, offset_models)
     return _most_likely(problem, [best] * len(_BENDS), tuple({"bend": value} for value in _BENDS))
 
 
 def _most_likely(
-    problem: LaneProblem, bases: list[Hyperparameters], changes: tuple[dict[str, float], ...]
+    problem: LaneProblem, bases: list[Hyperparameters], changes: tuple[Mapping[str, Any], ...]
 ) -> Hyperparameters:
     candidates = [replace(base, **change) for base, change in zip(bases, changes, strict=True)]
     return max(candidates, key=problem.log_likelihood)

@@ -21,6 +21,7 @@ from app.lanes.types import (
 
 _USUAL_SIGMA_M = 0.02  # [m] source: the survey of the CERPM paper, section 2.2
 _MIN_SIGMA_M = 0.005  # [m] source: half the 1.1 cm steps of a message's degrees (`markers.cerpm.DEGREE_STEP`)
+_PLACING_SD_M = 0.01  # [m] of a marker about its boundary; source: by hand, as `simulation.radio.markers`
 _SAME_POINT_DECIMALS = 2  # source: a centimetre, the steps of a message's degrees
 _NO_SIDE = 9  # source: above every `LaneSide`
 
@@ -110,10 +111,10 @@ def _report_two_places(
 
 
 def _valid_sigmas(stated_m: Floats) -> Floats:
-    """Standard deviations as stated, or the usual one where that is not positive and finite. [m]"""
+    """Standard deviations of markers about their boundary: of the survey, stated or usual, and of placing. [m]"""
     with np.errstate(invalid="ignore"):
         good = np.isfinite(stated_m) & (stated_m > 0)
-    return np.where(good, np.maximum(stated_m, _MIN_SIGMA_M), _USUAL_SIGMA_M)
+    return np.hypot(np.where(good, np.maximum(stated_m, _MIN_SIGMA_M), _USUAL_SIGMA_M), _PLACING_SD_M)
 
 
 def _common_sides(side: Ints, which: Ints, count: int, notes: Notes) -> Ints:
