@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from app.lanes.local_plane import plane_from_wgs84
 from app.lanes.observations import LaneObservations, distinct_places, observations_from_markers
 from app.lanes.paper_spline import boundaries_by_splines
 from app.lanes.smooth_line import SmoothLine
+from app.lanes.track_agreement import compare_with_track
 from app.lanes.types import (
     LEFT,
     RIGHT,
@@ -81,7 +83,8 @@ def fit_lane(
     line, taken = _initial_line(observations, taken, drive, rules, notes)
     if method == "paper":
         return _fit_by_splines(observations, taken, line, notes)
-    return _fit_by_least_squares(observations, taken, line, drive, rules, notes)
+    lane = _fit_by_least_squares(observations, taken, line, drive, rules, notes)
+    return lane if track is None else replace(lane, track_agreement=compare_with_track(lane, track))
 
 
 def preview_m(lane: Lane, lon_deg: float, lat_deg: float) -> float:

@@ -15,6 +15,8 @@ from app.markers.cerpm import LaneSide
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
+MAX_TRACK_SIGNIFICANCE = 4.0  # standard deviations above which path and track disagree; source: 1 in 16,000 by chance
+_MIN_TRACK_EFFECT_M = 0.4  # [m] smaller disagreements are not reported; source: by hand: a lane leaves as much room
 UNKNOWN, LEFT, RIGHT = (int(side) for side in (LaneSide.UNKNOWN, LaneSide.LEFT, LaneSide.RIGHT))
 
 
@@ -149,6 +151,55 @@ class LeftOut:
     off_m: float
 
 
+@dataclass(frozen=True, slots=True)
+class TrackAgreement:
+    """The transformation that brings a vehicle's track onto a path, with standard deviations.
+
+    Attributes
+    ----------
+    east_m, north_m : float
+        Shift of the markers' path against the track. [m]
+    shift_sigma_m : float
+        Of the shift in its own direction: driver, receiver and geometry. [m]
+    turn_deg, turn_sigma_deg : float
+        Turn about the middle of the track, anticlockwise. [deg]
+    scale_ppm, scale_sigma_ppm : float
+        The path is longer than the track by this. [ppm]
+    significance : float
+        The largest of shift, turn and scale, in standard deviations.
+    effect_m : float
+        How far the transformation moves the track, across the path, RMS. [m]
+    """
+
+    east_m: float
+    north_m: float
+    shift_sigma_m: float
+    turn_deg: float
+    turn_sigma_deg: float
+    scale_ppm: float
+    scale_sigma_ppm: float
+    significance: float
+    effect_m: float
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the path may not be trusted."""
+        return self.significance > MAX_TRACK_SIGNIFICANCE and self.effect_m > _MIN_TRACK_EFFECT_M
+
+    @property
+    def reason(self) -> str:
+        """What disagrees, for people."""
+        parts = [f"shifted by {self.east_m:+.2f} m east and {self.north_m:+.2f} m north"]
+        if abs(self.turn_deg) > MAX_TRACK_SIGNIFICANCE * self.turn_sigma_deg:
+            parts.append(f"turned by {self.turn_deg:+.2f} degrees")
+        if abs(self.scale_ppm) > MAX_TRACK_SIGNIFICANCE * self.scale_sigma_ppm:
+            parts.append(f"scaled by {self.scale_ppm:+.0f} ppm")
+        return (
+            f"all markers are {', '.join(parts)} against the vehicle's track ({self.significance:.0f} standard "
+            "deviations): check the datum and the survey of the markers, and of the receiver"
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Lane:
     """The reference path of a lane, at stations in the direction of travel; without stations if it was refused.
@@ -186,6 +237,8 @@ class Lane:
     refusal : str or None
         Why there is no path.
     method : str
+    track_agreement : TrackAgreement or None
+        With the vehicle's track; None without a track beside the path.
     """
 
     origin_lon_deg: float
@@ -208,6 +261,7 @@ class Lane:
     localization_warnings: tuple[str, ...] = ()
     refusal: str | None = None
     method: str = "waymark"
+    track_agreement: TrackAgreement | None = None
 
     @property
     def east_m(self) -> Floats:

@@ -12,7 +12,7 @@ from typing_extensions import TypedDict
 
 from app.lanes.local_plane import wgs84_from_plane
 from app.lanes.overlay import LaneOverlay, LineInFrame, PointsInFrame
-from app.lanes.types import Lane
+from app.lanes.types import Lane, TrackAgreement
 
 if TYPE_CHECKING:  # it loads numba
     from app.simulation.steering import SteeringCheck
@@ -51,6 +51,20 @@ class LaneStations(TypedDict):
     confidence: list[float | None]
 
 
+class TrackAgreementDocument(TypedDict):
+    """How the path lies against the vehicle's track, beyond what driver and receiver explain where it disagrees."""
+
+    east_m: float
+    north_m: float
+    shift_sigma_m: float
+    turn_deg: float
+    turn_sigma_deg: float
+    scale_ppm: float
+    scale_sigma_ppm: float
+    significance: float
+    disagrees: bool
+
+
 class DecodedLaneDocument(TypedDict):
     """The lane's reference path, at stations along it."""
 
@@ -63,6 +77,7 @@ class DecodedLaneDocument(TypedDict):
     sigma_max_m: float | None
     min_radius_m: float | None
     speed_limits_km_h: list[float]
+    track_agreement: TrackAgreementDocument | None
     origin: Origin
     stations: LaneStations
     left: list[list[list[float]]]
@@ -139,6 +154,7 @@ def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
         "sigma_max_m": round(float(lane.sigma_m.max()), 4) if has_sigma else None,
         "min_radius_m": round(1 / sharpest, 1) if sharpest > _STRAIGHT_1PM else None,
         "speed_limits_km_h": _distinct(lane.speed_limit_km_h),
+        "track_agreement": _track_agreement(lane.track_agreement),
         "origin": {"lon_deg": origin[0], "lat_deg": origin[1]},
         "stations": {
             "station_m": _column(lane.station_m, 3),
@@ -157,6 +173,22 @@ def lane_document(lane: Lane, *, grade: str) -> DecodedLaneDocument:
         },
         "left": _pieces(lane.left_enu_m, origin),
         "right": _pieces(lane.right_enu_m, origin),
+    }
+
+
+def _track_agreement(found: TrackAgreement | None) -> TrackAgreementDocument | None:
+    if found is None:
+        return None
+    return {
+        "east_m": round(found.east_m, 3),
+        "north_m": round(found.north_m, 3),
+        "shift_sigma_m": round(found.shift_sigma_m, 3),
+        "turn_deg": round(found.turn_deg, 4),
+        "turn_sigma_deg": round(found.turn_sigma_deg, 4),
+        "scale_ppm": round(found.scale_ppm, 1),
+        "scale_sigma_ppm": round(found.scale_sigma_ppm, 1),
+        "significance": round(found.significance, 1),
+        "disagrees": found.disagrees,
     }
 
 

@@ -207,6 +207,8 @@ def _path_warnings(lane: Lane) -> list[str]:
         return ["the method gives no standard deviation of the path"]
     if float(np.median(lane.sigma_m)) > _MAX_SIGMA_M:
         return [f"the standard deviation of the path is above {_MAX_SIGMA_M:g} m"]
+    if lane.track_agreement is not None and lane.track_agreement.disagrees:
+        return [lane.track_agreement.reason]
     return []
 
 

@@ -464,6 +464,21 @@ def test_a_track_of_another_place_accuses_no_marker(road: tuple[httpx.Client, Bu
         assert connection.execute(sa.select(observations).where(*own)).all() == []
 
 
+def test_markers_that_are_all_shifted_against_the_track_do_not_localize(road: tuple[httpx.Client, BuiltLane]) -> None:
+    """A survey in another datum shifts registered and sent positions alike: only the vehicle's track shows it."""
+    client, built = road
+    heard, _hour = drive(built, 1926)
+    shifted = replace(
+        heard, track=replace(heard.track, lon_deg=heard.track.lon_deg - 2.5e-5, lat_deg=heard.track.lat_deg + 1.4e-5)
+    )
+    found = decoded(client, packed(shifted))
+    agreement = found["lane"]["track_agreement"]
+    assert agreement["disagrees"]
+    assert agreement["significance"] > 4
+    assert found["lane"]["localization_grade"] == "unfit"
+    assert any("against the vehicle's track" in text for text in found["lane"]["localization_warnings"])
+
+
 def test_a_path_that_is_not_sure_is_not_for_localization(road: tuple[httpx.Client, BuiltLane]) -> None:
     client, built = road
     heard, _hour = drive(built, 1925)
