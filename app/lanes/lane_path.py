@@ -10,7 +10,7 @@ from app.lanes.local_plane import headings_deg, wgs84_from_plane
 from app.lanes.observations import LaneObservations
 from app.lanes.paper_spline import SplineBoundaries
 from app.lanes.smooth_line import SmoothLine, left_normals, lengths_along
-from app.lanes.types import UNKNOWN, Bools, Floats, Ints, Lane, LaneRules, Notes
+from app.lanes.types import UNKNOWN, Bools, Floats, Ints, Lane, LaneRules, LeftOutReason, Notes
 
 _MAX_WIDTH_SIGMA_M = (
     0.3  # [m] a width that is less certain is not published; source: by hand: an eighth of narrow lanes
@@ -19,9 +19,8 @@ _MAX_BOUNDARY_SIGMA_M = 0.4  # [m] a boundary that is less certain is not publis
 _SAME_STATION_M = (
     3.0  # [m] speed limits closer along the path must agree; source: by hand: a quarter of the paper's 12.2 m
 )
-_MIN_OTHER_ROW = 3  # so many outliers, and; source: by hand, two may be chance
-_MIN_OTHER_ROW_SHARE = 0.08  # such a share of all markers may be a row that the path should follow; source: by hand
-_OTHER_ROW_REACH_M = 40.0  # [m] within which so many are close together; source: by hand, three spacings of 12.2 m
+_MIN_OTHER_ROW = 3  # outliers that may be a row that the path should follow; source: by hand, two may be chance
+_OTHER_ROW_REACH_M, _OTHER_ROW_SPACINGS = 40.0, 3.0  # [m, 1] within which so many are close together; source: by hand
 _OTHER_ROW_SIGMA_M = 0.6  # [m] added then; source: by hand: the path's confidence falls below one half
 _MIN_SIGMA_M = 1e-6  # [m] keeps the confidence finite; source: below every survey, above rounding
 
@@ -153,25 +152,26 @@ def _accurate_stations(at: Floats, sigma: Floats, first: float, last: float, max
 
 
 def _sigma_with_other_row(sigma: Floats, at: Floats, markers_at: Floats, fit: LaneFit, notes: Notes) -> Floats:
-    """Standard deviations, larger where outliers may be a row of markers that the path should follow."""
-    out, count = len(fit.left_out), len(fit.left_out) + int(fit.used.sum())
-    if out < _MIN_OTHER_ROW:
+    """Standard deviations, larger where outliers may be a row of markers that the path should follow.
+
+    A row is so many outliers close together, all to the same side; markers that only name the wrong side lie on the
+    boundaries that the path has.
+    """
+    rows = [k for k, (reason, _) in fit.left_out.items() if reason is LeftOutReason.OFF_THE_LINE]
+    place, off = markers_at[rows], np.array([fit.left_out[k][1] for k in rows])
+    count = len(fit.left_out) + int(fit.used.sum())
+    reach = max(_OTHER_ROW_REACH_M, _OTHER_ROW_SPACINGS * 2 * float(np.ptp(markers_at[fit.used])) / count)
+    doubtful = np.zeros(len(at), bool)
+    for here in place:
+        near = np.abs(place - here) <= reach
+        if max((near & (off > 0)).sum(), (near & (off < 0)).sum()) >= _MIN_OTHER_ROW:
+            doubtful |= np.abs(at - here) <= reach
+    if not doubtful.any():
         return sigma
-    doubtful = np.full(len(at), fit.outlier_ratio > _MIN_OTHER_ROW_SHARE)
-    if doubtful.any():
-        notes.warn(f"{out} of {count} markers lie off the line: another lane's row, or a lane that merges or splits")
-    else:
-        place = np.sort(markers_at[list(fit.left_out)])
-        ends = np.stack([place - _OTHER_ROW_REACH_M, place + _OTHER_ROW_REACH_M])
-        for low, high in ends.T:
-            inside = (place >= low) & (place <= high)
-            if inside.sum() >= _MIN_OTHER_ROW:
-                doubtful |= (at >= low) & (at <= high)
-        if doubtful.any():
-            notes.warn(
-                f"{out} of {count} markers lie off the line, {_MIN_OTHER_ROW} or more of them close together: the path "
-                "may be another one there"
-            )
+    notes.warn(
+        f"{len(rows)} of {count} markers lie off the line, close together: another lane's row, or a lane that merges "
+        "or splits"
+    )
     return np.where(doubtful, np.hypot(sigma, _OTHER_ROW_SIGMA_M), sigma)
 
 

@@ -21,8 +21,8 @@ from app.sensors.pose_track import PoseTrack
 _SPACING_M = 3.0  # [m] between fixes that are compared; source: `driven_line._POINT_SPACING_M`
 _MIN_FIXES, _MIN_LENGTH_M = 10, 30.0  # fixes, and the length of track, without which nothing is compared; by hand
 _MAX_BESIDE_M = 500.0  # [m] fixes further from the path are of another road; source: by hand, above a datum's shift
-_OFFSET_SD_M = 0.2  # [m] of a driver's usual offset; source: by hand, above the 0.09 m of `driving.Driver.habit_sd_m`
-_WANDER_SD_M, _WANDER_LENGTH_M = 0.2, 30.0  # [m, m] source: `least_squares.OFFSET_MODELS`
+_OFFSET_SD_M = 0.25  # [m] of a driver's usual offset; source: by hand, the upper bound of `benchmarks.hunt.cerpm`
+_WANDER_SD_M, _WANDER_LENGTH_M = 0.25, 30.0  # [m, m] source: as above, and `least_squares.OFFSET_MODELS`
 _CUT_M2 = 2.0  # [m2] offset towards the inside of bends, per curvature; source: twice `driving.Driver.cut_m2`
 _SHIFT_SD_M, _TURN_SD, _SCALE_SD = 300.0, 0.2, 0.1  # [m, rad, 1] source: by hand, above any mistake that is searched
 _UNKNOWN_ACCURACY_M = 3.0  # [m] of a receiver that reports none; source: `lane_fit._UNKNOWN_ACCURACY_M`

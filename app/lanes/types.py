@@ -15,7 +15,7 @@ from app.markers.cerpm import LaneSide
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-MAX_TRACK_SIGNIFICANCE = 4.0  # standard deviations above which path and track disagree; source: 1 in 16,000 by chance
+MAX_TRACK_SIGNIFICANCE = 4.5  # standard deviations above which path and track disagree; source: by hand, 1 in 150,000
 _MIN_TRACK_EFFECT_M = 0.4  # [m] smaller disagreements are not reported; source: by hand: a lane leaves as much room
 UNKNOWN, LEFT, RIGHT = (int(side) for side in (LaneSide.UNKNOWN, LaneSide.LEFT, LaneSide.RIGHT))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,7 @@ class Tally:
     curvature_1pm: list[Floats] = field(default_factory=list)
     confidence: list[Floats] = field(default_factory=list)
     right: list[Floats] = field(default_factory=list)
+    within_2_sigma: list[float] = field(default_factory=list)
     covered: int = 0
     places: int = 0
     runs: int = 0
@@ -34,7 +36,7 @@ class Tally:
 
     def add(self, other: Tally) -> None:
         """Add the runs of another tally."""
-        for name in ("off_m", "curvature_1pm", "confidence", "right"):
+        for name in ("off_m", "curvature_1pm", "confidence", "right", "within_2_sigma"):
             getattr(self, name).extend(getattr(other, name))
         for name in ("covered", "places", "runs", "refused"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
@@ -66,8 +68,57 @@ class Tally:
         return float(parts[0].mean()), float(parts[1].mean())
 
 
+class PlaceErrors(NamedTuple):
+    """A path at true places every 0.25 m that are beside it.
+
+    Attributes
+    ----------
+    off_m, confidence, sigma_m, curvature_off_1pm : ndarray, shape (N,)
+        Distance of the true centre line from the path, what the path reports there, and the error of its curvature.
+    coverage : float
+        Share of all true places that a path covers.
+    """
+
+    off_m: Floats
+    confidence: Floats
+    sigma_m: Floats
+    curvature_off_1pm: Floats
+    coverage: float
+
+    @property
+    def rms_m(self) -> float:
+        """[m]"""
+        return float(np.sqrt(np.mean(self.off_m**2))) if len(self.off_m) else float("nan")
+
+    @property
+    def worst_m(self) -> float:
+        """[m]"""
+        return float(self.off_m.max(initial=0.0))
+
+
+def place_errors(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> PlaceErrors | None:
+    """Errors of a path at true places between two chainages; None where there is no path.
+
+    Notes
+    -----
+    At each true place the error is the distance to the path; places beyond the path's ends have none, but count as not
+    covered. A method without confidence counts as certain.
+    """
+    if path.refusal is not None or len(path.lon_deg) < 2:
+        return None
+    inside = (lane.chainage_m >= first_m) & (lane.chainage_m <= last_m)
+    points = lane.enu_from_wgs84(path.lon_deg, path.lat_deg)
+    off, at, beside = _distances_from_line(lane.centre_m[inside], points)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    confidence, sigma = np.interp(at, along, path.confidence), np.interp(at, along, path.sigma_m)
+    covered = (off <= NEAR_M) & (~np.isfinite(confidence) | (confidence >= MIN_CONFIDENCE))
+    bend = np.interp(at, along, path.curvature_1pm) - lane.curvature_1pm[inside]
+    share = float(covered.sum()) / max(int(inside.sum()), 1)
+    return PlaceErrors(off[beside], confidence[beside], sigma[beside], bend[beside], share)
+
+
 def path_errors(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> Tally:
-    """Errors of a path.
+    """Errors of a path, to add to those of other paths.
 
     Parameters
     ----------
@@ -75,28 +126,20 @@ def path_errors(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> Ta
     path : Lane
     first_m, last_m : float
         Chainages of the first and the last marker received. [m]
-
-    Notes
-    -----
-    At each true place the error is the distance to the path; places beyond the path's ends have none, but count as not
-    covered. A method without confidence counts as certain.
     """
-    inside = (lane.chainage_m >= first_m) & (lane.chainage_m <= last_m)
-    tally = Tally(places=int(inside.sum()), runs=1)
-    if path.refusal is not None or len(path.lon_deg) < 2:
+    places = int(((lane.chainage_m >= first_m) & (lane.chainage_m <= last_m)).sum())
+    tally, found = Tally(places=places, runs=1), place_errors(lane, path, first_m, last_m)
+    if found is None:
         tally.refused = 1
         return tally
-    points = lane.enu_from_wgs84(path.lon_deg, path.lat_deg)
-    off, at, beside = _distances_from_line(lane.centre_m[inside], points)
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    confidence = np.interp(at, along, path.confidence)
-    reported = np.isfinite(confidence)
-    tally.covered = int(((off <= NEAR_M) & (~reported | (confidence >= MIN_CONFIDENCE))).sum())
-    tally.off_m.append(off[beside])
-    bend = np.interp(at, along, path.curvature_1pm) - lane.curvature_1pm[inside]
-    tally.curvature_1pm.append(bend[beside])
-    tally.confidence.append(confidence[beside & reported])
-    tally.right.append((off[beside & reported] <= TOLERANCE_M).astype(float))
+    reported = np.isfinite(found.confidence)
+    tally.covered = round(found.coverage * places)
+    tally.off_m.append(found.off_m)
+    tally.curvature_1pm.append(found.curvature_off_1pm)
+    tally.confidence.append(found.confidence[reported])
+    tally.right.append((found.off_m[reported] <= TOLERANCE_M).astype(float))
+    z = found.off_m[reported] / found.sigma_m[reported]
+    tally.within_2_sigma.append(float(np.mean(z < 2)) if len(z) else float("nan"))
     return tally
 
 

@@ -1,0 +1,1 @@
+"""Search for scenes that break the decoders."""
