@@ -130,6 +130,8 @@ def test_what_the_earth_induces_turns_with_the_road() -> None:
     none = spheroid_clutter(thing, Road(20), rng(1), earth_ut=(0, 0, 0))[:, 3:].sum(axis=0)
     assert abs((north - none)[1]) < 1e-9  # the field is across the bars
     assert (east - none)[1] > 50 * abs((north - none)[0])  # along them, to the left
+    right = spheroid_clutter(thing, Road(20, heading_deg=0), rng(1), earth_ut=(20, 0, 0))[:, 3:].sum(axis=0)
+    assert (right - none)[1] == pytest.approx(-(east - none)[1])
 
 
 SCENE = Scene(
