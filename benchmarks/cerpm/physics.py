@@ -14,8 +14,8 @@ import numpy.typing as npt
 from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.verify import verify_packets
 from app.lanes.estimate import fit_lane
-from app.radio.path_loss import PathLoss, fit_path_loss
-from app.simulation.radio.drive import SimulatedDrive, drive_past
+from app.radio.path_loss import fit_path_loss
+from app.simulation.radio.drive import drive_past
 from app.simulation.radio.driving import Multipath, SatelliteReceiver
 from app.simulation.radio.lanes import TrueLane
 from app.simulation.radio.link import Radio, mean_rssi_dbm
@@ -28,8 +28,6 @@ Floats = npt.NDArray[np.float64]
 
 COMPARED_M = np.geomspace(5.0, 100.0, 50)
 """Distances at which a fitted path loss is compared. [m] Source: by hand; packets come from up to about 100 m."""
-_TICK_S = 1e-6
-"""[s] Source: seconds since 1970 have a resolution of 0.24 us as floating-point numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,18 +106,11 @@ def add_drive(row: Row, physics: Physics, lane: TrueLane, rng: np.random.Generat
     row.left_out += len(path.left_out)
     row.path.add(path_errors(lane, path, first, last))
     row.own.add(track_errors(lane, drive.track, first, last))
-    line = _path_loss(drive, physics.radio)
+    rssi_dbm = [packet.rssi_dbm for packet in drive.packets]
+    line = fit_path_loss(drive.distance_m[drive.transmission], rssi_dbm, drive.sender)
     if line is not None:
         row.exponents.append(line.exponent.value)
         row.line_errors_db.append(line.rssi_dbm(COMPARED_M) - _true_mean_dbm(physics.radio))
-
-
-def _path_loss(drive: SimulatedDrive, radio: Radio) -> PathLoss | None:
-    """Path loss from the received packets of a drive, with true distances."""
-    start_s = np.array([packet.received_at_s for packet in drive.packets]) - radio.airtime_s
-    sent = np.searchsorted(drive.sent.start_s, start_s - _TICK_S)
-    assert np.array_equal(drive.sent.sender[sent], drive.sender)
-    return fit_path_loss(drive.distance_m[sent], [packet.rssi_dbm for packet in drive.packets], drive.sender)
 
 
 def _true_mean_dbm(radio: Radio) -> Floats:

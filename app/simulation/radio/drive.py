@@ -50,6 +50,8 @@ class SimulatedDrive:
         Distance of each transmission from the vehicle, and strength at its receiver. [m, dBm]
     sender : ndarray of int, shape (len(packets),)
         Index of the installed marker that sent each packet.
+    transmission : ndarray of int, shape (len(packets),)
+        Index of each packet in `sent`.
     """
 
     packets: tuple[ReceivedPacket, ...]
@@ -59,6 +61,7 @@ class SimulatedDrive:
     distance_m: Floats
     strength_dbm: Floats
     sender: Ints = field(default_factory=lambda: np.zeros(0, int))
+    transmission: Ints = field(default_factory=lambda: np.zeros(0, int))
 
 
 def drive_past(
@@ -119,7 +122,7 @@ def drive_past(
         _packet(entry, markers, sent, int(k), radio, sign, float(strength[k]), float(snr[entry]))
         for entry, k in enumerate(received)
     )
-    return SimulatedDrive(packets, track, drive, sent, distance, strength, sent.sender[received])
+    return SimulatedDrive(packets, track, drive, sent, distance, strength, sent.sender[received], received)
 
 
 def _packet(
