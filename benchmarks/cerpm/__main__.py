@@ -1,6 +1,6 @@
 """``python -m benchmarks.cerpm [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: path, spoof, forged, dirty, tracking, radio, speed, all.
+Items: path, spoof, forged, dirty, tracking, radio, speed, physics, all.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterable, Sequence
 
 from benchmarks.cerpm.packets_and_steering import run_forged, run_radio, run_speed, run_tracking
 from benchmarks.cerpm.paths import Result, run_dirty, run_path, run_spoof
+from benchmarks.cerpm.physics import run_physics
 
 RUNS: dict[str, Callable[[int, bool], Result]] = {
     "path": run_path, "spoof": run_spoof, "forged": run_forged, "dirty": run_dirty, "tracking": run_tracking,
-    "radio": run_radio, "speed": run_speed,
+    "radio": run_radio, "speed": run_speed, "physics": run_physics,
 }  # fmt: skip
 ITEMS = tuple(RUNS)
 

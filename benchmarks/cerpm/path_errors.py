@@ -28,7 +28,7 @@ class Tally:
     curvature_1pm: list[Floats] = field(default_factory=list)
     confidence: list[Floats] = field(default_factory=list)
     right: list[Floats] = field(default_factory=list)
-    within_2_sigma: list[float] = field(default_factory=list)
+    within_two_sigma: list[Floats] = field(default_factory=list)
     covered: int = 0
     places: int = 0
     runs: int = 0
@@ -36,7 +36,7 @@ class Tally:
 
     def add(self, other: Tally) -> None:
         """Add the runs of another tally."""
-        for name in ("off_m", "curvature_1pm", "confidence", "right", "within_2_sigma"):
+        for name in ("off_m", "curvature_1pm", "confidence", "right", "within_two_sigma"):
             getattr(self, name).extend(getattr(other, name))
         for name in ("covered", "places", "runs", "refused"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
@@ -66,6 +66,11 @@ class Tally:
         """Mean confidence of paths, and the share of places that were within 0.25 m of the centre."""
         parts = [np.concatenate(p) if p else np.full(1, np.nan) for p in (self.confidence, self.right)]
         return float(parts[0].mean()), float(parts[1].mean())
+
+    @property
+    def share_within_two_sigma(self) -> float:
+        """Share of places whose error is within two of the path's standard deviations: 0.954 if those are right."""
+        return float(np.concatenate(self.within_two_sigma).mean()) if self.within_two_sigma else float("nan")
 
 
 class PlaceErrors(NamedTuple):
@@ -138,8 +143,7 @@ def path_errors(lane: TrueLane, path: Lane, first_m: float, last_m: float) -> Ta
     tally.curvature_1pm.append(found.curvature_off_1pm)
     tally.confidence.append(found.confidence[reported])
     tally.right.append((found.off_m[reported] <= TOLERANCE_M).astype(float))
-    z = found.off_m[reported] / found.sigma_m[reported]
-    tally.within_2_sigma.append(float(np.mean(z < 2)) if len(z) else float("nan"))
+    tally.within_two_sigma.append((found.off_m <= 2 * found.sigma_m)[reported].astype(float))
     return tally
 
 

@@ -1,6 +1,6 @@
 """``python -m benchmarks.magnets [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: recall, lateral, tags, ratio, wheel, false, speed, drawn, all. The decoder does not know the clearance.
+Items: recall, lateral, tags, ratio, wheel, false, speed, drawn, physics, all. The decoder does not know the clearance.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from app.sensors.magnetometer_bar import MagnetTrace
 from app.simulation.magnetic.drive import SimulatedDrive
 from app.simulation.magnetic.vehicle import Course, Vehicle
 from benchmarks.magnets import drawn_scenes, scenes
+from benchmarks.magnets.physics import run_physics
 from benchmarks.magnets.score import TagTally, Tally, score_magnets, score_tags
 
-ITEMS = ("recall", "lateral", "tags", "ratio", "wheel", "false", "speed", "drawn")
+ITEMS = ("recall", "lateral", "tags", "ratio", "wheel", "false", "speed", "drawn", "physics")
 REFERENCE = Path(__file__).parents[1] / "reference"
 BAR = Vehicle.compact().bar
 METRO = MetroSettings(amplitude_ut=5.0)
@@ -338,7 +339,7 @@ def _drawn_row(name: str, shares: Sequence[float], goal: float, total: Tally) ->
 
 RUNS: dict[str, Callable[[int, bool], Result]] = {
     "recall": run_recall, "lateral": run_lateral, "tags": run_tags, "ratio": run_ratio, "wheel": run_wheel,
-    "false": run_false, "speed": run_speed, "drawn": run_drawn,
+    "false": run_false, "speed": run_speed, "drawn": run_drawn, "physics": run_physics,
 }  # fmt: skip
 
 if __name__ == "__main__":

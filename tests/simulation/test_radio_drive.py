@@ -62,6 +62,9 @@ def test_every_packet_is_a_signed_message_of_its_marker(heard: SimulatedDrive, i
         assert packet.payload[BODY_BYTES:] == message_tag(_key(number), packet.payload[:BODY_BYTES])
         assert int.from_bytes(packet.payload[5:9], signed=True) == round(installed.lon_deg[row] * 1e7)
         assert packet.payload[15] == 25
+    assert (heard.sent.sender[heard.transmission] == heard.sender).all()
+    ended_s = heard.sent.start_s[heard.transmission] + Radio().airtime_s
+    assert ended_s == pytest.approx([p.received_at_s for p in heard.packets], rel=0, abs=1e-6)
     assert [p.entry for p in heard.packets] == list(range(len(heard.packets)))
     assert (np.diff([p.received_at_s for p in heard.packets]) >= 0).all()
 

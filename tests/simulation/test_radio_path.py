@@ -28,6 +28,9 @@ def test_errors_of_a_path_at_a_known_distance(lane: TrueLane) -> None:
     tally = path_errors(lane, replace(found, lon_deg=lon, lat_deg=lat), 0.0, lane.length_m)
     assert tally.rms_m == pytest.approx(0.5, abs=0.01)
     assert tally.coverage == 1.0
+    assert tally.share_within_two_sigma == 0.0
+    wide = path_errors(lane, replace(found, lon_deg=lon, lat_deg=lat, sigma_m=np.full(len(lon), 0.3)), 0, lane.length_m)
+    assert wide.share_within_two_sigma == 1.0
     third = len(lon) // 3
     tally = path_errors(lane, replace(found, **{k: getattr(found, k)[:third] for k in _ROWS}), 0.0, lane.length_m)
     assert tally.coverage == pytest.approx(1 / 3, abs=0.05)
@@ -37,7 +40,7 @@ def test_errors_of_a_path_at_a_known_distance(lane: TrueLane) -> None:
     assert (refused.coverage, refused.refused) == (0.0, 1)
 
 
-_ROWS = ("station_m", "position_enu_m", "lon_deg", "lat_deg", "curvature_1pm", "confidence")
+_ROWS = ("station_m", "position_enu_m", "lon_deg", "lat_deg", "curvature_1pm", "confidence", "sigma_m")
 
 
 def test_paths_beat_the_drivers_own_track(lane: TrueLane) -> None:

@@ -109,11 +109,22 @@ KINDS: dict[str, Callable[[np.random.Generator], Floats]] = {
 }  # fmt: skip
 
 
-def place_clutter(objects: Iterable[Clutter], road: Road, rng: np.random.Generator) -> tuple[Floats, Floats]:
+Draw = Callable[[Clutter, Road, np.random.Generator], Floats]
+"""From an object on a road to its dipoles in lane coordinates, shape (N, 6): place and moment. [m, A m2]"""
+
+
+def dipole_clutter(thing: Clutter, _road: Road, rng: np.random.Generator) -> Floats:
+    """Dipoles of an object as this module describes it, shape (N, 6). [m, A m2]"""
+    return KINDS[thing.kind](rng)
+
+
+def place_clutter(
+    objects: Iterable[Clutter], road: Road, rng: np.random.Generator, *, draw: Draw = dipole_clutter
+) -> tuple[Floats, Floats]:
     """Dipoles of objects, (N, 6) place and moment in the world, and the chainage of each."""
     rows, chainages = [], []
     for thing in objects:
-        local = KINDS[thing.kind](rng)
+        local = draw(thing, road, rng)
         chainage = thing.chainage_m + local[:, 0]
         world = np.empty_like(local)
         world[:, :2] = road.world_m(chainage, thing.left_m + local[:, 1])

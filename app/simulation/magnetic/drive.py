@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from app.markers.magnet import MOMENT_AM2, Orientation, Polarity
 from app.sensors.magnetometer_bar import MagnetTrace
-from app.simulation.magnetic.clutter import Clutter, place_clutter
+from app.simulation.magnetic.clutter import Clutter, dipole_clutter, place_clutter
+from app.simulation.magnetic.cylinders import Cylinder, cylinder_dipoles
 from app.simulation.magnetic.dipoles import add_static_field
 from app.simulation.magnetic.readout import CanBus, Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, Spread, place_magnets, tag_magnets
+from app.simulation.magnetic.spheroid_clutter import spheroid_clutter
 from app.simulation.magnetic.vehicle import Course, Motion, Vehicle, drive_course, wheel_field_ut
 
 Floats = npt.NDArray[np.float64]
@@ -38,6 +41,10 @@ class Scene:
     clutter : sequence of Clutter
     wrong_way : bool
         Driven against the direction of legal travel: chainages then count along the drive, and tags are met backwards.
+    magnet_shape : Cylinder or None
+        Size of the magnets; None for point dipoles.
+    spheroid_iron : bool
+        Clutter of spheroids that the earth's field magnetises (`spheroid_clutter`) in place of dipoles.
     """
 
     road: Road
@@ -52,6 +59,8 @@ class Scene:
     wrong_way: bool = False
     earth_ut: tuple[float, float, float] = EARTH_UT
     moment_am2: float = MOMENT_AM2
+    magnet_shape: Cylinder | None = None
+    spheroid_iron: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,16 +113,20 @@ def simulate_drive(scene: Scene, rng: np.random.Generator) -> SimulatedDrive:
     motion = drive_course(scene.course, scene.vehicle, road.length_m, rng)
     yaw = road.yaw_rad(motion.chainage_m) + motion.slip_rad
     dipoles, at = place_magnets(magnets, road, scene.spread, rng, moment_am2=scene.moment_am2)
-    iron, iron_at = place_clutter(scene.clutter, road, rng)
+    sources, sources_at = dipoles, at
+    if scene.magnet_shape is not None:
+        sources, sources_at = cylinder_dipoles(dipoles, at, scene.magnet_shape)
+    draw = partial(spheroid_clutter, earth_ut=scene.earth_ut) if scene.spheroid_iron else dipole_clutter
+    iron, iron_at = place_clutter(scene.clutter, road, rng, draw=draw)
     t = scene.chip.sample_times_s(motion.t_s[-1] - 0.05, rng)
     sensors = scene.vehicle.bar.sensor_count
-    chip_axes = scene.chip.axes(sensors, rng)
+    chip_axes = scene.chip.mixed_axes(scene.chip.axes(sensors, rng), rng)
     soft = np.eye(3) + rng.normal(0, scene.chip.soft_iron, (sensors, 3, 3))
     yaw_rate = np.gradient(yaw, motion.t_s)
-    axis_t = t[:, None] + np.array(scene.chip.axis_delay_s)
+    axis_t = scene.chip.true_times_s(t, rng)[:, None] + np.array(scene.chip.axis_delay_s)
     out = wheel_field_ut(scene.vehicle, motion, yaw_rate, axis_t, rng)
     out = np.einsum("saj,tsj->tsa", chip_axes, out) if out.any() else out
-    order, iron_order = np.argsort(at), np.argsort(iron_at)
+    order, iron_order = np.argsort(sources_at), np.argsort(iron_at)
     earth = np.array(scene.earth_ut)
     for start in range(0, len(t), _BLOCK):
         stop = min(start + _BLOCK, len(t))
@@ -122,7 +135,7 @@ def simulate_drive(scene: Scene, rng: np.random.Generator) -> SimulatedDrive:
             sensed = np.einsum("sj,tkj->tsk", chip_axes[:, axis], turn)  # the sensor's axis in the world
             through = np.einsum("sj,sjk,tlk->tsl", chip_axes[:, axis], soft, turn)
             part = through @ earth
-            add_static_field(part, points, sensed, along, dipoles[order], at[order], _REACH_M)
+            add_static_field(part, points, sensed, along, sources[order], sources_at[order], _REACH_M)
             add_static_field(part, points, sensed, along, iron[iron_order], iron_at[iron_order], _FAR_M)
             out[start:stop, :, axis] += part
     speed_t, speed = scene.can.speed(motion.t_s, motion.speed_m_s)

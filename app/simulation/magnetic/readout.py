@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,18 @@ class Chip:
         Spread of the interval, share of it; one in a thousand is three times as long.
     stale, spikes : float
         Odds that a sensor repeats its last sample, or sends one that is far off.
+    range_ut : float
+        Largest field that an axis shows, its offset included: stronger ones saturate. [uT]
+    cross_axis, gain_error : float
+        Spread of the entries beside and on the diagonal of a 3x3 matrix about the identity, which mixes the axes of
+        each sensor after `gain` and `misalignment_deg`.
+    stamp_jitter_s : float
+        Spread of the true times of samples about the recorded ones. [s]
+
+    Notes
+    -----
+    The last four are off by default. They draw from a generator of their own, spawned from the drive's, so that all
+    else in a drive stays the same with and without them.
     """
 
     rate_hz: float = 350.0
@@ -42,6 +55,10 @@ class Chip:
     jitter: float = 0.03
     stale: float = 1e-3
     spikes: float = 2e-4
+    range_ut: float = math.inf
+    cross_axis: float = 0.0
+    gain_error: float = 0.0
+    stamp_jitter_s: float = 0.0
 
     def sample_times_s(self, end_s: float, rng: np.random.Generator) -> Floats:
         """Times of the samples from 0 to the end."""
@@ -58,12 +75,29 @@ class Chip:
         scaled: Floats = turned * (1 + rng.normal(0, self.gain, (sensors, 3, 1)))
         return scaled
 
+    def mixed_axes(self, axes: Floats, rng: np.random.Generator) -> Floats:
+        """Axes of shape (S, 3, 3) mixed by each sensor's cross-axis sensitivity and gain errors."""
+        if not self.cross_axis and not self.gain_error:
+            return axes
+        spread = self.cross_axis + (self.gain_error - self.cross_axis) * np.eye(3)
+        matrix = np.eye(3) + rng.spawn(1)[0].normal(0, 1, axes.shape) * spread
+        mixed: Floats = matrix @ axes
+        return mixed
+
+    def true_times_s(self, t_s: Floats, rng: np.random.Generator) -> Floats:
+        """When samples were really taken, from their recorded times, shape (T,). [s]"""
+        if not self.stamp_jitter_s:
+            return t_s
+        return np.asarray(t_s + rng.spawn(1)[0].normal(0, self.stamp_jitter_s, len(t_s)))
+
     def read(self, field_ut: Floats, rng: np.random.Generator) -> npt.NDArray[np.float32]:
         """What is sent, from the field along each axis: offset, noise, counts, stale and spiked samples. [uT]"""
         shape = field_ut.shape
         out = field_ut + rng.normal(0, self.offset_ut, shape[1:])
         for axis in range(3):
             out[:, :, axis] += rng.standard_normal(shape[:2], np.float32) * self.noise_ut[axis]
+            if math.isfinite(self.range_ut):
+                np.clip(out[:, :, axis], -self.range_ut, self.range_ut, out=out[:, :, axis])
             if count := self.count_ut[axis]:
                 out[:, :, axis] = np.round(out[:, :, axis] / count) * count
         spiked = np.argwhere(rng.random(shape[:2], np.float32) < self.spikes)

@@ -22,12 +22,12 @@ from app.simulation.radio.link import (
     send_beacons,
 )
 from app.simulation.radio.markers import InstalledMarkers
+from app.simulation.radio.propagation import ANTENNA_M
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Sign = Callable[[CerpmMessage], bytes]
 
-ANTENNA_M = 1.5  # [m] height of the antenna above the road; source: assumed, the roof of a car
 _SNR_LIMITS_DB = (-20.0, 12.0)  # [dB] source: range that LoRa receivers report
 _SNR_SD_DB = 0.5  # [dB] of a reported SNR; source: assumed, no measurement kept
 
@@ -50,6 +50,8 @@ class SimulatedDrive:
         Distance of each transmission from the vehicle, and strength at its receiver. [m, dBm]
     sender : ndarray of int, shape (len(packets),)
         Index of the installed marker that sent each packet.
+    transmission : ndarray of int, shape (len(packets),)
+        Index of each packet in `sent`.
     """
 
     packets: tuple[ReceivedPacket, ...]
@@ -59,6 +61,7 @@ class SimulatedDrive:
     distance_m: Floats
     strength_dbm: Floats
     sender: Ints = field(default_factory=lambda: np.zeros(0, int))
+    transmission: Ints = field(default_factory=lambda: np.zeros(0, int))
 
 
 def drive_past(
@@ -103,9 +106,15 @@ def drive_past(
         len(markers), radio, float(drive.time_s[0]), float(drive.time_s[-1]), rng, first_sequence=first_sequence
     )
     at = np.stack([np.interp(sent.start_s, drive.time_s, drive.point_m[:, k]) for k in range(2)], 1)
-    distance = np.hypot(np.linalg.norm(at - markers.point_m[sent.sender], axis=1), ANTENNA_M)
+    across_m = markers.point_m[sent.sender] - at
+    ground = np.linalg.norm(across_m, axis=1)
+    distance = np.hypot(ground, ANTENNA_M)
     travelled = np.interp(sent.start_s, drive.time_s, drive.chainage_m)
-    strength = mean_rssi_dbm(distance) + draw_shadows_db(sent.sender, travelled, radio, rng)
+    mean = mean_rssi_dbm(distance) if radio.two_ray is None else radio.two_ray.mean_rssi_dbm(ground)
+    if radio.antenna_pattern is not None:
+        yaw = np.interp(sent.start_s, drive.time_s, drive.yaw_rad)
+        mean = mean + radio.antenna_pattern.gain_db(np.degrees(np.arctan2(across_m[:, 1], across_m[:, 0]) - yaw))
+    strength = mean + draw_shadows_db(sent.sender, travelled, radio, rng)
     strength = strength + rng.normal(0, radio.fading_sd_db, len(strength))
     received = np.flatnonzero(receive_transmissions(sent.start_s, strength, radio, rng))
     snr = np.clip(strength[received] - radio.noise_dbm + rng.normal(0, _SNR_SD_DB, len(received)), *_SNR_LIMITS_DB)
@@ -113,7 +122,7 @@ def drive_past(
         _packet(entry, markers, sent, int(k), radio, sign, float(strength[k]), float(snr[entry]))
         for entry, k in enumerate(received)
     )
-    return SimulatedDrive(packets, track, drive, sent, distance, strength, sent.sender[received])
+    return SimulatedDrive(packets, track, drive, sent, distance, strength, sent.sender[received], received)
 
 
 def _packet(

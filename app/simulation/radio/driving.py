@@ -50,6 +50,39 @@ class Driver:
 
 
 @dataclass(frozen=True, slots=True)
+class Multipath:
+    """Errors by reflected signals: coloured noise, and steps when a reflection appears and when it goes.
+
+    Attributes
+    ----------
+    sd_m, time_s : float
+        Coloured noise of each axis: standard deviation and time constant. [m, s]
+    step_sd_m : float
+        Of a step, each axis. [m]
+    steps_per_min, step_time_s : float
+        Reflections that appear in a minute, and how long one lasts on average. [1/min, s]
+
+    Raises
+    ------
+    InvalidParameter
+        A value is negative, or a time is below 0.1 s.
+    """
+
+    sd_m: float = 0.05  # [m] source: Groves, Principles of GNSS, 2nd ed. 2013, 9.3: a quarter of a wavelength at most
+    time_s: float = 3.0  # [s] source: assumed; multipath of a moving receiver changes within seconds
+    step_sd_m: float = 0.3  # [m] source: assumed, a few decimetres
+    steps_per_min: float = 3.0  # [1/min] source: assumed
+    step_time_s: float = 6.0  # [s] source: assumed, 70 m of driving beside a reflecting wall or vehicle
+
+    def __post_init__(self) -> None:
+        lowest = min(self.sd_m, self.step_sd_m, self.steps_per_min, self.time_s - 0.1, self.step_time_s - 0.1)
+        if not lowest >= 0:
+            raise InvalidParameter(
+                "multipath with a negative value", field="receiver.multipath", limit="0 or more; times from 0.1 s"
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class SatelliteReceiver:
     """A satellite receiver: errors of each axis.
 
@@ -67,6 +100,8 @@ class SatelliteReceiver:
         Rate of fixes. [Hz]
     lost : float
         Share of fixes that are missing.
+    multipath : Multipath or None
+        Further errors, which the reported accuracy does not know.
     """
 
     white_sd_m: float
@@ -76,6 +111,7 @@ class SatelliteReceiver:
     reported_accuracy_m: float
     rate_hz: float = 10.0
     lost: float = 0.01
+    multipath: Multipath | None = None
 
     @classmethod
     def rtk(cls, rate_hz: float = 20.0) -> SatelliteReceiver:
@@ -177,11 +213,41 @@ def observe_track(lane: TrueLane, drive: Drive, receiver: SatelliteReceiver, rng
     since = drive.time_s - drive.time_s[0]
     at = np.stack([np.interp(when, since, drive.point_m[:, k]) for k in range(2)], 1)
     at = at + slow[:, :2] * receiver.slow_sd_m + rng.normal(0, 1, (len(ticks), 2)) * receiver.white_sd_m
+    if receiver.multipath is not None:  # from a generator of its own, so that all else stays the same
+        at = at + draw_multipath_m(receiver.multipath, when, rng.spawn(1)[0])
     yaw_error = (slow[:, 2] + rng.normal(0, math.sqrt(3), len(ticks))) / 2 * receiver.heading_sd_deg
     heading = (90.0 - np.degrees(np.interp(when, since, drive.yaw_rad)) + yaw_error) % 360.0
     lon, lat = lane.wgs84_from_enu(at[kept])
     accuracy = np.full(int(kept.sum()), receiver.reported_accuracy_m)
     return PoseTrack(drive.time_s[0] + when[kept], lon, lat, heading[kept], accuracy)
+
+
+def draw_multipath_m(multipath: Multipath, time_s: Floats, rng: np.random.Generator) -> Floats:
+    """Errors of positions by reflected signals, east and north, shape (T, 2). [m]
+
+    Parameters
+    ----------
+    multipath : Multipath
+    time_s : ndarray, shape (T,)
+        Rising, nearly evenly; T is 2 or more. [s]
+    rng : numpy.random.Generator
+
+    Notes
+    -----
+    The coloured noise is a critically damped Gauss-Markov process of second order (Gelb, Applied Optimal Estimation,
+    1974, table 2.2-1), whose rate of change is finite. Steps begin as a Poisson process, last for exponential times and
+    add up; some have begun before the first fix.
+    """
+    step_s = float(np.mean(np.diff(time_s)))
+    noise = np.stack([matern_noise(len(time_s), step_s, multipath.time_s, rng) for _ in range(2)], 1)
+    error = multipath.sd_m * noise
+    begin, end = float(time_s[0]) - 5 * multipath.step_time_s, float(time_s[-1])
+    count = rng.poisson(multipath.steps_per_min * (end - begin) / 60)
+    starts = rng.uniform(begin, end, count)
+    ends = starts + rng.exponential(multipath.step_time_s, count)
+    for start, stop, step_m in zip(starts, ends, rng.normal(0, multipath.step_sd_m, (count, 2)), strict=True):
+        error[(time_s >= start) & (time_s < stop)] += step_m
+    return np.asarray(error)
 
 
 def ornstein_noise(count: int, step_s: float, time_s: float, rng: np.random.Generator, rows: int = 1) -> Floats:

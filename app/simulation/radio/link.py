@@ -12,6 +12,7 @@ from app.errors import InvalidParameter
 from app.markers.cerpm import MESSAGE_BYTES
 from app.radio.airtime import check_modulation, symbol_time_s, time_on_air_s
 from app.radio.link import LinkModel, sensitivity_dbm
+from app.simulation.radio.propagation import AntennaPattern, TwoRay
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -46,6 +47,10 @@ class Radio:
         Of shadowing, and its correlation length along the vehicle's way (Gudmundson 1991). [dB, m]
     fading_sd_db : float
         Of fading from packet to packet. [dB]
+    two_ray : TwoRay or None
+        Mean strength by two rays; None for log-distance.
+    antenna_pattern : AntennaPattern or None
+        Of the vehicle's antenna; None if it is alike in all directions.
     """
 
     spreading_factor: int = 7
@@ -59,6 +64,8 @@ class Radio:
     shadow_sd_db: float = 4.0  # [dB] source: assumed, no measurement kept
     shadow_length_m: float = 25.0  # [m] source: assumed, no measurement kept
     fading_sd_db: float = 2.0  # [dB] source: assumed, no measurement kept
+    two_ray: TwoRay | None = None
+    antenna_pattern: AntennaPattern | None = None
 
     def __post_init__(self) -> None:
         check_modulation(self.spreading_factor, self.bandwidth_hz)
