@@ -121,7 +121,7 @@ def evaluate_drive(drive: SchemeDrive) -> list[SchemeRecord]:
     under_stress = drive.set_name == "stress"
     conditions = draw_stress(rng) if under_stress else draw_light(drive.set_name, rng)
     stains = int(rng.integers(1 << 31))
-    places = _draw_places(rng)
+    places = draw_places(rng)
     blank = Face(PlateGeometry().side_mm / 1000, np.zeros((2, 2, 3), np.float32))
     if under_stress:
         views = draw_stress_views(blank, conditions, rng)
@@ -149,7 +149,7 @@ def evaluate_drive(drive: SchemeDrive) -> list[SchemeRecord]:
     return records
 
 
-def _draw_places(rng: np.random.Generator) -> list[tuple[float, float, int]]:
+def draw_places(rng: np.random.Generator) -> list[tuple[float, float, int]]:
     """Longitude, latitude [deg] and number of a plate and of its neighbours."""
     lon, lat, number = float(rng.uniform(-180, 180)), float(rng.uniform(-85, 85)), int(rng.integers(1 << 32))
     moves = rng.uniform(-0.005, 0.005, (2, NEIGHBOURS - 1))
