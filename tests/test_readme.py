@@ -102,6 +102,7 @@ def test_blocks_from_a_short_mode_are_marked() -> None:
 
 def test_every_benchmark_has_its_block() -> None:
     from benchmarks.cerpm.__main__ import ITEMS as CERPM
+    from benchmarks.hunt.families import FAMILIES as HUNTED
     from benchmarks.magnets.__main__ import ITEMS as MAGNETS
     from benchmarks.planning.__main__ import RUNS as PLANNING
     from benchmarks.plates.__main__ import ITEMS as PLATES
@@ -113,7 +114,8 @@ def test_every_benchmark_has_its_block() -> None:
     registry = [f"registry-{item}" for item in ("boxes", "tiles", "searches", "growth")]
     service = [f"service-{part}" for part in SERVICE]
     planning = [f"planning-{item}" for item in ("run", *PLANNING)]
-    blocks = ["demo", "run", *PLATES, *magnets, *cerpm, *imports, *registry, *planning, *service]
+    hunts = [f"hunt-{family}" for family in HUNTED]
+    blocks = ["demo", "run", *hunts, *PLATES, *magnets, *cerpm, *imports, *registry, *planning, *service]
     blocks += ["bundle", "http", "video", "track", "health"]
     filled = [name for page in PAGES for name in re.findall(r"<!-- bench:([\w-]+) -->", page.read_text())]
     assert sorted(filled) == sorted(blocks)

@@ -30,7 +30,7 @@ def tone(radiance: FloatArray, sensor: Sensor) -> FloatArray:
     knee = sensor.shoulder
     x = np.clip(radiance, 0, None)
     if knee < 1:
-        x = np.where(x > knee, knee + (1 - knee) * (1 - np.exp(-(x - knee) / (1 - knee))), x)
+        x = np.where(x > knee, knee + (1 - knee) * (1 - np.exp(-np.maximum(x - knee, 0) / (1 - knee))), x)
     x = np.minimum(x, 1)
     toe = 0.0031308
     encoded = np.where(x <= toe, 12.92 * x, 1.055 * np.power(np.maximum(x, toe), 1 / (sensor.gamma + 0.2)) - 0.055)

@@ -55,7 +55,9 @@ class Bound:
         return self.low + share * (self.high - self.low)
 
     def share(self, value: float) -> float:
-        """Inverse of `at`."""
+        """Inverse of `at`; a simple value outside of the bounds lies before or after them."""
+        if not self.low <= value <= self.high:
+            return -0.2 if value < self.low else 1.2
         if self.logarithmic:
             return math.log(value / self.low) / math.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)

@@ -26,7 +26,7 @@ def shrink(family: Family, scene: Scene, order: Sequence[str]) -> Scene:
         if value == bound.simple:
             continue
         simpler = _try(family, best, name, bound.simple)
-        if simpler is None and not bound.whole:
+        if simpler is None and not bound.whole and bound.low <= bound.simple <= bound.high:
             near, far = bound.share(value), bound.share(bound.simple)
             for _ in range(_HALVINGS):
                 middle = (near + far) / 2
