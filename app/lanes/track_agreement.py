@@ -19,6 +19,7 @@ from app.lanes.types import Floats, Lane, TrackAgreement
 from app.sensors.pose_track import PoseTrack
 
 _SPACING_M = 3.0  # [m] between fixes that are compared; source: `driven_line._POINT_SPACING_M`
+_MAX_STEPS = 5000  # of the track, longer steps on tracks above 15 km; source: by hand, bounds the time
 _MIN_FIXES, _MIN_LENGTH_M = 10, 30.0  # fixes, and the length of track, without which nothing is compared; by hand
 _MAX_BESIDE_M = 500.0  # [m] fixes further from the path are of another road; source: by hand, above a datum's shift
 _OFFSET_SD_M = 0.25  # [m] of a driver's usual offset; source: by hand, the upper bound of `benchmarks.hunt.cerpm`
@@ -63,11 +64,14 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
     priors, and repeated until the places do not move. Wander is correlated over 30 m, so fixes count less. The
     receiver's accuracy, which a slow error takes up whole, is added to what the geometry leaves open.
     """
-    if not len(lane.station_m) or np.isnan(lane.curvature_1pm).any():
+    if not len(lane.station_m) or np.isnan(lane.curvature_1pm).any() or (np.abs(track.lat_deg) > 90).any():
         return None
-    fixes = _thinned(plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg)))
+    fixes, spacing_m = _thinned(
+        plane_from_wgs84(track.lon_deg, track.lat_deg, (lane.origin_lon_deg, lane.origin_lat_deg))
+    )
     stated = track.accuracy_m[np.isfinite(track.accuracy_m)]
-    accuracy = _OPTIMISM * float(np.median(stated)) if len(stated) else _UNKNOWN_ACCURACY_M
+    accuracy = _OPTIMISM * max(float(np.median(stated)), 0.0) if len(stated) else _UNKNOWN_ACCURACY_M
+    wander = math.hypot(_WANDER_SD_M, _SLOW_SHARE * accuracy) * math.sqrt(max(2 * _WANDER_LENGTH_M / spacing_m, 1.0))
     tree = scipy.spatial.cKDTree(lane.position_enu_m)
     fixes = fixes[np.asarray(tree.query(fixes)[0]) < _MAX_BESIDE_M]
     if len(fixes) < _MIN_FIXES:
@@ -78,20 +82,21 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
         compared = _beside(lane, tree, fixes, moved)
         if len(compared.fix_m) < _MIN_FIXES or lengths_along(compared.fix_m)[-1] < _MIN_LENGTH_M:
             return None
-        values, covariance = _solve(compared, middle, values, math.hypot(_WANDER_SD_M, _SLOW_SHARE * accuracy))
+        values, covariance = _solve(compared, middle, values, wander)
         if np.abs(_transformed(fixes, middle, values) - moved).max() < _CONVERGED_M:
             break
     return _agreement(compared, middle, values, covariance, accuracy)
 
 
-def _thinned(fixes_m: Floats) -> Floats:
-    """Mean fixes of steps along the track, so that a vehicle that stands counts once."""
+def _thinned(fixes_m: Floats) -> tuple[Floats, float]:
+    """Mean fixes of steps along the track, so that a vehicle that stands counts once; and the length of a step. [m]"""
     fixes = fixes_m[np.isfinite(fixes_m).all(1)]
     if len(fixes) < 2:
-        return fixes
-    step = (lengths_along(fixes) / _SPACING_M).astype(np.int64)
-    _, which, count = np.unique(step, return_inverse=True, return_counts=True)
-    return np.stack([np.bincount(which, fixes[:, k]) / count for k in range(2)], 1)
+        return fixes, _SPACING_M
+    along = lengths_along(fixes)
+    spacing_m = max(_SPACING_M, float(along[-1]) / _MAX_STEPS)
+    _, which, count = np.unique((along / spacing_m).astype(np.int64), return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(which, fixes[:, k]) / count for k in range(2)], 1), spacing_m
 
 
 def _transformed(fixes_m: Floats, middle_m: Floats, values: Floats) -> Floats:
@@ -110,17 +115,19 @@ def _beside(lane: Lane, tree: scipy.spatial.cKDTree, fixes_m: Floats, moved_m: F
     return _Compared(fixes_m[keep], lane.position_enu_m[at], normal, lane.curvature_1pm[at])
 
 
-def _solve(compared: _Compared, middle_m: Floats, values: Floats, wander_sd_m: float) -> tuple[Floats, Floats]:
-    """The six unknowns and their covariance: shift, turn, scale, the driver's offset, cut of bends."""
+def _solve(compared: _Compared, middle_m: Floats, values: Floats, noise_m: float) -> tuple[Floats, Floats]:
+    """The six unknowns and their covariance: shift, turn, scale, the driver's offset, cut of bends.
+
+    The noise is that of a fix as if fixes were independent.
+    """
     q, p, n, bend = compared
     from_middle = q - middle_m
     turned = np.stack([-from_middle[:, 1], from_middle[:, 0]], 1)
     rows = np.column_stack([n, np.sum(n * turned, 1), np.sum(n * from_middle, 1), -np.ones(len(q)), -bend])
     wanted = np.sum(n * (p - q), 1)
     residual = np.abs(wanted - rows @ values)
-    spread = max(wander_sd_m, 1.4826 * float(np.median(residual)))
-    weight = np.minimum(1.0, _OUTLIER_SIGMAS * spread / np.maximum(residual, 1e-9))
-    weight /= wander_sd_m**2 * 2 * _WANDER_LENGTH_M / _SPACING_M
+    spread = max(_WANDER_SD_M, 1.4826 * float(np.median(residual)))
+    weight = np.minimum(1.0, _OUTLIER_SIGMAS * spread / np.maximum(residual, 1e-9)) / noise_m**2
     prior = np.array([_SHIFT_SD_M, _SHIFT_SD_M, _TURN_SD, _SCALE_SD, _OFFSET_SD_M, _CUT_M2]) ** -2.0
     covariance = np.linalg.inv(rows.T @ (weight[:, None] * rows) + np.diag(prior))
     return covariance @ (rows.T @ (weight * wanted)), covariance

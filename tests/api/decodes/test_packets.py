@@ -469,7 +469,7 @@ def test_markers_that_are_all_shifted_against_the_track_do_not_localize(road: tu
     client, built = road
     heard, _hour = drive(built, 1926)
     shifted = replace(
-        heard, track=replace(heard.track, lon_deg=heard.track.lon_deg - 2.5e-5, lat_deg=heard.track.lat_deg + 1.4e-5)
+        heard, track=replace(heard.track, lon_deg=heard.track.lon_deg - 4e-5, lat_deg=heard.track.lat_deg + 2.4e-5)
     )
     found = decoded(client, packed(shifted))
     agreement = found["lane"]["track_agreement"]
