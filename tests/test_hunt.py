@@ -56,7 +56,7 @@ class Steep:
         return Outcome(Kind.WRONG if steep else Kind.RIGHT, parameters["slope"])
 
     def draw(self, parameters: Parameters, seed: int, path: Path) -> None:
-        raise NotImplementedError
+        path.write_text(f"{parameters} {seed}")
 
 
 def steep_scenes() -> list[Scene]:

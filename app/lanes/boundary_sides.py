@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -80,18 +81,20 @@ def assign_sides(station_m: Floats, left_m: Floats, named: Ints, *, wander: floa
     widths = np.array(_WIDTHS_M)
     grid = np.arange(-_GRID_HALF_M, _GRID_HALF_M + _GRID_STEP_M / 2, _GRID_STEP_M)
     offset, label = left_m[order], named[order]
-    errors = _errors_of(offset[:, None, None] - grid, label[:, None, None], widths[:, None])
-    unary = np.minimum(np.minimum(errors.left_cost, errors.right_cost), _OUTLIER_COST)
-    if near_track:
-        unary = unary + _TRACK_COST * grid**2
-    state, width = _cheapest_course(unary, grid, widths, np.diff(station_m[order]), wander)
+    base = _TRACK_COST * grid**2 if near_track else np.zeros(len(grid))
+
+    def cost(marker: int) -> Floats:
+        errors = _errors_of(offset[marker] - grid, label[marker], widths[:, None])
+        return np.minimum(np.minimum(errors.left_cost, errors.right_cost), _OUTLIER_COST) + base
+
+    state, width = _cheapest_course(cost, grid, widths, np.diff(station_m[order]), wander)
     found = _assign_beside(offset - grid[state], label, widths[width])
     back = np.empty(len(order), np.int64)
     back[order] = np.arange(len(order))
     return SideAssignment(found.side[back], found.off_m[back], found.contradicts[back], found.width_m)
 
 
-def _errors_of(from_centre_m: Floats, label: Ints, width_m: Floats | float) -> _BoundaryErrors:
+def _errors_of(from_centre_m: Floats, label: Ints | np.int64, width_m: Floats | float) -> _BoundaryErrors:
     """Distances of markers from both boundaries of a lane, and the cost of each assignment."""
     left, right = from_centre_m - width_m / 2, from_centre_m + width_m / 2
     left_cost = (left / _MARKER_SIGMA_M) ** 2 + np.where(label == RIGHT, _WRONG_SIDE_COST, 0)
@@ -126,27 +129,27 @@ def _obvious_sides(left_m: Floats, named: Ints) -> SideAssignment | None:
 
 
 def _cheapest_course(
-    unary: Floats, grid: Floats, widths_m: Floats, ahead_m: Floats, wander: float
+    cost: Callable[[int], Floats], grid: Floats, widths_m: Floats, ahead_m: Floats, wander: float
 ) -> tuple[Ints, Ints]:
     """Cheapest course through the grid (Viterbi algorithm): indices of the offset and of the width at each marker.
 
     Parameters
     ----------
-    unary : ndarray, shape (K, W, G)
-        Cost of each marker by width and offset.
-    grid : ndarray, shape (G,)
+    cost : callable
+        Cost of a marker by width and offset, shape (W, G).
+    grid, widths_m : ndarray, shape (G,) and (W,)
         [m]
     ahead_m : ndarray, shape (K - 1,)
         From each marker to the next. [m]
     wander : float
         As in `assign_sides`.
     """
-    count, kinds, size = unary.shape
+    count, kinds, size = len(ahead_m) + 1, len(widths_m), len(grid)
     square = (grid[:, None] - grid) ** 2 / 2
     opening = _OPENING_COST * np.abs(widths_m[:, None] - widths_m)
-    came_offset = np.empty((count, kinds, size), np.int16)
-    came_width = np.empty((count, kinds, size), np.int16)
-    total = unary[0]
+    came_offset = np.empty((count, kinds, size), np.int8)
+    came_width = np.empty((count, kinds, size), np.int8)
+    total = cost(0)
     for i in range(1, count):
         move = np.minimum(square / (wander**2 * max(ahead_m[i - 1], 1.0)), 2 * _OUTLIER_COST)
         sums = total[:, None, :] + move
@@ -154,7 +157,7 @@ def _cheapest_course(
         moved = np.take_along_axis(sums, came_offset[i][:, :, None].astype(np.int64), 2)[:, :, 0]
         opened = moved[None] + opening[:, :, None]
         came_width[i] = opened.argmin(1)
-        total = np.take_along_axis(opened, came_width[i][:, None].astype(np.int64), 1)[:, 0] + unary[i]
+        total = np.take_along_axis(opened, came_width[i][:, None].astype(np.int64), 1)[:, 0] + cost(i)
     width, state = np.empty(count, np.int64), np.empty(count, np.int64)
     width[-1], state[-1] = np.unravel_index(int(total.argmin()), total.shape)
     for i in range(count - 1, 0, -1):

@@ -20,7 +20,7 @@ from app.lanes.least_squares import (
     OffsetModel,
     choose_hyperparameters,
 )
-from app.lanes.marker_pairs import find_pairs
+from app.lanes.marker_pairs import find_pairs, nearest_sorted
 from app.lanes.observations import LaneObservations
 from app.lanes.smooth_line import SmoothLine, lengths_along
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints, LaneRules, LeftOutReason, Notes
@@ -236,8 +236,9 @@ def _share_agreeing(station: Floats, left: Floats, named: Ints) -> float:
     """
     on_left, on_right = np.flatnonzero(named == LEFT), np.flatnonzero(named == RIGHT)
     if min(len(on_left), len(on_right)) >= _MIN_SIDED_MARKERS:
-        beside = np.abs(station[on_left, None] - station[on_right]).argmin(1)
-        return float(np.mean(left[on_left] > left[on_right[beside]]))
+        on_right = on_right[np.argsort(station[on_right])]
+        beside = on_right[nearest_sorted(station[on_right], station[on_left])]
+        return float(np.mean(left[on_left] > left[beside]))
     nearest, farthest = _SIDE_OFFSETS_M
     clear = (named != UNKNOWN) & (np.abs(left) > nearest) & (np.abs(left) < farthest)
     if clear.sum() < _MIN_SIDED_MARKERS:

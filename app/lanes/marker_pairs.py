@@ -40,8 +40,8 @@ def find_pairs(station_m: Floats, left_m: Floats, side: Ints, sigma_m: Floats) -
     if min(len(left), len(right)) < 2:
         return none
     left, right = left[np.argsort(station_m[left])], right[np.argsort(station_m[right])]
-    across = right[_nearest(station_m[right], station_m[left])]
-    back = left[_nearest(station_m[left], station_m[across])]
+    across = right[nearest_sorted(station_m[right], station_m[left])]
+    back = left[nearest_sorted(station_m[left], station_m[across])]
     mutual = back == left
     spacing = min(float(np.median(np.diff(station_m[chain]))) for chain in (left, right))
     ahead = station_m[left] - station_m[across]
@@ -66,7 +66,7 @@ def _spread_m(ahead_m: Floats) -> float:
     return _MAD_TO_SIGMA * float(np.median(np.abs(ahead_m - np.median(ahead_m))))
 
 
-def _nearest(sorted_m: Floats, wanted_m: Floats) -> Ints:
-    """Index of the nearest of sorted values for each wanted one."""
+def nearest_sorted(sorted_m: Floats, wanted_m: Floats) -> Ints:
+    """Index of the nearest of sorted values, at least two, for each wanted one."""
     above = np.clip(np.searchsorted(sorted_m, wanted_m), 1, len(sorted_m) - 1)
     return np.where(wanted_m - sorted_m[above - 1] <= sorted_m[above] - wanted_m, above - 1, above)

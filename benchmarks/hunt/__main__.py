@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.hunt.clusters import Cluster, find_clusters
 from benchmarks.hunt.families import FAMILIES
-from benchmarks.hunt.kept import evaluate_kept, keep, read_kept
+from benchmarks.hunt.kept import evaluate_kept, keep, read_kept, update_kept
 from benchmarks.hunt.scenes import FAILURES, Family, Kind, Scene, describe
 from benchmarks.hunt.search import search
 from benchmarks.hunt.shrink import shrink
@@ -35,11 +35,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="of the first scene; scenes have consecutive seeds")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the shrunk scenes")
-    parser.add_argument("--keep", action="store_true", help="add the shrunk scenes to the kept ones")
+    parser.add_argument(
+        "--keep",
+        action="store_true",
+        help="add the shrunk scenes to the kept ones; with --kept, write how they end now",
+    )
     parser.add_argument("--kept", action="store_true", help="evaluate the kept scenes instead")
     args = parser.parse_args()
     if args.kept:
         _print_kept(args.family)
+        if args.keep:
+            update_kept(args.family)
         return
     family, start = FAMILIES[args.family], time.monotonic()
     scenes = search(args.family, args.seed, minutes=args.minutes, processes=args.processes, most=args.scenes)

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter
+from app.radio.airtime import check_between
 from app.simulation.radio.lanes import STEP_M, Origin, TrueLane, lane_between
 
 Floats = npt.NDArray[np.float64]
@@ -74,14 +75,13 @@ class RoadShape:
         for one in fields(self):
             if not math.isfinite(getattr(self, one.name)):
                 raise InvalidParameter(f"{one.name} is not finite", field=one.name, limit="a finite value")
-        for name, low, high in (
-            ("length_m", 50.0, 5000.0), ("radius_m", 6.0, 1e6), ("second_radius_m", 6.0, 1e6),
-            ("turn_deg", 0.0, 250.0), ("second_turn_deg", 0.0, 250.0), ("clothoid_m", 1.0, 500.0),
-            ("width_m", 2.0, 6.0), ("taper_m", 5.0, 500.0), ("shift_length_m", 5.0, 500.0), ("extra_m", 0.0, 5.0),
-            ("widening_m2", 0.0, 100.0),
+        for name, low, high, unit in (
+            ("length_m", 50.0, 5000.0, "m"), ("radius_m", 6.0, 1e6, "m"), ("second_radius_m", 6.0, 1e6, "m"),
+            ("turn_deg", 0.0, 250.0, "deg"), ("second_turn_deg", 0.0, 250.0, "deg"), ("clothoid_m", 1.0, 500.0, "m"),
+            ("width_m", 2.0, 6.0, "m"), ("taper_m", 5.0, 500.0, "m"), ("shift_length_m", 5.0, 500.0, "m"),
+            ("extra_m", 0.0, 5.0, "m"), ("widening_m2", 0.0, 100.0, "m2"),
         ):  # fmt: skip
-            if not low <= getattr(self, name) <= high:
-                raise InvalidParameter(f"{name} is {getattr(self, name):g}", field=name, limit=f"{low:g} to {high:g}")
+            check_between(name, getattr(self, name), low, high, unit)
 
 
 def lane_of_shape(shape: RoadShape) -> TrueLane:
