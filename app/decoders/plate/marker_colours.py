@@ -18,6 +18,10 @@ from app.markers.plate import PlateGeometry
 Floats = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 
+LEVEL_QUANTILES = (0.15, 0.85)
+"""Shares of the units below the level of dark ones and of light ones. Source: by hand."""
+MIN_LEVEL_CONTRAST = 0.2
+"""[light units] between both levels, to call a triangle black. Source: by hand."""
 SPOT_PITCH = 0.03
 """[plate sides] between the 3 x 3 points that are sampled on a marker. Source: chosen by hand; half a marker is 0.115
 on 8 x 8, 0.077 on 12 x 12."""
@@ -50,6 +54,11 @@ class MarkerColours:
         Red of the other half of the triangle's cell over the triangle's own: near 1 where the marker is a square.
     beside : float
         The same of the reddest spot beside the plate: above 1 where red spreads from there into a dark corner.
+    paleness : float
+        The lower of blue and red of the palest square, from 0 as of dark units to 1 as of light ones: near 1 where the
+        square is white.
+    triangle_red : float
+        Red of the triangle on the same scale: below 0 where it is black.
     """
 
     margins: Floats
@@ -57,6 +66,8 @@ class MarkerColours:
     cast: Floats
     rest: float = 0.0
     beside: float = 0.0
+    paleness: float = 0.0
+    triangle_red: float = 1.0
 
 
 def red_around_triangle(
@@ -117,13 +128,33 @@ def marker_colours(signal: MarkerSignal, plate_from_image: Floats, centroids: Fl
     sign = np.array([1, -1, -1, -1])
     inside = strength[:spots].reshape(4, -1).mean(axis=1)
     between = strength[spots:]
+    paleness, triangle_red = _between_levels(blue, red, spots)
     # as grey units would look in the same light
     blue, green, red = (
         plane[:spots].reshape(4, -1).mean(axis=1) / c for plane, c in zip((blue, green, red), cast, strict=True)
     )
     tints = np.where(sign > 0, red - np.maximum(green, blue), green - np.maximum(red, blue))
     return MarkerColours(sign * (inside - between.mean()) / (between.std() + 1.0),
-                         tints / max(float(np.sort(tints[1:])[1]), 1.0), cast[[0, 2]])  # fmt: skip
+                         tints / max(float(np.sort(tints[1:])[1]), 1.0), cast[[0, 2]],
+                         paleness=paleness, triangle_red=triangle_red)  # fmt: skip
+
+
+def _between_levels(blue: Floats, red: Floats, spots: int) -> tuple[float, float]:
+    """`MarkerColours.paleness` and `triangle_red`; the latter is 0.5 where the units have no two levels.
+
+    Parameters
+    ----------
+    blue, red : ndarray, shape (points,)
+        At the spots of the markers, then at the units.
+    spots : int
+        Of all markers.
+    """
+    planes = np.stack([blue, red])
+    units = np.sort(planes[:, spots:], axis=1)
+    low, high = (units[:, int(share * (units.shape[1] - 1))] for share in LEVEL_QUANTILES)
+    markers = (planes[:, :spots].reshape(2, 4, -1).mean(axis=2).T - low) / np.maximum(high - low, 1.0)
+    has_levels = high[1] - low[1] > MIN_LEVEL_CONTRAST * high[1]  # an all-light plate has none
+    return float(markers[1:].min(axis=1).max()), float(markers[0, 1]) if has_levels else 0.5
 
 
 class _Signal(NamedTuple):

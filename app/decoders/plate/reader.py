@@ -56,6 +56,13 @@ MAX_BESIDE_ALONE = 1.0
 """[1] red beside the plate over the triangle's, without a registry. Source: 171 plates that were read have at most 0.91
 below 2 px a unit and 0.47 above; a look-alike beside a red sign, whose red spread into its dark corner, has 15 to 50
 (`python -m benchmarks.plates false --sets free --seed 930`)."""
+MAX_PALENESS_ALONE, PALE_MARGIN_ALONE = 0.8, 3.5
+"""[1, standard deviations] `MarkerColours.paleness` above which a square is white unless all margins are larger than
+this, without a registry. Source: 423 plates that were read have at most 0.57, but 0.75 in dapple and 1.05 in glare,
+with margins from 4.7 on; one with a white square on a pink road has 0.91 and 2.2 (set `look-alikes`, seed 3504)."""
+MIN_TRIANGLE_RED_ALONE = -0.4
+"""[1] `MarkerColours.triangle_red` below which the triangle is black. Source: the same plates have -0.24 at least; one
+with a black square in its place has -0.69 (the same, seed 3507)."""
 CAST_ALONE = (0.65, 1.5)
 """[green] blue and red of the units beyond which they are not grey, without a registry. Source: chosen by hand; effect:
 `python -m benchmarks.plates.thresholds`."""
@@ -399,8 +406,12 @@ def wrong_colours(colours: MarkerColours) -> tuple[PlateOutcome, str] | None:
         return PlateOutcome.RED_MARKER_MISSING, "the red spreads from beside the plate"
     if colours.rest > MAX_REST_ALONE:
         return PlateOutcome.RED_MARKER_MISSING, "the red marker is a square, not a triangle"
+    if colours.triangle_red < MIN_TRIANGLE_RED_ALONE:
+        return PlateOutcome.RED_MARKER_MISSING, "the red triangle is as dark as the dark units"
     if pale.any():
         return PlateOutcome.GREEN_MARKER_MISSING, "a green square is hardly green"
+    if colours.paleness > MAX_PALENESS_ALONE and colours.margins.min() < PALE_MARGIN_ALONE:
+        return PlateOutcome.GREEN_MARKER_MISSING, "a green square is as light as the light units"
     if colours.cast.min() < CAST_ALONE[0] or colours.cast.max() > CAST_ALONE[1]:
         return PlateOutcome.CELLS_UNDECODABLE, "the units are coloured"
     return None

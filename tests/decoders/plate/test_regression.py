@@ -47,6 +47,8 @@ def test_hard_frames_are_never_read_wrong(name: str, frames: int) -> None:
         ("look-alikes", 14, 2711, 21, PlateOutcome.RED_MARKER_MISSING),  # a red fringe on a dark corner
         ("look-alikes", 16, 2712, 17, PlateOutcome.RED_MARKER_MISSING),  # the same
         ("look-alikes", 26, 2712, 16, PlateOutcome.GREEN_MARKER_MISSING),  # two green corners and a white one
+        ("look-alikes", 39, 3504, 1, PlateOutcome.GREEN_MARKER_MISSING),  # the same on an overexposed pink road
+        ("look-alikes", 6, 3507, 16, PlateOutcome.RED_MARKER_MISSING),  # a black square in place of the triangle
     ],
 )
 def test_a_look_alike_is_not_read(name: str, index: int, seed: int, number: int, outcome: PlateOutcome) -> None:
