@@ -22,6 +22,10 @@ MAX_DELAY_S = 0.01
 """Largest time between a time stamp and the reading of an axis. [s] Source: chosen by hand, over three samples of
 METRO."""
 
+MIN_CLEARANCE_M, MAX_CLEARANCE_M = 0.1, 0.6
+"""Clearances that can be declared. [m] Source: as those that are estimated, `app.decoders.magnet.magnet_state`, less
+room for the load."""
+
 
 class SensorRole(StrEnum):
     """What a magnetometer is there for."""
@@ -38,14 +42,15 @@ class MagnetometerBar:
     ----------
     positions_m : array_like, shape (S, 3)
         In the vehicle frame (ISO 8855: x forward, y left, z up). The origin is the point that moves along the heading
-        (the middle of the rear axle; the bar itself if it is not known). Only differences of z count: the clearance
-        is not declared. [m]
+        (the middle of the rear axle; the bar itself if it is not known). Only differences of z count. [m]
     roles : tuple of SensorRole, length S
         Array sensors look for magnets, reference sensors listen to the wheels.
     vehicle_from_sensor : ndarray, shape (S, 3, 3)
         Rotation of each chip; the identity if left out.
     axis_delay_s : tuple of float
         Times after the time stamp at which x, y and z are converted. [s]
+    clearance_m : float, optional
+        Of the middle of the array sensors above the road, if it is known. [m]
 
     Raises
     ------
@@ -57,6 +62,7 @@ class MagnetometerBar:
     roles: tuple[SensorRole, ...]
     vehicle_from_sensor: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
     axis_delay_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    clearance_m: float | None = None
 
     def __post_init__(self) -> None:
         positions = np.array(self.positions_m, float)
@@ -91,13 +97,22 @@ class MagnetometerBar:
         delays = tuple(float(d) for d in self.axis_delay_s)
         if len(delays) != 3 or not all(abs(d) <= MAX_DELAY_S for d in delays):
             raise InvalidParameter("three delays", field="bar.axis_delay_s", limit="-0.01 to 0.01 s")
+        if self.clearance_m is not None and not MIN_CLEARANCE_M <= self.clearance_m <= MAX_CLEARANCE_M:
+            raise InvalidParameter(
+                f"the clearance is {self.clearance_m:g} m",
+                field="bar.clearance_m",
+                limit=f"{MIN_CLEARANCE_M:g} to {MAX_CLEARANCE_M:g} m",
+                cure="give the height of the array sensors above the road, or leave it out to have it estimated",
+            )
         object.__setattr__(self, "positions_m", positions)
         object.__setattr__(self, "roles", roles)
         object.__setattr__(self, "vehicle_from_sensor", turns)
         object.__setattr__(self, "axis_delay_s", delays)
 
     @classmethod
-    def metro(cls, *, forward_m: float = 0.0, references: bool = True) -> MagnetometerBar:
+    def metro(
+        cls, *, forward_m: float = 0.0, references: bool = True, clearance_m: float | None = None
+    ) -> MagnetometerBar:
         """METRO's bar: twelve sensors 16 cm apart, and one in each wheel well.
 
         The order is the array's own: 0-5 the left half outwards, 6 the left reference, 7-12 the right half outwards,
@@ -109,13 +124,15 @@ class MagnetometerBar:
             Of the bar, ahead of the point that moves along the heading. [m]
         references : bool
             With the two reference sensors.
+        clearance_m : float, optional
+            Above the road, if it is known. [m]
         """
         half = [(forward_m, 0.08 + 0.16 * i, 0.0) for i in range(6)]
         reference = [(forward_m - 0.62, 0.72, 0.52)] if references else []
         left = half + reference
         positions = np.array(left + [(x, -y, z) for x, y, z in left])
         roles = ([SensorRole.ARRAY] * 6 + [SensorRole.REFERENCE] * len(reference)) * 2
-        return cls(positions, tuple(roles))
+        return cls(positions, tuple(roles), clearance_m=clearance_m)
 
     @property
     def sensor_count(self) -> int:

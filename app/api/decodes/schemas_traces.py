@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 
 from app.api.http.dependencies import Number, Whole
 from app.families.inputs import Flag, StrictModel
-from app.sensors.magnetometer_bar import MAX_SENSORS
+from app.sensors.magnetometer_bar import MAX_CLEARANCE_M, MAX_SENSORS, MIN_CLEARANCE_M
 
 Text = Annotated[str, Field(min_length=1, max_length=120)]
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -28,6 +28,12 @@ class BarIn(StrictModel):
     """The bar of magnetometers; METRO's twelve and two where no sensors are declared."""
 
     forward_m: Number = Field(0.0, ge=-20, le=20, description="Ahead of the point that moves along the heading. [m]")
+    clearance_m: Number | None = Field(
+        None,
+        ge=MIN_CLEARANCE_M,
+        le=MAX_CLEARANCE_M,
+        description="Height of the array sensors above the road; left out, three magnets or more show it. [m]",
+    )
     sensors: list[SensorIn] | None = Field(None, min_length=3, max_length=MAX_SENSORS)
 
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from app.decoders.magnet.assemble import TagAssembler
 from app.decoders.magnet.classify import Classification, Rejected, classify_dipoles, shows_clearance
-from app.decoders.magnet.clearance import ClearanceEstimate
 from app.decoders.magnet.detect_dipoles import DipoleDetector
 from app.decoders.magnet.ferrous import FORGET_M
 from app.decoders.magnet.fit_window import WINDOW_M, Dipole, Region, SensorArray
 from app.decoders.magnet.identify import TagCandidates
+from app.decoders.magnet.magnet_state import MagnetState
 from app.decoders.magnet.matched_filter import (
     BIN_M,
     HALF_BINS,
@@ -72,12 +72,12 @@ class MagnetDecoder:
         Tags that may be on the road.
     moment_am2 : float
         Of the magnets on the road. [A m2]
-    clearance : ClearanceEstimate, optional
-        What is known of the bar's clearance before the trace.
+    state : MagnetState, optional
+        What is known of clearance and moment before the trace; by default what the bar declares.
 
     Attributes
     ----------
-    clearance : ClearanceEstimate
+    state : MagnetState
         With what the magnets so far have shown.
     """
 
@@ -87,7 +87,7 @@ class MagnetDecoder:
         *,
         candidates: TagCandidates | None = None,
         moment_am2: float = MOMENT_AM2,
-        clearance: ClearanceEstimate | None = None,
+        state: MagnetState | None = None,
     ) -> None:
         self.bar = bar
         positions = bar.positions_m[bar.array].copy()
@@ -102,7 +102,7 @@ class MagnetDecoder:
         self._bins = FieldBins(positions)
         self._bank = make_filter_bank(positions)
         self._detector = DipoleDetector(self._bank, self._array)
-        self.clearance = clearance or ClearanceEstimate(moment_am2)
+        self.state = state or MagnetState(moment_am2, bar.clearance_m)
         self._assembler = TagAssembler(candidates or TagCandidates())
         self._variance = np.full((self._bank.taps.size, 3), FIRST_VARIANCE, np.float32)
         self._state = np.zeros(4, np.int64)  # of `scan_bins`
@@ -167,7 +167,7 @@ class MagnetDecoder:
         last = self._next - quiet + REGION_MARGIN_BINS - 1
         self._report_up_to(first * BIN_M, final=False)
         region = self._make_region(first, last)
-        prior = self.clearance.prior
+        prior = self.state.prior
         dipoles = self._detector.detect(self._blocks, region, prior)
         dipoles.sort(key=lambda d: float(d.params[0]))
         classes = classify_dipoles(dipoles, self._before, prior, self._array.half_width_m)
@@ -179,7 +179,7 @@ class MagnetDecoder:
             if isinstance(reading, MagnetReading):
                 self._unplaced.append(reading)
             if shows_clearance(dipole, prior, self._array.half_width_m) and not _is_iron(classification):
-                self.clearance.learn(dipole, prior)
+                self.state.learn(dipole, prior)
         self._assemble()
 
     def _make_region(self, first: int, last: int) -> Region:
@@ -259,13 +259,13 @@ def decode_trace(trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCan
     found: list[Finding] = []
     for chunk in _chunks(trace):
         found += decoder.feed(chunk)
-        if decoder.clearance.is_sure:
+        if decoder.state.is_sure:
             break
     else:
         found += decoder.finish()
-    if not decoder.clearance.is_known:
+    if not decoder.state.is_known:
         return [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, OF_MAGNETS)]
-    decoder = MagnetDecoder(bar, candidates=candidates, clearance=decoder.clearance)
+    decoder = MagnetDecoder(bar, candidates=candidates, state=decoder.state)
     found = [finding for chunk in _chunks(trace) for finding in decoder.feed(chunk)]
     return found + decoder.finish()
 

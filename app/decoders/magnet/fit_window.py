@@ -20,13 +20,6 @@ from app.decoders.magnet.preprocess import Blocks
 
 Floats = npt.NDArray[np.float64]
 
-CLEARANCE_M, CLEARANCE_STD_M = 0.24, 0.12
-"""Clearance that is expected before one was estimated. [m] Source: the middle of the 15 to 35 cm of METRO section 7.3;
-it covers them within a standard deviation."""
-MOMENT_SPREAD = 0.12
-"""Standard deviation of a magnet's moment, share of it. Source: 3 % between magnets
-(`app.simulation.magnetic.road.Spread`) and errors of the gain and of the clearance; chosen by hand, no measurement
-kept."""
 TILT_SPREAD = 0.10
 """Standard deviation of a moment's components across its axis, share of it: 6 degrees. Source: 3 degrees between
 magnets (`Spread`) and the vehicle's pitch and roll; chosen by hand, no measurement kept."""
@@ -93,13 +86,11 @@ class Dipole:
         return self.misfit > MAX_MISFIT or self.prior_cost > MAX_REGION_PRIOR_COST
 
 
-def magnet_prior(
-    moment_am2: float, clearance_m: float = CLEARANCE_M, clearance_std_m: float = CLEARANCE_STD_M
-) -> MagnetPrior:
-    """What magnets of a moment are expected to be like."""
+def magnet_prior(moment_am2: float, moment_spread: float, clearance_m: float, clearance_std_m: float) -> MagnetPrior:
+    """What magnets are expected to be like whose moments differ by a share of their mean."""
     return MagnetPrior(
         moment_am2=moment_am2,
-        moment_std_am2=MOMENT_SPREAD * moment_am2,
+        moment_std_am2=moment_spread * moment_am2,
         clearance_m=clearance_m,
         clearance_std_m=clearance_std_m,
         tilt_std_am2=TILT_SPREAD * moment_am2,

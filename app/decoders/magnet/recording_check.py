@@ -59,6 +59,10 @@ MIRRORED = 2.0
 """[1] amplitude of the field that turns the other way over that of the one that turns as it must. Source: by hand."""
 
 
+CONTRADICTED_M = 0.06
+"""[m] between the declared clearance and that of the magnets. Source: a load lowers a car by up to 5 cm; by hand."""
+
+
 @dataclass(frozen=True, slots=True)
 class LikelyMistake:
     """A declaration that the recording contradicts.
@@ -99,10 +103,26 @@ def find_mistakes(
         Tags that may be on the road.
     """
     mistakes = [mistake] if (mistake := compare_with_earth(trace, bar)) is not None else []
-    magnets = sum(isinstance(one, MagnetReading) and one.confidence > SURE_CONFIDENCE for one in findings)
-    if magnets < MIN_MAGNETS and (mistake := compare_with_dipoles(trace, bar, candidates)) is not None:
+    sure = [one for one in findings if isinstance(one, MagnetReading) and one.confidence > SURE_CONFIDENCE]
+    if len(sure) >= MIN_MAGNETS and (mistake := compare_with_clearance(sure, bar)) is not None:
+        mistakes.append(mistake)
+    if len(sure) < MIN_MAGNETS and (mistake := compare_with_dipoles(trace, bar, candidates)) is not None:
         mistakes.append(mistake)
     return mistakes
+
+
+def compare_with_clearance(magnets: Sequence[MagnetReading], bar: MagnetometerBar) -> LikelyMistake | None:
+    """The declared clearance, if sure magnets lie elsewhere."""
+    if bar.clearance_m is None:
+        return None
+    seen_m = float(np.median([one.clearance_cm for one in magnets])) / 100
+    if abs(seen_m - bar.clearance_m) < CONTRADICTED_M:
+        return None
+    return LikelyMistake(
+        "bar.clearance_m",
+        f"{len(magnets)} magnets lie {100 * seen_m:.0f} cm below the bar, {100 * bar.clearance_m:.0f} cm were declared",
+        f"declare {seen_m:.2f} m, or leave the clearance out",
+    )
 
 
 def compare_with_earth(trace: MagnetTrace, bar: MagnetometerBar) -> LikelyMistake | None:

@@ -168,15 +168,15 @@ def trace_terms(declared: Mapping[str, Any]) -> TraceTerms:
 
 
 def _bar(declared: Mapping[str, Any]) -> MagnetometerBar:
-    forward_m = float(declared.get("forward_m", 0.0))
+    forward_m, clearance_m = float(declared.get("forward_m", 0.0)), declared.get("clearance_m")
     sensors = declared.get("sensors")
     if not sensors:
-        return MagnetometerBar.metro(forward_m=forward_m)
+        return MagnetometerBar.metro(forward_m=forward_m, clearance_m=clearance_m)
     positions = np.array([sensor["position_m"] for sensor in sensors], float)
     positions[:, 0] += forward_m
     turns = [sensor.get("vehicle_from_sensor") or np.eye(3) for sensor in sensors]
     roles = tuple(SensorRole(sensor.get("role", "array")) for sensor in sensors)
-    return MagnetometerBar(positions, roles, np.array(turns, float))
+    return MagnetometerBar(positions, roles, np.array(turns, float), clearance_m=clearance_m)
 
 
 def _declaration(declared: Mapping[str, Any], bar: MagnetometerBar) -> TraceDeclaration:

@@ -12,7 +12,7 @@ from app.decoders.magnet.readings import NoiseKind
 from app.markers.magnet import Orientation, Polarity
 
 HALF_M = 0.88
-PRIOR = magnet_prior(2.47, 0.16, 0.025)
+PRIOR = magnet_prior(2.47, 0.12, 0.16, 0.025)
 
 
 def pole(s_m: float, y_m: float, *, height_m: float = 0.16, moment: float = 2.47, prior_cost: float = 0.5) -> Dipole:
