@@ -1,3 +1,3 @@
 """Camera frame to readings of coded plates: `reader.decode_plates`."""
 
-DECODER_VERSION = "plate/6"
+DECODER_VERSION = "plate/7"

@@ -133,7 +133,7 @@ def read_evidence(
         max_damage=math.inf if thermal else MAX_DAMAGE,  # a stain does not hide a heater
     )  # fmt: skip
     lacking = _find_lacking(evidence)
-    refusal = lacking or _is_small(evidence, decoded)
+    refusal = lacking or _is_small(evidence, decoded) or _is_regular(decoded)
     usual, settled = _is_usual(evidence, decoded), decoded.confirmed or decoded.checked
     if refusal is None and not settled and verify is not None and not (usual and _shows_paint(evidence, decoded)):
         decoded = _verified(decoded, verify, _max_error(evidence, usual))
@@ -183,6 +183,14 @@ def _is_small(evidence: PlateEvidence, decoded: DecodedSymbols) -> tuple[PlateOu
     code, min_rows = decoded.code or decoded.likely, MIN_ROWS_ALONE * evidence.geometry.n
     if code is not None and not code.scheme.corrects and evidence.extent_px < min_rows:
         return PlateOutcome.UNSURE, f"a plate of less than {min_rows:g} rows, and these digits have no check"
+    return None
+
+
+def _is_regular(decoded: DecodedSymbols) -> tuple[PlateOutcome, str] | None:
+    """The refusal of one symbol in all cells without a check: tiles and grids with coloured corners show it too."""
+    code = decoded.code or decoded.likely
+    if code is not None and not code.scheme.corrects and len(set(code.symbols)) == 1:
+        return PlateOutcome.UNSURE, "the same symbol in all cells, as a pattern of tiles shows it, and no check"
     return None
 
 

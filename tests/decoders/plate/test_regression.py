@@ -49,6 +49,7 @@ def test_hard_frames_are_never_read_wrong(name: str, frames: int) -> None:
         ("look-alikes", 26, 2712, 16, PlateOutcome.GREEN_MARKER_MISSING),  # two green corners and a white one
         ("look-alikes", 39, 3504, 1, PlateOutcome.GREEN_MARKER_MISSING),  # the same on an overexposed pink road
         ("look-alikes", 6, 3507, 16, PlateOutcome.RED_MARKER_MISSING),  # a black square in place of the triangle
+        ("look-alikes", 37, 3619, 24, PlateOutcome.UNSURE),  # tiles with coloured corners: 999999999999
     ],
 )
 def test_a_look_alike_is_not_read(name: str, index: int, seed: int, number: int, outcome: PlateOutcome) -> None:
