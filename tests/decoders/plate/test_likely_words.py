@@ -35,7 +35,10 @@ def draw_code(scheme: PlateScheme, n: int, rng: np.random.Generator) -> PlateCod
 @given(st.sampled_from(CHECKED), st.integers(0, 2**32), st.data())
 @settings(max_examples=250, deadline=None)
 def test_errors_within_the_checks_are_corrected(kind: tuple[PlateScheme, int], seed: int, data: st.DataObject) -> None:
-    """In each word e unreadable cells and w wrong ones, 2 w + e up to its checks."""
+    """In each word e unreadable cells and w with one wrong unit, 2 w + e up to its checks.
+
+    With more wrong units in a cell another codeword may differ in more cells and fewer units, and is likelier.
+    """
     scheme, n = kind
     rng = np.random.default_rng(seed)
     code = draw_code(scheme, n, rng)
@@ -45,7 +48,7 @@ def test_errors_within_the_checks_are_corrected(kind: tuple[PlateScheme, int], s
         missing = data.draw(st.integers(0, word.checks - 2 * wrong))
         cells = rng.permutation(word.cells)[: wrong + missing]
         for cell in cells:
-            symbols[cell] ^= int(rng.integers(1, 16))
+            symbols[cell] ^= 1 << int(rng.integers(4))
         erased += cells[wrong:].tolist()
     found = likely_codeword(shown(symbols, tuple(erased)), n, scheme)
     assert found is not None
