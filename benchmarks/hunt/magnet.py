@@ -19,7 +19,7 @@ from app.simulation.magnetic.drive import Scene, SimulatedDrive, TrueMagnet, sim
 from app.simulation.magnetic.readout import Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, line_magnets
 from app.simulation.magnetic.vehicle import Course, Vehicle, Wheel
-from benchmarks.hunt.scenes import Bound, Kind, Outcome, Parameters, switch
+from benchmarks.hunt.scenes import Bound, Kind, Outcome, Parameters, draw_parameters, switch
 from benchmarks.magnets.drawn_scenes import FORMAT
 from benchmarks.magnets.scenes import LEAD_M, random_magnets, random_tag
 from benchmarks.magnets.score import REACH_M, UNDER_CM
@@ -88,6 +88,11 @@ class MagnetScenes:
         drive = _simulate(parameters, seed)
         findings = decode_trace(drive.trace, _BAR, candidates=TagCandidates(formats=[FORMAT]))
         path.with_suffix(".svg").write_text(_picture(drive, findings))
+
+
+def simulate_scene(seed: int) -> tuple[SimulatedDrive, MagnetometerBar]:
+    """The drive of a drawn scene, and the bar that recorded it."""
+    return _simulate(draw_parameters(MagnetScenes.bounds, seed), seed), _BAR
 
 
 def _simulate(p: Parameters, seed: int) -> SimulatedDrive:

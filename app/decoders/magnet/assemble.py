@@ -105,7 +105,7 @@ def make_reading(row: Sequence[PlacedMagnet], match: Identification | None) -> T
     readings = tuple(m.reading for m in members)
     gaps = tuple(math.dist(a.place_m, b.place_m) for a, b in pairwise(members))
     std = tuple(
-        math.hypot(a.along_std_m, b.along_std_m, _SPEED_STD * gap)
+        math.hypot(a.relative_std_m, b.relative_std_m, _SPEED_STD * gap)
         for (a, b), gap in zip(pairwise(readings), gaps, strict=True)
     )
     ratios = tuple(g / gaps[0] for g in gaps[1:]) if gaps and gaps[0] > 0 else ()

@@ -70,6 +70,8 @@ class Dipole:
         `UPRIGHT` or `FORWARD`: index of the moment's main component.
     margin : float
         By how much its kind costs less than the other.
+    log_odds : float
+        Of a magnet against iron, by its depth and moment alone (`app.decoders.magnet.magnet_odds`).
     """
 
     params: Floats
@@ -79,6 +81,7 @@ class Dipole:
     prior_cost: float
     kind: int
     margin: float
+    log_odds: float = 0.0
 
     @property
     def unlike_magnet(self) -> bool:

@@ -205,7 +205,7 @@ def _make_row(magnets: Sequence[PlacedMagnet]) -> _Row:
     return _Row(
         np.concatenate(([0.0], np.cumsum(chords))),
         np.array([m.reading.polarity.sign for m in magnets], float),
-        np.array([math.hypot(m.reading.along_std_m, _PLACEMENT_STD_M) for m in magnets]),
+        np.array([math.hypot(m.reading.relative_std_m, _PLACEMENT_STD_M) for m in magnets]),
     )
 
 

@@ -161,7 +161,7 @@ def _standard_errors(reading: TagReading, tag: RegisteredTag, passage: _Passage)
     lateral_std_m = LATERAL_STD_M * max(clearance_m / LATERAL_STD_CLEARANCE_M, MIN_CLEARANCE_RATIO) ** 2
     spread_m = math.sqrt(float(((along_m - along_m.mean()) ** 2).sum()))
     heading_std = math.hypot(lateral_std_m / spread_m, math.radians(TAG_BEARING_STD_DEG))
-    along_std_m = math.hypot(float(np.mean([m.along_std_m for m in reading.magnets])) / math.sqrt(count), survey_m)
+    along_std_m = math.hypot(float(np.mean([m.along_std_m for m in reading.magnets])), survey_m)  # they share stamps
     turned_m = 0.5 * abs(along_m[-1] - along_m[0]) * heading_std
     return along_std_m, math.hypot(lateral_std_m / math.sqrt(count), survey_m, turned_m), heading_std
 

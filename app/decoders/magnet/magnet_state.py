@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.magnet.dipole_fit import MagnetPrior
-from app.decoders.magnet.fit_window import Dipole, magnet_prior
+from app.decoders.magnet.fit_window import MAX_MISFIT, Dipole, magnet_prior
 
 Floats = npt.NDArray[np.float64]
 
@@ -29,7 +29,7 @@ to N52, 1.17 to 1.48 T, and 0.1 % per kelvin for NdFeB over 40 K; rounded up."""
 OWN_MOMENT_STD = 0.06
 """Standard deviation of one magnet's moment about the shared one. Source: 3 % between magnets
 (`app.simulation.magnetic.road.Spread`), and gains of the sensors near it."""
-IRON_SHARES = np.array([0.05, 0.2, 0.4, 0.6, 0.8, 0.95])
+IRON_SHARES = np.array([0.01, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95])
 """Shares of iron among the dipoles that look like magnets, each as likely. Source: town roads and roads with tags."""
 SPRING_STD_M = 0.02
 """What springs move the bar by, while magnets are passed. [m] Source: `app.simulation.magnetic.vehicle.drive_course`,
@@ -44,6 +44,8 @@ SURE_COUNT = 8
 """Dipoles from which on a known clearance is sure. Source: chosen by hand."""
 MIN_INFORMATION = 0.1
 """Share of a depth's precision that must come from the field, not from what was expected. Source: chosen by hand."""
+MIN_PRECISION = 0.02
+"""Precision that a field has of any parameter, over that of what is expected. Source: chosen by hand, for numbers."""
 CLEARANCE_M, CLEARANCE_STD_M = 0.24, 0.12
 """Clearance that is expected where none is declared. [m] Source: the middle of the 15 to 35 cm of METRO section 7.3;
 it covers them within a standard deviation."""
@@ -61,6 +63,11 @@ class MagnetState:
         Nominal, of the magnets on the road. [A m2]
     declared_m : float, optional
         Clearance of the bar as it was declared. [m]
+
+    Attributes
+    ----------
+    unlike : float
+        Dipoles under the bar that are unlike magnets, of about the last thirty.
     """
 
     def __init__(self, moment_am2: float, declared_m: float | None = None) -> None:
@@ -72,6 +79,7 @@ class MagnetState:
         self._log = np.log(depth[:, None, None] * strength[:, None] * np.ones(IRON_SHARES.size))
         self._first = self._log.copy()
         self._count = 0
+        self.unlike = 0.0
         self._set_prior()
 
     @property
@@ -89,18 +97,27 @@ class MagnetState:
         """Whether it is known from so many dipoles that further ones hardly change it."""
         return self.is_known and self._count >= SURE_COUNT
 
+    @property
+    def iron_log_odds(self) -> float:
+        """Log odds that a dipole of this road that looks like a magnet is iron."""
+        return self._iron_log_odds
+
+    def count(self, dipole: Dipole) -> None:
+        """Count a dipole under the bar as one like a magnet or unlike one."""
+        self.unlike = MEMORY * self.unlike + float(dipole.log_odds < 0 or dipole.misfit > MAX_MISFIT)
+
     def learn(self, dipole: Dipole, expected: MagnetPrior) -> None:
         """Add a dipole that looks like a magnet, fitted under what was expected of it."""
         at = np.ix_((2, 3 + dipole.kind), (2, 3 + dipole.kind))
-        precision = np.linalg.inv(dipole.covariance[at] + np.diag((1e-8, 1e-8)))
-        given = np.array([1 / expected.clearance_std_m**2, 1 / expected.moment_std_am2**2])
-        own = precision - np.diag(given)  # what the field alone says
-        if own[0, 0] < MIN_INFORMATION * precision[0, 0]:
-            return
-        sizes, axes = np.linalg.eigh(own)
-        covariance = (axes / np.maximum(sizes, 1e-3)) @ axes.T
+        std = np.array([expected.clearance_std_m, expected.moment_std_am2])
+        middle = np.array([expected.clearance_m, expected.moment_am2])
         fitted = np.array([dipole.params[2], abs(dipole.params[3 + dipole.kind])])
-        depth_m, moment = covariance @ (precision @ fitted - given * (expected.clearance_m, expected.moment_am2))
+        own = dipole.covariance[at] / np.outer(std, std)
+        if 1 - own[0, 0] < MIN_INFORMATION:
+            return
+        seen, covariance = without_prior(fitted / std, own, np.eye(2), (fitted - middle) / std)
+        depth_m, moment = seen * std
+        covariance *= np.outer(std, std)
         covariance += np.diag((SPRING_STD_M**2, (OWN_MOMENT_STD * self._moment_am2) ** 2))
         off_m, off = CLEARANCES_M[:, None] - depth_m, self._moment_am2 * MOMENT_RATIOS - moment
         inverse = np.linalg.inv(covariance)
@@ -113,8 +130,11 @@ class MagnetState:
         self._set_prior()
 
     def _set_prior(self) -> None:
-        weight = np.exp(self._log - self._log.max()).sum(axis=2)
-        weight /= weight.sum()
+        joint = np.exp(self._log - self._log.max())
+        joint /= joint.sum()
+        iron = float(joint.sum(axis=(0, 1)) @ IRON_SHARES)
+        self._iron_log_odds = math.log(iron / (1 - iron))
+        weight = joint.sum(axis=2)
         clearance_m, clearance_std_m = _moments(weight.sum(axis=1), CLEARANCES_M)
         ratio, ratio_std = _moments(weight.sum(axis=0), MOMENT_RATIOS)
         self._prior = magnet_prior(
@@ -123,6 +143,28 @@ class MagnetState:
             clearance_m,
             max(clearance_std_m, MIN_STD_M),
         )
+
+
+def without_prior(fitted: Floats, covariance: Floats, given: Floats, slope: Floats) -> tuple[Floats, Floats]:
+    """What the field alone says of fitted parameters, in standard deviations of what was expected of them.
+
+    Parameters
+    ----------
+    fitted : ndarray, shape (P,)
+        Most likely parameters, with what was expected of them.
+    covariance, given : ndarray, shape (P, P)
+        Theirs, and the precision of what was expected.
+    slope : ndarray, shape (P,)
+        Of half of the cost of what was expected: the field's own cost has the opposite one.
+
+    Returns
+    -------
+    seen : ndarray, shape (P,)
+    covariance : ndarray, shape (P, P)
+    """
+    sizes, axes = np.linalg.eigh(np.linalg.inv(covariance) - given)
+    alone = (axes / np.maximum(sizes, MIN_PRECISION)) @ axes.T
+    return fitted + alone @ slope, alone
 
 
 def _bell(grid: Floats, mean: float, std: float) -> Floats:

@@ -55,6 +55,8 @@ class MagnetReading:
         Fitted moment in vehicle axes. [A m2]
     along_std_m : float
         Standard error of its place along the drive. [m]
+    relative_std_m : float
+        The same against magnets near it, with which it shares the error of the time stamps. [m]
     snr : float
         Root of the energy that the magnet explains, in standard deviations of the noise.
     """
@@ -68,6 +70,7 @@ class MagnetReading:
     clearance_cm: float = 0.0
     moment_am2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     along_std_m: float = 0.0
+    relative_std_m: float = 0.0
     snr: float = 0.0
 
     @property

@@ -1,34 +1,48 @@
-"""Poles of iron are recognised by the poles beside them."""
+"""What is reported as a magnet follows from a dipole's own evidence and from the poles beside it."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from app.decoders.magnet.classify import classify_dipoles
-from app.decoders.magnet.ferrous import ferrous_reason, is_ferrous, rows_beside
-from app.decoders.magnet.fit_window import Dipole, magnet_prior
+from app.decoders.magnet.classify import MIN_PROBABILITY, Accepted, Rejected, classify_dipoles, with_log_odds
+from app.decoders.magnet.ferrous import is_ferrous, rows_beside
+from app.decoders.magnet.fit_window import Dipole
+from app.decoders.magnet.magnet_odds import EVIDENCE, WEIGHTS, magnet_evidence, own_log_odds
+from app.decoders.magnet.magnet_state import MagnetState
 from app.decoders.magnet.readings import NoiseKind
 from app.markers.magnet import Orientation, Polarity
 
 HALF_M = 0.88
-PRIOR = magnet_prior(2.47, 0.12, 0.16, 0.025)
+STATE = MagnetState(2.47, 0.16)
+PRIOR = STATE.prior
+STD = np.diag((0.004, 0.004, 0.004, 0.05, 0.05, 0.05)) ** 2
 
 
-def pole(s_m: float, y_m: float, *, height_m: float = 0.16, moment: float = 2.47, prior_cost: float = 0.5) -> Dipole:
+def pole(s_m: float, y_m: float, *, height_m: float = 0.16, moment: float = 2.47) -> Dipole:
     params = np.array([s_m, y_m, height_m, moment, 0.0, 0.0])
-    return Dipole(params, np.eye(6) * 1e-4, 400.0, 0.0, prior_cost, 0, 50.0)
+    return Dipole(params, STD, 400.0, 0.0, 0.5, 0, 50.0)
+
+
+def classify(dipoles: list[Dipole], before: list[Dipole] | None = None) -> list[Accepted | Rejected]:
+    return classify_dipoles(with_log_odds(dipoles, PRIOR), with_log_odds(before or [], PRIOR), STATE, HALF_M)
 
 
 MESH = [pole(s, y) for s, y in ((10.0, -0.8), (10.2, -0.3), (10.1, 0.2), (10.3, 0.7))]
 TAG = [pole(10 + 0.5 * i, 0.02 * i) for i in range(5)]
 
 
+def test_there_is_a_weight_for_each_evidence() -> None:
+    assert len(WEIGHTS) == len(EVIDENCE) == len(magnet_evidence(TAG[0], TAG, STATE, HALF_M))
+
+
 def test_poles_beside_each_other_are_iron_and_a_row_is_not() -> None:
     assert is_ferrous(MESH, HALF_M)
-    assert all(ferrous_reason(p, MESH, HALF_M) for p in MESH)
+    assert all(isinstance(one, Rejected) and one.kind is NoiseKind.FERROUS for one in classify(MESH))
     assert not is_ferrous(TAG, HALF_M)
-    assert not any(ferrous_reason(p, TAG, HALF_M) for p in TAG)
+    assert all(isinstance(one, Accepted) for one in classify(TAG))
 
 
 def test_a_line_beside_a_tag_is_one_row() -> None:
@@ -36,24 +50,41 @@ def test_a_line_beside_a_tag_is_one_row() -> None:
     assert rows_beside(TAG[0], [*TAG, line], HALF_M) == 1
     assert rows_beside(line, [*TAG, line], HALF_M) == 1
     assert not is_ferrous([*TAG, line], HALF_M)
+    assert all(isinstance(one, Accepted) for one in classify([*TAG, line]))
 
 
 def test_poles_of_parked_cars_do_not_count() -> None:
     cars = [pole(9.0, 1.1), pole(11.0, 1.1), pole(10.0, -1.2)]
     assert rows_beside(TAG[0], cars, HALF_M) == 0
+    kinds = [one.kind for one in classify(cars) if isinstance(one, Rejected)]
+    assert kinds == [NoiseKind.BESIDE] * 3
 
 
-def test_the_other_end_of_a_plate_is_iron_too() -> None:
+def test_the_other_end_of_a_plate_is_less_sure() -> None:
     end = pole(12.6, 0.1)
-    assert ferrous_reason(end, [*MESH, end], HALF_M)
-    assert classify_dipoles([end], MESH, PRIOR, HALF_M)[0][0] is NoiseKind.FERROUS
-    assert classify_dipoles([end], [], PRIOR, HALF_M)[0][:2] == (Orientation.FORWARD, Polarity.N)
+    (alone,), (behind,) = classify([end]), classify([end], MESH)
+    assert isinstance(alone, Accepted)
+    assert alone[:2] == (Orientation.FORWARD, Polarity.N)
+    assert isinstance(behind, Rejected) or behind.confidence < alone.confidence
 
 
-@pytest.mark.parametrize(("height_m", "fine"), [(0.11, True), (0.24, False)])
-def test_what_lies_deep_is_refused_sooner_than_a_low_nose(height_m: float, fine: bool) -> None:
-    cost = ((height_m - 0.16) / 0.025) ** 2
-    classification = classify_dipoles([pole(10, 0, height_m=height_m, prior_cost=cost)], [], PRIOR, HALF_M)[0]
-    assert (classification[0] is Orientation.FORWARD) is fine
-    if not fine:
-        assert classification[0] is NoiseKind.WRONG_HEIGHT
+@pytest.mark.parametrize(("height_m", "fine"), [(0.13, True), (0.34, False)])
+def test_what_lies_deep_is_no_magnet(height_m: float, fine: bool) -> None:
+    (classification,) = classify([pole(10, 0, height_m=height_m)])
+    assert isinstance(classification, Accepted) is fine
+    if isinstance(classification, Rejected):
+        assert classification.kind is NoiseKind.WRONG_HEIGHT
+        assert f"{MIN_PROBABILITY:.0%} are needed" in classification.reason
+
+
+def test_a_dipole_that_the_fit_moved_to_where_magnets_are_says_little() -> None:
+    sure = pole(10, 0)
+    weak = replace(sure, covariance=np.diag((0.03, 0.03, 0.0249, 0.17, 0.24, 0.34)) ** 2)
+    assert own_log_odds(sure, PRIOR) > 6
+    assert own_log_odds(weak, PRIOR) < own_log_odds(sure, PRIOR) - 3
+
+
+def test_a_moment_unlike_the_others_is_iron() -> None:
+    (classification,) = classify([pole(10, 0, moment=1.2)])
+    assert isinstance(classification, Rejected)
+    assert classification.kind is NoiseKind.WRONG_MOMENT

@@ -1,0 +1,145 @@
+"""How likely a fitted dipole is a magnet: what its field says, and what lies around it, weighed by a logistic model.
+
+A dipole's own evidence is the ratio of two likelihoods of its depth and moment: of a magnet, which lies at the bar's
+clearance with the moment of the road's magnets along one of two axes, and of iron, of any depth and moment. Poles
+beside it tell of a long piece of iron. The weights are those of a logistic regression on simulated drives
+(`benchmarks.training.magnet_odds`), so the probability can be taken as it is: of readings with 0.9 nine in ten are
+right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from app.decoders.magnet.dipole_fit import UPRIGHT, MagnetPrior
+from app.decoders.magnet.ferrous import BEYOND_M, POLE_ENERGY, rows_beside
+from app.decoders.magnet.fit_window import MAX_MISFIT, Dipole
+from app.decoders.magnet.magnet_state import MagnetState, without_prior
+
+Floats = npt.NDArray[np.float64]
+
+IRON_DEPTH_M, IRON_DEPTH_STD_M, IRON_MOMENT_STD = 0.05, 0.2, 1.2
+"""Depth of iron below that of magnets, its standard deviation, and that of each component of its moment, in moments of
+a magnet. [m, m, 1] Source: iron that is read as dipoles lies in or on the road and has up to three times the moment;
+chosen by hand, the regression weighs the ratio."""
+MIN_LOG_ODDS, MAX_LOG_ODDS = -20.0, 14.0
+"""Limits of a dipole's own evidence. Source: beyond them it is certain anyway."""
+SMALL_POLE = 0.05
+"""Energy of a pole that counts, over the dipole's own. Source: what a model that errs leaves of a strong magnet."""
+TOO_NEAR_M, OTHER_KIND_M, NEAR_M, NEAR_HEIGHTS, PIECE_M, ABREAST_M = 0.42, 0.9, 0.8, 3.0, 3.0, 1.2
+"""Distances within which magnets have no neighbour, tags and lines keep apart, poles are of one object (in heights
+too), and a long piece of iron has poles side by side. [m, m, m, 1, m, m] Source: `app.markers.magnet.MIN_GAP_M` less
+the error of two places; lengths of the pieces of iron in `app.simulation.magnetic.clutter`."""
+NEIGHBOUR_M = 1.0
+"""[m] within which the neighbour that is least like a magnet is looked for. Source: by hand."""
+EVIDENCE = (
+    "own", "own, up to 3", "misfit", "margin", "too near", "other kind", "unlike pole", "magnets around",
+    "piece of iron", "neighbour", "rows", "upright", "too deep", "like iron", "iron before",
+)  # fmt: skip
+"""Names of the entries of `magnet_evidence`."""
+WEIGHTS = np.array([
+    0.51,  # own
+    -0.17,  # own, up to 3
+    -0.59,  # misfit
+    1.09,  # margin
+    -1.38,  # too near
+    -0.45,  # other kind
+    -1.38,  # unlike pole
+    -0.31,  # magnets around
+    -3.32,  # piece of iron
+    0.12,  # neighbour
+    -1.35,  # rows
+    1.68,  # upright
+    -0.66,  # too deep
+    -0.53,  # like iron
+    -1.31,  # iron before
+])  # fmt: skip
+BIAS = -6.18
+"""Weights of the evidence, and the log odds without any. Source: `python -m benchmarks.training.magnet_odds --seed
+62000 --scenes 560`, two thirds of 560 drives; of the others it prints how well they hold."""
+
+
+def own_log_odds(dipole: Dipole, prior: MagnetPrior) -> float:
+    """Log ratio of the likelihoods of a dipole's depth and moment, of a magnet to iron.
+
+    What was expected is taken out of the fitted values, so that a weak dipole, which the fit moves to where a magnet
+    is expected, says little.
+    """
+    own, moment = dipole.kind, prior.moment_am2
+    beside = [axis for axis in range(3) if axis != own]
+    order = [2, 3 + own, *(3 + axis for axis in beside)]
+    std = np.array(
+        [prior.clearance_std_m, prior.moment_std_am2]
+        + [prior.yaw_std_am2 if own != UPRIGHT and axis == 1 else prior.tilt_std_am2 for axis in beside]
+    )  # all below is in these units
+    size = float(np.linalg.norm(dipole.params[3:]))
+    along = np.array([0.0, *dipole.params[order[1:]] / size * std[1:] / prior.moment_std_am2])
+    expected = np.array([prior.clearance_m, math.copysign(moment, dipole.params[3 + own]), 0.0, 0.0]) / std
+    fitted = dipole.params[order] / std
+    slope = along * (size - moment) / prior.moment_std_am2 + (fitted - expected) * (1, 0, 1, 1)
+    given = np.outer(along, along) + np.diag((1.0, 0.0, 1.0, 1.0))
+    seen, covariance = without_prior(fitted, dipole.covariance[np.ix_(order, order)] / np.outer(std, std), given, slope)
+    iron = np.array([IRON_DEPTH_STD_M, *3 * [IRON_MOMENT_STD * moment]]) / std
+    nowhere = np.array([prior.clearance_m + IRON_DEPTH_M, 0.0, 0.0, 0.0]) / std
+    odds = _log_density(seen - expected, covariance + np.eye(4)) - _log_density(
+        seen - nowhere, covariance + np.diag(iron**2)
+    )
+    return min(max(odds, MIN_LOG_ODDS), MAX_LOG_ODDS)
+
+
+def _log_density(off: Floats, covariance: Floats) -> float:
+    """Log of a normal density, but for a constant."""
+    return -0.5 * float(off @ np.linalg.solve(covariance, off)) - 0.5 * float(np.linalg.slogdet(covariance)[1])
+
+
+def magnet_evidence(dipole: Dipole, around: Sequence[Dipole], state: MagnetState, half_width_m: float) -> Floats:
+    """What speaks for a magnet, one number for each of `EVIDENCE`.
+
+    Parameters
+    ----------
+    dipole : Dipole
+    around : sequence of Dipole
+        Those near it, itself included, with their own log odds.
+    state : MagnetState
+        What the magnets of the road share.
+    half_width_m : float
+        Of the array. [m]
+    """
+    prior = state.prior
+    s, y, h = (float(p) for p in dipole.params[:3])
+    too_near = other_kind = unlike = piece = 0.0
+    neighbour, magnets = MAX_LOG_ODDS, 0
+    for other in around:
+        if other is dipole or other.explained < max(POLE_ENERGY, SMALL_POLE * dipole.explained):
+            continue
+        along, apart = abs(other.params[0] - s), math.hypot(other.params[0] - s, other.params[1] - y)
+        is_unlike = other.log_odds < 0 or other.misfit > MAX_MISFIT
+        too_near = max(too_near, float(apart < TOO_NEAR_M))
+        other_kind = max(other_kind, float(other.kind != dipole.kind and apart < OTHER_KIND_M))
+        unlike = max(unlike, float(is_unlike and apart < max(NEAR_M, NEAR_HEIGHTS * h)))
+        if apart < NEIGHBOUR_M:
+            neighbour = min(neighbour, other.log_odds)
+        if along < PIECE_M and abs(other.params[1]) < half_width_m + BEYOND_M:
+            magnets += not is_unlike
+            if not piece and rows_beside(other, around, half_width_m, ABREAST_M) > 1:
+                piece = 1.0
+    rows = min(max(0, rows_beside(dipole, around, half_width_m) - 1), 2)
+    return np.array([
+        dipole.log_odds, min(dipole.log_odds, 3.0), math.log(max(dipole.misfit, 0.004)),
+        math.log1p(min(dipole.margin, 40.0)), too_near, other_kind, unlike, math.log1p(magnets), piece, neighbour, rows,
+        float(dipole.kind == UPRIGHT), (h - prior.clearance_m) / prior.clearance_std_m, state.iron_log_odds,
+        math.log1p(state.unlike),
+    ])  # fmt: skip
+
+
+def magnet_probability(evidence: Floats) -> float:
+    """Probability that a dipole is a magnet of the kind and polarity with which it was fitted.
+
+    It is that of a magnet, times that of its kind: the margin is twice the log ratio of the likelihoods of both kinds.
+    """
+    margin = math.expm1(evidence[EVIDENCE.index("margin")])
+    return float(1 / (1 + np.exp(-(evidence @ WEIGHTS + BIAS))) / (1 + math.exp(-margin / 2)))
