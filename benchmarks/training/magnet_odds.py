@@ -134,7 +134,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=62_000)
-    parser.add_argument("--scenes", type=int, default=600)
+    parser.add_argument("--scenes", type=int, default=560)
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.scenes)

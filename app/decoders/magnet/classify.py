@@ -19,9 +19,9 @@ from app.markers.magnet import Orientation, Polarity
 
 MIN_ENERGY = POLE_ENERGY
 """Smallest explained energy of a magnet. [noise variances] Source: as that of a pole."""
-MIN_PROBABILITY = 0.8
+MIN_PROBABILITY = 0.9
 """Smallest probability of a magnet that is reported. Source: of the drives that nothing was learnt from
-(`benchmarks.training.magnet_odds`) 97.9 % of the magnets have more, and 15 of 3,443 readings are wrong."""
+(`benchmarks.training.magnet_odds`) 98.1 % of the magnets have more, and 5 of 3,956 readings are wrong."""
 MIN_MARGIN = 4.0
 """Smallest margin of a dipole that shows the clearance: a likelihood ratio of exp(2) = 7. Source: chosen by hand."""
 MAX_SHAPE_COST = 8.0

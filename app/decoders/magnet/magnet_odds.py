@@ -42,25 +42,25 @@ EVIDENCE = (
 )  # fmt: skip
 """Names of the entries of `magnet_evidence`."""
 WEIGHTS = np.array([
-    0.51,  # own
-    -0.17,  # own, up to 3
-    -0.59,  # misfit
-    1.09,  # margin
-    -1.38,  # too near
-    -0.45,  # other kind
-    -1.38,  # unlike pole
-    -0.31,  # magnets around
-    -3.32,  # piece of iron
+    0.59,  # own
+    -0.05,  # own, up to 3
+    -0.64,  # misfit
+    1.17,  # margin
+    -2.26,  # too near
+    -0.44,  # other kind
+    -0.31,  # unlike pole
+    -0.12,  # magnets around
+    -3.37,  # piece of iron
     0.12,  # neighbour
-    -1.35,  # rows
-    1.68,  # upright
-    -0.66,  # too deep
-    -0.53,  # like iron
-    -1.31,  # iron before
+    -1.61,  # rows
+    2.20,  # upright
+    -1.00,  # too deep
+    -0.49,  # like iron
+    -1.24,  # iron before
 ])  # fmt: skip
-BIAS = -6.18
+BIAS = -7.96
 """Weights of the evidence, and the log odds without any. Source: `python -m benchmarks.training.magnet_odds --seed
-62000 --scenes 560`, two thirds of 560 drives; of the others it prints how well they hold."""
+62000 --scenes 560`, two thirds of its drives; of the others it prints how well they hold."""
 
 
 def own_log_odds(dipole: Dipole, prior: MagnetPrior) -> float:

@@ -26,9 +26,10 @@ MOMENT_RATIOS = np.arange(0.5, 1.51, 0.04)
 MOMENT_RATIO_STD = 0.15
 """Standard deviation of the shared moment before any dipole, over the nominal one. Source: remanence of the grades N35
 to N52, 1.17 to 1.48 T, and 0.1 % per kelvin for NdFeB over 40 K; rounded up."""
-OWN_MOMENT_STD = 0.06
-"""Standard deviation of one magnet's moment about the shared one. Source: 3 % between magnets
-(`app.simulation.magnetic.road.Spread`), and gains of the sensors near it."""
+LIKE_STD, OWN_MOMENT_STD = 0.06, 0.12
+"""Standard deviation of a magnet's moment about the shared one: of those that show it, and of any. Source: 3 % between
+magnets (`app.simulation.magnetic.road.Spread`) and gains of the sensors near it; tags fade by a quarter and more
+(`app.services.health.traces`), which must be read, but show nothing of the others."""
 IRON_SHARES = np.array([0.01, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95])
 """Shares of iron among the dipoles that look like magnets, each as likely. Source: town roads and roads with tags."""
 SPRING_STD_M = 0.02
@@ -118,7 +119,7 @@ class MagnetState:
         seen, covariance = without_prior(fitted / std, own, np.eye(2), (fitted - middle) / std)
         depth_m, moment = seen * std
         covariance *= np.outer(std, std)
-        covariance += np.diag((SPRING_STD_M**2, (OWN_MOMENT_STD * self._moment_am2) ** 2))
+        covariance += np.diag((SPRING_STD_M**2, (LIKE_STD * self._moment_am2) ** 2))
         off_m, off = CLEARANCES_M[:, None] - depth_m, self._moment_am2 * MOMENT_RATIOS - moment
         inverse = np.linalg.inv(covariance)
         chi2 = inverse[0, 0] * off_m**2 + 2 * inverse[0, 1] * off_m * off + inverse[1, 1] * off**2

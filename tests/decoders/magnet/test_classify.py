@@ -88,7 +88,7 @@ def test_a_moment_unlike_the_others_is_iron() -> None:
     state = MagnetState(2.47, 0.16)
     for _ in range(10):
         state.learn(pole(10, 0), state.prior)
-    odd = with_log_odds([pole(10, 0, moment=1.2)], state.prior)
+    odd = with_log_odds([pole(10, 0, moment=0.9)], state.prior)
     (classification,) = classify_dipoles(odd, [], state, HALF_M)
     assert isinstance(classification, Rejected)
     assert classification.kind is NoiseKind.WRONG_MOMENT
