@@ -233,6 +233,27 @@ def test_imports_and_exports_that_cannot_be(
     assert not (tmp_path / "out.gpkg").exists()
 
 
+@pytest.mark.parametrize(
+    ("declared", "what"),
+    [
+        ("{", "--declaration"),
+        ("[]", "--declaration"),
+        ('{"bar": 5}', "--declaration bar"),
+        ('{"bar": {"clearance_m": "abc"}}', "--declaration bar.clearance_m"),
+        ('{"bar": {"clearance_m": 9}}', "--declaration bar.clearance_m"),
+        ('{"bar": {"forward_m": "abc"}}', "--declaration bar.forward_m"),
+        ('{"clearance_m": 0.3}', "--declaration clearance_m"),
+    ],
+)
+def test_wrong_declarations_of_traces_are_refused(waymark: Run, tmp_path: Path, declared: str, what: str) -> None:
+    recording = tmp_path / "drive.bin"
+    recording.write_bytes(b"1")
+    status, printed, said = waymark("decode-trace", str(recording), "--declaration", declared)
+    assert (status, printed) == (1, "")
+    assert what in said
+    assert "docs/magnets.md" in said
+
+
 @pytest.mark.parametrize("backend", ["sqlite", "postgresql"], scope="module")
 def test_a_snapshot_is_made_and_verified(
     waymark: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new_database_url: Callable[[Path], str]

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
 from app.cli.database import perform, read_settings
+from app.cli.declarations import read_declaration
 from app.errors import InvalidParameter
 
 
@@ -24,12 +24,7 @@ def import_survey(
 
     from app.api.surveys.schemas import DeclarationIn
 
-    try:
-        declaration = DeclarationIn.model_validate_json(declared)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise InvalidParameter(f"--declaration {place}: {first['msg']}", cure="see docs/imports.md") from error
+    declaration = read_declaration(DeclarationIn, declared, "docs/imports.md")
     declaration = declaration.model_copy(update={"dry_run": dry_run or declaration.dry_run})
     values = {"agency": agency, "declaration": declaration.declared()}
     with survey.open("rb") as file:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from app.errors import InvalidParameter
+from app.cli.declarations import read_declaration
 
 
 def decode_trace(
@@ -18,22 +18,14 @@ def decode_trace(
     """Decode the magnets and tags in a magnetometer trace, and print one JSON object."""
     import orjson
 
+    from app.api.decodes.schemas_traces import TraceIn
     from app.decoders.magnet.match import match_tags
     from app.formats.spooled_file import SpooledFile
     from app.jobs.trace_tasks import decode_recording
     from app.services.decodes.trace_documents import trace_document
     from app.services.decodes.trace_task import TraceTask, trace_terms
 
-    try:
-        terms: object = orjson.loads(declared)
-    except orjson.JSONDecodeError as error:
-        raise InvalidParameter(
-            f"--declaration is not JSON: {error}", field="declaration", cure="an empty declaration is {}"
-        ) from error
-    if not isinstance(terms, dict):
-        raise InvalidParameter(
-            "--declaration is not a JSON object", field="declaration", cure="an empty declaration is {}"
-        )
+    terms = read_declaration(TraceIn, declared, "docs/magnets.md").model_dump(exclude_unset=True)
     result = decode_recording(TraceTask(recording.name, SpooledFile.at(recording), terms), None)
     trace = match_tags(result.findings, (), trace_terms(terms).bar)
     if plot is not None:

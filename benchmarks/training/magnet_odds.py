@@ -1,4 +1,4 @@
-"""``python -m benchmarks.training.magnet_odds [--seed N] [--scenes N]``: weights of the evidence for a magnet.
+"""``python -m benchmarks.training.magnet_odds [--seed N] [--scenes N]``: weights of the features for a magnet.
 
 Fitted dipoles of simulated drives: scenes of the hunter, roads with iron and a few magnets, and roads without iron. A
 dipole is right where a magnet of its kind and polarity lies. A logistic regression learns from two thirds of the
@@ -19,12 +19,11 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.classify import MIN_ENERGY, Classification
+from app.decoders.magnet.classify import Classification, is_strong
 from app.decoders.magnet.decoder import MagnetDecoder, estimate_state
 from app.decoders.magnet.dipole_fit import UPRIGHT
-from app.decoders.magnet.ferrous import BEYOND_M
 from app.decoders.magnet.fit_window import Dipole
-from app.decoders.magnet.magnet_odds import EVIDENCE, magnet_evidence
+from app.decoders.magnet.magnet_odds import FEATURES, magnet_features
 from app.decoders.magnet.magnet_state import MagnetState
 from app.decoders.magnet.readings import MagnetReading, NoiseFinding
 from app.markers.magnet import Orientation, Polarity
@@ -50,7 +49,7 @@ BINS = (0.0, 0.1, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 class Sample:
     """Evidence of a dipole (F,), where it was found, and the moment along its kind."""
 
-    evidence: npt.NDArray[np.float64]
+    features: npt.NDArray[np.float64]
     explained: float
     t_s: float
     lateral_cm: float
@@ -59,28 +58,24 @@ class Sample:
 
 
 class _Recorder(MagnetDecoder):
-    """Keeps the evidence of each dipole that could be reported."""
+    """Keeps the features of each dipole that could be reported."""
 
     def __init__(self, bar: MagnetometerBar, state: MagnetState) -> None:
         super().__init__(bar, state=state)
         self.samples: list[Sample] = []
-        self._evidence: dict[int, npt.NDArray[np.float64]] = {}
+        self._features: dict[int, npt.NDArray[np.float64]] = {}
 
     def _classify(self, dipoles: list[Dipole]) -> list[Classification]:
         around, half = [*self._before, *dipoles], self._array.half_width_m
-        self._evidence = {
-            id(d): magnet_evidence(d, around, self.state, half)
-            for d in dipoles
-            if d.explained >= MIN_ENERGY and abs(d.params[1]) <= half + BEYOND_M
-        }
+        self._features = {id(d): magnet_features(d, around, self.state, half) for d in dipoles if is_strong(d, half)}
         return super()._classify(dipoles)
 
     def _reading(self, dipole: Dipole, classification: Classification) -> MagnetReading | NoiseFinding:
         reading = super()._reading(dipole, classification)
-        if id(dipole) in self._evidence:
-            evidence, moment = self._evidence[id(dipole)], float(dipole.params[3 + dipole.kind])
+        if id(dipole) in self._features:
+            features, moment = self._features[id(dipole)], float(dipole.params[3 + dipole.kind])
             at = reading.t_s, reading.lateral_cm
-            self.samples.append(Sample(evidence, dipole.explained, *at, dipole.kind, moment))
+            self.samples.append(Sample(features, dipole.explained, *at, dipole.kind, moment))
         return reading
 
 
@@ -141,18 +136,18 @@ def main() -> None:
     with ProcessPoolExecutor(arguments.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
         found = list(pool.map(collect, seeds, chunksize=4))
     drive = np.concatenate([np.full(len(right), k) for k, (_, right) in enumerate(found)])
-    evidence = np.array([one.evidence for samples, _ in found for one in samples])
+    features = np.array([one.features for samples, _ in found for one in samples])
     right = np.array([one for _, rights in found for one in rights], bool)
     test = drive % TEST_EVERY == 0
-    mean, std = evidence[~test].mean(axis=0), evidence[~test].std(axis=0)
-    model = LogisticRegression(C=PENALTY, max_iter=5000).fit((evidence[~test] - mean) / std, right[~test])
+    mean, std = features[~test].mean(axis=0), features[~test].std(axis=0)
+    model = LogisticRegression(C=PENALTY, max_iter=5000).fit((features[~test] - mean) / std, right[~test])
     weights = model.coef_[0] / std
     bias = float(model.intercept_[0] - mean @ weights)
     print(f"{len(right)} dipoles of {len(found)} drives, {right.mean():.1%} are magnets\n\nWEIGHTS = np.array([")
-    print("".join(f"    {weight:.4f},  # {name}\n" for name, weight in zip(EVIDENCE, weights, strict=True)) + "])")
+    print("".join(f"    {weight:.4f},  # {name}\n" for name, weight in zip(FEATURES, weights, strict=True)) + "])")
     print(f"BIAS = {bias:.4f}\n")
-    margin = np.expm1(evidence[test, EVIDENCE.index("margin")])
-    odds = 1 / (1 + np.exp(-(evidence[test] @ weights + bias))) / (1 + np.exp(-margin / 2))
+    margin = np.expm1(features[test, FEATURES.index("margin")])
+    odds = 1 / (1 + np.exp(-(features[test] @ weights + bias))) / (1 + np.exp(-margin / 2))
     true = right[test]
     rows = [(p, int(true[odds >= p].sum()), int(true.sum()), int((~true[odds >= p]).sum())) for p in THRESHOLDS]
     print(table(("from probability", "right", "of", "wrong"), rows))

@@ -12,13 +12,11 @@ import numpy as np
 from app.decoders.magnet.dipole_fit import UPRIGHT, MagnetPrior
 from app.decoders.magnet.ferrous import BEYOND_M, POLE_ENERGY
 from app.decoders.magnet.fit_window import MAX_MISFIT, Dipole
-from app.decoders.magnet.magnet_odds import EVIDENCE, WEIGHTS, Floats, magnet_evidence, magnet_probability, own_log_odds
+from app.decoders.magnet.magnet_odds import FEATURES, WEIGHTS, Floats, magnet_features, magnet_probability, own_log_odds
 from app.decoders.magnet.magnet_state import MagnetState
 from app.decoders.magnet.readings import NoiseKind
 from app.markers.magnet import Orientation, Polarity
 
-MIN_ENERGY = POLE_ENERGY
-"""Smallest explained energy of a magnet. [noise variances] Source: as that of a pole."""
 MIN_PROBABILITY = 0.9
 """Smallest probability of a magnet that is reported. Source: of the drives that nothing was learnt from
 (`benchmarks.training.magnet_odds`) 98.1 % of the magnets have more, and 5 of 3,956 readings are wrong."""
@@ -35,7 +33,7 @@ SKEW_DEG = 8.0
 """Angle that weighs as much as a standard deviation when the reason of a rejection is chosen. [deg] Source:
 `YAW_SPREAD`."""
 _CLEAR = np.array([8.0, 3.0, math.log(0.004), math.log1p(40.0), 0, 0, 0, 0, 0, 14.0, 0, 0, 0, -3.0, 0])
-"""Evidence of a clear magnet: what a rejected dipole lacks most is the reason."""
+"""Features of a clear magnet: the group of features that lowers the log odds most is the reason of a rejection."""
 _REASONS = {
     "own": ("own", "own, up to 3", "too deep", "like iron", "iron before"), "misfit": ("misfit",),
     "margin": ("margin",), "piece": ("piece of iron",), "rows": ("rows",),
@@ -91,23 +89,23 @@ def classify_dipoles(
 
 def _classify(dipole: Dipole, around: Sequence[Dipole], state: MagnetState, half_width_m: float) -> Classification:
     y = float(dipole.params[1])
-    if dipole.explained < MIN_ENERGY:
-        return Rejected(NoiseKind.WEAK, f"explains {dipole.explained:.0f} of {MIN_ENERGY:.0f} noise variances")
+    if dipole.explained < POLE_ENERGY:
+        return Rejected(NoiseKind.WEAK, f"explains {dipole.explained:.0f} of {POLE_ENERGY:.0f} noise variances")
     if abs(y) > half_width_m + BEYOND_M:
         return Rejected(NoiseKind.BESIDE, f"{100 * (abs(y) - half_width_m):.0f} cm beyond the bar")
-    evidence = magnet_evidence(dipole, around, state, half_width_m)
-    probability = magnet_probability(evidence)
+    features = magnet_features(dipole, around, state, half_width_m)
+    probability = magnet_probability(features)
     if probability < MIN_PROBABILITY:
-        kind, reason = _rejection(dipole, evidence, state.prior)
+        kind, reason = _rejection(dipole, features, state.prior)
         return Rejected(kind, f"{reason}; {probability:.0%} likely a magnet, {MIN_PROBABILITY:.0%} are needed")
     orientation = Orientation.UP if dipole.kind == UPRIGHT else Orientation.FORWARD
     polarity = Polarity.N if dipole.params[3 + dipole.kind] > 0 else Polarity.S
     return Accepted(orientation, polarity, min(probability, MAX_CONFIDENCE))
 
 
-def _rejection(dipole: Dipole, evidence: Floats, prior: MagnetPrior) -> Rejected:
+def _rejection(dipole: Dipole, features: Floats, prior: MagnetPrior) -> Rejected:
     """What a dipole lacks most of a clear magnet."""
-    lacks = dict(zip(EVIDENCE, WEIGHTS * (evidence - _CLEAR), strict=True))
+    lacks = dict(zip(FEATURES, WEIGHTS * (features - _CLEAR), strict=True))
     worst = min(_REASONS, key=lambda reason: sum(lacks[name] for name in _REASONS[reason]))
     match worst:
         case "misfit":
@@ -141,7 +139,7 @@ def _unlike_magnet(dipole: Dipole, prior: MagnetPrior) -> Rejected:
 
 def is_strong(dipole: Dipole, half_width_m: float) -> bool:
     """Whether a dipole is strong enough to be a magnet, and under the bar: what lies beside it may be a wheel."""
-    return dipole.explained > MIN_ENERGY and abs(float(dipole.params[1])) < half_width_m + BEYOND_M
+    return dipole.explained >= POLE_ENERGY and abs(float(dipole.params[1])) <= half_width_m + BEYOND_M
 
 
 def shows_clearance(dipole: Dipole, prior: MagnetPrior, half_width_m: float) -> bool:

@@ -84,6 +84,11 @@ class Dipole:
     log_odds: float = 0.0
 
     @property
+    def resembles_iron(self) -> bool:
+        """Whether iron explains its depth and moment better than a magnet, or its field is not a dipole's."""
+        return self.log_odds < 0 or self.misfit > MAX_MISFIT
+
+    @property
     def unlike_magnet(self) -> bool:
         """Whether its field is not a dipole's, or its moment, clearance or axis not a magnet's."""
         return self.misfit > MAX_MISFIT or self.prior_cost > MAX_REGION_PRIOR_COST

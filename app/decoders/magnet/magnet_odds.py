@@ -1,10 +1,10 @@
-"""How likely a fitted dipole is a magnet: what its field says, and what lies around it, weighed by a logistic model.
+"""Probability that a fitted dipole is a magnet: a logistic model of the fit and of the dipoles around it.
 
-A dipole's own evidence is the ratio of two likelihoods of its depth and moment: of a magnet, which lies at the bar's
-clearance with the moment of the road's magnets along one of two axes, and of iron, of any depth and moment. Poles
-beside it tell of a long piece of iron. The weights are those of a logistic regression on simulated drives
-(`benchmarks.training.magnet_odds`), so the probability can be taken as it is: of readings with 0.9 nine in ten are
-right.
+The fit enters as the log likelihood ratio of its depth and moment under two hypotheses: a magnet, which lies at the
+bar's clearance with the moment of the road's magnets along one of two axes; and iron, of any depth and moment. Dipoles
+around it enter because a long piece of iron has poles side by side. The weights are those of a logistic regression on
+simulated drives (`benchmarks.training.magnet_odds`), so the probability is calibrated: of the readings with 0.95, 95 %
+are right.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.magnet.dipole_fit import UPRIGHT, MagnetPrior
-from app.decoders.magnet.ferrous import BEYOND_M, POLE_ENERGY, rows_beside
-from app.decoders.magnet.fit_window import MAX_MISFIT, Dipole
+from app.decoders.magnet.ferrous import BEYOND_M, POLE_ENERGY, POLE_SHARE, rows_beside
+from app.decoders.magnet.fit_window import Dipole
 from app.decoders.magnet.magnet_state import MagnetState, without_prior
 
 Floats = npt.NDArray[np.float64]
@@ -27,20 +27,18 @@ IRON_DEPTH_M, IRON_DEPTH_STD_M, IRON_MOMENT_STD = 0.05, 0.2, 1.2
 a magnet. [m, m, 1] Source: iron that is read as dipoles lies in or on the road and has up to three times the moment;
 chosen by hand, the regression weighs the ratio."""
 MIN_LOG_ODDS, MAX_LOG_ODDS = -20.0, 14.0
-"""Limits of a dipole's own evidence. Source: beyond them it is certain anyway."""
-SMALL_POLE = 0.05
-"""Energy of a pole that counts, over the dipole's own. Source: what a model that errs leaves of a strong magnet."""
+"""Limits of `own_log_odds`. Source: beyond them a dipole is certainly iron, or a magnet."""
 TOO_NEAR_M, OTHER_KIND_M, NEAR_M, NEAR_HEIGHTS, PIECE_M, ABREAST_M = 0.42, 0.9, 0.8, 3.0, 3.0, 1.2
 """Distances within which magnets have no neighbour, tags and lines keep apart, poles are of one object (in heights
 too), and a long piece of iron has poles side by side. [m, m, m, 1, m, m] Source: `app.markers.magnet.MIN_GAP_M` less
 the error of two places; lengths of the pieces of iron in `app.simulation.magnetic.clutter`."""
 NEIGHBOUR_M = 1.0
 """[m] within which the neighbour that is least like a magnet is looked for. Source: by hand."""
-EVIDENCE = (
+FEATURES = (
     "own", "own, up to 3", "misfit", "margin", "too near", "other kind", "unlike pole", "magnets around",
     "piece of iron", "neighbour", "rows", "upright", "too deep", "like iron", "iron before",
 )  # fmt: skip
-"""Names of the entries of `magnet_evidence`."""
+"""Names of the features that `magnet_features` returns."""
 WEIGHTS = np.array([
     0.59,  # own
     -0.05,  # own, up to 3
@@ -59,16 +57,18 @@ WEIGHTS = np.array([
     -1.24,  # iron before
 ])  # fmt: skip
 BIAS = -7.96
-"""Weights of the evidence, and the log odds without any. Source: `python -m benchmarks.training.magnet_odds --seed
+"""Weights of the features, and the intercept. Source: `python -m benchmarks.training.magnet_odds --seed
 62000 --scenes 560`, two thirds of its drives; of the others it prints how well they hold."""
 
 
 def own_log_odds(dipole: Dipole, prior: MagnetPrior) -> float:
     """Log ratio of the likelihoods of a dipole's depth and moment, of a magnet to iron.
 
-    What was expected is taken out of the fitted values, so that a weak dipole, which the fit moves to where a magnet
-    is expected, says little.
+    The prior is removed from the fit first (`without_prior`): a fit to a weak signal stays at the prior, and its ratio
+    is then near 0. A fit without a finite covariance is not a magnet's.
     """
+    if not np.isfinite(dipole.covariance).all():
+        return MIN_LOG_ODDS
     own, moment = dipole.kind, prior.moment_am2
     beside = [axis for axis in range(3) if axis != own]
     order = [2, 3 + own, *(3 + axis for axis in beside)]
@@ -96,8 +96,8 @@ def _log_density(off: Floats, covariance: Floats) -> float:
     return -0.5 * float(off @ np.linalg.solve(covariance, off)) - 0.5 * float(np.linalg.slogdet(covariance)[1])
 
 
-def magnet_evidence(dipole: Dipole, around: Sequence[Dipole], state: MagnetState, half_width_m: float) -> Floats:
-    """What speaks for a magnet, one number for each of `EVIDENCE`.
+def magnet_features(dipole: Dipole, around: Sequence[Dipole], state: MagnetState, half_width_m: float) -> Floats:
+    """Features of the logistic model, in the order of `FEATURES`.
 
     Parameters
     ----------
@@ -114,17 +114,16 @@ def magnet_evidence(dipole: Dipole, around: Sequence[Dipole], state: MagnetState
     too_near = other_kind = unlike = piece = 0.0
     neighbour, magnets = MAX_LOG_ODDS, 0
     for other in around:
-        if other is dipole or other.explained < max(POLE_ENERGY, SMALL_POLE * dipole.explained):
+        if other is dipole or other.explained < max(POLE_ENERGY, POLE_SHARE * dipole.explained):
             continue
         along, apart = abs(other.params[0] - s), math.hypot(other.params[0] - s, other.params[1] - y)
-        is_unlike = other.log_odds < 0 or other.misfit > MAX_MISFIT
         too_near = max(too_near, float(apart < TOO_NEAR_M))
         other_kind = max(other_kind, float(other.kind != dipole.kind and apart < OTHER_KIND_M))
-        unlike = max(unlike, float(is_unlike and apart < max(NEAR_M, NEAR_HEIGHTS * h)))
+        unlike = max(unlike, float(other.resembles_iron and apart < max(NEAR_M, NEAR_HEIGHTS * h)))
         if apart < NEIGHBOUR_M:
             neighbour = min(neighbour, other.log_odds)
         if along < PIECE_M and abs(other.params[1]) < half_width_m + BEYOND_M:
-            magnets += not is_unlike
+            magnets += not other.resembles_iron
             if not piece and rows_beside(other, around, half_width_m, ABREAST_M) > 1:
                 piece = 1.0
     rows = min(max(0, rows_beside(dipole, around, half_width_m) - 1), 2)
@@ -132,14 +131,14 @@ def magnet_evidence(dipole: Dipole, around: Sequence[Dipole], state: MagnetState
         dipole.log_odds, min(dipole.log_odds, 3.0), math.log(max(dipole.misfit, 0.004)),
         math.log1p(min(dipole.margin, 40.0)), too_near, other_kind, unlike, math.log1p(magnets), piece, neighbour, rows,
         float(dipole.kind == UPRIGHT), (h - prior.clearance_m) / prior.clearance_std_m, state.iron_log_odds,
-        math.log1p(state.unlike),
+        math.log1p(state.iron_before),
     ])  # fmt: skip
 
 
-def magnet_probability(evidence: Floats) -> float:
+def magnet_probability(features: Floats) -> float:
     """Probability that a dipole is a magnet of the kind and polarity with which it was fitted.
 
     It is that of a magnet, times that of its kind: the margin is twice the log ratio of the likelihoods of both kinds.
     """
-    margin = math.expm1(evidence[EVIDENCE.index("margin")])
-    return float(1 / (1 + np.exp(-(evidence @ WEIGHTS + BIAS))) / (1 + math.exp(-margin / 2)))
+    margin = math.expm1(features[FEATURES.index("margin")])
+    return float(1 / (1 + np.exp(-(features @ WEIGHTS + BIAS))) / (1 + math.exp(-margin / 2)))

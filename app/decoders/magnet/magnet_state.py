@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.magnet.dipole_fit import MagnetPrior
-from app.decoders.magnet.fit_window import MAX_MISFIT, Dipole, magnet_prior
+from app.decoders.magnet.fit_window import Dipole, magnet_prior
 
 Floats = npt.NDArray[np.float64]
 
@@ -46,7 +46,7 @@ SURE_COUNT = 8
 MIN_INFORMATION = 0.1
 """Share of a depth's precision that must come from the field, not from what was expected. Source: chosen by hand."""
 MIN_PRECISION = 0.02
-"""Precision that a field has of any parameter, over that of what is expected. Source: chosen by hand, for numbers."""
+"""Smallest precision of the data, over that of the prior: keeps covariances finite. Source: chosen by hand."""
 CLEARANCE_M, CLEARANCE_STD_M = 0.24, 0.12
 """Clearance that is expected where none is declared. [m] Source: the middle of the 15 to 35 cm of METRO section 7.3;
 it covers them within a standard deviation."""
@@ -67,8 +67,8 @@ class MagnetState:
 
     Attributes
     ----------
-    unlike : float
-        Dipoles under the bar that are unlike magnets, of about the last thirty.
+    iron_before : float
+        Number of the dipoles under the bar that resemble iron, of about the last thirty.
     """
 
     def __init__(self, moment_am2: float, declared_m: float | None = None) -> None:
@@ -79,8 +79,8 @@ class MagnetState:
         strength = _bell(MOMENT_RATIOS, 1.0, MOMENT_RATIO_STD)
         self._log = np.log(depth[:, None, None] * strength[:, None] * np.ones(IRON_SHARES.size))
         self._first = self._log.copy()
-        self._count = 0
-        self.unlike = 0.0
+        self._learnt = 0
+        self.iron_before = 0.0
         self._set_prior()
 
     @property
@@ -96,16 +96,16 @@ class MagnetState:
     @property
     def is_sure(self) -> bool:
         """Whether it is known from so many dipoles that further ones hardly change it."""
-        return self.is_known and self._count >= SURE_COUNT
+        return self.is_known and self._learnt >= SURE_COUNT
 
     @property
     def iron_log_odds(self) -> float:
         """Log odds that a dipole of this road that looks like a magnet is iron."""
         return self._iron_log_odds
 
-    def count(self, dipole: Dipole) -> None:
-        """Count a dipole under the bar as one like a magnet or unlike one."""
-        self.unlike = MEMORY * self.unlike + float(dipole.log_odds < 0 or dipole.misfit > MAX_MISFIT)
+    def count_iron(self, dipole: Dipole) -> None:
+        """Update `iron_before` with a dipole under the bar."""
+        self.iron_before = MEMORY * self.iron_before + dipole.resembles_iron
 
     def learn(self, dipole: Dipole, expected: MagnetPrior) -> None:
         """Add a dipole that looks like a magnet, fitted under what was expected of it."""
@@ -114,7 +114,7 @@ class MagnetState:
         middle = np.array([expected.clearance_m, expected.moment_am2])
         fitted = np.array([dipole.params[2], abs(dipole.params[3 + dipole.kind])])
         own = dipole.covariance[at] / np.outer(std, std)
-        if 1 - own[0, 0] < MIN_INFORMATION:
+        if not (np.isfinite(own).all() and 1 - own[0, 0] >= MIN_INFORMATION):
             return
         seen, covariance = without_prior(fitted / std, own, np.eye(2), (fitted - middle) / std)
         depth_m, moment = seen * std
@@ -125,7 +125,7 @@ class MagnetState:
         chi2 = inverse[0, 0] * off_m**2 + 2 * inverse[0, 1] * off_m * off + inverse[1, 1] * off**2
         magnet = np.exp(-0.5 * chi2) / (2 * math.pi * math.sqrt(float(np.linalg.det(covariance))))
         iron = 1 / (float(np.ptp(CLEARANCES_M)) * self._moment_am2 * float(np.ptp(MOMENT_RATIOS)))
-        self._count += 1
+        self._learnt += 1
         self._log = self._first + MEMORY * (self._log - self._first)
         self._log += np.log((1 - IRON_SHARES) * magnet[:, :, None] + IRON_SHARES * iron)
         self._set_prior()
@@ -147,21 +147,26 @@ class MagnetState:
 
 
 def without_prior(fitted: Floats, covariance: Floats, given: Floats, slope: Floats) -> tuple[Floats, Floats]:
-    """What the field alone says of fitted parameters, in standard deviations of what was expected of them.
+    """Maximum likelihood estimate and covariance of fitted parameters, from their maximum a posteriori estimate.
+
+    All are in standard deviations of the prior. At the maximum of the posterior, the gradients of both costs cancel.
 
     Parameters
     ----------
     fitted : ndarray, shape (P,)
-        Most likely parameters, with what was expected of them.
-    covariance, given : ndarray, shape (P, P)
-        Theirs, and the precision of what was expected.
+        Maximum a posteriori estimate.
+    covariance : ndarray, shape (P, P)
+        Of the posterior.
+    given : ndarray, shape (P, P)
+        Precision of the prior.
     slope : ndarray, shape (P,)
-        Of half of the cost of what was expected: the field's own cost has the opposite one.
+        Gradient of half of the prior's cost at the estimate.
 
     Returns
     -------
-    seen : ndarray, shape (P,)
+    estimate : ndarray, shape (P,)
     covariance : ndarray, shape (P, P)
+        Large in directions in which the data determine nothing.
     """
     sizes, axes = np.linalg.eigh(np.linalg.inv(covariance) - given)
     alone = (axes / np.maximum(sizes, MIN_PRECISION)) @ axes.T

@@ -1,4 +1,4 @@
-"""What is reported as a magnet follows from a dipole's own evidence and from the poles beside it."""
+"""The probability of a magnet follows from the fit of its dipole and from the poles beside it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from app.decoders.magnet.classify import MIN_PROBABILITY, Accepted, Rejected, classify_dipoles, with_log_odds
 from app.decoders.magnet.ferrous import is_ferrous, rows_beside
 from app.decoders.magnet.fit_window import Dipole
-from app.decoders.magnet.magnet_odds import EVIDENCE, WEIGHTS, magnet_evidence, own_log_odds
+from app.decoders.magnet.magnet_odds import FEATURES, WEIGHTS, magnet_features, own_log_odds
 from app.decoders.magnet.magnet_state import MagnetState
 from app.decoders.magnet.readings import NoiseKind
 from app.markers.magnet import Orientation, Polarity
@@ -34,8 +34,8 @@ MESH = [pole(s, y) for s, y in ((10.0, -0.8), (10.2, -0.3), (10.1, 0.2), (10.3, 
 TAG = [pole(10 + 0.5 * i, 0.02 * i) for i in range(5)]
 
 
-def test_there_is_a_weight_for_each_evidence() -> None:
-    assert len(WEIGHTS) == len(EVIDENCE) == len(magnet_evidence(TAG[0], TAG, STATE, HALF_M))
+def test_there_is_a_weight_for_each_feature() -> None:
+    assert len(WEIGHTS) == len(FEATURES) == len(magnet_features(TAG[0], TAG, STATE, HALF_M))
 
 
 def test_poles_beside_each_other_are_iron_and_a_row_is_not() -> None:
