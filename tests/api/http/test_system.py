@@ -23,7 +23,7 @@ from app.logs import configure_logs
 from app.settings import Settings
 from app.storage import probe
 from tests.conftest import LiveServer
-from tests.http import refused
+from tests.http import refused, wait_until
 
 OPEN = {"/", "/healthz", "/readyz", "/metrics", "/docs", "/docs/oauth2-redirect", "/redoc", "/openapi.json"}
 
@@ -204,14 +204,20 @@ def test_logs_are_one_json_object_a_line(
     before, level = root.handlers, root.level
     try:
         configure_logs("json", "INFO")
+        lines: list[dict[str, Any]] = []
+
+        def access_line() -> dict[str, Any] | None:
+            lines.extend(orjson.loads(line) for line in capsys.readouterr().err.splitlines())
+            return next((line for line in lines if line.get("request_id") == "one"), None)
+
         with serve(settings).client() as client:
             client.get("/v1/markers", headers={"X-Request-ID": "one"})
+        access = wait_until(access_line, "the line of the request")  # written after the response is sent
         logging.getLogger("elsewhere").warning("from the standard library")
-        lines = [orjson.loads(line) for line in capsys.readouterr().err.splitlines()]
+        lines.extend(orjson.loads(line) for line in capsys.readouterr().err.splitlines())
     finally:
         root.handlers, root.level = before, level
         structlog.reset_defaults()
-    access = next(line for line in lines if line.get("request_id") == "one")
     assert (access["event"], access["status"], access["route"]) == ("request", 200, "/v1/markers")
     assert {"agency", "ms", "timestamp", "level"} <= access.keys()
     assert lines[-1]["event"] == "from the standard library"
