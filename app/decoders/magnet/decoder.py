@@ -13,6 +13,7 @@ import numpy as np
 
 from app.decoders.magnet.assemble import TagAssembler
 from app.decoders.magnet.classify import (
+    Accepted,
     Classification,
     Rejected,
     classify_dipoles,
@@ -20,7 +21,7 @@ from app.decoders.magnet.classify import (
     shows_clearance,
     with_log_odds,
 )
-from app.decoders.magnet.detect_dipoles import DipoleDetector
+from app.decoders.magnet.detect_dipoles import DipoleDetector, are_same
 from app.decoders.magnet.ferrous import FORGET_M
 from app.decoders.magnet.fit_window import WINDOW_M, Dipole, Region, SensorArray
 from app.decoders.magnet.identify import TagCandidates
@@ -123,6 +124,7 @@ class MagnetDecoder:
         self._scores = BinScores.empty(0)
         self._score_start = HALF_BINS
         self._before: list[Dipole] = []  # of the last regions
+        self._read: list[Dipole] = []  # those of them that were reported as magnets
         self._unplaced: list[MagnetReading] = []
         self._findings: list[Finding] = []
 
@@ -182,9 +184,14 @@ class MagnetDecoder:
         region = self._make_region(first, last)
         prior = self.state.prior
         dipoles = with_log_odds(self._detector.detect(self._blocks, region, prior), prior)
+        # a magnet at the border of two regions is detected in both: it is reported once, by the first that is sure
+        dipoles = [d for d in dipoles if not any(are_same(d, read) for read in self._read)]
+        self._before = [b for b in self._before if not any(are_same(b, d) for d in dipoles)]
         classes = self._classify(dipoles)
-        start_m = (region.start + HALF_BINS) * BIN_M
-        self._before = [d for d in (*self._before, *dipoles) if d.params[0] > start_m - FORGET_M]
+        keep_m = (region.start + HALF_BINS) * BIN_M - FORGET_M
+        self._before = [d for d in (*self._before, *dipoles) if d.params[0] > keep_m]
+        accepted = (d for d, c in zip(dipoles, classes, strict=True) if isinstance(c, Accepted))
+        self._read = [d for d in (*self._read, *accepted) if d.params[0] > keep_m]
         for dipole, classification in zip(dipoles, classes, strict=True):
             reading = self._reading(dipole, classification)
             self._findings.append(reading)

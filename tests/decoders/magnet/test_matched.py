@@ -260,3 +260,28 @@ def test_bad_input_is_named() -> None:
         decode_trace(MagnetTrace(t, field[:, :3], t, t), BAR)
     with pytest.raises(InvalidParameter, match="finite"):
         MagnetTrace(t, field, t, np.array([1, np.nan, 2]))
+
+
+@pytest.mark.parametrize("clearance_m", [0.30, 0.36])
+@pytest.mark.parametrize("seed", [22, 23, 24])
+def test_opposed_magnets_half_a_metre_apart_are_not_one_of_the_other_kind(clearance_m: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    magnets = [
+        RoadMagnet(at_m + shift, 0.1, polarity, Orientation.FORWARD)
+        for at_m in 20 + np.cumsum(rng.uniform(3, 6, 12))
+        for shift, polarity in ((0.0, Polarity.N), (0.5, Polarity.S))
+    ]
+    scene = Scene(Road(110), Vehicle.compact(clearance_m=clearance_m), Course(18.0), lines=magnets)
+    drive = simulate_drive(scene, rng)
+    right, other = right_and_other(drive, decode_trace(drive.trace, BAR))
+    assert other == 0
+    assert right >= 20
+
+
+def test_a_magnet_at_the_border_of_two_regions_is_read_once() -> None:
+    lines = line_magnets(20, 180, 2.0, 0.7, Polarity.N)  # regions end after 8 m, wherever a magnet is
+    scene = Scene(Road(200), Vehicle.compact(clearance_m=0.16), Course(15.0, weave_m=0.1), lines=lines)
+    findings = decode_trace(simulate_drive(scene, np.random.default_rng(6)).trace, BAR)
+    places = np.sort([f.odometer_m for f in findings if isinstance(f, MagnetReading)])
+    assert len(places) > 60
+    assert np.diff(places).min() > 1.0
