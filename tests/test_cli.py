@@ -248,10 +248,10 @@ def test_imports_and_exports_that_cannot_be(
 def test_wrong_declarations_of_traces_are_refused(waymark: Run, tmp_path: Path, declared: str, what: str) -> None:
     recording = tmp_path / "drive.bin"
     recording.write_bytes(b"1")
-    status, printed, said = waymark("decode-trace", str(recording), "--declaration", declared)
+    status, printed, error = waymark("decode-trace", str(recording), "--declaration", declared)
     assert (status, printed) == (1, "")
-    assert what in said
-    assert "docs/magnets.md" in said
+    assert what in error
+    assert "docs/magnets.md" in error
 
 
 @pytest.mark.parametrize("backend", ["sqlite", "postgresql"], scope="module")

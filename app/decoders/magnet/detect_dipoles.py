@@ -38,7 +38,7 @@ PAIR_HEIGHT_M, PAIR_ALONE_M, PAIR_HALF_GAP_M = 0.25, 0.8, 0.27
 """A dipole at least so deep, and without another so near along the road, may be two opposed ones at this distance on
 each side. [m] Source: `MIN_GAP_M` of 0.5 m; from half of that depth on the fields of both merge."""
 PAIR_ALONE_SHARE = 0.2
-"""Dipoles that explain less than this share of its energy may stand for what one in place of two does not explain.
+"""Dipoles near it that explain less than this share of its energy may be the residual of one dipole fitted to two.
 Source: by hand."""
 PAIR_PENALTY = 15.0
 """Cost of two magnets in place of one. [chi-squared] Source: the pair costs 9 less at most at 261 single magnets of

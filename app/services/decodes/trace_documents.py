@@ -6,7 +6,7 @@ import math
 from typing import Literal
 
 import numpy as np
-from typing_extensions import TypedDict
+from typing_extensions import NotRequired, TypedDict
 
 from app import __version__
 from app.decoders.magnet.localize import TagFix
@@ -80,6 +80,7 @@ class PassedMagnetDocument(TypedDict):
     phi_deg: int
     clearance_cm: float
     confidence: float
+    along_std_m: NotRequired[float | None]  # decodes before matched-4 have none
 
 
 class CrossingDocument(TypedDict):
@@ -356,6 +357,7 @@ def _magnet(magnet: MagnetReading) -> PassedMagnetDocument:
         "phi_deg": magnet.phi_deg,
         "clearance_cm": round(magnet.clearance_cm, 2),
         "confidence": float(magnet.confidence),
+        "along_std_m": round(magnet.along_std_m, 4) or None,  # the paper's pipeline has none
     }
 
 
