@@ -4,8 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
+# Byte code is kept: without it every process compiles the sources anew, and pytest rewrites every test.
+export PYTHONDONTWRITEBYTECODE :=
+
 .DEFAULT_GOAL := help
-.PHONY: help demo serve test static check bench lock clean
+.PHONY: help demo serve test slow static web check bench docs lock clean
 
 help: ## Show the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -27,19 +30,41 @@ demo: $(VENV)/.runtime ## From coordinates, meanings and a road to decoded drive
 serve: $(VENV)/.runtime ## Serve on http://127.0.0.1:8000
 	$(BIN)/waymark serve
 
-test: $(VENV)/.dev ## All tests
-	$(BIN)/python -m pytest -n 4 --dist worksteal --durations=30 $(PYTEST_ARGS)
+PYTEST := $(BIN)/python -m pytest -n 4 --durations=30
 
-static: $(VENV)/.dev
+test: $(VENV)/.dev ## The quick tests; `make check` runs all
+	$(PYTEST) --dist worksteal -m "not slow" $(PYTEST_ARGS)
+
+slow: $(VENV)/.dev
+	$(PYTEST) --dist loadfile -m slow $(PYTEST_ARGS)
+
+static: $(VENV)/.dev web
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-check: static test ## Format, lint, types, import contracts, tests
+web: $(VENV)/.dev
+	@if command -v npm > /dev/null; then \
+		$(MAKE) --no-print-directory node_modules/.installed && node_modules/.bin/tsc -p . \
+			&& $(BIN)/python -m tests.web.api_types --check; \
+	elif [ -n "$$CI" ]; then \
+		echo "make web: npm is not installed" >&2; exit 1; \
+	else \
+		echo "The types of the web pages are not checked: that needs node and npm, see docs/web-pages.md."; \
+	fi
+
+node_modules/.installed: package-lock.json .npmrc
+	npm ci --no-audit --no-fund --loglevel=error
+	@touch $@
+
+check: static test slow ## Format, lint, types, import contracts, all tests
 
 bench: $(VENV)/.dev ## Benchmarks beside the paper's figures; SHORT=1 for the quick version
 	$(BIN)/python -m benchmarks $(if $(SHORT),--short)
+
+docs: $(VENV)/.dev ## The guide, from docs/ into build/guide; the server shows it at /guide
+	$(BIN)/python -m guide
 
 lock: $(VENV)/.dev ## Resolve the dependencies again, with hashes
 	$(BIN)/uv pip compile pyproject.toml --group dev --generate-hashes --no-emit-index-url --universal \
@@ -48,6 +73,8 @@ lock: $(VENV)/.dev ## Resolve the dependencies again, with hashes
 		--python-version 3.11 -o requirements.txt -c requirements-dev.txt
 	$(BIN)/uv pip compile pyproject.toml --extra s3 --extra tracing --extra bags --generate-hashes --no-emit-index-url \
 		--universal --no-header --python-version 3.11 -o docker/requirements.txt -c requirements-dev.txt
+	$(BIN)/uv pip compile --group guide --generate-hashes --no-emit-index-url --universal --no-header \
+		--python-version 3.11 -o docker/requirements-guide.txt -c requirements-dev.txt
 
 clean: ## Remove what was built
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
 
 import structlog
 from fastapi import Depends, FastAPI, Response
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api.access import audit, keys
+from app.api.access import audit, keys, me
 from app.api.decodes import decodes
+from app.api.decodes import details as decode_details
 from app.api.drives import drives
 from app.api.fleet import calibrations, snapshots, vehicles
 from app.api.health import maintenance
-from app.api.http import system, ui
+from app.api.http import server_settings, system, ui, web_settings
 from app.api.http.costs import Budget, Slots
 from app.api.http.dependencies import refuse_unknown_parameters
 from app.api.http.middleware import Guarded, Observed
@@ -30,9 +30,25 @@ from app.api.http.rate_limits import RateLimit
 from app.api.jobs import events, files, webhooks
 from app.api.jobs import jobs as job_routes
 from app.api.jobs.streams import Streams
-from app.api.markers import artwork, bulk, cerpms, codebooks, layouts, markers, observations, print_grades, searches
+from app.api.markers import (
+    artwork,
+    bulk,
+    cerpms,
+    codebook_drafts,
+    codebooks,
+    layouts,
+    markers,
+    observations,
+    plate_drafts,
+    print_grades,
+    searches,
+)
 from app.api.ogc import mount_ogc
-from app.api.plans import alignments, packages, plan_jobs, plans, proofs, radio_checks
+from app.api.plans import alignments, packages, plan_jobs, plans, proofs, radio_checks, rules
+from app.api.public_pages import damage_reports, page_settings, pages
+from app.api.public_pages.forms import MAX_FIELD_BYTES
+from app.api.public_pages.limits import public_limits
+from app.api.public_pages.pages import FormLimits
 from app.api.reprocessing import reprocessings
 from app.api.roads import roads
 from app.api.surveys import exports, imports
@@ -42,13 +58,18 @@ from app.control.operations import OperatorCases
 from app.control.server import ControlServer
 from app.families.plate.frames import decode_plates
 from app.jobs.frame_tasks import DecodePlates
+from app.published_settings import other_hosts, page_settings_of, server_settings_of
 from app.registry.database import Database
 from app.services.access.access import Access
+from app.services.ports import utc_now
 from app.settings import Settings
 from app.storage.probe import FolderProbe
-from app.wiring import Outside, connect_outside, make_use_cases, utc_now
+from app.use_cases import UseCases
+from app.wiring import Outside, connect_outside, make_use_cases
 
 _LOG = structlog.get_logger("waymark")
+_FORM_BYTES = MAX_FIELD_BYTES * 16
+"""Of a damage report besides the photo; a larger photo, up to here, is answered with the form. [byte]"""
 ROUTERS = (
     searches.router,
     bulk.router,
@@ -57,11 +78,13 @@ ROUTERS = (
     roads.router,
     markers.router,
     artwork.router,
+    plate_drafts.router,
     print_grades.router,
     layouts.router,
     cerpms.router,
     radio_checks.router,
     alignments.router,
+    rules.router,
     plans.router,
     proofs.router,
     packages.router,
@@ -73,7 +96,9 @@ ROUTERS = (
     reprocessings.router,
     reprocessings.decode_versions,
     codebooks.router,
+    codebook_drafts.router,
     decodes.router,
+    decode_details.router,
     uploads.router,
     drives.router,
     imports.router,
@@ -83,6 +108,11 @@ ROUTERS = (
     vehicles.router,
     calibrations.router,
     keys.router,
+    page_settings.router,
+    damage_reports.router,
+    me.router,
+    web_settings.router,
+    server_settings.router,
 )
 
 
@@ -105,6 +135,10 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         setattr(app.state, name, use_case)
     app.state.database = outside.database
     app.state.spool = outside.spool
+    app.state.public_limits = public_limits(
+        settings.public_pages_per_minute, settings.damage_reports_per_hour, settings.marker_reports_per_day
+    )
+    app.state.form_limits = FormLimits(settings.max_report_photo_bytes, settings.report_contact_days)
     app.state.public_url = settings.public_url.rstrip("/")
     app.state.readiness = {
         "database": outside.database.is_ready,
@@ -114,7 +148,10 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.streams = Streams(use_cases["all_jobs"].watched, use_cases["agency_events"].newest_of)
     app.state.metrics = CollectorRegistry()
     app.state.metrics.register(ProcessMetrics(outside.database, outside.pool, utc_now))
+    app.state.page_settings = page_settings_of(settings, __version__)
+    app.state.server_settings = server_settings_of(settings, __version__)
     _add_routes(app)
+    ui.mount_static(app, other_hosts(settings), settings.base_map_file, settings.guide_dir)
     _add_guard(app, settings, app.state.access)
     app.add_middleware(Observed, registry=app.state.metrics)
     return app
@@ -127,7 +164,7 @@ def _folders(outside: Outside) -> set[Path]:
 
 
 @asynccontextmanager
-async def _running(settings: Settings, outside: Outside, use_cases: Mapping[str, Any]) -> AsyncIterator[None]:
+async def _running(settings: Settings, outside: Outside, use_cases: UseCases) -> AsyncIterator[None]:
     """The time between the server's start and its end."""
     jobs, access, unused_blobs = use_cases["jobs"], use_cases["access"], use_cases["unused_blobs"]
     control = _control(outside.database, use_cases)
@@ -154,6 +191,7 @@ async def _running(settings: Settings, outside: Outside, use_cases: Mapping[str,
             _each(timedelta(days=1), delivery.delete_old, stop=delivery.stop),
             _each(timedelta(days=1), job_files.try_to_delete_expired, stop=job_files.stop),
             _each(timedelta(seconds=1), delivery.try_to_work, stop=delivery.stop),
+            _each(timedelta(days=1), use_cases["damage_reports"].try_to_delete_old_contacts, stop=_nothing),
             _each(timedelta(minutes=1), upload_cases.try_to_tidy, stop=upload_cases.stop),
         ):
             yield
@@ -165,22 +203,22 @@ async def _running(settings: Settings, outside: Outside, use_cases: Mapping[str,
         outside.database.close()
 
 
-def _control(database: Database, use_cases: Mapping[str, Any]) -> ControlServer | None:
+def _control(database: Database, use_cases: UseCases) -> ControlServer | None:
     """What carries out commands; those for PostgreSQL open the database themselves."""
     if database.path is None:
         return None
-    names = ("access", "imports", "exports")
-    cases = OperatorCases(database, utc_now, **{name: use_cases[name] for name in names})
+    cases = OperatorCases(
+        database, utc_now, use_cases["access"], lambda: use_cases["imports"], lambda: use_cases["exports"]
+    )
     return ControlServer(database.path, cases)
 
 
 def _add_routes(app: FastAPI) -> None:
-    for router in (ui.router, system.router):
+    for router in (ui.router, system.router, pages.router):
         app.include_router(router)
     for router in ROUTERS:
         app.include_router(router, dependencies=[Depends(refuse_unknown_parameters)])
     mount_ogc(app)
-    ui.mount_static(app)
     install_problem_handlers(app)
     describe(app)
 
@@ -201,6 +239,7 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
             "/v1/calibrations": settings.max_upload_bytes,
             "/v1/print-grades": settings.max_upload_bytes,
             "/v1/uploads": settings.max_resumable_bytes,
+            "/m/": settings.max_report_photo_bytes + _FORM_BYTES,
         },
         permissions=Permissions(),
         body_timeout_s=settings.body_timeout_s,
@@ -243,6 +282,10 @@ async def _each(wait: timedelta, work: Callable[[], None], *, stop: Callable[[],
     finally:
         stop()
         task.cancel()
+
+
+def _nothing() -> None:
+    """Work of one statement needs no way to stop it."""
 
 
 def _admin_key(settings: Settings) -> str | None:

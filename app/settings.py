@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from pathlib import Path
 from typing import Literal, Self
+from urllib.parse import urlsplit
 
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 MIN_ADMIN_KEY_CHARACTERS = 24
+_TILE = ("{z}", "{x}", "{y}")
 _LOOPBACK = ("http://127.0.0.1:", "http://localhost:", "http://[::1]:")
 
 
@@ -54,7 +57,13 @@ class Settings(BaseSettings):
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
     public_url: str = Field(
-        default="", description="Address at which clients reach the server; used in QR codes and links."
+        default="",
+        max_length=100,
+        description="Address at which clients reach the server, http://... or https://...; used in QR codes and links. "
+        "Artwork has no QR code without it, or with an address of this machine only.",
+    )
+    guide_dir: Path | None = Field(
+        default=None, description="Folder with the built guide, which is shown at /guide; empty: that of `make docs`."
     )
     master_key_file: Path | None = Field(
         default=None, description="File with the 32 bytes that encrypt the agencies' secret keys; created if missing."
@@ -153,6 +162,29 @@ class Settings(BaseSettings):
         default=30.0, ge=0, le=1e6, description="Maximum rate of wrong keys from one address; 0: unlimited. [1/min]"
     )
 
+    public_pages_per_minute: float = Field(
+        default=60.0,
+        ge=0,
+        le=1e6,
+        description="Maximum rate of requests for public pages from one address; one without a page counts as five; 0: "
+        "unlimited. [1/min]",
+    )
+    damage_reports_per_hour: float = Field(
+        default=10.0, ge=0, le=1e6, description="Maximum rate of damage reports from one address; 0: unlimited. [1/h]"
+    )
+    marker_reports_per_day: float = Field(
+        default=20.0, ge=0, le=1e6, description="Maximum rate of damage reports of one marker; 0: unlimited. [1/d]"
+    )
+    max_report_photo_bytes: int = Field(
+        default=16_000_000, ge=1_000_000, description="Maximum size of the photo in a damage report. [byte]"
+    )
+    report_contact_days: int = Field(
+        default=90,
+        ge=1,
+        le=3650,
+        description="Time after which e-mail addresses of damage reports are deleted. [d]",
+    )
+
     trusted_proxies: str = Field(
         default="",
         description="Addresses of proxies whose X-Forwarded-For and X-Forwarded-Proto are accepted, separated by "
@@ -187,6 +219,24 @@ class Settings(BaseSettings):
     oidc_agency_claim: str = Field(default="waymark_agency", description="Claim that names the agency.")
     oidc_scope_claim: str = Field(default="waymark_scope", description="Claim that names the scope.")
 
+    oidc_client_id: str = Field(
+        default="",
+        description="Client of the web pages at the issuer (public, authorization code with PKCE); empty: the pages "
+        "ask for a key.",
+    )
+    oidc_authorize_url: str = Field(default="", description="The issuer's authorization endpoint, for the pages.")
+    oidc_token_url: str = Field(default="", description="The issuer's token endpoint, for the pages.")
+    oidc_request_scopes: str = Field(
+        default="openid profile", description="OAuth scopes that the pages request, separated by spaces."
+    )
+
+    base_map: str = Field(
+        default="",
+        description="Map under the markers on the pages: a PMTiles file on the server, or the URL of raster tiles with "
+        "{z}, {x} and {y}; empty: a grid.",
+    )
+    base_map_attribution: str = Field(default="", description="Attribution that the base map requires.")
+
     webhooks_to_loopback: bool = Field(
         default=False, description="Webhooks may be sent to this machine, also by http: for trying them out."
     )
@@ -213,6 +263,20 @@ class Settings(BaseSettings):
             raise ValueError(f"an admin key has at least {MIN_ADMIN_KEY_CHARACTERS} characters")
         return key
 
+    @field_validator("public_url")
+    @classmethod
+    def _is_an_address(cls, url: str) -> str:
+        parts = urlsplit(url)
+        if url and not (
+            parts.scheme in ("http", "https")
+            and parts.hostname
+            and url.isascii()
+            and url.isprintable()
+            and not re.search(r"[\s?#]", url)
+        ):
+            raise ValueError("public_url must be http://HOST[:PORT][/PATH] or https://..., in printable ASCII")
+        return url
+
     @field_validator("trusted_proxies")
     @classmethod
     def _are_addresses(cls, addresses: str) -> str:
@@ -227,6 +291,32 @@ class Settings(BaseSettings):
         if folder is not None and not folder.is_dir():
             raise ValueError(f"{folder} is not a folder")
         return folder
+
+    @field_validator("base_map")
+    @classmethod
+    def _is_map(cls, base_map: str) -> str:
+        if not base_map:
+            return base_map
+        if base_map.endswith(".pmtiles"):
+            if "://" in base_map or not Path(base_map).is_file():
+                raise ValueError(f"{base_map} is not a PMTiles file of this machine")
+        elif not (base_map.startswith(("https://", "/", *_LOOPBACK)) and all(p in base_map for p in _TILE)):
+            raise ValueError("base_map is a .pmtiles file, or an https URL with {z}, {x} and {y}")
+        elif any(character in base_map for character in " ;,'\""):
+            raise ValueError("the URL of a base_map has no spaces, quotes, commas or semicolons")
+        return base_map
+
+    @model_validator(mode="after")
+    def _whole_client(self) -> Self:
+        if self.oidc_client_id and not self.oidc_issuer:
+            raise ValueError("an oidc_client_id needs an oidc_issuer")
+        for name in ("oidc_authorize_url", "oidc_token_url"):
+            url = getattr(self, name)
+            if self.oidc_client_id and not url.startswith(("https://", *_LOOPBACK)):
+                raise ValueError(f"an oidc_client_id needs an {name}, by https")
+            if any(character in url for character in " ;,'\""):
+                raise ValueError(f"{name} has no spaces, quotes, commas or semicolons")
+        return self
 
     @model_validator(mode="after")
     def _supported_database(self) -> Self:
@@ -259,6 +349,11 @@ class Settings(BaseSettings):
         if self.oidc_jwks.startswith("http://") and not self.oidc_jwks.startswith(_LOOPBACK):
             raise ValueError("oidc_jwks is fetched by https")
         return self
+
+    @property
+    def base_map_file(self) -> Path | None:
+        """The base map's file, if it is one."""
+        return Path(self.base_map).resolve() if self.base_map.endswith(".pmtiles") else None
 
     @property
     def proxies(self) -> list[str]:
@@ -296,6 +391,16 @@ class Settings(BaseSettings):
         return self.signing_key_file or self.data_dir / "signing.key"
 
     @property
-    def resolved_public_url(self) -> str:
-        """Public URL without a trailing slash, with the default filled in."""
-        return self.public_url.rstrip("/") or f"http://{self.host}:{self.port}"
+    def qr_code_url(self) -> str:
+        """Start of the addresses in QR codes, without a trailing slash; empty if only this machine could open them."""
+        host = urlsplit(self.public_url).hostname or "localhost"
+        return "" if _is_this_machine(host) else self.public_url.rstrip("/")
+
+
+def _is_this_machine(host: str) -> bool:
+    """Whether an address leads each machine to itself."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host == "localhost" or host.endswith(".localhost")
+    return address.is_loopback or address.is_unspecified

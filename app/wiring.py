@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from functools import lru_cache, partial
 from typing import Any
 
@@ -33,6 +33,7 @@ from app.services.access.keys import Keys
 from app.services.access.oidc import Issuer, KeySet, Tokens
 from app.services.decodes.archive_handler import ArchiveHandler
 from app.services.decodes.decodes import Decodes
+from app.services.decodes.details import DecodeDetails
 from app.services.decodes.frame_handler import FrameHandler
 from app.services.decodes.outputs import DecodeOutputs
 from app.services.decodes.packet_handler import PacketHandler
@@ -45,7 +46,7 @@ from app.services.fleet.calibrations import Calibrations
 from app.services.fleet.snapshots import Snapshots
 from app.services.fleet.vehicles import Vehicles
 from app.services.health.maintenance import Maintenance
-from app.services.jobs import Jobs
+from app.services.jobs import JobHandler, Jobs
 from app.services.markers.artwork import Artworks
 from app.services.markers.artwork_jobs import ArtworkJobs
 from app.services.markers.bulk import BulkMarkers
@@ -55,6 +56,7 @@ from app.services.markers.features import Features
 from app.services.markers.layouts import Layouts
 from app.services.markers.markers import Markers
 from app.services.markers.observations import Observations
+from app.services.markers.plate_drafts import PlateDrafts
 from app.services.markers.print_grades import PrintGrades
 from app.services.markers.searches import Searches
 from app.services.plans.alignments import Alignments
@@ -62,10 +64,15 @@ from app.services.plans.making import PlanMaking
 from app.services.plans.packages import Packages
 from app.services.plans.plan_jobs import PlanJobs
 from app.services.plans.plans import Plans
+from app.services.plans.previews import PlanPreviews
 from app.services.plans.proofs import Proofs
+from app.services.ports import utc_now
 from app.services.progress.events import AgencyEvents
 from app.services.progress.jobs import AllJobs
 from app.services.progress.results import JobFiles
+from app.services.public_pages.form_tokens import FormTokens
+from app.services.public_pages.pages import PublicPages
+from app.services.public_pages.reports import DamageReports
 from app.services.reprocessing.reprocessings import Reprocessings
 from app.services.request_work import check_deadline
 from app.services.roads.roads import Roads
@@ -86,6 +93,18 @@ from app.storage.s3_parts import S3Parts
 from app.storage.signing_key import load_signing_keys
 from app.storage.spool import Spool
 from app.storage.webhook_sender import WebhookSender
+from app.use_cases import (
+    AccessUseCases,
+    DecodeUseCases,
+    FileUseCases,
+    ImportUseCases,
+    MarkerUseCases,
+    PlanUseCases,
+    PlateUseCases,
+    PublicUseCases,
+    UseCases,
+    WebhookUseCases,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,105 +143,170 @@ def _job_queue(settings: Settings) -> JobEngine:
     return CeleryQueue(make_celery(settings.broker_url, settings.broker_prefix), settings.broker_prefix)
 
 
-def make_use_cases(settings: Settings, outside: Outside, decode: DecodePlates) -> dict[str, Any]:
+def make_use_cases(settings: Settings, outside: Outside, decode: DecodePlates) -> UseCases:
     """The use cases by the names under which routes ask for them."""
-    database, blobs, pool, queue = outside.database, outside.blobs, outside.pool, outside.queue
-    rules = _decode_rules(settings)
-    ttl = rules.idempotency_ttl
-    secrets = AgencySecrets(lru_cache(lambda: load_master_key(settings.resolved_master_key_file)))
-    signing_keys = partial(load_signing_keys, settings.resolved_signing_key_file)
-    handlers = _handlers(database, pool, secrets, rules)
-    marker_cases = Markers(database, utc_now, marker_rules(settings))
-    import_cases = Imports(database, utc_now, pool, marker_rules(settings))
-    import_jobs = ImportJobs(database, utc_now, blobs, queue, imports=import_cases, idempotency_ttl=ttl)
-    quotas = _quotas(settings, database)
-    decode_cases = Decodes(database, utc_now, blobs=blobs, quotas=quotas, queue=queue, handlers=handlers, rules=rules)
-    access = Access(database, utc_now, _token_check(settings))
+    ttl = timedelta(hours=settings.idempotency_ttl_h)
+    master_key = lru_cache(lambda: load_master_key(settings.resolved_master_key_file))
+    secrets = AgencySecrets(master_key)
+    quotas = _quotas(settings, outside.database)
+    access = _access_use_cases(settings, outside, ttl)
+    imports = _import_use_cases(settings, outside, ttl)
+    decodes = _decode_use_cases(settings, outside, secrets, quotas)
     plans = _plan_use_cases(settings, outside, ttl)
-    drives = Drives(database, utc_now, blobs, pool, queue, idempotency_ttl=ttl)
-    sender = WebhookSender(loopback=settings.webhooks_to_loopback)
-    files = _job_file_use_cases(settings, outside, ttl)
-    reprocessings = Reprocessings(database, utc_now, blobs, queue, decode_cases)
-    audit_verifications = AuditVerifications(database, utc_now, queue, idempotency_ttl=ttl)
+    files = _file_use_cases(settings, outside, ttl)
+    handlers = _job_handlers(access, imports, decodes, plans, files)
     return {
-        "access": access,
-        "agency_events": AgencyEvents(database),
-        "artworks": Artworks(database, public_url=settings.resolved_public_url, read=_face_reader(decode)),
-        "audit": AuditLog(database),
-        "audit_verifications": audit_verifications,
-        "bulk_markers": BulkMarkers(database, utc_now, marker_cases, ttl),
-        "calibrations": Calibrations(database, utc_now, pool, rules.images, ttl),
-        "codebooks": Codebooks(database, utc_now, ttl),
-        "decode_outputs": DecodeOutputs(database, blobs=blobs, processes=pool, rules=rules),
-        "decodes": decode_cases,
-        "drives": drives,
-        "features": Features(database, utc_now),
-        "import_jobs": import_jobs,
-        "imports": import_cases,
-        "jobs": Jobs(
-            database,
-            utc_now,
-            {
-                JobKind.AUDIT: audit_verifications,
-                JobKind.DECODE: decode_cases,
-                JobKind.IMPORT: import_jobs,
-                JobKind.PLAN: plans["plan_making"],
-                JobKind.PROOF: plans["proofs"],
-                JobKind.PACKAGE: plans["packages"],
-                JobKind.ARTWORK: files["artwork_jobs"],
-                JobKind.EXPORT: files["export_jobs"],
-                JobKind.REPROCESS: reprocessings,
-                JobKind.DRIVE: drives,
-            },
-            queue,
-        ),
-        "keys": Keys(database, utc_now, access),
-        "layouts": Layouts(database),
-        "maintenance": Maintenance(database, utc_now, marker_cases),
-        "markers": marker_cases,
-        "observations": Observations(database),
-        "print_grades": PrintGrades(database, utc_now, pool, rules.images),
-        "programs": CerpmPrograms(database, utc_now, secrets),
-        "reprocessings": reprocessings,
-        "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
+        "jobs": Jobs(outside.database, utc_now, handlers, outside.queue),
         "quotas": quotas,
-        "searches": Searches(database),
-        "snapshots": Snapshots(database, utc_now, signing_keys),
-        "unused_blobs": UnusedBlobs(database, utc_now, blobs, alone=settings.is_embedded),
-        "webhook_delivery": WebhookDelivery(database, utc_now, secrets, sender),
-        "webhooks": Webhooks(database, utc_now, secrets, sender.check_url),
-        "uploads": Uploads(
-            database,
-            utc_now,
-            blobs=blobs,
-            spool=outside.spool,
-            s3=S3Parts(settings.resolved_blobs_url),
-            decodes=decode_cases,
-            quotas=quotas,
-            rules=UploadRules(settings.max_resumable_bytes, timedelta(hours=settings.upload_expiry_h)),
-        ),
-        "vehicles": Vehicles(database, utc_now, ttl),
+        **access,
+        **_marker_use_cases(settings, outside, secrets, ttl),
+        **imports,
+        **_plate_use_cases(settings, outside, decode, ttl),
+        **decodes,
         **plans,
         **files,
+        **_webhook_use_cases(settings, outside, secrets),
+        **_public_use_cases(settings, outside, quotas, master_key),
     }
 
 
-def _plan_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> dict[str, Any]:
-    """Those about roads to plan and their plans."""
+def _job_handlers(
+    access: AccessUseCases, imports: ImportUseCases, decodes: DecodeUseCases, plans: PlanUseCases, files: FileUseCases
+) -> dict[JobKind, JobHandler]:
+    """What runs the jobs of each kind."""
+    return {
+        JobKind.AUDIT: access["audit_verifications"],
+        JobKind.DECODE: decodes["decodes"],
+        JobKind.IMPORT: imports["import_jobs"],
+        JobKind.PLAN: plans["plan_making"],
+        JobKind.PROOF: plans["proofs"],
+        JobKind.PACKAGE: plans["packages"],
+        JobKind.ARTWORK: files["artwork_jobs"],
+        JobKind.EXPORT: files["export_jobs"],
+        JobKind.REPROCESS: decodes["reprocessings"],
+        JobKind.DRIVE: decodes["drives"],
+    }
+
+
+def _access_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> AccessUseCases:
+    """Permissions, keys and the audit log."""
+    database = outside.database
+    access = Access(database, utc_now, _token_check(settings))
+    return {
+        "access": access,
+        "audit": AuditLog(database),
+        "audit_verifications": AuditVerifications(database, utc_now, outside.queue, idempotency_ttl=ttl),
+        "keys": Keys(database, utc_now, access),
+        "vehicles": Vehicles(database, utc_now, ttl),
+    }
+
+
+def _marker_use_cases(settings: Settings, outside: Outside, secrets: AgencySecrets, ttl: timedelta) -> MarkerUseCases:
+    """The registry: markers, roads and codebooks, and what is read of them."""
+    database = outside.database
+    markers = Markers(database, utc_now, marker_rules(settings))
+    return {
+        "bulk_markers": BulkMarkers(database, utc_now, markers, ttl),
+        "codebooks": Codebooks(database, utc_now, ttl),
+        "features": Features(database, utc_now),
+        "layouts": Layouts(database),
+        "maintenance": Maintenance(database, utc_now, markers),
+        "markers": markers,
+        "observations": Observations(database),
+        "programs": CerpmPrograms(database, utc_now, secrets),
+        "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
+        "searches": Searches(database),
+        "snapshots": Snapshots(database, utc_now, partial(load_signing_keys, settings.resolved_signing_key_file)),
+    }
+
+
+def _import_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> ImportUseCases:
+    """Surveys, at once and as jobs."""
+    imports = Imports(outside.database, utc_now, outside.pool, marker_rules(settings))
+    jobs = ImportJobs(outside.database, utc_now, outside.blobs, outside.queue, imports=imports, idempotency_ttl=ttl)
+    return {"imports": imports, "import_jobs": jobs}
+
+
+def _plate_use_cases(settings: Settings, outside: Outside, decode: DecodePlates, ttl: timedelta) -> PlateUseCases:
+    """Artwork, prints and cameras."""
+    database, pool, read, images = outside.database, outside.pool, _face_reader(decode), _decode_rules(settings).images
+    return {
+        "artworks": Artworks(database, public_url=settings.qr_code_url, read=read),
+        "calibrations": Calibrations(database, utc_now, pool, images, ttl),
+        "plate_drafts": PlateDrafts(pool, read=read, crs_accuracy_m=settings.crs_accuracy_m),
+        "print_grades": PrintGrades(database, utc_now, pool, images),
+    }
+
+
+def _decode_use_cases(settings: Settings, outside: Outside, secrets: AgencySecrets, quotas: Quotas) -> DecodeUseCases:
+    """Uploads and what is decoded of them."""
+    database, blobs, pool, queue = outside.database, outside.blobs, outside.pool, outside.queue
+    rules = _decode_rules(settings)
+    handlers = _handlers(database, pool, secrets, rules)
+    decodes = Decodes(database, utc_now, blobs=blobs, quotas=quotas, queue=queue, handlers=handlers, rules=rules)
+    parts = UploadRules(settings.max_resumable_bytes, timedelta(hours=settings.upload_expiry_h))
+    return {
+        "decode_details": DecodeDetails(database, blobs=blobs, processes=pool, rules=rules),
+        "decode_outputs": DecodeOutputs(database, blobs=blobs, processes=pool, rules=rules),
+        "decodes": decodes,
+        "drives": Drives(database, utc_now, blobs, pool, queue, idempotency_ttl=rules.idempotency_ttl),
+        "reprocessings": Reprocessings(database, utc_now, blobs, queue, decodes),
+        "unused_blobs": UnusedBlobs(database, utc_now, blobs, alone=settings.is_embedded),
+        "uploads": Uploads(
+            database, utc_now, blobs=blobs, spool=outside.spool, s3=S3Parts(settings.resolved_blobs_url),
+            decodes=decodes, quotas=quotas, rules=parts,
+        ),
+    }  # fmt: skip
+
+
+def _webhook_use_cases(settings: Settings, outside: Outside, secrets: AgencySecrets) -> WebhookUseCases:
+    """Events and the webhooks that deliver them."""
+    sender = WebhookSender(loopback=settings.webhooks_to_loopback)
+    return {
+        "agency_events": AgencyEvents(outside.database),
+        "webhook_delivery": WebhookDelivery(outside.database, utc_now, secrets, sender),
+        "webhooks": Webhooks(outside.database, utc_now, secrets, sender.check_url),
+    }
+
+
+def _public_use_cases(
+    settings: Settings, outside: Outside, quotas: Quotas, master_key: Callable[[], bytes]
+) -> PublicUseCases:
+    """The pages that need no key."""
+    photo_limits = ImageLimits(pixels=settings.max_image_pixels, file_bytes=settings.max_report_photo_bytes)
+    return {
+        "damage_reports": DamageReports(
+            outside.database,
+            utc_now,
+            outside.blobs,
+            outside.pool,
+            quotas,
+            images=photo_limits,
+            contact_days=settings.report_contact_days,
+        ),
+        "form_tokens": FormTokens(master_key, utc_now),
+        "public_pages": PublicPages(outside.database, utc_now),
+    }
+
+
+def _plan_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> PlanUseCases:
+    """Roads to plan and their plans."""
     stores = (outside.database, utc_now, outside.blobs, outside.pool)
     plan_cases = Plans(*stores, marker_rules(settings))
+    making = PlanMaking(outside.database, utc_now, outside.queue, plans=plan_cases, idempotency_ttl=ttl)
     workers = settings.decode_workers
     return {
         "alignments": Alignments(*stores, accuracy_m=settings.crs_accuracy_m, idempotency_ttl=ttl),
         "packages": Packages(*stores, outside.queue, in_flight=workers, idempotency_ttl=ttl),
         "plan_jobs": PlanJobs(outside.database, utc_now),
-        "plan_making": PlanMaking(outside.database, utc_now, outside.queue, plans=plan_cases, idempotency_ttl=ttl),
+        "plan_making": making,
+        "plan_previews": PlanPreviews(plan_cases, making),
         "plans": plan_cases,
         "proofs": Proofs(*stores, outside.queue, in_flight=workers, idempotency_ttl=ttl),
     }
 
 
-def _job_file_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> dict[str, Any]:
+def _file_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> FileUseCases:
     """Jobs of every kind, and those that write files."""
     database, queue = outside.database, outside.queue
     jobs, exports = AllJobs(database, utc_now), Exports(database)
@@ -231,17 +315,12 @@ def _job_file_use_cases(settings: Settings, outside: Outside, ttl: timedelta) ->
         "all_jobs": jobs,
         "artwork_jobs": ArtworkJobs(
             database, utc_now, outside.pool, queue, files,
-            public_url=settings.resolved_public_url, in_flight=settings.decode_workers, idempotency_ttl=ttl,
+            public_url=settings.qr_code_url, in_flight=settings.decode_workers, idempotency_ttl=ttl,
         ),
         "export_jobs": ExportJobs(database, utc_now, queue, exports, files, ttl),
         "exports": exports,
         "job_files": files,
     }  # fmt: skip
-
-
-def utc_now() -> datetime:
-    """The system's clock."""
-    return datetime.now(UTC)
 
 
 def marker_rules(settings: Settings) -> MarkerRules:

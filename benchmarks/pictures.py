@@ -12,6 +12,7 @@ import tempfile
 import zipfile
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import cv2
 import httpx
@@ -20,7 +21,7 @@ import numpy as np
 import app.demo
 from app.demo.cerpms import build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import drive_over, list_plates, registered_code
-from app.demo.road_plan import ORIGIN_DEG, ROAD, RULES
+from app.demo.road_plan import ORIGIN_DEG, ROAD, RULES, plan_road
 from app.demo.server import LocalServer
 from app.formats.spooled_file import SpooledFile
 from app.jobs.trace_tasks import decode_recording
@@ -31,11 +32,12 @@ from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
 from app.simulation.magnetic.vehicle import Course, Vehicle
 from app.simulation.radio.drive import drive_past
-from tests.browser import Browser
+from tests.web.browsing import chromium, watched_page
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 _SEED = 3
 _FRAME_ROWS = 75.0
+_MAP_SETTLES_MS = 3000
 _CHOSEN = 2  # the plate with the paper's digits
 
 
@@ -58,7 +60,7 @@ def main() -> None:
         print(decode["summary"]["text"], markers[0]["position"], markers[0]["heading_deg"])
         annotated = client.get(decode["links"]["annotated"]).raise_for_status().content
         (IMAGES / "drive.jpg").write_bytes(_recoded(annotated, 0.5, 85))
-        _write_page(server, Path(folder))
+        _write_pages(server, client, markers)
         _write_lane(client)
     _write_trace()
     _write_strip_map()
@@ -138,20 +140,25 @@ def _write_plate(client: httpx.Client, marker_id: str) -> None:
     cv2.imwrite(str(IMAGES / "plate.png"), smaller)
 
 
-def _write_page(server: LocalServer, folder: Path) -> None:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        print("there is no chromium here: the picture of the page stays as it is")
+def _write_pages(server: LocalServer, client: httpx.Client, markers: list[dict[str, Any]]) -> None:
+    """The page of the markers, and that of the demo's plan before its proof."""
+    if shutil.which("chromium") is None:
+        print("there is no chromium here: the pictures of the pages stay as they are")
         return
-    with Browser(chromium, folder / "profile", (1200, 860)) as page:
-        page.open(f"{server.url}/")
-        page.fill("#key", server.key)
-        page.click("#key-form button")
-        page.until("document.querySelectorAll('#marker-rows button').length")
-        page.run(f"document.querySelectorAll('#marker-rows button')[{_CHOSEN}].click()")
-        page.until("document.querySelector('.preview') && document.querySelector('.preview').naturalWidth > 0")
-        page.until("/Read back/.test(document.querySelector('#detail').innerText)")
-        (IMAGES / "page.png").write_bytes(page.screenshot())
+    with chromium() as browser, watched_page(browser, server.url, server.key, (1200, 860)) as watched:
+        page = watched.open(f"/markers/{markers[_CHOSEN]['id']}")
+        page.locator(".artwork").wait_for()
+        page.locator(".map-tools").wait_for()
+        page.get_by_text(f"{len(markers)} markers on the map").wait_for()
+        page.wait_for_timeout(_MAP_SETTLES_MS)
+        page.screenshot(path=IMAGES / "page.png")
+        with tempfile.TemporaryDirectory() as folder:
+            plan = plan_road(client, Path(folder)).plan
+        page.set_viewport_size({"width": 1200, "height": 1120})
+        page = watched.open(f"/plans/{plan['id']}")
+        page.locator(".strip svg").first.wait_for()
+        page.wait_for_timeout(_MAP_SETTLES_MS)
+        page.screenshot(path=IMAGES / "plan-page.png")
 
 
 if __name__ == "__main__":

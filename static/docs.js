@@ -4,5 +4,6 @@ SwaggerUIBundle({
   dom_id: "#docs",
   deepLinking: true,
   validatorUrl: null, // nothing is sent to another host
+  requestInterceptor: (request) => Object.assign(request, { credentials: "omit" }), // no password dialogue of the browser
   syntaxHighlight: false, // its themes are inline styles, which the content security policy refuses
 });

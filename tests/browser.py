@@ -95,12 +95,14 @@ class Browser:
         self.until("document.readyState === 'complete' && location.href !== 'about:blank'")
 
     def until(self, condition: str) -> Any:
-        """Wait until an expression is true in the page."""
+        """Wait until an expression is true in the page; one that fails, as in a page just replaced, is not true."""
         deadline = time.monotonic() + WITHIN_S
-        while not (value := self.run(condition)):
-            assert time.monotonic() < deadline, f"never came true: {condition}; {self.complaints}"
+        while True:
+            answer = self.call("Runtime.evaluate", expression=condition, awaitPromise=True, returnByValue=True)
+            if value := answer["result"].get("value"):
+                return value
+            assert time.monotonic() < deadline, f"never came true: {condition}; {answer}; {self.complaints}"
             time.sleep(0.05)
-        return value
 
     def fill(self, selector: str, text: str) -> None:
         """Type into a field."""

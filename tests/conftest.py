@@ -7,6 +7,7 @@ import os
 import shutil
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -38,8 +39,16 @@ from tests.documented import DEVIATIONS, CheckedResponses
 from tests.http import WITHIN_S
 
 ADMIN_KEY = "an-admin-key-for-tests-only"
-UNLIMITED: dict[str, Any] = {"requests_per_s": 0.0, "wrong_keys_per_minute": 0.0}
+UNLIMITED: dict[str, Any] = {
+    "requests_per_s": 0.0,
+    "wrong_keys_per_minute": 0.0,
+    "public_pages_per_minute": 0.0,
+    "damage_reports_per_hour": 0.0,
+    "marker_reports_per_day": 0.0,
+}
 """Settings of servers that tests ask faster than a key may."""
+Place = Callable[[], dict[str, Any]]
+"""The fixture `place`."""
 
 
 class LiveServer:
@@ -191,10 +200,32 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("backend", ["sqlite", "postgresql"], scope="module")
 
 
+_SERVERS = {"postgres", "browser", "broker"}
+"""Fixtures of what a machine has only if somebody installed it."""
+
+
+_LONG = {"web", "test_no_server_errors.py"}
+"""Folders and files of slow tests alone. They are not even read where slow tests are left out: they load much."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Read no file of slow tests alone when slow tests are left out."""
+    return True if config.option.markexpr == "not slow" and collection_path.name in _LONG else None
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run files with slow tests first: processes that share the tests then end at about the same time."""
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    """Mark what needs a server or a browser as slow, and begin with the files that take longest.
+
+    Processes then end at about the same time. Of many slow tests in a file, most are quick ones on PostgreSQL.
+    """
+    for item in items:
+        parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
+        needs_server = _SERVERS & set(getattr(item, "fixturenames", ())) or parameters.get("backend") == "postgresql"
+        if needs_server or _LONG & set(item.path.parts):
+            item.add_marker("slow")
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: (not _LONG & set(item.path.parts), slow[item.path] or len(items)))
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,12 @@ import orjson
 from fastapi import FastAPI
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.api.http.page_addresses import PAGES
+
 PROBLEM = "application/problem+json"
-OUTSIDE = re.compile(r"/(static(/.*)?|docs(/.*)?|redoc|openapi\.json|metrics)?")
-"""Paths that the document does not describe: the files of the web page, the document itself, metrics as text."""
+_PAGES = "|".join(re.sub(r"\{\w+\}", "[^/]+", page) for page in PAGES)
+OUTSIDE = re.compile(rf"{_PAGES}|/(static(/.*)?|guide(/.*)?|docs(/.*)?|redoc|openapi\.json|metrics)?")
+"""Paths that the document does not describe: files of the web pages and of the guide, the document itself, metrics."""
 DEVIATIONS: list[str] = []
 """What was found since a test last looked."""
 
@@ -75,6 +78,8 @@ class _Document:
         if method == "HEAD" and operation is not None and media_type != PROBLEM:
             return [] if str(status) in operation["responses"] else ["the status is not documented"]
         if operation is None:  # there is no such resource or method, and the server says so
+            if path.startswith("/m/") and media_type == "text/html" and status >= 400:
+                return []  # for people
             if media_type != PROBLEM:
                 return ["no operation describes this"]
             return self._schema_faults("problem", {"$ref": "#/components/schemas/Problem"}, body)

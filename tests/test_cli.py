@@ -40,6 +40,7 @@ def test_migrate_up_and_down(waymark: Run, tmp_path: Path) -> None:
     assert (tmp_path / "waymark.sqlite3").exists()
 
 
+@pytest.mark.slow
 def test_a_key_for_another_agency(waymark: Run, tmp_path: Path) -> None:
     status, key, _ = waymark("key", "City of Elsewhere", "--scope", "viewer", "--label", "map")
     assert status == 0
@@ -58,6 +59,7 @@ def test_a_key_for_another_agency(waymark: Run, tmp_path: Path) -> None:
     assert "admin, planner, surveyor, viewer, vehicle" in error
 
 
+@pytest.mark.slow
 def test_the_admin_key_of_the_environment_can_change(tmp_path: Path) -> None:
     old, new = "an-old-admin-key-of-32-characters", "a-newer-admin-key-of-33-characters"
     for current, other in ((old, new), (new, old), (old, new)):
@@ -112,6 +114,7 @@ def test_a_plate_is_written_and_read_back(waymark: Run, tmp_path: Path, scheme: 
         assert [reading["digits"] for reading in orjson.loads(line)["readings"]] == [digits]
 
 
+@pytest.mark.slow
 def test_the_artwork_of_a_plate_is_a_perfect_print(waymark: Run, tmp_path: Path) -> None:
     place = ("--lon-deg", "114.179203", "--lat-deg", "22.304161")
     scheme = ("--scheme", "position")
@@ -209,6 +212,7 @@ def test_a_survey_goes_in_and_markers_come_out(waymark: Run, tmp_path: Path) -> 
     assert drawn.read_text().startswith("<svg")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
@@ -254,6 +258,7 @@ def test_wrong_declarations_of_traces_are_refused(waymark: Run, tmp_path: Path, 
     assert "docs/magnets.md" in error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["sqlite", "postgresql"], scope="module")
 def test_a_snapshot_is_made_and_verified(
     waymark: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new_database_url: Callable[[Path], str]
@@ -293,6 +298,7 @@ def test_a_snapshot_is_made_and_verified(
     assert "is not JSON" in waymark(*verify, str(newer))[2]
 
 
+@pytest.mark.slow
 def test_a_rotation_of_signing_keys(waymark: Run, tmp_path: Path) -> None:
     """The drill of docs/snapshots.md, section Keys: no vehicle that follows it is without a valid snapshot."""
     waymark("key", "Roads")
@@ -332,6 +338,7 @@ def test_a_rotation_of_signing_keys(waymark: Run, tmp_path: Path) -> None:
     assert path.read_bytes() == b"short"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [

@@ -30,10 +30,11 @@ from app.markers.plate import PlateCode
 from app.simulation.magnetic.drive import simulate_drive
 from tests.http import WITHIN_S
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
-@pytest.mark.slow
 def test_the_demo_reads_every_plate_and_tag(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from app.cli import main; main()", "demo", "--out", str(tmp_path / "out")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WITHIN_S)

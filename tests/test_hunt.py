@@ -81,6 +81,7 @@ def test_the_cause_of_failures_is_found_and_scenes_are_shrunk_to_it():
     assert find_clusters(family.bounds, scenes, Kind.MISSED) == ([], {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", sorted(FAMILIES))
 def test_scenes_that_failed_once_do_not_get_worse(family):
     kept = read_kept(family)

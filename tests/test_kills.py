@@ -26,6 +26,7 @@ from tests.jobs import standin
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.slow,
     pytest.mark.timeout(600),
     # Celery warns of its default whenever a connection is lost; as an error it would end the worker
     pytest.mark.filterwarnings("ignore::celery.exceptions.CPendingDeprecationWarning"),

@@ -1,4 +1,4 @@
-"""The README's tour runs unchanged against a real server, and must print what the README shows."""
+"""The README's tour and the tutorials run unchanged against a real server, and must print what they show."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from app.demo.free_ports import free_ports
 from benchmarks.readme import PAGES, SHORT_MARK, fill_blocks, read_sections
 from tests.http import WITHIN_S
+from tests.tours import assert_same, read_blocks, run_blocks
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
-TOUR = README.split("## Five minutes")[1].split("\n## ")[0]
-BLOCKS = re.findall(r"^```sh\n(.*?)^```\n+(?:^```text\n(.*?)^```)", TOUR, re.MULTILINE | re.DOTALL)
-NUMBER = re.compile(r"(?<![\w.])-?\d+\.\d+")
-END = "=== end of block ==="
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 
 
 def require(name: str) -> None:
@@ -31,41 +30,21 @@ def require(name: str) -> None:
         pytest.skip(f"{name} is not installed")
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(3600)  # a loaded machine compiles the decoders for minutes
-def test_the_tour_prints_what_the_readme_shows(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["README.md", *(f"docs/tutorials/{path.name}" for path in TUTORIALS)])
+def test_commands_print_what_the_document_shows(tmp_path: Path, name: str) -> None:
     require("curl")
     require("bash")
-    assert len(BLOCKS) == len(re.findall(r"^```sh$", README, re.MULTILINE)) >= 6
-    for folder in ("docs", "app"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
-    programs = tmp_path / "bin"
-    programs.mkdir()
-    (programs / "waymark").write_text(f'#!/bin/sh\nexec {sys.executable} -c "from app.cli import main; main()" "$@"\n')
-    (programs / "waymark").chmod(0o755)
-    script = f"\necho '{END}'\n".join(commands for commands, _ in BLOCKS)
-    script = script.replace("WAYMARK_PORT=8000", f"WAYMARK_PORT={free_ports(1)[0]}")
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")} | {
-        "PATH": f"{programs}:{os.environ['PATH']}",
-        "PYTHONPATH": str(ROOT),
-        "no_proxy": "127.0.0.1",
-    }
-    stop = "trap 'kill $(jobs -p) 2> /dev/null || true; wait' EXIT\n"
-    done = subprocess.run(
-        ["bash", "-c", f"set -euo pipefail\n{stop}{script}"],
-        cwd=tmp_path, env=environment, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    printed = done.stdout.split(f"{END}\n")
-    for (commands, expected), got in zip(BLOCKS, printed, strict=True):
+    text = (ROOT / name).read_text()
+    blocks = read_blocks(text)
+    assert len(blocks) == len(re.findall(r"^```sh$", text, re.MULTILINE)) >= 6
+    printed = run_blocks(blocks, tmp_path)
+    for (commands, expected), got in zip(blocks, printed, strict=True):
         assert_same(got.strip(), expected.strip(), commands)
 
 
-def assert_same(got: str, expected: str, commands: str) -> None:
-    """Texts are equal but for the last digits of measured numbers."""
-    assert NUMBER.sub("#", got) == NUMBER.sub("#", expected), commands
-    for mine, shown in zip(NUMBER.findall(got), NUMBER.findall(expected), strict=True):
-        assert float(mine) == pytest.approx(float(shown), abs=0.02), f"{mine} in place of {shown}: {commands}"
+def test_there_is_a_tutorial_for_each_kind_of_user() -> None:
+    assert {path.stem for path in TUTORIALS} >= {"planner", "fabricator", "vehicle-engineer", "operator"}
 
 
 @pytest.mark.parametrize("name", re.findall(r"python -m ([\w.]+)", README))
@@ -119,3 +98,12 @@ def test_every_benchmark_has_its_block() -> None:
     blocks += ["bundle", "http", "video", "track", "health"]
     filled = [name for page in PAGES for name in re.findall(r"<!-- bench:([\w-]+) -->", page.read_text())]
     assert sorted(filled) == sorted(blocks)
+
+
+def test_pictures_of_tutorials_are_small_and_shown() -> None:
+    texts = "".join(path.read_text() for path in TUTORIALS)
+    pictures = [path for path in (ROOT / "docs/images/tutorials").iterdir() if path.suffix in (".png", ".jpg")]
+    assert len(pictures) >= 8
+    for picture in pictures:
+        assert picture.stat().st_size <= 150_000, picture.name
+        assert f"images/tutorials/{picture.name}" in texts, f"{picture.name} is not shown"

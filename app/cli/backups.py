@@ -125,7 +125,7 @@ def _write_backup(settings: Settings, target: Path, options: BackupOptions) -> M
     from app import __version__
     from app.registry.database import Database
     from app.services.backups.backup import Backups
-    from app.wiring import utc_now
+    from app.services.ports import utc_now
 
     with closing(Database(settings.resolved_database_url)) as database, Progress() as shown:
         backups = Backups(database, _blobs(settings), utc_now, __version__, _key_files(settings))

@@ -17,6 +17,8 @@ from app.settings import Settings
 if TYPE_CHECKING:
     from app.control.operations import Values
     from app.registry.database import Database
+    from app.services.surveys.exports import Exports
+    from app.services.surveys.imports import Imports
 
 _STORE_SECRETS = ("aws_access_key_id", "aws_secret_access_key")
 """Files of the folder of secrets that the client of S3 takes from the environment."""
@@ -92,15 +94,32 @@ def perform(settings: Settings, name: str, values: Values, files: Sequence[int] 
     from app.cli.progress import Progress
     from app.control.client import perform as carry_out
     from app.control.operations import OperatorCases
-    from app.jobs.tasks import SameProcess
     from app.services.access.access import Access
-    from app.services.surveys.exports import Exports
-    from app.services.surveys.imports import Imports
-    from app.wiring import marker_rules, utc_now
+    from app.services.ports import utc_now
 
     def make_cases(database: Database) -> OperatorCases:
-        imports = Imports(database, utc_now, SameProcess(), marker_rules(settings))
-        return OperatorCases(database, utc_now, Access(database, utc_now), imports, Exports(database))
+        return OperatorCases(
+            database,
+            utc_now,
+            Access(database, utc_now),
+            lambda: _imports(settings, database),
+            lambda: _exports(database),
+        )
 
     with Progress() as shown:
         return carry_out(settings.resolved_database_url, name, values, make_cases, files, shown.show)
+
+
+def _imports(settings: Settings, database: Database) -> Imports:
+    from app.jobs.tasks import SameProcess
+    from app.services.ports import utc_now
+    from app.services.surveys.imports import Imports
+    from app.wiring import marker_rules
+
+    return Imports(database, utc_now, SameProcess(), marker_rules(settings))
+
+
+def _exports(database: Database) -> Exports:
+    from app.services.surveys.exports import Exports
+
+    return Exports(database)

@@ -34,10 +34,10 @@ def make_snapshot(
     hours: Annotated[float, typer.Option(help="Hours until the snapshot expires, at most 168. [h]")] = 24.0,
 ) -> None:
     """Write the signed snapshot of an area."""
-    from app.api.markers.filters import parse_box
     from app.control.operations import operator
     from app.services.fleet.snapshots import Snapshots
-    from app.wiring import utc_now
+    from app.services.markers.search_boxes import parse_box
+    from app.services.ports import utc_now
 
     _refuse_existing(out)
     box, settings = parse_box(bbox), read_settings()
@@ -59,7 +59,7 @@ def write_trust(
     from app.control.operations import operator
     from app.services.fleet.documents import trust_document
     from app.services.fleet.snapshots import Snapshots
-    from app.wiring import utc_now
+    from app.services.ports import utc_now
 
     _refuse_existing(out)
     settings = read_settings()
@@ -84,7 +84,7 @@ def verify_snapshot(
     from app.decoders.newest_snapshot import open_newest_snapshot
     from app.decoders.snapshot import open_snapshot
     from app.markers.snapshot import Trust
-    from app.wiring import utc_now
+    from app.services.ports import utc_now
 
     try:
         trusted = Trust.from_document(orjson.loads(trust.read_bytes()))

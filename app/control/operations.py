@@ -14,9 +14,8 @@ from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from app.api.markers.filters import parse_box
 from app.errors import InvalidParameter
 from app.formats.spooled_file import SpooledFile
 from app.registry.agencies import find_agency
@@ -26,22 +25,23 @@ from app.registry.markers import MarkerFilter
 from app.registry.tenancy import across_agencies, acting_for
 from app.services.access.access import Access, Caller, Scope, parse_scope
 from app.services.ports import Clock
-from app.services.surveys.declarations import import_input
-from app.services.surveys.exports import Exports
-from app.services.surveys.imports import SETTLED, Imports
+
+if TYPE_CHECKING:
+    from app.services.surveys.exports import Exports
+    from app.services.surveys.imports import Imports
 
 _CHUNK_BYTES = 1024**2
 
 
 @dataclass(frozen=True, slots=True)
 class OperatorCases:
-    """The use cases that operations need."""
+    """The use cases that operations need; the ones of surveys are made when they are asked for: they load much."""
 
     database: Database
     clock: Clock
     access: Access
-    imports: Imports
-    exports: Exports
+    imports: Callable[[], Imports]
+    exports: Callable[[], Exports]
 
 
 Values = Mapping[str, Any]
@@ -66,12 +66,15 @@ def create_key(cases: OperatorCases, values: Values, _files: Sequence[int], _rep
 
 def import_survey(cases: OperatorCases, values: Values, files: Sequence[int], report: Report) -> Values:
     """Import the survey in the first file."""
+    from app.services.surveys.declarations import import_input
+    from app.services.surveys.imports import SETTLED
+
     with TemporaryDirectory(prefix="waymark-import-") as folder, operator(cases.database, values["agency"]) as caller:
         survey = Path(folder, "survey")  # decoder processes open it by its path, and not all paths are theirs
         with os.fdopen(os.dup(files[0]), "rb") as given_file, survey.open("xb") as copy:
             shutil.copyfileobj(given_file, copy, _CHUNK_BYTES)
         given = import_input(values["declaration"], SpooledFile.at(survey))
-        found, _ = cases.imports.run(
+        found, _ = cases.imports().run(
             caller, given, step=lambda done: report("check", done / SETTLED, 1.0), stored=partial(report, "store")
         )
     return {"report": found}
@@ -79,12 +82,14 @@ def import_survey(cases: OperatorCases, values: Values, files: Sequence[int], re
 
 def export_markers(cases: OperatorCases, values: Values, files: Sequence[int], report: Report) -> Values:
     """Write an agency's markers into the first file."""
+    from app.services.markers.search_boxes import parse_box
+
     box = parse_box(values["bbox"]) if values["bbox"] else None
     filtered = MarkerFilter(box=box, status=values["status"], family=values["family"])
     with TemporaryDirectory(prefix="waymark-export-") as folder, operator(cases.database, values["agency"]) as caller:
         with cases.database.read() as connection:
             total = count_records(connection, caller.agency_id, filtered)
-        path, left_out = cases.exports.write_file(
+        path, left_out = cases.exports().write_file(
             caller, values["kind"], filtered, Path(folder), lambda done: report("export", min(done, total), total)
         )
         with path.open("rb") as content, os.fdopen(os.dup(files[0]), "wb") as file:

@@ -1,4 +1,4 @@
-"""PDF 1.4 at true size: the file, its pages and properties, embedded fonts, and drawing in millimetres.
+"""PDF 1.4 and PDF/X-4 at true size: the file, its pages and properties, embedded fonts, drawing in millimetres.
 
 Artwork needs spot inks, overprint, outlined text and a hundred plates a second; a drilling sheet needs text that can
 be searched. Both need a dozen kinds of PDF object (ISO 32000-1), which are written here once. Numbers in brackets are
@@ -15,6 +15,7 @@ from io import BytesIO
 
 from fontTools.ttLib import TTFont
 
+from app.encoders import pdf_x
 from app.encoders.typeface import load_typeface
 
 POINTS_PER_MM = 72.0 / 25.4
@@ -23,16 +24,30 @@ Box = tuple[float, float, float, float]
 """Left, bottom, right, top. [mm]"""
 _CATALOG, _PAGES, _INFO = 1, 2, 3
 _COMPRESSION = 6
+_TOOL = "Waymark"
 _CIRCLE = 0.5522847498
 """Distance of the control points of a quarter circle of radius 1 from its ends: 4 / 3 (sqrt(2) - 1)."""
 
 
 class PdfFile:
-    """Objects by number, and the pages among them."""
+    """Objects by number, and the pages among them.
 
-    def __init__(self, title: str, *, compress: bool = True) -> None:
+    Parameters
+    ----------
+    title : str
+    compress : bool
+        Deflate the streams.
+    print_ready : bool
+        Make it a PDF/X-4. What is painted must then be in process or spot inks, without transparency.
+    """
+
+    def __init__(self, title: str, *, compress: bool = True, print_ready: bool = False) -> None:
         self.compress = compress
-        properties = f"<< /Title {text_string(title)} /Creator (Waymark) /Producer (Waymark) /Trapped /False >>"
+        self._title = pdf_x.xml_text(title)
+        self._print_ready = print_ready
+        dates = f" /CreationDate ({pdf_x.PDF_DATE}) /ModDate ({pdf_x.PDF_DATE})" if print_ready else ""
+        names = f"/Creator ({_TOOL}) /Producer ({_TOOL})"
+        properties = f"<< /Title {text_string(self._title)} {names}{dates} /Trapped /False >>"
         self._objects: list[bytes] = [b"", b"", properties.encode()]
         self._pages: list[int] = []
 
@@ -70,19 +85,31 @@ class PdfFile:
     def to_bytes(self) -> bytes:
         """The file: header, objects, cross-reference table and trailer (7.5)."""
         kids = " ".join(f"{number} 0 R" for number in self._pages)
-        self._objects[_CATALOG - 1] = f"<< /Type /Catalog /Pages {_PAGES} 0 R >>".encode()
-        self._objects[_PAGES - 1] = f"<< /Type /Pages /Count {len(self._pages)} /Kids [{kids}] >>".encode()
-        chunks = [b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n"]
+        pages = f"<< /Type /Pages /Count {len(self._pages)} /Kids [{kids}] >>".encode()
+        objects = [b"", pages, *self._objects[2:]]
+        version, extra, file_id = b"1.4", "", ""
+        if self._print_ready:
+            document = pdf_x.document_id(objects)
+            profile = len(objects) + 1
+            objects += [
+                pdf_x.profile_stream(),
+                pdf_x.output_intent(profile),
+                pdf_x.metadata_stream(self._title, _TOOL, document),
+            ]
+            version, extra = b"1.6", f" /OutputIntents [{profile + 1} 0 R] /Metadata {profile + 2} 0 R"
+            file_id = f" /ID [<{document.hex}> <{document.hex}>]"
+        objects[_CATALOG - 1] = f"<< /Type /Catalog /Pages {_PAGES} 0 R{extra} >>".encode()
+        chunks = [b"%PDF-" + version + b"\n%\xe2\xe3\xcf\xd3\n"]
         position, offsets = len(chunks[0]), []
-        for number, body in enumerate(self._objects, start=1):
+        for number, body in enumerate(objects, start=1):
             chunk = b"%d 0 obj\n%b\nendobj\n" % (number, body)
             offsets.append(position)
             position += len(chunk)
             chunks.append(chunk)
-        chunks.append(b"xref\n0 %d\n0000000000 65535 f \n" % self.next_number)
+        chunks.append(b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1))
         chunks += [b"%010d 00000 n \n" % offset for offset in offsets]
-        trailer = b"trailer\n<< /Size %d /Root %d 0 R /Info %d 0 R >>\nstartxref\n%d\n%%%%EOF\n"
-        chunks.append(trailer % (self.next_number, _CATALOG, _INFO, position))
+        trailer = b"trailer\n<< /Size %d /Root %d 0 R /Info %d 0 R%b >>\nstartxref\n%d\n%%%%EOF\n"
+        chunks.append(trailer % (len(objects) + 1, _CATALOG, _INFO, file_id.encode(), position))
         return b"".join(chunks)
 
 

@@ -32,7 +32,7 @@ class MarkerArtwork(ABC):
 
     @abstractmethod
     def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
-        """The drawing of a marker, whose record clients reach at an address.
+        """The drawing of a marker, whose public page is at an address; without one it has no QR code.
 
         Raises
         ------

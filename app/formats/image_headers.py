@@ -147,8 +147,8 @@ def unknown_picture(head: bytes, accepted: str = _KINDS, cure: str = SEND_AS_IT_
     kind = next((name for signature, name in _OTHER_SIGNATURES if head.startswith(signature)), None)
     if head[4:8] == b"ftyp":
         kind = "a video, HEIC or AVIF"
-    what = f"the file is {kind}" if kind else "the file is neither a JPEG nor a PNG"
-    return UnsupportedUpload(f"{what}, which no frame decoder reads", field=FIELD, limit=accepted, cure=cure)
+    what = f"the file is {kind}, not a JPEG or PNG picture" if kind else "the file is not a JPEG or PNG picture"
+    return UnsupportedUpload(what, field=FIELD, limit=accepted, cure=cure)
 
 
 def _check_size(width_px: int, height_px: int, limits: ImageLimits) -> None:

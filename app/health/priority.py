@@ -13,9 +13,13 @@ URGENCY: Mapping[str, float] = {
     "missing": 0.6,
     "unregistered": 0.5,
     "fading": 0.4,
+    "loose": 0.7,
+    "damaged": 0.6,
+    "dirty": 0.4,
+    "other": 0.4,
 }
-"""How much a fault can mislead a vehicle: a marker that shows a wrong place is worse than one that shows none. Source:
-by hand."""
+"""How much a fault can mislead a vehicle: a marker that shows a wrong place is worse than one that shows none. The last
+four, and `missing`, are kinds of damage that people report; a loose marker can also hurt somebody. Source: by hand."""
 SAFETY_ROLE, USUAL_ROLE = 1.0, 0.8
 """Of markers whose meaning vehicles act on (stop line, speed limit, bend), and of all others. Source: by hand."""
 BUSY_PASSES = 3000.0
@@ -28,7 +32,7 @@ def item_priority(what: str, *, acted_on: bool, ratio: float, limit: float, mont
     Parameters
     ----------
     what : str
-        A fault, or ``wrong-way-driver``, which is always first.
+        A fault, a reported kind of damage, or ``wrong-way-driver``, which is always first.
     acted_on : bool
         Vehicles act on the marker's meaning.
     ratio, limit : float

@@ -1,26 +1,42 @@
-"""``python -m app.jobs.compile_kernels``: compile what decodes plates and traces and estimates tracks, ahead of use.
+"""``python -m app.jobs.compile_kernels``: compile what decodes plates, traces and packets, and estimates tracks.
 
 Numba keeps the result beside the code, or in NUMBA_CACHE_DIR, for processors like this one.
 """
 
 from __future__ import annotations
 
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+
 import numpy as np
 
 from app.decoders.plate.reader import decode_plates
 from app.jobs.decoder_process import warm_frame
 from app.jobs.trace_tasks import compile_traces
+from app.lanes.boundary_sides import assign_sides
 from app.services.decodes.trace_task import CompileTracesTask
 from app.tracks import Clock, LanePath, PositionFix, Samples, TrackInput
 from app.tracks.estimate import estimate_track
 
 _STEP_DEG = 1e-4
+_STATIONS_M = np.arange(0.0, 40.0, 10.0)
 
 
 def main() -> None:
-    """Decode a plate and a trace, and estimate a track, so that every kernel takes part."""
+    """Run everything once, so that every kernel takes part: plates in one process, the rest in another."""
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        for done in [pool.submit(_read_plate), pool.submit(_read_trace_and_track)]:
+            done.result()
+
+
+def _read_plate() -> None:
     decode_plates(warm_frame())
+
+
+def _read_trace_and_track() -> None:
+    """Decode a trace, find sides of a lane, and estimate a track."""
     compile_traces(CompileTracesTask(), None)
+    assign_sides(_STATIONS_M, np.resize((1.7, -1.7), 4), np.zeros(4, np.int64), wander=0.1, near_track=False)
     estimate_track(_short_track())
 
 

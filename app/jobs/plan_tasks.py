@@ -22,13 +22,15 @@ from app.planning.read_rules import check_rules
 from app.planning.rules import RoadRules
 from app.plots.trade_off import draw_trade_off
 from app.services.plans.as_built import compare_as_built
-from app.services.plans.documents import AsBuiltDocument
+from app.services.plans.documents import AlignmentProfile, AsBuiltDocument
 from app.services.plans.features import lane_features, planned_columns
+from app.services.plans.profiles import alignment_profile
 from app.services.plans.summaries import plan_summary, road_summary
 from app.services.plans.tasks import (
     CompareTask,
     MadePlan,
     MakePlanTask,
+    ProfileRoadTask,
     RoadFile,
     SummarizedRoad,
     SummarizeRoadTask,
@@ -45,6 +47,13 @@ def summarize_road(task: SummarizeRoadTask, _before: None) -> SummarizedRoad:
         file = read_alignment(task.road.file.read(), task.road.file_name)
         road = _build(file, task.road, None)
         return SummarizedRoad(dict(road_summary(road, file.format)), lane_features(road))
+
+
+def profile_road(task: ProfileRoadTask, _before: None) -> AlignmentProfile:
+    """Read a road to draw it."""
+    with memory_is_the_limit("road", _CURE):
+        file = read_alignment(task.road.file.read(), task.road.file_name)
+        return alignment_profile(_build(file, task.road, None), task.samples)
 
 
 def make_plan(task: MakePlanTask, _before: None) -> MadePlan:

@@ -12,26 +12,39 @@ from app.jobs.frame_list_tasks import read_frame_lists
 from app.jobs.frame_tasks import annotate_frame, decode_run, find_markers, load_frame
 from app.jobs.package_tasks import list_package_parts, write_package_manifest, write_package_part
 from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
-from app.jobs.plan_tasks import compare_plan, make_plan, summarize_road, write_file_of_plan, write_map
+from app.jobs.plan_tasks import compare_plan, make_plan, profile_road, summarize_road, write_file_of_plan, write_map
 from app.jobs.print_tasks import grade_photo
 from app.jobs.proof_tasks import list_proof_units, prove_unit, write_proof
+from app.jobs.report_photo_tasks import write_report_photo
+from app.jobs.sample_tasks import draw_video_frame, read_samples
 from app.jobs.survey_tasks import read_survey_file
 from app.jobs.trace_tasks import compile_traces, decode_recording
 from app.jobs.track_tasks import write_track
 from app.jobs.video_tasks import decode_segment, index_frames
+from app.jobs.view_tasks import render_camera_view
 from app.services.decoder_processes import Task
 from app.services.decodes.frame_poses import FrameListTask
 from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameRunTask, FrameSearch
 from app.services.decodes.packet_task import DriveTask, LaneTask, OverlayTask
+from app.services.decodes.sample_task import SamplesTask, VideoFrameTask
 from app.services.decodes.trace_task import CompileTracesTask, TraceTask
 from app.services.decodes.video_task import IndexVideoTask, SegmentTask
 from app.services.drives.track_task import TrackTask
 from app.services.fleet.calibrations import CalibrationTask
 from app.services.markers.artwork_tasks import DrawPlateTask, WriteSheetsTask
 from app.services.markers.print_task import PrintGradeTask
+from app.services.markers.view_task import CameraViewTask
 from app.services.plans.package_tasks import ListPartsTask, WriteManifestTask, WritePartTask
 from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask
-from app.services.plans.tasks import CompareTask, MakePlanTask, SummarizeRoadTask, WriteMapTask, WritePlanFileTask
+from app.services.plans.tasks import (
+    CompareTask,
+    MakePlanTask,
+    ProfileRoadTask,
+    SummarizeRoadTask,
+    WriteMapTask,
+    WritePlanFileTask,
+)
+from app.services.public_pages.report_photo import ReportPhotoTask
 from app.services.surveys.imports import SurveyTask
 
 ResultT = TypeVar("ResultT")
@@ -46,6 +59,8 @@ STEPS: dict[type, StepFunction] = {
     FrameListTask: read_frame_lists,
     TraceTask: decode_recording,
     CompileTracesTask: compile_traces,
+    SamplesTask: read_samples,
+    VideoFrameTask: draw_video_frame,
     IndexVideoTask: index_frames,
     SegmentTask: decode_segment,
     DriveTask: read_drive,
@@ -54,6 +69,7 @@ STEPS: dict[type, StepFunction] = {
     SurveyTask: read_survey_file,
     CalibrationTask: calibrate_photos,
     SummarizeRoadTask: summarize_road,
+    ProfileRoadTask: profile_road,
     MakePlanTask: make_plan,
     WritePlanFileTask: write_file_of_plan,
     WriteMapTask: write_map,
@@ -68,6 +84,8 @@ STEPS: dict[type, StepFunction] = {
     WriteSheetsTask: write_sheets,
     TrackTask: write_track,
     PrintGradeTask: grade_photo,
+    CameraViewTask: render_camera_view,
+    ReportPhotoTask: write_report_photo,
     ProcessIdTask: process_id,
 }
 

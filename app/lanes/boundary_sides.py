@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints
@@ -83,11 +84,10 @@ def assign_sides(station_m: Floats, left_m: Floats, named: Ints, *, wander: floa
     offset, label = left_m[order], named[order]
     base = _TRACK_COST * grid**2 if near_track else np.zeros(len(grid))
 
-    def cost(marker: int) -> Floats:
-        errors = _errors_of(offset[marker] - grid, label[marker], widths[:, None])
-        return np.minimum(np.minimum(errors.left_cost, errors.right_cost), _OUTLIER_COST) + base
-
-    state, width = _cheapest_course(cost, grid, widths, np.diff(station_m[order]), wander)
+    errors = _errors_of((offset[:, None] - grid)[:, None], label[:, None, None], widths[:, None])
+    cost = np.minimum(np.minimum(errors.left_cost, errors.right_cost), _OUTLIER_COST) + base
+    reach = wander**2 * np.maximum(np.diff(station_m[order]), 1.0)
+    state, width = _cheapest_course(cost, grid, _OPENING_COST * np.abs(widths[:, None] - widths), reach)
     found = _assign_beside(offset - grid[state], label, widths[width])
     back = np.empty(len(order), np.int64)
     back[order] = np.arange(len(order))
@@ -128,38 +128,54 @@ def _obvious_sides(left_m: Floats, named: Ints) -> SideAssignment | None:
     return SideAssignment(side, off, np.zeros(len(side), bool), width)
 
 
-def _cheapest_course(
-    cost: Callable[[int], Floats], grid: Floats, widths_m: Floats, ahead_m: Floats, wander: float
-) -> tuple[Ints, Ints]:
+@nb.njit(cache=True)
+def _cheapest_course(cost: Floats, grid: Floats, opening: Floats, reach_m2: Floats) -> tuple[Ints, Ints]:
     """Cheapest course through the grid (Viterbi algorithm): indices of the offset and of the width at each marker.
 
     Parameters
     ----------
-    cost : callable
-        Cost of a marker by width and offset, shape (W, G).
-    grid, widths_m : ndarray, shape (G,) and (W,)
-        [m]
-    ahead_m : ndarray, shape (K - 1,)
-        From each marker to the next. [m]
-    wander : float
-        As in `assign_sides`.
+    cost : ndarray, shape (K, W, G)
+        Of each marker by width and offset.
+    grid : ndarray, shape (G,)
+        Offsets, evenly spaced. [m]
+    opening : ndarray, shape (W, W)
+        Cost of a change of width.
+    reach_m2 : ndarray, shape (K - 1,)
+        Variance of what the centre moves sideways from each marker to the next. [m2]
+
+    Notes
+    -----
+    A move costs half of its square over the variance, and at most that of two outliers: beyond there, every offset
+    costs the same.
     """
-    count, kinds, size = len(ahead_m) + 1, len(widths_m), len(grid)
-    square = (grid[:, None] - grid) ** 2 / 2
-    opening = _OPENING_COST * np.abs(widths_m[:, None] - widths_m)
-    came_offset = np.empty((count, kinds, size), np.int8)
-    came_width = np.empty((count, kinds, size), np.int8)
-    total = cost(0)
+    count, kinds, size = cost.shape
+    most, step = 2 * _OUTLIER_COST, grid[1] - grid[0]
+    came_offset = np.empty((count, kinds, size), np.int16)
+    came_width = np.empty((count, kinds, size), np.int16)
+    total, moved = cost[0].copy(), np.empty((kinds, size))
     for i in range(1, count):
-        move = np.minimum(square / (wander**2 * max(ahead_m[i - 1], 1.0)), 2 * _OUTLIER_COST)
-        sums = total[:, None, :] + move
-        came_offset[i] = sums.argmin(2)
-        moved = np.take_along_axis(sums, came_offset[i][:, :, None].astype(np.int64), 2)[:, :, 0]
-        opened = moved[None] + opening[:, :, None]
-        came_width[i] = opened.argmin(1)
-        total = np.take_along_axis(opened, came_width[i][:, None].astype(np.int64), 1)[:, 0] + cost(i)
+        price = step * step / 2 / reach_m2[i - 1]
+        window = min(int(math.sqrt(most / price)), size)
+        for w in range(kinds):
+            lowest = int(np.argmin(total[w]))
+            for g in range(size):
+                best, at = total[w, lowest] + most, lowest
+                for h in range(max(g - window, 0), min(g + window + 1, size)):
+                    value = total[w, h] + price * (g - h) * (g - h)
+                    if value < best:
+                        best, at = value, h
+                moved[w, g], came_offset[i, w, g] = best, at
+        for w in range(kinds):
+            for g in range(size):
+                best, at = moved[w, g], w
+                for v in range(kinds):
+                    value = moved[v, g] + opening[w, v]
+                    if value < best:
+                        best, at = value, v
+                total[w, g], came_width[i, w, g] = best + cost[i, w, g], at
     width, state = np.empty(count, np.int64), np.empty(count, np.int64)
-    width[-1], state[-1] = np.unravel_index(int(total.argmin()), total.shape)
+    last = int(np.argmin(total))
+    width[-1], state[-1] = last // size, last % size
     for i in range(count - 1, 0, -1):
         width[i - 1] = came_width[i, width[i], state[i]]
         state[i - 1] = came_offset[i, width[i - 1], state[i]]

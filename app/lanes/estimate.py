@@ -167,6 +167,11 @@ def _fit_by_least_squares(
     fit = LaneFit(line, observations, taken, drive, rules, notes)
     try:
         found = fit.run()
+        if found and (scatter := fit.scatter()) > 1:
+            notes.warn(f"the markers lie about {scatter:.1f} times as far from smooth boundaries as was stated")
+            observations = replace(observations, sigma_m=scatter * observations.sigma_m)
+            fit = LaneFit(fit.line, observations, taken, drive, rules, notes)
+            found = fit.run()
     except np.linalg.LinAlgError:  # weights too different for float64
         return refused("the accuracies of markers and track are too different to be combined")
     for k, (reason, off) in fit.left_out.items():

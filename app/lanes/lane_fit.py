@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from app.lanes.boundary_sides import SideAssignment, assign_sides
 from app.lanes.driven_line import TRUSTED_TRACK_M, DrivenLine
 from app.lanes.even_spacing import NO_KNOWN_LENGTHS, find_known_lengths
 from app.lanes.least_squares import (
+    BENDS,
     OFFSET_MODELS,
     WIDTH_MODELS,
     Hyperparameters,
@@ -31,6 +33,10 @@ _NEARLY_CONVERGED_M = 0.5  # [m] a line that moved less shows no new outliers; s
 _MAX_REJECTIONS = 12  # of outliers beside one line; source: by hand, sensitivity 1.00, 1.00
 _MAX_GROWTH = 2.0  # of the length of the initial line; more is a line that winds between outliers; source: by hand
 _REJECTION_STRETCH_M = 60.0  # [m] within it one outlier at a time; source: by hand, sensitivity 1.00, 1.00
+_SCATTERS = (1.6, 2.5, 4.0)  # of markers, in their stated accuracy; source: by hand: 3.5, 5.5, 9 cm for the usual 2.2
+_MIN_GAIN = 1.5  # of the log likelihood by a larger scatter; source: by hand, on scenes of `benchmarks.hunt cerpm`
+_STIFFER = 3  # bends that are tried with a scatter: the one found and stiffer ones; source: by hand
+_CONSTANT_WIDTH: Mapping[str, Any] = WIDTH_MODELS[0]
 _OPPOSITE_SHARE = (
     0.2  # of sides that agree with the track, below which they are of the other direction; source: by hand
 )
@@ -133,15 +139,42 @@ class LaneFit:
         return self.outlier_ratio <= self._rules.max_outlier_ratio
 
     @property
+    def has_both_sides(self) -> bool:
+        """Whether markers of both sides are used."""
+        return len(np.unique(self.side[self.used])) == 2
+
+    @property
     def outlier_ratio(self) -> float:
         """Share of the markers that lie off the line."""
         return len(self.left_out) / max(len(self.left_out) + int(self.used.sum()), 1)
+
+    def scatter(self) -> float:
+        """Factor on the markers' standard deviations that is the most likely one: 1 unless another is far likelier."""
+        best, most = 1.0, self._log_likelihood(1.0)
+        for factor in _SCATTERS:
+            value = self._log_likelihood(factor)
+            if value < most + _MIN_GAIN:
+                break
+            best, most = factor, value
+        return best
+
+    def _log_likelihood(self, scatter: float) -> float:
+        """Log likelihood where markers scatter so many times as much: of the lane as found, or of a simpler one."""
+        now, found = self.problem, self._hyperparameters
+        problem, sigma_m = now, scatter * now.measured.sigma_m
+        if scatter != 1:  # how far pairs are out of square was measured
+            measured = replace(now.measured, sigma_m=sigma_m)
+            problem = LaneProblem(self.line, measured, float(now.station_m[0]), float(now.station_m[-1]))
+        bends = [bend for bend in BENDS if bend <= found.bend][-_STIFFER:]
+        widths = (found, replace(found, **_CONSTANT_WIDTH)) if scatter != 1 and self.has_both_sides else (found,)
+        likeliest = max(problem.log_likelihood(replace(width, bend=bend)) for width in widths for bend in bends)
+        return likeliest - float(np.log(sigma_m).sum())
 
     def _solve(self, turn: int, *, nearly_converged: bool) -> None:
         """Solve beside one line, leaving out outliers until there are none; not beside a nearly converged line."""
         side = self.side[self.used]
         offset_models = _offset_models(side, self._drive)
-        width_models = WIDTH_MODELS if len(np.unique(side)) == 2 else ()
+        width_models = WIDTH_MODELS if self.has_both_sides else ()
         choosing = turn < (1 if self._drive is not None else 2)
         for left in range(_MAX_REJECTIONS, -1, -1):
             self.problem = self._problem(turn)
@@ -158,6 +191,8 @@ class LaneFit:
             choosing = True
         self.residual_m[:] = np.nan
         self.residual_m[self.used] = residual
+        if self.has_both_sides and not self._hyperparameters.opens:
+            self._hyperparameters = replace(self._hyperparameters, width_m=float(np.mean(self.solution.width_m)))
 
     def _problem(self, turn: int) -> LaneProblem:
         """The problem of all used markers and of the fixes beside them."""

@@ -23,6 +23,9 @@ _MIN_OTHER_ROW = 3  # outliers that may be a row that the path should follow; so
 _OTHER_ROW_REACH_M, _OTHER_ROW_SPACINGS = 40.0, 3.0  # [m, 1] within which so many are close together; source: by hand
 _OTHER_ROW_SIGMA_M = 0.6  # [m] added then; source: by hand: the path's confidence falls below one half
 _MIN_SIGMA_M = 1e-6  # [m] keeps the confidence finite; source: below every survey, above rounding
+_TAIL_FREEDOM, _TAIL_SCALE = 2.4, 0.61
+"""Degrees of freedom and scale, in standard deviations, of the distribution of errors. Source: maximum likelihood of
+which of 33,203 places on 4,240 paths of the scene hunter (seeds 160000 to 165000) are within the tolerance."""
 
 
 def path_from_fit(fit: LaneFit, observations: LaneObservations, rules: LaneRules, notes: Notes) -> Lane:
@@ -68,12 +71,22 @@ def path_from_fit(fit: LaneFit, observations: LaneObservations, rules: LaneRules
         width_m=np.where(sigma_width < _MAX_WIDTH_SIGMA_M, width, np.nan)[keep],
         speed_limit_km_h=limit[keep],
         sigma_m=sigma[keep],
-        confidence=scipy.special.erf(rules.tolerance_m / (np.sqrt(2) * np.maximum(sigma[keep], _MIN_SIGMA_M))),
+        confidence=_confidence(sigma[keep], rules.tolerance_m),
         side=row_side,
         residual_m=row_residual,
         left_out=tuple(notes.left_out),
         localization_warnings=tuple(notes.localization_warnings),
     )
+
+
+def _confidence(sigma_m: Floats, tolerance_m: float) -> Floats:
+    """Probability that errors of these standard deviations are within the tolerance.
+
+    Student's t distribution: most errors are smaller than the standard deviations, but a marker that is taken for an
+    honest one, or for one of the other side, gives more large errors than a normal distribution has.
+    """
+    z = tolerance_m / np.maximum(sigma_m, _MIN_SIGMA_M)
+    return np.asarray(2 * scipy.special.stdtr(_TAIL_FREEDOM, z / _TAIL_SCALE) - 1, float)
 
 
 def path_from_splines(bounds: SplineBoundaries, observations: LaneObservations, taken: Bools, notes: Notes) -> Lane:

@@ -64,7 +64,7 @@ class Hyperparameters:
         The width is Matern 3/2 noise, as of a lane that opens or merges over tapers.
     """
 
-    bend: float = 0.003  # source: middle of `_BENDS`
+    bend: float = 0.003  # source: middle of `BENDS`
     wander_m: float = 0.2  # source: drivers keep 0.18 m RMS (`simulation.radio.driving.Driver`)
     wander_length_m: float = 30.0  # source: 2.5 s (`Driver.wander_time_s`) at 45 km/h
     drift: float = 0.0
@@ -356,13 +356,14 @@ OFFSET_MODELS: tuple[OffsetModel, ...] = (
 hand to span a driver's 0.18 m RMS and receivers of 0.5 to 4 m over 100 m; the likelihood decides for each drive."""
 WidthModel = dict[str, float | bool]
 WIDTH_MODELS: tuple[WidthModel, ...] = (
+    {"width_sd_m": 0.06, "width_length_m": 60.0, "opens": False},
     {"width_sd_m": 0.25, "width_length_m": 60.0, "opens": False},
     {"width_sd_m": 1.0, "width_length_m": 40.0, "opens": True},
     {"width_sd_m": 2.5, "width_length_m": 40.0, "opens": True},
 )  # fmt: skip
 """Candidates for the width of a lane with two known sides: as painted, or with lanes that open and merge. Source: by
 hand, the roads of decision record 0035."""
-_BENDS = (0.0005, 0.0015, 0.003, 0.006, 0.015)
+BENDS = (0.0005, 0.0015, 0.003, 0.006, 0.015)
 """Candidates for `Hyperparameters.bend`. Source: by hand, factors of two to three apart; the likelihood decides for
 each drive. [1/(m^2 sqrt(m))]"""
 
@@ -380,7 +381,7 @@ def choose_hyperparameters(
     if problem.tracked and offset_models:
         bases = [replace(best, drift=0.0) if "drift" not in model else best for model in offset_models]
         best = _most_likely(problem, bases, offset_models)
-    return _most_likely(problem, [best] * len(_BENDS), tuple({"bend": value} for value in _BENDS))
+    return _most_likely(problem, [best] * len(BENDS), tuple({"bend": value} for value in BENDS))
 
 
 def _most_likely(

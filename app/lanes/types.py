@@ -226,7 +226,7 @@ class Lane:
     sigma_m : ndarray, shape (S,)
         Standard deviation of the path across its direction. [m]
     confidence : ndarray, shape (S,)
-        Probability that the path is within `LaneRules.tolerance_m` of the centre: erf(tolerance / (sqrt(2) sigma)).
+        Probability that the path is within `LaneRules.tolerance_m` of the centre.
     side : ndarray of int, shape (K,)
         Boundary that each marker was assigned to; 0 for markers that were not used.
     residual_m : ndarray, shape (K,)

@@ -6,6 +6,8 @@ import difflib
 import json
 import math
 from collections.abc import Iterable, Mapping
+from functools import cache
+from itertools import islice
 from typing import Any
 
 from pydantic import ValidationError
@@ -39,10 +41,12 @@ _OPENING = (BlockMappingStartToken, BlockSequenceStartToken, FlowMappingStartTok
 _CLOSING = (BlockEndToken, FlowMappingEndToken, FlowSequenceEndToken)
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _LONG_LIST = 12  # names that an error lists; source: chosen by hand
+_MAX_FAULTS = 100  # that are listed; source: chosen by hand, more than a person mends at once
 
 
+@cache
 def rules_schema() -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of a document of rules."""
+    """JSON Schema (draft 2020-12) of a document of rules; not to be changed."""
     return {"$schema": _DIALECT, "$id": SCHEMA_ID, **PlanRules.model_json_schema()}
 
 
@@ -154,7 +158,7 @@ def _unreadable(message: str, cure: str) -> UnreadableUpload:
 def _invalid(error: ValidationError, document: Mapping[Any, Any]) -> InvalidParameter:
     """One error a place; the first is raised and has all of them as parts."""
     found: dict[str, InvalidParameter] = {}
-    for detail in error.errors(include_url=False):
+    for detail in islice(error.errors(include_url=False, include_context=False), _MAX_FAULTS):
         path = _path(detail, document)
         found.setdefault(_dotted(path), _invalid_value(detail, path))
     first, *rest = found.values()

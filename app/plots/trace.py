@@ -86,12 +86,7 @@ def _field_panel(trace: MagnetTrace, bar: MagnetometerBar, odometer: Floats, alo
     starts = np.flatnonzero(np.r_[True, np.diff(bins) > 0])
     curves = []
     for axis in (0, 2):
-        largest = np.zeros(len(trace.t_s))
-        for sensor in bar.array:
-            values = np.nan_to_num(trace.field_ut[:, sensor, axis].astype(float))
-            values = scipy.ndimage.median_filter(values, 3, mode="nearest")  # a sample that stands alone is a fault
-            largest = np.maximum(largest, np.abs(values - _background(values, trace.rate_hz)))
-        curves.append((odometer[starts], np.maximum.reduceat(largest, starts)))
+        curves.append((odometer[starts], np.maximum.reduceat(largest_change(trace, bar, axis), starts)))
     full = max(float(max(c[1].max() for c in curves)), 10.0)
 
     up = Scale(0.0, full, _FIELD.bottom, _FIELD.top, np.sqrt)
@@ -101,6 +96,16 @@ def _field_panel(trace: MagnetTrace, bar: MagnetometerBar, odometer: Floats, alo
     for (at_m, value_ut), colour in zip(curves, (_FORWARD, _VERTICAL), strict=True):
         parts += polylines(np.column_stack([along.px(at_m), up.px(value_ut)]), colour, 1.0)
     return parts
+
+
+def largest_change(trace: MagnetTrace, bar: MagnetometerBar, axis: int) -> Floats:
+    """Largest change of one component on any array sensor, without samples that stand alone, shape (T,). [uT]"""
+    largest = np.zeros(len(trace.t_s))
+    for sensor in bar.array:
+        values = np.nan_to_num(trace.field_ut[:, sensor, axis].astype(float))
+        values = scipy.ndimage.median_filter(values, 3, mode="nearest")  # a sample that stands alone is a fault
+        largest = np.maximum(largest, np.abs(values - _background(values, trace.rate_hz)))
+    return largest
 
 
 def _background(values: Floats, rate_hz: float) -> Floats:

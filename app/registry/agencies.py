@@ -64,6 +64,11 @@ def find_agency(connection: sa.Connection, name: str) -> str | None:
     return connection.execute(sa.select(agencies.c.id).where(agencies.c.name == name)).scalar_one_or_none()
 
 
+def get_agency_name(connection: sa.Connection, agency_id: str) -> str:
+    """Name of an agency by its id."""
+    return str(connection.scalar(sa.select(agencies.c.name).where(agencies.c.id == agency_id)))
+
+
 def find_first_agency(connection: sa.Connection) -> str | None:
     """Id of the oldest agency."""
     return connection.execute(sa.select(agencies.c.id).order_by(agencies.c.id).limit(1)).scalar_one_or_none()

@@ -253,7 +253,61 @@ def count_history(connection: sa.Connection, agency_id: str) -> int:
     return int(connection.execute(sa.select(counts[0] + counts[1])).scalar_one())
 
 
-def list_entries(connection: sa.Connection, agency_id: str, *, after: int = 0, limit: int = 100) -> list[EntryRow]:
-    """Entries of the agency's chain, oldest first."""
-    query = _ENTRIES.where(audit_log.c.agency_id == agency_id, audit_log.c.number > after)
-    return fetch_all(connection, query.order_by(audit_log.c.number).limit(limit), EntryRow)
+@dataclass(frozen=True, slots=True)
+class EntryFilter:
+    """Which entries of a log; what is None is not filtered by.
+
+    Attributes
+    ----------
+    who, subject : str, optional
+        Exactly.
+    action : str, optional
+        Exactly, or all that begin so, with a ``*`` at the end.
+    since, until : datetime, optional
+        At this time or later; before this time.
+    """
+
+    who: str | None = None
+    action: str | None = None
+    subject: str | None = None
+    since: datetime | None = None
+    until: datetime | None = None
+
+    def conditions(self) -> list[sa.ColumnElement[bool]]:
+        """The filter in SQL."""
+        found: list[sa.ColumnElement[bool]] = []
+        if self.who is not None:
+            found.append(audit_log.c.who == self.who)
+        if self.subject is not None:
+            found.append(audit_log.c.subject == self.subject)
+        if self.action is not None and self.action.endswith("*"):
+            found.append(audit_log.c.action.startswith(self.action[:-1], autoescape=True))
+        elif self.action is not None:
+            found.append(audit_log.c.action == self.action)
+        if self.since is not None:
+            found.append(audit_log.c.at >= self.since.astimezone(UTC))
+        if self.until is not None:
+            found.append(audit_log.c.at < self.until.astimezone(UTC))
+        return found
+
+
+def list_entries(
+    connection: sa.Connection,
+    agency_id: str,
+    *,
+    after: int = 0,
+    before: int | None = None,
+    limit: int = 100,
+    wanted: EntryFilter | None = None,
+) -> list[EntryRow]:
+    """Entries of the agency's chain after a number, oldest first; or those before a number, newest first."""
+    query = _ENTRIES.where(audit_log.c.agency_id == agency_id)
+    if wanted is not None:
+        query = query.where(*wanted.conditions())
+    number = audit_log.c.number
+    query = (
+        query.where(number > after).order_by(number)
+        if before is None
+        else query.where(number < before).order_by(number.desc())
+    )
+    return fetch_all(connection, query.limit(limit), EntryRow)

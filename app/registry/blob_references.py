@@ -10,6 +10,7 @@ import sqlalchemy as sa
 
 from app.registry.jobs import JobKind
 from app.registry.plan_tables import alignments, plans
+from app.registry.public_tables import damage_reports
 from app.registry.reprocessing_tables import decode_versions, reprocessed_decodes
 from app.registry.tables import decodes, jobs
 from app.registry.upload_tables import upload_parts, uploads
@@ -22,6 +23,7 @@ COLUMNS = (
     uploads.c.store_key,
     alignments.c.source_key,
     plans.c.document_key,
+    damage_reports.c.photo_key,
     decode_versions.c.picture_key,
     reprocessed_decodes.c.picture_key,
 )

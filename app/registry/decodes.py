@@ -54,6 +54,24 @@ class DecodeRow(NamedTuple):
     upload_sha256: str | None = None
 
 
+class DecodeFilter(NamedTuple):
+    """Which decodes a list has; None: any.
+
+    Attributes
+    ----------
+    vehicle : str or None
+        Name or id of the vehicle that the upload named.
+    since, until : datetime or None
+        Uploaded then or later, and before then.
+    """
+
+    state: str | None = None
+    kind: str | None = None
+    vehicle: str | None = None
+    since: datetime | None = None
+    until: datetime | None = None
+
+
 class NewObservation(NamedTuple):
     """What a decode observed of a marker.
 
@@ -117,17 +135,26 @@ def get_decode(connection: sa.Connection, agency_id: str, decode_id: str, *, hol
 
 
 def list_decodes(
-    connection: sa.Connection, agency_id: str,
-    *, state: str | None, before: str | None, limit: int, holder_id: str | None = None,
+    connection: sa.Connection, agency_id: str, wanted: DecodeFilter,
+    *, before: str | None, limit: int, holder_id: str | None = None,
 ) -> list[DecodeRow]:  # fmt: skip
     """Decodes without their results, newest first; of anybody in the agency or of one holder of a key."""
     query = _WITHOUT_RESULT.where(decodes.c.agency_id == agency_id)
     if holder_id is not None:
         query = query.where(decodes.c.holder_id == holder_id)
-    if state == "done":
-        query = query.where(sa.or_(jobs.c.id.is_(None), jobs.c.state == state))
-    elif state is not None:  # of a decode with a job: an index of jobs finds the few that are not done
-        query = query.where(jobs.c.state == state, jobs.c.agency_id == agency_id, jobs.c.kind == "decode")
+    if wanted.state == "done":
+        query = query.where(sa.or_(jobs.c.id.is_(None), jobs.c.state == wanted.state))
+    elif wanted.state is not None:  # of a decode with a job: an index of jobs finds the few that are not done
+        query = query.where(jobs.c.state == wanted.state, jobs.c.agency_id == agency_id, jobs.c.kind == "decode")
+    if wanted.kind is not None:
+        query = query.where(decodes.c.kind == wanted.kind)
+    if wanted.vehicle is not None:
+        named = decodes.c.context["vehicle"]
+        query = query.where(sa.or_(*(named[part].as_string() == wanted.vehicle for part in ("name", "id"))))
+    if wanted.since is not None:
+        query = query.where(decodes.c.created_at >= wanted.since)
+    if wanted.until is not None:
+        query = query.where(decodes.c.created_at < wanted.until)
     if before is not None:
         query = query.where(decodes.c.id < before)
     return fetch_all(connection, query.order_by(decodes.c.id.desc()).limit(limit), DecodeRow)

@@ -27,15 +27,15 @@ class ItemRow(NamedTuple):
     subject : str
         As of `HealthRow`, or the drive of a driver on the wrong way.
     decode_id : str or None
-        The upload that made it an item.
+        The upload that made it an item; None for damage reports.
     what : str
-        A fault, or ``wrong-way-driver``.
+        A fault, ``wrong-way-driver``, or ``reported`` by people.
     state, outcome : str, str or None
         open, approved or dismissed; and what was approved.
     ratio : float
         Logarithm of the likelihood ratio. [nat]
     evidence : dict
-        JSON: limits, displacement, uploads.
+        JSON: limits, displacement, uploads, damage reports.
     """
 
     id: str
@@ -95,7 +95,9 @@ class ItemFilter:
 
 _ITEMS = select_rows(ItemRow, maintenance_items)
 ITEM_FIELDS = (
-    Field("what", "string", _M.what, "missing, moved, cloned, wrong-way, fading, unregistered or wrong-way-driver"),
+    Field(
+        "what", "string", _M.what, "missing, moved, cloned, wrong-way, fading, unregistered, wrong-way-driver, reported"
+    ),
     Field("status", "string", _M.state, "open, approved or dismissed"),
     Field("outcome", "string", _M.outcome, "What was approved: suspect, retired, resurvey or none"),
     Field("priority", "number", _M.priority, "0 to 1, the most urgent first"),

@@ -19,6 +19,9 @@ from app.registry.plan_tables import plan_markers as plan_markers
 from app.registry.plan_tables import plan_versions as plan_versions
 from app.registry.plan_tables import plans as plans
 from app.registry.plan_tables import proof_units as proof_units
+from app.registry.public_tables import damage_report_contacts as damage_report_contacts
+from app.registry.public_tables import damage_reports as damage_reports
+from app.registry.public_tables import public_pages as public_pages
 from app.registry.reprocessing_tables import decode_versions as decode_versions
 from app.registry.reprocessing_tables import reprocessed_decodes as reprocessed_decodes
 from app.registry.reprocessing_tables import reprocessings as reprocessings

@@ -30,32 +30,44 @@ class Tile:
     column: int
     row: int
 
-    def box(self) -> Box:
+    def box(self, margin_px: int = _BUFFER_PX) -> Box:
         """The area of the tile with a margin, in which symbols at its edge are drawn whole."""
-        size, margin = 2**self.zoom, _BUFFER_PX / EXTENT
+        size, margin = 2**self.zoom, margin_px / EXTENT
         west, east = (self.column - margin) / size * 360 - 180, (self.column + 1 + margin) / size * 360 - 180
         north, south = (_lat_deg((self.row + step) / size) for step in (-margin, 1 + margin))
         return Box(max(west, -180.0), south, min(east, 180.0), north)
 
     def from_lon_lat(self, lon_lat_deg: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+        """Positions on the tile, shape (N, 2), to the nearest pixel. [px]"""
+        return np.asarray(np.rint(self.project(lon_lat_deg)), dtype=np.int64)
+
+    def project(self, lon_lat_deg: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Positions on the tile, shape (N, 2). [px]"""
         lat = np.clip(lon_lat_deg[:, 1], -_SOUTHERNMOST_DEG, _SOUTHERNMOST_DEG)
         right = (lon_lat_deg[:, 0] + 180.0) / 360.0
         down = 0.5 - np.arcsinh(np.tan(np.radians(lat))) / (2 * np.pi)
         world = np.column_stack((right, down)) * 2**self.zoom - (self.column, self.row)
-        return np.asarray(np.rint(world * EXTENT), dtype=np.int64)
+        return np.asarray(world * EXTENT)
 
 
 def _lat_deg(down: float) -> float:
     return math.degrees(math.atan(math.sinh(math.pi * (1 - 2 * min(max(down, 0.0), 1.0)))))
 
 
-def feature_tile(connection: sa.Connection, agency_id: str, tile: Tile, table: FeatureTable, *, layer: str) -> bytes:
-    """The agency's features on a tile, at most `MAX_FEATURES`; empty if there are none.
+def feature_tile(
+    connection: sa.Connection,
+    agency_id: str,
+    tile: Tile,
+    table: FeatureTable,
+    *,
+    layer: str,
+    margin_px: int = _BUFFER_PX,
+) -> bytes:
+    """The agency's features on a tile and its margin, at most `MAX_FEATURES`; empty if there are none.
 
     Both databases write the same, but for the last digits of headings.
     """
-    box = tile.box()
+    box = tile.box(margin_px)
     values: dict[str, Any] = {**table.values(connection, agency_id), "most": MAX_FEATURES}
     values |= {"w0": box.west_deg, "s0": box.south_deg, "e0": box.east_deg, "n0": box.north_deg}
     if connection.dialect.name == "postgresql":

@@ -44,7 +44,8 @@ class MagnetometerBar:
         In the vehicle frame (ISO 8855: x forward, y left, z up). The origin is the point that moves along the heading
         (the middle of the rear axle; the bar itself if it is not known). Only differences of z count. [m]
     roles : tuple of SensorRole, length S
-        Array sensors look for magnets, reference sensors listen to the wheels.
+        Array sensors look for magnets, reference sensors listen to the wheels: each is nearer to its wheel than any
+        array sensor.
     vehicle_from_sensor : ndarray, shape (S, 3, 3)
         Rotation of each chip; the identity if left out.
     axis_delay_s : tuple of float

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from app.formats.surveys.table import Fault, Floats, Severity, warn
+from app.formats.surveys.table import Change, Fault, Floats, Severity, warn
 from app.surveys.georeference import GeoreferencedSurvey
 
 Flags = npt.NDArray[np.bool_]
@@ -60,6 +60,7 @@ def check_accuracy(horizontal_rmse_m: float | None, vertical_rmse_m: float | Non
             yield warn(
                 None, field, "coarse_accuracy", f"the stated accuracy is {rmse_m:g} m",
                 f"state it in metres ({rmse_m:g} mm are {rmse_m / 1000:g} m), or survey again: for vehicles",
+                (Change(f"survey.{field}", rmse_m / 1000),),
             )  # fmt: skip
 
 

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from app.formats.surveys.declaration import ImportDeclaration
-from app.formats.surveys.table import Fault, Floats
+from app.formats.surveys.table import Fault, Floats, Severity
 from app.surveys.consistency_checks import nearest_of
 from app.surveys.georeference import GeoreferencedSurvey, east_north_m
+from app.surveys.location_checks import measured_changes
 
 _SAME_M = 0.1  # [m] two markers of a family are never this near: plates are 0.3 m wide
 _SAME_RMSE = 2.0  # [1] times the RMSE of the survey within which two measurements of a marker lie (95 %)
@@ -59,7 +60,7 @@ def find_duplicates(
     same = np.flatnonzero(np.array([family == declaration.family for family in known.families]))
     if not len(rows) or not len(same):
         return
-    origin = survey.origin_deg
+    origin, changes = survey.origin_deg, measured_changes(survey)
     others = np.column_stack(east_north_m(known.lon_deg[same], known.lat_deg[same], origin))
     here = np.column_stack([survey.east_m[rows], survey.north_m[rows]])
     distance, index = nearest_of(here, others, min(_NEAREST, len(same)))
@@ -73,7 +74,9 @@ def find_duplicates(
                 marker = f"marker {known.marker_ids[other]}"
                 shown = f" from point {known.points[other]}" if known.points[other] else ""
                 message = f"{marker} is registered{shown}, {metres:.2f} m from this row"
-                yield Fault(int(rows[k]) + 1, "position", "already_registered", message, _CURE)
+                yield Fault(
+                    int(rows[k]) + 1, "position", "already_registered", message, _CURE, Severity.REFUSED, changes
+                )  # fmt: skip
                 break
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from app.errors import WaymarkError
 from app.formats.surveys.declaration import METRES, ImportDeclaration
 from app.formats.surveys.grids import unit_factor, without_zone
-from app.formats.surveys.table import Floats, SurveyTable
+from app.formats.surveys.table import Change, Floats, SurveyTable
 from app.geodesy import PlacedPositions, place_positions, reference_system
 
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
@@ -19,6 +19,8 @@ _THOUSANDS = (
     (1000.0, "multiply the coordinates by 1000; in a drawing whose $INSUNITS is not their unit declare unit"),
     (0.001, "divide the coordinates by 1000: they seem to be millimetres"),
 )
+_DECLARE_UNIT = "declare unit "
+_OTHER_ORDER = {"pnezd": "penzd", "penzd": "pnezd", "nezd": "enzd", "enzd": "nezd"}
 _ZONES = (  # first and last EPSG code of the zones of a grid, and its name; source: EPSG registry
     (32601, 32660, "WGS 84 / UTM north"),
     (32701, 32760, "WGS 84 / UTM south"),
@@ -62,6 +64,7 @@ class Alternative:
 
     code: str
     proposal: str
+    changes: tuple[Change, ...]
     lon_deg: float
     lat_deg: float
 
@@ -90,6 +93,24 @@ def georeference_survey(table: SurveyTable, declaration: ImportDeclaration, accu
     return GeoreferencedSurvey(table, placed, east, north, height)
 
 
+def without_rows(table: SurveyTable, rows: Sequence[int]) -> SurveyTable:
+    """A table whose rows of these numbers, counted from 1, have no coordinates and no faults."""
+    if not rows:
+        return table
+    table.faults.leave_out(rows)
+    indices = [row - 1 for row in rows if row <= table.rows]
+    height = None if table.height is None else _without(table.height, indices)
+    return replace(
+        table, first=_without(table.first, indices), second=_without(table.second, indices), height=height
+    )  # fmt: skip
+
+
+def _without(values: Floats, indices: Sequence[int]) -> Floats:
+    kept = values.copy()
+    kept[indices] = np.nan
+    return kept
+
+
 def median_deg(placed: PlacedPositions) -> tuple[float, float]:
     """Median longitude and latitude of the rows that have a position; NaN without any. [deg]"""
     if not placed.placed.any():
@@ -109,6 +130,7 @@ def list_alternatives(table: SurveyTable, declaration: ImportDeclaration) -> lis
     rows = finite[:: max(len(finite) // _SAMPLE, 1)]
     found = []
     for code, proposal, first, second, crs in _readings(table, table.first[rows], table.second[rows]):
+        changes = _changes_of(code, proposal, crs, table, declaration)
         try:
             placed = place_positions(
                 first, second, np.full(len(rows), np.nan), crs=crs, realization=declaration.realization
@@ -116,8 +138,33 @@ def list_alternatives(table: SurveyTable, declaration: ImportDeclaration) -> lis
         except WaymarkError:
             continue
         if len(rows) and placed.placed.mean() > 0.5:
-            found.append(Alternative(code, proposal, *median_deg(placed)))
+            found.append(Alternative(code, proposal, changes, *median_deg(placed)))
     return found
+
+
+def _changes_of(
+    code: str, proposal: str, crs: str, table: SurveyTable, declaration: ImportDeclaration
+) -> tuple[Change, ...]:
+    """What has to be declared for another reading; nothing where the file has to be changed."""
+    if code == "swapped_axes":
+        return _swapped(table, declaration)
+    if code == "wrong_zone":
+        return (Change("crs", crs),)
+    unit = proposal.removeprefix(_DECLARE_UNIT)
+    return (Change("unit", unit),) if unit in METRES else ()
+
+
+def _swapped(table: SurveyTable, declaration: ImportDeclaration) -> tuple[Change, ...]:
+    """The layout or the columns with the axes in the other order, as far as they are known by their names."""
+    found = {detected.what: detected.value for detected in table.detected}
+    layout = declaration.layout or found.get("layout")
+    if layout in _OTHER_ORDER:
+        return (Change("layout", _OTHER_ORDER[layout]),)
+    roles = ("easting", "northing") if table.projected else ("lon_deg", "lat_deg")
+    columns = [declaration.columns.get(role) or found.get(f"column of {role}") for role in roles]
+    if None in columns:
+        return ()
+    return Change(f"columns.{roles[0]}", columns[1]), Change(f"columns.{roles[1]}", columns[0])
 
 
 def _readings(table: SurveyTable, first: Floats, second: Floats) -> Iterator[tuple[str, str, Floats, Floats, str]]:
@@ -143,7 +190,7 @@ def _readings(table: SurveyTable, first: Floats, second: Floats) -> Iterator[tup
     for unit in METRES:
         if unit != table.unit:
             change = METRES[unit] / METRES[table.unit]
-            yield "wrong_unit", f"declare unit {unit}", first * change, second * change, crs
+            yield "wrong_unit", f"{_DECLARE_UNIT}{unit}", first * change, second * change, crs
     yield from ((code, proposal, first, second, other) for code, proposal, other in _sibling_zones(crs))
 
 

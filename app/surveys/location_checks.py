@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.formats.surveys.declaration import ImportDeclaration
-from app.formats.surveys.table import Fault, Floats, warn
+from app.formats.surveys.table import Change, Fault, Floats, Severity, warn
 from app.surveys.consistency_checks import nearest_of
 from app.surveys.georeference import Alternative, GeoreferencedSurvey, east_north_m, list_alternatives
 
@@ -95,6 +95,7 @@ def _check_whole(
 ) -> list[Fault]:
     """One fault for the file if most rows are in the wrong place, with the reading that would correct it."""
     placed = survey.placed.placed
+    kept = max(survey.table.rows - len(declaration.leave_out), 1)
     if declaration.area_deg is not None:
         if placed.any() and outside.sum() <= 0.5 * placed.sum():
             return []
@@ -103,8 +104,8 @@ def _check_whole(
         message = "most rows lie outside the declared area"
         return [_whole(hit, message, "outside_area", "declare the area the survey lies in, or correct the file")]
     if near or (placed.any() and is_known(*survey.origin_deg)):
-        return [] if placed.mean() > 0.5 else [_no_position(survey, declaration, is_known)]
-    if not placed.any() or placed.mean() <= 0.5:
+        return [] if placed.sum() > 0.5 * kept else [_no_position(survey, declaration, is_known)]
+    if not placed.any() or placed.sum() <= 0.5 * kept:
         return [_no_position(survey, declaration, is_known)]
     hit = _first_hit(survey, declaration, is_known)
     if hit is not None:
@@ -134,7 +135,8 @@ def _first_hit(survey: GeoreferencedSurvey, declaration: ImportDeclaration, fits
 def _whole(hit: Alternative | None, message: str, code: str, cure: str) -> Fault:
     if hit is None:
         return Fault(None, "position", code, message, cure)
-    return Fault(None, "position", hit.code, message, f"{hit.proposal}; the survey then fits")
+    proposal = f"{hit.proposal}; the survey then fits"
+    return Fault(None, "position", hit.code, message, proposal, Severity.REFUSED, hit.changes)
 
 
 def _check_height_range(survey: GeoreferencedSurvey, declaration: ImportDeclaration) -> Iterator[Fault]:
@@ -165,7 +167,7 @@ def _check_neighbours(
         yield from _area_only(declaration, known=True)
         return
     if not declaration.compare:
-        yield from _check_already_there(rows, distance[:, 0])
+        yield from _check_already_there(rows, distance[:, 0], measured_changes(survey))
     yield from _check_beside(points[close], others[index[close]], distance[close])
     yield from _check_heights(survey, declaration, neighbours, rows[close], distance[close], index[close])
 
@@ -185,12 +187,20 @@ def _area_only(declaration: ImportDeclaration, *, known: bool) -> list[Fault]:
     ]  # fmt: skip
 
 
-def _check_already_there(rows: np.ndarray[tuple[int], np.dtype[np.intp]], distance_m: Floats) -> Iterator[Fault]:
+def measured_changes(survey: GeoreferencedSurvey) -> tuple[Change, ...]:
+    """What has to be declared of a survey that measures registered markers."""
+    match = "code" if "code" in survey.table.texts else "nearest"
+    return Change("compare", True), Change("match", match)
+
+
+def _check_already_there(
+    rows: np.ndarray[tuple[int], np.dtype[np.intp]], distance_m: Floats, changes: tuple[Change, ...]
+) -> Iterator[Fault]:
     return (
         warn(
             int(rows[k]) + 1, "position", "marker_already_there",
             f"a registered marker lies {distance_m[k]:.2f} m from here",
-            "declare compare if the survey measures registered markers",
+            "declare compare if the survey measures registered markers", changes,
         )
         for k in np.flatnonzero(distance_m <= _ALREADY_THERE_M)
     )  # fmt: skip
@@ -236,7 +246,7 @@ def _check_heights(
     if comparable.sum() >= 3 and np.mean(np.abs(rise[comparable]) > allowed[comparable]) > 0.5:
         shift = float(np.median(rise[comparable]))
         message = f"the heights differ by {shift:+.1f} m from those of the registered markers beside them"
-        return [warn(None, "height", "height_shift", message, _height_cure(survey, rows, nearest, neighbours))]
+        return [warn(None, "height", "height_shift", message, *_height_cure(survey, rows, nearest, neighbours))]
     if not comparable.sum() and foreign.sum() >= 3 and np.median(np.abs(rise[foreign])) < 1.0:
         message = "the heights agree with those of registered markers whose heights are above another datum"
         return [warn(None, "height", "height_datum", message, "check vertical_datum (geoid or ellipsoid)")]
@@ -248,9 +258,9 @@ def _height_cure(
     rows: np.ndarray[tuple[int], np.dtype[np.intp]],
     nearest: np.ndarray[tuple[int], np.dtype[np.intp]],
     neighbours: Neighbours,
-) -> str:
+) -> tuple[str, tuple[Change, ...]]:
     ratio = float(np.nanmedian(survey.height_m[rows]) / np.nanmedian(neighbours.height_m[nearest]))
-    for factor, unit in ((3.2808, "ft"), (0.3048, "m")):
+    for factor, unit, declared in ((3.2808, "ft", "ft-intl"), (0.3048, "m", "m")):
         if abs(ratio / factor - 1) < 0.05:
-            return f"the heights seem to be in {unit}: declare height_unit"
-    return "check vertical_datum: heights above the geoid and above the ellipsoid differ by up to 100 m"
+            return f"the heights seem to be in {unit}: declare height_unit", (Change("height_unit", declared),)
+    return "check vertical_datum: heights above the geoid and above the ellipsoid differ by up to 100 m", ()

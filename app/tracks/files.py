@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Any
 from xml.sax.saxutils import escape
@@ -70,26 +70,45 @@ def write_geojson(track: Track, name: str, others: Sequence[dict[str, Any]] = ()
 
 def write_gpx(track: Track, name: str) -> str:
     """One segment for each stretch without a gap; markers that were used are waypoints."""
+    waypoints = [
+        f'<wpt lat="{result.fix.lat_deg:.9f}" lon="{result.fix.lon_deg:.9f}"><time>{_time_text(result.time_s)}</time>'
+        f"<name>{escape(result.fix.marker_id or result.fix.clock)}</name><type>{escape(result.fix.family)}</type></wpt>"
+        for result in track.fixes
+        if result.used
+    ]
+    stamps, lon, lat = time_texts(track.time_s), track.lon_deg, track.lat_deg
+    segments = (
+        [(lat[k], lon[k], stamps[k]) for k in part if not track.in_gap[k]]
+        for part in stretches(track)
+        if len(part) < 2 or not bool(track.in_gap[part[1:]].all())
+    )
+    return gpx_document(name, segments, waypoints)
+
+
+def gpx_document(
+    name: str, segments: Iterable[Iterable[tuple[float, float, str | None]]], waypoints: Sequence[str] = ()
+) -> str:
+    """A GPX 1.1 document with one track.
+
+    Parameters
+    ----------
+    name : str
+        Of the track.
+    segments : iterable of iterables of (latitude, longitude, time)
+        [deg, deg, RFC 3339]; the time may be missing.
+    waypoints : sequence of str
+        Elements before the track.
+    """
     parts = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<gpx version="1.1" creator="Waymark" xmlns="http://www.topografix.com/GPX/1/1">',
+        *waypoints,
+        f"<trk><name>{escape(name)}</name>",
     ]
-    for result in track.fixes:
-        if result.used:
-            fix = result.fix
-            parts.append(
-                f'<wpt lat="{fix.lat_deg:.9f}" lon="{fix.lon_deg:.9f}"><time>{_time_text(result.time_s)}</time>'
-                f"<name>{escape(fix.marker_id or fix.clock)}</name><type>{escape(fix.family)}</type></wpt>"
-            )
-    parts.append(f"<trk><name>{escape(name)}</name>")
-    stamps, lon, lat = time_texts(track.time_s), track.lon_deg, track.lat_deg
-    for part in stretches(track):
-        if bool(track.in_gap[part[1:]].all()) and len(part) > 1:
-            continue
+    for segment in segments:
         points = (
-            f'<trkpt lat="{lat[k]:.9f}" lon="{lon[k]:.9f}"><time>{stamps[k]}</time></trkpt>'
-            for k in part
-            if not track.in_gap[k]
+            f'<trkpt lat="{lat_deg:.9f}" lon="{lon_deg:.9f}">{f"<time>{time}</time>" if time else ""}</trkpt>'
+            for lat_deg, lon_deg, time in segment
         )
         parts += ["<trkseg>", *points, "</trkseg>"]
     parts.append("</trk></gpx>\n")

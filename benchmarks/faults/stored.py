@@ -14,9 +14,9 @@ from app.registry.jobs import UNFINISHED
 from app.registry.tables import decodes, jobs, markers, plan_markers, planned_markers
 from app.registry.tenancy import across_agencies
 from app.services.access.audit import AuditLog
+from app.services.ports import utc_now
 from app.services.unused_blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.storage.blobs import Blobs
-from app.wiring import utc_now
 from benchmarks.faults.writers import IMPORT_ROAD, IMPORT_ROWS, Acknowledged
 
 

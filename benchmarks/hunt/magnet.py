@@ -41,7 +41,7 @@ COURSE = {
     "speed_m_s": Bound(2, 36, 13.4, "walking traffic to a motorway", logarithmic=True),
     "slows_to": Bound(0, 1, 1, "share of the speed in the middle of the drive: stop and go", plain=0.6),
     "weave_m": Bound(0, 0.3, 0.05, "lateral position in driving studies"),
-    "hunting": Bound(0, 0.05, 0.01, _BY_HAND, plain=0.5),
+    "hunting": Bound(0, 0.05, 0.01, "by hand; less where speed times it is harder than comfortable braking", plain=0.5),
     "radius_m": Bound(40, 1000, 1000, "a roundabout to a motorway", logarithmic=True, plain=0.5),
     "bends_left": switch("either"),
     "wrong_way": switch("against the direction of travel", plain=0.85),
@@ -65,6 +65,9 @@ _MIN_MAGNETS = 4  # with fewer, iron at another clearance looks the same; source
 _MAX_MISSED = 0.15  # share of these magnets; source: by hand
 _BAR = MagnetometerBar.metro(forward_m=3.2)
 _APART_M = 1.0  # [m] source: by hand, the width of a manhole cover's field at 20 cm
+_SLOPE_PER_M = (
+    2 * math.pi / 60
+)  # [1/m] of slow changes of speed, standard deviations; derived: `drive_course` filters at 60 m
 _BRAKING_M_S2 = 2.5  # [m/s2] source: comfortable braking, AASHTO Green Book, section 3.2.2: 3.4 m/s2 is the limit
 
 
@@ -132,7 +135,9 @@ def _course(p: Parameters, length_m: float) -> Course:
     slow = math.sqrt(max(speed**2 - 2 * _BRAKING_M_S2 * ramp_m, 0.36))
     middle = 0.5 * length_m
     speeds = [(middle + at * ramp_m, speed - (speed - slow) * down) for at, down in ((-1, 0), (0, 1), (1, 0))]
-    return Course(speed, speeds if p["slows_to"] < 1 else (), hunting=p["hunting"], weave_m=p["weave_m"])
+    # three standard deviations of the acceleration are comfortable braking: traffic at 130 km/h holds its speed better
+    hunting = min(p["hunting"], _BRAKING_M_S2 / 3 / (speed**2 * _SLOPE_PER_M))
+    return Course(speed, speeds if p["slows_to"] < 1 else (), hunting=hunting, weave_m=p["weave_m"])
 
 
 def _bends(p: Parameters, length_m: float) -> list[tuple[float, float, float]]:

@@ -22,7 +22,8 @@ from app.formats.surveys.read import read_survey
 from app.jobs.tasks import SameProcess
 from app.registry.database import Database
 from app.services.access.access import Access, Caller, Scope
-from app.services.surveys.imports import ImportInput, Imports
+from app.services.surveys.import_report import ImportInput
+from app.services.surveys.imports import Imports
 from app.surveys.georeference import east_north_m, georeference_survey
 from benchmarks.imports.faults import Planted
 from benchmarks.imports.surveys import Survey

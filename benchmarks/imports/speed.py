@@ -153,7 +153,8 @@ def main() -> None:
     from app.registry.markers import MarkerFilter
     from app.services.access.access import Access, Scope
     from app.services.surveys.exports import Exports
-    from app.services.surveys.imports import ImportInput, Imports
+    from app.services.surveys.import_report import ImportInput
+    from app.services.surveys.imports import Imports
     from benchmarks.imports.judge import now
 
     step, url, survey, out = sys.argv[1:]

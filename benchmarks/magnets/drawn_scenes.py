@@ -69,14 +69,15 @@ def draw_magnets_drive(rng: np.random.Generator, clearance_m: float, *, count: i
     return simulate_drive(scene, rng)
 
 
-def draw_line_beside_tags(rng: np.random.Generator, *, count: int = 12) -> SimulatedDrive:
-    """Tags with a line of magnets 35 to 100 cm beside them, as plans permit it."""
+def draw_line_beside_tags(rng: np.random.Generator, *, count: int = 12, line: bool = True) -> SimulatedDrive:
+    """Tags with a line of magnets 35 to 100 cm beside them, as plans permit it; the same drive without the line."""
     clearance_m = float(rng.uniform(0.14, 0.38))
     tags = [PlacedTag(random_tag(rng, FORMAT), LEAD_M + i * 15, float(rng.uniform(-0.2, 0.2))) for i in range(count)]
     length_m = LEAD_M + count * 15 + 20
     side_m = float(rng.choice((-1, 1)) * rng.uniform(0.55, 0.8))
     lines = line_magnets(LEAD_M, length_m - 15, float(rng.choice((2, 3, 6))), side_m, Polarity.N)
-    scene = Scene(Road(length_m), draw_vehicle(rng, clearance_m), draw_course(rng), tags=tags, lines=lines)
+    beside = lines if line else []
+    scene = Scene(Road(length_m), draw_vehicle(rng, clearance_m), draw_course(rng), tags=tags, lines=beside)
     return simulate_drive(scene, rng)
 
 

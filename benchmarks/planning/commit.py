@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from app.families.rules import MarkerRules
+from app.formats.spooled_file import SpooledFile
 from app.jobs.tasks import SameProcess
 from app.planning.alignment_declaration import AlignmentDeclaration
 from app.registry.database import Database
@@ -61,7 +62,7 @@ def _commit(kind: str, km: float) -> tuple[int, float, float]:
         roads = Alignments(database, _now, blobs, processes, accuracy_m=0.1)
         plans = Plans(database, _now, blobs, processes, MarkerRules())
         data = generated_file(1000 * km, 13, radii_m=(400.0, 900.0))
-        road, _ = roads.add(author, "road", data, "road.geojson", AlignmentDeclaration())
+        road, _ = roads.add(author, "road", SpooledFile.of(data), "road.geojson", AlignmentDeclaration())
         began = time.perf_counter()
         plan, _ = plans.make(author, "plan", road["id"], _RULES)
         made_s = time.perf_counter() - began

@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 
 from app.families.cerpm.registration import NewCerpm
 from app.families.inputs import PositionIn
-from app.families.plate.registration import NewPlate
-from app.markers.plate import PlateCode
+from app.families.plate.registration import CodeInput, NewPlate
+from app.markers.plate import PlateCode, PlateScheme
 from app.registry.bulk_load import large_load, load_rows
 from app.registry.database import Database
 from app.registry.feature_text import feature_text
@@ -106,7 +106,7 @@ def _register_templates(database: Database, caller: Caller) -> dict[str, dict[st
     place = PositionIn(lon_deg=-30.0, lat_deg=-30.0, **_SURVEY)
     common: dict[str, Any] = {"status": "surveyed", "heading_deg": 90.0, "heading_rmse_deg": 0.5, "road": "A0"}
     common |= {"measure_m": 0.0, "offset_m": 1.75}
-    use_cases.register(caller, NewPlate(place, **common))
+    use_cases.register(caller, NewPlate(place, CodeInput(PlateScheme.POSITION), **common))
     use_cases.register(caller, NewCerpm(place, **common))
     with database.read() as connection:
         return {str(row["family"]): dict(row) for row in connection.execute(sa.select(*_COLUMNS)).mappings()}

@@ -143,7 +143,8 @@ def _import(way: str, rows: int) -> None:
     from app.registry.database import Database
     from app.registry.tenancy import across_agencies
     from app.services.access.access import Access, Scope
-    from app.services.surveys.imports import ImportInput, Imports
+    from app.services.surveys.import_report import ImportInput
+    from app.services.surveys.imports import Imports
     from benchmarks.imports.judge import now
     from benchmarks.imports.speed import write_survey
 

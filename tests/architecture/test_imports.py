@@ -30,6 +30,7 @@ def test_the_import_contracts_are_kept() -> None:
     assert "0 broken" in run.stdout
 
 
+@pytest.mark.slow
 def test_the_core_imports_no_framework_no_database_and_nothing_heavy() -> None:
     """Libraries of GIS and CAD files and parts of SciPy are loaded when they are used: a server has 130 MB less."""
     names = [name for name in _modules() if name.split(".")[1] in CORE]
@@ -45,6 +46,7 @@ def test_the_core_imports_no_framework_no_database_and_nothing_heavy() -> None:
     assert run.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_a_server_loads_decoders_and_simulations_only_when_it_needs_one() -> None:
     """They compile with Numba, which takes 70 MB and a second at each start."""
     program = "import app.main, sys; print({'numba', 'app.jobs.tasks', 'app.decoders.plate.reader'} & set(sys.modules))"
@@ -52,6 +54,7 @@ def test_a_server_loads_decoders_and_simulations_only_when_it_needs_one() -> Non
     assert run.stdout.strip() == "set()"
 
 
+@pytest.mark.slow
 def test_no_module_creates_an_app_or_reads_settings_at_import(tmp_path: Path) -> None:
     program = f"""
 import importlib, os, sys

@@ -18,6 +18,8 @@ from app.errors import CalibrationRefused, InvalidParameter
 from app.sensors.calibration_board import CalibrationBoard
 from tests.api.fleet.board_photos import BOARD, Pose, TrueCamera, good_photos, photo, poses, true_corners_px
 
+pytestmark = pytest.mark.slow
+
 CAMERA = TrueCamera()
 ROOT = Path(__file__).resolve().parents[2]
 Grey = npt.NDArray[np.uint8]

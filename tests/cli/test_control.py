@@ -47,6 +47,7 @@ def server_of(folder: Path) -> LiveServer:
     return LiveServer(create_app(settings))
 
 
+@pytest.mark.slow
 def test_import_export_and_errors_while_the_server_runs(waymark: Run, folder: Path, tmp_path: Path) -> None:
     survey, out = tmp_path / "survey.csv", tmp_path / "out.geojson"
     survey.write_text(CSV)
@@ -59,7 +60,8 @@ def test_import_export_and_errors_while_the_server_runs(waymark: Run, folder: Pa
         assert "store: 100%, 5 of 5" in error
         assert len(client.get("/v1/markers").json()["items"]) == 5
         status, _, error = waymark("export", str(out), "--agency", agency, "--format", "geojson")
-        assert (status, error) == (0, "export: 100%, 5 of 5\n")
+        assert status == 0
+        assert "export: 100%, 5 of 5\n" in error  # the server, which is in this process, may write its log between
         assert len(orjson.loads(out.read_bytes())["features"]) == 5
         status, _, error = waymark("export", str(tmp_path / "b"), "--agency", "nobody", "--format", "csv")
         assert (status, "there is no agency 'nobody'" in error, "waymark key" in error) == (1, True, True)

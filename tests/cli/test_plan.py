@@ -83,6 +83,7 @@ def test_artwork_and_sheets_are_written_on_request(tmp_path: Path) -> None:
     assert list(out.glob("drilling/line-*.pdf"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rural-plates", "city-magnets", "work-zone-cerpms"])
 def test_the_examples_plan_a_road_of_their_speed(name: str, tmp_path: Path) -> None:
     lane = straight(400)

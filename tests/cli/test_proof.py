@@ -14,6 +14,8 @@ from app.planning.placement import place_plan
 from app.planning.rules import PlanRules
 from tests.planning.roads import road, straight
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -56,7 +58,6 @@ def test_a_proof_writes_its_files_and_goes_on_after_an_interruption(folder: Path
     assert json.loads((folder / "proof.json").read_bytes())["rates"][0]["read"] == 12
 
 
-@pytest.mark.slow
 def test_two_processes_give_the_same_as_one(folder: Path) -> None:
     assert prove(folder)[0] == 0
     one = (folder / "proof.json").read_bytes()

@@ -28,6 +28,8 @@ from tests.formats.pictures import png
 from tests.http import created, finished
 from tests.jobs import standin
 
+pytestmark = pytest.mark.slow
+
 GOOD = png(standin.frame_that(standin.OBEY))
 
 

@@ -57,6 +57,7 @@ def spans_of(received: list[bytes]) -> list[Any]:
     return spans
 
 
+@pytest.mark.slow
 @pytest.mark.both_databases
 def test_a_span_goes_through_request_job_and_decoder_process(
     settings: Settings, collector: tuple[str, list[bytes]]

@@ -118,6 +118,7 @@ def test_an_empty_area_is_a_snapshot() -> None:
     assert snapshot.near("plate", 8.4, 49.0, 1e6) == []
 
 
+@pytest.mark.slow
 def test_every_change_of_one_byte_is_refused() -> None:
     """To each of the 255 other values, in each place: header, body and signature."""
     data = _write([])

@@ -139,6 +139,7 @@ def answers(url: str) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_two_servers_behind_the_proxy_share_rows_limits_and_failures(
     tmp_path: Path, postgres: PostgresServer, require_tool: Callable[..., str]
 ) -> None:

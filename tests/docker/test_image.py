@@ -65,16 +65,17 @@ def context_files() -> list[Path]:
     return found
 
 
-def copies() -> list[tuple[list[str], str]]:
-    """Sources and target of each COPY from the context."""
-    lines = re.findall(r"^COPY (?!--from)(.+)$", (ROOT / "docker/Dockerfile").read_text(), re.MULTILINE)
+def copies(stage: str) -> list[tuple[list[str], str]]:
+    """Sources and target of each COPY from the context in a stage of the build."""
+    text = re.split(rf"^FROM \S+ AS {stage}$", (ROOT / "docker/Dockerfile").read_text(), flags=re.MULTILINE)[1]
+    lines = re.findall(r"^COPY (?!--from)(.+)$", text.split("\nFROM ")[0], re.MULTILINE)
     return [(words[:-1], words[-1]) for words in (line.split() for line in lines)]
 
 
-def assemble(image: Path) -> None:
+def assemble(image: Path, *stages: str) -> None:
     """Copy to `image` what the COPY lines copy from the context; a source that is missing there fails the build."""
     context = context_files()
-    for sources, target in copies():
+    for sources, target in (copy for stage in stages for copy in copies(stage)):
         for source in sources:
             files = [path for path in context if path == Path(source) or Path(source) in path.parents]
             assert files, f"COPY {source}: .dockerignore excludes it"
@@ -149,6 +150,7 @@ def root() -> Iterator[Path]:
         yield Path(folder)
 
 
+@pytest.mark.slow
 def test_the_command_copies_the_compiled_decoders_once(tmp_path: Path) -> None:
     kernels, numba = tmp_path / "kernels", tmp_path / "numba"
     (kernels / "plate").mkdir(parents=True)
@@ -164,8 +166,9 @@ def test_the_command_copies_the_compiled_decoders_once(tmp_path: Path) -> None:
         (numba / "plate/fit.nbi").write_bytes(b"compiled later")
 
 
+@pytest.mark.slow
 def test_the_image_has_what_the_server_needs(root: Path) -> None:
-    assemble(root)
+    assemble(root, "build")
     image = root / "opt/waymark/src"
     assert (root / "tmp/requirements.txt").is_file()
     assert not list(image.glob("**/__pycache__"))
@@ -196,15 +199,18 @@ def test_the_image_has_what_the_server_needs(root: Path) -> None:
 def test_the_base_is_pinned_and_nothing_is_downloaded_without_a_hash() -> None:
     lines = (ROOT / "docker/Dockerfile").read_text()
     bases = set(re.findall(r"^FROM (\S+)", lines, re.MULTILINE))
-    assert bases == {"${PYTHON}"}
+    assert bases == {"${PYTHON}", "build"}
     assert re.search(r"^ARG PYTHON=python:3\.11-slim-bookworm@sha256:[0-9a-f]{64}$", lines, re.MULTILINE)
     runs = re.findall(r"^RUN (.+?[^\\])$", lines, re.MULTILINE | re.DOTALL)
-    assert len(runs) == 4
+    assert len(runs) == 6
     for run in runs:
         assert not re.search(r"\b(apt|apt-get|curl|wget|git)\b", run)
         assert "pip" not in run or "--require-hashes" in run
-    wanted = re.findall(r"^[a-z0-9][^\n]*==[^\n]*(?:\n +[^\n]*)*", (ROOT / "docker/requirements.txt").read_text(), re.M)
+    pattern = r"^[a-z0-9][^\n]*==[^\n]*(?:\n +[^\n]*)*"
+    wanted = re.findall(pattern, (ROOT / "docker/requirements.txt").read_text(), re.M)
     assert len(wanted) > 80
+    wanted += re.findall(pattern, (ROOT / "docker/requirements-guide.txt").read_text(), re.M)
+    assert len(wanted) > 100
     assert all("--hash=sha256:" in requirement for requirement in wanted)
 
 
@@ -213,12 +219,13 @@ def test_the_images_requirements_are_those_of_the_tests() -> None:
         return set(re.findall(r"^([a-z0-9][\w.-]*==\S+)", (ROOT / path).read_text(), re.MULTILINE))
 
     assert versions("requirements.txt") <= versions("docker/requirements.txt") <= versions("requirements-dev.txt")
+    assert versions("docker/requirements-guide.txt") <= versions("requirements-dev.txt")
 
 
 def test_what_the_build_does_not_need_stays_outside() -> None:
     files = set(context_files())
     assert Path("static/index.html") in files
-    for path in ("tests/docker/test_image.py", "docs/ogc.md", "Makefile", ".gitignore"):
+    for path in ("tests/docker/test_image.py", "benchmarks/pictures.py", "Makefile", ".gitignore"):
         assert Path(path) not in files
 
 

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import httpx
+import pytest
 
 from tests.docker.test_image import STARTED
 from tests.http import WITHIN_S, finished, wait_until
@@ -53,6 +54,7 @@ def address_of(server: subprocess.Popen[bytes], log: Path) -> str | None:
     return started[1] if started else None
 
 
+@pytest.mark.slow
 def test_the_log_has_ids_and_neither_keys_nor_positions_nor_contents(tmp_path: Path) -> None:
     own = {
         "WAYMARK_DATA_DIR": str(tmp_path / "var"), "WAYMARK_ADMIN_KEY": ADMIN_KEY, "WAYMARK_LOG_FORMAT": "json",

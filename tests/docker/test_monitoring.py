@@ -22,10 +22,12 @@ from app.registry import jobs as store
 from app.registry.jobs import JobKind
 from app.registry.tenancy import across_agencies
 from app.services.decodes.measures import DECODE_METRICS, measured
+from app.services.ports import utc_now
 from app.settings import Settings
-from app.wiring import utc_now
 from tests.conftest import LiveServer
 from tests.http import WITHIN_S
+
+pytestmark = pytest.mark.slow
 
 FOLDER = Path(__file__).resolve().parents[2] / "docker/monitoring"
 FUNCTIONS = {"rate", "increase", "sum", "max", "min", "histogram_quantile", "by", "on", "and"}

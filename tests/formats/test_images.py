@@ -154,8 +154,8 @@ def test_a_constant_thermal_frame_is_a_frame() -> None:
         (b"ffconcat version 1.0\nfile other.avi", "playlist"),
         (b"#EXTM3U\nfile:///etc/passwd", "playlist"),
         (b"<svg xmlns='http://www.w3.org/2000/svg'/>", "SVG"),
-        (b"hello", "neither"),
-        (b"\xff\xd8", "neither"),
+        (b"hello", "not a JPEG"),
+        (b"\xff\xd8", "not a JPEG"),
     ],
 )
 def test_other_kinds_are_named_and_refused(data: bytes, names: str) -> None:

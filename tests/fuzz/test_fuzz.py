@@ -12,6 +12,7 @@ from benchmarks.fuzz.parsers import Parser, attack, list_parsers
 PARSERS = list_parsers()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parser", PARSERS, ids=[parser.name for parser in PARSERS])
 def test_damaged_files_are_read_or_refused(parser: Parser) -> None:
     outcome = attack(parser, examples=60, seed=1)

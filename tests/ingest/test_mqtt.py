@@ -35,6 +35,8 @@ from tests.conftest import ADMIN_KEY, LiveServer
 from tests.http import WITHIN_S, wait_until
 from tests.jobs import standin
 
+pytestmark = pytest.mark.slow
+
 BROKER = ("127.0.0.1", 1883)
 
 

@@ -23,6 +23,7 @@ def _noise() -> CalibrationTask:
     )
 
 
+@pytest.mark.slow
 def test_sixty_photos_of_noise_are_refused_after_eight(monkeypatch: pytest.MonkeyPatch) -> None:
     searched: list[int] = []
 

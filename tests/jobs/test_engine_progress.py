@@ -36,6 +36,7 @@ def server(
         yield running
 
 
+@pytest.mark.slow
 def test_a_job_is_followed_to_its_end(client: httpx.Client) -> None:
     good = png(standin.frame_that(standin.OBEY))
     job = post_frame(client, pack({f"{k}.png": good for k in range(3)}), name="drive.zip").json()

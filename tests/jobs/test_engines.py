@@ -33,7 +33,7 @@ from tests.http import created, finished, refused, wait_until
 from tests.jobs import standin
 from tests.jobs.hostile_files import hostile_files, send
 
-pytestmark = pytest.mark.both_engines
+pytestmark = [pytest.mark.slow, pytest.mark.both_engines]
 
 
 @pytest.fixture(scope="module")

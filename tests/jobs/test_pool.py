@@ -128,6 +128,7 @@ def test_a_process_killed_from_outside_is_tried_again(tmp_path: Path) -> None:
         made.close()
 
 
+@pytest.mark.slow
 def test_the_process_that_the_others_are_forks_of_is_replaced_too() -> None:
     made = DecodePool(standin.decode, workers=1)
     made.open()
@@ -156,6 +157,7 @@ pending.result()
 """
 
 
+@pytest.mark.slow
 def test_no_process_outlives_a_server_that_is_killed_while_it_decodes() -> None:
     with subprocess.Popen([sys.executable, "-c", SERVER], stdout=subprocess.PIPE) as server:
         assert server.stdout is not None
@@ -259,6 +261,7 @@ def test_an_agency_that_takes_every_place_keeps_no_other_from_its_own(tmp_path: 
         small.close()
 
 
+@pytest.mark.slow
 def test_a_decoder_that_cannot_start_is_unavailable() -> None:
     broken = DecodePool(broken_decode, workers=1)
     for _attempt in range(2):

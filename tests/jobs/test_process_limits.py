@@ -96,6 +96,7 @@ def pool() -> Iterator[DecodePool]:
     made.close()
 
 
+@pytest.mark.slow
 def test_every_limit_holds_and_the_next_task_finds_an_empty_folder(pool: DecodePool) -> None:
     first, second = attempt(pool), attempt(pool)
     for report in (first, second):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 _COUNTED = """
 import gc
 from pathlib import Path
@@ -24,6 +26,7 @@ print(before, compiled())
 """
 
 
+@pytest.mark.slow
 def test_a_recording_compiles_nothing_after_the_warm_up() -> None:
     """In a process of its own: in this one other tests have compiled the kernels."""
     ended = subprocess.run([sys.executable, "-c", _COUNTED], capture_output=True, text=True, check=True)

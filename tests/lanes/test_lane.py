@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 
 from app.errors import InvalidParameter
 from app.lanes.estimate import LaneMarkers, LaneRules, LeftOutReason, fit_lane, preview_m
@@ -29,6 +30,8 @@ def test_path_of_a_bendy_lane(labelled):
     assert lane.station_m[-1] > road.at[-1] - 2
     assert 0.4 < rms(errors) / rms(lane.sigma_m) < 2
     assert (lane.confidence > 0.9).mean() > 0.9
+    beyond = 2 * scipy.stats.t.sf(0.25, df=2.4, scale=0.61 * lane.sigma_m)
+    np.testing.assert_allclose(1 - lane.confidence, beyond, rtol=1e-6)
 
 
 def test_heading_curvature_and_frames():
@@ -84,6 +87,19 @@ def test_a_marker_off_the_line_is_named(away):
     assert lane.side[k] == 0
     assert np.isnan(lane.residual_m[k])
     assert rms(road.errors(lane)) < 0.04
+
+
+@pytest.mark.parametrize(("noise_m", "fewest", "most"), [(0.02, 0, 1), (0.06, 5, 8)])
+def test_markers_that_scatter_more_than_stated(noise_m, fewest, most):
+    z, warnings = [], 0
+    for seed in range(8):
+        rng = np.random.default_rng([seed, 91])
+        road = bendy()
+        lane = fit_lane(place(road, rng, noise=noise_m), drive(road, rng))
+        z.append(rms(road.errors(lane)) / rms(lane.sigma_m))
+        warnings += any("from smooth boundaries" in warning for warning in lane.localization_warnings)
+    assert fewest <= warnings <= most
+    assert 0.5 < rms(np.array(z)) < 1.4
 
 
 def test_a_marker_that_names_the_wrong_side():

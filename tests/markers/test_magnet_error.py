@@ -100,6 +100,7 @@ def test_the_distinguishable_share_is_what_drawing_gives() -> None:
     assert verdict.codes == round(verdict.share * 61) * 8
 
 
+@pytest.mark.slow
 def test_with_more_magnets_the_share_is_a_bound_from_below() -> None:
     design, at = TagDesign(4, 3.0, 0.1), ReadingConditions(20.0, 0.30)
     verdict = distinguishable(design, at)

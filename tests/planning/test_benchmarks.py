@@ -11,12 +11,14 @@ from benchmarks.planning.roads import LANES, generated_road, real_lane
 from benchmarks.planning.speed import RADII_M, RULES, SEED, measure_road
 
 
+@pytest.mark.slow
 def test_the_papers_set_ups_come_out() -> None:
     section = measure_papers(short=True)
     assert section.met, section.text
     assert " NO " not in section.text
 
 
+@pytest.mark.slow
 def test_a_road_of_the_speed_table_has_all_families() -> None:
     found = measure_road(1.0)
     assert found.markers.keys() == {"plate", "magnet", "cerpm"}

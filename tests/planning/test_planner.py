@@ -84,6 +84,7 @@ def test_plates_and_tags_ahead_of_events_count_as_fixes_and_tags_are_not_covered
             assert not any(at - 0.5 < marker.chainage_m < at + 4.5 for at in tags)
 
 
+@pytest.mark.slow
 def test_pairs_of_cerpms_follow_the_required_path_and_else_the_rules() -> None:
     lane = winding(2, 40, 1500)
     required = made(road(lane), cerpm={"straight": 3.0}, quality={**QUALITY, "path_error_m": 0.05})

@@ -229,6 +229,7 @@ def test_what_cannot_be_reached_lawfully_is_said() -> None:
     assert "no settings are lawful" in nowhere.sentence
 
 
+@pytest.mark.slow
 def test_an_approach_is_computed_once_for_all_channels(monkeypatch: pytest.MonkeyPatch) -> None:
     approached: list[tuple[float, float]] = []
 
@@ -243,6 +244,7 @@ def test_an_approach_is_computed_once_for_all_channels(monkeypatch: pytest.Monke
     assert len(approached) <= 8 * len(set(approached))
 
 
+@pytest.mark.slow
 def test_reception_among_twenty_thousand_is_computed_at_fewer_stations() -> None:
     def stations(count: int) -> int:
         markers = RoadMarkers(np.linspace(0.0, 2000.0, count), np.tile([1.8, -1.8], count // 2))

@@ -195,6 +195,7 @@ TAMPERED: dict[str, tuple[str, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", TAMPERED)
 def test_what_was_changed_or_removed_is_named(registry: Registry, what: str) -> None:
     statement, expected = TAMPERED[what]
@@ -269,6 +270,7 @@ def test_what_moved_to_another_agency_is_found(registry: Registry) -> None:
     assert "entry 5: changed: its hash does not match its content" in registry.faults("two")
 
 
+@pytest.mark.slow
 def test_logs_that_two_agencies_swapped_are_found(registry: Registry) -> None:
     one, two = registry.agency_ids
     with registry.database.write() as connection:

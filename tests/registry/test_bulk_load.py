@@ -83,6 +83,7 @@ def test_columns_are_stored_as_rows_are(database: Database, agency: str, count: 
         assert _stored(connection, agency) == rows
 
 
+@pytest.mark.slow
 def test_rows_that_are_all_the_same(database: Database) -> None:
     table = sa.Table("alike", sa.MetaData(), sa.Column("a", sa.Integer, server_default="5"), sa.Column("b", sa.Text))
     with database.write() as connection:
@@ -140,6 +141,7 @@ def test_a_large_load_that_fails_leaves_nothing(database: Database, agency: str)
         assert _stored(connection, agency) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1, 51, 52, 2_700, 140_000])
 def test_a_packed_rtree_is_sound_and_proposes_every_row(count: int) -> None:
     rng = np.random.default_rng(count)

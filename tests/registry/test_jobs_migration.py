@@ -11,7 +11,7 @@ import pytest
 import sqlalchemy as sa
 
 from app.registry.database import Database
-from app.registry.decodes import get_decode, list_decodes
+from app.registry.decodes import DecodeFilter, get_decode, list_decodes
 from app.registry.job_leases import list_startable, start_job
 from app.registry.jobs import JobKind, list_jobs
 from app.registry.tenancy import acting_for
@@ -119,7 +119,7 @@ def test_decodes_stay_and_imports_become_jobs(database: Database) -> None:
     database.migrate()
     assert database.is_ready()
     with database.read() as connection:
-        found = list_decodes(connection, AGENCY, state=None, before=None, limit=100)
+        found = list_decodes(connection, AGENCY, DecodeFilter(), before=None, limit=100)
         assert [row.id for row in found] == [_id(k) for k in range(6, -1, -1)]
         for k, (kind, state, attempts, progress, _context, result, error) in enumerate(DECODES[:7]):
             row = get_decode(connection, AGENCY, _id(k))
@@ -136,7 +136,7 @@ def test_decodes_stay_and_imports_become_jobs(database: Database) -> None:
         assert all(job.input == DECLARED for job in imports)
         assert [job.id for job in list_startable(connection, NOW)] == [_id(k) for k in (2, 4, 8, 9)]
         by_state = {
-            state: len(list_decodes(connection, AGENCY, state=state, before=None, limit=100))
+            state: len(list_decodes(connection, AGENCY, DecodeFilter(state=state), before=None, limit=100))
             for state in ("queued", "running", "done", "failed", "cancelled")
         }
         assert by_state == {"queued": 1, "running": 1, "done": 3, "failed": 1, "cancelled": 1}
@@ -147,6 +147,7 @@ def test_decodes_stay_and_imports_become_jobs(database: Database) -> None:
         assert start_job(connection, _id(0), NOW) is None
 
 
+@pytest.mark.slow
 def test_documents_have_the_new_names(database: Database) -> None:
     database.migrate()
     with database.read() as connection:
@@ -159,6 +160,7 @@ def test_documents_have_the_new_names(database: Database) -> None:
     }
 
 
+@pytest.mark.slow
 def test_back_and_forth_changes_nothing(database: Database) -> None:
     before = _older_rows(database)
     database.migrate()

@@ -171,6 +171,7 @@ def test_rows_are_the_same_on_both_databases(database: Database) -> None:
     assert _hashes(database, ["markers"]) == {"markers": plain.hexdigest()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("revision", EARLIER)
 def test_down_and_up_keeps_what_the_older_schema_knows(database: Database, revision: str) -> None:
     made = _made(MARKERS)
@@ -269,6 +270,7 @@ def test_older_positions_are_graded_and_their_history_verifies(database: Databas
     assert "state horizontal_rmse_m" in (rows[4].transform_note or "")
 
 
+@pytest.mark.slow
 def test_to_nothing_and_back(database: Database) -> None:
     made = _made(100)
     _fill(database, made)
@@ -309,6 +311,7 @@ def test_older_histories_get_kinds_hashes_and_a_first_entry(database: Database) 
     assert faults == []
 
 
+@pytest.mark.slow
 def test_more_markers_than_migrations_read_at_once(database: Database) -> None:
     """To the oldest schema that knows all families and back: hashes unchanged, and the new history verifies."""
     made = _made(LARGE)

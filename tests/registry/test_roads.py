@@ -81,6 +81,7 @@ def test_thousands_of_markers_are_measured_and_the_log_covers_each(database: Dat
     assert said == _measures(database)
 
 
+@pytest.mark.slow
 def test_down_and_up_again_keeps_markers_and_their_measures(database: Database, caller: Caller) -> None:
     _fill(database, caller)
     Roads(database, lambda: NOW).register(caller, NewRoad("A 5", LinesInput((LINE,))))

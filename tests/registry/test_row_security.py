@@ -118,6 +118,7 @@ def test_threads_do_not_mix(database: Database, owners: tuple[str, str]) -> None
         assert all(pool.map(look, range(8)))
 
 
+@pytest.mark.slow
 def test_all_rows_for_one_question_and_then_ones_own_again(database: Database, owners: tuple[str, str]) -> None:
     with acting_for(owners[1]), database.read() as connection:
         with seeing_every_agency(connection):
@@ -150,6 +151,7 @@ def test_rows_by_copy_pass_the_lock(
         assert connection.exec_driver_sql(forced).scalar_one() is True
 
 
+@pytest.mark.slow
 def test_a_request_sees_its_agencys_rows_even_if_the_query_forgets(
     tmp_path: Path,
     new_database_url: Callable[[Path], str],

@@ -98,6 +98,7 @@ def test_a_write_takes_the_lock_at_its_start(database: Database) -> None:
     rival.dispose()
 
 
+@pytest.mark.slow
 def test_a_second_process_is_told_who_owns_the_file(database: Database) -> None:
     program = (
         "import sys; from app.registry.database import Database; from app.errors import Unavailable\n"

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from app.registry import agencies
+from app.registry import agencies, audit
+from app.registry.audit import Author
 from app.registry.database import Database
 from app.registry.features import ON_ROAD, RETIRED, TILE_FIELDS
 from app.registry.mvt import EXTENT, write_layer
 from app.registry.tables import markers
+from app.registry.tile_groups import MAX_SINGLE, FeatureGrid, read_grid
 from app.registry.tiles import MAX_FEATURES, Tile, feature_tile
+from app.services.access.access import Caller, Scope
+from app.services.markers.features import MARKERS, Features
 from tests.databases import PostgresServer
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
@@ -198,3 +204,92 @@ def test_a_full_tile_holds_the_markers_that_were_registered_first(
     for database in both:
         _, found = read_tile(_tile(database, Tile(0, 0, 0)))
         assert [properties["id"] for properties, _ in found] == sorted(whole)[:20]
+
+
+def _grid(database: Database, zoom: int, on: Tile | None = None) -> FeatureGrid:
+    with database.read() as connection:
+        agency_id = connection.execute(sa.select(sa.column("id")).select_from(sa.table("agencies"))).scalar_one()
+        return read_grid(connection, agency_id, ON_ROAD, zoom=zoom, on=on)
+
+
+def test_groups_hold_every_marker_of_its_kind_once(both: tuple[Database, Database]) -> None:
+    with both[0].read() as connection:
+        rows = connection.execute(sa.select(markers.c.family).where(markers.c.status != "retired")).scalars().all()
+    for database in both:
+        grid = _grid(database, 3)
+        assert grid.kinds == ("cerpm_active", "plate_active")
+        for zoom in (0, 1, 3):
+            tiles = [Tile(zoom, column, row) for column in range(2**zoom) for row in range(2**zoom)]
+            groups = [group for tile in tiles if grid.count_on(tile) for group in _groups(grid, tile)]
+            assert sum(properties["count"] for properties, _ in groups) == len(rows)
+            for family in ("plate", "cerpm"):
+                assert sum(properties.get(f"{family}_active", 0) for properties, _ in groups) == rows.count(family)
+            assert all(properties["count"] >= 1 and 0 not in properties.values() for properties, _ in groups)
+            assert all(0 <= right < EXTENT and 0 <= down < EXTENT for _, (right, down) in groups)
+
+
+def _groups(grid: FeatureGrid, tile: Tile) -> list[tuple[dict[str, Any], tuple[int, int]]]:
+    name, groups = read_tile(grid.write(tile, "markers_groups"))
+    assert name == "markers_groups"
+    return groups
+
+
+def test_a_group_is_at_the_mean_of_its_markers(both: tuple[Database, Database]) -> None:
+    town = Tile(9, 267, 175)  # the 400 markers close together, with some that are far away
+    for database in both:
+        singles = [place for _, place in read_tile(_tile(database, town))[1]]
+        groups = _groups(_grid(database, town.zoom, town), town)
+        assert 1 < len(groups) < len(singles) / 5
+        total = sum(properties["count"] for properties, _ in groups)
+        mean = sum(np.array(place) * properties["count"] for properties, place in groups) / total
+        inside = [place for place in singles if min(place) >= 0 and max(place) < EXTENT]
+        assert total == len(inside)
+        assert mean == pytest.approx(np.mean(inside, axis=0), abs=1)
+
+
+def test_only_tiles_with_too_many_markers_have_groups(
+    both: tuple[Database, Database], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert MAX_SINGLE == 2_000
+    monkeypatch.setattr("app.services.markers.features.MAX_SINGLE", 100)
+    now = [NOW]
+    for database in both:
+        with database.read() as connection:
+            agency_id = connection.execute(sa.select(sa.column("id")).select_from(sa.table("agencies"))).scalar_one()
+        caller, features = Caller(agency_id, "key", "test", Scope.VIEWER), Features(database, lambda: now[0])
+        for zoom, layer in ((0, "markers_groups"), (8, "markers_groups"), (12, "markers")):
+            lon, lat = 8.05, 49.05
+            down = 0.5 - np.arcsinh(np.tan(np.radians(lat))) / (2 * np.pi)
+            tile = Tile(zoom, int((lon + 180) / 360 * 2**zoom), int(down * 2**zoom))
+            name, points = read_tile(features.grouped_tile(caller, MARKERS, tile))
+            assert name == layer
+            assert all(0 <= right <= EXTENT and 0 <= down_px <= EXTENT for _, (right, down_px) in points)
+        assert features.grouped_tile(caller, MARKERS, Tile(8, 0, 200)) == b""
+
+
+def test_tiles_are_counted_once_until_something_changes(both: tuple[Database, Database]) -> None:
+    counted: list[str] = []
+    now = [NOW]
+
+    def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        counted.append(statement)
+
+    tiles = [Tile(2, column, row) for column in range(4) for row in range(4)]
+    for database in both:
+        counted.clear()
+        with database.read() as connection:
+            agency_id = connection.execute(sa.select(sa.column("id")).select_from(sa.table("agencies"))).scalar_one()
+        sa.event.listen(sa.Engine, "before_cursor_execute", note)
+        ask = partial(
+            Features(database, lambda: now[0]).grouped_tile, Caller(agency_id, "key", "test", Scope.VIEWER), MARKERS
+        )
+        for passes, later in ((1, timedelta(seconds=61)), (1, timedelta(hours=1)), (2, timedelta(seconds=61))):
+            with ThreadPoolExecutor(4) as threads:
+                list(threads.map(ask, tiles))
+            assert sum("GROUP BY" in statement for statement in counted) == passes
+            now[0] += later
+        with database.write() as connection:
+            audit.record(connection, agency_id, Author("test"), "marker.registered", now=now[0])
+        ask(tiles[0])
+        assert sum("GROUP BY" in statement for statement in counted) == 3
+        sa.event.remove(sa.Engine, "before_cursor_execute", note)

@@ -17,7 +17,7 @@ from app.registry.ids import new_id
 from app.registry.jobs import JobKind, new_job
 from app.registry.metadata import metadata
 from app.registry.plan_tables import alignments, plans
-from app.registry.tables import decodes
+from app.registry.tables import damage_reports, decodes, markers
 from app.services.unused_blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.storage.blobs import Blobs, new_blob_key
 
@@ -51,7 +51,7 @@ def stored(blobs: Blobs) -> set[str]:
 
 def refer(connection: sa.Connection, agency_id: str, blobs: Blobs) -> set[str]:
     """Rows of every kind that refers to blobs; returns the keys."""
-    keys = [put(blobs) for _ in range(9)]
+    keys = [put(blobs) for _ in range(10)]
     times = {"created_at": NOW, "updated_at": NOW}
     row = {"id": new_id(NOW), "agency_id": agency_id}
     decode = {**row, "kind": "trace", "context": {}, "created_at": NOW, "upload_key": keys[0], "picture_key": keys[1]}
@@ -66,6 +66,19 @@ def refer(connection: sa.Connection, agency_id: str, blobs: Blobs) -> set[str]:
     jobs.add_job(connection, new)
     new = new_job(JobKind.PACKAGE, new_id(NOW), agency_id, "x", NOW, job_input={"document_key": keys[7]})
     jobs.add_job(connection, new._replace(state="done", result={"blob_key": keys[8]}))
+    marker: dict[str, Any] = {
+        **row,
+        "family": "plate",
+        "status": "active",
+        "lon_deg": 0.0,
+        "lat_deg": 0.0,
+        "crs": "EPSG:4326",
+    }
+    connection.execute(
+        sa.insert(markers), {**marker, "original": {}, "localization_grade": "cm", "version": 1, **times}
+    )
+    report: dict[str, Any] = {**row, "marker_id": row["id"], "form_nonce": "", "kind": "other", "language": "en"}
+    connection.execute(sa.insert(damage_reports), {**report, "state": "new", "photo_key": keys[9], "created_at": NOW})
     return set(keys)
 
 

@@ -247,6 +247,7 @@ def test_an_occluder_hides_its_share():
     assert share.sum() == pytest.approx(whole.sum() / 2, rel=0.02)
 
 
+@pytest.mark.slow
 def test_plates_whose_windows_overlap_are_all_there():
     places = [(i, j) for i in range(5) for j in range(5) if (i + j) % 2 == 0]
     np.random.default_rng(0).shuffle(places)

@@ -55,6 +55,7 @@ def test_placed_faces_have_the_wanted_height():
         assert 23.9 <= truth.height_px <= 60.1
 
 
+@pytest.mark.slow
 def test_heights_that_a_camera_never_sees_are_refused():
     with pytest.raises(InvalidParameter, match="rows"):
         draw_place(CAMERA, FACE, np.random.default_rng(0), (900.0, 1000.0))

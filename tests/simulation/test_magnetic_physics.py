@@ -108,6 +108,7 @@ def test_the_default_line_of_dipoles_is_fine_enough_under_the_bar() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_spheroids_are_about_as_strong_as_the_dipoles_of_their_kind(kind: str) -> None:
     road, points = Road(20), np.array([[0.0, 1.2, 0.6], [0.3, -1.2, 0.6], [0.0, 0.1, 0.9]])
@@ -157,6 +158,7 @@ def test_without_options_a_drive_is_the_one_recorded_before_they_existed() -> No
     assert np.abs(field.astype(float)).mean() == pytest.approx(184.366116437, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scene",
     [

@@ -12,6 +12,8 @@ from app.lanes.control import Controller, SteeringSettings
 from app.simulation.steering import check_steering
 from app.simulation.vehicle import PoseNoise, Vehicle, draw_pose_errors
 
+pytestmark = pytest.mark.slow
+
 EAST = np.column_stack([np.arange(0.0, 301.0), np.zeros(301)])
 
 

@@ -22,6 +22,7 @@ def judge() -> Iterator[Judge]:
         yield opened
 
 
+@pytest.mark.slow
 def test_every_kind_of_fault_is_warned_or_refused(judge: Judge) -> None:
     verdicts: Counter[str] = Counter()
     for planted in plant_faults(SEED, len(KINDS)):

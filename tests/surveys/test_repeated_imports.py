@@ -18,10 +18,10 @@ from app.registry.database import Database
 from app.registry.tables import markers
 from app.registry.tenancy import seeing_every_agency
 from app.services.access.access import Access, Scope
+from app.services.ports import utc_now
 from app.services.surveys.declarations import import_input
 from app.services.surveys.documents import ImportReport
 from app.services.surveys.imports import SETTLED, Imports
-from app.wiring import utc_now
 
 DECLARED = {"crs": "EPSG:25832", "family": "cerpm", "area_deg": [8.3, 48.9, 8.6, 49.1], "ignore_heights": True}
 EAST, NORTH = 457000.0, 5428000.0

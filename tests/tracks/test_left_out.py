@@ -10,6 +10,7 @@ from app.tracks.left_out import count_passages, stretches_left_out, times_lost
 from benchmarks.track.drives import simulate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [61_005, 61_049])
 def test_a_drive_that_loses_its_way_is_led_back(seed: int) -> None:
     """With 61005 a cloned plate looked like a clock that was set, with 61049 twelve rounds did not suffice."""

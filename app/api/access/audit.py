@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
-from fastapi import APIRouter, Body, Path, Query, Request, Response
+from fastapi import APIRouter, Body, Depends, Path, Query, Request, Response
+from pydantic import AwareDatetime
 
-from app.api.http.dependencies import Caller, Idempotency, Identifier, PageSize, use_cases
+from app.api.http.dependencies import Caller, Idempotency, Identifier, PageSize, Text, use_cases
 from app.api.http.responses import created_response, document_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
+from app.registry.audit import EntryFilter
 from app.services.access.audit import AuditLog
 from app.services.access.audit_jobs import AuditVerifications, VerificationDocument, VerificationInput
 from app.services.access.documents import AuditPage
@@ -16,17 +18,42 @@ from app.services.access.documents import AuditPage
 router = APIRouter(prefix="/v1/audit", tags=["audit"], route_class=StrictRoute)
 
 
+_NEWEST = 2**53 - 1
+
+
+async def get_entry_filter(
+    who: Annotated[Text | None, Query(max_length=200, description="Label of the key or name of the person.")] = None,
+    action: Annotated[
+        Text | None,
+        Query(max_length=80, description="What was done; with `*` at the end all that begin so.", examples=["key.*"]),
+    ] = None,
+    subject: Annotated[Text | None, Query(max_length=200, description="Id or name of what it was done to.")] = None,
+    since: Annotated[AwareDatetime | None, Query(description="At this time or later.")] = None,
+    until: Annotated[AwareDatetime | None, Query(description="Before this time.")] = None,
+) -> EntryFilter:
+    """The filter in a query."""
+    return EntryFilter(who, action, subject, since, until)
+
+
 @router.get("", responses=document_response(AuditPage))
 def list_audit_entries(
     request: Request,
     caller: Caller,
     log: Annotated[AuditLog, use_cases("audit")],
+    wanted: Annotated[EntryFilter, Depends(get_entry_filter)],
     limit: PageSize = 100,
     after: Annotated[int, Query(ge=0, lt=2**53, description="Last number of the page before.")] = 0,
+    before: Annotated[
+        int | None, Query(ge=1, lt=2**53, description="Last number of the page before, where the newest come first.")
+    ] = None,
+    order: Annotated[Literal["oldest", "newest"], Query(description="Which entries come first.")] = "oldest",
 ) -> Response:
-    """The agency's log, oldest first. `waymark audit verify` computes its hashes again."""
-    page, last = log.page(caller, after=after, limit=limit)
-    return page_response(request, page, after=last)
+    """The agency's log, oldest first or newest first. `waymark audit verify` computes its hashes again."""
+    if order == "oldest":
+        page, last = log.page(caller, after=after, limit=limit, wanted=wanted)
+        return page_response(request, page, after=last)
+    page, last = log.page(caller, before=before or _NEWEST, limit=limit, wanted=wanted)
+    return page_response(request, page, before=last)
 
 
 @router.post(

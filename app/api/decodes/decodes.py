@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import AwareDatetime
 
 from app.api.decodes.schemas import CONTEXT_EXAMPLE, ContextIn
 from app.api.decodes.uploads import RAW_TYPES, Upload
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_cases
 from app.api.http.forms import form_body
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -22,9 +23,11 @@ from app.api.http.responses import (
     page_response,
 )
 from app.api.http.strict_json import StrictRoute
+from app.registry.decodes import DecodeFilter
 from app.registry.jobs import JobState
 from app.services.decodes.decodes import Decodes as DecodesService
 from app.services.decodes.documents import DecodeDocument, DecodePage
+from app.services.decodes.kinds import DecodeKind
 from app.services.decodes.outputs import DecodeOutputs
 
 router = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
@@ -83,11 +86,16 @@ def list_decodes(
     caller: Caller,
     decodes: Decodes,
     state: JobState | None = None,
+    kind: DecodeKind | None = None,
+    vehicle: Annotated[Text | None, Query(max_length=80, description="Name or id of the vehicle.")] = None,
+    since: Annotated[AwareDatetime | None, Query(description="Uploaded then or later.")] = None,
+    until: Annotated[AwareDatetime | None, Query(description="Uploaded before then.")] = None,
     limit: PageSize = 100,
     before: LastId = None,
 ) -> Response:
     """Decodes without their results, newest first."""
-    page, last = decodes.page(caller, state=state, before=before, limit=limit)
+    wanted = DecodeFilter(state=state, kind=kind, vehicle=vehicle, since=since, until=until)
+    page, last = decodes.page(caller, wanted, before=before, limit=limit)
     return page_response(request, {"items": page}, before=last)
 
 
@@ -157,13 +165,18 @@ def get_annotated(
     caller: Caller,
     decodes: Decodes,
     outputs: Outputs,
-    frame: Annotated[int, Query(ge=0, le=100_000, description="Number of the frame in an archive.")] = 0,
+    frame: Annotated[int, Query(ge=0, le=500_000, description="Number of the frame in an archive or a video.")] = 0,
+    outlines: Annotated[bool, Query(description="false: the frame as it is.")] = True,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """The frame with outlines, digits and confidence of its readings, drawn when it is asked for."""
-    headers = {"ETag": f'"{decode_id}-{frame}-{suffix}"', "Cache-Control": "private, no-cache"}
+    """The frame with outlines, digits and confidence of its readings, drawn when it is asked for.
+
+    Of a video, only frames in which something was found.
+    """
+    form = suffix if outlines else f"{suffix}-plain"
+    headers = {"ETag": f'"{decode_id}-{frame}-{form}"', "Cache-Control": "private, no-cache"}
     if if_none_match == headers["ETag"]:
         decodes.get(caller, decode_id)
         return Response(status_code=304, headers=headers)
-    picture = outputs.annotated(caller, decode_id, suffix, frame)
+    picture = outputs.annotated(caller, decode_id, suffix, frame, outlined=outlines)
     return Response(picture, headers=headers, media_type=_MEDIA_TYPES[suffix])

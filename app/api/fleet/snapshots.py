@@ -10,11 +10,11 @@ from app.api.http.dependencies import Caller, Text, use_cases
 from app.api.http.problems import problem_responses
 from app.api.http.responses import document_response, file_response, json_response
 from app.api.http.strict_json import StrictRoute
-from app.api.markers.filters import parse_box
 from app.markers.snapshot import MEDIA_TYPE
 from app.services.fleet.documents import TrustDocument, trust_document
 from app.services.fleet.snapshots import MAX_HOURS
 from app.services.fleet.snapshots import Snapshots as SnapshotsService
+from app.services.markers.search_boxes import parse_box
 
 router = APIRouter(prefix="/v1/snapshots", tags=["snapshots"], route_class=StrictRoute)
 Snapshots = Annotated[SnapshotsService, use_cases("snapshots")]

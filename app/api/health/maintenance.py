@@ -13,12 +13,12 @@ from app.api.http.dependencies import AfterLink, Caller, MarkerId, PageSize, Sen
 from app.api.http.problems import problem_responses
 from app.api.http.responses import document_response, file_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
-from app.api.markers.filters import parse_box
 from app.families import FamilyName
 from app.families.inputs import Identifier
 from app.registry.maintenance import ItemFilter
 from app.services.health.documents import HealthDocument, ItemStatus, MaintenanceItem, MaintenancePage, Outcome, What
 from app.services.health.maintenance import Maintenance as MaintenanceService
+from app.services.markers.search_boxes import parse_box
 from app.services.request_work import counted_steps
 
 router = APIRouter(prefix="/v1", tags=["maintenance"], route_class=StrictRoute)

@@ -33,6 +33,9 @@ EXPENSIVE = frozenset(
         "GET /v1/snapshots",
         "POST /v1/alignments",
         "GET /v1/alignments/{alignment_id}/map.{form}",
+        "GET /v1/alignments/{alignment_id}/profile",
+        "POST /v1/plan-rules",
+        "POST /v1/plan-previews",
         "POST /v1/plans",
         "PATCH /v1/plans/{plan_id}",
         "GET /v1/plans/{plan_id}/files/{name}",
@@ -43,9 +46,14 @@ EXPENSIVE = frozenset(
         "POST /v1/roads/{road_id}/locate",
         "POST /v1/roads/{road_id}/position",
         "POST /v1/codebooks",
+        "POST /v1/codebook-drafts",
         "POST /v1/codebooks/{codebook_id}/entries",
         "POST /v1/calibrations",
+        "POST /v1/plate-drafts/artwork.{form}",
+        "POST /v1/plate-drafts/view",
         "POST /v1/print-grades",
+        "GET /v1/decodes/{decode_id}/samples",
+        "GET /v1/decodes/{decode_id}/packets",
     }
 )
 """Routes whose largest request takes over a second. Source: `python -m benchmarks.abuse`."""

@@ -13,31 +13,36 @@ from anyio import to_thread
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import tracing
 from app.api.http.costs import Budget, Slots, admitted
+from app.api.http.credentials import key_in
 from app.api.http.permissions import Permissions
 from app.api.http.problems import BodyRefused, problem_from, unexpected
 from app.api.http.rate_limits import RateLimit, address_of
+from app.api.public_pages.negotiation import accepts_html
 from app.errors import MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
 from app.registry.tenancy import acting_for
 from app.services.access.access import Caller
 
 PROTECTED = ("/v1", "/ogc")
+_OPEN = ("/v1/page-settings",)
 _METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 _AUTH_THREADS = 4
 _UNKNOWN_PER_S = 20.0
 """Unknown keys from an address that sent too many wrong ones that are checked per second. Source: chosen by hand; a key
 that an operator chose has 24 characters or more, and 20/s are 600 million guesses a year."""
 _ID = re.compile(r"[0-9a-f]{8}(-?[0-9a-f]{4}){3}-?[0-9a-f]{12}")
+_RECORD = re.compile(r"/v1/markers/([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})")
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _LOG = structlog.get_logger("waymark.access")
 
 
 def is_protected(path: str) -> bool:
     """Whether a path needs a key."""
-    return any(path == prefix or path.startswith(prefix + "/") for prefix in PROTECTED)
+    return path not in _OPEN and any(path == prefix or path.startswith(prefix + "/") for prefix in PROTECTED)
 
 
 class Observed:
@@ -188,6 +193,9 @@ class Guarded:
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
+        if (page := _page_of_old_qr_code(scope, headers)) is not None:
+            await page(scope, receive, send)
+            return
         try:
             if is_protected(scope["path"]):
                 await self._admit(scope, headers)
@@ -244,7 +252,7 @@ class Guarded:
                     self._budget.charge(caller, work.used_s)
 
     async def _admit(self, scope: Scope, headers: Headers) -> None:
-        key = _key_in(headers)
+        key = key_in(headers)
         caller = self._recall(key)
         if caller is None:
             caller = await self._authenticated(scope, key)
@@ -275,21 +283,20 @@ class Guarded:
             raise
 
 
+def _page_of_old_qr_code(scope: Scope, headers: Headers) -> Response | None:
+    """A redirect to the public page, for a browser that asks for a marker without a key.
+
+    QR codes had the address of the marker's record before there were public pages. The address is relative: a proxy may
+    serve this server below a path.
+    """
+    found = _RECORD.fullmatch(scope["path"]) if scope["method"] in ("GET", "HEAD") else None
+    if found is None or "authorization" in headers or "x-api-key" in headers or not accepts_html(headers):
+        return None
+    return Response(status_code=303, headers={"Location": f"../../m/{found[1]}", "Vary": "Accept"})
+
+
 def _by_prefix(table: Mapping[str, int], path: str) -> int:
     return table[max((prefix for prefix in table if path.startswith(prefix)), key=len)]
-
-
-def _key_in(headers: Headers) -> str:
-    scheme, _, key = headers.get("authorization", "").partition(" ")
-    found = key.strip() if scheme.lower() == "bearer" else headers.get("x-api-key", "").strip()
-    if not found:
-        raise NotAuthenticated(
-            "this resource requires a key",
-            field="Authorization",
-            limit="Authorization: Bearer KEY or X-API-Key: KEY",
-            cure="send the admin key that the server printed at its first start, or a key that was created with it",
-        )
-    return found
 
 
 def _check_declared_length(headers: Headers, limit: int) -> None:

@@ -9,13 +9,15 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 
 from app.api.http.components import component_schemas
+from app.api.http.credentials import SECURITY, SECURITY_SCHEMES
 from app.api.http.middleware import is_protected
 
 DESCRIPTION = """The registry of machine-readable roads: coded plates, magnet tags, radio markers (CERPMs) and fiducial
 signs, from the plan of a road to artwork and surveys, and to the decoded uploads and drives of vehicles.
 
-Send your key as `Authorization: Bearer KEY` or `X-API-Key: KEY`. Every error is an RFC 9457 problem document that names
-the field, the limit and the cure. Positions are longitude, latitude in degrees; headings are clockwise from true north.
+Send your key as `Authorization: Bearer KEY`, as `X-API-Key: KEY`, or as the password of HTTP Basic with any user name.
+Every error is an RFC 9457 problem document that names the field, the limit and the cure. Positions are longitude,
+latitude in degrees; headings are clockwise from true north.
 """
 
 _TAGS = {
@@ -32,6 +34,7 @@ _TAGS = {
     "decodes": "What was read in photos, videos, traces and packet logs, against the registry.",
     "drives": "Several decodes of one vehicle as one track.",
     "maintenance": "Markers that vehicles found missing, moved, cloned, reversed or fading; people decide.",
+    "public pages": "Pages of markers that need no key, what agencies release on them, and damage reports.",
     "jobs": "Work that goes on after the answer: state, progress, cancellation.",
     "events": "What happened, as it happens.",
     "webhooks": "Signed messages to your server when jobs end and markers become suspect.",
@@ -62,10 +65,7 @@ def describe(app: FastAPI) -> None:
             )  # fmt: skip
             components = document.setdefault("components", {})
             components.setdefault("schemas", {}).update(component_schemas())
-            components["securitySchemes"] = {
-                "bearer": {"type": "http", "scheme": "bearer"},
-                "apiKey": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
-            }
+            components["securitySchemes"] = SECURITY_SCHEMES
             _require_keys(document)
             _describe_headers(document)
             app.openapi_schema = document
@@ -81,7 +81,7 @@ def _require_keys(document: dict[str, Any]) -> None:
     for path, operations in document["paths"].items():
         if is_protected(path):
             for operation in operations.values():
-                operation["security"] = [{"bearer": []}, {"apiKey": []}]
+                operation["security"] = SECURITY
 
 
 def _describe_headers(document: dict[str, Any]) -> None:

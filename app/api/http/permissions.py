@@ -12,6 +12,7 @@ from re import Pattern
 
 from starlette.routing import compile_path
 
+from app.api.http.page_addresses import PAGES
 from app.services.access.access import Scope
 
 Allowed = frozenset[Scope]
@@ -30,15 +31,31 @@ _OGC_ITEMS = "/ogc/collections/{collection}/items"
 _OGC_TILES = "/ogc/collections/{collection}/tiles"
 
 PERMISSIONS: dict[str, Allowed] = {
-    # --- the page, the documentation, the operator's
-    "GET /": PUBLIC,
+    # --- the pages, the documentation, the operator's
+    **{f"GET {path}": PUBLIC for path in PAGES},
+    "GET /v1/page-settings": PUBLIC,
     "GET /static": PUBLIC,
+    "GET /guide": PUBLIC,
     "GET /docs": PUBLIC,
     "GET /redoc": PUBLIC,
     "GET /openapi.json": PUBLIC,
     "GET /healthz": PUBLIC,
     "GET /readyz": PUBLIC,
     "GET /metrics": PUBLIC,
+    # --- public pages; what they show is up to the agency
+    "GET /m/{marker_id}": PUBLIC,
+    "GET /m/{marker_id}/thanks": PUBLIC,
+    "POST /m/{marker_id}/reports": PUBLIC,
+    "GET /v1/public-page": READERS,
+    "PUT /v1/public-page": ADMINS,
+    "GET /v1/damage-reports": READERS,
+    "GET /v1/damage-reports/{report_id}": READERS,
+    "GET /v1/damage-reports/{report_id}/photo": READERS,
+    "DELETE /v1/damage-reports/{report_id}/photo": SURVEYORS,
+    "GET /v1/damage-reports/{report_id}/contact": SURVEYORS,  # an e-mail address: for those who decide
+    "DELETE /v1/damage-reports/{report_id}/contact": SURVEYORS,
+    "POST /v1/damage-reports/{report_id}/accept": SURVEYORS,
+    "POST /v1/damage-reports/{report_id}/reject": SURVEYORS,
     # --- markers and what is made from them
     "GET /v1/markers": READERS,
     "POST /v1/markers": PLANNERS,
@@ -56,6 +73,10 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/markers/{marker_id}/layout.{form}": READERS,
     "GET /v1/markers/{marker_id}/payload.{form}": PLANNERS,  # who has a payload can speak for the marker
     "POST /v1/artwork": READERS,
+    "POST /v1/plate-drafts": READERS,  # nothing is stored
+    "POST /v1/plate-drafts/artwork.{form}": READERS,
+    "POST /v1/plate-drafts/pass": READERS,
+    "POST /v1/plate-drafts/view": READERS,
     "POST /v1/print-grades": READERS,  # fabricators; nothing is stored
     "POST /v1/programs": PLANNERS,  # with the markers' keys: admins, see app/services/markers/cerpm_programs.py
     "POST /v1/radio-checks": READERS,
@@ -76,6 +97,10 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/alignments/{alignment_id}": READERS,
     "GET /v1/alignments/{alignment_id}/source": READERS,
     "GET /v1/alignments/{alignment_id}/map.{form}": READERS,
+    "GET /v1/alignments/{alignment_id}/profile": READERS,
+    "GET /v1/plan-rules/schema": READERS,
+    "POST /v1/plan-rules": PLANNERS,
+    "POST /v1/plan-previews": PLANNERS,
     "GET /v1/plans": READERS,
     "POST /v1/plans": PLANNERS,
     "GET /v1/plans/{plan_id}": READERS,
@@ -132,6 +157,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/maintenance/{item_id}/approve": SURVEYORS,
     "POST /v1/maintenance/{item_id}/dismiss": SURVEYORS,
     # --- codebooks
+    "POST /v1/codebook-drafts": READERS,  # nothing is stored
     "GET /v1/codebooks": READERS,
     "POST /v1/codebooks": PLANNERS,
     "GET /v1/codebooks/{codebook_id}": READERS,
@@ -144,6 +170,10 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/decodes/{decode_id}": EVERYBODY,
     "POST /v1/decodes/{decode_id}/cancel": UPLOADERS,
     "GET /v1/decodes/{decode_id}/plot.svg": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/samples": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/packets": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/track.{form}": EVERYBODY,
+    "GET /v1/decodes/{decode_id}/readings.{form}": EVERYBODY,
     "GET /v1/decodes/{decode_id}/lane.geojson": EVERYBODY,
     "GET /v1/decodes/{decode_id}/overlay.{suffix}": EVERYBODY,
     "GET /v1/decodes/{decode_id}/annotated.{suffix}": EVERYBODY,
@@ -178,6 +208,8 @@ PERMISSIONS: dict[str, Allowed] = {
     "PUT /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
     "DELETE /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
     # --- keys
+    "GET /v1/server-settings": ADMINS,
+    "GET /v1/me": EVERYBODY,
     "GET /v1/keys": ADMINS,
     "POST /v1/keys": ADMINS,
     "GET /v1/keys/{key_id}": ADMINS,
@@ -191,6 +223,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /ogc/collections": READERS,
     "GET /ogc/collections/{collection}": READERS,
     "GET /ogc/collections/{collection}/schema": READERS,
+    "GET /ogc/collections/{collection}/geojson-schema": READERS,
     "GET /ogc/collections/{collection}/queryables": READERS,
     f"GET {_OGC_ITEMS}": READERS,
     f"POST {_OGC_ITEMS}": PLANNERS,
@@ -204,6 +237,8 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /ogc/tileMatrixSets/{matrix_set}": READERS,
     f"GET {_OGC_TILES}": READERS,
     f"GET {_OGC_TILES}/{{matrix_set}}": READERS,
+    f"GET {_OGC_TILES}/{{matrix_set}}/tilejson": READERS,
+    f"GET {_OGC_TILES}/{{matrix_set}}/style": READERS,
     f"GET {_OGC_TILES}/{{matrix_set}}/{{zoom}}/{{row}}/{{column}}": READERS,
 }
 

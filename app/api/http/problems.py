@@ -15,6 +15,8 @@ from starlette.exceptions import HTTPException
 
 from app import errors
 from app.api.http.components import reference
+from app.api.http.credentials import CHALLENGES
+from app.api.public_pages.responses import as_page
 from app.encoders.magnet import CodebookFull
 from app.services.error_documents import ErrorCause, cut_text, error_cause
 
@@ -183,7 +185,10 @@ def problem(
         if (left_out := left_out + len(faults[MAX_ERRORS:])) > 0:
             body["errors_left_out"] = left_out
     content = orjson.dumps(body, default=str)
-    return Response(content, kind.status, _challenge(kind.status, headers) | _protocol(scope), media_type=MEDIA_TYPE)
+    response = Response(content, kind.status, _wait(kind.status, headers) | _protocol(scope), media_type=MEDIA_TYPE)
+    for challenge in CHALLENGES if kind.status == 401 else ():
+        response.headers.append("WWW-Authenticate", challenge)
+    return as_page(response, scope)
 
 
 def report_problem(slug: str, title: str, fault: FieldError, scope: Any, report: object) -> Response:
@@ -310,10 +315,8 @@ def _protocol(scope: Any) -> dict[str, str]:
     return {"Tus-Resumable": "1.0.0", "Tus-Version": "1.0.0"} if is_tus else {}
 
 
-def _challenge(status: int, headers: dict[str, str] | None) -> dict[str, str]:
+def _wait(status: int, headers: dict[str, str] | None) -> dict[str, str]:
     extra = dict(headers or {})
-    if status == 401:
-        extra["WWW-Authenticate"] = 'Bearer realm="waymark"'
     if status in (503, 507):
         extra["Retry-After"] = "5"
     return extra

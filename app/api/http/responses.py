@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import orjson
@@ -55,10 +56,20 @@ def wants_job(prefer: str | None) -> bool:
     return "respond-async" in (prefer or "").lower()
 
 
-def file_response(media_types: Iterable[str], description: str = "The file", status: int = 200) -> Described:
-    """A response that is a file of one of some media types: binary, or GeoJSON."""
+def file_response(
+    media_types: Iterable[str],
+    description: str = "The file",
+    status: int = 200,
+    headers: Mapping[str, str] = MappingProxyType({}),
+) -> Described:
+    """A response that is a file of one of some media types: binary, or GeoJSON; with descriptions of its headers."""
     content = {media_type: {"schema": _SCHEMAS.get(media_type, BINARY)} for media_type in media_types}
-    return {status: {"description": description, "content": content}}
+    described: dict[str, Any] = {"description": description, "content": content}
+    if headers:
+        described["headers"] = {
+            name: {"description": text, "schema": {"type": "string"}} for name, text in headers.items()
+        }
+    return {status: described}
 
 
 def text_response(media_type: str, description: str = "The text", status: int = 200) -> Described:

@@ -1,4 +1,4 @@
-"""The web pages: the files of `static/`, with a content security policy that allows nothing else."""
+"""The web pages: one HTML file for every address, and the files of `static/`, under a strict policy."""
 
 from __future__ import annotations
 
@@ -7,45 +7,57 @@ from pathlib import Path
 import orjson
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import FileResponse
-from starlette.datastructures import MutableHeaders
-from starlette.staticfiles import StaticFiles
-from starlette.types import Message, Receive, Scope, Send
+
+from app.api.http.guide_files import GUIDE, GuideFiles
+from app.api.http.page_addresses import PAGES
+from app.api.http.page_policy import content_security_policy, import_map_hashes
+from app.api.http.static_files import CompressedFiles
 
 STATIC = Path(__file__).resolve().parents[3] / "static"
-_HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
-        "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-    ),
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cache-Control": "no-cache",
-}
+BASE_MAP = "base-map.pmtiles"
+"""Name under /static of the operator's base map."""
 _REDOC_STYLES = (
-    "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=' 'sha256-QMIg+bpjm3JdElJ388KYke01izlUW0UoNOeKjpMxdgc='"
+    "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU='",
+    "'sha256-QMIg+bpjm3JdElJ388KYke01izlUW0UoNOeKjpMxdgc='",
 )
 """Hashes of the two style elements that Redoc makes: an empty one, which its script fills, and that of its menu."""
 
 router = APIRouter()
 
 
-@router.get("/", response_class=FileResponse, include_in_schema=False)
-def get_page() -> FileResponse:
-    """The page; everything else that it needs is under /static."""
-    return FileResponse(STATIC / "index.html", headers=_HEADERS)
+def page_headers(policy: str) -> dict[str, str]:
+    """Headers of a page with a policy."""
+    return {
+        "Content-Security-Policy": policy,
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Cache-Control": "no-cache",
+    }
+
+
+PAGE_HEADERS = page_headers(content_security_policy())
+"""Headers of pages that have nothing inline and ask this host only."""
+
+
+def get_page(request: Request) -> Response:
+    """The page, whatever its address: its script draws what the address names."""
+    return FileResponse(STATIC / "index.html", headers=request.app.state.page_headers)
+
+
+for _path in PAGES:
+    router.add_api_route(_path, get_page, response_class=FileResponse, include_in_schema=False)
 
 
 @router.get("/docs", response_class=FileResponse, include_in_schema=False)
 def get_docs() -> FileResponse:
     """The API's documentation by Swagger UI, from static/vendor."""
-    return FileResponse(STATIC / "docs.html", headers=_HEADERS)
+    return FileResponse(STATIC / "docs.html", headers=page_headers(content_security_policy()))
 
 
 @router.get("/redoc", response_class=FileResponse, include_in_schema=False)
 def get_redoc() -> FileResponse:
     """The API's reference by Redoc, from static/vendor."""
-    policy = _HEADERS["Content-Security-Policy"].replace("style-src 'self'", f"style-src 'self' {_REDOC_STYLES}")
-    return FileResponse(STATIC / "redoc.html", headers=_HEADERS | {"Content-Security-Policy": policy})
+    return FileResponse(STATIC / "redoc.html", headers=page_headers(content_security_policy(styles=_REDOC_STYLES)))
 
 
 @router.get("/openapi.json", include_in_schema=False)
@@ -57,16 +69,24 @@ def get_openapi_document(request: Request) -> Response:
     return Response(state.openapi_json, media_type="application/json", headers={"Cache-Control": "no-cache"})
 
 
-def mount_static(app: FastAPI) -> None:
-    """Serve the page's scripts, style and pictures."""
-    app.mount("/static", _Files(directory=STATIC))
+def mount_static(
+    app: FastAPI, hosts: tuple[str, ...] = (), base_map: Path | None = None, guide: Path | None = None
+) -> None:
+    """Serve the files of the pages, that of the base map, and the guide.
 
-
-class _Files(StaticFiles):
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def send_with_policy(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(_HEADERS)
-            await send(message)
-
-        await super().__call__(scope, receive, send_with_policy)
+    Parameters
+    ----------
+    app : FastAPI
+    hosts : tuple of str
+        Origins of other hosts that the pages may ask: a configured base map and identity provider.
+    base_map : Path, optional
+        A PMTiles file.
+    guide : Path, optional
+        Folder of the built guide; by default that of `make docs`.
+    """
+    page = (STATIC / "index.html").read_text("utf-8")
+    app.state.page_headers = page_headers(content_security_policy(hosts=hosts, scripts=import_map_hashes(page)))
+    policy = content_security_policy(hosts=hosts)
+    others = {BASE_MAP: base_map} if base_map is not None else {}
+    app.mount("/static", CompressedFiles(STATIC, page_headers(policy), others))
+    app.mount("/guide", GuideFiles(guide or GUIDE, page_headers(content_security_policy(pictures="data:"))))

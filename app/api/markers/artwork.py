@@ -54,12 +54,20 @@ class ArtworkIn(SelectionIn):
         return self.model_dump(include={"formats", "heaters", "leds", "resolution_dpi", "sheet"}, mode="json")
 
 
+_HEADERS = {
+    "Waymark-Proof": "What the decoder read from the drawing.",
+    "Waymark-QR-Code": '`public-page`: the QR code opens the public page. `none; reason="..."`: there is none.',
+}
 ArtworkService = Annotated[Artworks, use_cases("artworks")]
 
 
 @router.get(
     "/markers/{marker_id}/artwork.{form}",
-    responses={**file_response(form.media_type for form in ArtworkFormat), **NOT_MODIFIED, **problem_responses(404)},
+    responses={
+        **file_response((form.media_type for form in ArtworkFormat), headers=_HEADERS),
+        **NOT_MODIFIED,
+        **problem_responses(404),
+    },
 )
 def get_artwork(
     marker_id: MarkerId,
@@ -71,7 +79,11 @@ def get_artwork(
     resolution_dpi: Annotated[Resolution, Query(description="Of a PNG. [1/inch]")] = 150.0,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """Artwork at true size. It was rendered and read back before it is sent; `Waymark-Proof` says what was read."""
+    """Artwork at true size. It was rendered and read back before it is sent; `Waymark-Proof` holds what was read.
+
+    The QR code on the margin has the address of the marker's public page. Without a public address of the server the
+    artwork has none, and the margin and `Waymark-QR-Code` state the reason.
+    """
     options = ArtworkOptions(heaters=heaters, leds=leds)
     headers = {
         "ETag": f'"{artworks.tag(caller, marker_id, form, options, resolution_dpi)}"',
@@ -81,6 +93,7 @@ def get_artwork(
         return Response(status_code=304, headers=headers)
     artwork = artworks.artwork(caller, marker_id, form, options, resolution_dpi)
     headers["Waymark-Proof"] = f"read-back digits={artwork.proof.digits} confidence={artwork.proof.confidence:.6f}"
+    headers["Waymark-QR-Code"] = artwork.qr_code
     headers["Content-Disposition"] = f'inline; filename="{artwork.file_name}"'
     return Response(artwork.content, headers=headers, media_type=artwork.media_type)
 
@@ -89,7 +102,7 @@ def get_artwork(
     "/artwork",
     response_class=StreamingResponse,
     responses={
-        **file_response(["application/zip"]),
+        **file_response(["application/zip"], headers=_HEADERS),
         202: {"model": JobDocument, "description": "Queued; Location leads to its progress"},
         **problem_responses(404),
     },
@@ -105,6 +118,7 @@ def post_artwork(
     """Artwork of a selection as a ZIP with a manifest and a quality sheet; every plate was read back first.
 
     More than 10 plates, or any with `Prefer: respond-async`, become a job: 202, with the ZIP at its `links.result`.
+    Without a public address of the server the plates have no QR codes; `notes` of the manifest states the reason.
     """
     if wants_job(prefer) or jobs.is_job(caller, wanted.selection()):
         return queued_job(*jobs.submit(caller, wanted.selection(), wanted.declared(), idempotency))
@@ -113,6 +127,7 @@ def post_artwork(
         "Content-Length": str(bundle.size),
         "Content-Disposition": 'attachment; filename="waymark-artwork.zip"',
         "Waymark-Proof": f"read-back plates={bundle.plates} lowest-confidence={bundle.lowest_confidence:.6f}",
+        "Waymark-QR-Code": bundle.qr_code,
     }
     if bundle.approximate:
         headers["Waymark-Note"] = (

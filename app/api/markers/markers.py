@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict, Discriminator, RootModel, Tag, model_validator
 
 from app.api.http.dependencies import AfterVersion, Caller, Idempotency, MarkerId, Markers, PageSize, Version
-from app.api.http.problems import UNION_TAG
+from app.api.http.problems import UNION_TAG, Described
 from app.api.http.responses import (
     NOT_MODIFIED,
     IfNoneMatch,
@@ -81,7 +81,12 @@ def post_marker(
     return created_response(document, replayed, path="/v1/markers")
 
 
-@router.get("/{marker_id}", responses={**NOT_MODIFIED, **document_response(AnyMarkerDetail, 404)})
+_PUBLIC_PAGE: Described = {
+    303: {"description": "Of a browser without a key, as plates from before public pages lead it here: the public page"}
+}
+
+
+@router.get("/{marker_id}", responses={**_PUBLIC_PAGE, **NOT_MODIFIED, **document_response(AnyMarkerDetail, 404)})
 def get_marker(marker_id: MarkerId, caller: Caller, markers: Markers, if_none_match: IfNoneMatch = None) -> Response:
     """One marker, with its version as ETag."""
     return versioned_response(markers.get(caller, marker_id), if_none_match)

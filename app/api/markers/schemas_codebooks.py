@@ -89,6 +89,17 @@ class CodebookIn(StrictModel):
     meanings: list[MeaningIn] = Field(default_factory=list, max_length=MAX_MEANINGS)
 
 
+class CodebookDraftIn(StrictModel):
+    """A codebook to see the capacity of before it is made."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"design": {"magnets": 3, "length_m": 4.0, "segment_m": 0.1}}]},
+    )
+
+    design: DesignIn
+    rules: RulesIn = Field(default_factory=lambda: RulesIn())
+
+
 class MeaningsIn(StrictModel):
     """Further meanings of a codebook."""
 

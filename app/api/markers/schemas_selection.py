@@ -7,11 +7,11 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from app.api.http.dependencies import Identifier, Number
-from app.api.markers.filters import checked_box
 from app.errors import InvalidParameter
 from app.families.inputs import StrictModel
 from app.markers.status import Status
 from app.registry.markers import MarkerFilter
+from app.services.markers.search_boxes import checked_box
 from app.services.markers.selection import Selection
 
 

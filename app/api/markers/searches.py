@@ -13,13 +13,14 @@ from app.api.http.dependencies import AfterLink, Caller, LastId, PageSize, Text,
 from app.api.http.responses import document_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
 from app.api.http.times import parse_time
-from app.api.markers.filters import Filtered, check_measures, checked_box, parse_numbers
+from app.api.markers.filters import Filtered, check_measures
 from app.api.markers.schemas_searches import MAX_PAGE, MAX_RADIUS_M, AlongIn, SearchIn
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
 from app.registry.markers import MarkerFilter
 from app.services.markers.documents import FoundMarker, MarkerPage
 from app.services.markers.search_areas import area_of
+from app.services.markers.search_boxes import checked_box, parse_numbers
 from app.services.markers.searches import Searches as SearchesService
 from app.services.markers.searches import circle
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Annotated
 
 from fastapi import Depends, Path, Request
 
 from app.api.http.dependencies import use_cases
 from app.api.ogc.parameters import OF_ITEM, ONLY_FORMAT
-from app.api.ogc.query import ItemsQuery, crs_parameter, items_query, known_parameters
+from app.api.ogc.query import ItemsQuery, crs_parameter, items_query, known_parameters, query_pairs
 from app.api.ogc.responses import GEOJSON, JSON, base_url, negotiate
 from app.errors import InvalidParameter
 from app.services.markers.feature_crs import FeatureCrs
@@ -58,18 +59,28 @@ async def get_feature_id(
 
 
 async def get_items_query(request: Request, collection: CollectionOf) -> ItemsQuery:
-    """The query of a request for items, whose client takes GeoJSON."""
-    query = items_query(request, collection)
-    negotiate(request, query.format, GEOJSON, JSON, names=_GEOJSON_NAMES)
-    return query
+    """The query of a request for items, whose client takes GeoJSON or HTML."""
+    pairs = query_pairs(request)
+    form = next((value for name, value in pairs if name == "f"), None)
+    is_page = negotiate(request, form, GEOJSON, JSON, names=_GEOJSON_NAMES, html=True)
+    return items_query(pairs, collection, is_page=is_page)
 
 
-async def get_item_crs(request: Request, _collection: CollectionOf) -> FeatureCrs:
-    """The CRS of a request for one item, whose client takes GeoJSON."""
+@dataclass(frozen=True, slots=True)
+class ItemQuery:
+    """What a request for one item asks for: parameters as they were sent, the CRS, and whether it wants HTML."""
+
+    pairs: list[tuple[str, str]]
+    crs: FeatureCrs
+    is_page: bool
+
+
+async def get_item_query(request: Request, _collection: CollectionOf) -> ItemQuery:
+    """The query of a request for one item, whose client takes GeoJSON or HTML."""
     found = known_parameters(request, OF_ITEM)
     crs = crs_parameter(found, "crs")
-    negotiate(request, found.get("f"), GEOJSON, JSON, names=_GEOJSON_NAMES)
-    return crs
+    is_page = negotiate(request, found.get("f"), GEOJSON, JSON, names=_GEOJSON_NAMES, html=True)
+    return ItemQuery(list(found.items()), crs, is_page)
 
 
 async def refuse_parameters(request: Request) -> None:
@@ -78,15 +89,20 @@ async def refuse_parameters(request: Request) -> None:
 
 
 class Offers:
-    """A dependency that refuses clients that take none of some media types, and parameters other than `f`."""
+    """A dependency: whether a client gets HTML.
 
-    def __init__(self, *kinds: str, names: tuple[str, ...] = ("json",)) -> None:
+    It refuses clients that take none of the offered media types, and parameters other than `f`.
+    """
+
+    def __init__(self, *kinds: str, names: tuple[str, ...] = ("json",), html: bool = False) -> None:
         self._kinds = kinds
         self._names = names
+        self._html = html
 
-    async def __call__(self, request: Request) -> None:
+    async def __call__(self, request: Request) -> bool:
         """Check one request."""
-        negotiate(request, known_parameters(request, ONLY_FORMAT).get("f"), *self._kinds, names=self._names)
+        form = known_parameters(request, ONLY_FORMAT).get("f")
+        return negotiate(request, form, *self._kinds, names=self._names, html=self._html)
 
 
 async def get_base_url(request: Request) -> str:
@@ -98,5 +114,5 @@ EditableCollection = Annotated[Collection, Depends(get_editable_collection)]
 FeatureId = Annotated[str, Depends(get_feature_id)]
 FeaturesService = Annotated[Features, use_cases("features")]
 ItemsQueryOf = Annotated[ItemsQuery, Depends(get_items_query)]
-ItemCrs = Annotated[FeatureCrs, Depends(get_item_crs)]
+ItemQueryOf = Annotated[ItemQuery, Depends(get_item_query)]
 BaseUrl = Annotated[str, Depends(get_base_url)]

@@ -48,7 +48,7 @@ _SURVEYED = (
     *("check_points", "surveyor", "instrument"),
 )
 _FIXED = ("family", "scheme", "code")
-_READ_ONLY = ("transform_accuracy_m", "localization_grade", "version", "updated_at")
+READ_ONLY = ("transform_accuracy_m", "localization_grade", "version", "updated_at")
 _NEW_MARKER, _MARKER_PATCH = TypeAdapter(NewMarkerIn), TypeAdapter(MarkerPatch)
 BODY_TYPES = (GEOJSON, JSON, "application/merge-patch+json")
 
@@ -225,7 +225,7 @@ def _properties(feature: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise InvalidParameter("properties is not an object", field="properties", limit="an object")
     for name in given:
-        if name not in (*_PLAIN, *_SURVEYED, *_FIXED, *_READ_ONLY, "id"):
+        if name not in (*_PLAIN, *_SURVEYED, *_FIXED, *READ_ONLY, "id"):
             raise InvalidParameter(
                 f"there is no property {name[:80]!r}",
                 field="properties",

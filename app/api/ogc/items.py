@@ -6,12 +6,14 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import cast
 
+import orjson
 from starlette.responses import Response
 
 from app.api.http.dependencies import Caller
-from app.api.ogc.dependencies import BaseUrl, CollectionOf, FeatureId, FeaturesService, ItemCrs, ItemsQueryOf
+from app.api.ogc.dependencies import BaseUrl, CollectionOf, FeatureId, FeaturesService, ItemQueryOf, ItemsQueryOf
+from app.api.ogc.pages import html_response, item_page, items_page
 from app.api.ogc.query import ItemsQuery
-from app.api.ogc.responses import GEOJSON, JSON, answer, link, with_query
+from app.api.ogc.responses import GEOJSON, HTML, JSON, answer, link, with_query
 from app.api.ogc.shapes import Feature, FeaturePage, Link
 
 
@@ -24,7 +26,10 @@ def list_items(
         count = partial(features.count_lines, lines=collection.lines)
         read = partial(features.lines, lines=collection.lines)
     if query.hits:
-        return answer(_hits(count(caller, filtered=query.filtered)), GEOJSON)
+        hits = _hits(count(caller, filtered=query.filtered))
+        if query.is_page:
+            return html_response(items_page(base, collection, query, hits, None))
+        return answer(hits, GEOJSON)
     page = read(
         caller, filtered=query.filtered, after=query.after, limit=query.limit, crs=query.crs, counted=query.counted
     )
@@ -37,12 +42,15 @@ def list_items(
     }
     if page.matched is not None:
         document["numberMatched"] = page.matched
+    if query.is_page:
+        document["features"] = orjson.loads(orjson.dumps(page.features))
+        return html_response(items_page(base, collection, query, document, page.after))
     return answer(document, GEOJSON, crs=query.crs)
 
 
 def get_item(
     collection: CollectionOf,
-    crs: ItemCrs,
+    query: ItemQueryOf,
     feature_id: FeatureId,
     base: BaseUrl,
     caller: Caller,
@@ -50,19 +58,25 @@ def get_item(
 ) -> Response:
     """One feature."""
     if collection.lines is not None:
-        feature = features.get_line(caller, collection, collection.lines, feature_id, crs)
+        feature = features.get_line(caller, collection, collection.lines, feature_id, query.crs)
     else:
-        feature = features.get(caller, collection, feature_id, crs)
+        feature = features.get(caller, collection, feature_id, query.crs)
     url = f"{base}/collections/{collection.id}"
     document: Feature = {
         "type": "Feature",
         "id": feature["id"],
         "geometry": feature["geometry"],
         "properties": feature["properties"],
-        "links": [link(f"{url}/items/{feature['id']}", "self", GEOJSON), link(url, "collection", JSON)],
+        "links": [
+            link(f"{url}/items/{feature['id']}", "self", GEOJSON),
+            link(f"{url}/items/{feature['id']}?f=html", "alternate", HTML, "As HTML"),
+            link(url, "collection", JSON),
+        ],
     }
+    if query.is_page:
+        return html_response(item_page(base, collection, query.crs, query.pairs, feature))
     version = feature["properties"].get("version")
-    return answer(document, GEOJSON, crs=crs, headers={"ETag": f'"{version}"'} if version is not None else None)
+    return answer(document, GEOJSON, crs=query.crs, headers={"ETag": f'"{version}"'} if version is not None else None)
 
 
 def _hits(matched: int) -> FeaturePage:
@@ -77,8 +91,13 @@ def _hits(matched: int) -> FeaturePage:
 
 
 def _links(query: ItemsQuery, url: str, after: str | None) -> list[Link]:
-    links = [link(with_query(f"{url}/items", query.pairs), "self", GEOJSON), link(url, "collection", JSON)]
+    rest = [(name, value) for name, value in query.pairs if name not in ("f", "earlier")]
+    links = [
+        link(with_query(f"{url}/items", query.pairs), "self", GEOJSON),
+        link(with_query(f"{url}/items", [*rest, ("f", "html")]), "alternate", HTML, "As HTML"),
+        link(url, "collection", JSON),
+    ]
     if after is not None:
-        onward = [*((name, value) for name, value in query.pairs if name != "after"), ("after", after)]
+        onward = [*((name, value) for name, value in query.pairs if name not in ("after", "earlier")), ("after", after)]
         links.append(link(with_query(f"{url}/items", onward), "next", GEOJSON))
     return links

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from app import __version__
+from app.api.http.credentials import SECURITY, SECURITY_SCHEMES
 from app.api.ogc.parameters import OF_ITEM, ONLY_FORMAT, PARAMETERS, described, list_parameters
 from app.api.ogc.responses import GEOJSON, JSON, SCHEMA
 from app.services.markers.features import COLLECTIONS, Collection
@@ -34,19 +35,16 @@ def api_document(base: str) -> dict[str, Any]:
         "info": {
             "title": "Waymark",
             "version": __version__,
-            "description": "Road markers as OGC API Features. Send your key as `Authorization: Bearer KEY` or "
-            "`X-API-Key: KEY`.",
+            "description": "Road markers as OGC API Features. Send your key as `Authorization: Bearer KEY`, as "
+            "`X-API-Key: KEY`, or as the password of HTTP Basic with any user name.",
         },
         "servers": [{"url": base}],
-        "security": [{"bearer": []}, {"apiKey": []}],
+        "security": SECURITY,
         "paths": paths,
         "components": {
             "parameters": _parameters(),
             "responses": {"Problem": _PROBLEM},
-            "securitySchemes": {
-                "bearer": {"type": "http", "scheme": "bearer"},
-                "apiKey": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
-            },
+            "securitySchemes": SECURITY_SCHEMES,
         },
     }
 
@@ -59,6 +57,7 @@ def _paths(collection: Collection) -> dict[str, Any]:
     return {
         url: _read(name),
         f"{url}/schema": _read(f"{name}: schema", SCHEMA),
+        f"{url}/geojson-schema": _read(f"{name}: schema in GeoJSON", SCHEMA),
         f"{url}/queryables": _read(f"{name}: what can be asked of the properties", SCHEMA),
         f"{url}/items": items,
         f"{url}/items/{{featureId}}": item,

@@ -10,6 +10,9 @@ from app.services.markers.features import COLLECTIONS, Collection
 
 DEFAULT_LIMIT = 1000
 MAX_LIMIT = 10_000
+DEFAULT_HTML_LIMIT = 100
+MAX_HTML_LIMIT = 1000
+"""In HTML: browsers draw all rows of a table before they show one."""
 _CRS = {"type": "string", "format": "uri", "enum": list(FeatureCrs), "default": STORAGE_CRS}
 _NUMBERS = {"type": "array", "minItems": 4, "maxItems": 6, "items": {"type": "number"}}
 
@@ -22,7 +25,7 @@ class Parameter(NamedTuple):
 
 
 _COMMON = {
-    "f": Parameter({"type": "string", "enum": ["json"]}, "Format"),
+    "f": Parameter({"type": "string", "enum": ["json", "html"]}, "Format; without it the Accept header decides"),
     "crs": Parameter(_CRS, "CRS of the response, its axes in the authority's order"),
     "bbox": Parameter(_NUMBERS, "west,south,east,north; west is greater across the antimeridian"),
     "bbox-crs": Parameter(_CRS, "CRS of bbox"),
@@ -32,6 +35,7 @@ _COMMON = {
         "Features on a page; a number beyond the bounds is set to the nearest bound",
     ),
     "after": Parameter({"type": "string"}, "Last id of the page before; next links have it"),
+    "earlier": Parameter({"type": "string"}, "Starts of the pages before, in HTML; links of pages have it"),
     "resultType": Parameter(
         {"type": "string", "enum": ["results", "hits"], "default": "results"}, "hits: only numberMatched"
     ),
@@ -40,16 +44,25 @@ _COMMON = {
     "filter-lang": Parameter({"type": "string", "enum": LANGUAGES, "default": LANGUAGES[0]}, "Language of filter"),
     "filter-crs": Parameter(_CRS, "CRS of positions in filter; expressions have none"),
 }
+_OF_TILES = {
+    "groups": Parameter(
+        {"type": "boolean", "default": False},
+        "Where a tile has too many features: the layer of groups, with their numbers, in place of single features",
+    )
+}
 _FIELDS = {
     field.name: field
     for collection in reversed(COLLECTIONS.values())  # of equal names the first collection's description is kept
     for field in collection.fields
     if field.name in collection.filters
 }
-PARAMETERS = _COMMON | {
-    name: Parameter({"type": field.kind}, f"{field.text}: equal to this") for name, field in sorted(_FIELDS.items())
-}
+PARAMETERS = (
+    _COMMON
+    | _OF_TILES
+    | {name: Parameter({"type": field.kind}, f"{field.text}: equal to this") for name, field in sorted(_FIELDS.items())}
+)
 ONLY_FORMAT = ("f",)
+OF_TILE = ("f", *_OF_TILES)
 OF_ITEM = ("f", "crs")
 OF_ITEMS = tuple(_COMMON)
 
@@ -59,9 +72,10 @@ def list_parameters(collection: Collection) -> tuple[str, ...]:
     return (*OF_ITEMS, *collection.filters)
 
 
-def described(name: str) -> dict[str, Any]:
-    """A query parameter as OpenAPI describes it."""
+def described(name: str, formats: tuple[str, ...] = ("json", "html")) -> dict[str, Any]:
+    """A query parameter as OpenAPI describes it, of a route that offers some formats."""
     parameter = PARAMETERS[name]
+    schema = {"type": "string", "enum": list(formats)} if name == "f" else parameter.schema
     return {
         "name": name,
         "in": "query",
@@ -69,5 +83,5 @@ def described(name: str) -> dict[str, Any]:
         "style": "form",
         "explode": False,
         "description": parameter.text,
-        "schema": parameter.schema,
+        "schema": schema,
     }

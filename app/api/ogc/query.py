@@ -12,15 +12,15 @@ from urllib.parse import parse_qsl
 
 from starlette.requests import Request
 
-from app.api.markers.filters import MAX_OVER_ANTIMERIDIAN_DEG
 from app.api.ogc.cql2 import LANGUAGES, Reader
-from app.api.ogc.parameters import DEFAULT_LIMIT, MAX_LIMIT, list_parameters
+from app.api.ogc.parameters import DEFAULT_HTML_LIMIT, DEFAULT_LIMIT, MAX_HTML_LIMIT, MAX_LIMIT, list_parameters
 from app.errors import MalformedRequest
 from app.registry.conditions import Condition
 from app.registry.features import FeatureFilter
 from app.registry.spatial import Box
 from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.markers.features import Collection
+from app.services.markers.search_boxes import MAX_OVER_ANTIMERIDIAN_DEG
 
 _MAX_QUERY_BYTES = 8192
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?", re.ASCII)
@@ -44,7 +44,8 @@ class ItemsQuery:
     crs: FeatureCrs
     hits: bool
     counted: bool
-    format: str | None
+    is_page: bool = False
+    earlier: tuple[str, ...] = ()
 
 
 def refuse(name: str, message: str, limit: str) -> NoReturn:
@@ -95,15 +96,14 @@ def _named(pairs: list[tuple[str, str]], known: Sequence[str]) -> dict[str, str]
     return found
 
 
-def items_query(request: Request, collection: Collection) -> ItemsQuery:
-    """The parsed parameters of a request for items of a collection.
+def items_query(pairs: list[tuple[str, str]], collection: Collection, *, is_page: bool = False) -> ItemsQuery:
+    """The parsed parameters of a request for items of a collection, as JSON or as a page in HTML.
 
     Raises
     ------
     MalformedRequest
         One is unknown or cannot be.
     """
-    pairs = query_pairs(request)
     found = _named(pairs, list_parameters(collection))
     box, heights_m = _bbox(found)
     since, until = _datetime(found["datetime"]) if "datetime" in found else (None, None)
@@ -128,12 +128,13 @@ def items_query(request: Request, collection: Collection) -> ItemsQuery:
     return ItemsQuery(
         pairs=pairs,
         filtered=filtered,
-        limit=_limit(found),
+        limit=min(_limit(found, DEFAULT_HTML_LIMIT), MAX_HTML_LIMIT) if is_page else _limit(found, DEFAULT_LIMIT),
         after=after,
         crs=crs_parameter(found, "crs"),
         hits=kind == "hits",
-        counted=_flag(found, "count"),
-        format=found.get("f"),
+        counted=flag_parameter(found, "count"),
+        is_page=is_page,
+        earlier=_earlier(found),
     )
 
 
@@ -167,16 +168,32 @@ def number(name: str, text: str) -> float:
     return float(text)
 
 
-def _limit(found: dict[str, str]) -> int:
+def _earlier(found: dict[str, str]) -> tuple[str, ...]:
+    if "earlier" not in found:
+        return ()
+    starts = tuple(found["earlier"].split(","))
+    if not all(_ID.fullmatch(start) for start in starts):
+        refuse("earlier", "earlier is a list of ids of features", "take it from the links of a page")
+    return starts
+
+
+def _limit(found: dict[str, str], default: int) -> int:
     text = found.get("limit")
     if text is None:
-        return DEFAULT_LIMIT
+        return default
     if not re.fullmatch(r"[+-]?[0-9]{1,200}", text, re.ASCII):
         refuse("limit", "limit is not a whole number", f"1 to {MAX_LIMIT}; what is beyond is brought back to it")
     return min(max(int(text), 1), MAX_LIMIT)
 
 
-def _flag(found: dict[str, str], name: str) -> bool:
+def flag_parameter(found: dict[str, str], name: str) -> bool:
+    """The value of a parameter that is true or false; false if it is missing.
+
+    Raises
+    ------
+    MalformedRequest
+        It is neither.
+    """
     text = found.get(name, "false")
     if text not in ("true", "false"):
         refuse(name, f"{name} is true or false", "true, false")

@@ -20,8 +20,8 @@ from app.api.http.problems import Described, problem_responses
 from app.api.http.responses import file_response
 from app.api.http.strict_json import StrictRoute
 from app.api.ogc import documents, edits, items, tiles
-from app.api.ogc.parameters import OF_ITEM, OF_ITEMS, ONLY_FORMAT, PARAMETERS, described
-from app.api.ogc.responses import GEOJSON, JSON, MVT, OPENAPI, SCHEMA
+from app.api.ogc.parameters import OF_ITEM, OF_ITEMS, OF_TILE, ONLY_FORMAT, PARAMETERS, described
+from app.api.ogc.responses import GEOJSON, HTML, JSON, MAP_STYLE, MVT, OPENAPI, SCHEMA
 from app.api.ogc.shapes import (
     CollectionDocument,
     Collections,
@@ -62,9 +62,11 @@ def _in_own_threads(answer: Callable[..., Response]) -> Callable[..., Awaitable[
     return endpoint
 
 
-def _json(model: Any, *media_types: str) -> Described:
+def _json(model: Any, media_type: str, *, html: bool = True) -> Described:
+    """A document, which may be offered as HTML as well."""
     schema = _ANY_OBJECT if model is JsonObject else reference(model, "serialization")
-    return {200: {"description": "OK", "content": {media_type: {"schema": schema} for media_type in media_types}}}
+    page = {HTML: {"schema": {"type": "string"}}} if html else {}
+    return {200: {"description": "OK", "content": {media_type: {"schema": schema}, **page}}}
 
 
 def _add_read(
@@ -74,13 +76,16 @@ def _add_read(
     found: Described,
     parameters: tuple[str, ...] = ONLY_FORMAT,
     name: str | None = None,
+    formats: tuple[str, ...] | None = None,
 ) -> None:
+    """A route that reads; it offers JSON, and HTML if `found` has it, unless other `formats` are named."""
+    formats = formats or (("json", "html") if HTML in found[200]["content"] else ("json",))
     router.add_api_route(
         path,
         endpoint,
         name=name,
         responses={**found, **problem_responses(404, 406)},
-        openapi_extra={"parameters": [described(parameter) for parameter in parameters]},
+        openapi_extra={"parameters": [described(parameter, formats) for parameter in parameters]},
     )
 
 
@@ -113,6 +118,8 @@ def _router() -> APIRouter:
         f"{_TILES}/{{matrix_set}}/{{zoom}}/{{row}}/{{column}}",
         _in_own_threads(tiles.get_tile),
         {**file_response([MVT]), 204: {"description": "No features"}},
+        OF_TILE,
+        formats=("mvt", "pbf"),
     )
     read("/ogc", documents.landing_page, _json(LandingPage, JSON))
     read("/ogc/", documents.landing_page, _json(LandingPage, JSON), name="landing_page_with_slash")
@@ -121,12 +128,19 @@ def _router() -> APIRouter:
     read("/ogc/collections", documents.list_collections, _json(Collections, JSON))
     read("/ogc/collections/{collection}", documents.get_collection, _json(CollectionDocument, JSON))
     read("/ogc/collections/{collection}/schema", documents.get_schema, _json(JsonObject, SCHEMA))
+    read(
+        "/ogc/collections/{collection}/geojson-schema",
+        documents.get_geojson_schema,
+        _json(JsonObject, SCHEMA, html=False),
+    )
     read("/ogc/collections/{collection}/queryables", documents.get_queryables, _json(JsonObject, SCHEMA))
     read(_ITEM, items.get_item, _json(Feature, GEOJSON), OF_ITEM)
-    read("/ogc/tileMatrixSets", tiles.list_matrix_sets, _json(TileMatrixSets, JSON))
-    read("/ogc/tileMatrixSets/{matrix_set}", tiles.get_matrix_set, _json(TileMatrixSet, JSON))
-    read(_TILES, tiles.list_tilesets, _json(TileSets, JSON))
-    read(f"{_TILES}/{{matrix_set}}", tiles.get_tileset, _json(TileSet, JSON))
+    read("/ogc/tileMatrixSets", tiles.list_matrix_sets, _json(TileMatrixSets, JSON, html=False))
+    read("/ogc/tileMatrixSets/{matrix_set}", tiles.get_matrix_set, _json(TileMatrixSet, JSON, html=False))
+    read(_TILES, tiles.list_tilesets, _json(TileSets, JSON, html=False))
+    read(f"{_TILES}/{{matrix_set}}", tiles.get_tileset, _json(TileSet, JSON, html=False))
+    read(f"{_TILES}/{{matrix_set}}/tilejson", tiles.get_tilejson, _json(JsonObject, JSON, html=False))
+    read(f"{_TILES}/{{matrix_set}}/style", tiles.get_map_style, _json(JsonObject, MAP_STYLE, html=False))
     edit(_ITEMS, edits.post_feature, "POST", 201)
     edit(_ITEM, edits.put_feature, "PUT", 204)
     edit(_ITEM, edits.patch_feature, "PATCH", 204)
@@ -138,7 +152,7 @@ def _router() -> APIRouter:
 
 
 def _filters() -> list[str]:
-    return [name for name in PARAMETERS if name not in OF_ITEMS]
+    return [name for name in PARAMETERS if name not in (*OF_ITEMS, *OF_TILE)]
 
 
 def mount_ogc(app: FastAPI) -> None:

@@ -6,12 +6,15 @@ import math
 import re
 from typing import Annotated
 
-from fastapi import Depends, Path
+from fastapi import Depends, Path, Request
 from starlette.responses import Response
 
 from app.api.http.dependencies import Caller
 from app.api.ogc.dependencies import BaseUrl, CollectionOf, FeaturesService, Offers
-from app.api.ogc.responses import JSON, MVT, answer, link
+from app.api.ogc.map_style import map_style, tilejson
+from app.api.ogc.parameters import OF_TILE
+from app.api.ogc.query import flag_parameter, known_parameters
+from app.api.ogc.responses import JSON, MAP_STYLE, MVT, answer, link, negotiate
 from app.api.ogc.shapes import TileMatrix, TileMatrixSet, TileMatrixSets, TileSet, TileSets
 from app.errors import NotFound
 from app.registry.tiles import MAX_ZOOM, Tile
@@ -69,13 +72,20 @@ async def get_tile_place(zoom: TileNumber, row: TileNumber, column: TileNumber) 
     )
 
 
+async def get_groups(request: Request) -> bool:
+    """Whether a client, which takes vector tiles, wants groups in place of too many features."""
+    found = known_parameters(request, OF_TILE)
+    kinds = (MVT, "application/x-protobuf", "application/octet-stream")
+    negotiate(request, found.get("f"), *kinds, names=("mvt", "pbf"))
+    return flag_parameter(found, "groups")
+
+
 Tiled = Annotated[Collection, Depends(get_tiled_collection)]
 MatrixSet = Annotated[None, Depends(check_matrix_set)]
 TilePlace = Annotated[Tile, Depends(get_tile_place)]
-OffersJson = Annotated[None, Depends(Offers(JSON))]
-OffersTiles = Annotated[
-    None, Depends(Offers(MVT, "application/x-protobuf", "application/octet-stream", names=("mvt", "pbf")))
-]
+Groups = Annotated[bool, Depends(get_groups)]
+OffersJson = Annotated[bool, Depends(Offers(JSON))]
+OffersStyle = Annotated[bool, Depends(Offers(MAP_STYLE, JSON))]
 
 
 def list_tilesets(collection: Tiled, _offers: OffersJson, base: BaseUrl) -> Response:
@@ -88,16 +98,34 @@ def get_tileset(collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, 
     return answer(_tileset(base, collection))
 
 
+def get_tilejson(
+    collection: Tiled, _matrix_set: MatrixSet, _offers: OffersJson, base: BaseUrl, caller: Caller,
+    features: FeaturesService,
+) -> Response:  # fmt: skip
+    """A tile set of a collection as TileJSON 3.0."""
+    return answer(tilejson(collection, _template(base, collection), features.extent(caller, collection)))
+
+
+def get_map_style(
+    collection: Tiled, _matrix_set: MatrixSet, _offers: OffersStyle, base: BaseUrl, caller: Caller,
+    features: FeaturesService,
+) -> Response:  # fmt: skip
+    """A MapLibre style of a tile set: symbols by family and status."""
+    sprite_url = f"{base.removesuffix('/ogc')}/static/sprites/markers"
+    extent = features.extent(caller, collection)
+    return answer(map_style(collection, _template(base, collection), sprite_url, extent), MAP_STYLE)
+
+
 def get_tile(
     collection: Tiled,
     _matrix_set: MatrixSet,
     tile: TilePlace,
-    _offers: OffersTiles,
+    groups: Groups,
     caller: Caller,
     features: FeaturesService,
 ) -> Response:
     """A tile; 204 without features."""
-    content = features.tile(caller, collection, tile)
+    content = (features.grouped_tile if groups else features.tile)(caller, collection, tile)
     headers = {"Cache-Control": "private, no-cache"}
     if not content:
         return Response(status_code=204, headers=headers)
@@ -135,6 +163,10 @@ def get_matrix_set(_matrix_set: MatrixSet, _offers: OffersJson) -> Response:
     return answer(document)
 
 
+def _template(base: str, collection: Collection) -> str:
+    return f"{base}/collections/{collection.id}/tiles/{MATRIX_SET}/{{z}}/{{y}}/{{x}}"
+
+
 def _tileset(base: str, collection: Collection) -> TileSet:
     url = f"{base}/collections/{collection.id}/tiles/{MATRIX_SET}"
     template = link(f"{url}/{{tileMatrix}}/{{tileRow}}/{{tileCol}}", "item", MVT)
@@ -148,5 +180,7 @@ def _tileset(base: str, collection: Collection) -> TileSet:
             link(url, "self", JSON),
             link(f"{base}/tileMatrixSets/{MATRIX_SET}", _SCHEME_REL, JSON),
             template,
+            link(f"{url}/tilejson", "describedby", JSON, "TileJSON 3.0"),
+            link(f"{url}/style", "stylesheet", MAP_STYLE, "MapLibre style"),
         ],
     }

@@ -21,6 +21,7 @@ from app.api.http.responses import (
     created_response,
     document_response,
     file_response,
+    json_response,
     page_response,
     versioned_response,
 )
@@ -31,7 +32,8 @@ from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
 from app.formats.spooled_file import SpooledFile
 from app.services.idempotency import IdempotencyKey
 from app.services.plans.alignments import Alignments
-from app.services.plans.documents import AlignmentDocument, AlignmentPage
+from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile
+from app.services.plans.profiles import MAX_SAMPLES
 from app.services.plans.tasks import MapForm
 
 router = APIRouter(prefix="/v1/alignments", tags=["plans"], route_class=StrictRoute)
@@ -141,6 +143,17 @@ def get_source(alignment_id: AlignmentId, caller: Caller, alignments: Service) -
     """The file as it came."""
     data, _name = alignments.source(caller, alignment_id)
     return Response(data, media_type="application/octet-stream")
+
+
+@router.get("/{alignment_id}/profile", responses=document_response(AlignmentProfile, 404))
+def get_profile(
+    alignment_id: AlignmentId,
+    caller: Caller,
+    alignments: Service,
+    samples: Annotated[int, Query(ge=2, le=MAX_SAMPLES, description="Of each lane at most.")] = 1000,
+) -> Response:
+    """The lanes to draw: lines, stations, curvature, events and areas in which nothing is installed."""
+    return json_response(alignments.profile(caller, alignment_id, samples))
 
 
 @router.get(

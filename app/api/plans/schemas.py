@@ -14,6 +14,8 @@ from app.planning.proof import ProofTerms
 from app.services.plans.plans import PlanChange
 
 Name = Annotated[Text, Field(min_length=1, max_length=80)]
+MAX_RULES_TEXT = 50_000
+"""Longest text of rules. [characters] Source: chosen by hand, 25 times the examples; as YAML it takes seconds."""
 
 
 class _Body(BaseModel):
@@ -87,6 +89,35 @@ class PlanIn(_Body):
     name: Name
     alignment_id: Identifier
     rules: dict[str, Any]
+
+
+class PlanPreviewIn(_Body):
+    """Rules to try on an alignment."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "alignment_id": "019cb624-0000-7000-8000-0000000000aa",
+                    "rules": {"version": 1, "plates": {"spacing_m": 50}},
+                }
+            ]
+        },
+    )
+
+    alignment_id: Identifier
+    rules: dict[str, Any]
+
+
+class RulesTextIn(_Body):
+    """A document of rules as it stands in a file."""
+
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"examples": [{"text": "version: 1\nplates:\n  spacing_m: 50\n"}]}
+    )
+
+    text: str = Field(max_length=MAX_RULES_TEXT, description="YAML 1.2 or JSON.")
 
 
 class PlanPatch(_Body):

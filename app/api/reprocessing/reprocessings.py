@@ -12,9 +12,9 @@ from app.api.http.dependencies import Caller, Identifier, LastId, Number, PageSi
 from app.api.http.problems import problem_responses
 from app.api.http.responses import created_response, document_response, file_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
-from app.api.markers.filters import checked_box
 from app.families.inputs import StrictModel
 from app.services.decodes.kinds import DecodeKind
+from app.services.markers.search_boxes import checked_box
 from app.services.reprocessing.documents import (
     DecodeVersions,
     ReprocessingDocument,

@@ -24,20 +24,23 @@ Count = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 
 
 class StationIn(StrictModel):
-    """A calibration point: a place with a known measure."""
+    """A calibration point: a place with a known measure. The place is a vertex, a position or a chainage."""
 
     measure_m: Metres = Field(description="Measure there, coming from before. [m]")
     ahead_m: Metres | None = Field(None, description="At an equation of stationing: the measure going on. [m]")
-    part: Count = Field(0, description="Line of a MultiLineString, from 0; with `vertex`.")
+    part: Count = Field(0, description="Line of a MultiLineString, from 0; with `vertex` or `chainage_m`.")
     vertex: Count | None = Field(None, description="Vertex of the line, from 0.")
     position: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = Field(
         None, description="Instead of a vertex: a position within 50 m of the axis, in the road's CRS."
+    )
+    chainage_m: Metres | None = Field(
+        None, description="Instead of a vertex: distance along the axis from the start of its first line. [m]"
     )
 
     def given(self) -> CalibrationInput:
         """The point as the use cases know it."""
         position = (self.position[0], self.position[1]) if self.position is not None else None
-        return CalibrationInput(self.measure_m, self.ahead_m, self.part, self.vertex, position)
+        return CalibrationInput(self.measure_m, self.ahead_m, self.part, self.vertex, position, self.chainage_m)
 
 
 class _AxisIn(StrictModel):

@@ -13,10 +13,11 @@ from app.api.http.problems import problem_responses
 from app.api.http.responses import document_response, file_response
 from app.api.http.strict_json import StrictRoute
 from app.api.jobs.files import queued_job
-from app.api.markers.filters import Filtered, check_measures, checked_box
+from app.api.markers.filters import Filtered, check_measures
 from app.families import FamilyName
 from app.families.inputs import StrictModel
 from app.markers.status import Status
+from app.services.markers.search_boxes import checked_box
 from app.services.progress.documents import JobDocument
 from app.services.request_work import counted_steps
 from app.services.surveys.export_jobs import MAX_LEFT_OUT_IDS, SUFFIXES, ExportJobs, filter_of

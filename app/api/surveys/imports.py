@@ -30,7 +30,7 @@ from app.services.idempotency import IdempotencyKey
 from app.services.surveys.declarations import import_input
 from app.services.surveys.documents import ImportJobDocument, ImportJobPage, ImportReport
 from app.services.surveys.import_jobs import ImportJobs, takes_long
-from app.services.surveys.imports import ImportInput
+from app.services.surveys.import_report import ImportInput
 from app.services.surveys.imports import Imports as ImportsService
 
 router = APIRouter(prefix="/v1/imports", tags=["imports"], route_class=StrictRoute)

@@ -10,6 +10,7 @@ from app.api.http.dependencies import Number, Text
 from app.families import FAMILIES, FamilyName
 from app.families.inputs import Accuracy, StrictModel, VerticalDatum
 from app.markers.status import Status
+from app.services.surveys.import_report import MAX_ROWS_LISTED
 
 Unit = Literal["m", "ft-us", "ft-intl"]
 Name = Annotated[Text, Field(min_length=1, max_length=200)]
@@ -125,6 +126,12 @@ class DeclarationIn(_FamilyMembers):
     mode: Literal["all", "good"] = Field("all", description="Store all rows or none, or the good ones.")
     warnings: Literal["store", "refuse"] = Field(
         "store", description="What a warning means: its row is stored, or refused as a faulty one is."
+    )
+    leave_out: list[Annotated[int, Field(strict=True, ge=1, le=1_000_000)]] = Field(
+        default_factory=list, max_length=1000, description="Numbers of rows that are neither checked nor stored."
+    )
+    list_rows: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS_LISTED)] = Field(
+        0, description="Rows that the report lists with their positions, those with faults first."
     )
     reason: Annotated[Text, Field(min_length=1, max_length=500)] | None = None
 

@@ -19,7 +19,8 @@ from app.markers.magnet import Orientation, Polarity
 
 MIN_PROBABILITY = 0.9
 """Smallest probability of a magnet that is reported. Source: of the drives that nothing was learnt from
-(`benchmarks.training.magnet_odds`) 98.2 % of the magnets have more, and 6 of 3,964 readings are wrong."""
+(`benchmarks.training.magnet_odds`) 98.8 % of the magnets have more, and 5 of 8,805 readings are wrong; with 0.8 it is
+99.2 % and 9 of 8,848, one of them over iron without any magnet (`tests/decoders/magnet/test_matched.py`)."""
 MIN_MARGIN = 4.0
 """Smallest margin of a dipole that shows the clearance: a likelihood ratio of exp(2) = 7. Source: chosen by hand."""
 MAX_SHAPE_COST = 8.0
@@ -32,10 +33,10 @@ MAX_CONFIDENCE = 0.9999
 SKEW_DEG = 8.0
 """Angle that weighs as much as a standard deviation when the reason of a rejection is chosen. [deg] Source:
 `YAW_SPREAD`."""
-_CLEAR = np.array([8.0, 3.0, math.log(0.004), math.log1p(40.0), 0, 0, 0, 0, 0, 14.0, 0, 0, 0, -3.0, 0])
+_CLEAR = np.array([8.0, 8.0, math.log(0.004), math.log1p(40.0), 0, 0, 0, 0, 0, 14.0, 0, 0, 0, -3.0, 0, 0])
 """Features of a clear magnet: the group of features that lowers the log odds most is the reason of a rejection."""
 _REASONS = {
-    "own": ("own", "own, up to 3", "too deep", "like iron", "iron before"), "misfit": ("misfit",),
+    "own": ("own", "own, above 0", "too deep", "like iron", "iron before"), "misfit": ("misfit",),
     "margin": ("margin",), "piece": ("piece of iron",), "rows": ("rows",),
     "pole": ("too near", "other kind", "unlike pole", "neighbour"),
 }  # fmt: skip

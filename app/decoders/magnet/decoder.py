@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from copy import deepcopy
 
 import numpy as np
 
@@ -54,7 +55,7 @@ from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
-VERSION = "matched-4"
+VERSION = "matched-6"
 """Kept with every decode; to be raised when findings change."""
 FIRST_VARIANCE = 2.0
 """Variance of the matched filters' noise that is assumed at first. [uT2] Source: a chip's noise of 1.5 uT."""
@@ -73,6 +74,9 @@ OF_MAGNETS = (TagReading, LineCrossing)
 """Findings that follow from several magnets."""
 CHUNK_SAMPLES = 4096
 """Samples of a whole trace that are decoded at a time. Source: chosen by hand, bounds the memory."""
+BEGINNING_M = 60.0
+"""Distance of a whole trace from which the noise of the wheels is learnt first. [m] Source: that over which it is
+learnt (`app.decoders.magnet.wheel_noise.LEARN_M`)."""
 
 
 class MagnetDecoder:
@@ -88,6 +92,9 @@ class MagnetDecoder:
         Of the magnets on the road. [A m2]
     state : MagnetState, optional
         What is known of clearance and moment before the trace; by default what the bar declares.
+    wheels : WheelNoiseCanceller, optional
+        That has learnt the noise of the wheels, as `learn_wheels` returns it; it is copied. By default the noise is
+        learnt while the trace is decoded, and not known for the first metres.
 
     Attributes
     ----------
@@ -102,6 +109,7 @@ class MagnetDecoder:
         candidates: TagCandidates | None = None,
         moment_am2: float = MOMENT_AM2,
         state: MagnetState | None = None,
+        wheels: WheelNoiseCanceller | None = None,
     ) -> None:
         self.bar = bar
         positions = bar.positions_m[bar.array].copy()
@@ -111,7 +119,7 @@ class MagnetDecoder:
         positions[:, 2] -= np.median(positions[:, 2])
         self._array = SensorArray(positions, bar.array, bar.axis_delay_s)
         self._preprocessor = Preprocessor(bar)
-        self._wheels = WheelNoiseCanceller(bar.references, bar.sensor_count)
+        self._wheels = deepcopy(wheels) if wheels else WheelNoiseCanceller(bar.references, bar.positions_m)
         self._blocks = Blocks(bar.sensor_count)
         self._bins = FieldBins(positions)
         self._bank = make_filter_bank(positions)
@@ -140,11 +148,10 @@ class MagnetDecoder:
     def _advance(self, *, final: bool) -> list[Finding]:
         count = self._blocks.s.size
         self._preprocessor.take(self._blocks, final=final)
-        s, t, x = self._blocks.s[count:], self._blocks.t[count:], self._blocks.x[count:]
-        self._wheels.cancel(s, x)
+        s, yaw, x = self._blocks.s[count:], self._blocks.yaw[count:], self._blocks.x[count:]
+        self._wheels.cancel(s, yaw, x)
         self._bins.append(s, np.ascontiguousarray(x[:, self.bar.array]))
-        self._path.append(s, t, self._preprocessor.headings, final=final)
-        self._preprocessor.headings = np.empty((0, 2))
+        self._path.append(s, yaw)
         self._search(final)
         self._report_up_to(np.inf if final else (self._next - self._region_bins - 5) * BIN_M, final)
         self._forget()
@@ -281,19 +288,34 @@ def decode_trace(trace: MagnetTrace, bar: MagnetometerBar, *, candidates: TagCan
     It is decoded from its beginning again as soon as its magnets have shown the clearance, so that all of it is judged
     by that. Where they never do, no magnet is reported: iron would look like one at some clearance.
     """
-    state, found = estimate_state(trace, bar, candidates)
+    wheels = learn_wheels(trace, bar)
+    state, found = estimate_state(trace, bar, wheels, candidates)
     if not state.is_known:
         return [_unsure(f) if isinstance(f, MagnetReading) else f for f in found if not isinstance(f, OF_MAGNETS)]
-    decoder = MagnetDecoder(bar, candidates=candidates, state=state)
+    decoder = MagnetDecoder(bar, candidates=candidates, state=state, wheels=wheels)
     found = [finding for chunk in _chunks(trace) for finding in decoder.feed(chunk)]
     return found + decoder.finish()
 
 
+def learn_wheels(trace: MagnetTrace, bar: MagnetometerBar) -> WheelNoiseCanceller:
+    """The noise of the wheels, as the first `BEGINNING_M` of a whole trace show it, for a decoder that starts there."""
+    wheels = WheelNoiseCanceller(bar.references, bar.positions_m)
+    front, blocks = Preprocessor(bar), Blocks(bar.sensor_count)
+    for chunk in _chunks(trace):
+        front.feed(chunk)
+        front.take(blocks)
+        if blocks.s.size and blocks.s[-1] > BEGINNING_M:
+            break
+    near = blocks.s < BEGINNING_M
+    wheels.learn_beginning(blocks.s[near], blocks.yaw[near], blocks.x[near])
+    return wheels
+
+
 def estimate_state(
-    trace: MagnetTrace, bar: MagnetometerBar, candidates: TagCandidates | None = None
+    trace: MagnetTrace, bar: MagnetometerBar, wheels: WheelNoiseCanceller, candidates: TagCandidates | None = None
 ) -> tuple[MagnetState, list[Finding]]:
     """What the magnets of a trace share, and the findings up to where they have surely shown it."""
-    decoder = MagnetDecoder(bar, candidates=candidates)
+    decoder = MagnetDecoder(bar, candidates=candidates, wheels=wheels)
     found: list[Finding] = []
     for chunk in _chunks(trace):
         found += decoder.feed(chunk)

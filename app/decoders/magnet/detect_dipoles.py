@@ -108,7 +108,28 @@ class DipoleDetector:
                 return found
             if _is_unclear(cluster) and 2 * sum(d.unlike_magnet for d in cluster) <= len(cluster):
                 found = self._fit_one_kind(pursuit, found, cluster)
-        return self._with_pairs(pursuit.window, pursuit.polish(found))
+        return self._with_pairs(pursuit.window, self._with_kinds_of_moments(pursuit.window, pursuit.polish(found)))
+
+    def _with_kinds_of_moments(self, window: FitWindow, found: list[Dipole]) -> list[Dipole]:
+        """Fit dipoles as the kind that their moments show, where that is likelier.
+
+        One that was found before a magnet beside it may have been taken for the other kind; fitted together with that
+        magnet, it finds its moment but keeps the kind.
+        """
+        for cluster in _clusters(found):
+            kinds = [_kind_of_moment(d) for d in cluster]
+            if kinds == [d.kind for d in cluster] or len(cluster) > MAX_POLISHED:
+                continue
+            others = [d for d in found if all(d is not c for c in cluster)]
+            fitted = window.fit([d.params for d in cluster], kinds, others)
+            if fitted is None:
+                continue
+            span = float(cluster[0].params[0]), float(cluster[-1].params[0])
+            margin = window.cost(found, *span) - window.cost([*others, *fitted], *span)
+            if margin > 0:
+                pairs = zip(cluster, fitted, strict=True)
+                found = others + [replace(f, margin=d.margin if f.kind == d.kind else margin) for d, f in pairs]
+        return found
 
     def _with_pairs(self, window: FitWindow, found: list[Dipole]) -> list[Dipole]:
         """Replace a dipole by two opposed ones of the other kind where these fit better, or lower its margin.
@@ -148,7 +169,8 @@ class DipoleDetector:
         for kind in (FORWARD, UPRIGHT):
             if any(d.kind != kind for d in cluster):
                 whole = others + part.run((kind,), others)[0]
-                costs.append((pursuit.window.cost(whole, *span) + _penalty(whole), whole))
+                if all(_kind_of_moment(d) == d.kind for d in whole):
+                    costs.append((pursuit.window.cost(whole, *span) + _penalty(whole), whole))
         costs.sort(key=lambda c: c[0])
         best = costs[0][1]
         own = [d for d in best if all(d is not o for o in others)]
@@ -366,6 +388,13 @@ def _is_unclear(cluster: list[Dipole]) -> bool:
     return len(cluster) > 1 and bool(
         len(kinds) > 1 or min(np.diff(places)) < CLOSE_M or min(d.margin for d in cluster) < SURE_MARGIN
     )
+
+
+def _kind_of_moment(dipole: Dipole) -> int:
+    """The kind within 45 degrees of whose axis the moment is; without any, that as which it was fitted."""
+    moment = dipole.params[3:]
+    other = FORWARD if dipole.kind == UPRIGHT else UPRIGHT
+    return other if 2 * moment[other] ** 2 > moment @ moment else dipole.kind
 
 
 def _mostly_unlike(dipoles: list[Dipole]) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.magnet.kernels import entry, step
+from app.decoders.magnet.matched_filter import BIN_M
 from app.markers.magnet import FIELD_UT_M3
 
 Floats = npt.NDArray[np.float64]
@@ -23,6 +24,9 @@ Floats32 = npt.NDArray[np.float32]
 
 PARAMETERS = 6
 """Parameters of a dipole: s, y, h [m] and the moment's x, y, z [A m2]. Source: definition of a point dipole."""
+
+MIN_BLOCK_M, MAX_BLOCK_M = 0.001, 1.0
+"""Lengths of a block that its noise counts for. [m] Source: gaps are longer; a vehicle that stands still."""
 
 
 class FitData(NamedTuple):
@@ -55,7 +59,59 @@ class FitData(NamedTuple):
     common_share: Floats
 
 
+class Samples(NamedTuple):
+    """Blocks about a region of road, N of them, and their noise.
+
+    Attributes
+    ----------
+    s_m : ndarray, shape (N,)
+        Odometer. [m]
+    field_ut : ndarray, shape (S, 3, N)
+        [uT]
+    good : ndarray, shape (S, N)
+        Share of good samples.
+    quiet : ndarray, shape (S, 3)
+        1 over the noise of each channel in that of its axis.
+    common_share : ndarray, shape (3,)
+        Share of the common mode that is taken out of each axis.
+    """
+
+    s_m: Floats
+    field_ut: Floats
+    good: Floats
+    quiet: Floats
+    common_share: Floats
+
+
 @entry
+def whiten(
+    samples: Samples, low: int, high: int, noise_ut: Floats, known: Floats32, degree: int
+) -> tuple[Floats, Floats, Floats]:
+    """Field and weight (S, 3, K) and basis of a `FitData`, of the blocks low to high less a known field (K, S, 3).
+
+    The noise (3,) is that of bins of road; blocks are shorter.
+    """
+    sensors, blocks = samples.field_ut.shape[0], high - low
+    s = samples.s_m[low:high]
+    scale = np.empty(blocks)
+    for k in range(blocks):
+        before, after = max(k - 1, 0), min(k + 1, blocks - 1)
+        length = (s[after] - s[before]) / (after - before)
+        scale[k] = math.sqrt(min(max(length, MIN_BLOCK_M), MAX_BLOCK_M) / BIN_M)
+    field, weight = np.empty((sensors, 3, blocks)), np.empty((sensors, 3, blocks))
+    for j in range(sensors):
+        for axis in range(3):
+            share = samples.quiet[j, axis] / noise_ut[axis]
+            for k in range(blocks):
+                w = scale[k] * share * samples.good[j, low + k]
+                weight[j, axis, k] = w
+                field[j, axis, k] = w * (samples.field_ut[j, axis, low + k] + known[k, j, axis])
+    basis = background_basis(s, scale, degree)
+    remove_background(field, basis, samples.common_share)
+    return field, weight, basis
+
+
+@step
 def background_basis(s_m: Floats, scale: Floats, degree: int) -> Floats:
     """Orthonormal scale, scale s, scale s2 .. up to the degree (Gram-Schmidt), shape (degree + 1, K)."""
     mid = (s_m[0] + s_m[-1]) / 2
@@ -85,7 +141,7 @@ def _project_out(row: Floats, unit: Floats) -> None:
         row[k] -= dot * unit[k]
 
 
-@entry
+@step
 def remove_background(field: Floats, basis: Floats, common_share: Floats) -> None:
     """Take the share of the common mode, then the background, out of a field (S, 3, K), in place."""
     sensors, blocks = field.shape[0], field.shape[2]

@@ -11,11 +11,11 @@ from app.decoders.magnet.dipole_fit import FORWARD, UPRIGHT, MagnetPrior, fit_di
 from app.decoders.magnet.dipole_model import (
     PARAMETERS,
     FitData,
+    Samples,
     add_dipole_field,
-    background_basis,
-    remove_background,
+    whiten,
 )
-from app.decoders.magnet.matched_filter import BIN_M, DISTANCES_M, BinScores
+from app.decoders.magnet.matched_filter import DISTANCES_M, BinScores
 from app.decoders.magnet.preprocess import Blocks
 
 Floats = npt.NDArray[np.float64]
@@ -169,12 +169,15 @@ class FitWindow:
         self._array = array
         self._prior = prior
         self._variance = region.variance
-        self._common_share = region.common_share
-        self._quiet = 1 / np.sqrt(region.loudness.astype(float))[:, :, None]
-        self._s = blocks.s[low:high]
-        self._x = np.ascontiguousarray(blocks.x[low:high][:, array.indices].transpose(1, 2, 0))
-        self._good = np.ascontiguousarray(blocks.w[low:high][:, array.indices].T)
+        self._samples = Samples(
+            blocks.s[low:high].copy(),
+            np.ascontiguousarray(blocks.x[low:high][:, array.indices].transpose(1, 2, 0)),
+            np.ascontiguousarray(blocks.w[low:high][:, array.indices].T),
+            1 / np.sqrt(region.loudness.astype(float)),
+            region.common_share,
+        )
         self._delay_m = np.array(array.axis_delay_s)[:, None] * blocks.v[low:high]
+        self._costed: tuple[tuple[float, float], FitData | None] | None = None  # the last stretch of `cost`
         self.joint_fits = 0
         """Fits of two or more magnets so far: what takes time."""
 
@@ -255,33 +258,29 @@ class FitWindow:
 
     def _whitened(self, start_m: float, end_m: float, height_m: float, others: list[Dipole]) -> FitData | None:
         """The blocks between two odometers, less the fields of others, for fits at a height; None if too few."""
-        low, high = (int(i) for i in np.searchsorted(self._s, (start_m, end_m)))
+        samples, positions = self._samples, self._array.positions_m
+        low, high = (int(i) for i in np.searchsorted(samples.s_m, (start_m, end_m)))
         if high - low < MIN_BLOCKS:
             return None
-        s, positions = self._s[low:high], self._array.positions_m
+        s = samples.s_m[low:high]
         d = int(np.argmin(abs(np.log(DISTANCES_M / (NOISE_HEIGHTS * height_m)))))
-        scale = np.sqrt(np.clip(np.gradient(s), 1e-3, 1.0) / BIN_M)
-        noise = np.sqrt(self._variance[d].astype(float))[None, :, None]
-        weight = np.ascontiguousarray(scale / noise * self._good[:, None, low:high] * self._quiet)
-        x = self._x[:, :, low:high]
-        if others:
-            rest = np.zeros((len(s), len(positions), 3), np.float32)
-            for other in others:
-                add_dipole_field(other.params, s, positions, -1.0, np.zeros(3), rest)
-            x = x + rest.transpose(1, 2, 0)
-        field = np.ascontiguousarray(x * weight)
+        noise_ut = np.sqrt(self._variance[d].astype(float))
+        known = np.zeros((len(s), len(positions), 3), np.float32)
+        for other in others:
+            add_dipole_field(other.params, s, positions, -1.0, np.zeros(3), known)
         length_m = float(s[-1] - s[0])
         degree = BACKGROUND_DEGREE + max(0, int((length_m - BACKGROUND_FREE_M) / BACKGROUND_STEP_M))
-        basis = background_basis(s, scale, degree)
-        remove_background(field, basis, self._common_share)
+        field, weight, basis = whiten(samples, low, high, noise_ut, known, degree)
         delay_m = np.ascontiguousarray(self._delay_m[:, low:high])
-        return FitData(s, field, weight, delay_m, positions, basis, self._common_share)
+        return FitData(s, field, weight, delay_m, positions, basis, samples.common_share)
 
     def cost(self, dipoles: list[Dipole], start_m: float, end_m: float) -> float:
         """-2 log likelihood of the blocks about a stretch of road and of the dipoles, but for a constant."""
         height = self._prior.clearance_m
         reach = FIT_HEIGHTS * min(max(height, MIN_COST_HEIGHT_M), MAX_COST_HEIGHT_M) + FIT_M
-        data = self._whitened(start_m - reach, end_m + reach, height, [])
+        if self._costed is None or self._costed[0] != (start_m, end_m):  # fits of both kinds are compared in turn
+            self._costed = (start_m, end_m), self._whitened(start_m - reach, end_m + reach, height, [])
+        data = self._costed[1]
         if data is None:
             return 0.0
         params = np.array([d.params for d in dipoles]).reshape(-1, PARAMETERS)

@@ -19,7 +19,7 @@ from app.decoders.magnet.fit_window import Dipole, magnet_prior
 
 Floats = npt.NDArray[np.float64]
 
-CLEARANCES_M = np.arange(0.08, 0.651, 0.005)
+CLEARANCES_M = np.arange(0.08, 0.651, 0.01)
 """Clearances of the grid. [m] Source: bars below bumpers, 15 to 35 cm (METRO section 7.3), trucks 40 cm, and room."""
 MOMENT_RATIOS = np.arange(0.5, 1.51, 0.04)
 """Moments of the grid, over the nominal one. Source: aged and hot ferrite or NdFeB to the next grades; by hand."""

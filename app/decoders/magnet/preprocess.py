@@ -31,6 +31,8 @@ MAX_GAP_M = 10.0
 MAX_INTERPOLATION_S = 1.0
 """A speed is interpolated between values at most so far apart, else the last one is kept. [s] Source: chosen by hand,
 ten values of METRO's CAN bus (section 7.1: 10 Hz)."""
+MAX_HEADING_INTERPOLATION_S = 3.0
+"""The same for headings. [s] Source: chosen by hand, three values of a receiver at 1 Hz."""
 MIN_SPIKE_UT = 25.0
 """Smallest deviation of a spike from the samples around it. [uT] Source: chosen by hand, no measurement kept."""
 SPIKE_RATIO = 4.0
@@ -55,26 +57,30 @@ FORGET_BLOCKS = 400
 class Blocks:
     """Averages of neighbouring samples, those not yet forgotten.
 
-    Odometer s (N,) [m], time t (N,) [s], speed v (N,) [m/s], field x (N, S, 3) [uT], share of good samples w (N, S).
+    Odometer s (N,) [m], time t (N,) [s], speed v (N,) [m/s], yaw (N,) [rad, anticlockwise from north, unwrapped; 0
+    without headings], field x (N, S, 3) [uT], share of good samples w (N, S).
     """
 
     def __init__(self, sensors: int) -> None:
         self.s = np.empty(0)
         self.t = np.empty(0)
         self.v = np.empty(0)
+        self.yaw = np.empty(0)
         self.x = np.empty((0, sensors, 3))
         self.w = np.empty((0, sensors))
 
-    def append(self, s: Floats, t: Floats, v: Floats, x: Floats, w: Floats) -> None:
-        """Add blocks at the end."""
-        self.s, self.t, self.v = (np.concatenate(p) for p in ((self.s, s), (self.t, t), (self.v, v)))
+    def append(self, drive: Floats, x: Floats, w: Floats) -> None:
+        """Add blocks at the end: drive (N, 4) has odometer, time, speed and yaw."""
+        old = (self.s, self.t, self.v, self.yaw)
+        self.s, self.t, self.v, self.yaw = (np.concatenate(p) for p in zip(old, drive.T, strict=True))
         self.x, self.w = np.concatenate((self.x, x)), np.concatenate((self.w, w))
 
     def forget(self, before_m: float) -> None:
         """Drop what lies before a distance, in large pieces."""
         n = int(np.searchsorted(self.s, before_m))
         if n > FORGET_BLOCKS:
-            self.s, self.t, self.v, self.x, self.w = (a[n:].copy() for a in (self.s, self.t, self.v, self.x, self.w))
+            self.s, self.t, self.v, self.yaw = (a[n:].copy() for a in (self.s, self.t, self.v, self.yaw))
+            self.x, self.w = self.x[n:].copy(), self.w[n:].copy()
 
 
 class Preprocessor:
@@ -87,13 +93,15 @@ class Preprocessor:
         self._x = np.empty((0, n, 3))
         self._speed_t = np.empty(0)
         self._speed = np.empty(0)
+        self._yaw_t = np.empty(0)
+        self._yaw = np.empty(0)  # [rad] anticlockwise, unwrapped
+        self._has_headings = False
         self._last: tuple[float, float, float] | None = None  # time, speed and odometer of the newest sample used
         self._repair = _Repair(
             np.full((n, 3), np.nan), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), _neighbours(bar)
         )
-        self._open = _OpenBlock(np.zeros((n, 3)), np.zeros(n), np.zeros(5))
+        self._open = _OpenBlock(np.zeros((n, 3)), np.zeros(n), np.zeros(6))
         self.findings: list[NoiseFinding] = []
-        self.headings = np.empty((0, 2))
 
     def feed(self, chunk: MagnetTrace) -> None:
         """Take a piece of the trace."""
@@ -117,7 +125,9 @@ class Preprocessor:
         self._speed_t = np.concatenate((self._speed_t, chunk.speed_t_s))
         self._speed = np.concatenate((self._speed, np.abs(chunk.speed_m_s)))
         if chunk.heading_t_s is not None and chunk.heading_deg is not None:
-            self.headings = np.concatenate((self.headings, np.stack([chunk.heading_t_s, chunk.heading_deg], 1)))
+            self._has_headings = True
+            self._yaw_t = np.concatenate((self._yaw_t, chunk.heading_t_s))
+            self._yaw = np.concatenate((self._yaw, _unwrap(-np.radians(chunk.heading_deg), self._yaw[-1:])))
 
     def take(self, blocks: Blocks, *, final: bool = False) -> None:
         """Move what is complete into the blocks; all of it if final."""
@@ -130,25 +140,31 @@ class Preprocessor:
         if lacking := ready + AHEAD - len(raw):  # the very last samples have no sample after them
             raw = np.concatenate((raw, np.repeat(raw[-1:], lacking, axis=0)))
         s, v = self._odometer(t)
-        out = _OpenBlock(np.empty((ready, *raw.shape[1:])), np.empty((ready, raw.shape[1])), np.empty((ready, 5)))
-        n = _repair_and_average(raw, np.stack([s, t, v], axis=1), self._repair, self._open, out)
-        blocks.append(out.drive[:n, 2], out.drive[:n, 3], out.drive[:n, 4], out.field[:n], out.good[:n])
+        yaw = np.zeros(ready)
+        if self._yaw_t.size:
+            yaw = _interpolate(t, self._yaw_t, self._yaw, MAX_HEADING_INTERPOLATION_S)
+        out = _OpenBlock(np.empty((ready, *raw.shape[1:])), np.empty((ready, raw.shape[1])), np.empty((ready, 6)))
+        n = _repair_and_average(raw, np.stack([s, t, v, yaw], axis=1), self._repair, self._open, out)
+        blocks.append(out.drive[:n, 2:], out.field[:n], out.good[:n])
         self._t, self._x = self._t[ready:], self._x[ready:]
-        keep = max(int(np.searchsorted(self._speed_t, t[ready - 1])) - 2, 0)
-        self._speed_t, self._speed = self._speed_t[keep:], self._speed[keep:]
+        self._speed_t, self._speed = _still_needed(t[-1], self._speed_t, self._speed)
+        self._yaw_t, self._yaw = _still_needed(t[-1], self._yaw_t, self._yaw)
         if final:
             self._close(blocks)
 
     def _ready(self, final: bool) -> int:
-        """Samples that can be used: their speed is known, and so are the samples after them."""
+        """Samples that can be used: their speed and heading are known, and so are the samples after them."""
         if final:
             return self._t.size
         if not self._t.size or not self._speed_t.size:
             return 0
-        until = self._speed_t[-1]
-        if self._t[-1] > until + MAX_INTERPOLATION_S:
-            return self._t.size - AHEAD
-        return min(int(np.searchsorted(self._t, until, side="right")), self._t.size - AHEAD)
+        if self._has_headings and not self._yaw_t.size and self._t[-1] < self._t[0] + MAX_HEADING_INTERPOLATION_S:
+            return 0
+        ready = self._t.size - AHEAD
+        for times, longest_s in ((self._speed_t, MAX_INTERPOLATION_S), (self._yaw_t, MAX_HEADING_INTERPOLATION_S)):
+            if times.size and self._t[-1] <= times[-1] + longest_s:
+                ready = min(ready, int(np.searchsorted(self._t, times[-1], side="right")))
+        return ready
 
     def _odometer(self, t: Floats) -> tuple[Floats, Floats]:
         """Distance and speed at times."""
@@ -156,11 +172,7 @@ class Preprocessor:
             raise InvalidParameter(
                 "the trace has no speed", field="trace.speed_m_s", limit="one value or more", cure="upload the CAN log"
             )
-        v = np.interp(t, self._speed_t, self._speed)
-        before = np.clip(np.searchsorted(self._speed_t, t, side="right") - 1, 0, self._speed_t.size - 1)
-        after = np.minimum(before + 1, self._speed_t.size - 1)
-        far = self._speed_t[after] - self._speed_t[before] > MAX_INTERPOLATION_S
-        v = np.where(far, self._speed[before], v)
+        v = _interpolate(t, self._speed_t, self._speed, MAX_INTERPOLATION_S)
         if self._last is None:
             self._last = (float(t[0]), float(v[0]), 0.0)
         time = np.concatenate(([self._last[0]], t))
@@ -182,10 +194,31 @@ class Preprocessor:
         """Move the open block into the blocks."""
         count = self._open.drive[0]
         if count:
-            s, t, v = self._open.drive[2:] / count
-            x, w = self._open.field / count, self._open.good / count
-            blocks.append(np.array([s]), np.array([t]), np.array([v]), x[None], w[None])
+            drive, x, w = (a / count for a in (self._open.drive[2:], self._open.field, self._open.good))
+            blocks.append(drive[None], x[None], w[None])
             self._open.drive[0] = 0
+
+
+def _unwrap(angle: Floats, before: Floats) -> Floats:
+    """Angles with whole turns added so that none is more than half a turn from the one before; `before` has 0 or 1.
+
+    Unlike `numpy.unwrap`, it gives the same to the last bit however the angles come in pieces.
+    """
+    step = np.diff(angle, prepend=before if before.size else angle[:1])
+    return angle - 2 * np.pi * np.cumsum(np.round(step / (2 * np.pi)))
+
+
+def _interpolate(t: Floats, times: Floats, values: Floats, longest_s: float) -> Floats:
+    """Values at t; the last one is kept where the next one comes later than `longest_s` after it."""
+    before = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
+    after = np.minimum(before + 1, times.size - 1)
+    return np.where(times[after] - times[before] > longest_s, values[before], np.interp(t, times, values))
+
+
+def _still_needed(t: float, times: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Times and values without those that are not needed after t."""
+    keep = max(int(np.searchsorted(times, t)) - 2, 0)
+    return times[keep:], values[keep:]
 
 
 def _neighbours(bar: MagnetometerBar) -> npt.NDArray[np.int64]:
@@ -227,7 +260,7 @@ class _OpenBlock(NamedTuple):
 
     field: Floats  # (S, 3) [uT]
     good: Floats  # (S,) number of good samples
-    drive: Floats  # (5,) samples, s of the first, sums of s [m], t [s], v [m/s]
+    drive: Floats  # (6,) samples, s of the first, sums of s [m], t [s], v [m/s], yaw [rad]
 
 
 @exact_step
@@ -300,14 +333,14 @@ def _is_spike(j: int, repair: _Repair, check: _Check) -> bool:
 
 @exact_step
 def _add_sample(sample: Floats, drive: Floats, repair: _Repair, check: _Check, block: _OpenBlock) -> None:
-    """Repair a sample (S, 3) taken at drive (3,) and add it to the open block."""
+    """Repair a sample (S, 3) taken at drive (4,) and add it to the open block."""
     if block.drive[0] == 0:
         block.field[:] = 0.0
         block.good[:] = 0.0
         block.drive[:] = 0.0
         block.drive[1] = drive[0]
     block.drive[0] += 1
-    for q in range(3):
+    for q in range(drive.size):
         block.drive[2 + q] += drive[q]
     for j in range(sample.shape[0]):
         good = check.usable[j] and not _is_spike(j, repair, check)
@@ -329,14 +362,14 @@ def _close_block(block: _OpenBlock, out: _OpenBlock, at: int) -> None:
         out.good[at, j] = block.good[j] / count
         for a in range(3):
             out.field[at, j, a] = block.field[j, a] / count
-    for q in range(5):
+    for q in range(block.drive.size):
         out.drive[at, q] = block.drive[q] / count
     block.drive[0] = 0.0
 
 
 @exact_entry
 def _repair_and_average(raw: Floats, drive: Floats, repair: _Repair, block: _OpenBlock, out: _OpenBlock) -> int:
-    """Repair samples raw (N + AHEAD, S, 3) taken at drive (N, 3): s, t, v; average them; return the blocks closed."""
+    """Repair samples raw (N + AHEAD, S, 3) taken at drive (N, 4): s, t, v, yaw; average them; return how many."""
     sensors, closed = raw.shape[1], 0
     check = _Check(np.empty((sensors, 3)), np.empty(sensors), np.empty(sensors, np.bool_), np.empty(sensors, np.bool_))
     for i in range(drive.shape[0]):

@@ -5,7 +5,7 @@ turn. A bar sensor and a reference sensor see it in different shape and phase, s
 subtracted. It gives the length of a turn; the harmonics are then learnt for each channel by least mean squares
 (the adaptive notch filter of Widrow et al., Adaptive noise cancelling: principles and applications, 1975).
 
-Shapes: W wheels, S sensors, L trial circumferences, H harmonics.
+Shapes: W wheels, S sensors, L trial circumferences, H harmonics by which the turn is found.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from app.decoders.magnet.kernels import entry, step
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-Complexes = npt.NDArray[np.complex128]
 
 HARMONICS = 8
 """Harmonics of a turn that are cancelled. Source: chosen by hand, no measurement kept."""
@@ -32,9 +31,9 @@ BANK_M = 30.0
 """Distance over which the length of a turn is found. [m] Source: chosen by hand, some 15 turns."""
 RENEW_M = 0.1
 """Distance after which the bank of trial lengths is renewed. [m] Source: chosen by hand for speed."""
-LEARN_M, FIRST_LEARN_M, LEARN_SLOPE = 25.0, 3.0, 0.3
+LEARN_M, FIRST_LEARN_M, LEARN_SLOPE = 60.0, 3.0, 0.6
 """Distance over which harmonics are learnt: in the long run, at first, and its growth per distance. [m, m, 1] Source:
-chosen by hand, no measurement kept."""
+in less, the magnets of a line that are about as far apart as a turn is long are learnt too (decision 0042)."""
 OFFSET_M, FIRST_OFFSET_M = 6.0, 0.5
 """Distance over which a channel's offset is averaged, in the long run and at first. [m] Source: chosen by hand, three
 turns."""
@@ -56,18 +55,22 @@ hand."""
 MEAN_DEVIATION = 1.25
 """Standard deviation over mean absolute deviation of Gaussian noise: sqrt(pi / 2) = 1.253. Source: normal
 distribution."""
+MAX_LOUDNESS = 4.0
+"""Largest strength of a wheel's noise at a sensor, over that at the reference beside the wheel. Source: 2.2 at most in
+24 drives over roads without magnets."""
 HALF_GAIN = 0.1
 """Strength of the noise over the residual's variance at which half of it is taken out. Source: chosen by hand."""
-STEER_M, FOLLOW_M = 8.0, 12.0
+STEER_M, FOLLOW_M = 4.0, 12.0
 """Distance over which the phase of a turn follows the noise at its reference, and that since the wheel was found noisy
-from which on it does. [m, m] Source: drives with strong wheels at 40 cm; with 4 and 2 m fewer magnets are read."""
+from which on it does. [m, m] Source: drives with strong wheels at 40 cm; with 2 to 8 m as many magnets are read."""
 OUTLIER_CHANNELS = 3
 """So many channels off by more than `CLIP` deviations are a magnet or iron, from which nothing is learnt. Source: by
 hand; what magnets lost without it was not kept (change "learn wheel noise away from magnets")."""
 MAGNET_RATE = 0.1
 """Factor on the rate at which the residual's strength follows over a magnet. Source: chosen by hand."""
-MAX_BOOST = 2.0
-"""Channels with strong noise are learnt up to so many times faster, and once more. Source: chosen by hand."""
+NEAR_M = 0.3
+"""Added to the distance of a sensor from a reference, which is that far from the wheel. [m] Source: by hand; with 0.8 m
+as many magnets are read."""
 MAX_STEP_M = 0.5
 """Longest step between two blocks: longer ones are gaps. [m] Source: chosen by hand."""
 FIRST_ERROR_UT, FIRST_LENGTH_M = 3.0, 2.0
@@ -78,8 +81,11 @@ class _Turns(NamedTuple):
     """The rotation of the wheels, as the references see it."""
 
     references: Integers  # (W,) reference sensors
+    left_m: Floats  # (W,) of the middle of the vehicle
+    rolled_m: Floats  # (W,) so far
     lengths_m: Floats  # (L,) trial lengths
-    bank: Complexes  # (W, L, H, 3) running correlations with each trial length
+    bank: Floats  # (W, 2, H, 3, L) running correlations with the cosine and sine of each trial length
+    work: Floats  # (5, L) cosine and sine of a turn of each trial length, of a harmonic, and energies
     power: Floats  # (W, 3) running signal power [uT2 m]
     pending: Floats  # (W, 4) distance and integral of the signal since the bank was renewed
     length_m: Floats  # (W,) of a turn
@@ -97,6 +103,7 @@ class _Channels(NamedTuple):
     strength: Floats  # (S, 3) mean square of the noise [uT2]
     residual: Floats  # (S, 3) of the present block [uT]
     regressors: Floats  # (2 W HARMONICS,) of the present block
+    near: Floats  # (S, W) how much of its noise a sensor can have from each wheel, 1 for the nearest
 
 
 class WheelNoiseCanceller:
@@ -106,16 +113,20 @@ class WheelNoiseCanceller:
     ----------
     references : ndarray of int
         Reference sensors, one for each wheel; without any, nothing is changed.
-    sensors : int
-        All sensors.
+    positions_m : ndarray, shape (S, 3)
+        Of all sensors. [m]
     """
 
-    def __init__(self, references: npt.NDArray[np.intp], sensors: int) -> None:
+    def __init__(self, references: npt.NDArray[np.intp], positions_m: Floats) -> None:
+        sensors = len(positions_m)
         wheels, regressors = len(references), 2 * len(references) * HARMONICS
         self._turns = _Turns(
             references.astype(np.int64),
+            np.ascontiguousarray(positions_m[references, 1]),
+            np.zeros(wheels),
             CIRCUMFERENCES_M.copy(),
-            np.zeros((wheels, CIRCUMFERENCES_M.size, BANK_HARMONICS, 3), np.complex128),
+            np.zeros((wheels, 2, BANK_HARMONICS, 3, CIRCUMFERENCES_M.size)),
+            np.zeros((5, CIRCUMFERENCES_M.size)),
             np.zeros((wheels, 3)),
             np.zeros((wheels, 4)),
             np.full(wheels, FIRST_LENGTH_M),
@@ -130,34 +141,78 @@ class WheelNoiseCanceller:
             np.zeros((sensors, 3)),
             np.zeros((sensors, 3)),
             np.zeros(regressors),
+            _nearness(positions_m, references),
         )
-        self._drive = np.zeros(3)  # 1 once begun, s of the newest block, distance driven
+        self._drive = np.zeros(4)  # 1 once begun, s and yaw of the newest block, distance driven
 
-    def cancel(self, s: Floats, x: Floats) -> None:
-        """Take the noise out of blocks at odometers s (N,): x (N, S, 3), in place."""
+    def cancel(self, s: Floats, yaw: Floats, x: Floats) -> None:
+        """Take the noise out of blocks at odometers s and yaw (N,), anticlockwise: x (N, S, 3), in place. [m, rad, uT]
+
+        In a bend, a wheel rolls less by the change of yaw times how far to the left of the middle it is.
+        """
         if self._turns.references.size and s.size:
-            _cancel(s, x, self._turns, self._channels, self._drive)
+            _cancel(s, yaw, x, self._turns, self._channels, self._drive)
+
+    def learn_beginning(self, s: Floats, yaw: Floats, x: Floats) -> None:
+        """Learn the noise of the first blocks of a recording (as for `cancel`), forwards and back; x stays as it is.
+
+        Otherwise it is not known for the first metres, and strong wheels look like magnets there.
+        """
+        if not self._turns.references.size or not s.size:
+            return
+        self.cancel(s, yaw, x.copy())
+        self._reverse()
+        self.cancel(-s[::-1], -yaw[::-1], x[::-1].copy())
+        self._reverse()
+
+    def _reverse(self) -> None:
+        """Go on in the opposite direction: the phases and distances change their signs, and with them all sines."""
+        for part in (
+            self._turns.phase,
+            self._turns.rolled_m,
+            self._turns.bank[:, 1],
+            self._channels.weights[..., 1::2],
+        ):
+            part *= -1.0
+        self._turns.pending[:] = 0.0
+        self._drive[1:3] *= -1.0
+
+
+def _nearness(positions_m: Floats, references: npt.NDArray[np.intp]) -> Floats:
+    """How much of its noise a sensor can have from each wheel (S, W), 1 for the nearest.
+
+    The energy of a dipole's field falls with the sixth power of the distance. Without this, two wheels with turns of
+    the same length share what a sensor hears of one of them, and go wrong as soon as one gets ahead of the other.
+    """
+    if not len(references):
+        return np.ones((len(positions_m), 0))
+    apart = np.linalg.norm(positions_m[:, None] - positions_m[references], axis=2)
+    energy = (apart + NEAR_M) ** -6.0
+    return np.asarray(energy / energy.max(axis=1, keepdims=True))
 
 
 @entry
-def _cancel(s: Floats, x: Floats, turns: _Turns, channels: _Channels, drive: Floats) -> None:
+def _cancel(s: Floats, yaw: Floats, x: Floats, turns: _Turns, channels: _Channels, drive: Floats) -> None:
     """Follow the turns, take the noise out of each block and learn from what is left."""
     for i in range(s.size):
         if drive[0] == 0:
-            drive[0], drive[1] = 1.0, s[i]
+            drive[0], drive[1], drive[2] = 1.0, s[i], yaw[i]
             _track_offset(x[i], 1.0, channels)
             continue
         step = min(max(s[i] - drive[1], 0.0), MAX_STEP_M)
         drive[1] = s[i]
-        drive[2] += step
+        drive[3] += step
         if step <= 0:
             continue
-        _track_offset(x[i], min(step / min(OFFSET_M, FIRST_OFFSET_M + drive[2]), 1.0), channels)
+        turned = yaw[i] - drive[2]
+        drive[2] = yaw[i]
+        _track_offset(x[i], min(step / min(OFFSET_M, FIRST_OFFSET_M + drive[3]), 1.0), channels)
         for w in range(turns.references.size):
-            _follow_turn(w, s[i], step, drive[2], x[i], turns, channels)
+            rolled_m = min(max(step - turns.left_m[w] * turned, 0.0), 2 * step)
+            _follow_turn(w, rolled_m, drive[3], x[i], turns, channels)
         locked_m = turns.locked_m.max()
         if locked_m > 0:
-            outliers = _subtract_noise(x[i], step, locked_m, channels)
+            outliers = _subtract_noise(x[i], step, locked_m, _loudest(turns, channels), channels)
             if locked_m > FOLLOW_M:
                 _steer(step, turns, channels)
             _learn(step, locked_m, outliers >= OUTLIER_CHANNELS and locked_m > START_M, channels)
@@ -172,22 +227,25 @@ def _track_offset(x: Floats, rate: float, channels: _Channels) -> None:
 
 
 @step
-def _follow_turn(w: int, s: float, step: float, driven_m: float, x: Floats, turns: _Turns, channels: _Channels) -> None:
-    """Advance a wheel's phase by a block (S, 3), and set its regressors: 0 unless the wheel is noisy."""
+def _follow_turn(w: int, step: float, driven_m: float, x: Floats, turns: _Turns, channels: _Channels) -> None:
+    """Advance a wheel's phase by what it rolled for a block (S, 3), and set its regressors: 0 unless it is noisy."""
     reference, pending = turns.references[w], turns.pending[w]
+    turns.rolled_m[w] += step
     pending[0] += step
     for axis in range(3):
         pending[1 + axis] += step * (x[reference, axis] - channels.offset[reference, axis])
     if pending[0] > RENEW_M:
-        _renew_length(w, s - pending[0] / 2, turns)
+        _renew_length(w, turns.rolled_m[w] - pending[0] / 2, turns)
         pending[:] = 0.0
     turns.phase[w] = (turns.phase[w] + 2 * math.pi * step / turns.length_m[w]) % (2 * math.pi)
     noisy = turns.periodic[w] > (STILL_PERIODIC if turns.locked_m[w] > 0 else MIN_PERIODIC) and driven_m > START_M
     turns.locked_m[w] = turns.locked_m[w] + step if noisy else 0.0
+    cosine, sine = (math.cos(turns.phase[w]), math.sin(turns.phase[w])) if noisy else (0.0, 0.0)
+    cosine_h, sine_h = cosine, sine
     for h in range(HARMONICS):
         k = 2 * (w * HARMONICS + h)
-        channels.regressors[k] = math.cos((h + 1) * turns.phase[w]) if noisy else 0.0
-        channels.regressors[k + 1] = math.sin((h + 1) * turns.phase[w]) if noisy else 0.0
+        channels.regressors[k], channels.regressors[k + 1] = cosine_h, sine_h
+        cosine_h, sine_h = cosine_h * cosine - sine_h * sine, sine_h * cosine + cosine_h * sine
 
 
 @step
@@ -202,44 +260,71 @@ def _renew_length(w: int, s: float, turns: _Turns) -> None:
     for axis in range(3):
         turns.power[w, axis] = keep * turns.power[w, axis] + pending[1 + axis] ** 2 / pending[0]
         total += turns.power[w, axis]
-    best, at = 0.0, 0
-    for c in range(lengths.size):
-        turn = 2 * math.pi * (s / lengths[c] % 1.0)
-        one = complex(math.cos(turn), -math.sin(turn))
-        spin = one
-        for h in range(bank.shape[1]):
-            for axis in range(3):
-                bank[c, h, axis] = keep * bank[c, h, axis] + pending[1 + axis] * spin
-            spin = spin * one
-        value = _bank_energy(bank[c])
-        if value > best:
-            best, at = value, c
-    turns.length_m[w] = lengths[at]
-    turns.periodic[w] = best / (bank.shape[1] * pending[0] * total)
-    if 0 < at < lengths.size - 1:  # the parabola through the best and its neighbours
-        left, right = _bank_energy(bank[at - 1]), _bank_energy(bank[at + 1])
-        bend = left - 2 * best + right
-        if bend < 0:
-            turns.length_m[w] *= (lengths[1] / lengths[0]) ** (0.5 * (left - right) / bend)
-
-
-@step
-def _bank_energy(z: Complexes) -> float:
-    """Energy of the harmonics (H, 3) of one trial length."""
-    value = 0.0
-    for h in range(z.shape[0]):
+    _set_turns(s, turns)
+    cosine, sine, cosine_h, sine_h, energy = turns.work
+    cosine_h[:], sine_h[:], energy[:] = cosine, sine, 0.0
+    for h in range(bank.shape[1]):
         for axis in range(3):
-            value += z[h, axis].real ** 2 + z[h, axis].imag ** 2
-    return value
+            piece, real, imaginary = pending[1 + axis], bank[0, h, axis], bank[1, h, axis]
+            for c in range(lengths.size):
+                real[c] = keep * real[c] + piece * cosine_h[c]
+                imaginary[c] = keep * imaginary[c] + piece * sine_h[c]
+                energy[c] += real[c] * real[c] + imaginary[c] * imaginary[c]
+        for c in range(lengths.size):
+            cosine_h[c], sine_h[c] = (
+                cosine_h[c] * cosine[c] - sine_h[c] * sine[c],
+                sine_h[c] * cosine[c] + cosine_h[c] * sine[c],
+            )
+    at = int(np.argmax(energy))
+    turns.length_m[w] = lengths[at]
+    turns.periodic[w] = energy[at] / (bank.shape[1] * pending[0] * total)
+    if 0 < at < lengths.size - 1:  # the parabola through the best and its neighbours
+        bend = energy[at - 1] - 2 * energy[at] + energy[at + 1]
+        if bend < 0:
+            turns.length_m[w] *= (lengths[1] / lengths[0]) ** (0.5 * (energy[at - 1] - energy[at + 1]) / bend)
 
 
 @step
-def _subtract_noise(x: Floats, step: float, locked_m: float, channels: _Channels) -> int:
-    """Take the predicted noise out of a block (S, 3), less where it is weak; returns the channels that are far off."""
+def _set_turns(s: float, turns: _Turns) -> None:
+    """Set cosine and sine of the turn at an odometer for each trial length.
+
+    They are computed by the series of an eighth of the angle, which vectorises, and doubled three times: error 1e-10.
+    """
+    cosine, sine = turns.work[0], turns.work[1]
+    for c in range(cosine.size):
+        turn = s / turns.lengths_m[c]
+        angle = (turn - math.floor(turn + 0.5)) * (math.pi / 4)
+        a2 = angle * angle
+        x = 1 - a2 / 2 * (1 - a2 / 12 * (1 - a2 / 30 * (1 - a2 / 56)))
+        y = angle * (1 - a2 / 6 * (1 - a2 / 20 * (1 - a2 / 42 * (1 - a2 / 72))))
+        for _ in range(3):
+            x, y = x * x - y * y, 2 * x * y
+        cosine[c], sine[c] = x, y
+
+
+@step
+def _loudest(turns: _Turns, channels: _Channels) -> float:
+    """Strength of the noise at the reference that has most. [uT2]"""
+    loudest = 0.0
+    for w in range(turns.references.size):
+        strength = channels.strength[turns.references[w]]
+        loudest = max(loudest, strength[0] + strength[1] + strength[2])
+    return loudest
+
+
+@step
+def _subtract_noise(x: Floats, step: float, locked_m: float, loudest: float, channels: _Channels) -> int:
+    """Take the predicted noise out of a block (S, 3), less where it is weak; returns the channels that are far off.
+
+    A channel with much more of it than the references has learnt the magnets of a line, as far apart as a turn is
+    long.
+    """
     share = min(step / STRENGTH_M, 1.0)
     fade = min(max((locked_m - FADE_AFTER_M) / FADE_M, 0.0), 1.0)
     outliers = 0
     for j in range(x.shape[0]):
+        strength = channels.strength[j, 0] + channels.strength[j, 1] + channels.strength[j, 2]
+        wheel = fade if strength < MAX_LOUDNESS * loudest else 0.0
         for axis in range(3):
             predicted = 0.0
             for k in range(channels.regressors.size):
@@ -249,7 +334,7 @@ def _subtract_noise(x: Floats, step: float, locked_m: float, channels: _Channels
             outliers += abs(residual) > CLIP * channels.error[j, axis]
             channels.strength[j, axis] += share * (predicted * predicted - channels.strength[j, axis])
             ratio = channels.strength[j, axis] / (channels.error[j, axis] ** 2 + 1e-6)
-            x[j, axis] -= fade * predicted * ratio / (ratio + HALF_GAIN)
+            x[j, axis] -= wheel * predicted * ratio / (ratio + HALF_GAIN)
     return outliers
 
 
@@ -278,14 +363,15 @@ def _steer(step: float, turns: _Turns, channels: _Channels) -> None:
 def _learn(step: float, locked_m: float, over_magnet: bool, channels: _Channels) -> None:
     """Renew the residual's deviation, and the weights by least mean squares unless a magnet is passed."""
     gain = 2 * step / min(LEARN_M, FIRST_LEARN_M + LEARN_SLOPE * locked_m)
-    share = min(step / STRENGTH_M, 1.0) * (MAGNET_RATE if over_magnet else 1.0)
+    follow = min(step / STRENGTH_M, 1.0) * (MAGNET_RATE if over_magnet else 1.0)
     clip = CLIP * (FIRST_CLIP if locked_m < FIRST_CLIP_M else 1.0)
     for j in range(channels.error.shape[0]):
         for axis in range(3):
             limit = clip * channels.error[j, axis]
             clipped = min(max(channels.residual[j, axis], -limit), limit)
-            channels.error[j, axis] += share * (MEAN_DEVIATION * abs(clipped) - channels.error[j, axis])
+            channels.error[j, axis] += follow * (MEAN_DEVIATION * abs(clipped) - channels.error[j, axis])
             if not over_magnet:
-                boost = min(channels.strength[j, axis] / (channels.error[j, axis] ** 2 + 1e-6), MAX_BOOST)
-                for k in range(channels.regressors.size):
-                    channels.weights[j, axis, k] += gain * (1 + boost) * clipped * channels.regressors[k]
+                for w in range(channels.near.shape[1]):
+                    move = gain * channels.near[j, w] * clipped
+                    for k in range(2 * HARMONICS * w, 2 * HARMONICS * (w + 1)):
+                        channels.weights[j, axis, k] += move * channels.regressors[k]

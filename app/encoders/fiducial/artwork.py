@@ -16,6 +16,7 @@ from app.encoders.plate.margin import (
     TOP_MARGIN_MM,
     crop_marks,
     dimension,
+    no_qr_code,
     qr_code,
 )
 from app.markers.fiducial import FiducialCode, FiducialGeometry, Mounting
@@ -37,7 +38,7 @@ class FiducialOrder:
     code : FiducialCode
     geometry : FiducialGeometry
     record_url : str
-        Address of the registry's record, for the QR code on the margin; empty for none.
+        Address of the marker's public page, for the QR code on the margin; empty for none.
     revision : int
         Revision of the record that the artwork shows.
     """
@@ -103,4 +104,6 @@ def _margin(order: FiducialOrder, half: float) -> tuple[Part, ...]:
         parts.append(Text(Layer.NOTE, line, 0.0, y, fitted_height_mm(line, _TEXT_MM, room), "middle"))
     if order.record_url:
         parts.append(qr_code(order.record_url, -_QR_SIDE_MM / 2, -half - 38.0))
+    else:
+        parts += no_qr_code(0.0, -half - 38.0 - _QR_SIDE_MM / 2, "middle")
     return tuple(parts)

@@ -1,6 +1,13 @@
 """Magnet tag -> what is built: codebooks, layouts on a lane, drilling sheets."""
 
-from app.encoders.magnet.codebook import CodebookFull, CodebookRules, allocate_codes, codebook_capacity, list_conflicts
+from app.encoders.magnet.codebook import (
+    CodebookFull,
+    CodebookRules,
+    allocate_codes,
+    codebook_capacity,
+    fitting_codes,
+    list_conflicts,
+)
 from app.encoders.magnet.formats import write_sheet
 from app.encoders.magnet.layout import Hole, MagnetLayout, place_line, place_tag
 from app.encoders.magnet.sheet import DrillingSheet, SheetFormat
@@ -14,6 +21,7 @@ __all__ = [
     "SheetFormat",
     "allocate_codes",
     "codebook_capacity",
+    "fitting_codes",
     "list_conflicts",
     "place_line",
     "place_tag",

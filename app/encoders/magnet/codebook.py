@@ -81,13 +81,7 @@ def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookR
     InvalidParameter
         The rules cannot be met by any tag of this design.
     """
-    if rules.survive_missing and book.design.magnets < 4:
-        raise InvalidParameter(
-            f"tags of {book.design.magnets} magnets do not survive the loss of one: two magnets have no ratio",
-            field="survive_missing",
-            limit="4 magnets or more",
-            cure="choose a design of 4 to 7 magnets",
-        )
+    _check_rules(book.design, rules)
     space = _CodeSpace(book.design, rules)
     for tag in book.tags:
         space.take(tag)
@@ -102,16 +96,45 @@ def allocate_codes(book: Codebook, meanings: Sequence[Meaning], rules: CodebookR
     return Codebook(book.name, book.design, (*book.entries, *assigned))
 
 
+def _check_rules(design: TagDesign, rules: CodebookRules) -> None:
+    if rules.survive_missing and design.magnets < 4:
+        raise InvalidParameter(
+            f"tags of {design.magnets} magnets do not survive the loss of one: two magnets have no ratio",
+            field="survive_missing",
+            limit="4 magnets or more",
+            cure="choose a design of 4 to 7 magnets",
+        )
+
+
 def codebook_capacity(design: TagDesign, rules: CodebookRules, *, max_count: int = 100_000) -> int:
-    """Codes that an empty book of a design takes under these rules, counted up to `max_count`."""
+    """Codes that an empty book of a design takes under these rules, counted up to `max_count`; raises as below."""
+    return len(fitting_codes(design, rules, max_count=max_count))
+
+
+def fitting_codes(design: TagDesign, rules: CodebookRules, *, max_count: int) -> list[InformationTag]:
+    """The codes that an empty book of a design takes under these rules, in the order in which they are assigned.
+
+    Parameters
+    ----------
+    design : TagDesign
+    rules : CodebookRules
+    max_count : int
+        Codes at most.
+
+    Raises
+    ------
+    InvalidParameter
+        The rules cannot be met by any tag of this design.
+    """
+    _check_rules(design, rules)
     space = _CodeSpace(design, rules)
-    count = 0
+    found: list[InformationTag] = []
     for tag in space.list_free():
         space.take(tag)
-        count += 1
-        if count == max_count:
+        found.append(tag)
+        if len(found) == max_count:
             break
-    return count
+    return found
 
 
 def list_conflicts(book: Codebook, rules: CodebookRules) -> list[tuple[InformationTag, InformationTag]]:

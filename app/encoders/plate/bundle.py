@@ -22,7 +22,9 @@ from app.encoders.plate.quality import quality_csv, quality_sheets
 from app.errors import InvalidParameter
 
 MANIFEST_FORMAT = "waymark-artwork/1"
-ARTWORK_VERSION = "1"
+ARTWORK_VERSION = "2"
+NO_QR_CODE = "the server has no public address"
+"""Why artwork has no QR code: in headers and manifests."""
 MAX_PLATES = 10_000
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 _RESERVED = re.compile(r"(?i)^(con|prn|aux|nul|com\d|lpt\d)(\.|$)")
@@ -175,7 +177,7 @@ def _plate_entry(order: PlateOrder, files: list[str], proof: PlateProof | None) 
     return {
         "plate_id": order.plate_id,
         "revision": order.revision,
-        "record_url": order.record_url,
+        "record_url": order.record_url or None,
         "code": {"digits": code.digits, "scheme": code.scheme.value, "n": code.n, "check_digits": code.check_digits},
         "geometry": {**asdict(geometry), "side_mm": geometry.side_mm},
         "position": None if order.lon_deg is None else {"lon_deg": order.lon_deg, "lat_deg": order.lat_deg},
@@ -189,6 +191,7 @@ def bundle_manifest(
     plates: list[dict[str, Any]], files: list[dict[str, Any]], options: BundleOptions, *, proved: bool
 ) -> dict[str, Any]:
     """The manifest of a bundle, from the entries of its plates and files."""
+    without_qr = sum(plate["record_url"] is None for plate in plates)
     return {
         "format": MANIFEST_FORMAT,
         "artwork_version": ARTWORK_VERSION,
@@ -196,6 +199,7 @@ def bundle_manifest(
         "proved": proved,
         "options": {"heaters": options.artwork.heaters, "leds": options.artwork.leds, "sheet_mm": options.sheet_mm},
         "colours": [asdict(spec) for spec in COLOURS],
+        "notes": [] if without_qr == 0 else [f"{without_qr} of {len(plates)} plates have no QR code: {NO_QR_CODE}"],
         "plates": plates,
         "files": files,
     }

@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from app.encoders.plate.drawing import Boxes, Layer, Modules, Part, Shape, Stroke, Text, box_points
+from app.encoders.plate.drawing import Anchor, Boxes, Layer, Modules, Part, Shape, Stroke, Text, box_points
 from app.encoders.plate.lettering import fitted_height_mm, text_width_mm
 from app.encoders.plate.order import PlateOrder
 from app.encoders.plate.qr import qr_modules
@@ -93,7 +93,16 @@ def _back_mark(order: PlateOrder, right: float, top: float) -> list[Part]:
     parts: list[Part] = [Text(Layer.ENGRAVE, order.plate_id, right, top - QR_SIDE_MM - 5.6, id_mm, "end")]
     if order.record_url:
         parts.append(qr_code(order.record_url, right - QR_SIDE_MM, top))
+    else:
+        why = "no public address" if order.registered else "a draft, not registered"
+        parts += no_qr_code(right, top - QR_SIDE_MM / 2, "end", why)
     return parts
+
+
+def no_qr_code(x: float, y: float, anchor: Anchor, why: str = "no public address") -> list[Part]:
+    """The note in place of a QR code, which is not engraved."""
+    lines = ("No QR code:", why)
+    return [Text(Layer.NOTE, line, x, y - k * 3.6, 2.0, anchor) for k, line in enumerate(lines)]
 
 
 def qr_code(url: str, left: float, top: float) -> Modules:

@@ -25,13 +25,16 @@ class PlateOrder:
     geometry : PlateGeometry
         Its ``n`` is the code's.
     record_url : str
-        Address of the registry record, for the QR on the margin; printable ASCII, at most 150 characters.
+        Address of the marker's public page, for the QR code on the margin; printable ASCII, at most 150 characters.
+        Empty: there is no QR code, and the margin states that.
     revision : int
         Revision of the record that the artwork shows, >= 1.
     lon_deg, lat_deg : float, optional
         Surveyed or planned position. [deg]
     crs : str
         Its coordinate reference system, realization and epoch, for the margin, at most 80 characters.
+    registered : bool
+        Whether the plate is in the registry; a draft is not, and the margin gives that as the reason for no QR code.
 
     Raises
     ------
@@ -47,6 +50,7 @@ class PlateOrder:
     lon_deg: float | None = None
     lat_deg: float | None = None
     crs: str = ""
+    registered: bool = True
 
     def __post_init__(self) -> None:
         if self.code.n != self.geometry.n:

@@ -1,4 +1,4 @@
-"""Drawings to PDF at true size, every layer in a spot ink of its own."""
+"""Drawings to PDF/X-4 at true size, every layer in a spot ink of its own."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MIN_REPEATS = 3  # a text that occurs as often is written once, as a form; chos
 
 
 def write_pdf(drawings: Drawing | Sequence[Drawing], *, compress: bool = True) -> bytes:
-    """Write drawings as the pages of a PDF 1.4.
+    """Write drawings as the pages of a PDF/X-4.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def write_pdf(drawings: Drawing | Sequence[Drawing], *, compress: bool = True) -
         if any(part.layer in UNDER_LAYERS for part in drawing.parts):
             pages.append((drawing, (*UNDER_LAYERS, *SHEET_LAYERS)))
     forms = _repeated_texts(pages)
-    file = PdfFile(sheets[0].title, compress=compress)
+    file = PdfFile(sheets[0].title, compress=compress, print_ready=True)
     resources = file.add(_resources(file.next_number + 1, len(forms)))
     for text in forms:
         _add_form(file, text)

@@ -13,7 +13,7 @@ from app.registry.marker_rows import MarkerRow
 class FiducialArtwork(MarkerArtwork):
     """Drawings of fiducial signs."""
 
-    version = "fiducial/1"
+    version = "fiducial/2"
 
     def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
         """The drawing of a sign.

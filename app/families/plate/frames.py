@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from app.families.frames import (
 )
 from app.families.plate.rows import plate_code, plate_geometry
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
-from app.markers.plate_position import decimal_codes, resolve_position
+from app.markers.plate_position import ResolvedPosition, decimal_codes, resolve_position
 from app.markers.reading import PlateReading
 from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.registry import markers as store
@@ -234,13 +234,20 @@ def _possible_codes(code: PlateCode) -> tuple[PlateCode, ...]:
 
 def _resolve_unregistered(code: PlateCode, position: ApproximatePosition) -> Match:
     """Where the digits place a plate: under the scheme with most check digits of those that place it within reach."""
-    matches = [_resolve_code(possible, position) for possible in _possible_codes(code)]
-    plausible = [match for match in matches if match.plausible]
-    return plausible[-1] if plausible else matches[0]
+    codes = _possible_codes(code)
+    places = [resolve_position(one, position.lon_deg, position.lat_deg) for one in codes]
+    matches = [_match_at(one, place, position) for one, place in zip(codes, places, strict=True)]
+    plausible = [(place, match) for place, match in zip(places, matches, strict=True) if match.plausible]
+    if not plausible:
+        return matches[0]
+    (plain, _), (checked, match) = plausible[0], plausible[-1]
+    if plain is checked:
+        return match
+    apart_m = distance_m(plain.lon_deg, plain.lat_deg, checked.lon_deg, checked.lat_deg)
+    return replace(match, note=f"{match.note}; otherwise it is {apart_m:.1f} m away")
 
 
-def _resolve_code(code: PlateCode, position: ApproximatePosition) -> Match:
-    resolved = resolve_position(code, position.lon_deg, position.lat_deg)
+def _match_at(code: PlateCode, resolved: ResolvedPosition, position: ApproximatePosition) -> Match:
     away_m = distance_m(position.lon_deg, position.lat_deg, resolved.lon_deg, resolved.lat_deg)
     next_m = resolved.next_distance_deg * _M_PER_DEG * math.cos(math.radians(position.lat_deg))
     plausible = away_m <= position.reach_m

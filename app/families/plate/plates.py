@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import sqlalchemy as sa
 
-from app.errors import CodeMismatch, CodeTaken, InvalidParameter, naming
+from app.errors import CodeTaken
 from app.families.family import Family, Registration, map_point
 from app.families.plate.artwork import PlateArtwork
+from app.families.plate.coding import CodedPlate, coded_plate, position_code
 from app.families.plate.documents import PlateDocument, plate_document
 from app.families.plate.frames import PlateFrames
 from app.families.plate.inputs import PLATE_EXAMPLES, PlateIn
 from app.families.plate.planned import PlannedPlates
-from app.families.plate.registration import CodeInput, NewPlate
+from app.families.plate.registration import NewPlate
 from app.families.plate.rows import plate_code, plate_geometry
 from app.families.plate.snapshot import PlateSnapshot
 from app.families.plate.survey import PlateSurvey
@@ -30,15 +30,6 @@ from app.registry.marker_rows import MarkerRow
 _LETTERS = frozenset("ABCDEF")
 _MIN_LETTERS = 3
 _ALLOCATION_TRIES = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class _Plate:
-    """A code with its relation to the position."""
-
-    code: PlateCode
-    digits_match_position: bool | None
-    is_explicit: bool
 
 
 class Plates(Family[NewPlate, PlacedPosition]):
@@ -73,8 +64,10 @@ class Plates(Family[NewPlate, PlacedPosition]):
         CodeTaken
             Another plate near by carries the code.
         """
-        with naming("code"):
-            coded = _coded(connection, registration, new, prepared)
+        coded = coded_plate(
+            new.code, new.geometry.n, (prepared.lon_deg, prepared.lat_deg),
+            lambda: _allocate(connection, registration, new.geometry.n),
+        )  # fmt: skip
         _check_free(connection, registration, coded, prepared.lon_deg, prepared.lat_deg)
         geometry, code = new.geometry, coded.code
         return {
@@ -121,42 +114,16 @@ class Plates(Family[NewPlate, PlacedPosition]):
         matches = row.digits_match_position
         is_explicit = matches is False
         if code.scheme is not PlateScheme.ID:
-            expected = _position_code(merged.lon_deg, merged.lat_deg, code.n, code.scheme, row.check_digits)
+            expected = position_code(merged.lon_deg, merged.lat_deg, code.n, code.scheme, row.check_digits)
             if row.status == PLANNED and matches:
                 code = expected
             matches = code == expected
-        coded = _Plate(code, matches, is_explicit)
+        coded = CodedPlate(code, matches, is_explicit)
         _check_free(connection, registration, coded, merged.lon_deg, merged.lat_deg, row.id)
         return {"digits": code.digits, "digits_match_position": matches}
 
 
 PLATE = Plates()
-
-
-def _coded(connection: sa.Connection, registration: Registration, plate: NewPlate, placed: PlacedPosition) -> _Plate:
-    """The code that was asked for, or the one that follows from the position or from a free registry number."""
-    wanted, n = plate.code, plate.geometry.n
-    _check_code_request(wanted)
-    if wanted.scheme is PlateScheme.ID:
-        if wanted.digits is not None:
-            return _Plate(PlateCode(wanted.digits, PlateScheme.ID, n), None, True)
-        if wanted.registry_number is not None:
-            return _Plate(PlateCode.from_registry_number(wanted.registry_number, n=n), None, True)
-        return _Plate(_allocate(connection, registration, n), None, False)
-    expected = _position_code(placed.lon_deg, placed.lat_deg, n, wanted.scheme, wanted.check_digits)
-    if wanted.digits is None:
-        return _Plate(expected, True, False)
-    code = PlateCode(wanted.digits, wanted.scheme, n, wanted.check_digits or 1)
-    matches = code == expected
-    if not matches and not wanted.allow_mismatched_digits:
-        raise CodeMismatch(
-            f"the digits {code.digits} do not fit the position {placed.lon_deg:.6f}, {placed.lat_deg:.6f}, "
-            f"whose digits are {expected.digits}",
-            field="code.digits",
-            limit=f"{expected.digits} at {placed.lon_deg:.6f}, {placed.lat_deg:.6f} deg",
-            cure="leave the digits out, correct the position, or set code.allow_mismatched_digits for a test plate",
-        )
-    return _Plate(code, matches, not matches)
 
 
 def _allocate(connection: sa.Connection, registration: Registration, n: int) -> PlateCode:
@@ -174,7 +141,7 @@ def _allocate(connection: sa.Connection, registration: Registration, n: int) -> 
 def _check_free(
     connection: sa.Connection,
     registration: Registration,
-    plate: _Plate,
+    plate: CodedPlate,
     lon_deg: float,
     lat_deg: float,
     ignoring: str | None = None,
@@ -205,30 +172,3 @@ def _check_free(
         limit=limit,
         cure="choose other digits or another position, or retire the other plate",
     )
-
-
-def _check_code_request(wanted: CodeInput) -> None:
-    is_id = wanted.scheme is PlateScheme.ID
-    for name, misplaced in (
-        ("registry_number", not is_id and wanted.registry_number is not None),
-        ("check_digits", wanted.scheme is not PlateScheme.POSITION_CHECK and wanted.check_digits is not None),
-        ("allow_mismatched_digits", is_id and wanted.allow_mismatched_digits),
-    ):
-        if misplaced:
-            raise InvalidParameter(
-                f"{name} means nothing in the scheme {wanted.scheme}",
-                field=f"code.{name}",
-                limit="registry_number: id; check_digits: position-check; allow_mismatched_digits: position schemes",
-                cure=f"leave {name} out or choose the scheme it belongs to",
-            )
-    if wanted.digits is not None and wanted.registry_number is not None:
-        raise InvalidParameter(
-            "give the digits or the registry number, not both",
-            field="code.registry_number",
-            limit="one of digits, registry_number",
-            cure="leave one of the two out",
-        )
-
-
-def _position_code(lon_deg: float, lat_deg: float, n: int, scheme: PlateScheme, check_digits: int | None) -> PlateCode:
-    return PlateCode.from_position(lon_deg, lat_deg, n=n, scheme=scheme, check_digits=check_digits or 0)

@@ -22,7 +22,7 @@ from app.formats.surveys.cells import (
 )
 from app.formats.surveys.declaration import NUMBER_ROLES, ImportDeclaration
 from app.formats.surveys.roles import WKT_NAMES, cell_text, plain_name
-from app.formats.surveys.table import Detected, Fault, Floats, Severity, SourceTable, Texts, warn
+from app.formats.surveys.table import Change, Detected, Fault, Floats, Severity, SourceTable, Texts, warn
 from app.geodesy import reference_system
 from app.geodesy.systems import best_effort
 
@@ -34,6 +34,7 @@ _SRID = re.compile(r"SRID=([0-9]{4,6});", re.IGNORECASE)
 _AGREE_M = 5.0
 """Difference between two pairs of coordinates of a row that the datums of a continent explain. [m] Chosen by hand:
 above NAD83 - WGS 84 (1 to 2 m) and the rounding of five decimals of a degree, below NAD27 or ED50 (30 to 200 m)."""
+_IGNORED = (Change("ignore_heights", True),)
 _FEW = 4  # rows whose heights may be equal by chance; chosen by hand
 _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
 
@@ -246,9 +247,10 @@ def _with_plausible_heights(read: Coordinates, declaration: ImportDeclaration) -
     if len(known) > 1 and not known.any():
         message = f"all {len(known)} heights are 0, as software writes unknown ones; they were left out"
         cure = "measure the heights, or declare ignore_heights"
-        read.faults.append(warn(None, "height", "zero_heights", message, cure))
+        read.faults.append(warn(None, "height", "zero_heights", message, cure, _IGNORED))
         read.height = None
     elif len(known) > _FEW and np.ptp(known) == 0:
         message = f"all {len(known)} heights are {known[0]:g}, as devices without heights write them"
-        read.faults.append(warn(None, "height", "equal_heights", message, "declare ignore_heights to leave them out"))
+        cure = "declare ignore_heights to leave them out"
+        read.faults.append(warn(None, "height", "equal_heights", message, cure, _IGNORED))
     return read

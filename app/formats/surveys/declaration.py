@@ -128,6 +128,8 @@ class ImportDeclaration:
         ``code`` or ``nearest``.
     tolerance_m : float
         Residuals beyond it are reported. [m]
+    leave_out : tuple of int
+        Numbers of rows, counted from 1, that are neither checked nor stored.
     survey : mapping
         horizontal_rmse_m, vertical_rmse_m, survey_method, surveyor, instrument, check_points.
     """
@@ -156,6 +158,7 @@ class ImportDeclaration:
     duplicates: str = "refuse"
     match: str = "code"
     tolerance_m: float = 0.1
+    leave_out: tuple[int, ...] = ()
     survey: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

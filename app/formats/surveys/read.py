@@ -15,7 +15,18 @@ from app.formats.surveys.declaration import FEET, METRES, NUMBER_ROLES, TEXT_ROL
 from app.formats.surveys.formats import SURVEY_FORMATS, SurveyReader
 from app.formats.surveys.grids import crs_unit, unit_factor, without_zone
 from app.formats.surveys.roles import CodeForm, cell_text, find_roles
-from app.formats.surveys.table import MAX_TEXT, Detected, Fault, Floats, SourceTable, SurveyTable, Texts, warn
+from app.formats.surveys.table import (
+    MAX_TEXT,
+    Change,
+    Detected,
+    Fault,
+    Floats,
+    Severity,
+    SourceTable,
+    SurveyTable,
+    Texts,
+    warn,
+)
 from app.geodesy import normalize_crs, reference_system
 
 _DOCUMENTS = (
@@ -164,7 +175,7 @@ def _units(
         if own in _FEET and declaration.unit is None:
             message = f"the file is in feet without stating which; they were read as {own}, the unit of {system.name}"
             cure = "declare unit: ft-us or ft-intl; they differ by 2 ppm, a metre in 500 km"
-            faults.append(warn(None, "unit", "which_foot", message, cure))
+            faults.append(warn(None, "unit", "which_foot", message, cure, (Change("unit", own),)))
     if of_file is not None and declaration.unit is not None and of_file != declaration.unit:
         raise InvalidParameter(
             f"the file is in {of_file}, the declaration has {declaration.unit}",
@@ -207,7 +218,10 @@ def _unit_names(
             named = "m"
         if named is not None and unit_used not in named.split(" or "):
             message = f"the column {name} is named in {named}, its values are read as {unit_used}"
-            faults.append(Fault(None, role, "unit_in_header", message, f"declare unit or height_unit {named}"))
+            member = "height_unit" if role == "height" else "unit"
+            changes = (Change(member, named),) if named in METRES else ()
+            cure = f"declare unit or height_unit {named}"
+            faults.append(Fault(None, role, "unit_in_header", message, cure, Severity.REFUSED, changes))
     return faults
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from app.errors import InvalidParameter
 from app.formats.columns import normal_name
 from app.formats.surveys.declaration import NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
-from app.formats.surveys.table import Detected, Fault, SourceTable, warn
+from app.formats.surveys.table import Change, Detected, Fault, SourceTable, warn
 from app.markers.status import STATUSES
 
 _NAMES = {
@@ -160,6 +160,7 @@ def _detected(
             refuted = warn(
                 None, role, "role_without_evidence", f"the column {shown} was not read as {role}: {evidence}",
                 f"declare columns {{{role!r}: {shown}}} if it is, or {{{role!r}: null}} if it is not".replace("'", '"'),
+                (Change(f"columns.{role}", None),),
             )  # fmt: skip
     if refuted is not None:
         roles.faults.append(refuted)

@@ -30,6 +30,20 @@ class Severity(StrEnum):
     WARNING = "warning"
 
 
+class Change(NamedTuple):
+    """A member of the declaration, and the value that it should have.
+
+    Attributes
+    ----------
+    member : str
+        Its path, such as ``unit`` or ``columns.easting``.
+    value : str, float, bool or None
+    """
+
+    member: str
+    value: str | float | bool | None
+
+
 class Fault(NamedTuple):
     """A mistake, or a possible one.
 
@@ -44,6 +58,8 @@ class Fault(NamedTuple):
     proposal : str or None
         How to correct it.
     severity : Severity
+    changes : tuple of Change
+        How the declaration would have to be changed, where that is the correction.
     """
 
     row: int | None
@@ -52,11 +68,19 @@ class Fault(NamedTuple):
     message: str
     proposal: str | None = None
     severity: Severity = Severity.REFUSED
+    changes: tuple[Change, ...] = ()
 
 
-def warn(row: int | None, field: str, code: str, message: str, proposal: str | None = None) -> Fault:
+def warn(
+    row: int | None,
+    field: str,
+    code: str,
+    message: str,
+    proposal: str | None = None,
+    changes: tuple[Change, ...] = (),
+) -> Fault:
     """A fault that only warns."""
-    return Fault(row, field, code, message, proposal, Severity.WARNING)
+    return Fault(row, field, code, message, proposal, Severity.WARNING, changes)
 
 
 class Detected(NamedTuple):
@@ -83,11 +107,14 @@ class Faults:
         self.file_warnings: set[str] = set()
         self._rows = {severity: bytearray() for severity in Severity}
         self._kept: dict[tuple[str, Severity], list[Fault]] = {}
+        self._left_out: frozenset[int] = frozenset()
         self.add(faults)
 
     def add(self, faults: Iterable[Fault]) -> None:
         """Add faults, however many."""
         for fault in faults:
+            if fault.row in self._left_out:
+                continue
             self.counts[fault.code] += 1
             kept = self._kept.setdefault((fault.code, fault.severity), [])
             if len(kept) < KEPT_FAULTS:
@@ -101,6 +128,19 @@ class Faults:
             if len(flags) < fault.row:
                 flags.extend(bytes(max(fault.row - len(flags), len(flags))))
             flags[fault.row - 1] = 1
+
+    def leave_out(self, rows: Iterable[int]) -> None:
+        """Forget the faults of some rows, counted from 1, and ignore those that are added later."""
+        self._left_out = frozenset(rows)
+        for (code, _severity), kept in self._kept.items():
+            others = [fault for fault in kept if fault.row not in self._left_out]
+            self.counts[code] -= len(kept) - len(others)
+            kept[:] = others
+        self.counts = +self.counts
+        for flags in self._rows.values():
+            for row in self._left_out:
+                if row <= len(flags):
+                    flags[row - 1] = 0
 
     def flags(self, rows: int, severity: Severity) -> Flags:
         """Which of the first `rows` rows have a fault of this severity, shape (rows,)."""

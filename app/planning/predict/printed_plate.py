@@ -177,7 +177,7 @@ def read_passes(
         Each pass draws light, sensor and noise of its own.
     """
     cv2.setNumThreads(1)
-    codebook, out = _codebook(code), PassesRead()
+    codebook, out = dense_codebook(code), PassesRead()
     for k in range(passes):
         frames: list[tuple[float, bool]] = []
         for unit_px, image in _frames(face, geometry, design, np.random.default_rng((seed, k))):
@@ -227,7 +227,7 @@ def _face(reflectance: npt.NDArray[np.float32], geometry: PlateGeometry) -> Face
     return Face(geometry.side_mm / 1000, np.ascontiguousarray(np.clip(texels * WHITE_REFLECTANCE, 0, 1), np.float32))
 
 
-def _codebook(code: PlateCode) -> list[PlateCode]:
+def dense_codebook(code: PlateCode) -> list[PlateCode]:
     """The plate and its neighbours on a dense road, as a vehicle's registry has them."""
     if code.scheme is PlateScheme.ID:
         numbers = [code.registry_number + step for step in _NEAR_NUMBERS]

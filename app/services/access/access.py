@@ -187,6 +187,11 @@ class Access:
             )
         return Caller(agency_id, bearer.holder_id, bearer.label, bearer.scope), bearer.expires_at
 
+    def agency_name(self, caller: Caller) -> str:
+        """Name of a caller's agency."""
+        with self._database.read() as connection:
+            return agencies.get_agency_name(connection, caller.agency_id)
+
     def last_use(self, key: agencies.KeyRow) -> datetime | None:
         """When a key was last used, as far as this process knows."""
         times = (key.last_used_at, self._uses.get(key.id))

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from app.errors import InvalidParameter, NotFound
 from app.registry import agencies
 from app.registry import audit as store
-from app.registry.audit import Author
+from app.registry.audit import Author, EntryFilter
 from app.registry.audit_check import ChainReport, Fault, check_history
 from app.registry.database import Database
 from app.services.access.access import Caller
@@ -64,10 +64,27 @@ class AuditLog:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def page(self, caller: Caller, *, after: int = 0, limit: int = 100) -> tuple[AuditPage, int | None]:
-        """A page of entries, oldest first, with the log's head; and the number to continue after if there are more."""
+    def page(
+        self,
+        caller: Caller,
+        *,
+        after: int = 0,
+        before: int | None = None,
+        limit: int = 100,
+        wanted: EntryFilter | None = None,
+    ) -> tuple[AuditPage, int | None]:
+        """A page of entries with the log's head: oldest first, or newest first where `before` is given.
+
+        Returns
+        -------
+        page : AuditPage
+        last : int or None
+            Number to continue after, or before; None if there are no more.
+        """
         with self._database.read() as connection:
-            rows = store.list_entries(connection, caller.agency_id, after=after, limit=limit + 1)
+            rows = store.list_entries(
+                connection, caller.agency_id, after=after, before=before, limit=limit + 1, wanted=wanted
+            )
             head = store.find_head(connection, caller.agency_id)
         page = AuditPage(
             items=[document_of(AuditEntryDocument, row) for row in rows[:limit]],

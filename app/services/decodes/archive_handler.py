@@ -10,10 +10,12 @@ import sqlalchemy as sa
 
 from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.pose import with_pose
-from app.errors import WaymarkError
+from app.errors import UnsupportedUpload, WaymarkError
 from app.formats.archives import Member, count_members, is_archive, list_names, read_members
 from app.formats.frame_list import is_beside_frames
+from app.formats.image_headers import FIELD
 from app.formats.images import ImageHeader
+from app.formats.kinds import UploadKind, guess_kind
 from app.formats.spooled_file import SpooledFile
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateReading
@@ -33,6 +35,7 @@ from app.services.decodes.rules import DecodeRules
 from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
 from app.services.ports import Clock
 
+_PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png")
 PART_EVERY = timedelta(seconds=10)
 """Time between two stores of the frames so far. Source: a result of 500 frames is written in a tenth of a second."""
 
@@ -60,8 +63,11 @@ class ArchiveHandler(UploadHandler[ArchiveSignal]):
         return is_archive(file.head())
 
     def is_job(self, file: SpooledFile) -> bool:
-        """Always; an archive that breaks a limit is refused before it is queued."""
+        """Always; an archive that breaks a limit, or that holds a trace or packets, is refused before it is queued."""
         count_members(file, self._rules.archives)
+        names = list_names(file, self._rules.archives)
+        if not any(name.lower().endswith(_PICTURE_SUFFIXES) for name in names):
+            _check_holds_frames(file)
         return True
 
     def start(self, upload: Upload) -> StartedArchive:
@@ -71,6 +77,18 @@ class ArchiveHandler(UploadHandler[ArchiveSignal]):
     def match(self, connection: sa.Connection, upload: Upload, signal: ArchiveSignal) -> Decoded:
         """Collect the frames, which were matched as they came."""
         return decoded_frames(signal.frames, signal.codebook_plates, upload.observed_at, signal.notes)
+
+
+def _check_holds_frames(file: SpooledFile) -> None:
+    """Refuse an archive of another kind, which would be decoded to nothing but frames that cannot be read."""
+    kind = guess_kind("upload.zip", file)
+    if kind in (UploadKind.TRACE, UploadKind.PACKETS):
+        raise UnsupportedUpload(
+            f"the archive holds {'a trace' if kind is UploadKind.TRACE else 'packets'} and no frames",
+            field=FIELD,
+            limit="JPEG or PNG frames, where the context has neither trace nor packets",
+            cure=f'add "{kind}": {{}} to the context',
+        )
 
 
 class StartedArchive:

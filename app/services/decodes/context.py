@@ -202,6 +202,8 @@ class DecodeContext:
     vehicle : dict, optional
         Id, name and version of the vehicle, and the source of each member
         (`app.services.fleet.profiles.inherit`).
+    file_name : str, optional
+        Of the uploaded file, for people.
     """
 
     coarse_position: CoarsePosition | None = None
@@ -214,6 +216,7 @@ class DecodeContext:
     packets: dict[str, Any] | None = None
     frames: dict[str, Any] | None = None
     vehicle: dict[str, Any] | None = None
+    file_name: str | None = None
 
     def __post_init__(self) -> None:
         if self.trace is not None and self.packets is not None:
@@ -272,6 +275,7 @@ def context_from_document(document: dict[str, Any]) -> DecodeContext:
         packets=document.get("packets"),
         frames=document.get("frames"),
         vehicle=document.get("vehicle"),
+        file_name=document.get("file_name"),
     )
     if camera is not None:
         setup = CameraSetup(**{**camera, "distortion": tuple(camera.get("distortion", ()))})

@@ -14,6 +14,7 @@ from app.registry import decodes as store
 from app.registry import jobs
 from app.registry.audit import Author
 from app.registry.database import Database
+from app.registry.decodes import DecodeFilter
 from app.registry.jobs import JobKind, new_job
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
@@ -197,13 +198,13 @@ class Decodes:
         return decode_document(row)
 
     def page(
-        self, caller: Caller, *, state: str | None = None, before: str | None = None, limit: int = 100
+        self, caller: Caller, wanted: DecodeFilter | None = None, *, before: str | None = None, limit: int = 100
     ) -> tuple[list[DecodeHead], str | None]:
         """A page of decodes without their results, newest first, and the id to continue before."""
         with self._database.read() as connection:
             rows = store.list_decodes(
-                connection, caller.agency_id,
-                state=state, before=before, limit=limit + 1, holder_id=caller.own_key_id,
+                connection, caller.agency_id, wanted or DecodeFilter(),
+                before=before, limit=limit + 1, holder_id=caller.own_key_id,
             )  # fmt: skip
         page = [decode_head(row) for row in rows[:limit]]
         return page, page[-1]["id"] if len(rows) > limit else None

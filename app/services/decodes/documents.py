@@ -46,6 +46,10 @@ class DecodeLinks(TypedDict):
 
     self: str
     annotated: NotRequired[str]
+    samples: NotRequired[str]
+    packets: NotRequired[str]
+    track: NotRequired[str]
+    readings: NotRequired[str]
     plot: NotRequired[str]
     lane: NotRequired[str]
     overlay: NotRequired[str]
@@ -62,6 +66,8 @@ class DecodeHead(TypedDict):
     created_at: datetime
     finished_at: datetime | None
     context: Annotated[dict[str, JsonValue], Field(description="What was declared of the upload.")]
+    file_name: Annotated[str | None, Field(description="Of the uploaded file, if it had one.")]
+    upload_bytes: Annotated[int | None, Field(description="Size of the upload; null of those of older versions.")]
     error: ErrorDocument | None
     links: DecodeLinks
 
@@ -117,20 +123,35 @@ def decode_head(row: DecodeRow) -> DecodeHead:
         "attempts": row.attempts,
         "created_at": row.created_at,
         "finished_at": row.finished_at,
-        "context": row.context,
+        "context": {name: value for name, value in row.context.items() if name != "file_name"},
+        "file_name": _file_name(row.context),
+        "upload_bytes": row.upload_bytes,
         "error": cast("ErrorDocument | None", row.error),
         "links": _links(f"/v1/decodes/{row.id}", row.kind, row.result or {}),
     }
 
 
+def _file_name(context: Mapping[str, Any]) -> str | None:
+    declared = context.get("trace") or context.get("packets") or {}
+    return context.get("file_name") or declared.get("file_name")
+
+
 def _links(path: str, kind: str, result: Mapping[str, Any]) -> DecodeLinks:
     links: DecodeLinks = {"self": path}
+    frames = [frame["frame"] for frame in result.get("frames", ()) if frame["error"] is None]
     if kind in (DecodeKind.FRAME, DecodeKind.ARCHIVE):
         links["annotated"] = f"{path}/annotated.jpg"
+    elif kind == DecodeKind.VIDEO and frames:
+        links["annotated"] = f"{path}/annotated.jpg?frame={frames[0]}"
     elif kind != DecodeKind.VIDEO:
         links["plot"] = f"{path}/plot.svg"
+    if kind == DecodeKind.TRACE:
+        links["samples"] = f"{path}/samples"
     if kind == DecodeKind.PACKETS:
         links["lane"] = f"{path}/lane.geojson"
+        links["packets"] = f"{path}/packets"
         if result.get("overlay"):
             links["overlay"] = f"{path}/overlay.jpg"
+    if result:
+        links["track"], links["readings"] = f"{path}/track.geojson", f"{path}/readings.geojson"
     return links

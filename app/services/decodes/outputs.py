@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, Literal
 
 from app.errors import NotFound
 from app.formats.archives import read_member
@@ -16,10 +16,13 @@ from app.services.access.access import Caller
 from app.services.decoder_processes import DecoderProcesses
 from app.services.decodes.context import context_from_document
 from app.services.decodes.frame_task import AnnotationTask
+from app.services.decodes.frame_terms import frame_terms
 from app.services.decodes.kinds import DecodeKind
 from app.services.decodes.lane_documents import LaneCollection, lane_geojson, overlay_from_document
 from app.services.decodes.packet_task import OverlayTask
 from app.services.decodes.rules import DecodeRules
+from app.services.decodes.sample_task import VideoFrameTask
+from app.services.decodes.video_handler import video_of
 from app.services.ports import Blobs
 
 
@@ -41,8 +44,10 @@ class DecodeOutputs:
         self._database, self._blobs, self._processes = database, blobs, processes
         self._rules = rules or DecodeRules()
 
-    def annotated(self, caller: Caller, decode_id: str, suffix: str, frame: int = 0) -> bytes:
-        """A frame with its readings drawn over it, encoded as ``png`` or ``jpg``.
+    def annotated(
+        self, caller: Caller, decode_id: str, suffix: Literal["png", "jpg"], frame: int = 0, *, outlined: bool = True
+    ) -> bytes:
+        """A frame, with its readings drawn over it or without, encoded as ``png`` or ``jpg``.
 
         Raises
         ------
@@ -50,14 +55,22 @@ class DecodeOutputs:
             There is no such decode or frame, or it is not done.
         """
         row, result = self._result(caller, decode_id)
-        if row.kind == DecodeKind.VIDEO:
-            raise NotFound(f"decode {decode_id} is of a video: its frames are not kept as pictures", field="decode_id")
         shown = next((entry for entry in result.get("frames", ()) if entry["frame"] == frame), None)
         if shown is None or shown["error"] is not None:
-            raise NotFound(f"decode {decode_id} has no readable frame {frame}", field="frame")
+            raise NotFound(
+                f"decode {decode_id} has no readable frame {frame}",
+                field="frame",
+                cure="`frames` of the decode lists them; of a video, those in which something was found",
+            )
         context = context_from_document(row.context)
-        outlines = tuple(_outline(reading) for reading in result["readings"] if reading["frame"] == frame)
+        readings = result["readings"] if outlined else ()
+        outlines = tuple(_outline(reading) for reading in readings if reading["frame"] == frame)
         with self._upload(row) as file:
+            if row.kind == DecodeKind.VIDEO:
+                video = video_of(context, file, self._rules.archives)
+                rate_hz = frame_terms(context.frames or {}).rate_hz
+                video_task = VideoFrameTask(video, frame, outlines, suffix, self._rules.videos, rate_hz)
+                return self._processes.submit(video_task).result()
             if row.kind == DecodeKind.ARCHIVE:
                 file = SpooledFile.of(read_member(file, frame, self._rules.archives).data)
             task = AnnotationTask(

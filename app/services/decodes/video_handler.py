@@ -12,7 +12,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from app.families.frames import FrameReading, Nearby, distance_to_row
-from app.formats.archives import Member
+from app.formats.archives import ArchiveLimits, Member
 from app.formats.images import ImageHeader, ImageKind
 from app.formats.spooled_file import SpooledFile
 from app.formats.video.archive import holds_video, open_packed_video
@@ -254,6 +254,12 @@ class StartedVideo:
 def _kind_of(context: DecodeContext, file: SpooledFile) -> VideoKind | None:
     is_stream = (context.frames or {}).get("rate_hz") is not None
     return detect_video(file.head(), is_stream=is_stream)
+
+
+def video_of(context: DecodeContext, file: SpooledFile, limits: ArchiveLimits) -> VideoFile:
+    """The video of an upload, which may be in an archive."""
+    kind = _kind_of(context, file)
+    return open_packed_video(file, limits).video if kind is None else VideoFile(file, kind)
 
 
 def _header(width_px: int, height_px: int) -> ImageHeader:

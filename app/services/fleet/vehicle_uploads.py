@@ -164,11 +164,12 @@ def _check_sections(vehicle: VehicleRow, given: ContextInput, kind: str) -> None
 
 
 def _named(context: DecodeContext, name: str) -> DecodeContext:
-    """A trace's or a packet log's context with the name of its file: its suffix distinguishes kinds of text files."""
+    """A context with the name of its file; the suffix of a trace or packet log distinguishes kinds of text files."""
     if not name:
         return context
     if context.trace is not None:
         return replace(context, trace={**context.trace, "file_name": name[:120]})
     if context.packets is not None:
         return replace(context, packets={**context.packets, "file_name": name[:120]})
-    return context
+    shown = "".join(sign for sign in name if sign.isprintable())[:120]
+    return replace(context, file_name=shown or None)

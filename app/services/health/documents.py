@@ -16,7 +16,7 @@ from app.services.documents import document_of
 ItemStatus = Literal["open", "approved", "dismissed"]
 Outcome = Literal["suspect", "retired", "resurvey", "none"]
 What = Literal[
-    "missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "wrong-way-driver"
+    "missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "wrong-way-driver", "reported"
 ]  # fmt: skip
 
 
@@ -28,8 +28,16 @@ class UploadLink(TypedDict):
     picture: str
 
 
+class ReportLink(TypedDict):
+    """A damage report that was accepted into an item."""
+
+    report_id: str
+    kind: str
+    at: datetime
+
+
 class ItemEvidence(TypedDict):
-    """Why a fault is suspected.
+    """Why a fault is suspected. An item that people reported has `reports` instead of figures.
 
     The likelihood ratio has passed the limit, both as natural logarithms. A healthy marker reaches this ratio with
     `false_alarm_probability` at most. `offset_m` is the estimated displacement of a marker that has moved;
@@ -45,6 +53,7 @@ class ItemEvidence(TypedDict):
     elsewhere_lon_deg: NotRequired[float]
     elsewhere_lat_deg: NotRequired[float]
     uploads: list[UploadLink]
+    reports: NotRequired[list[ReportLink]]
 
 
 class MaintenanceItem(TypedDict):

@@ -11,7 +11,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from app.families.rules import RETIRED
-from app.health import Fault, Verdict
+from app.health import Fault, MarkerState, Verdict
 from app.health.priority import item_priority
 from app.registry import health as store
 from app.registry import maintenance
@@ -25,6 +25,10 @@ from app.registry.markers import get_marker
 WRONG_WAY_DRIVER = "wrong-way-driver"
 OPENED, DECIDED = "maintenance.opened", "maintenance.decided"
 """Kinds of events."""
+REPORTED = "reported"
+"""What an item is that people reported, not a test."""
+MAX_REPORTS = 20
+"""Reports that an item lists. Source: as `app.services.public_pages.reports.MAX_NEW_OF_MARKER`."""
 WRONG_WAY_EVENT = "maintenance.wrong-way-driver"
 MAX_UPLOADS = 5
 """Uploads that an item links to. Source: chosen by hand, what a person looks at."""
@@ -114,8 +118,42 @@ def _open_wrong_way(
     add_event(connection, agency_id, WRONG_WAY_EVENT, subject_id=row.id, at=now, detail=_event_detail(row))
 
 
+def open_reported_item(
+    connection: sa.Connection, agency_id: str, marker: MarkerRow, report_id: str, kind: str, at: datetime, now: datetime
+) -> ItemRow:
+    """Open an item for a damage report that was accepted, or add the report to the one that is open.
+
+    Parameters
+    ----------
+    kind : str
+        Of damage, which decides the priority.
+    at : datetime
+        When the report was sent.
+    """
+    known = maintenance.find_open(connection, agency_id, marker.id, REPORTED)
+    stored = store.find_marker_health(connection, agency_id, marker.id)
+    month_passes = 0.0 if stored is None else MarkerState.from_document(stored.state).month_passes
+    priority = item_priority(kind, acted_on=_is_acted_on(marker), ratio=0.0, limit=0.0, month_passes=month_passes)
+    reports = [{"report_id": report_id, "kind": kind, "at": at.isoformat()}]
+    if known is not None:
+        reports = [*known.evidence["reports"], *reports][-MAX_REPORTS:]
+        changes = {
+            "priority": max(priority, known.priority), "first_at": min(at, known.first_at),
+            "last_at": max(at, known.last_at), "evidence": {"uploads": [], "reports": reports}, "updated_at": now,
+        }  # fmt: skip
+        return maintenance.change_item(connection, agency_id, known, changes)
+    figures = {
+        "priority": priority, "ratio": 0.0, "vehicles": 0, "passes": 0, "first_at": at, "last_at": at,
+        "evidence": {"uploads": [], "reports": reports},
+    }  # fmt: skip
+    row = _new_item(marker.id, None, REPORTED, marker, None, figures, now)
+    maintenance.add_item(connection, agency_id, row)
+    add_event(connection, agency_id, OPENED, subject_id=row.id, at=now, detail=_event_detail(row))
+    return row
+
+
 def _new_item(
-    subject: str, decode_id: str, what: str, marker: MarkerRow | None, reading: NewUnregistered | None,
+    subject: str, decode_id: str | None, what: str, marker: MarkerRow | None, reading: NewUnregistered | None,
     figures: dict[str, Any], now: datetime,
 ) -> ItemRow:  # fmt: skip
     place = marker if marker is not None else reading
@@ -200,8 +238,8 @@ def _event_detail(row: ItemRow) -> dict[str, Any]:
 
 
 def fault_of(row: ItemRow) -> Fault | None:
-    """The fault whose test an item is of; None for a driver on the wrong way."""
-    return None if row.what == WRONG_WAY_DRIVER else Fault(row.what)
+    """The fault whose test an item is of; None for a driver on the wrong way, and for what people reported."""
+    return None if row.what in (WRONG_WAY_DRIVER, REPORTED) else Fault(row.what)
 
 
 def decided_event(connection: sa.Connection, agency_id: str, row: ItemRow, now: datetime) -> None:

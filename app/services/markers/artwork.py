@@ -16,6 +16,7 @@ from app.encoders.plate import (
     write_artwork,
     write_bundle,
 )
+from app.encoders.plate.bundle import NO_QR_CODE
 from app.encoders.plate.formats import DEFAULT_DPI
 from app.errors import NotFound, Unavailable
 from app.families import FAMILIES, get_family
@@ -40,6 +41,7 @@ class Artwork:
     media_type: str
     file_name: str
     proof: ArtworkProof
+    qr_code: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,7 @@ class Bundle:
     plates: int
     approximate: int
     lowest_confidence: float
+    qr_code: str
 
 
 class Artworks:
@@ -60,7 +63,7 @@ class Artworks:
     ----------
     database : Database
     public_url : str
-        Where the registry's records are reached; goes into the QR codes.
+        Start of the addresses of public pages, which go into the QR codes; empty: there are no QR codes.
     read : callable
         Decoder of the self-proof.
     """
@@ -70,6 +73,7 @@ class Artworks:
         self._public_url = public_url
         self._read = read
         self._places = threading.BoundedSemaphore(_BUNDLES_AT_ONCE)
+        self.qr_code = qr_code_header(public_url)
 
     def tag(
         self, caller: Caller, marker_id: str, form: ArtworkFormat, options: ArtworkOptions, dpi: float = DEFAULT_DPI
@@ -98,10 +102,10 @@ class Artworks:
             The drawing did not read back as its own code.
         """
         row, artwork = self._get(caller, marker_id)
-        drawing = artwork.draw(row, options, record_url=self._record_url(row))
+        drawing = artwork.draw(row, options, record_url=page_url(self._public_url, row.id))
         proof = artwork.prove(row, drawing, self._read)
         written = write_artwork(drawing, form, dpi=dpi)
-        return Artwork(written.content, written.media_type, f"{row.id}-r{row.version}.{form}", proof)
+        return Artwork(written.content, written.media_type, f"{row.id}-r{row.version}.{form}", proof, self.qr_code)
 
     def bundle(self, caller: Caller, selection: Selection, options: BundleOptions) -> Bundle:
         """Artwork of a selection in one ZIP, every plate proved.
@@ -122,7 +126,10 @@ class Artworks:
         file = tempfile.TemporaryFile(prefix="waymark-artwork-")  # noqa: SIM115 - the response reads it
         try:
             manifest = write_bundle(
-                [plate_order(row, self._record_url(row)) for row in rows], file, options=options, read=self._read
+                [plate_order(row, page_url(self._public_url, row.id)) for row in rows],
+                file,
+                options=options,
+                read=self._read,
             )
         except BaseException:
             file.close()
@@ -131,7 +138,9 @@ class Artworks:
             self._places.release()
         size = file.tell()
         file.seek(0)
-        return Bundle(file, size, len(rows), sum(is_unfit(row) for row in rows), _lowest_confidence(manifest))
+        return Bundle(
+            file, size, len(rows), sum(is_unfit(row) for row in rows), _lowest_confidence(manifest), self.qr_code
+        )
 
     def _get(self, caller: Caller, marker_id: str) -> tuple[MarkerRow, MarkerArtwork]:
         with self._database.read() as connection:
@@ -145,8 +154,15 @@ class Artworks:
             )
         return row, family.artwork
 
-    def _record_url(self, row: MarkerRow) -> str:
-        return f"{self._public_url}/v1/markers/{row.id}"
+
+def page_url(public_url: str, marker_id: str) -> str:
+    """Address of a marker's public page, as QR codes contain it; empty if the server has no public address."""
+    return f"{public_url}/m/{marker_id}" if public_url else ""
+
+
+def qr_code_header(public_url: str) -> str:
+    """Value of the header Waymark-QR-Code of artwork."""
+    return "public-page" if public_url else f'none; reason="{NO_QR_CODE}"'
 
 
 def _lowest_confidence(manifest: dict[str, Any]) -> float:

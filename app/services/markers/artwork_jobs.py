@@ -25,7 +25,7 @@ from app.services.access.access import Caller
 from app.services.decoder_processes import DecoderProcesses
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
-from app.services.markers.artwork import MAX_PLATES
+from app.services.markers.artwork import MAX_PLATES, page_url, qr_code_header
 from app.services.markers.artwork_tasks import DrawPlateTask, WriteSheetsTask
 from app.services.markers.selection import Selection, select_markers
 from app.services.plans.fan_out import WAIT_S, tasks_in_order
@@ -45,7 +45,7 @@ class ArtworkJobs:
     database, clock, processes, queue
     files : JobFiles
     public_url : str
-        Where the registry's records are reached; goes into the QR codes.
+        Start of the addresses of public pages, which go into the QR codes; empty: there are no QR codes.
     in_flight : int
         Plates that are drawn at the same time.
     idempotency_ttl : timedelta
@@ -94,7 +94,7 @@ class ArtworkJobs:
         selection = Selection(tuple(job.row.input["marker_ids"]))
         with self._database.read() as connection:
             rows = select_markers(connection, job.row.agency_id, selection, PLATE.name, most=MAX_PLATES)
-        orders = tuple(plate_order(row, f"{self._public_url}/v1/markers/{row.id}") for row in rows)
+        orders = tuple(plate_order(row, page_url(self._public_url, row.id)) for row in rows)
         tasks = (DrawPlateTask(*one, options) for one in zip(orders, plate_names(orders), strict=True))
         total, plates = len(orders), []
         job.report_progress(0.0, steps=(0, total))
@@ -114,7 +114,10 @@ class ArtworkJobs:
                 manifest = bundle_manifest(plates, list(packer.entries), options, proved=True)
                 packer.add("manifest.json", orjson.dumps(manifest, option=orjson.OPT_INDENT_2))
             lowest = min(plate["proof"]["confidence"] for plate in plates)
-            headers = {"Waymark-Proof": f"read-back plates={total} lowest-confidence={lowest:.6f}"}
+            headers = {
+                "Waymark-Proof": f"read-back plates={total} lowest-confidence={lowest:.6f}",
+                "Waymark-QR-Code": qr_code_header(self._public_url),
+            }
             if approximate := sum(is_unfit(row) for row in rows):
                 headers["Waymark-Note"] = (
                     f"{approximate} of {total} plates have a position that is not for localization"

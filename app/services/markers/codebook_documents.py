@@ -7,7 +7,8 @@ from typing import Any
 
 from typing_extensions import TypedDict
 
-from app.encoders.magnet import CodebookRules, codebook_capacity
+from app.encoders.magnet import CodebookRules, fitting_codes
+from app.errors import naming
 from app.families.magnet.documents import MeaningDocument, meaning_document
 from app.markers.magnet import InformationTag
 from app.markers.magnet_codebook import Codebook, Meaning
@@ -94,6 +95,22 @@ class CodebookDocument(CodebookSummary):
     entries: list[EntryDocument]
 
 
+class CodeDocument(TypedDict):
+    """A code."""
+
+    code: str
+    tuple: str
+
+
+class CodebookDraftDocument(TypedDict):
+    """A codebook that is not made yet. `codes` are those that fit, in the order of their assignment, up to 200."""
+
+    design: DesignDocument
+    rules: RulesDocument
+    figures: FiguresDocument
+    codes: list[CodeDocument]
+
+
 class CodebookPage(TypedDict):
     """A page of codebooks; the Link header leads to the next one."""
 
@@ -139,9 +156,30 @@ def rules_columns(rules: CodebookRules) -> RulesDocument:
     }
 
 
+def codebook_draft(design: TagDesign, rules: CodebookRules) -> CodebookDraftDocument:
+    """A codebook that is not made yet, with the codes that its first meanings would get.
+
+    Raises
+    ------
+    InvalidParameter
+        The rules cannot be met by any tag of this design.
+    """
+    with naming("rules"):
+        codes = fitting_codes(design, rules, max_count=MAX_COUNTED)
+    return {
+        "design": document_of(DesignDocument, design),
+        "rules": rules_columns(rules),
+        "figures": _figures(design, rules, len(codes)),
+        "codes": [{"code": tag.text, "tuple": tag.tuple_text} for tag in codes],
+    }
+
+
 def design_figures(design: TagDesign, rules: CodebookRules) -> FiguresDocument:
     """How many codes a design has, how many fit the rules, and how many can be distinguished when all are used."""
-    fitting = codebook_capacity(design, rules, max_count=MAX_COUNTED)
+    return _figures(design, rules, len(fitting_codes(design, rules, max_count=MAX_COUNTED)))
+
+
+def _figures(design: TagDesign, rules: CodebookRules, fitting: int) -> FiguresDocument:
     apart = distinguishable(design, rules.conditions, accuracy=_ACCURACY)
     return {
         "ideal_capacity": design.ideal_capacity,

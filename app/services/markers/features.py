@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import islice
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import orjson
 import shapely
@@ -17,6 +17,7 @@ import sqlalchemy as sa
 from app.errors import NotFound
 from app.families import FAMILIES
 from app.registry import features as store
+from app.registry.audit import find_head
 from app.registry.conditions import holds, pinned_values
 from app.registry.database import Database
 from app.registry.features import FIELDS, ON_ROAD, RETIRED, Extent, FeatureFilter, FeatureTable, Field
@@ -24,14 +25,17 @@ from app.registry.lines import LINE_FIELDS, Line, find_line, read_lines
 from app.registry.maintenance import ITEM_FIELDS, MAINTENANCE
 from app.registry.plan_features import LANE_FIELDS, PLAN_FIELDS, PLANNED, AlignmentLanes
 from app.registry.spatial import Box
+from app.registry.tile_groups import COARSE_ZOOM, GROUPED_ZOOM, MAX_SINGLE, FeatureGrid, read_grid
 from app.registry.tiles import Tile, feature_tile
 from app.services.access.access import Caller
 from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
 from app.services.ports import Clock
 
-_EXTENT_AGE = timedelta(seconds=60)
+_KEPT_FOR, _KEPT_UNCHANGED_FOR = timedelta(seconds=60), timedelta(hours=1)
 _MAX_EXTENTS = 4096
+_MAX_GRIDS = 64  # of some MB
 Answer = TypeVar("Answer")
+Kept = TypeVar("Kept")
 
 
 class LineReader(Protocol):
@@ -76,7 +80,10 @@ class MarkerLines:
 
 @dataclass(frozen=True, slots=True)
 class Collection:
-    """A set of features that clients list as a layer: points of a table, or lines of a reader."""
+    """A set of features that clients list as a layer: points of a table, or lines of a reader.
+
+    `is_audited`: each change of them has an entry in the audit log.
+    """
 
     id: str
     title: str
@@ -87,6 +94,7 @@ class Collection:
     filters: tuple[str, ...] = tuple(field.name for field in FIELDS if field.kind != "date-time")
     table: FeatureTable = ON_ROAD
     lines: LineReader | None = None
+    is_audited: bool = False
 
     @property
     def has_tiles(self) -> bool:
@@ -100,9 +108,15 @@ MARKERS = Collection(
     f"{', '.join(family.title for family in FAMILIES)} that are on the road or planned: one point each.",
     "Point",
     editable=True,
+    is_audited=True,
 )
 RETIRED_MARKERS = Collection(
-    "retired_markers", "Retired markers", "Markers that are out of use: one point each.", "Point", table=RETIRED
+    "retired_markers",
+    "Retired markers",
+    "Markers that are out of use: one point each.",
+    "Point",
+    table=RETIRED,
+    is_audited=True,
 )
 LINES = Collection(
     "marker_lines",
@@ -112,6 +126,7 @@ LINES = Collection(
     fields=LINE_FIELDS,
     filters=("family", "side", "road", "status"),
     lines=MarkerLines(),
+    is_audited=True,
 )
 ALIGNMENTS = Collection(
     "alignments",
@@ -172,14 +187,61 @@ def get_collection(collection_id: str) -> Collection:
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class _Overview(Generic[Kept]):
+    """What all features of a collection gave, when, and the number of the agency's newest audit entry before."""
+
+    value: Kept
+    at: datetime
+    audit_number: int
+
+
+class _Overviews(Generic[Kept]):
+    """What takes a pass over all features, kept for a minute, and for an hour while no marker changes."""
+
+    def __init__(self, database: Database, clock: Clock, most: int) -> None:
+        self._database = database
+        self._clock = clock
+        self._most = most
+        self._finding: dict[tuple[str, str], threading.Lock] = {}
+        self._kept: dict[tuple[str, str], _Overview[Kept]] = {}
+        self._lock = threading.Lock()
+
+    def get(self, caller: Caller, collection: Collection, find: Callable[[], Kept]) -> Kept:
+        """What is kept, or what is found now."""
+        key = (caller.agency_id, collection.id)
+        with self._lock:
+            finding = self._finding.setdefault(key, threading.Lock())
+        with finding:  # a map asks for several tiles at once: the first request finds it, the others wait
+            now = self._clock()
+            with self._lock:
+                known = self._kept.get(key)
+            if known is not None and timedelta() <= now - known.at < _KEPT_FOR:
+                return known.value
+            number = self._audit_number(caller)
+            unchanged = known is not None and collection.is_audited and number == known.audit_number
+            if known is not None and unchanged and timedelta() <= now - known.at < _KEPT_UNCHANGED_FOR:
+                return known.value
+            value = find()
+            with self._lock:
+                if len(self._kept) >= self._most:
+                    self._kept.clear()
+                self._kept[key] = _Overview(value, now, number)
+        return value
+
+    def _audit_number(self, caller: Caller) -> int:
+        head = self._database.ask(lambda connection: find_head(connection, caller.agency_id))
+        return 0 if head is None else head.number
+
+
 class Features:
     """Reading features, one transaction each."""
 
     def __init__(self, database: Database, clock: Clock) -> None:
         self._database = database
         self._clock = clock
-        self._extents: dict[tuple[str, str], tuple[datetime, Extent | None]] = {}
-        self._lock = threading.Lock()
+        self._extents = _Overviews[Extent | None](database, clock, _MAX_EXTENTS)
+        self._grids = _Overviews[FeatureGrid](database, clock, _MAX_GRIDS)
 
     def page(
         self,
@@ -288,23 +350,40 @@ class Features:
         table = collection.table
         return self._ask(table, lambda c: feature_tile(c, caller.agency_id, tile, table, layer=collection.id))
 
+    def grouped_tile(self, caller: Caller, collection: Collection, tile: Tile) -> bytes:
+        """A vector tile with groups in place of too many features, as they were within the last minute.
+
+        There is no margin around it, so that no feature is on two tiles.
+        """
+        table = collection.table
+        if tile.zoom <= GROUPED_ZOOM:
+            grid = self._grid(caller, collection)
+            if grid.count_on(tile) > MAX_SINGLE:
+                if tile.zoom > COARSE_ZOOM:
+                    grid = self._ask(table, lambda c: read_grid(c, caller.agency_id, table, zoom=tile.zoom, on=tile))
+                return grid.write(tile, f"{collection.id}_groups")
+        return self._ask(
+            table, lambda c: feature_tile(c, caller.agency_id, tile, table, layer=collection.id, margin_px=0)
+        )
+
+    def _grid(self, caller: Caller, collection: Collection) -> FeatureGrid:
+        def count() -> FeatureGrid:
+            return self._ask(
+                collection.table, lambda c: read_grid(c, caller.agency_id, collection.table, zoom=COARSE_ZOOM)
+            )
+
+        return self._grids.get(caller, collection, count)
+
     def extent(self, caller: Caller, collection: Collection) -> Extent | None:
         """What the agency's features cover, as it was within the last minute."""
-        key, now = (caller.agency_id, collection.id), self._clock()
-        with self._lock:
-            known = self._extents.get(key)
-        if known is not None and timedelta() <= now - known[0] < _EXTENT_AGE:
-            return known[1]
-        with self._database.read() as connection:
-            if collection.lines is not None:
-                extent = collection.lines.extent(connection, caller.agency_id)
-            else:
-                extent = store.find_extent(connection, caller.agency_id, collection.table)
-        with self._lock:
-            if len(self._extents) >= _MAX_EXTENTS:
-                self._extents.clear()
-            self._extents[key] = (now, extent)
-        return extent
+
+        def find() -> Extent | None:
+            with self._database.read() as connection:
+                if collection.lines is not None:
+                    return collection.lines.extent(connection, caller.agency_id)
+                return store.find_extent(connection, caller.agency_id, collection.table)
+
+        return self._extents.get(caller, collection, find)
 
     def _ask(self, table: FeatureTable, question: Callable[[sa.Connection], Answer]) -> Answer:
         """The result of a question; one about plans takes two statements, which see the same snapshot."""

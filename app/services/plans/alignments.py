@@ -28,8 +28,8 @@ from app.services.access.audit import log_change
 from app.services.decoder_processes import DecoderProcesses
 from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
-from app.services.plans.documents import AlignmentDocument, AlignmentPage
-from app.services.plans.tasks import MapForm, RoadFile, SummarizeRoadTask, WriteMapTask
+from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile
+from app.services.plans.tasks import MapForm, ProfileRoadTask, RoadFile, SummarizeRoadTask, WriteMapTask
 from app.services.ports import Blobs, Clock
 from app.services.staged_blobs import staged
 
@@ -164,6 +164,20 @@ class Alignments:
             )
         with self._blobs.opened(row.source_key) as file:
             task = WriteMapTask(road_of(row, file, self._accuracy_m), form, tuple(found), within_m)
+            return self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
+
+    def profile(self, caller: Caller, alignment_id: str, samples: int) -> AlignmentProfile:
+        """The lanes of an alignment to draw, with at most so many samples each.
+
+        Raises
+        ------
+        NotFound
+            There is no such alignment.
+        """
+        with self._database.read() as connection:
+            row = ALIGNMENTS.get(connection, caller.agency_id, alignment_id)
+        with self._blobs.opened(row.source_key) as file:
+            task = ProfileRoadTask(road_of(row, file, self._accuracy_m), samples)
             return self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
 
     def get(self, caller: Caller, alignment_id: str) -> AlignmentDocument:

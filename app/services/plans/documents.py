@@ -67,6 +67,49 @@ class AlignmentDocument(RoadSummary):
     updated_at: datetime
 
 
+class LaneProfile(TypedDict):
+    """A lane along its way; the lists without `line` have one value for each of its samples."""
+
+    name: str
+    road: str
+    length_m: float
+    left_style: str
+    right_style: str
+    line: list[list[float]]
+    """Centre line as longitude and latitude, within 2 cm. [deg]"""
+    chainage_m: list[float]
+    station_m: list[float]
+    """As signs and drawings show it, after the station equations. [m]"""
+    curvature_per_m: list[float]
+    """The greatest between the neighbouring samples, left positive. [1/m]"""
+    grade: list[float]
+    design_speed_kmh: list[float] | None
+    lon_deg: list[float]
+    lat_deg: list[float]
+
+
+class ProfileEvent(EventSummary):
+    """An event with its position."""
+
+    lon_deg: float
+    lat_deg: float
+
+
+class ProfileArea(TypedDict):
+    """An area in which nothing is installed."""
+
+    kind: str
+    ring_deg: list[list[float]]
+
+
+class AlignmentProfile(TypedDict):
+    """The lanes of an alignment to draw: their lines, stations and curvature."""
+
+    lanes: list[LaneProfile]
+    events: list[ProfileEvent]
+    areas: list[ProfileArea]
+
+
 class AlignmentPage(TypedDict):
     """A page of alignments."""
 
@@ -125,6 +168,32 @@ class CheckFigure(TypedDict):
     limit: float
     unit: str
     verdict: str
+
+
+class PreviewedMarker(TypedDict):
+    """A marker that would be placed."""
+
+    number: int
+    family: str
+    purpose: str
+    lane: str
+    chainage_m: float
+    station_m: float
+    offset_m: float
+    lon_deg: float
+    lat_deg: float
+
+
+class PlanPreview(PlanSummary):
+    """What rules would place, what the checks find, and what it costs. Nothing is stored, no code is assigned."""
+
+    markers: list[PreviewedMarker]
+
+
+class ReadRules(TypedDict):
+    """Rules of a file, as plans take them: what the file leaves out is left out."""
+
+    rules: dict[str, Any]
 
 
 class PlanOverview(TypedDict):

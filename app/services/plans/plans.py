@@ -121,7 +121,7 @@ class Plans:
             return earlier, True
         with self._database.read() as connection:
             PLANS.check_name(connection, agency_id, name)
-        made = self._made(caller, name, alignment_id, rules)
+        made = self.place(caller, name, alignment_id, rules)
         if job is not None:
             job.report_progress(PLACED)
         with staged(self._blobs) as stage:
@@ -195,7 +195,7 @@ class Plans:
         row = self._get(caller, plan_id)
         _check_status(row, (DRAFT, CHECKED, PROVED, APPROVED), "changed", "make another plan on the same alignment")
         name, rules = change.values.get("name", row.name), change.values.get("rules", row.rules)
-        made = self._made(caller, name, row.alignment_id, rules) if "rules" in change.values else None
+        made = self.place(caller, name, row.alignment_id, rules) if "rules" in change.values else None
         now, agency_id = self._clock(), caller.agency_id
         with staged(self._blobs) as stage:
             changes: dict[str, Any] = {"name": name}
@@ -310,14 +310,14 @@ class Plans:
         task = CompareTask(self._blobs.get(row.document_key), tuple(built), existing)
         return self._processes.submit(task, wait_s=BUSY_WAIT_S).result()
 
-    # --- steps ------------------------------------------------------------------------------------------------------
+    def place(self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any]) -> MadePlan:
+        """A plan with codes that no stored marker has, placed and checked; nothing is stored.
 
-    def _get(self, caller: Caller, plan_id: str) -> PlanRow:
-        with self._database.read() as connection:
-            return PLANS.get(connection, caller.agency_id, plan_id)
-
-    def _made(self, caller: Caller, name: str, alignment_id: str, rules: dict[str, Any]) -> MadePlan:
-        """The plan, with codes that no stored marker has."""
+        Raises
+        ------
+        NotFound, InvalidParameter, Conflict
+            As `make`.
+        """
         with self._database.read() as connection:
             row = ALIGNMENTS.get(connection, caller.agency_id, alignment_id)
             existing = self._existing(connection, caller, row.summary["extent_deg"])
@@ -334,6 +334,12 @@ class Plans:
                     return made
                 taken |= found
         raise Conflict("no unused registry numbers were found", field="rules", cure="try again, or name the plan anew")
+
+    # --- steps ------------------------------------------------------------------------------------------------------
+
+    def _get(self, caller: Caller, plan_id: str) -> PlanRow:
+        with self._database.read() as connection:
+            return PLANS.get(connection, caller.agency_id, plan_id)
 
     def _existing(
         self, connection: sa.Connection, caller: Caller, extent_deg: list[float]

@@ -12,7 +12,7 @@ from app.registry.columns import Columns
 from app.registry.marker_rows import MarkerRow
 from app.registry.plans import BuiltRow
 from app.services.decoder_processes import Task
-from app.services.plans.documents import AsBuiltDocument
+from app.services.plans.documents import AlignmentProfile, AsBuiltDocument
 from app.services.plans.features import LaneFeature
 
 
@@ -40,6 +40,14 @@ class SummarizeRoadTask(Task[SummarizedRoad]):
     """A road to read: its lanes, events, warnings and extent."""
 
     road: RoadFile
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileRoadTask(Task[AlignmentProfile]):
+    """A road to draw: its lanes with at most so many samples each."""
+
+    road: RoadFile
+    samples: int
 
 
 MapForm = Literal["osm", "xodr"]

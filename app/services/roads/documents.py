@@ -15,6 +15,7 @@ from app.services.documents import document_of
 from app.services.roads.routes import Route, is_ambiguous, route_of
 
 _SAME_PLACE_DEG = 1e-9
+_SAME_CHAINAGE_M = 1e-6
 
 
 class RoadSummary(TypedDict):
@@ -43,7 +44,9 @@ class RoadGeometry(TypedDict):
 
 
 class Station(StoredStation):
-    """A calibration point on the axis."""
+    """A calibration point on the axis; `vertex` counts within its part, and is null between vertices."""
+
+    vertex: int | None
 
 
 class Section(TypedDict):
@@ -177,15 +180,22 @@ class RoadPlacedMany(OnRoad):
 def road_document(row: RoadRow) -> RoadDocument:
     """A road with its geometry and its calibration."""
     several = row.given["several"] or len(row.parts) > 1
+    route = route_of(row)
     return {
         **road_summary(row),
         "geometry": {
             "type": "MultiLineString" if several else "LineString",
             "coordinates": row.parts if several else row.parts[0],
         },
-        "calibration": [{**point} for point in row.calibration],
-        "sections": sections(route_of(row)),
+        "calibration": [{**point, "vertex": _vertex_of(route, point)} for point in row.calibration],
+        "sections": sections(route),
     }
+
+
+def _vertex_of(route: Route, point: StoredStation) -> int | None:
+    vertices_m = route.axis.vertex_chainages_m[point["part"]]
+    nearest = int(np.argmin(np.abs(vertices_m - point["chainage_m"])))
+    return nearest if abs(vertices_m[nearest] - point["chainage_m"]) < _SAME_CHAINAGE_M else None
 
 
 def road_summary(row: RoadRow | RoadSummaryRow) -> RoadSummary:

@@ -15,6 +15,7 @@ from app.roads.measures import CalibrationPoint
 
 _REACH_M = 50.0
 _AMBIGUOUS_M = 1.0
+_ROUNDING_M = 0.001  # of chainages that a form shows
 
 Point = tuple[float, float]
 
@@ -42,13 +43,14 @@ class LinesInput:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationInput:
-    """A place with a known measure: a vertex of a part, or a position beside the axis in the road's CRS."""
+    """A place with a known measure: a vertex of a part, a position beside the axis in the road's CRS, or a chainage."""
 
     measure_m: float
     ahead_m: float | None = None
     part: int = 0
     vertex: int | None = None
     position: Point | None = None
+    chainage_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,13 +111,15 @@ def _feet(
 
 
 def _settled(axis: Axis, point: CalibrationInput, feet: list[Foot], field: str) -> CalibrationPoint:
-    if (point.vertex is None) == (point.position is None):
+    if [point.vertex, point.position, point.chainage_m].count(None) != 2:
         raise InvalidParameter(
-            "a calibration point is a vertex or a position",
+            "a calibration point is a vertex, a position or a chainage",
             field=field,
-            limit="vertex (and part), or position",
-            cure="send one of the two",
+            limit="vertex, position or chainage_m",
+            cure="send one of the three",
         )
+    if point.chainage_m is not None:
+        return _at_chainage(axis, point, point.chainage_m, field)
     if point.vertex is not None:
         vertices_m = axis.vertex_chainages_m
         if point.part >= len(vertices_m) or point.vertex >= len(vertices_m[point.part]):
@@ -142,6 +146,21 @@ def _settled(axis: Axis, point: CalibrationInput, feet: list[Foot], field: str) 
             cure="give the vertex instead",
         )
     return CalibrationPoint(feet[0].part, feet[0].chainage_m, point.measure_m, point.ahead_m)
+
+
+def _at_chainage(axis: Axis, point: CalibrationInput, chainage_m: float, field: str) -> CalibrationPoint:
+    """The place at a chainage, in the part that was named: where parts touch, both have the chainage."""
+    ranges_m = axis.part_ranges_m
+    for start_m, end_m in ranges_m[point.part : point.part + 1]:
+        if start_m - _ROUNDING_M <= chainage_m <= end_m + _ROUNDING_M:
+            return CalibrationPoint(point.part, min(max(chainage_m, start_m), end_m), point.measure_m, point.ahead_m)
+    parts = ", ".join(f"{start:.3f} to {end:.3f}" for start, end in ranges_m[:20])
+    raise InvalidParameter(
+        f"the chainage {chainage_m:g} m is not on part {point.part}",
+        field=f"{field}.chainage_m",
+        limit=f"along the axis, part by part: {parts} m",
+        cure="give the distance along the axis from its start, and its part, from 0",
+    )
 
 
 def _placed(

@@ -9,10 +9,10 @@ from app.errors import naming
 from app.families import FAMILIES
 from app.formats.spooled_file import SpooledFile
 from app.formats.surveys.declaration import ControlPoint, ImportDeclaration, LocalGrid
-from app.services.surveys.imports import ImportInput
+from app.services.surveys.import_report import ImportInput
 
 _SURVEYS = {family.name: family.survey for family in FAMILIES if family.survey is not None}
-_NOT_OF_THE_SURVEY = {"dry_run", "mode", "reason", "warnings"}.union(
+_NOT_OF_THE_SURVEY = {"dry_run", "mode", "reason", "warnings", "list_rows"}.union(
     *(s.members.model_fields for s in _SURVEYS.values())
 )
 
@@ -35,6 +35,7 @@ def import_input(declared: Mapping[str, Any], file: SpooledFile) -> ImportInput:
     values = {name: value for name, value in declared.items() if name not in _NOT_OF_THE_SURVEY}
     for name in ("area_deg", "height_range_m"):
         values[name] = tuple(values[name]) if values[name] is not None else None
+    values["leave_out"] = tuple(values.get("leave_out", ()))
     with naming("declaration"):
         if (grid := values["local_grid"]) is not None:
             points = tuple(ControlPoint(**point) for point in grid["control_points"])
@@ -42,7 +43,10 @@ def import_input(declared: Mapping[str, Any], file: SpooledFile) -> ImportInput:
         defaults = _defaults(declared)
         declaration = ImportDeclaration(**values)
     strict = declared["warnings"] == "refuse"
-    return ImportInput(file, declaration, defaults, declared["dry_run"], declared["mode"], declared["reason"], strict)
+    rows = declared.get("list_rows", 0)
+    return ImportInput(
+        file, declaration, defaults, declared["dry_run"], declared["mode"], declared["reason"], strict, rows
+    )
 
 
 def _defaults(declared: Mapping[str, Any]) -> Any:

@@ -7,10 +7,10 @@ from datetime import datetime
 from typing import Annotated, Literal, cast
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, JsonValue
 from typing_extensions import TypedDict
 
-from app.formats.surveys.table import Detected, Fault
+from app.formats.surveys.table import Change, Detected, Fault
 from app.plots.residual_map import draw_residuals
 from app.registry.jobs import JobRow, JobState
 from app.registry.marker_rows import MarkerRow
@@ -25,6 +25,7 @@ _MAX_TEXT_BYTES, _MAX_FIELD_BYTES = 320, 120  # source: a report of a thousand f
 MAX_RESIDUALS = 1000
 """Rows of a comparison that a report has the residuals of. Chosen by hand."""
 Outcome = Literal["checked", "stored", "refused"]
+RowState = Literal["good", "warning", "refused", "left-out"]
 
 
 class FaultDocument(TypedDict):
@@ -36,6 +37,22 @@ class FaultDocument(TypedDict):
     message: str
     proposal: str | None
     severity: Literal["refused", "warning"]
+    changes: Annotated[
+        dict[str, JsonValue] | None,
+        Field(description="The correction, where it is one of the declaration: JSON to merge into it (RFC 7396)."),
+    ]
+
+
+class SurveyRow(TypedDict):
+    """A row with its position in WGS 84; null where it has none."""
+
+    row: int
+    state: RowState
+    point: str | None
+    code: str | None
+    lon_deg: float | None
+    lat_deg: float | None
+    height_m: Annotated[float | None, Field(description="Above the declared vertical datum.")]
 
 
 class DetectedDocument(TypedDict):
@@ -83,12 +100,14 @@ class ImportReport(TypedDict):
     good_rows: int
     refused_rows: int
     warned_rows: int
+    left_out_rows: int
     stored: int
     extent_deg: Annotated[list[float] | None, Field(description="West, south, east, north.")]
     counts: Annotated[dict[str, int], Field(description="Faults by code.")]
     comparison: ComparisonDocument | None
     faults: Annotated[list[FaultDocument], Field(description="The first thousand, refusals first.")]
     faults_left_out: int
+    listed: Annotated[list[SurveyRow], Field(description="As many rows as `list_rows` asks for.")]
 
 
 class ImportJobLinks(TypedDict):
@@ -168,4 +187,17 @@ def fault_document(fault: Fault) -> FaultDocument:
         message=cut_text(fault.message, _MAX_TEXT_BYTES),
         proposal=None if fault.proposal is None else cut_text(fault.proposal, _MAX_TEXT_BYTES),
         severity=fault.severity.value,
+        changes=merge_patch(fault.changes),
     )
+
+
+def merge_patch(changes: Sequence[Change]) -> dict[str, JsonValue] | None:
+    """Changes of a declaration as JSON to merge into it; None without any."""
+    patch: dict[str, JsonValue] = {}
+    for change in changes:
+        *parents, name = change.member.split(".")
+        place = patch
+        for parent in parents:
+            place = cast("dict[str, JsonValue]", place.setdefault(parent, {}))
+        place[name] = change.value
+    return patch or None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, Literal
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -26,40 +26,31 @@ from app.registry.audit import AuditEntry, EntryRow, find_head, recording
 from app.registry.bulk_load import LARGE
 from app.registry.columns import Columns
 from app.registry.database import Database
-from app.registry.grade_columns import grade_columns
 from app.registry.ids import new_ids
 from app.registry.marker_rows import MarkerRow
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
 from app.services.decoder_processes import DecoderProcesses, Task
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
-from app.services.markers.accuracy import accuracy_document
 from app.services.ports import Clock
 from app.services.roads.routes import linear_references
-from app.services.surveys.documents import (
-    ImportReport,
-    Outcome,
-    comparison_document,
-    detected_document,
-    fault_document,
-)
+from app.services.surveys.documents import ImportReport, Outcome, comparison_document
 from app.services.surveys.import_codes import assign_codes
 from app.services.surveys.import_neighbours import MAX_NEIGHBOURS, list_neighbours, places_of, survey_box
+from app.services.surveys.import_report import ALL, Found, ImportInput, import_report
 from app.services.surveys.import_rows import check_values, common_columns, marker_columns
 from app.services.version_kinds import kind_of_change, kind_of_new
 from app.surveys.comparison import Comparison, check_residuals, compare_survey
 from app.surveys.consistency_checks import check_accuracy, check_consistency
 from app.surveys.duplicates import RegisteredPoints, find_duplicates
-from app.surveys.georeference import GeoreferencedSurvey, georeference_survey
+from app.surveys.georeference import GeoreferencedSurvey, georeference_survey, without_rows
 from app.surveys.local_grid import LocalGridDocument, apply_local_grid
 from app.surveys.location_checks import KNOWN_M, check_location
 
-ALL: Final = "all"
 SURVEYED = tuple(name for name, family in zip(FAMILY_NAMES, FAMILIES, strict=True) if family.survey is not None)
 """Families whose markers can be imported from points."""
 READ, SETTLED = 0.3, 0.5
 """How far an import is when its file was read, and when it goes to store what is good."""
-MAX_FAULTS = 1000
 _BUSY_WAIT_S = 10.0
 _PART = 2000
 _ACCURACY = ("horizontal_rmse_m", "vertical_rmse_m", "check_points")
@@ -74,19 +65,6 @@ class SurveyTask(Task[SurveyTable]):
     file: SpooledFile
     declaration: ImportDeclaration
     code_form: CodeForm
-
-
-@dataclass(frozen=True, slots=True)
-class ImportInput:
-    """A file with what is declared of it."""
-
-    file: SpooledFile
-    declaration: ImportDeclaration
-    defaults: Any = None
-    dry_run: bool = False
-    mode: Literal["all", "good"] = ALL
-    reason: str | None = None
-    refuse_warnings: bool = False
 
 
 class Imports:
@@ -138,6 +116,7 @@ class Imports:
             SurveyTask(given.file, given.declaration, _code_form(given)), wait_s=_BUSY_WAIT_S
         )
         table, grid = apply_local_grid(pending.result(), given.declaration)
+        table = without_rows(table, given.declaration.leave_out)
         survey = georeference_survey(table, given.declaration, self._rules.crs_accuracy_m)
         step(READ)
         registration = Registration(caller.agency_id, now, self._rules, self._database)
@@ -225,7 +204,12 @@ class _Running:
     @property
     def is_hopeless(self) -> bool:
         """Whether nothing can be stored, whatever the codes are."""
-        return self._refuses_file or (self._given.mode == ALL and len(self._good_rows()) < self._survey.table.rows)
+        return self._refuses_file or (self._given.mode == ALL and len(self._good_rows()) < self._kept_rows)
+
+    @property
+    def _kept_rows(self) -> int:
+        rows = self._survey.table.rows
+        return rows - sum(1 <= row <= rows for row in set(self._given.declaration.leave_out))
 
     @property
     def is_refused(self) -> bool:
@@ -259,42 +243,13 @@ class _Running:
 
     def report(self, outcome: Outcome) -> ImportReport:
         """What was found, and what was stored of it."""
-        table, placed = self._survey.table, self._survey.placed
-        refused = self._faults.flags(table.rows, Severity.REFUSED)
-        warned = self._faults.flags(table.rows, Severity.WARNING)
-        shown = self._faults.shown(MAX_FAULTS)
-        good = len(self._good_rows())
-        rmse_m = self._given.declaration.survey.get("horizontal_rmse_m")
-        grade = grade_columns(rmse_m, placed.transform_accuracy_m, placed.note)
-        lon, lat = placed.lon_deg[placed.placed], placed.lat_deg[placed.placed]
-        return {
-            "outcome": outcome,
-            "dry_run": self._given.dry_run,
-            "mode": self._given.mode,
-            "warnings": "refuse" if self._given.refuse_warnings else "store",
-            "format": table.format,
-            "file_sha256": self._sha256,
-            "crs": table.crs,
-            "localization_grade": grade["localization_grade"],
-            "transform_note": grade["transform_note"],
-            "detected": [detected_document(detected) for detected in table.detected],
-            "local_grid": self._grid,
-            "accuracy": accuracy_document(*(self._given.declaration.survey.get(name) for name in _ACCURACY)),
-            "rows": table.rows,
-            "good_rows": good,
-            "refused_rows": int(refused.sum()),
-            "warned_rows": int((warned & ~refused).sum()),
-            "stored": self._stored,
-            "extent_deg": [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]
-            if len(lon)
-            else None,
-            "counts": dict(self._faults.counts),
-            "comparison": comparison_document(
+        found = Found(
+            self._given, self._survey, self._faults, self._good_rows(), self._stored, self._grid,
+            comparison_document(
                 self._comparison, self._survey, self._known, self._given.declaration.tolerance_m
             ),
-            "faults": [fault_document(fault) for fault in shown],
-            "faults_left_out": len(self._faults) - len(shown),
-        }
+        )  # fmt: skip
+        return import_report(outcome, found)
 
     # --- steps ------------------------------------------------------------------------------------------------------
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import httpx
 import pytest
@@ -15,11 +14,9 @@ from app.cli import cli
 from app.registry.tenancy import EVERY_AGENCY, set_whose
 from app.services.access.access import Scope
 from app.settings import Settings
-from tests.conftest import LiveServer
+from tests.conftest import LiveServer, Place
 
 pytestmark = pytest.mark.both_databases
-
-Place = Callable[[], dict[str, Any]]
 
 
 @pytest.fixture
@@ -28,6 +25,7 @@ def admin(server: LiveServer) -> Iterator[httpx.Client]:
         yield client
 
 
+@pytest.mark.slow
 def test_each_change_is_an_entry(admin: httpx.Client, place: Place) -> None:
     before = admin.get("/v1/audit").json()
     marker = admin.post("/v1/markers", json={"position": place()}).json()
@@ -59,6 +57,7 @@ def test_the_log_comes_in_pages(admin: httpx.Client, place: Place) -> None:
     assert numbers == list(range(1, page.json()["head"]["number"] + 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong", ["limit=0", "limit=1000000000", "after=-1", "after=1e400", "after=123456789012345678901234"]
 )
@@ -80,6 +79,7 @@ def test_only_admins_read_it(server: LiveServer) -> None:
         assert planner.get("/v1/audit").status_code == 403
 
 
+@pytest.mark.slow
 def test_verify_beside_a_running_server(
     serve: Callable[[Settings], LiveServer], settings: Settings, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,3 +144,52 @@ def test_handing_out_keys_of_markers_is_an_entry(admin: httpx.Client, place: Pla
     items = admin.get("/v1/audit", params={"limit": 1000}).json()["items"]
     assert [entry["action"] for entry in items].count("marker-keys.handed-out") == 1
     assert [entry["action"] for entry in items].count("agency-key.made") == 1
+
+
+def test_entries_are_filtered_and_the_newest_can_come_first(server: LiveServer, place: Place) -> None:
+    with server.agency("filtered log", Scope.ADMIN) as admin:
+        marker = admin.post("/v1/markers", json={"position": place()}).json()
+        other = admin.post("/v1/markers", json={"position": place()}).json()
+        admin.patch(f"/v1/markers/{marker['id']}", json={"status": "built"}, headers={"If-Match": '"1"'})
+
+        def numbers(**wanted: str) -> list[int]:
+            answer = admin.get("/v1/audit", params=wanted)
+            assert answer.status_code == 200, answer.text
+            return [entry["number"] for entry in answer.json()["items"]]
+
+        everything = admin.get("/v1/audit").json()["items"]
+        known = {entry["number"]: entry for entry in everything}
+        assert numbers(order="newest") == [entry["number"] for entry in reversed(everything)]
+        found = numbers(action="marker.registered")
+        assert [known[number]["subject"] for number in found] == [marker["id"], other["id"]]
+        assert numbers(action="marker.*", order="newest") == sorted((n for n in known if n >= found[0]), reverse=True)
+        assert numbers(action="marker_*") == []
+        assert len(numbers(subject=marker["id"])) == 2
+        who = everything[-1]["who"]
+        assert numbers(who=who)[-1] == everything[-1]["number"]
+        assert numbers(who="nobody") == []
+        at = everything[-1]["at"]
+        assert numbers(since=at)[-1] == everything[-1]["number"]
+        assert everything[-1]["number"] not in numbers(until=at)
+
+
+def test_the_newest_entries_come_in_pages(server: LiveServer, place: Place) -> None:
+    with server.agency("newest first", Scope.ADMIN) as admin:
+        for _ in range(3):
+            assert admin.post("/v1/markers", json={"position": place()}).status_code == 201
+        page = admin.get("/v1/audit", params={"limit": 1, "order": "newest", "action": "marker.registered"})
+        numbers = [page.json()["items"][0]["number"]]
+        while "next" in page.links:
+            page = admin.get(page.links["next"]["url"])
+            numbers += [entry["number"] for entry in page.json()["items"]]
+        assert len(numbers) == 3
+        assert numbers == sorted(numbers, reverse=True)
+
+
+@pytest.mark.parametrize(
+    "wrong", ["order=sideways", "since=yesterday", "until=2026-01-01T00:00:00", "before=0", "who=%00"]
+)
+def test_bad_filters_are_refused(admin: httpx.Client, wrong: str) -> None:
+    response = admin.get(f"/v1/audit?{wrong}")
+    assert response.status_code == 422
+    assert response.json()["type"].startswith("urn:waymark:problem:")

@@ -121,6 +121,7 @@ def test_a_mistyped_key_is_refused_without_a_query(database: Database) -> None:
     assert access.authenticate(key).scope is Scope.VIEWER
 
 
+@pytest.mark.slow
 def test_the_environments_key_may_be_of_any_form_but_not_mistyped(database: Database) -> None:
     access = Access(database, Clock())
     key = new_key()
@@ -133,6 +134,7 @@ def test_the_environments_key_may_be_of_any_form_but_not_mistyped(database: Data
 # --- making and listing -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_key_is_shown_once_and_stored_as_a_hash(server: LiveServer, admin: httpx.Client) -> None:
     response = admin.post("/v1/keys", json={"scope": "viewer", "label": "a map"})
     made = response.json()
@@ -307,6 +309,7 @@ def test_a_vehicle_keeps_its_decodes_when_its_key_is_replaced(database: Database
 # --- last use -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_uses_are_written_together_and_no_request_waits_for_it(database: Database) -> None:
     clock = Clock()
     access = Access(database, clock)

@@ -16,9 +16,11 @@ from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
 from app.formats.archives import ArchiveLimits, count_members, read_members
 from app.main import create_app
 from app.settings import Settings
+from app.simulation.magnetic.recorder import write_recorder_files
 from tests.api.decodes.conftest import Stored, near, post_frame
 from tests.conftest import ADMIN_KEY, LiveServer
 from tests.formats.pictures import corner_frame, huge_png, jpeg, lying_png, png
+from tests.formats.traces.recordings import make_trace
 from tests.http import finished, wait_until
 from tests.jobs import standin
 
@@ -49,6 +51,27 @@ def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client
         yield client
 
 
+@pytest.mark.parametrize(
+    ("files", "kind"),
+    [
+        (write_recorder_files(make_trace(200)), "trace"),
+        (
+            {"log.jsonl": b'{"time": "2026-06-01T08:00:00Z", "payload_hex": "00", "rssi_dbm": -80, "snr_db": 9}\n'},
+            "packets",
+        ),
+    ],
+)
+def test_an_archive_of_another_kind_is_refused_with_the_cure(
+    client: httpx.Client, files: dict[str, bytes], kind: str
+) -> None:
+    answer = post_frame(client, pack(files), name="drive.zip")
+    assert answer.status_code == 415, answer.text
+    assert answer.json()["field"] == "file"
+    assert f'"{kind}": {{}}' in answer.json()["cure"]
+    beside = post_frame(client, pack(files | {"0001.png": GOOD}), name="drive.zip")
+    assert wait_for(client, beside.headers["location"])["frames"]
+
+
 # --- jobs ---------------------------------------------------------------------------------------------------------
 
 
@@ -68,6 +91,7 @@ def test_an_archive_becomes_a_job(client: httpx.Client, plate: dict[str, Any], s
     assert client.get(f"{answer.headers['location']}/annotated.jpg?frame=6").status_code == 404
 
 
+@pytest.mark.slow
 def test_a_member_that_cannot_be_read_is_named_and_the_rest_goes_on(impatient: httpx.Client) -> None:
     client = impatient
     inner = pack({"x.png": GOOD})
@@ -108,6 +132,7 @@ def test_a_frame_of_another_size_than_the_camera_is_named(client: httpx.Client) 
     assert second["error"]["field"] == "camera.width_px"
 
 
+@pytest.mark.slow
 def test_a_running_job_can_be_cancelled(impatient: httpx.Client) -> None:
     client = impatient
     slow = png(standin.frame_that(standin.SLEEP))
@@ -135,6 +160,7 @@ def test_an_idempotency_key_queues_once(client: httpx.Client, stored: Stored) ->
     assert stored.counts() == counts
 
 
+@pytest.mark.slow
 def test_jobs_that_were_cut_off_are_taken_up_at_the_next_start(
     serve: Callable[..., LiveServer], tmp_path: Any, place: Callable[[], dict[str, Any]]
 ) -> None:
@@ -178,24 +204,25 @@ def bomb() -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("data", "status"),
+    ("make", "status"),
     [
-        (pack({}), 422),
-        (pack({"folder/": b""}), 422),
-        (pack({"a.png": GOOD})[:-30], 422),
-        (b"PK\x03\x04 and nothing else", 422),
-        (pack({f"{k}.png": b"x" for k in range(21)}), 413),
-        (pack({f"{k}": b"" for k in range(60_000)}, zipfile.ZIP_STORED), 413),
+        (lambda: pack({}), 422),
+        (lambda: pack({"folder/": b""}), 422),
+        (lambda: pack({"a.png": GOOD})[:-30], 422),
+        (lambda: b"PK\x03\x04 and nothing else", 422),
+        (lambda: pack({f"{k}.png": b"x" for k in range(21)}), 413),
+        (lambda: pack({f"{k}": b"" for k in range(60_000)}, zipfile.ZIP_STORED), 413),
     ],
     ids=["empty", "folders", "cut", "no-directory", "21-members", "60000-members"],
 )
 @pytest.mark.usefixtures("unchanged")
-def test_bad_archives(client: httpx.Client, data: bytes, status: int) -> None:
-    answer = post_frame(client, data)
+def test_bad_archives(client: httpx.Client, make: Callable[[], bytes], status: int) -> None:
+    answer = post_frame(client, make())
     assert answer.status_code == status, answer.text
     assert answer.json()["field"] == "file"
 
 
+@pytest.mark.slow
 def test_a_bomb_is_reported_and_costs_no_memory() -> None:
     import tracemalloc
 

@@ -8,16 +8,13 @@ import json
 import struct
 import xml.etree.ElementTree as ET
 import zipfile
-from collections.abc import Callable
 from typing import Any
 
 import httpx
 import pytest
 
 from app.services.markers.artwork import MAX_PLATES
-from tests.conftest import LiveServer
-
-Place = Callable[[], dict[str, Any]]
+from tests.conftest import LiveServer, Place
 
 
 def register(client: httpx.Client, position: dict[str, Any], **more: Any) -> dict[str, Any]:
@@ -32,6 +29,7 @@ def marker(real_client: httpx.Client, place: Place) -> dict[str, Any]:
     return register(real_client, place())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "media_type", "magic"),
     [
@@ -102,6 +100,7 @@ def test_other_agencies_and_other_formats(
         assert nobody.post("/v1/artwork", json={}).status_code == 401
 
 
+@pytest.mark.slow
 def test_artwork_that_does_not_read_back_is_not_handed_out(client: httpx.Client, plate: dict[str, Any]) -> None:
     """This server's decoder is the stand-in, which reads nothing."""
     answer = client.get(f"/v1/markers/{plate['id']}/artwork.svg")

@@ -18,6 +18,8 @@ from tests.conftest import LiveServer
 from tests.formats.pictures import png
 from tests.jobs import standin
 
+pytestmark = pytest.mark.slow
+
 CONFIG = Path(__file__).parents[3] / "docs" / "openapi-python-client.json"
 PACKAGE = "waymark_client"
 

@@ -82,6 +82,7 @@ def _found(client: httpx.Client) -> dict[str, str]:
     return {item["marker_id"]: item["what"] for item in items}
 
 
+@pytest.mark.slow
 def test_a_plate_that_moved_and_one_that_is_gone_are_the_work_list(real_server: LiveServer) -> None:
     with real_server.agency("health agency") as client:
         markers, rng = _register(client), np.random.default_rng(7)

@@ -33,6 +33,8 @@ from app.simulation.radio.markers import InstalledMarkers
 from tests.api.decodes.conftest import post_frame
 from tests.conftest import LiveServer
 
+pytestmark = pytest.mark.slow
+
 CODES = (
     "SNS_4_0.1_10-30", "NNS_4_0.1_15-25", "SSN_4_0.1_30-10", "NSN_4_0.1_12-28", "SNN_4_0.1_25-15", "SNS_4_0.1_16-24",
     "NNS_4_0.1_22-18", "SSN_4_0.1_13-27",

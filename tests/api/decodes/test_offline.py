@@ -46,7 +46,7 @@ from tests.api.decodes.test_traces import Place as Lane
 from tests.api.decodes.test_traces import _drive, _zipped
 from tests.conftest import ADMIN_KEY, LiveServer
 
-pytestmark = pytest.mark.both_databases
+pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 
 _AGENCIES = itertools.count(1)
 

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import httpx
+import pytest
 import sqlalchemy as sa
 
 from app.main import create_app
@@ -23,6 +24,7 @@ PLACES, BURST, UPLOADS = 32, 36, 40
 """Tasks of the decoder processes (`max_waiting`), requests with one key, and more than both."""
 
 
+@pytest.mark.slow
 def test_too_many_uploads_at_once_are_refused_for_a_time(tmp_path: Path) -> None:
     settings = Settings(
         data_dir=tmp_path / "var", admin_key=ADMIN_KEY, warm_decoders=False, decode_workers=1, decode_timeout_s=240.0,

@@ -111,6 +111,7 @@ def _off_painted_line_px(frame: np.ndarray[Any, Any], line_px: np.ndarray[Any, A
     return np.array(off_px)
 
 
+@pytest.mark.slow
 def test_a_drive_gives_the_lane_its_pictures_and_observations(road: tuple[httpx.Client, BuiltLane]) -> None:
     client, built = road
     heard, _hour = drive(built, 1902)
@@ -258,6 +259,7 @@ def test_a_network_server_posts_one_uplink_as_it_is(road: tuple[httpx.Client, Bu
 # --- what is not accepted -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_forged_and_replayed_packets_are_refused_and_move_nothing(road: tuple[httpx.Client, BuiltLane]) -> None:
     client, built = road
     first, _hour = drive(built, 1906)
@@ -277,6 +279,7 @@ def test_forged_and_replayed_packets_are_refused_and_move_nothing(road: tuple[ht
     assert path_rms_m(built, found) < 0.05
 
 
+@pytest.mark.slow
 def test_forged_tags_are_limited_and_in_the_audit_log(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
     """One entry for an upload, whatever it contains; the limit is of the key, not of its agency."""
     handler = next(handler for handler in server.app.state.decodes._handlers if handler.kind == "packets")
@@ -327,6 +330,7 @@ def test_the_limit_of_invalid_tags_begins_anew_at_midnight(hour: int) -> None:
     assert limit.left("one", now + timedelta(seconds=refused.value.retry_after_s)) == 1000
 
 
+@pytest.mark.slow
 def test_what_was_heard_is_known_after_a_restart(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY, warm_decoders=False, decode_workers=1)
     with LiveServer(create_app(settings, decode=standin.decode)) as server, server.client() as client:
@@ -343,6 +347,7 @@ def test_what_was_heard_is_known_after_a_restart(tmp_path: Path) -> None:
         assert client.get(f"/v1/markers/{built.markers[0]['id']}/payload.bin").status_code == 200
 
 
+@pytest.mark.slow
 def test_uploads_at_once_cannot_pass_by_each_other(road: tuple[httpx.Client, BuiltLane]) -> None:
     client, built = road
     heard, _hour = drive(built, 1912)
@@ -371,6 +376,7 @@ def test_a_marker_that_claims_another_place_is_named(road: tuple[httpx.Client, B
     assert path_rms_m(built, found) < 0.06
 
 
+@pytest.mark.slow
 def test_two_markers_with_one_number_are_named(road: tuple[httpx.Client, BuiltLane]) -> None:
     client, built = road
     heard, _hour = drive(built, 1915)

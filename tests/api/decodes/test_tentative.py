@@ -15,6 +15,8 @@ from tests.api.decodes.conftest import post_frame
 from tests.api.decodes.test_archives import pack, wait_for
 from tests.http import created
 
+pytestmark = pytest.mark.slow
+
 SEED, JOB, FIRST, LAST = 51, 1, 17, 19  # of a drive over a plate under spots of paint
 WHERE = {"lon_deg": 11.5, "lat_deg": 48.1, "accuracy_m": 20}
 

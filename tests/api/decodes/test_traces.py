@@ -116,6 +116,7 @@ def place(client: httpx.Client) -> Place:
     return Place(client)
 
 
+@pytest.mark.slow
 def test_a_drive_over_registered_tags_gives_tuples_matches_and_fixes(client: httpx.Client, place: Place) -> None:
     drive = _drive()
     answer = post_frame(client, _zipped(write_recorder_files(drive.trace)), place.context, name="drive.zip")
@@ -146,6 +147,7 @@ def test_a_drive_over_registered_tags_gives_tuples_matches_and_fixes(client: htt
     assert all(code in plot.text for code in _CODES)
 
 
+@pytest.mark.slow
 def test_the_wrong_way_is_flagged_and_turns_the_heading(client: httpx.Client, place: Place) -> None:
     tags = [PlacedTag(_tag(code), LENGTH_M - at - 4.0, -0.05) for code, at in zip(_CODES, _AT_M, strict=True)]
     scene = Scene(Road(LENGTH_M), Vehicle.compact(), Course(speed_m_s=12.0), tags=tags, wrong_way=True)
@@ -159,6 +161,7 @@ def test_the_wrong_way_is_flagged_and_turns_the_heading(client: httpx.Client, pl
         assert abs((tag["fix"]["heading_deg"] - 210.0 + 180) % 360 - 180) < 1.0
 
 
+@pytest.mark.slow
 def test_lines_that_are_crossed_are_departures(client: httpx.Client) -> None:
     lines = line_magnets(40, 80, 5.0, 0.6, Polarity.S) + line_magnets(90, 105, 5.0, -0.7, Polarity.N)
     scene = Scene(Road(LENGTH_M), Vehicle.compact(), Course(speed_m_s=12.0), lines=lines)
@@ -169,6 +172,7 @@ def test_lines_that_are_crossed_are_departures(client: httpx.Client) -> None:
     assert decode["fix"] is None
 
 
+@pytest.mark.slow
 def test_the_stream_is_resynchronised_and_says_so(client: httpx.Client, place: Place) -> None:
     drive = _drive(7)
     stream = bytearray(write_array_stream(drive.trace))
@@ -183,6 +187,7 @@ def test_the_stream_is_resynchronised_and_says_so(client: httpx.Client, place: P
     assert [tag["tag"] for tag in answer.json()["tags"]] == list(_CODES)
 
 
+@pytest.mark.slow
 def test_the_same_key_gets_the_same_answer(client: httpx.Client, place: Place) -> None:
     data = _zipped(write_recorder_files(_drive(8).trace))
     first = post_frame(client, data, place.context, name="drive.zip", **{"Idempotency-Key": "trace-1"})
@@ -191,6 +196,7 @@ def test_the_same_key_gets_the_same_answer(client: httpx.Client, place: Place) -
     assert again.headers["Idempotency-Replayed"] == "true"
 
 
+@pytest.mark.slow
 def test_a_long_recording_becomes_a_job(client: httpx.Client, place: Place) -> None:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
@@ -219,6 +225,7 @@ def _csv(drive: SimulatedDrive, *, speed: bool = True, scale: float = 1.0, backw
     return (",".join(names) + "\n" + "\n".join(",".join(f"{v:.6g}" for v in row) for row in rows)).encode()
 
 
+@pytest.mark.slow
 def test_a_plain_csv_is_read_with_its_declaration(client: httpx.Client, place: Place) -> None:
     context = {**place.context, "trace": {"unit": "uT", "axes": "ISO8855"}}
     answer = post_frame(client, _csv(_drive(10)), context, name="trace.csv")
@@ -226,6 +233,7 @@ def test_a_plain_csv_is_read_with_its_declaration(client: httpx.Client, place: P
     assert [tag["tag"] for tag in answer.json()["tags"]] == list(_CODES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "trace", "status", "field"),
     [
@@ -256,6 +264,7 @@ def test_bad_input_names_what_is_wrong_and_leaves_nothing(
     assert len(client.get("/v1/decodes?limit=1000").json()["items"]) == before
 
 
+@pytest.mark.slow
 def test_microtesla_declared_as_gauss_are_refused(client: httpx.Client, place: Place) -> None:
     context = {**place.context, "trace": {"unit": "gauss", "axes": "FLU"}}
     answer = post_frame(client, _csv(_drive(12)), context, name="trace.csv")
@@ -263,6 +272,7 @@ def test_microtesla_declared_as_gauss_are_refused(client: httpx.Client, place: P
     assert "uT" in problem["cure"]
 
 
+@pytest.mark.slow
 def test_frames_have_no_plot_and_traces_no_annotation(client: httpx.Client, place: Place) -> None:
     data = _zipped(write_recorder_files(_drive(13).trace))
     decode = post_frame(client, data, place.context, name="drive.zip").json()
@@ -271,6 +281,7 @@ def test_frames_have_no_plot_and_traces_no_annotation(client: httpx.Client, plac
     assert json.loads(client.get("/v1/decodes?limit=1").text)["items"][0]["kind"] == "trace"
 
 
+@pytest.mark.slow
 def test_a_wrong_scale_of_the_speed_does_not_move_the_fix(client: httpx.Client, place: Place) -> None:
     drive = _drive(14, can=CanBus(speed_scale=0.04))
     decode = post_frame(client, _zipped(write_recorder_files(drive.trace)), place.context, name="drive.zip").json()

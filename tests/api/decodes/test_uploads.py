@@ -132,6 +132,7 @@ def test_retired_plates_are_no_codebook(client: httpx.Client, plate: dict[str, A
 # --- refusals: a problem that names field and cure, and nothing stored --------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "status", "slug"),
     [
@@ -162,7 +163,7 @@ def test_bad_files(client: httpx.Client, data: bytes, status: int, slug: str) ->
 @pytest.mark.usefixtures("unchanged")
 def test_a_file_of_no_kind_is_refused_with_all_kinds(client: httpx.Client) -> None:
     for data, looks_like in (
-        (b"no picture", "neither a JPEG"),
+        (b"no picture", "not a JPEG"),
         (b"v=0\no=- 0 0 IN IP4 127.0.0.1", "SDP"),
         (b"GIF89a", "GIF"),
     ):
@@ -174,6 +175,7 @@ def test_a_file_of_no_kind_is_refused_with_all_kinds(client: httpx.Client) -> No
         assert "ROS 1" in problem["limit"]
 
 
+@pytest.mark.slow
 def test_a_frame_that_takes_too_long_is_refused(tmp_path: Path) -> None:
     """The stand-in would sleep for ten minutes: the time limit of a frame ends it."""
     settings = Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY, decode_timeout_s=1.0)
@@ -188,6 +190,7 @@ def test_a_killed_process_disturbs_nobody_else(client: httpx.Client) -> None:
     check_problem(post_frame(client, png(standin.frame_that(standin.DIE))), 422, "unreadable-upload", "file")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchanged")
 def test_a_defect_of_ours_is_a_500_and_stores_nothing(client: httpx.Client) -> None:
     answer = post_frame(client, png(standin.frame_that(standin.BUG)))
@@ -378,6 +381,7 @@ def test_the_annotated_picture(client: httpx.Client, suffix: str) -> None:
     assert client.get(path[:-3] + "gif").status_code in (404, 422)
 
 
+@pytest.mark.slow
 def test_openapi_describes_uploads(client: httpx.Client) -> None:
     document = client.get("/openapi.json").json()
     body = document["paths"]["/v1/decodes"]["post"]["requestBody"]["content"]

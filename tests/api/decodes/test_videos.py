@@ -11,51 +11,16 @@ import httpx
 import numpy as np
 import pytest
 
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
-from app.sensors.camera import Camera
-from app.simulation.camera import render_plate_scene
-from app.simulation.conditions import draw_daylight
-from app.simulation.plate_face import plate_face
-from app.simulation.plate_scene import PlacedFace, PlateScene
 from tests.api.decodes.conftest import near, post_frame
 from tests.api.decodes.test_archives import wait_for
+from tests.api.decodes.videos import DECLARED, RATE_HZ, SPEED_M_S, video_past
 from tests.formats.test_video import HEIGHT, WIDTH, cut_video, turned, video
 from tests.http import finished
 
-CAMERA = Camera.from_field_of_view(960, 540, 60.0)
-DECLARED = {"width_px": 960, "height_px": 540, "horizontal_fov_deg": 60.0}
-SPEED_M_S, RATE_HZ = 12.0, 20.0
 
-
-@pytest.fixture(scope="module")
-def passing() -> Any:
-    """A video that passes a plate, by the plate's digits."""
-
-    def encode(code: PlateCode) -> bytes:
-        rng = np.random.default_rng(5)
-        fair = draw_daylight(rng)
-        face = plate_face(code, PlateGeometry(8), fair.look, fair.wear, rng)
-        out = io.BytesIO()
-        with av.open(out, "w", format="mp4") as container:
-            stream: Any = container.add_stream("libx264", rate=round(RATE_HZ))
-            stream.width, stream.height, stream.pix_fmt = 960, 540, "yuv420p"
-            stream.options = {"preset": "ultrafast", "crf": "18", "x264-params": "log-level=none"}
-            for number in range(14):
-                ahead_m = 8.0 - number * SPEED_M_S / RATE_HZ
-                scene = PlateScene(CAMERA, (PlacedFace(face, ahead_m, 0.2),), SPEED_M_S, fair.exposure_s)
-                image = render_plate_scene(scene, None, rng).image
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-            container.mux(stream.encode(None))
-        return out.getvalue()
-
-    return encode
-
-
-def test_a_video_is_a_job_that_reads_the_plates_it_passes(
-    client: httpx.Client, plate: dict[str, Any], passing: Any
-) -> None:
-    shown = plate["code"]
-    data = passing(PlateCode(shown["digits"], PlateScheme(shown["scheme"])))
+@pytest.mark.slow
+def test_a_video_is_a_job_that_reads_the_plates_it_passes(client: httpx.Client, plate: dict[str, Any]) -> None:
+    data = video_past(plate["code"])
     context = near(plate, camera=DECLARED, captured_at="2026-05-04T08:30:00Z")
     answer = post_frame(client, data, context, name="drive.bin")
     assert answer.status_code == 202, answer.text
@@ -72,7 +37,7 @@ def test_a_video_is_a_job_that_reads_the_plates_it_passes(
     first = decode["frames"][0]
     assert first["time_s"] == pytest.approx(first["frame"] / RATE_HZ, abs=1e-4)
     assert first["captured_at"].startswith("2026-05-04T08:30:00")
-    assert client.get(f"{answer.headers['location']}/annotated.jpg").status_code == 404
+    assert client.get(f"{answer.headers['location']}/annotated.jpg?frame=499999").status_code == 404
 
 
 def test_a_video_beside_a_track_has_poses(client: httpx.Client, plate: dict[str, Any]) -> None:

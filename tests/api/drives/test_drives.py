@@ -31,7 +31,7 @@ from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
 from tests.http import finished, refused
 from tests.jobs import standin
 
-pytestmark = pytest.mark.both_databases
+pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 
 BEGAN = datetime(2026, 6, 1, 8, 0, tzinfo=UTC)
 ORIGIN = (11.0, 48.0, 0.0)

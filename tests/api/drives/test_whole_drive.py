@@ -16,6 +16,8 @@ from benchmarks.track.end_to_end import make_drive, track_errors_m, upload
 from benchmarks.track.vehicle import CAMERA_LATE_S, LOG_LATE_S, Recorded, install, record
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveServer]:

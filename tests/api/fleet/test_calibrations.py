@@ -20,7 +20,7 @@ from tests.conftest import LiveServer
 from tests.formats.pictures import huge_png
 from tests.http import refused
 
-pytestmark = pytest.mark.both_databases
+pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 
 _AGENCIES = itertools.count(1)
 CAMERA = TrueCamera()

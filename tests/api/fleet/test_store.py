@@ -47,6 +47,7 @@ def _fill(connection: sa.Connection) -> str:
     return agency_id
 
 
+@pytest.mark.slow
 def test_migrations_go_down_and_up_over_a_fleet(tmp_path: Path, new_database_url: Callable[[Path], str]) -> None:
     database = Database(new_database_url(tmp_path))
     database.open()
@@ -86,6 +87,7 @@ def test_what_was_driven_counts_once(tmp_path: Path, new_database_url: Callable[
             database.close()
 
 
+@pytest.mark.slow
 def test_uploads_at_once_are_all_counted_and_repeated_ones_once(server: LiveServer) -> None:
     picture = bytes(cv2.imencode(".png", np.full((64, 96), 90, np.uint8))[1])
     camera = {"horizontal_fov_deg": 70.0}

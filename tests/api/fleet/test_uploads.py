@@ -64,6 +64,7 @@ def _grey_png(width: int = 96, height: int = 64) -> bytes:
 # --- the file and little else -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_frame_with_the_vehicles_name_gives_its_position(fleet: httpx.Client) -> None:
     road = Road(fleet, PLATE_AT, (5.0, 0.3, 4.0)).register()
     vehicle = _vehicle(fleet, camera=CAMERA_IN)

@@ -31,6 +31,7 @@ def _new_vehicle(client: httpx.Client, **body: Any) -> dict[str, Any]:
     return created(client, "/v1/vehicles", **{"name": "BUS-7", "profile": PROFILE} | body)
 
 
+@pytest.mark.slow
 def test_a_vehicle_is_added_read_changed_and_retired(client: httpx.Client) -> None:
     answer = client.post("/v1/vehicles", json={"name": "BUS-7", "note": "yellow", "profile": PROFILE})
     vehicle = answer.json()

@@ -11,6 +11,8 @@ import pytest
 from tests.browser import Browser
 from tests.conftest import LiveServer
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(("path", "operations"), [("/docs", ".opblock"), ("/redoc", "[data-section-id]")])
 def test_the_api_is_described_without_another_host(

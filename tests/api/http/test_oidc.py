@@ -319,6 +319,7 @@ def live(serve: Callable[[Settings], LiveServer], settings: Settings, provider: 
     return serve(settings.model_copy(update=chosen))
 
 
+@pytest.mark.slow
 def test_a_token_works_as_a_key_does(live: LiveServer) -> None:
     with live.agency("Roads") as keyed, live.agency("Others") as others:
         position = {"lon_deg": 8.5, "lat_deg": 47.5}

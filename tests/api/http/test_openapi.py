@@ -13,6 +13,7 @@ from tests.conftest import LiveServer
 from tests.documented import DEVIATIONS
 
 
+@pytest.mark.slow
 def test_the_document_does_not_depend_on_settings(server: LiveServer, tmp_path: Path) -> None:
     other = create_app(Settings(data_dir=tmp_path, public_url="https://example.org", max_upload_bytes=1 << 20))
     assert other.openapi() == server.app.openapi()

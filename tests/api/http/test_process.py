@@ -62,6 +62,7 @@ def _serving(folder: Path, **extra: str) -> Iterator[_Served]:
     assert process.returncode in (0, -signal.SIGTERM), served.logs
 
 
+@pytest.mark.slow
 def test_a_fresh_server_prints_its_key_once_and_keeps_what_it_is_told(tmp_path: Path) -> None:
     with _serving(tmp_path / "new" / "var") as first:
         assert httpx.get(f"{first.url}/v1/markers", trust_env=False).status_code == 401

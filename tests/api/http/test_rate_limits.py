@@ -128,6 +128,7 @@ def test_whose_addresses_are_one() -> None:
 # --- through HTTP -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_key_that_asks_too_much_waits_and_others_do_not(serve: Serve, settings: Settings) -> None:
     server = serve(settings.model_copy(update={"requests_per_s": 0.5, "requests_at_once": 5}))
     with server.agency("one", Scope.VIEWER) as busy, server.agency("one", Scope.VIEWER) as other:
@@ -156,6 +157,7 @@ def test_a_replaced_key_shares_its_holders_bucket(serve: Serve, settings: Settin
             assert replaced.get("/v1/keys").status_code == 429
 
 
+@pytest.mark.slow
 def test_no_limit_if_none_is_wanted(serve: Serve, settings: Settings) -> None:
     server = serve(settings.model_copy(update={"requests_per_s": 0.0, "wrong_keys_per_minute": 0.0}))
     with server.client() as admin, server.client("a-key-that-nobody-has") as stranger:
@@ -165,6 +167,7 @@ def test_no_limit_if_none_is_wanted(serve: Serve, settings: Settings) -> None:
         assert {stranger.get("/v1/markers").status_code for _ in range(60)} == {401}
 
 
+@pytest.mark.slow
 def test_guessing_is_refused_and_locks_nobody_out(serve: Serve, settings: Settings) -> None:
     server = serve(settings.model_copy(update={"wrong_keys_per_minute": 6.0}))
     unseen = server.agency("three", Scope.VIEWER)

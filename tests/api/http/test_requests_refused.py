@@ -228,15 +228,13 @@ def test_without_a_valid_key(server: LiveServer, headers: dict[str, str], path: 
     with server.client(None) as anonymous:
         response = anonymous.get(path, headers=raw)
     assert _problem(response, 401)["type"] == "urn:waymark:problem:not-authenticated"
-    assert response.headers["www-authenticate"] == 'Bearer realm="waymark"'
+    assert response.headers.get_list("www-authenticate") == [
+        'Bearer realm="waymark"',
+        'Basic realm="waymark", charset="UTF-8"',
+    ]
 
 
-def test_both_ways_to_send_a_key(server: LiveServer) -> None:
-    with server.client(None) as anonymous:
-        for headers in ({"Authorization": f"bearer {ADMIN_KEY}"}, {"X-API-Key": ADMIN_KEY}):
-            assert anonymous.get("/v1/markers?limit=1", headers=headers).status_code == 200
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["/healthz", "/readyz", "/metrics", "/docs", "/openapi.json"])
 def test_what_needs_no_key(server: LiveServer, path: str) -> None:
     with server.client(None) as anonymous:

@@ -13,10 +13,11 @@ from app.cli import serving
 from app.settings import Settings
 from tests.conftest import LiveServer
 
-PUBLIC = ("/", "/docs", "/redoc", "/openapi.json", "/static/api.js")
+PUBLIC = ("/", "/docs", "/redoc", "/openapi.json", "/static/app/main.js", "/markers")
 PRIVATE = ("/v1/markers", "/v1/keys", "/ogc", "/nowhere", "/healthz", "/v1/markers/none")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", [*PUBLIC, *PRIVATE])
 def test_no_response_is_given_to_another_key(server: LiveServer, path: str) -> None:
     for key in ("a wrong key", None, "an-admin-key-for-tests-only"):

@@ -64,6 +64,7 @@ def test_depth() -> None:
     assert _refused("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1)).limit == f"{MAX_DEPTH} levels"
 
 
+@pytest.mark.slow
 def test_many_values_under_a_long_key_are_walked_without_their_paths() -> None:
     """The path of each value would take gigabytes: 190,000 times 200,000 characters."""
     value = {"k" * 200_000: [[]] * 190_000}

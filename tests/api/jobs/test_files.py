@@ -49,6 +49,7 @@ def queued(answer: httpx.Response) -> str:
     return str(job["links"]["self"])
 
 
+@pytest.mark.slow
 def test_artwork_of_many_plates_is_a_job(
     client: httpx.Client, server: LiveServer, place: Callable[[], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -64,12 +65,15 @@ def test_artwork_of_many_plates_is_a_job(
     assert sent.headers["content-type"] == "application/zip"
     assert sent.headers["etag"] == f'"{hashlib.sha256(sent.content).hexdigest()}"'
     assert sent.headers["waymark-proof"].startswith("read-back plates=2 ")
+    assert sent.headers["waymark-qr-code"] == 'none; reason="the server has no public address"'
     assert client.get(job["links"]["result"], headers={"If-None-Match": sent.headers["etag"]}).status_code == 304
     with zipfile.ZipFile(io.BytesIO(sent.content)) as archive:
         manifest = json.loads(archive.read("manifest.json"))
         names = set(archive.namelist())
     assert [plate["plate_id"] for plate in manifest["plates"]] == ids
     assert manifest["proved"] is True
+    assert manifest["notes"] == ["2 of 2 plates have no QR code: the server has no public address"]
+    assert [plate["record_url"] for plate in manifest["plates"]] == [None, None]
     assert {"quality.pdf", "quality.csv", "sheets/sheet-0001.svg"} < names
     # the ZIP that is answered at once has the same files
     monkeypatch.setattr(artwork_jobs, "IMMEDIATE_PLATES", 2)

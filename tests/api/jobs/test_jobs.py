@@ -203,6 +203,7 @@ def test_what_was_seen_is_not_sent_again(server: LiveServer, client: httpx.Clien
     assert [event["event"] for event in before.rest()] == ["cancelled"]
 
 
+@pytest.mark.slow
 def test_many_streams_share_one_query_and_no_threads(
     server: LiveServer, client: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -163,6 +163,7 @@ def test_an_event_is_delivered_signed(
     refused(client.get(f"/v1/webhooks/{webhook['id']}"), 404, "not-found")
 
 
+@pytest.mark.slow
 def test_a_server_delivers_by_itself(serve: Callable[..., LiveServer], settings: Any, receiver: Receiver) -> None:
     server = serve(settings.model_copy(update={"webhooks_to_loopback": True}))
     with server.client() as client:
@@ -172,6 +173,7 @@ def test_a_server_delivers_by_itself(serve: Callable[..., LiveServer], settings:
         wait_until(lambda: receiver.got, "the delivery")
 
 
+@pytest.mark.slow
 def test_what_fails_is_repeated_for_a_day_and_then_disabled(
     client: httpx.Client, server: LiveServer, receiver: Receiver, worker: WebhookDelivery, clock: list[datetime]
 ) -> None:

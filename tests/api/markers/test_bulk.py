@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -11,12 +10,10 @@ import pytest
 
 from app.services.access.access import Scope
 from app.services.markers.markers import Markers, Step
-from tests.conftest import LiveServer
+from tests.conftest import LiveServer, Place
 from tests.http import refused
 
 pytestmark = pytest.mark.both_databases
-
-Place = Callable[[], dict[str, Any]]
 
 
 def _bulk(client: httpx.Client, *items: Any, headers: dict[str, str] | None = None, **more: Any) -> httpx.Response:
@@ -31,6 +28,7 @@ def _markers(client: httpx.Client) -> dict[str, dict[str, Any]]:
     return {item["id"]: item for item in client.get("/v1/markers?limit=1000").json()["items"]}
 
 
+@pytest.mark.slow
 def test_markers_of_several_families_are_registered_and_changed_together(client: httpx.Client, place: Place) -> None:
     first = client.post("/v1/markers", json={"position": place()}).json()
     change = {"id": first["id"], "version": 1, "change": {"status": "retired", "reason": "resurfaced"}}
@@ -159,6 +157,7 @@ def test_requests_that_cannot_be_are_refused(client: httpx.Client, body: dict[st
     assert (answer.json()["field"], answer.json()["type"]) == (field, "urn:waymark:problem:invalid-parameter")
 
 
+@pytest.mark.slow
 def test_a_thousand_items_fit(client: httpx.Client) -> None:
     items = [
         {"create": {"family": "cerpm", "position": {"lon_deg": 8 + k / 1e4, "lat_deg": 49.0}}} for k in range(1000)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import httpx
 import pytest
 
-from tests.conftest import LiveServer
+from tests.conftest import LiveServer, Place
 
 pytestmark = pytest.mark.both_databases
-
-Place = Callable[[], dict[str, Any]]
 
 
 def cerpm(place: dict[str, Any], **more: Any) -> dict[str, Any]:
@@ -20,6 +17,7 @@ def cerpm(place: dict[str, Any], **more: Any) -> dict[str, Any]:
     return {"family": "cerpm", "position": {**place, "horizontal_rmse_m": 0.02, "height_m": 20.0}, **more}
 
 
+@pytest.mark.slow
 def test_a_marker_is_registered_read_listed_and_found_by_its_number(client: httpx.Client, place: Place) -> None:
     at = place()
     limit = {"value": 25, "unit": "mph"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -19,9 +18,7 @@ from app.services.access.access import Scope
 from app.services.access.agency_secrets import AgencySecrets
 from app.settings import Settings
 from tests.api.markers.test_cerpm_markers import cerpm
-from tests.conftest import LiveServer
-
-Place = Callable[[], dict[str, Any]]
+from tests.conftest import LiveServer, Place
 
 
 @pytest.fixture

@@ -35,6 +35,7 @@ def _codes(book: dict[str, Any]) -> list[str]:
     return [entry["code"] for entry in book["entries"]]
 
 
+@pytest.mark.slow
 def test_a_codebook_gives_codes_to_meanings(client: httpx.Client) -> None:
     rules = {"speed_mps": 13.4, "clearance_m": 0.3, "confusion": 0.0001, "wrong_way_safe": True}
     response = client.post(
@@ -233,6 +234,7 @@ def test_books_end_somewhere(client: httpx.Client) -> None:
     assert "500" in str(refused(client.post(path, json={"meanings": meanings}), 422, "invalid-parameter")["limit"])
 
 
+@pytest.mark.slow
 def test_the_documented_examples_and_members(client: httpx.Client) -> None:
     schemas = client.get("/openapi.json").json()["components"]["schemas"]
     (example,) = schemas["CodebookIn"]["examples"]

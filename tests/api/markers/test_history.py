@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,12 +11,11 @@ import pytest
 
 from app.registry import history
 from app.services.access.access import Scope
-from tests.conftest import LiveServer
+from tests.conftest import LiveServer, Place
 from tests.http import created
 
 pytestmark = pytest.mark.both_databases
 
-Place = Callable[[], dict[str, Any]]
 NOBODY = "00000000-0000-7000-8000-000000000000"
 
 
@@ -123,6 +121,7 @@ def _list(client: httpx.Client, **parameters: Any) -> list[dict[str, Any]]:
     return list(items)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [1, 500])
 def test_the_registry_as_it_was_is_what_was_listed_then(
     client: httpx.Client, monkeypatch: pytest.MonkeyPatch, chunk: int
@@ -180,6 +179,8 @@ WITHOUT_VERSION = {
     "PUT /v1/vehicles/{vehicle_id}/keys/{key_id}": "links, which are there or not",
     "DELETE /v1/vehicles/{vehicle_id}/keys/{key_id}": "links, which are there or not",
     "DELETE /v1/keys/{key_id}": "keys only end",
+    "DELETE /v1/damage-reports/{report_id}/contact": "an address is there or not",
+    "DELETE /v1/damage-reports/{report_id}/photo": "a photo is there or not",
     "DELETE /v1/drives/{drive_id}": "drives are jobs: a finished one does not change any more",
     "PATCH /v1/uploads/{upload_id}": "tus: Upload-Offset is what a part is based on",
     "DELETE /v1/uploads/{upload_id}": "tus: termination",
@@ -187,6 +188,7 @@ WITHOUT_VERSION = {
 }
 
 
+@pytest.mark.slow
 def test_every_route_that_changes_something_asks_for_its_version(server: LiveServer, client: httpx.Client) -> None:
     """428 without If-Match; a route that is new has to answer it, or say above why not."""
     paths = client.get("/openapi.json").json()["paths"]
@@ -196,6 +198,7 @@ def test_every_route_that_changes_something_asks_for_its_version(server: LiveSer
     bodies: dict[str, Any] = {  # a body that is refused is refused first
         "/v1/vehicles/{vehicle_id}/calibration": {"calibration_id": NOBODY},
         "/v1/plans/{plan_id}": {"name": "q"},
+        "/v1/public-page": {"fields": [], "damage_reports": False},
         "/v1/roads/{road_id}": {"calibration": []},
     }
     with server.agency("changes", Scope.ADMIN) as admin:

@@ -475,6 +475,7 @@ def test_plates_have_no_layout_and_magnets_no_artwork(
 # --- OpenAPI ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_documented_examples_and_members(client: httpx.Client) -> None:
     schemas = client.get("/openapi.json").json()["components"]["schemas"]
     examples = schemas["MagnetIn"]["examples"]

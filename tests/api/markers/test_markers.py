@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -12,12 +11,10 @@ import pytest
 
 from app.markers.plate import PlateCode, PlateScheme
 from app.services.access.access import Scope
-from tests.conftest import LiveServer
+from tests.conftest import LiveServer, Place
 from tests.http import created, refused
 
 pytestmark = pytest.mark.both_databases
-
-Place = Callable[[], dict[str, Any]]
 
 
 PLAIN, ROBUST = {"scheme": "position"}, {"scheme": "position-robust"}

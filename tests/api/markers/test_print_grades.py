@@ -26,7 +26,7 @@ from tests.decoders.plate.print_photos import CODE, photo_of, pixels
 from tests.formats.pictures import huge_png
 from tests.http import created, refused
 
-pytestmark = pytest.mark.both_databases
+pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 
 _AGENCIES = itertools.count(1)
 DECLARED = {"code": {"scheme": "position", "digits": CODE.digits}, "speed_kmh": 50.0}

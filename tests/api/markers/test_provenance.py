@@ -18,13 +18,12 @@ from app.services.access.access import Scope
 from app.services.decodes.fixes import horizontal_rmse_m
 from app.services.markers.accuracy import accuracy_document
 from app.settings import Settings
-from tests.conftest import LiveServer
+from tests.conftest import LiveServer, Place
 from tests.geodesy.test_geodesy import GRID, ntv2
 from tests.http import created
 
 pytestmark = pytest.mark.both_databases
 
-Place = Callable[[], dict[str, Any]]
 SHA256 = "0123456789abcdef" * 4
 SURVEY = {
     "height_m": 5.2,
@@ -81,6 +80,7 @@ def test_a_lane_of_magnets_has_a_survey_too(client: httpx.Client) -> None:
     assert {name: marker["position"][name] for name in KEPT} == {name: SURVEY[name] for name in KEPT}
 
 
+@pytest.mark.slow
 def test_imports_set_it_and_exports_carry_it(client: httpx.Client, place: Place) -> None:
     spot = place()
     file = f"lon,lat\n{spot['lon_deg']},{spot['lat_deg']}\n".encode()
@@ -139,6 +139,7 @@ def test_the_bound_of_a_transformation_makes_a_position_worse() -> None:
     assert horizontal_rmse_m(exact._replace(horizontal_rmse_m=None)) is None
 
 
+@pytest.mark.slow
 def test_a_folder_of_grids_reaches_the_server(
     serve: Callable[[Settings], LiveServer], settings: Settings, tmp_path: Path
 ) -> None:

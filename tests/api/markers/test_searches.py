@@ -36,6 +36,7 @@ def _found(answer: httpx.Response) -> list[str]:
     return [item["id"] for item in answer.json()["items"]]
 
 
+@pytest.mark.slow
 def test_boxes_span_the_antimeridian_when_their_west_is_above_their_east(client: httpx.Client) -> None:
     west, east, _other = _register(client, _cerpm(179.99, -16.5), _cerpm(-179.99, -16.5), _cerpm(0, -16.5))
     assert _found(client.get("/v1/markers?bbox=179.9,-17,-179.9,-16")) == [west, east]

@@ -47,6 +47,7 @@ def row(client: httpx.Client) -> list[str]:
 # --- documents ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_link_leads_somewhere_with_its_type(client: httpx.Client, row: list[str]) -> None:
     seen: set[str] = set()
     todo = [f"{client.base_url}/ogc/"]
@@ -80,7 +81,7 @@ def test_one_epoch_of_all_markers_is_published(client: httpx.Client) -> None:
 
 
 def test_the_schema_names_every_property(client: httpx.Client, row: list[str]) -> None:
-    schema = get(client, "/ogc/collections/markers/schema")
+    schema = get(client, "/ogc/collections/markers/geojson-schema")
     feature = get(client, f"{ITEMS}/{row[0]}")
     properties = schema["properties"]["properties"]["properties"]
     assert list(properties) == list(feature["properties"])
@@ -150,15 +151,26 @@ def test_head_and_formats(client: httpx.Client, row: list[str]) -> None:
     assert response.headers["content-type"] == "application/geo+json"
     assert not response.content
     assert client.get(ITEMS, params={"f": "json"}).status_code == 200
-    assert client.get(ITEMS, params={"f": "html"}).status_code == 400
-    for accept, status in (
-        ("application/geo+json", 200),
-        ("text/html,application/xhtml+xml,*/*;q=0.8", 200),
-        ("application/*", 200),
-        ("text/html", 406),
-        ("application/gml+xml", 406),
+    for accept, kind in (
+        (None, "application/geo+json"),
+        ("*/*", "application/geo+json"),
+        ("application/geo+json", "application/geo+json"),
+        ("application/json, text/html;q=0.9", "application/geo+json"),
+        ("application/geo+json, text/html", "application/geo+json"),
+        ("text/html;q=0.5, */*;q=0.8", "application/geo+json"),
+        ("application/*", "application/geo+json"),
+        ("text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8", "text/html; charset=utf-8"),
+        ("text/html", "text/html; charset=utf-8"),
+        ("text/*;q=wrong", "text/html; charset=utf-8"),
+        ("application/gml+xml", None),
+        ("application/geo+json;q=0", None),
     ):
-        assert client.get(ITEMS, headers={"Accept": accept}).status_code == status, accept
+        response = client.get(ITEMS, headers={"Accept": accept} if accept else {})
+        assert response.status_code == (200 if kind else 406), accept
+        assert kind is None or response.headers["content-type"] == kind, accept
+    assert client.get("/ogc/tileMatrixSets", headers={"Accept": "text/html"}).status_code == 406
+    for path in (ITEMS, "/ogc", "/ogc/tileMatrixSets"):
+        assert client.get(path, params={"f": "gml"}).status_code == 400
 
 
 # --- filters ------------------------------------------------------------------------------------------------------

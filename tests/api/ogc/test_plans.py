@@ -44,6 +44,7 @@ def make(client: httpx.Client, start: tuple[float, float], name: str = NAME, **r
     return created(client, "/v1/plans", **body)
 
 
+@pytest.mark.slow
 def test_planned_markers_are_points_with_their_plan(client: httpx.Client, start: tuple[float, float]) -> None:
     plan = make(client, start)
     document = client.get(f"/v1/plans/{plan['id']}/files/plan.json").json()["markers"]
@@ -59,7 +60,7 @@ def test_planned_markers_are_points_with_their_plan(client: httpx.Client, start:
             assert properties[name] == pytest.approx(marker[name], abs=1e-4), name
         assert (properties["plan_id"], properties["plan"]) == (plan["id"], NAME)
         assert properties["status"] == plan["status"]
-    schema = get(client, "/ogc/collections/plans/schema")["properties"]["properties"]["properties"]
+    schema = get(client, "/ogc/collections/plans/geojson-schema")["properties"]["properties"]["properties"]
     assert list(schema) == list(page["features"][0]["properties"])
     one = get(client, f"{PLANS}/{page['features'][7]['id']}")
     assert one["properties"] == page["features"][7]["properties"]
@@ -161,7 +162,7 @@ def test_lanes_are_lines_with_their_figures(client: httpx.Client, start: tuple[f
     assert properties["max_curvature_per_m"] == pytest.approx(0.01, rel=0.1)
     assert properties["localization_grade"] == "m"
     assert GEOD.line_length(*zip(*lane["geometry"]["coordinates"], strict=True)) == pytest.approx(209.4, abs=0.5)
-    schema = get(client, "/ogc/collections/alignments/schema")["properties"]
+    schema = get(client, "/ogc/collections/alignments/geojson-schema")["properties"]
     assert list(schema["properties"]["properties"]) == list(properties)
     assert schema["geometry"]["$ref"].endswith("LineString.json")
     assert get(client, f"{LANES}/{lane['id']}")["properties"] == properties

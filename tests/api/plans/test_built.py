@@ -15,7 +15,7 @@ from tests.api.plans.test_plans import road, send_road
 from tests.conftest import LiveServer
 from tests.http import created, refused
 
-pytestmark = pytest.mark.both_databases
+pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 
 GEOD = Geod(ellps="WGS84")
 PLACES = itertools.count(1)

@@ -48,6 +48,7 @@ def register(client: httpx.Client, start: tuple[float, float]) -> dict[str, Any]
     return created(client, "/v1/roads", name="B 27", geometry=line, calibration=[{"measure_m": 2000, "vertex": 0}])
 
 
+@pytest.mark.slow
 def test_a_registered_road_is_the_source_of_an_alignment(client: httpx.Client, start: tuple[float, float]) -> None:
     source = register(client, start)
     body = {"name": "B 27, two lanes", "road_id": source["id"], "lanes": LANES}

@@ -21,7 +21,7 @@ from tests.api.plans.test_plans import road, send_road
 from tests.conftest import LiveServer
 from tests.http import created, finished, refused
 
-pytestmark = pytest.mark.both_databases
+pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 
 PLACES = itertools.count(1)
 RULES: dict[str, Any] = {"version": 1, "plates": {"spacing_m": 100}, "lines": {}, "tags": {}}

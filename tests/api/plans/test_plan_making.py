@@ -30,6 +30,7 @@ def body(client: httpx.Client) -> dict[str, Any]:
     return {"name": f"p{number}", "alignment_id": alignment["id"], "rules": {"version": 1, "plates": {}}}
 
 
+@pytest.mark.slow
 def test_a_plan_is_made_by_a_job_and_is_the_same_as_an_immediate_one(
     client: httpx.Client, body: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -101,6 +101,7 @@ def make_plan(client: httpx.Client, alignment: dict[str, Any], **more: Any) -> d
     return created(client, "/v1/plans", name=f"plan {next(PLACES)}", alignment_id=alignment["id"], rules=rules)
 
 
+@pytest.mark.slow
 def test_a_road_is_stored_with_its_lanes(client: httpx.Client, alignment: dict[str, Any]) -> None:
     assert client.get(f"/v1/alignments/{alignment['id']}").json() == alignment
     [lane] = alignment["lanes"]
@@ -119,6 +120,7 @@ def test_bad_roads_are_refused_and_nothing_is_stored(client: httpx.Client) -> No
     assert client.get("/v1/alignments").json()["items"] == []
 
 
+@pytest.mark.slow
 def test_a_plan_is_made_checked_approved_and_committed(
     client: httpx.Client, alignment: dict[str, Any], other_planner: httpx.Client
 ) -> None:

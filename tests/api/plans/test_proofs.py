@@ -23,7 +23,7 @@ from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
 from tests.formats.pictures import corner_frame, png
 from tests.http import created, finished, refused, wait_until
 
-pytestmark = pytest.mark.both_databases
+pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 
 PLACES = itertools.count(1)
 PLATES: dict[str, Any] = {"version": 1, "plates": {"spacing_m": 100}}

@@ -17,6 +17,7 @@ NOTHING_ELSE: dict[str, Any] = {"lines": None, "tags": None, "cerpm": None}
 QUALITY = {"fix_every_m": 150, "fix_probability": 0.98, "fix_error_m": 0.1}
 
 
+@pytest.mark.slow
 def test_a_required_quality_is_planned_at_the_least_cost(client: httpx.Client, alignment: dict[str, Any]) -> None:
     plan = make_plan(client, alignment, **NOTHING_ELSE, quality=QUALITY)
     assert plan["status"] == "checked"

@@ -13,6 +13,7 @@ from tests.conftest import LiveServer
 URL = "/v1/radio-checks"
 
 
+@pytest.mark.slow
 def test_a_fixed_narrow_beacon_is_warned_of_under_the_us_rules(client: httpx.Client) -> None:
     answer = client.post(URL, json={"radio": {"bandwidth_hz": 125_000, "spreading_factor": 7, "interval_s": 2.0}})
     assert answer.status_code == 200, answer.text

@@ -82,6 +82,7 @@ def ended(client: httpx.Client, answer: httpx.Response) -> dict[str, Any]:
     return wait_until(found, "the reprocessing")
 
 
+@pytest.mark.slow
 def test_what_changed_is_reported_and_becomes_current_when_accepted(
     server: LiveServer, admin: httpx.Client, place: Callable[[], dict[str, Any]]
 ) -> None:
@@ -194,6 +195,7 @@ def test_a_shard_goes_on_where_it_was_killed_and_can_be_cancelled(
     refused(admin.post(f"{other['links']['self']}/accept"), 409, "conflict")
 
 
+@pytest.mark.slow
 def test_packets_are_no_repetitions_of_themselves(server: LiveServer, admin: httpx.Client) -> None:
     built = build_lane(admin, np.random.default_rng(2702))
     first, hour = drive(built, 2703)

@@ -30,6 +30,12 @@ def _line(*steps: tuple[float, float], start: tuple[float, float] | None = None)
     return points
 
 
+def _ahead(place: list[float], metres: float) -> tuple[float, float]:
+    """A place north of another one."""
+    lon, lat, _ = GEOD.fwd(*place, 0, metres)
+    return float(lon), float(lat)
+
+
 def _along(line: Line, metres: float, left_m: float = 0.0) -> list[float]:
     """A place along the first edge of a line."""
     heading = GEOD.inv(*line[0], *line[1])[0]
@@ -157,7 +163,7 @@ def test_equations_of_stationing(client: httpx.Client) -> None:
 
 def test_parts_and_gaps(client: httpx.Client) -> None:
     first = _line((0, 500))
-    second = _line((0, 500), start=tuple(GEOD.fwd(*first[-1], 0, 200)[:2]))  # type: ignore[arg-type]
+    second = _line((0, 500), start=_ahead(first[-1], 200))
     geometry = {"type": "MultiLineString", "coordinates": [first, second]}
     calibration = [{"measure_m": 0, "vertex": 0}, {"measure_m": 700, "part": 1, "vertex": 0}]
     road = client.post("/v1/roads", json={"name": "gap", "geometry": geometry, "calibration": calibration}).json()
@@ -165,6 +171,25 @@ def test_parts_and_gaps(client: httpx.Client) -> None:
     refused(client.get(f"/v1/roads/{road['id']}/position?measure_m=600"), 422, field="measure_m")
     (place,) = client.get(f"/v1/roads/{road['id']}/position?measure_m=700").json()["places"]
     assert GEOD.inv(place["lon_deg"], place["lat_deg"], *second[0])[2] < 1e-6
+
+
+def test_known_measures_are_sent_back_as_they_were_answered(client: httpx.Client) -> None:
+    first = _line((0, 500), (10, 300))
+    second = _line((0, 500), start=_ahead(first[-1], 200))
+    known = [
+        {"measure_m": 0, "vertex": 0},
+        {"measure_m": 260, "ahead_m": 300, "chainage_m": 250.5},
+        {"measure_m": 550, "vertex": 1},
+        {"measure_m": 1200, "part": 1, "chainage_m": 900},
+    ]
+    geometry = {"type": "MultiLineString", "coordinates": [first, second]}
+    road = client.post("/v1/roads", json={"name": "there and back", "geometry": geometry, "calibration": known}).json()
+    assert [point["vertex"] for point in road["calibration"]] == [0, None, 1, None]
+    assert [point["chainage_m"] for point in road["calibration"]] == pytest.approx([0, 250.5, 500, 900], abs=1e-3)
+    given = [{**point, "chainage_m": None} if point["vertex"] is not None else point for point in road["calibration"]]
+    again = _patch(client, road, calibration=given).json()
+    assert again["calibration"] == road["calibration"]
+    assert again["sections"] == road["sections"]
 
 
 # --- markers ------------------------------------------------------------------------------------------------------
@@ -319,6 +344,10 @@ SHORT = [[8.0, 49.0], [8.001, 49.0]]
         ({"calibration": [{"measure_m": 0}]}, "calibration.0"),
         ({"calibration": [{"measure_m": 0, "vertex": 2}]}, "calibration.0.vertex"),
         ({"calibration": [{"measure_m": 0, "vertex": 0, "part": 1}]}, "calibration.0.vertex"),
+        ({"calibration": [{"measure_m": 0, "vertex": 0, "chainage_m": 0}]}, "calibration.0"),
+        ({"calibration": [{"measure_m": 0, "chainage_m": 1e7}]}, "calibration.0.chainage_m"),
+        ({"calibration": [{"measure_m": 0, "chainage_m": -1}]}, "calibration.0.chainage_m"),
+        ({"calibration": [{"measure_m": 0, "chainage_m": 0, "part": 1}]}, "calibration.0.chainage_m"),
         ({"calibration": [{"measure_m": 0, "position": [9.0, 49.0]}]}, "calibration.0.position"),
         ({"calibration": [{"measure_m": 0, "vertex": 0}, {"measure_m": -50, "vertex": 1}]}, "calibration"),
         ({"calibration": [{"measure_m": 0, "vertex": 0}, {"measure_m": 0.07, "vertex": 1}]}, "calibration"),

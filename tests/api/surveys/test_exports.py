@@ -42,6 +42,7 @@ def markers(client: httpx.Client) -> list[dict[str, float]]:
     return made
 
 
+@pytest.mark.slow
 def test_csv_is_harmless_and_its_numbers_are_exact(client: httpx.Client, markers: list[dict[str, float]]) -> None:
     answer = client.get("/v1/exports/csv", params={"family": "cerpm"})
     assert answer.headers["content-type"].startswith("text/csv")
@@ -105,6 +106,7 @@ def test_dxf_is_in_metres(client: httpx.Client, markers: list[dict[str, float]])
     assert len(document.modelspace()) == 3
 
 
+@pytest.mark.slow
 def test_filters_and_refusals(client: httpx.Client, markers: list[dict[str, float]]) -> None:
     box = f"{LON - 1e-5},{LAT - 1e-5},{LON + 1e-5},{LAT + 1e-5}"
     found = json.loads(client.get("/v1/exports/geojson", params={"bbox": box}).text)["features"]
@@ -114,6 +116,7 @@ def test_filters_and_refusals(client: httpx.Client, markers: list[dict[str, floa
     assert client.get("/v1/exports/exe").status_code == 422
 
 
+@pytest.mark.slow
 def test_the_filters_are_those_of_the_list(client: httpx.Client, markers: list[dict[str, float]]) -> None:
     around = f"POLYGON(({LON - 1e-4} 49, {LON + 1e-4} 49, {LON + 1e-4} 49.1, {LON - 1e-4} 49.1, {LON - 1e-4} 49))"
     for wanted, params in (
@@ -211,8 +214,10 @@ def test_a_distant_marker_is_left_out_and_named(
     assert marker["id"] in retired.text
 
 
-def test_no_file_is_left_behind(client: httpx.Client, markers: list[dict[str, float]]) -> None:
-    before = set(Path(tempfile.gettempdir()).glob("waymark-export-*"))
+def test_no_file_is_left_behind(
+    client: httpx.Client, markers: list[dict[str, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # the server is in this process
     assert client.get("/v1/exports/gpkg").status_code == 200
     assert client.get("/v1/exports/kml", params={"status": "retired"}).status_code == 422
-    assert set(Path(tempfile.gettempdir()).glob("waymark-export-*")) <= before
+    assert list(tmp_path.iterdir()) == []

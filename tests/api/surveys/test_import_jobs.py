@@ -50,6 +50,7 @@ def _cancel(client: httpx.Client, import_id: str) -> httpx.Response:
     return client.post(f"/v1/imports/{import_id}/cancel")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("limit", "value"), [("IMMEDIATE_LINES", 4), ("IMMEDIATE_BYTES", 200)])
 def test_long_surveys_become_jobs(
     client: httpx.Client, waiting: list[str], monkeypatch: pytest.MonkeyPatch, limit: str, value: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -51,6 +51,7 @@ def _markers(client: httpx.Client) -> list[dict[str, Any]]:
     return client.get("/v1/markers", params={"limit": 1000}).json()["items"]
 
 
+@pytest.mark.slow
 def test_a_dry_run_stores_nothing_and_says_what_would_be(client: httpx.Client) -> None:
     answer = _send(client, _csv(), {**DEGREES, "dry_run": True})
     assert answer.status_code == 200
@@ -275,9 +276,9 @@ def _bad_zip(name: str, content: bytes) -> bytes:
         (b"<kml>" + b"<a>" * 5000 + b"</a>" * 5000 + b"</kml>", {}, "file"),
         (b"SQLite format 3\x00" + b"\x00" * 1000, {}, "file"),
         (b"PK\x03\x04 no archive", {}, "file"),
-        (_bad_zip("survey", b"\x00" * 200), {}, "file"),
-        (_bad_zip("../../etc/passwd", b"\x00\x00\x27\x0a" + b"\xff" * 300), {}, "file"),
-        (_bad_zip("bomb", b"\x00\x00\x27\x0a" + b"\x00" * 600 * 2**20), {}, "file"),
+        (lambda: _bad_zip("survey", b"\x00" * 200), {}, "file"),
+        (lambda: _bad_zip("../../etc/passwd", b"\x00\x00\x27\x0a" + b"\xff" * 300), {}, "file"),
+        (lambda: _bad_zip("bomb", b"\x00\x00\x27\x0a" + b"\x00" * 600 * 2**20), {}, "file"),
         (b'{"type": "FeatureCollection", "features": ' + b"[" * 100_000, {}, "file"),
         (b'{"type": "Point"}', {}, "file"),
         (b"0\nSECTION\n2\nHEADER\n9\n", {"crs": "EPSG:32632"}, "file"),
@@ -303,9 +304,10 @@ def _bad_zip(name: str, content: bytes) -> bytes:
     ],
 )  # fmt: skip
 def test_bad_input_is_a_problem_with_field_limit_and_cure(
-    client: httpx.Client, data: bytes, declared: dict[str, Any], field: str
+    client: httpx.Client, data: bytes | Callable[[], bytes], declared: dict[str, Any], field: str
 ) -> None:
-    answer = _send(client, data, {**DEGREES, "columns": {}, **declared})
+    content = data if isinstance(data, bytes) else data()
+    answer = _send(client, content, {**DEGREES, "columns": {}, **declared})
     assert 400 <= answer.status_code < 500, answer.text
     problem = answer.json()
     assert problem["field"] == field, problem
@@ -363,6 +365,7 @@ def test_an_import_can_be_a_job(server: LiveServer, client: httpx.Client) -> Non
         assert other.get(f"/v1/imports/{job['id']}").status_code == 404
 
 
+@pytest.mark.slow
 def test_a_large_file_becomes_a_job_and_runs_once(server: LiveServer, client: httpx.Client) -> None:
     blank = b"\n" * (8 * 2**20)  # empty lines count for nothing but bytes
     job = _finished(client, _send(client, _csv(20) + blank, DEGREES))
@@ -398,3 +401,64 @@ def test_rows_on_a_registered_road_get_its_measures_and_keep_them_right_when_the
     built = {**DEGREES, "compare": True, "tolerance_m": 5.0, "status": "surveyed"}
     assert _send(client, moved.encode(), built).status_code == 201
     assert measures() == pytest.approx([m + length_m / 1000 for m in expected], abs=1e-3)
+
+
+def test_rows_that_are_left_out_are_neither_checked_nor_stored(client: httpx.Client) -> None:
+    data = _csv(row3="3,8.4,abc", row5="2,8.417,49.0052")
+    dry = _send(client, data, {**DEGREES, "dry_run": True, "list_rows": 100}).json()
+    assert [(row["row"], row["state"]) for row in dry["listed"]][2:5] == [(3, "refused"), (4, "good"), (5, "refused")]
+    left = {**DEGREES, "leave_out": [3, 5, 999]}
+    dry = _send(client, data, {**left, "dry_run": True, "list_rows": 100}).json()
+    assert (dry["good_rows"], dry["refused_rows"], dry["left_out_rows"]) == (6, 0, 2)
+    assert "not_a_number" not in dry["counts"]
+    listed = {row["row"]: row for row in dry["listed"]}
+    assert [row for row in listed if listed[row]["state"] == "left-out"] == [3, 5]
+    assert listed[3]["lon_deg"] is None
+    assert listed[1] == {
+        "row": 1, "state": "good", "point": None, "code": "1", "lon_deg": pytest.approx(LON + STEP, abs=1e-8),
+        "lat_deg": pytest.approx(LAT, abs=1e-6), "height_m": None,
+    }  # fmt: skip
+    stored = _send(client, data, left)
+    assert stored.status_code == 201, stored.text
+    assert stored.json()["listed"] == []
+    assert sorted(marker["code"]["number"] for marker in _markers(client)) == [1, 2, 4, 6, 7, 8]
+
+
+def test_most_rows_can_be_left_out(client: httpx.Client) -> None:
+    report = _send(client, _csv(), {**DEGREES, "leave_out": [1, 2, 3, 4, 5, 6], "dry_run": True}).json()
+    assert (report["good_rows"], report["left_out_rows"]) == (2, 6)
+    nothing = _send(client, _csv(), {**DEGREES, "leave_out": list(range(1, 9))})
+    assert nothing.status_code == 422
+
+
+def test_a_correction_of_the_declaration_can_be_merged_into_it(client: httpx.Client) -> None:
+    data = _csv().replace(b"number,lon,lat", b"number,lat,lon")  # the header is wrong
+    report = _send(client, data, {**DEGREES, "dry_run": True}).json()
+    (fault,) = [fault for fault in report["faults"] if fault["row"] is None and fault["severity"] == "refused"]
+    assert fault["code"] == "swapped_axes"
+    assert fault["changes"] == {"columns": {"lon_deg": "lat", "lat_deg": "lon"}}
+    corrected = {**DEGREES, "columns": {**DEGREES["columns"], **fault["changes"]["columns"]}}
+    report = _send(client, data, {**corrected, "dry_run": True}).json()
+    assert report["good_rows"] == 8
+
+
+def test_accuracies_in_millimetres_are_corrected(client: httpx.Client) -> None:
+    survey = {"horizontal_rmse_m": 15.0, "surveyor": "A. Muster"}
+    report = _send(client, _csv(), {**DEGREES, "survey": survey, "dry_run": True}).json()
+    (fault,) = [fault for fault in report["faults"] if fault["code"] == "coarse_accuracy"]
+    assert fault["changes"] == {"survey": {"horizontal_rmse_m": 0.015}}
+
+
+def test_listed_rows_of_a_long_survey_are_spread_over_it(client: httpx.Client) -> None:
+    report = _send(client, _csv(60, row30="30,8.4,abc"), {**DEGREES, "dry_run": True, "list_rows": 10}).json()
+    rows = [row["row"] for row in report["listed"]]
+    assert rows == sorted(set(rows))
+    assert {1, 30, 60} <= set(rows)
+    assert len(rows) <= 10
+
+
+@pytest.mark.parametrize("wrong", [{"leave_out": [0]}, {"leave_out": [1.5]}, {"list_rows": 2001}, {"list_rows": -1}])
+def test_bad_lists_of_rows_are_refused(client: httpx.Client, wrong: dict[str, Any]) -> None:
+    answer = _send(client, _csv(), {**DEGREES, **wrong})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"].startswith(f"declaration.{next(iter(wrong))}")

@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
+import pytest
 from tusclient.client import TusClient
 
 from benchmarks.faults.server import HEADERS, FaultServer
@@ -19,6 +20,7 @@ from tests.http import WITHIN_S
 MIB = 1 << 20
 
 
+@pytest.mark.slow
 def test_tuspy_resumes_after_kill_9(tmp_path: Path) -> None:
     data = zip_of_frames(40 * MIB)
     server = FaultServer(tmp_path / "var")

@@ -52,6 +52,7 @@ def started(client: httpx.Client, size: int) -> dict[str, object]:
     return document
 
 
+@pytest.mark.slow
 def test_parts_in_s3_become_a_decode(server: LiveServer, client: httpx.Client) -> None:
     data = zip_of_frames(1000)
     document = started(client, len(data))
@@ -83,6 +84,7 @@ def test_an_upload_that_is_given_up_leaves_no_parts(client: httpx.Client) -> Non
     assert left == []
 
 
+@pytest.mark.slow
 def test_a_server_with_a_folder_names_tus(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY, warm_decoders=False, **UNLIMITED)
     with LiveServer(create_app(settings, decode=standin.decode)) as local, local.agency("local") as client:

@@ -90,6 +90,7 @@ def test_signs_of_other_dictionaries_are_not_taken_for_registered_ones() -> None
         assert not [reading for reading in readings if reading.outcome is FiducialOutcome.READ]
 
 
+@pytest.mark.slow
 def test_frames_without_signs_give_no_reading() -> None:
     """Plates, and pictures full of squares with random modules: no code is returned, whatever is registered."""
     rng = np.random.default_rng(11)

@@ -30,7 +30,7 @@ def classify(dipoles: list[Dipole], before: list[Dipole] | None = None) -> list[
     return classify_dipoles(with_log_odds(dipoles, PRIOR), with_log_odds(before or [], PRIOR), STATE, HALF_M)
 
 
-MESH = [pole(s, y) for s, y in ((10.0, -0.8), (10.2, -0.3), (10.1, 0.2), (10.3, 0.7))]
+MESH = [pole(s, y, height_m=0.19) for s, y in ((10.0, -0.8), (10.2, -0.3), (10.1, 0.2), (10.3, 0.7))]
 TAG = [pole(10 + 0.5 * i, 0.02 * i) for i in range(5)]
 
 
@@ -41,6 +41,7 @@ def test_there_is_a_weight_for_each_feature() -> None:
 def test_poles_beside_each_other_are_iron_and_a_row_is_not() -> None:
     assert is_ferrous(MESH, HALF_M)
     assert all(isinstance(one, Rejected) and one.kind is NoiseKind.FERROUS for one in classify(MESH))
+    assert all(isinstance(classify([one])[0], Accepted) for one in MESH)
     assert not is_ferrous(TAG, HALF_M)
     assert all(isinstance(one, Accepted) for one in classify(TAG))
 
@@ -75,6 +76,16 @@ def test_what_lies_deep_is_no_magnet(height_m: float, fine: bool) -> None:
     if isinstance(classification, Rejected):
         assert classification.kind is NoiseKind.WRONG_HEIGHT
         assert f"{MIN_PROBABILITY:.0%} are needed" in classification.reason
+
+
+def test_magnets_in_a_row_with_a_dipole_make_it_likelier() -> None:
+    odd = pole(12, 0, moment=3.1)
+    (alone,), (*_, in_a_row) = classify([odd]), classify([pole(10, 0), pole(11, 0.02), odd])
+    (*_, beside) = classify([pole(10, 0.5), pole(11, 0.52), odd])
+    assert isinstance(alone, Accepted)
+    assert isinstance(in_a_row, Accepted)
+    assert in_a_row.confidence > alone.confidence
+    assert isinstance(beside, Rejected) or beside.confidence < in_a_row.confidence
 
 
 def test_a_dipole_that_the_fit_moved_to_where_magnets_are_says_little() -> None:

@@ -60,6 +60,7 @@ def test_nothing_there_is_a_result() -> None:
     assert not [f for f in decode_trace(drive.trace, BAR) if isinstance(f, MagnetReading | TagReading | LineCrossing)]
 
 
+@pytest.mark.slow
 def test_town_iron_is_named_not_read() -> None:
     rng = np.random.default_rng(13)
     lines = line_magnets(20, 60, 6, 0.2, Polarity.N)
@@ -73,6 +74,18 @@ def test_town_iron_is_named_not_read() -> None:
     assert all("%" in f.reason or "cm" in f.reason for f in iron)
 
 
+@pytest.mark.slow
+def test_a_line_is_not_learnt_as_the_noise_of_a_wheel_whose_turn_is_about_as_long() -> None:
+    lines = line_magnets(60, 200, 2, 0.6, Polarity.N)  # a turn is 1.95 m long
+    vehicle = Vehicle.compact(clearance_m=0.25, wheel_moment_am2=1.0)
+    scene = Scene(Road(220), vehicle, Course(25 * MPH, weave_m=0.1), lines=lines)
+    drive = simulate_drive(scene, np.random.default_rng(23))
+    findings = [f for f in decode_trace(drive.trace, BAR) if isinstance(f, MagnetReading)]
+    assert len(findings) >= 0.95 * len(lines)
+    assert {(f.orientation, f.polarity) for f in findings} == {(Orientation.UP, Polarity.N)}
+
+
+@pytest.mark.slow
 def test_iron_alone_shows_no_clearance_and_no_magnet() -> None:
     rng = np.random.default_rng([5, 0, 0])  # a drive that had eight magnets at clearances of 26 to 52 cm
     vehicle = Vehicle.compact(clearance_m=0.24)
@@ -278,6 +291,7 @@ def test_opposed_magnets_half_a_metre_apart_are_not_one_of_the_other_kind(cleara
     assert right >= 20
 
 
+@pytest.mark.slow
 def test_a_magnet_at_the_border_of_two_regions_is_read_once() -> None:
     lines = line_magnets(20, 180, 2.0, 0.7, Polarity.N)  # regions end after 8 m, wherever a magnet is
     scene = Scene(Road(200), Vehicle.compact(clearance_m=0.16), Course(15.0, weave_m=0.1), lines=lines)

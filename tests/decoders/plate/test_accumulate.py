@@ -50,6 +50,7 @@ def test_equal_frames_count_as_stated(noisy: list[tuple[PlateReading, PlateEvide
     assert accumulate([one]) is one
 
 
+@pytest.mark.slow
 def test_frames_that_are_not_read_alone_are_read_together() -> None:
     noisy = _noisy_frames(85.0, 14, UNCHECKED)
     refused = [evidence for reading, evidence in noisy if reading.code is None]

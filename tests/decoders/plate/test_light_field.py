@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from app.decoders.plate.light_field import (
     ALBEDO_WEIGHT,
@@ -60,6 +61,7 @@ def whole_covariance_light(pixels: PlatePixels, white: np.ndarray, parts: np.nda
     return light
 
 
+@pytest.mark.slow
 def test_the_light_is_that_of_the_whole_covariance() -> None:
     rng = np.random.default_rng(5)
     count, level = 900, 0.5

@@ -77,6 +77,7 @@ def test_the_best_codeword_is_that_of_an_algebraic_decoder(scheme: PlateScheme, 
     assert agreed >= 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "n"), CHECKED)
 def test_random_symbols_are_accepted_no_more_often_than_stated(scheme: PlateScheme, n: int) -> None:
     """Evidence above L for random symbols has a probability of exp(-L) at most, here for L from 0 to 4."""
@@ -114,6 +115,7 @@ def test_the_error_probability_is_that_of_all_codewords() -> None:
     assert found.wrong == pytest.approx(0.4**5 / (0.4**5 + 0.6**5), rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [10, 12])
 def test_words_of_the_two_schemes_are_far_apart(n: int) -> None:
     """A plate of one scheme, with as many wrong cells as checks correct, is none of the other."""

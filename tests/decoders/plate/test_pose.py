@@ -100,6 +100,7 @@ def test_the_surveys_errors_reach_the_vehicle() -> None:
     np.testing.assert_allclose(by_turn, np.outer(moved, moved), atol=8e-5)  # a degree is not quite small
 
 
+@pytest.mark.slow
 def test_the_poses_errors_reach_the_vehicle() -> None:
     camera = replace(CAMERA, height_m=1.5)
     pose = seen_from(camera, 1.0, -3.0, 40.0, 10.0)
@@ -168,6 +169,7 @@ def seen() -> list[tuple[PlateReading, RenderedFrame]]:
     return pairs
 
 
+@pytest.mark.slow
 def test_the_camera_is_placed_within_centimetres(seen: list[tuple[PlateReading, RenderedFrame]]) -> None:
     errors_m = [
         np.linalg.norm(camera_position_m(r.pose) - f.truths[0].camera_position_m) for r, f in seen if r.pose is not None

@@ -21,6 +21,8 @@ from app.simulation.plate_scene import Shadow
 from app.simulation.printed_plate import PrintFaults, Stain
 from tests.decoders.plate.print_photos import CODE, GEOMETRY, LOOK, photo_of, pixels
 
+pytestmark = pytest.mark.slow
+
 LIGHT_UNIT, DARK_UNIT = (5, 3), (3, 3)  # of CODE
 BLACK_GAPS = replace(LOOK, gap=(0.05, 0.05, 0.05))
 WHITE_GAPS = replace(LOOK, gap=(0.7, 0.7, 0.7))

@@ -31,6 +31,7 @@ def corner_errors(reading: PlateReading, truth_px: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(reading.corners_px - truth_px, axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn_deg", range(0, 360, 15))
 def test_a_plate_is_read_at_any_turn(turn_deg: int) -> None:
     frame = shoot_plate(turn_deg=turn_deg, left_m=-0.2, seed=turn_deg + 1)

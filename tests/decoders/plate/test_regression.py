@@ -9,6 +9,8 @@ from app.markers.reading import PlateOutcome
 from benchmarks.plates.evaluate import Record, evaluate_job
 from benchmarks.plates.sets import Job, Shot, find_shot, read_trials
 
+pytestmark = pytest.mark.slow
+
 TRIALS = (2, 5, 9, 14, 16, 20, 22, 24, 25)  # of the paper's 26, in figures 10, 12 and 13
 MIN_ROWS = 16.0
 MIN_READ_SHARE = 0.88  # 0.95 were read when this was written

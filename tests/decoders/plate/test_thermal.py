@@ -13,6 +13,8 @@ from app.markers.reading import PlateOutcome
 from benchmarks.plates.sets import Job, Shot, find_shot, shoot
 from tests.decoders.plate.scenes import PAPER, THERMAL_CAMERA, shoot_warm
 
+pytestmark = pytest.mark.slow
+
 CODES = [PAPER, PlateCode.from_registry_number(0xDEADBEEF)]
 
 

@@ -107,6 +107,7 @@ def test_a_plate_that_is_seen_clearly_ends_the_search() -> None:
     assert len(task.evidence) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("veil", [0.0, 0.004])
 def test_the_likelihoods_are_those_of_normal_distributions(veil: float) -> None:
     rng = np.random.default_rng(4)

@@ -73,6 +73,10 @@ def _name(bgr: npt.NDArray[np.float64]) -> str:
 
 def read_qr(picture: Rendering) -> str:
     """Text of the QR code on a sheet."""
-    grey = cv2.cvtColor(picture.bgr, cv2.COLOR_BGR2GRAY)
-    text, _, _ = cv2.QRCodeDetector().detectAndDecode(grey)
-    return text
+    return qr_text(cv2.cvtColor(picture.bgr, cv2.COLOR_BGR2GRAY))
+
+
+def qr_text(grey: cv2.typing.MatLike) -> str:
+    """Text of the QR code in a picture, "" without one: either of OpenCV's readers misses a code now and then."""
+    readers = (cv2.QRCodeDetector(), cv2.QRCodeDetectorAruco())
+    return next((text for reader in readers if (text := reader.detectAndDecode(grey)[0])), "")

@@ -51,6 +51,7 @@ def _bundle(orders: list[PlateOrder], **arguments: Any) -> tuple[zipfile.ZipFile
     return archive, manifest
 
 
+@pytest.mark.slow
 def test_the_manifest_accounts_for_every_file(make_order: Callable[..., PlateOrder]) -> None:
     options = BundleOptions(formats=tuple(ArtworkFormat), sheet_mm=(800.0, 900.0), dpi=72)
     archive, manifest = _bundle(_orders(make_order, 5), options=options, read=sampling_reader)

@@ -49,10 +49,15 @@ def _extents(drawing: Drawing) -> list[tuple[str, Polygon]]:
     ids=["8-small", "8", "10", "12"],
 )
 @pytest.mark.parametrize("plate_id", ["A", "W" * 64], ids=["short", "long"])
+@pytest.mark.parametrize("without_qr", [{}, {"record_url": ""}], ids=["QR", "no QR"])
 def test_the_margin_is_uncluttered(
-    code: PlateCode, geometry: PlateGeometry, plate_id: str, make_order: Callable[..., PlateOrder]
+    code: PlateCode,
+    geometry: PlateGeometry,
+    plate_id: str,
+    without_qr: dict[str, str],
+    make_order: Callable[..., PlateOrder],
 ) -> None:
-    drawing = encode_plate(make_order(code, geometry, plate_id=plate_id, crs="W" * 80))
+    drawing = encode_plate(make_order(code, geometry, plate_id=plate_id, crs="W" * 80, **without_qr))
     extents = _extents(drawing)
     assert len(extents) > 15
     sheet, face = box(0, 0, drawing.width_mm, drawing.height_mm), box(*drawing.trim_mm[0])

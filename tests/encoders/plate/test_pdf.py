@@ -56,6 +56,7 @@ def test_boxes_are_the_plate_and_its_bleed(geometry: PlateGeometry, make_order: 
     assert media[3] > bleed[3]
 
 
+@pytest.mark.slow
 def test_every_ink_is_a_separation_with_its_own_area(
     make_order: Callable[..., PlateOrder], require_tool: Callable[..., str], tmp_path: Path
 ) -> None:
@@ -80,6 +81,7 @@ def test_every_ink_is_a_separation_with_its_own_area(
         assert area[name] < 1.0, name
 
 
+@pytest.mark.slow
 def test_the_base_bleeds_and_crop_marks_are_on_every_separation(
     make_order: Callable[..., PlateOrder], require_tool: Callable[..., str], tmp_path: Path
 ) -> None:

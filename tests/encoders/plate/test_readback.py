@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from app.encoders.plate import ArtworkOptions, PlateOrder, encode_plate, write_pdf, write_png, write_svg
+from app.encoders.plate.drawing import Layer, Modules, Text
 from app.markers.plate import PlateCode, PlateGeometry
 from tests.encoders.plate.artwork_reading import marker_colours, read_digits, read_qr, rendering
 from tests.http import WITHIN_S
@@ -62,6 +63,7 @@ def _from_chromium(order: PlateOrder, options: ArtworkOptions, folder: Path, too
     return cv2.imread(str(folder / "page.png"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("render", [_from_png, _from_svg, _from_pdf])
 @pytest.mark.parametrize("code", CODES, ids=lambda c: f"{c.scheme}-{c.n}-{c.check_digits}")
 def test_every_scheme_and_size_reads_back(
@@ -80,6 +82,7 @@ def test_every_scheme_and_size_reads_back(
     assert marker_colours(picture, *geometry) == CORNERS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("render", [_from_png, _from_svg, _from_pdf, _from_chromium])
 def test_heaters_and_leds_stay_under_the_face_and_the_qr_opens_the_record(
     render: Callable[..., npt.NDArray[np.uint8]],
@@ -94,3 +97,26 @@ def test_heaters_and_leds_stay_under_the_face_and_the_qr_opens_the_record(
     assert read_digits(picture, 8, 35.0, 5.0) == "023792168411"
     assert marker_colours(picture, 8, 35.0, 5.0) == CORNERS
     assert read_qr(picture) == order.record_url
+
+
+@pytest.mark.parametrize("render", [_from_png, _from_svg, _from_pdf])
+def test_without_an_address_the_face_is_the_same_and_the_margin_says_that_there_is_no_qr_code(
+    render: Callable[..., npt.NDArray[np.uint8]],
+    make_order: Callable[..., PlateOrder],
+    require_tool: Callable[..., str],
+    tmp_path: Path,
+) -> None:
+    order = make_order(record_url="")
+    drawing = encode_plate(order)
+    picture = rendering(
+        render(order, ArtworkOptions(), tmp_path, require_tool),
+        (drawing.width_mm, drawing.height_mm),
+        drawing.trim_mm[0],
+    )
+    assert read_digits(picture, 8, 35.0, 5.0) == "023792168411"
+    assert marker_colours(picture, 8, 35.0, 5.0) == CORNERS
+    assert read_qr(picture) == ""
+    assert not [part for part in drawing.parts if isinstance(part, Modules)]
+    notes = [part for part in drawing.parts if isinstance(part, Text) and part.layer is Layer.NOTE]
+    assert {"No QR code:", "no public address"} <= {note.text for note in notes}  # a note: it is not engraved
+    assert "No QR code:" not in {part.text for part in encode_plate(make_order()).parts if isinstance(part, Text)}

@@ -47,6 +47,7 @@ def panel_of(client: httpx.Client, marker: dict[str, Any]) -> np.ndarray[Any, np
     return np.asarray(sheet[top : top + panel_px, left : left + panel_px], dtype=np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mounting", "ahead_m", "left_m", "up_m", "turn_deg", "limit_m"),
     [
@@ -102,6 +103,7 @@ def test_the_vehicle_is_found_by_a_sign(
     assert [reading for reading in unmatched["readings"] if reading["family"] == "fiducial"] == []
 
 
+@pytest.mark.slow
 def test_corners_are_found_to_parts_of_a_pixel(capsys: pytest.CaptureFixture[str]) -> None:
     """`CORNER_SIGMA_PX` in app/decoders/fiducial/pose.py rests on the figure that this test prints."""
     code = FiducialCode("apriltag-36h11", 17)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -19,10 +18,9 @@ from app.decoders.fiducial.offline import known_fiducials, match_fiducial
 from app.decoders.snapshot import open_snapshot
 from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial
 from app.markers.snapshot import Trust
+from tests.conftest import Place
 
 pytestmark = pytest.mark.both_databases
-
-Place = Callable[[], dict[str, Any]]
 
 
 def sign(place: dict[str, Any], number: int = 17, dictionary: str = "apriltag-36h11", **more: Any) -> dict[str, Any]:
@@ -126,6 +124,7 @@ def test_a_sign_goes_out_to_gis_files_and_vehicles(client: httpx.Client, place: 
     assert snapshot.summary()["markers"] == {"fiducial": 1}
 
 
+@pytest.mark.slow
 def test_a_survey_registers_signs_by_their_numbers(client: httpx.Client, place: Place) -> None:
     at = place()
     lon, lat = at["lon_deg"], at["lat_deg"]

@@ -152,6 +152,7 @@ def test_no_speed() -> None:
     assert any("declared" in text for text in result.report.warnings)
 
 
+@pytest.mark.slow
 def test_a_damaged_archive_and_a_bomb() -> None:
     archive = zipped(write_recorder_files(make_trace(2000)))
     for damaged in (archive[: len(archive) // 2], archive[:5000] + bytes(500) + archive[5500:]):

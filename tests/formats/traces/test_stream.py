@@ -188,6 +188,7 @@ def _damage(stream: bytearray, rng: np.random.Generator, *, flips: bool) -> byte
     return stream
 
 
+@pytest.mark.slow
 def test_no_sample_is_misaligned_by_cuts_and_insertions() -> None:
     """Only a cut and an insertion that make up a whole number of samples within one sample could splice one unseen."""
     wrong = read_samples = lost = 0
@@ -205,6 +206,7 @@ def test_no_sample_is_misaligned_by_cuts_and_insertions() -> None:
     assert lost / 60 < 20  # of which most were cut out
 
 
+@pytest.mark.slow
 def test_any_damage_ends_in_samples_or_in_a_refusal() -> None:
     refused = 0
     for seed in range(60):

@@ -115,6 +115,7 @@ def test_the_cheapest_mix_takes_the_family_that_is_good_enough_in_each_place() -
         place_plan(road(straight(1000)), rules, name="tags", chosen=plan.places)
 
 
+@pytest.mark.slow
 def test_the_path_and_the_fixes_of_a_winding_road_cost_at_most_eight_tenths_of_even_spacing() -> None:
     lane = winding(2, 1, 1200)
     rules = rules_of(cerpm={"straight": 3.0}, quality={"fix_every_m": 100, "path_error_m": 0.05})

@@ -44,6 +44,7 @@ def files(package: Package) -> dict[str, bytes]:
     return dict(found)
 
 
+@pytest.mark.slow
 def test_it_has_every_file_every_plate_every_tag_and_every_line(package: Package, files: dict[str, bytes]) -> None:
     plan = package.plan
     plain = {file.name: file.write() for file in plan_files(plan)}
@@ -74,6 +75,7 @@ def test_drilling_sheets_have_the_holes_of_the_plan(package: Package, files: dic
     assert sheet != other, "diameter and depth of the holes are on the sheet"
 
 
+@pytest.mark.slow
 def test_parts_give_the_same_in_any_order_and_the_manifest_has_their_hashes(
     package: Package, files: dict[str, bytes]
 ) -> None:

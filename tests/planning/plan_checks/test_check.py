@@ -71,6 +71,7 @@ def test_few_frames_fail_with_the_place_and_the_cure() -> None:
     assert "larger units" in found.sentence
 
 
+@pytest.mark.slow
 def test_path_error_is_found_at_the_change_of_curvature() -> None:
     plan = checked(road(bend(62.5, 195, 90.0)), cerpm={"max_path_error_m": None, "straight": 2.5, "curve": 2.5})
     found = finding(plan, "path-error")
@@ -122,6 +123,7 @@ def test_busy_radio_fails_at_the_busiest_place() -> None:
     assert 500 < found.station_m < 1500
 
 
+@pytest.mark.slow
 def test_radio_settings_are_recommended_for_the_busiest_place() -> None:
     """On the straights pairs are far apart, and settings for the mean spacing lose most packets in the bend."""
     rules = {"max_path_error_m": 0.01}
@@ -135,6 +137,7 @@ def test_radio_settings_are_recommended_for_the_busiest_place() -> None:
     assert finding(checked(plan.alignment, cerpm=fixed), "radio read-in-time").verdict is Verdict.FAIL
 
 
+@pytest.mark.slow
 def test_the_path_beside_a_shared_line_is_that_of_the_lane() -> None:
     """Markers on the line between two lanes name no side."""
     lane = straight(500)

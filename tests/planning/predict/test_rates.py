@@ -139,6 +139,7 @@ def test_the_fitted_parameters_name_the_command_that_makes_them() -> None:
     assert middle == pytest.approx([0.018], rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_path_of_a_proof_is_as_far_off_as_predicted(cerpms: Plan) -> None:
     """Twelve drives of a road on which nothing was fitted; the benchmark has more roads and stricter limits."""
     prover = Prover(cerpms, ProofTerms(drives=12, seed=5, max_sections_per_drive=10))

@@ -15,6 +15,8 @@ from app.planning.proof.prove import Prover, list_units, prove_plan, prove_unit
 from tests.planning.proof.conftest import plan_on
 from tests.planning.roads import bend, straight
 
+pytestmark = pytest.mark.slow
+
 
 def test_plates_of_a_slow_road_are_all_read_and_give_positions_within_the_survey(plates: Plan) -> None:
     report = prove_plan(plates, ProofTerms(drives=2, conditions=("day", "night+rain"), survey_rmse_m=0.02))

@@ -31,12 +31,14 @@ from app.registry.tenancy import across_agencies
 from app.services.backups.backup import BackupOptions, Backups
 from app.services.backups.manifest import verify_backup
 from app.services.backups.restore import Restores
+from app.services.ports import utc_now
 from app.settings import Settings
 from app.storage.backup_files import DamagedBackup
 from app.storage.blobs import Blobs
-from app.wiring import utc_now
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
 from tests.http import wait_until
+
+pytestmark = pytest.mark.slow
 
 NewUrl = Callable[[Path], str]
 NUMBERS = itertools.count()

@@ -1,0 +1,1 @@
+"""/m: pages of markers that need no key, and /v1/damage-reports."""

@@ -1,0 +1,100 @@
+"""/v1/damage-reports: what people reported on public pages, and the agency's decisions."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import ConfigDict, Field
+
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_cases
+from app.api.http.problems import problem_responses
+from app.api.http.responses import document_response, file_response, json_response, page_response
+from app.api.http.strict_json import StrictRoute
+from app.families.inputs import StrictModel
+from app.services.public_pages.documents import DamageReport, DamageReportPage, ReportContact, ReportStatus
+from app.services.public_pages.reports import DamageReports
+
+router = APIRouter(prefix="/v1/damage-reports", tags=["public pages"], route_class=StrictRoute)
+
+ReportId = Annotated[Identifier, Path(description="Id of the report.")]
+Service = Annotated[DamageReports, use_cases("damage_reports")]
+_PHOTO_HEADERS = {"Content-Security-Policy": "default-src 'none'; sandbox"}
+
+
+class AcceptanceIn(StrictModel):
+    """What the crew should know."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"note": "seen by the patrol"}, {}]})
+
+    note: Text | None = Field(default=None, min_length=1, max_length=300)
+
+
+class RejectionIn(StrictModel):
+    """Why a report is rejected."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"reason": "the photo shows another marker"}]})
+
+    reason: Text = Field(min_length=1, max_length=300)
+
+
+@router.get("", responses=document_response(DamageReportPage))
+def list_damage_reports(
+    request: Request,
+    caller: Caller,
+    reports: Service,
+    status: Annotated[ReportStatus | None, Query(description="Of the reports; without it, all.")] = None,
+    marker_id: Annotated[Identifier | None, Query(description="Id of a marker.")] = None,
+    limit: PageSize = 100,
+    before: LastId = None,
+) -> Response:
+    """Damage reports, newest first."""
+    page, last = reports.page(caller, state=status, marker_id=marker_id, before=before, limit=limit)
+    return page_response(request, page, before=last)
+
+
+@router.get("/{report_id}", responses=document_response(DamageReport, 404))
+def get_damage_report(report_id: ReportId, caller: Caller, reports: Service) -> Response:
+    """One damage report."""
+    return json_response(reports.get(caller, report_id))
+
+
+@router.get("/{report_id}/photo", responses={**file_response(["image/jpeg"]), **problem_responses(404)})
+def get_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> Response:
+    """The photo of a report: a JPEG that was written anew, without metadata."""
+    return Response(reports.photo(caller, report_id), headers=_PHOTO_HEADERS, media_type="image/jpeg")
+
+
+@router.delete("/{report_id}/photo", status_code=204, responses=problem_responses(404))
+def delete_damage_photo(report_id: ReportId, caller: Caller, reports: Service) -> Response:
+    """Delete the photo of a report, such as one that shows people. The report stays."""
+    reports.delete_photo(caller, report_id)
+    return Response(status_code=204)
+
+
+@router.get("/{report_id}/contact", responses=document_response(ReportContact, 404))
+def get_report_contact(report_id: ReportId, caller: Caller, reports: Service) -> Response:
+    """The e-mail address that the sender of a report left for questions."""
+    return json_response(reports.contact(caller, report_id))
+
+
+@router.delete("/{report_id}/contact", status_code=204, responses=problem_responses(404))
+def delete_report_contact(report_id: ReportId, caller: Caller, reports: Service) -> Response:
+    """Delete the sender's e-mail address. The report stays."""
+    reports.delete_contact(caller, report_id)
+    return Response(status_code=204)
+
+
+@router.post("/{report_id}/accept", responses=document_response(DamageReport, 404, 409))
+def accept_damage_report(acceptance: AcceptanceIn, report_id: ReportId, caller: Caller, reports: Service) -> Response:
+    """Accept a report into the work list, `/v1/maintenance`: a new item, or the open one of the same marker.
+
+    The marker does not change; that is decided with the item.
+    """
+    return json_response(reports.accept(caller, report_id, acceptance.note))
+
+
+@router.post("/{report_id}/reject", responses=document_response(DamageReport, 404, 409))
+def reject_damage_report(rejection: RejectionIn, report_id: ReportId, caller: Caller, reports: Service) -> Response:
+    """Reject a report with a reason."""
+    return json_response(reports.reject(caller, report_id, rejection.reason))

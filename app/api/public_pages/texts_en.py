@@ -1,0 +1,73 @@
+"""The public pages in English."""
+
+from __future__ import annotations
+
+from app.api.public_pages.texts import Texts
+
+ENGLISH = Texts(
+    language="en",
+    name="English",
+    decimal_point=".",
+    marker="Road marker",
+    code="Code",
+    agency="Road agency",
+    status="Status",
+    revision="Artwork revision",
+    road="Road",
+    measure="Distance along the road",
+    statuses={
+        "planned": "planned",
+        "built": "installed",
+        "surveyed": "surveyed",
+        "active": "in use",
+        "suspect": "in use, to be checked",
+        "retired": "out of use",
+    },
+    report="Report damage",
+    report_intro="Is something wrong with this marker? Tell the road agency. Please do not stop or walk on the road.",
+    kind="What is wrong?",
+    kinds={
+        "damaged": "The marker is damaged",
+        "dirty": "The marker is dirty or covered",
+        "missing": "The marker is missing",
+        "loose": "The marker is loose",
+        "other": "Something else",
+    },
+    text="Description",
+    text_hint="At most {limit} characters.",
+    photo="Photo",
+    photo_hint="JPEG or PNG, at most {limit} MB. Place and time stored in the photo are removed. Please show no "
+    "people.",
+    email="Your e-mail address",
+    email_hint="Only for questions about this report. The agency deletes it when you ask, and after {days} days.",
+    leave_empty="Leave this field empty",
+    optional="optional",
+    required="required",
+    send="Send report",
+    error_prefix="Error",
+    errors_title="The report was not sent",
+    faults={
+        "kind-missing": "Choose what is wrong.",
+        "text-missing": "Describe what is wrong, or add a photo.",
+        "text-long": "The description has {found} characters. Shorten it to {limit}.",
+        "email-wrong": "This is not an e-mail address. Correct it, or leave the field empty.",
+        "photo-large": "The photo is larger than {limit} MB, or has too many pixels. Choose a smaller one.",
+        "photo-kind": "The file is not a JPEG or PNG photo. Choose another one.",
+        "photo-damaged": "The photo cannot be read. Choose another one.",
+        "website-filled": "Leave this field empty.",
+        "token-expired": "The form was open for too long. Send it again.",
+        "token-young": "The form was sent very quickly. Wait a few seconds, then send it again.",
+    },
+    photo_again="Choose the photo again: browsers do not keep it.",
+    thanks="Thank you",
+    thanks_text="The report was sent to the road agency. Staff will look at it.",
+    back="Back to the marker",
+    problems={
+        404: ("Page not found", "There is no public page at this address."),
+        413: ("Too large", "What was sent is too large. Send the report with a smaller photo, or without one."),
+        429: ("Too many requests", "Wait a while, then try again."),
+        503: ("Not available at present", "Try again in a minute."),
+        507: ("Not available at present", "Try again later."),
+        0: ("The request cannot be answered", "Go back and try again."),
+    },
+)

@@ -1,0 +1,1 @@
+"""Public pages of markers, and the damage reports that come from them."""

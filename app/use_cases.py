@@ -1,0 +1,164 @@
+"""The use cases of the server and of `waymark worker`, by the names under which routes ask for them."""
+
+from __future__ import annotations
+
+from typing import TypedDict
+
+from app.services.access.access import Access
+from app.services.access.audit import AuditLog
+from app.services.access.audit_jobs import AuditVerifications
+from app.services.access.keys import Keys
+from app.services.decodes.decodes import Decodes
+from app.services.decodes.details import DecodeDetails
+from app.services.decodes.outputs import DecodeOutputs
+from app.services.drives.drives import Drives
+from app.services.fleet.calibrations import Calibrations
+from app.services.fleet.snapshots import Snapshots
+from app.services.fleet.vehicles import Vehicles
+from app.services.health.maintenance import Maintenance
+from app.services.jobs import Jobs
+from app.services.markers.artwork import Artworks
+from app.services.markers.artwork_jobs import ArtworkJobs
+from app.services.markers.bulk import BulkMarkers
+from app.services.markers.cerpm_programs import CerpmPrograms
+from app.services.markers.codebooks import Codebooks
+from app.services.markers.features import Features
+from app.services.markers.layouts import Layouts
+from app.services.markers.markers import Markers
+from app.services.markers.observations import Observations
+from app.services.markers.plate_drafts import PlateDrafts
+from app.services.markers.print_grades import PrintGrades
+from app.services.markers.searches import Searches
+from app.services.plans.alignments import Alignments
+from app.services.plans.making import PlanMaking
+from app.services.plans.packages import Packages
+from app.services.plans.plan_jobs import PlanJobs
+from app.services.plans.plans import Plans
+from app.services.plans.previews import PlanPreviews
+from app.services.plans.proofs import Proofs
+from app.services.progress.events import AgencyEvents
+from app.services.progress.jobs import AllJobs
+from app.services.progress.results import JobFiles
+from app.services.public_pages.form_tokens import FormTokens
+from app.services.public_pages.pages import PublicPages
+from app.services.public_pages.reports import DamageReports
+from app.services.reprocessing.reprocessings import Reprocessings
+from app.services.roads.roads import Roads
+from app.services.surveys.export_jobs import ExportJobs
+from app.services.surveys.exports import Exports
+from app.services.surveys.import_jobs import ImportJobs
+from app.services.surveys.imports import Imports
+from app.services.unused_blobs import UnusedBlobs
+from app.services.uploads.quotas import Quotas
+from app.services.uploads.uploads import Uploads
+from app.services.webhooks.delivery import WebhookDelivery
+from app.services.webhooks.webhooks import Webhooks
+
+
+class AccessUseCases(TypedDict):
+    """Permissions, keys and the audit log."""
+
+    access: Access
+    audit: AuditLog
+    audit_verifications: AuditVerifications
+    keys: Keys
+    vehicles: Vehicles
+
+
+class MarkerUseCases(TypedDict):
+    """The registry: markers, roads and codebooks, and what is read of them."""
+
+    bulk_markers: BulkMarkers
+    codebooks: Codebooks
+    features: Features
+    layouts: Layouts
+    maintenance: Maintenance
+    markers: Markers
+    observations: Observations
+    programs: CerpmPrograms
+    roads: Roads
+    searches: Searches
+    snapshots: Snapshots
+
+
+class ImportUseCases(TypedDict):
+    """Surveys, at once and as jobs."""
+
+    imports: Imports
+    import_jobs: ImportJobs
+
+
+class PlateUseCases(TypedDict):
+    """Artwork, prints and cameras."""
+
+    artworks: Artworks
+    calibrations: Calibrations
+    plate_drafts: PlateDrafts
+    print_grades: PrintGrades
+
+
+class DecodeUseCases(TypedDict):
+    """Uploads and what is decoded of them."""
+
+    decode_details: DecodeDetails
+    decode_outputs: DecodeOutputs
+    decodes: Decodes
+    drives: Drives
+    reprocessings: Reprocessings
+    unused_blobs: UnusedBlobs
+    uploads: Uploads
+
+
+class PlanUseCases(TypedDict):
+    """Roads to plan and their plans."""
+
+    alignments: Alignments
+    packages: Packages
+    plan_jobs: PlanJobs
+    plan_making: PlanMaking
+    plan_previews: PlanPreviews
+    plans: Plans
+    proofs: Proofs
+
+
+class FileUseCases(TypedDict):
+    """Jobs of every kind, and those that write files."""
+
+    all_jobs: AllJobs
+    artwork_jobs: ArtworkJobs
+    export_jobs: ExportJobs
+    exports: Exports
+    job_files: JobFiles
+
+
+class WebhookUseCases(TypedDict):
+    """Events and the webhooks that deliver them."""
+
+    agency_events: AgencyEvents
+    webhook_delivery: WebhookDelivery
+    webhooks: Webhooks
+
+
+class PublicUseCases(TypedDict):
+    """The pages that need no key."""
+
+    damage_reports: DamageReports
+    form_tokens: FormTokens
+    public_pages: PublicPages
+
+
+class UseCases(
+    AccessUseCases,
+    MarkerUseCases,
+    ImportUseCases,
+    PlateUseCases,
+    DecodeUseCases,
+    PlanUseCases,
+    FileUseCases,
+    WebhookUseCases,
+    PublicUseCases,
+):
+    """All use cases."""
+
+    jobs: Jobs
+    quotas: Quotas
