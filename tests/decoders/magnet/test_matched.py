@@ -291,6 +291,20 @@ def test_opposed_magnets_half_a_metre_apart_are_not_one_of_the_other_kind(cleara
     assert right >= 20
 
 
+@pytest.mark.parametrize(("beside_m", "seed"), [(0.5, 0), (0.45, 1)])
+def test_a_magnet_is_of_the_kind_that_its_moment_shows_beside_one_of_the_other_kind(beside_m: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    magnets = []
+    for at_m in 20 + 6.0 * np.arange(12):
+        magnets.append(RoadMagnet(at_m, 0.0, Polarity.N, Orientation.FORWARD))
+        magnets.append(RoadMagnet(at_m + rng.uniform(-0.15, 0.15), beside_m, Polarity.N, Orientation.UP))
+    scene = Scene(Road(110), Vehicle.compact(clearance_m=0.32), Course(18.0), lines=magnets)
+    drive = simulate_drive(scene, rng)
+    right, other = right_and_other(drive, decode_trace(drive.trace, BAR))
+    assert other == 0
+    assert right >= 17  # 11 and 13 where each keeps the kind as which it was found
+
+
 @pytest.mark.slow
 def test_a_magnet_at_the_border_of_two_regions_is_read_once() -> None:
     lines = line_magnets(20, 180, 2.0, 0.7, Polarity.N)  # regions end after 8 m, wherever a magnet is
