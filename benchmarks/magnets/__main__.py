@@ -1,6 +1,7 @@
 """``python -m benchmarks.magnets [ITEM ...] [--short] [--seed N]``: print the tables.
 
-Items: recall, lateral, tags, ratio, wheel, false, speed, drawn, physics, all. The decoder does not know the clearance.
+Items: recall, lateral, tags, ratio, wheel, lines, false, speed, drawn, physics, all. The decoder does not know the
+clearance.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from benchmarks.magnets import drawn_scenes, scenes
 from benchmarks.magnets.physics import run_physics
 from benchmarks.magnets.score import TagTally, Tally, score_magnets, score_tags
 
-ITEMS = ("recall", "lateral", "tags", "ratio", "wheel", "false", "speed", "drawn", "physics")
+ITEMS = ("recall", "lateral", "tags", "ratio", "wheel", "lines", "false", "speed", "drawn", "physics")
 REFERENCE = Path(__file__).parents[1] / "reference"
 BAR = Vehicle.compact().bar
 LOW_BAR_M = 0.30
@@ -229,6 +230,28 @@ def run_wheel(seed: int, short: bool) -> Result:
     )
 
 
+def run_lines(seed: int, short: bool) -> Result:
+    """Lines that look like the noise of a wheel."""
+    rows: list[Sequence[object]] = []
+    for spacing in (0.97, 0.99, 1.0, 1.01, 1.03):
+        for clearance_m in (0.20, 0.33):
+            total, shares = Tally(), []
+            for k in range(3 if short else 20):
+                rng = np.random.default_rng([seed, 71, k, round(100 * clearance_m), round(100 * spacing)])
+                drive = drawn_scenes.draw_line_per_turn(rng, spacing=spacing, clearance_m=clearance_m)
+                tally = score_magnets(drive, decode_trace(drive.trace, BAR))
+                total.add(tally)
+                shares.append(tally.recall)
+            rows.append(
+                (
+                    f"{spacing:g} turns, {100 * clearance_m:.0f} cm", total.true, f"{total.recall:.3f}",
+                    f"{min(shares):.3f}", total.wrong, total.extra,
+                )
+            )  # fmt: skip
+    head = ("distance, clearance", "magnets", "read", "worst drive", "wrong", "false")
+    return "Lines anywhere under the bar, belt dipoles of 0.1 to 1 A m2, 8 to 25 m/s.", head, rows
+
+
 def run_false(seed: int, short: bool) -> Result:
     """False magnets a kilometre."""
     rows: list[Sequence[object]] = []
@@ -361,7 +384,7 @@ def _drawn_row(name: str, shares: Sequence[float], goal: float, total: Tally) ->
 
 RUNS: dict[str, Callable[[int, bool], Result]] = {
     "recall": run_recall, "lateral": run_lateral, "tags": run_tags, "ratio": run_ratio, "wheel": run_wheel,
-    "false": run_false, "speed": run_speed, "drawn": run_drawn, "physics": run_physics,
+    "lines": run_lines, "false": run_false, "speed": run_speed, "drawn": run_drawn, "physics": run_physics,
 }  # fmt: skip
 
 if __name__ == "__main__":

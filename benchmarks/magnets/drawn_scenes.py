@@ -11,7 +11,7 @@ from app.markers.magnet import Polarity
 from app.simulation.magnetic.clutter import ferrous_clutter, town_clutter
 from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
-from app.simulation.magnetic.vehicle import MPH, Course, Vehicle
+from app.simulation.magnetic.vehicle import MPH, Course, Vehicle, Wheel
 from benchmarks.magnets.scenes import LEAD_M, random_magnets, random_tag
 
 WHEEL_MOMENTS_AM2 = (0.01, 1.0)
@@ -89,3 +89,13 @@ def draw_iron_drive(rng: np.random.Generator, *, town: bool, lines: bool, length
     course = replace(draw_course(rng), weave_m=0.15)
     scene = Scene(Road(length_m), draw_vehicle(rng, clearance_m), course, lines=magnets, clutter=clutter)
     return simulate_drive(scene, rng)
+
+
+def draw_line_per_turn(rng: np.random.Generator, *, spacing: float, clearance_m: float) -> SimulatedDrive:
+    """A line whose magnets are about as far apart as a turn of a wheel is long: times that, anywhere under the bar."""
+    turn_m = 2 * np.pi * Wheel((0.0, 0.0, 0.0)).radius_m
+    lines = line_magnets(14, 200, spacing * turn_m, float(rng.uniform(-0.7, 0.7)), Polarity.N)
+    wheels_am2 = float(np.exp(rng.uniform(np.log(0.1), np.log(1.0))))
+    vehicle = Vehicle.compact(clearance_m=clearance_m, wheel_moment_am2=wheels_am2)
+    course = Course(float(rng.uniform(8, 25)), weave_m=0.02)
+    return simulate_drive(Scene(Road(210), vehicle, course, lines=lines), rng)

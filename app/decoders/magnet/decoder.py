@@ -1,7 +1,8 @@
 """The default decoder (``method="matched"``): matched filters over all sensors and axes, then a fit of dipoles.
 
 The stages in order: `preprocess`, `wheel_noise`, `resample`, `matched_filter` (candidates), `detect_dipoles` (with
-`fit_window`, `dipole_fit`, `dipole_model`), `classify` (with `ferrous`), `vehicle_path`, `assemble` (with `identify`).
+`reconsider`, `fit_window`, `dipole_fit`, `dipole_model`), `classify` (with `ferrous`), `vehicle_path`, `assemble`
+(with `identify`).
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
-VERSION = "matched-6"
+VERSION = "matched-7"
 """Kept with every decode; to be raised when findings change."""
 FIRST_VARIANCE = 2.0
 """Variance of the matched filters' noise that is assumed at first. [uT2] Source: a chip's noise of 1.5 uT."""

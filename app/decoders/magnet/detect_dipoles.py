@@ -18,6 +18,7 @@ from app.decoders.magnet.ferrous import is_ferrous
 from app.decoders.magnet.fit_window import SURE_MARGIN, Dipole, FitWindow, Region, SensorArray
 from app.decoders.magnet.matched_filter import BIN_M, HALF_BINS, THRESHOLD, BinScores, FilterBank, score_bins
 from app.decoders.magnet.preprocess import Blocks
+from app.decoders.magnet.reconsider import CLOSE_M, MAX_POLISHED, apart_m, clusters, kind_of_moment, penalty, reconsider
 
 Floats = npt.NDArray[np.float64]
 Floats32 = npt.NDArray[np.float32]
@@ -28,27 +29,8 @@ leaves of a strong magnet. Source: chosen by hand, no measurement kept."""
 MAX_MAGNETS = 12
 """Dipoles of a region at most. Source: chosen by hand; a region of 8 m holds two tags of METRO's seven magnets at
 most."""
-PENALTY, CLOSE_PENALTY = 30.0, 30.0
-"""Cost of each further magnet when numbers of magnets are compared, and of two that stand too close.
-[chi-squared] Source: chosen by hand, near the detection threshold."""
-CLOSE_M = 0.42
-"""Distance along the road below which two magnets stand too close. [m] Source: `MIN_GAP_M` of 0.5 m, METRO figure 17a,
-less the error of two places."""
-PAIR_HEIGHT_M, PAIR_ALONE_M, PAIR_HALF_GAP_M = 0.25, 0.8, 0.27
-"""A dipole at least so deep, and without another so near along the road, may be two opposed ones at this distance on
-each side. [m] Source: `MIN_GAP_M` of 0.5 m; from half of that depth on the fields of both merge."""
-PAIR_ALONE_SHARE = 0.2
-"""Dipoles near it that explain less than this share of its energy may be the residual of one dipole fitted to two.
-Source: by hand."""
-PAIR_PENALTY = 15.0
-"""Cost of two magnets in place of one. [chi-squared] Source: the pair costs 9 less at most at 261 single magnets of
-nine scenes of `benchmarks.hunt.magnet`, and 27 and 59 less at two pairs."""
-CLUSTER_M, CLUSTER_MARGIN_M = 1.2, 0.6
-"""Largest distance in a cluster, whose fields overlap, and the road beyond it that is scored again. [m] Source: by
-hand."""
-MAX_POLISHED = 6
-"""Dipoles that are fitted together at most in the end. Source: chosen by hand for speed: a fit grows with the
-square."""
+CLUSTER_MARGIN_M = 0.6
+"""Road beyond a cluster that is scored again. [m] Source: chosen by hand."""
 FERROUS_COUNT = 4
 """Number of dipoles after which, and after twice of which, a region is examined for iron. Source: chosen by hand."""
 MAX_FAILED = 3
@@ -103,61 +85,12 @@ class DipoleDetector:
         found, ferrous = pursuit.run((FORWARD, UPRIGHT), [])
         if ferrous:
             return found
-        for cluster in _clusters(found):
+        for cluster in clusters(found):
             if pursuit.is_slow(found):
-                return found
+                break
             if _is_unclear(cluster) and 2 * sum(d.unlike_magnet for d in cluster) <= len(cluster):
                 found = self._fit_one_kind(pursuit, found, cluster)
-        return self._with_pairs(pursuit.window, self._with_kinds_of_moments(pursuit.window, pursuit.polish(found)))
-
-    def _with_kinds_of_moments(self, window: FitWindow, found: list[Dipole]) -> list[Dipole]:
-        """Fit dipoles as the kind that their moments show, where that is likelier.
-
-        One that was found before a magnet beside it may have been taken for the other kind; fitted together with that
-        magnet, it finds its moment but keeps the kind.
-        """
-        for cluster in _clusters(found):
-            kinds = [_kind_of_moment(d) for d in cluster]
-            if kinds == [d.kind for d in cluster] or len(cluster) > MAX_POLISHED:
-                continue
-            others = [d for d in found if all(d is not c for c in cluster)]
-            fitted = window.fit([d.params for d in cluster], kinds, others)
-            if fitted is None:
-                continue
-            span = float(cluster[0].params[0]), float(cluster[-1].params[0])
-            margin = window.cost(found, *span) - window.cost([*others, *fitted], *span)
-            if margin > 0:
-                pairs = zip(cluster, fitted, strict=True)
-                found = others + [replace(f, margin=d.margin if f.kind == d.kind else margin) for d, f in pairs]
-        return found
-
-    def _with_pairs(self, window: FitWindow, found: list[Dipole]) -> list[Dipole]:
-        """Replace a dipole by two opposed ones of the other kind where these fit better, or lower its margin.
-
-        Two opposed magnets half a metre apart, as in a tag, have almost the field of one of the other kind between them
-        where the bar is high above them.
-        """
-        for dipole in sorted(found, key=lambda d: -d.explained):
-            s, y, h = (float(p) for p in dipole.params[:3])
-            near = [d for d in found if d is not dipole and abs(d.params[0] - s) < PAIR_ALONE_M]
-            alone = all(d.explained < PAIR_ALONE_SHARE * dipole.explained for d in near)
-            if h < PAIR_HEIGHT_M or not alone or all(d is not dipole for d in found):
-                continue
-            rest = [d for d in found if d is not dipole and all(d is not n for n in near)]
-            kind = FORWARD if dipole.kind == UPRIGHT else UPRIGHT
-            starts = [np.array([s + shift, y, h, 0.0, 0.0, 0.0]) for shift in (-PAIR_HALF_GAP_M, PAIR_HALF_GAP_M)]
-            pair = window.fit(starts, [kind, kind], rest)
-            if pair is None:
-                continue
-            span = s - PAIR_ALONE_M, s + PAIR_ALONE_M
-            margin = window.cost([*rest, *pair], *span) + PAIR_PENALTY - window.cost(found, *span) - PENALTY * len(near)
-            if margin > 0:
-                found = [d if d is not dipole else replace(d, margin=min(d.margin, margin)) for d in found]
-            elif _apart_m(pair[0].params, pair[1].params) < CLOSE_M:
-                found = [d if d is not dipole else replace(d, margin=0.0) for d in found]
-            else:
-                found = rest + [replace(d, margin=-margin) for d in pair]
-        return found
+        return reconsider(pursuit.window, prior, pursuit.polish(found))
 
     def _fit_one_kind(self, pursuit: _Pursuit, found: list[Dipole], cluster: list[Dipole]) -> list[Dipole]:
         """Explain a cluster by magnets of one kind, if that is as likely."""
@@ -165,12 +98,12 @@ class DipoleDetector:
         places = [float(d.params[0]) for d in cluster]
         span = min(places), max(places)
         part = pursuit.between(span[0] - CLUSTER_MARGIN_M, span[1] + CLUSTER_MARGIN_M)
-        costs = [(pursuit.window.cost(found, *span) + _penalty(found), found)]
+        costs = [(pursuit.window.cost(found, *span) + penalty(found), found)]
         for kind in (FORWARD, UPRIGHT):
             if any(d.kind != kind for d in cluster):
                 whole = others + part.run((kind,), others)[0]
-                if all(_kind_of_moment(d) == d.kind for d in whole):
-                    costs.append((pursuit.window.cost(whole, *span) + _penalty(whole), whole))
+                if all(kind_of_moment(d) == d.kind for d in whole):
+                    costs.append((pursuit.window.cost(whole, *span) + penalty(whole), whole))
         costs.sort(key=lambda c: c[0])
         best = costs[0][1]
         own = [d for d in best if all(d is not o for o in others)]
@@ -258,7 +191,7 @@ class _Pursuit:
             if best < max(THRESHOLD, STOP_SHARE * strongest):
                 break
             candidate = self._candidate(k, kinds, columns, left, found)
-            if any(_apart_m(d.params, candidate.start) < SAME_M for d in found):
+            if any(apart_m(d.params, candidate.start) < SAME_M for d in found):
                 left.discard(k, KNOWN_BINS)  # what the model of that dipole missed
                 continue
             before, failed = [found[i] for i in candidate.group], self._failed
@@ -307,7 +240,7 @@ class _Pursuit:
             left.discard(candidate.bin, 0)
             return None
         added = fitted[-1]
-        same = any(_apart_m(d.params, added.params) < SAME_M for d in fitted[:-1])
+        same = any(apart_m(d.params, added.params) < SAME_M for d in fitted[:-1])
         if added.explained < CONFIRMED_SHARE * THRESHOLD or same:
             left.discard(candidate.bin, REFUSED_BINS)
             self._failed += 1
@@ -341,7 +274,7 @@ class _Pursuit:
 
     def polish(self, found: list[Dipole]) -> list[Dipole]:
         """Fit the dipoles of each cluster together: those found first were fitted without the others."""
-        for cluster in (c for c in _clusters(found) if len(c) > 1):
+        for cluster in (c for c in clusters(found) if len(c) > 1):
             for k in range(0, len(cluster), MAX_POLISHED):
                 part = cluster[k : k + MAX_POLISHED]
                 others = [d for d in found if all(d is not p for p in part)]
@@ -370,17 +303,6 @@ class _Pursuit:
             score_bins(x, HALF_BINS + a, self.bank, self.region.variance, left.scores.part(a, b))
 
 
-def _clusters(dipoles: list[Dipole]) -> list[list[Dipole]]:
-    """Groups of dipoles with less than `CLUSTER_M` from each to the next."""
-    groups: list[list[Dipole]] = []
-    for dipole in sorted(dipoles, key=lambda d: float(d.params[0])):
-        if groups and dipole.params[0] - groups[-1][-1].params[0] < CLUSTER_M:
-            groups[-1].append(dipole)
-        else:
-            groups.append([dipole])
-    return groups
-
-
 def _is_unclear(cluster: list[Dipole]) -> bool:
     """Whether the kinds of a cluster's dipoles may be others, as their fields overlap."""
     places = [float(d.params[0]) for d in cluster]
@@ -388,13 +310,6 @@ def _is_unclear(cluster: list[Dipole]) -> bool:
     return len(cluster) > 1 and bool(
         len(kinds) > 1 or min(np.diff(places)) < CLOSE_M or min(d.margin for d in cluster) < SURE_MARGIN
     )
-
-
-def _kind_of_moment(dipole: Dipole) -> int:
-    """The kind within 45 degrees of whose axis the moment is; without any, that as which it was fitted."""
-    moment = dipole.params[3:]
-    other = FORWARD if dipole.kind == UPRIGHT else UPRIGHT
-    return other if 2 * moment[other] ** 2 > moment @ moment else dipole.kind
 
 
 def _mostly_unlike(dipoles: list[Dipole]) -> bool:
@@ -409,16 +324,6 @@ def _is_row(dipoles: list[Dipole]) -> bool:
     return bool(np.ptp(places[:, 1]) < TAG_WIDTH_M and gap_m > CLOSE_M)
 
 
-def _penalty(dipoles: list[Dipole]) -> float:
-    """Cost of the number of dipoles, and of those that stand too close."""
-    places = np.sort([float(d.params[0]) for d in dipoles])
-    return PENALTY * len(dipoles) + CLOSE_PENALTY * int(np.sum(np.diff(places) < CLOSE_M))
-
-
 def are_same(one: Dipole, other: Dipole) -> bool:
     """Whether two dipoles are so near to each other that they are one."""
-    return _apart_m(one.params, other.params) < SAME_M
-
-
-def _apart_m(a: Floats, b: Floats) -> float:
-    return float(np.hypot(a[0] - b[0], a[1] - b[1]))
+    return apart_m(one.params, other.params) < SAME_M

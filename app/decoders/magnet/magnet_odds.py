@@ -36,6 +36,10 @@ NEIGHBOUR_M = 1.0
 ROW_M, ROW_WIDTH_M, ROW_LOG_ODDS, MAX_IN_ROW = 4.3, 0.12, 2.0, 3
 """Magnets of the same kind in a row with a dipole, as those of a tag: length and half width of the row, their own log
 odds at least, and how many count. [m, m, 1, 1] Source: tags of 4 m, and a vehicle that heads 2 degrees off."""
+MIN_TOO_DEEP = -1.0
+"""Smallest value of the feature "too deep": what lies far above the road is no likelier a magnet for that. Source: with
+-1, iron of 5 to 20 A m2 20 cm above the road is never read in 96 scenes, in place of up to 14 of 24 times; as many
+magnets are read."""
 FEATURES = (
     "own", "own, above 0", "misfit", "margin", "too near", "other kind", "unlike pole", "magnets around",
     "piece of iron", "neighbour", "rows", "upright", "too deep", "like iron", "iron before", "in a row",
@@ -132,10 +136,11 @@ def magnet_features(dipole: Dipole, around: Sequence[Dipole], state: MagnetState
             if not piece and rows_beside(other, around, half_width_m, ABREAST_M) > 1:
                 piece = 1.0
     rows = min(max(0, rows_beside(dipole, around, half_width_m) - 1), 2)
+    too_deep = (h - prior.clearance_m) / prior.clearance_std_m
     return np.array([
         dipole.log_odds, max(dipole.log_odds, 0.0), math.log(max(dipole.misfit, 0.004)),
         math.log1p(min(dipole.margin, 40.0)), too_near, other_kind, unlike, math.log1p(magnets), piece, neighbour, rows,
-        float(dipole.kind == UPRIGHT), (h - prior.clearance_m) / prior.clearance_std_m, state.iron_log_odds,
+        float(dipole.kind == UPRIGHT), max(too_deep, MIN_TOO_DEEP), state.iron_log_odds,
         math.log1p(state.iron_before), min(in_row, MAX_IN_ROW),
     ])  # fmt: skip
 
