@@ -170,11 +170,15 @@ class LaneProblem:
 
     def _add_pairs(self) -> None:
         """A pair of markers measures the slope of c."""
-        place = (self.measured.pair_station_m - self.start_m) / self.knot_m
-        knot = np.clip(place.astype(np.int64), 0, self.count - 2)
-        index = self.fields * np.stack([knot, knot + 1], 1)
-        value = np.broadcast_to(np.array([-1.0, 1.0]) / self.knot_m, (len(knot), 2))
+        index, value = self.slope_rows(self.measured.pair_station_m)
         self._add(index, value, self.measured.pair_sigma, self.measured.pair_slope)
+
+    def slope_rows(self, station_m: Floats) -> tuple[Ints, Floats]:
+        """Sparse rows for the slope of c at stations."""
+        place = (station_m - self.start_m) / self.knot_m
+        knot = np.clip(place.astype(np.int64), 0, self.count - 2)
+        value = np.broadcast_to(np.array([-1.0, 1.0]) / self.knot_m, (len(knot), 2))
+        return self.fields * np.stack([knot, knot + 1], 1), value
 
     def _set_priors(self, line: SmoothLine) -> None:
         """Third differences of the centre as a curve in the plane, and squared derivatives of the other fields."""
@@ -292,6 +296,14 @@ class LaneSolution:
         group, groups = _independent_groups(p.measured.station_m)
         variance = covariances(self._cholesky, p.marker_index, p.marker_value, p.marker_value, group, p.size, groups)
         return np.maximum(1 - variance / p.measured.sigma_m**2, _MIN_VARIANCE_SHARE)
+
+    def slopes(self, station_m: Floats) -> tuple[Floats, Floats]:
+        """Slope of the centre against the line at stations, and its standard deviation."""
+        p = self.problem
+        index, value = p.slope_rows(station_m)
+        group, groups = _independent_groups(station_m)
+        variance = covariances(self._cholesky, index, value, value, group, p.size, groups)
+        return apply(index, value, self._x), np.sqrt(np.maximum(variance, 0.0))
 
     def sigmas(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """Some stations, and standard deviations there of the centre, left boundary, right boundary and width. [m]"""

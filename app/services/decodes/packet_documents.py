@@ -32,7 +32,7 @@ from app.services.decodes.packet_task import DriveFiles, LaneResult
 from app.services.decodes.receiver_positions import ReceiverPositions, receiver_positions
 from app.services.decodes.wording import count_of
 
-DECODER_VERSION = "cerpm/2"
+DECODER_VERSION = "cerpm/3"
 MAX_REFUSED = 500
 _MAX_SIGMA_M = 0.25
 MAX_PROFILE = 200
