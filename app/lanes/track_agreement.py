@@ -22,6 +22,9 @@ _SPACING_M = 3.0  # [m] between fixes that are compared; source: `driven_line._P
 _MAX_STEPS = 5000  # of the track, longer steps on tracks above 15 km; source: by hand, bounds the time
 _MIN_FIXES, _MIN_LENGTH_M = 10, 30.0  # fixes, and the length of track, without which nothing is compared; by hand
 _MAX_BESIDE_M = 500.0  # [m] fixes further from the path are of another road; source: by hand, above a datum's shift
+_APART_M = (
+    20.0  # [m] short tracks with a fix closer than this are beside the path; source: four times a poor receiver's 5 m
+)
 _OFFSET_SD_M = 0.25  # [m] of a driver's usual offset; source: by hand, the upper bound of `benchmarks.hunt.cerpm`
 _WANDER_SD_M, _WANDER_LENGTH_M = 0.25, 30.0  # [m, m] source: as above, and `least_squares.OFFSET_MODELS`
 _CUT_M2 = 2.0  # [m2] offset towards the inside of bends, per curvature; source: twice `driving.Driver.cut_m2`
@@ -55,7 +58,7 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
     Returns
     -------
     TrackAgreement or None
-        None where less than 30 m of the track are beside the path.
+        None where less than 30 m of the track are beside the path; see `runs_apart`.
 
     Notes
     -----
@@ -86,6 +89,26 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
         if np.abs(_transformed(fixes, middle, values) - moved).max() < _CONVERGED_M:
             break
     return _agreement(compared, middle, values, covariance, accuracy)
+
+
+def runs_apart(lane: Lane, track: PoseTrack) -> bool:
+    """Whether a track that could not be compared with a path is elsewhere, rather than beside it but too short.
+
+    Parameters
+    ----------
+    lane : Lane
+        With stations.
+    track : PoseTrack
+        For which `compare_with_track` returned None.
+    """
+    origin = (lane.origin_lon_deg, lane.origin_lat_deg)
+    fixes = plane_from_wgs84(track.lon_deg, track.lat_deg, origin)
+    fixes = fixes[np.isfinite(fixes).all(1)]
+    if not len(fixes):
+        return False
+    nearest_m = float(np.min(scipy.spatial.cKDTree(lane.position_enu_m).query(fixes)[0]))
+    moved_m = math.hypot(*np.ptp(fixes, axis=0))
+    return nearest_m > _APART_M or min(moved_m, float(lane.station_m[-1])) > _MIN_LENGTH_M
 
 
 def _thinned(fixes_m: Floats) -> tuple[Floats, float]:

@@ -239,6 +239,8 @@ class Lane:
     method : str
     track_agreement : TrackAgreement or None
         With the vehicle's track; None without a track beside the path.
+    track_apart : bool
+        The vehicle's track was used, but does not run beside the path: the path may be anywhere.
     """
 
     origin_lon_deg: float
@@ -262,6 +264,7 @@ class Lane:
     refusal: str | None = None
     method: str = "waymark"
     track_agreement: TrackAgreement | None = None
+    track_apart: bool = False
 
     @property
     def east_m(self) -> Floats:

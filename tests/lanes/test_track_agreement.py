@@ -74,3 +74,27 @@ def test_what_cannot_be_compared_is_not():
         ).track_agreement
         is None
     )
+
+
+@pytest.mark.parametrize("receiver", [SatelliteReceiver.rtk(), SatelliteReceiver.plain()])
+def test_a_path_far_from_the_track_is_not_sure(receiver):
+    lane, _ = drive(5, shift_m=(300.0, -700.0), receiver=receiver)
+    assert lane.refusal is None
+    assert lane.track_agreement is None
+    assert lane.track_apart
+    assert any("does not run beside the path" in text for text in lane.localization_warnings)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_short_track_beside_the_path_is_no_evidence_against_it(seed):
+    built = lane_of_shape(BENDY)
+    rng = np.random.default_rng(seed)
+    markers = scenes.markers_for_lane(scenes.install(built, rng))
+    track = scenes.track(built, rng)
+    along = np.hypot(*np.diff(built.enu_from_wgs84(track.lon_deg, track.lat_deg), axis=0).T).cumsum()
+    start = np.concatenate([[True], along < 25.0])
+    names = ("time_s", "lon_deg", "lat_deg", "heading_deg", "accuracy_m")
+    lane = fit_lane(markers, type(track)(*(getattr(track, name)[start] for name in names)))
+    assert lane.refusal is None
+    assert lane.track_agreement is None
+    assert not lane.track_apart

@@ -173,7 +173,7 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
     lane = result.lane
     markers = _markers(read, lane)
     unsure = _path_warnings(lane)
-    grade = LocalizationGrade.UNFIT if unsure else read.grade
+    grade = LocalizationGrade.UNFIT if unsure or lane.track_apart else read.grade
     document = lane_document(lane, grade=str(grade))
     document["localization_warnings"] += unsure
     document["localization_warnings"] += read.localization_warnings
