@@ -160,13 +160,15 @@ def _agreement(
     compared: _Compared, middle_m: Floats, values: Floats, covariance: Floats, accuracy_m: float
 ) -> TrackAgreement:
     shift, turn, scale = values[:2], float(values[2]), float(values[3])
-    total = covariance[:2, :2] + accuracy_m**2 * np.eye(2)
-    shift_z = math.sqrt(float(shift @ np.linalg.solve(total, shift)))
     reach_m = math.sqrt(float(np.mean(np.sum((compared.fix_m - middle_m) ** 2, 1))))
     slow = accuracy_m / reach_m  # a receiver's error that changes by itself along the track
+    receiver = np.diag([accuracy_m, accuracy_m, slow, slow]) ** 2
+    total = covariance[:2, :2] + accuracy_m**2 * np.eye(2)
+    shift_z = math.sqrt(float(shift @ np.linalg.solve(total, shift)))
     turn_sigma, scale_sigma = (math.hypot(math.sqrt(float(covariance[k, k])), slow) for k in (2, 3))
     moved = _transformed(compared.fix_m, middle_m, values) - compared.fix_m
     across = np.sum(moved * compared.normal, 1)
+    alone = max(shift_z, abs(turn) / turn_sigma, abs(scale) / scale_sigma)
     return TrackAgreement(
         east_m=float(shift[0]),
         north_m=float(shift[1]),
@@ -175,6 +177,20 @@ def _agreement(
         turn_sigma_deg=math.degrees(turn_sigma),
         scale_ppm=1e6 * scale,
         scale_sigma_ppm=1e6 * scale_sigma,
-        significance=max(shift_z, abs(turn) / turn_sigma, abs(scale) / scale_sigma),
+        significance=max(alone, _joint_significance(values[:4], covariance[:4, :4] + receiver)),
         effect_m=float(np.sqrt(np.mean(across**2))),
     )
+
+
+def _joint_significance(values: Floats, covariance: Floats) -> float:
+    """Significance of four values together, in standard deviations of a normal distribution with the same probability.
+
+    A shift, a turn and a scale that can replace each other are uncertain one by one, but not together.
+
+    Notes
+    -----
+    The chance of a larger chi-squared x of four degrees of freedom is exp(-x / 2) (1 + x / 2).
+    """
+    squared = float(values @ np.linalg.solve(covariance, values))
+    log_chance = -squared / 2 + math.log1p(squared / 2)
+    return float(-scipy.special.ndtri_exp(log_chance - math.log(2.0)))

@@ -166,7 +166,7 @@ class TrackAgreement:
     scale_ppm, scale_sigma_ppm : float
         The path is longer than the track by this. [ppm]
     significance : float
-        The largest of shift, turn and scale, in standard deviations.
+        Of shift, turn and scale, together or of one of them alone, whichever is larger. In standard deviations.
     effect_m : float
         How far the transformation moves the track, across the path, RMS. [m]
     """
