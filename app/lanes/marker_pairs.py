@@ -46,6 +46,7 @@ _MIN_ROW_STAGGER_M = 0.1  # [m] of one row ahead of the other; source: by hand, 
 _ROW_STAGGER_Z = 3.0  # and by this many standard errors; source: three sigma, one false alarm in 370
 _MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745
 _NEIGHBOURS = 5  # pairs that a pair is compared with, itself included; source: two of five may be wrong
+_NEIGHBOURS_WITHIN_M = 120.0  # [m] further apart, the lane bends between them; source: decision 0045, five at 24.4 m
 _OUTLIER_SIGMAS = 3.0  # from which on a pair counts less; source: three sigma, one false alarm in 370
 
 
@@ -89,8 +90,10 @@ def _cautious_sigma(station_m: Floats, slope: Floats, sigma: Floats) -> Floats:
     first = np.clip(np.arange(len(order)) - size // 2, 0, len(order) - size)
     usual = np.empty(len(order))
     usual[order] = np.median(slope[order][first[:, None] + np.arange(size)], axis=1)
+    near = np.empty(len(order), bool)
+    near[order] = station_m[order][first + size - 1] - station_m[order][first] < _NEIGHBOURS_WITHIN_M
     off = np.abs(slope - usual)
-    return np.where(off > _OUTLIER_SIGMAS * sigma, np.hypot(sigma, off), sigma)
+    return np.where(near & (off > _OUTLIER_SIGMAS * sigma), np.hypot(sigma, off), sigma)
 
 
 def _is_staggered(ahead_m: Floats) -> bool:
