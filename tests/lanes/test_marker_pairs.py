@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from app.lanes.estimate import fit_lane
+from app.lanes.even_spacing import find_known_lengths
 from app.lanes.marker_pairs import find_pairs
+from app.lanes.smooth_line import SmoothLine
 from app.lanes.types import LEFT, RIGHT
 from tests.lanes.lanes import Road, bendy, markers_at, place
 
@@ -51,3 +53,33 @@ def test_an_oblique_pair_is_doubtful_and_a_bend_is_not():
     pairs = find_pairs(station, left, np.repeat([int(LEFT), int(RIGHT)], 12), np.full(24, 0.02))
     assert np.flatnonzero(pairs.cautious_sigma > pairs.sigma).tolist() == [5]
     assert pairs.cautious_sigma[5] > 0.2
+
+
+@pytest.mark.parametrize("along_m", [-0.4, 0.4, 0.6])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pair_beside_its_even_place_does_not_bend_the_path(seed, along_m):
+    """At 80 ft, without a track: the stretch before it seems to be longer than the line, the next one shorter."""
+    road, station = even_road(along_m)
+    rng = np.random.default_rng(seed)
+    points = np.concatenate(
+        [road.beside(station, left) + rng.normal(0, 0.02, (len(station), 2)) for left in (1.6, -1.6)]
+    )
+    found = fit_lane(markers_at(points, np.repeat([1, 2], len(station))))
+    assert found.refusal is None
+    assert np.abs(road.errors(found)).max() < 0.25  # 1.4 m and more where these lengths counted
+
+
+def test_lengths_beside_a_moved_pair_are_not_known():
+    road, station = even_road(0.4)
+    found = find_known_lengths(SmoothLine(road.centre[::12]), station, np.ones(len(station), bool), 3.2)
+    assert len(found.start_m) == len(station) - 3
+    assert np.abs(found.excess_m).max() < 0.2
+
+
+def even_road(along_m):
+    """A road with a bend, and places every 80 ft along its centre of which one in the bend is moved."""
+    at = np.arange(0, 352.1, 0.25)
+    road = Road(np.interp(at, [0, 120, 140, 180, 200, 352], [0, 0, 1 / 60, 1 / 60, 0, 0]), at * 0 + 3.2)
+    station = np.arange(10.0, 350.0, 2 * SPACING_M)
+    station[6] += along_m
+    return road, station
