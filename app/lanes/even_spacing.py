@@ -88,7 +88,7 @@ def _beside_moved_pairs(excess_m: Floats, good: Bools, length_m: Floats) -> Bool
     cancel = np.abs(first + second) < np.maximum(_MOVED_M, _CANCEL_SHARE * np.maximum(np.abs(first), np.abs(second)))
     short = np.maximum(length_m[:-1], length_m[1:]) < _SHORT_M
     moved = good[:-1] & good[1:] & (first * second < 0) & (size > _MOVED_M) & (short | cancel)
-    return np.append(moved, False) | np.append(False, moved)
+    return np.asarray(np.append(moved, False) | np.append(False, moved), bool)
 
 
 def _placed_along(excess_m: Floats, turn_rad: Floats, good: Bools, width_m: float) -> Floats | None:
