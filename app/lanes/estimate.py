@@ -17,7 +17,7 @@ from app.lanes.local_plane import plane_from_wgs84
 from app.lanes.observations import LaneObservations, distinct_places, observations_from_markers
 from app.lanes.paper_spline import boundaries_by_splines
 from app.lanes.smooth_line import SmoothLine
-from app.lanes.track_agreement import compare_with_track
+from app.lanes.track_agreement import compare_with_track, runs_apart
 from app.lanes.types import (
     LEFT,
     RIGHT,
@@ -35,6 +35,10 @@ from app.sensors.pose_track import PoseTrack
 
 __all__ = ["Lane", "LaneMarkers", "LaneRules", "LeftOut", "LeftOutReason", "fit_lane", "preview_m"]
 
+_TRACK_APART = (
+    "the vehicle's track does not run beside the path, so that nothing shows that the path is in its place: check the "
+    "datum and the survey of the markers, and of the receiver"
+)
 _BEYOND_TRACK_M = 15.0  # [m] further past its ends a track is not used; source: by hand, sensitivity 1.00, 1.00
 _PRECISE_TRACK_M = (
     0.1  # [m] noise of a track that shows sides by itself; source: by hand: between RTK and other receivers
@@ -84,7 +88,13 @@ def fit_lane(
     if method == "paper":
         return _fit_by_splines(observations, taken, line, notes)
     lane = _fit_by_least_squares(observations, taken, line, drive, rules, notes)
-    return lane if track is None else replace(lane, track_agreement=compare_with_track(lane, track))
+    if track is None:
+        return lane
+    agreement = compare_with_track(lane, track)
+    if agreement is None and drive is not None and lane.refusal is None and runs_apart(lane, track):
+        warnings = (*lane.localization_warnings, _TRACK_APART)
+        return replace(lane, track_apart=True, localization_warnings=warnings)
+    return replace(lane, track_agreement=agreement)
 
 
 def preview_m(lane: Lane, lon_deg: float, lat_deg: float) -> float:

@@ -2,7 +2,8 @@
 
 Crews place markers at even distances along the lane's centre or one of its boundaries. Whether they did is found from
 the markers' positions, mainly on stretches that hardly turn; in a bend, the length between two markers then shows how
-far the lane swings out.
+far the lane swings out. A pair of markers that was set a metre too early or too late makes one stretch too short
+and the next one too long by as much: their lengths are not used.
 """
 
 from __future__ import annotations
@@ -23,6 +24,11 @@ _EVEN_M = 0.2  # [m] a length this close to a multiple is even; source: by hand,
 _LENGTH_SIGMA_M = 0.03  # [m] of a known length; source: survey of 0.02 m and placing of 0.01 m at both ends
 _MAX_SPACINGS = 4  # between two markers: three missing in between; source: by hand, sensitivity 1.00, 1.00
 _MAX_EXCESS_SHARE = 0.1  # of the distance; source: by hand, sensitivity 1.00, 1.00
+_MOVED_M = (
+    0.1  # [m] opposite errors of neighbouring lengths above this show a moved pair; source: 3 x `_LENGTH_SIGMA_M`
+)
+_SHORT_M = 40.0  # [m] on longer stretches bends make opposite errors too; source: decision 0045, rows of ten a side
+_CANCEL_SHARE = 0.3  # of the errors, which their sum must be below on longer stretches; source: as above
 _CLEARLY_BETTER = 0.5  # of the squared misfit along the second best line; source: by hand, sensitivity 0.93, 1.28
 
 
@@ -71,7 +77,18 @@ def find_known_lengths(line: SmoothLine, station_m: Floats, used: Bools, width_m
     found = _placed_along(excess, turn, good, width_m)
     if found is None:
         return NO_KNOWN_LENGTHS
+    good &= ~_beside_moved_pairs(found, good, length)
     return KnownLengths(place[:-1][good], place[1:][good], found[good], np.full(int(good.sum()), _LENGTH_SIGMA_M))
+
+
+def _beside_moved_pairs(excess_m: Floats, good: Bools, length_m: Floats) -> Bools:
+    """Stretches that begin or end where markers stand before or behind their even place."""
+    first, second = excess_m[:-1], excess_m[1:]
+    size = np.minimum(np.abs(first), np.abs(second))
+    cancel = np.abs(first + second) < np.maximum(_MOVED_M, _CANCEL_SHARE * np.maximum(np.abs(first), np.abs(second)))
+    short = np.maximum(length_m[:-1], length_m[1:]) < _SHORT_M
+    moved = good[:-1] & good[1:] & (first * second < 0) & (size > _MOVED_M) & (short | cancel)
+    return np.asarray(np.append(moved, False) | np.append(False, moved), bool)
 
 
 def _placed_along(excess_m: Floats, turn_rad: Floats, good: Bools, width_m: float) -> Floats | None:

@@ -22,7 +22,7 @@ from app.lanes.least_squares import (
     OffsetModel,
     choose_hyperparameters,
 )
-from app.lanes.marker_pairs import find_pairs, nearest_sorted
+from app.lanes.marker_pairs import Pairs, find_pairs, nearest_sorted
 from app.lanes.observations import LaneObservations
 from app.lanes.smooth_line import SmoothLine, lengths_along
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints, LaneRules, LeftOutReason, Notes
@@ -33,6 +33,10 @@ _NEARLY_CONVERGED_M = 0.5  # [m] a line that moved less shows no new outliers; s
 _MAX_REJECTIONS = 12  # of outliers beside one line; source: by hand, sensitivity 1.00, 1.00
 _MAX_GROWTH = 2.0  # of the length of the initial line; more is a line that winds between outliers; source: by hand
 _REJECTION_STRETCH_M = 60.0  # [m] within it one outlier at a time; source: by hand, sensitivity 1.00, 1.00
+_PAIR_SIGMAS = (
+    5.0  # from which on a pair does not agree with the lane; source: decision 0045, 3 loses pairs of tight bends
+)
+_MIN_SLOPE_SHARE = 0.05  # of a pair's variance that others explain; source: by hand, keeps the division by it finite
 _SCATTERS = (1.6, 2.5, 4.0)  # of markers, in their stated accuracy; source: by hand: 3.5, 5.5, 9 cm for the usual 2.2
 _MIN_GAIN = 1.5  # of the log likelihood by a larger scatter; source: by hand, on scenes of `benchmarks.hunt cerpm`
 _STIFFER = 3  # bends that are tried with a scatter: the one found and stiffer ones; source: by hand
@@ -92,6 +96,7 @@ class LaneFit:
 
     problem: LaneProblem
     solution: LaneSolution
+    _pairs: Pairs
 
     def __init__(
         self,
@@ -183,6 +188,7 @@ class LaneFit:
                     self.problem, self._hyperparameters, offset_models, width_models
                 )
             self.solution = self.problem.solve(self._hyperparameters)
+            self._trust_pairs()
             residual = self.solution.residuals()
             if nearly_converged or not left:
                 break
@@ -206,9 +212,7 @@ class LaneFit:
         if self._drive is None and turn:  # lengths along an initial line are too inaccurate
             known_lengths = find_known_lengths(self.line, self.station_m, self.used, self._hyperparameters.width_m)
         used_side = np.where(self.used, self.side, UNKNOWN)
-        pair_station, pair_slope, pair_sigma = find_pairs(
-            self.station_m, self._left_m, used_side, self._observations.sigma_m
-        )
+        self._pairs = find_pairs(self.station_m, self._left_m, used_side, self._observations.sigma_m)
         measured = Measurements(
             station_m=self.station_m[self.used],
             left_m=self._left_m[self.used],
@@ -217,12 +221,35 @@ class LaneFit:
             fix_station_m=fixes.station_m[inside],
             fix_left_m=fixes.left_m[inside],
             fix_sigma_m=fixes.sigma_m[inside],
-            pair_station_m=pair_station,
-            pair_slope=pair_slope,
-            pair_sigma=pair_sigma,
+            pair_station_m=self._pairs.station_m,
+            pair_slope=self._pairs.slope,
+            pair_sigma=self._pairs.cautious_sigma,
             known_lengths=known_lengths,
         )
         return LaneProblem(self.line, measured, start, end)
+
+    def _trust_pairs(self) -> None:
+        """Solve again, where pairs differ from those beside them, with those that agree with the lane and no others.
+
+        A pair that differs but agrees is of a bend; one that does not differ and disagrees is oblique as others beside
+        it are.
+        """
+        pairs, now = self._pairs, self.problem
+        differs = pairs.cautious_sigma > pairs.sigma
+        if not differs.any():
+            return
+        slope, slope_sigma = self.solution.slopes(pairs.station_m)
+        off = np.abs(pairs.slope - slope)
+        share = np.maximum(1 - (slope_sigma / pairs.sigma) ** 2, _MIN_SLOPE_SHARE)
+        agrees = off < _PAIR_SIGMAS * np.where(
+            differs, np.hypot(pairs.sigma, slope_sigma), pairs.sigma * np.sqrt(share)
+        )
+        if (agrees == ~differs).all():
+            return
+        cautious = np.where(differs, pairs.cautious_sigma, np.hypot(pairs.sigma, off / share))
+        measured = replace(now.measured, pair_sigma=np.where(agrees, pairs.sigma, cautious))
+        self.problem = LaneProblem(self.line, measured, float(now.station_m[0]), float(now.station_m[-1]))
+        self.solution = self.problem.solve(self._hyperparameters)
 
     def _drop_outliers(self, residual_m: Floats, share: Floats) -> bool:
         """Leave out the worst of the markers that are far from where the others predict them; whether any was."""

@@ -17,19 +17,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from app.lanes.banded_matrix import (
     apply,
-    covariances,
     difference_gram,
     factor,
     gather,
     gram,
+    inverse_band,
     log_determinant,
     solve,
+    variances,
 )
 from app.lanes.even_spacing import NO_KNOWN_LENGTHS, KnownLengths
 from app.lanes.smooth_line import SmoothLine, left_normals
@@ -37,10 +39,6 @@ from app.lanes.types import Floats, Ints
 
 KNOT_M = 3.0  # [m] between knots; source: by hand, sensitivity 0.95, 1.02
 _MIN_KNOTS = 5  # source: third differences need four
-_PROBE_KNOTS = (
-    2  # every so many knots the standard deviation is computed, between them interpolated; source: by hand, exact at 1
-)
-_MEMORY_M = 256.0  # [m] measurements further away have no effect on a place; source: by hand, sensitivity 1.00, 1.00
 _BAND = 9  # source: a third difference spans four knots of three fields: 3 x 3
 _LENGTH_SUM_SIGMA_M = 1e-3  # [m] of one step of the summed length; source: a 30th of `even_spacing._LENGTH_SIGMA_M`
 _MIN_VARIANCE_SHARE = 1e-9  # source: keeps the division by 1 - h finite
@@ -170,11 +168,15 @@ class LaneProblem:
 
     def _add_pairs(self) -> None:
         """A pair of markers measures the slope of c."""
-        place = (self.measured.pair_station_m - self.start_m) / self.knot_m
-        knot = np.clip(place.astype(np.int64), 0, self.count - 2)
-        index = self.fields * np.stack([knot, knot + 1], 1)
-        value = np.broadcast_to(np.array([-1.0, 1.0]) / self.knot_m, (len(knot), 2))
+        index, value = self.slope_rows(self.measured.pair_station_m)
         self._add(index, value, self.measured.pair_sigma, self.measured.pair_slope)
+
+    def slope_rows(self, station_m: Floats) -> tuple[Ints, Floats]:
+        """Sparse rows for the slope of c at stations."""
+        place = (station_m - self.start_m) / self.knot_m
+        knot = np.clip(place.astype(np.int64), 0, self.count - 2)
+        value = np.broadcast_to(np.array([-1.0, 1.0]) / self.knot_m, (len(knot), 2))
+        return self.fields * np.stack([knot, knot + 1], 1), value
 
     def _set_priors(self, line: SmoothLine) -> None:
         """Third differences of the centre as a curve in the plane, and squared derivatives of the other fields."""
@@ -277,6 +279,11 @@ class LaneSolution:
         self.centre_m = x[:: problem.fields]
         self.width_m = x[1 :: problem.fields]
 
+    @cached_property
+    def _inverse(self) -> Floats:
+        """Covariance of unknowns that are near each other."""
+        return np.asarray(inverse_band(self._cholesky))
+
     def residuals(self) -> Floats:
         """Distance of each marker left of its boundary. [m]"""
         p = self.problem
@@ -289,36 +296,21 @@ class LaneSolution:
         sigma / sqrt(1 - h).
         """
         p = self.problem
-        group, groups = _independent_groups(p.measured.station_m)
-        variance = covariances(self._cholesky, p.marker_index, p.marker_value, p.marker_value, group, p.size, groups)
+        variance = variances(self._inverse, p.marker_index, p.marker_value)
         return np.maximum(1 - variance / p.measured.sigma_m**2, _MIN_VARIANCE_SHARE)
 
+    def slopes(self, station_m: Floats) -> tuple[Floats, Floats]:
+        """Slope of the centre against the line at stations, and its standard deviation."""
+        index, value = self.problem.slope_rows(station_m)
+        variance = variances(self._inverse, index, value)
+        return apply(index, value, self._x), np.sqrt(np.maximum(variance, 0.0))
+
     def sigmas(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Some stations, and standard deviations there of the centre, left boundary, right boundary and width. [m]"""
-        p = self.problem
-        knots = np.unique(np.append(np.arange(0, p.count, _PROBE_KNOTS), p.count - 1))
-        groups = min(len(knots), max(int(_MEMORY_M / (p.knot_m * _PROBE_KNOTS)), 1))
-        group = np.arange(len(knots)) % groups
-        right = np.zeros((p.size, 2 * groups))
-        right[p.fields * knots, group] = 1
-        right[p.fields * knots + 1, group + groups] = 1
-        solved = solve(self._cholesky, right)
-        cc = solved[p.fields * knots, group]
-        cw = solved[p.fields * knots + 1, group]
-        ww = solved[p.fields * knots + 1, group + groups]
+        """The knots, and standard deviations there of the centre, left boundary, right boundary and width. [m]"""
+        p, inverse = self.problem, self._inverse
+        cc, cw, ww = inverse[0, :: p.fields], inverse[1, :: p.fields], inverse[0, 1 :: p.fields]
         left, right_side = (np.sqrt(np.maximum(cc + k * cw + ww / 4, 0)) for k in (1, -1))
-        return p.station_m[knots], np.sqrt(np.maximum(cc, 0)), left, right_side, np.sqrt(np.maximum(ww, 0))
-
-
-def _independent_groups(station_m: Floats) -> tuple[Ints, int]:
-    """The fewest groups of rows in which no two rows are within `_MEMORY_M`: group of each row, and their number."""
-    order = np.argsort(station_m, kind="stable")
-    ordered = station_m[order]
-    within = np.searchsorted(ordered, ordered + _MEMORY_M, side="left") - np.arange(len(ordered))
-    groups = int(within.max())
-    group = np.empty(len(ordered), np.int64)
-    group[order] = np.arange(len(ordered)) % groups
-    return group, groups
+        return p.station_m, np.sqrt(np.maximum(cc, 0)), left, right_side, np.sqrt(np.maximum(ww, 0))
 
 
 def _ornstein_weights(sd: float, length: float) -> list[float]:

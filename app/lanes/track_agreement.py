@@ -22,6 +22,9 @@ _SPACING_M = 3.0  # [m] between fixes that are compared; source: `driven_line._P
 _MAX_STEPS = 5000  # of the track, longer steps on tracks above 15 km; source: by hand, bounds the time
 _MIN_FIXES, _MIN_LENGTH_M = 10, 30.0  # fixes, and the length of track, without which nothing is compared; by hand
 _MAX_BESIDE_M = 500.0  # [m] fixes further from the path are of another road; source: by hand, above a datum's shift
+_APART_M = (
+    20.0  # [m] short tracks with a fix closer than this are beside the path; source: four times a poor receiver's 5 m
+)
 _OFFSET_SD_M = 0.25  # [m] of a driver's usual offset; source: by hand, the upper bound of `benchmarks.hunt.cerpm`
 _WANDER_SD_M, _WANDER_LENGTH_M = 0.25, 30.0  # [m, m] source: as above, and `least_squares.OFFSET_MODELS`
 _CUT_M2 = 2.0  # [m2] offset towards the inside of bends, per curvature; source: twice `driving.Driver.cut_m2`
@@ -55,7 +58,7 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
     Returns
     -------
     TrackAgreement or None
-        None where less than 30 m of the track are beside the path.
+        None where less than 30 m of the track are beside the path; see `runs_apart`.
 
     Notes
     -----
@@ -86,6 +89,26 @@ def compare_with_track(lane: Lane, track: PoseTrack) -> TrackAgreement | None:
         if np.abs(_transformed(fixes, middle, values) - moved).max() < _CONVERGED_M:
             break
     return _agreement(compared, middle, values, covariance, accuracy)
+
+
+def runs_apart(lane: Lane, track: PoseTrack) -> bool:
+    """Whether a track that could not be compared with a path is elsewhere, rather than beside it but too short.
+
+    Parameters
+    ----------
+    lane : Lane
+        With stations.
+    track : PoseTrack
+        For which `compare_with_track` returned None.
+    """
+    origin = (lane.origin_lon_deg, lane.origin_lat_deg)
+    fixes = plane_from_wgs84(track.lon_deg, track.lat_deg, origin)
+    fixes = fixes[np.isfinite(fixes).all(1)]
+    if not len(fixes):
+        return False
+    nearest_m = float(np.min(scipy.spatial.cKDTree(lane.position_enu_m).query(fixes)[0]))
+    moved_m = math.hypot(*np.ptp(fixes, axis=0))
+    return nearest_m > _APART_M or min(moved_m, float(lane.station_m[-1])) > _MIN_LENGTH_M
 
 
 def _thinned(fixes_m: Floats) -> tuple[Floats, float]:
@@ -137,13 +160,15 @@ def _agreement(
     compared: _Compared, middle_m: Floats, values: Floats, covariance: Floats, accuracy_m: float
 ) -> TrackAgreement:
     shift, turn, scale = values[:2], float(values[2]), float(values[3])
-    total = covariance[:2, :2] + accuracy_m**2 * np.eye(2)
-    shift_z = math.sqrt(float(shift @ np.linalg.solve(total, shift)))
     reach_m = math.sqrt(float(np.mean(np.sum((compared.fix_m - middle_m) ** 2, 1))))
     slow = accuracy_m / reach_m  # a receiver's error that changes by itself along the track
+    receiver = np.diag([accuracy_m, accuracy_m, slow, slow]) ** 2
+    total = covariance[:2, :2] + accuracy_m**2 * np.eye(2)
+    shift_z = math.sqrt(float(shift @ np.linalg.solve(total, shift)))
     turn_sigma, scale_sigma = (math.hypot(math.sqrt(float(covariance[k, k])), slow) for k in (2, 3))
     moved = _transformed(compared.fix_m, middle_m, values) - compared.fix_m
     across = np.sum(moved * compared.normal, 1)
+    alone = max(shift_z, abs(turn) / turn_sigma, abs(scale) / scale_sigma)
     return TrackAgreement(
         east_m=float(shift[0]),
         north_m=float(shift[1]),
@@ -152,6 +177,20 @@ def _agreement(
         turn_sigma_deg=math.degrees(turn_sigma),
         scale_ppm=1e6 * scale,
         scale_sigma_ppm=1e6 * scale_sigma,
-        significance=max(shift_z, abs(turn) / turn_sigma, abs(scale) / scale_sigma),
+        significance=max(alone, _joint_significance(values[:4], covariance[:4, :4] + receiver)),
         effect_m=float(np.sqrt(np.mean(across**2))),
     )
+
+
+def _joint_significance(values: Floats, covariance: Floats) -> float:
+    """Significance of four values together, in standard deviations of a normal distribution with the same probability.
+
+    A shift, a turn and a scale that can replace each other are uncertain one by one, but not together.
+
+    Notes
+    -----
+    The chance of a larger chi-squared x of four degrees of freedom is exp(-x / 2) (1 + x / 2).
+    """
+    squared = float(values @ np.linalg.solve(covariance, values))
+    log_chance = -squared / 2 + math.log1p(squared / 2)
+    return float(-scipy.special.ndtri_exp(log_chance - math.log(2.0)))

@@ -166,7 +166,7 @@ class TrackAgreement:
     scale_ppm, scale_sigma_ppm : float
         The path is longer than the track by this. [ppm]
     significance : float
-        The largest of shift, turn and scale, in standard deviations.
+        Of shift, turn and scale, together or of one of them alone, whichever is larger. In standard deviations.
     effect_m : float
         How far the transformation moves the track, across the path, RMS. [m]
     """
@@ -239,6 +239,8 @@ class Lane:
     method : str
     track_agreement : TrackAgreement or None
         With the vehicle's track; None without a track beside the path.
+    track_apart : bool
+        The vehicle's track was used, but does not run beside the path: the path may be anywhere.
     """
 
     origin_lon_deg: float
@@ -262,6 +264,7 @@ class Lane:
     refusal: str | None = None
     method: str = "waymark"
     track_agreement: TrackAgreement | None = None
+    track_apart: bool = False
 
     @property
     def east_m(self) -> Floats:

@@ -64,7 +64,6 @@ CONSTANTS = (
     "least_squares.Hyperparameters.width_length_m",
     "least_squares.Hyperparameters.width_sd_m",
     "least_squares.KNOT_M",
-    "least_squares._MEMORY_M",
     "marker_pairs._MIN_PAIRED_SHARE",
     "marker_pairs._MIN_PAIRS",
     "marker_pairs._MIN_ROW_STAGGER_M",

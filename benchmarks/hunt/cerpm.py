@@ -209,7 +209,7 @@ def _judge(p: Parameters, drive: _Drive, path: Lane, oracle: Lane) -> Outcome:
     limit = place_errors(drive.lane, oracle, *drive.span_m)
     possible = limit is not None and limit.coverage > _MIN_COVERED and limit.rms_m < _ORACLE_RMS_M
     found = place_errors(drive.lane, path, *drive.span_m)
-    blocked = path.track_agreement is not None and path.track_agreement.disagrees
+    blocked = path.track_apart or (path.track_agreement is not None and path.track_agreement.disagrees)
     if p["shift_all_m"]:
         return _judge_shifted(p, drive, path, found, blocked)
     if found is None or blocked or found.coverage < _MIN_COVERED:

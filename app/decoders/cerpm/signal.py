@@ -34,7 +34,7 @@ MIN_LEVELS = 8  # packets with strength and distance, for a level; source: by ha
 MIN_EXPECTED = 10  # transmissions, for a delivery ratio; source: by hand, no measurement kept
 _MIN_AUDIBLE = 4.0  # expected receptions of a healthy marker for silence to be evidence; source: exp(-4), 2 % by chance
 _REACH_M = 2000.0  # [m] source: `merged_markers.MergeRules.reach_m`
-_MAX_TRANSMISSIONS = 100_000  # in a drive, more are not reconstructed; source: by hand, a bound on memory
+_MAX_TRANSMISSIONS = 100_000  # of a marker in a drive, more are not reconstructed; source: by hand, a bound on memory
 _PAUSE_S, _PAUSE_INTERVALS = 60.0, 20.0  # [s, intervals] longer silence is out of range; source: by hand
 _SIGMAS = 1.96  # source: 95 % of a normal distribution
 _CERTAIN_SHARE = 0.97  # chance of enough strength above which only collisions lose packets; source: by hand
@@ -274,8 +274,7 @@ def _missed_transmissions(
 ) -> tuple[float, dict[int, Floats]]:
     """The interval of the markers, and the distance of the vehicle at each transmission that it did not receive.
 
-    Between two packets, transmissions are counted by sequences; before the first and after the last packet by the
-    interval, within the log and the track.
+    Only those within the log and the track count.
     """
     steps = [np.diff(one.time_s) / np.diff(one.sequence) for one in markers if len(one.sequence) > 1]
     pooled = np.concatenate(steps) if steps else np.empty(0)
@@ -291,15 +290,50 @@ def _missed_transmissions(
     for one in markers:
         if one.number not in places:
             continue
-        gaps = np.maximum(np.diff(one.sequence).astype(int), 1)
-        share = np.concatenate([np.arange(1, gap) / gap for gap in gaps]) if len(gaps) else np.empty(0)
-        between = np.repeat(one.time_s[:-1], gaps - 1) + share * np.repeat(np.diff(one.time_s), gaps - 1)
-        before = np.arange(one.time_s[0] - interval_s, start_s, -interval_s)
-        after = np.arange(one.time_s[-1] + interval_s, end_s, interval_s)
-        vehicle = vehicle_positions(track, np.concatenate((before, between, after)))
+        at_s = _missed_times_s(one, interval_s, start_s, end_s)
+        vehicle = vehicle_positions(track, at_s)
         away = np.hypot(distances_m(vehicle, np.broadcast_to(places[one.number], vehicle.shape)), antenna_m)
         missed[one.number] = away[np.isfinite(away) & (away <= _REACH_M)]
     return interval_s, missed
+
+
+def _missed_times_s(one: _MarkerPackets, interval_s: float, start_s: float, end_s: float) -> Floats:
+    """Times from start to end at which a marker's transmissions were not received. [s]
+
+    Between two packets, transmissions are counted by sequences; before the first and after the last packet by the
+    interval. A packet whose clock is years off does not add more of them: times are computed only from start to end.
+    """
+    before_s = (
+        one.time_s.min() - interval_s - _steps_s(one.time_s.min() - interval_s - end_s, interval_s, start_s, end_s)
+    )
+    after_s = (
+        one.time_s.max() + interval_s + _steps_s(start_s - one.time_s.max() - interval_s, interval_s, start_s, end_s)
+    )
+    at_s = np.concatenate((before_s, _times_between_s(one, start_s, end_s), after_s))
+    return at_s[(at_s >= start_s) & (at_s <= end_s)]
+
+
+def _steps_s(away_s: float, interval_s: float, start_s: float, end_s: float) -> Floats:
+    """Multiples of an interval from a distance on, as many as there may be from start to end. [s]"""
+    first = max(math.ceil(away_s / interval_s), 0)
+    return interval_s * (first + np.arange(math.ceil(max(end_s - start_s, 0.0) / interval_s) + 1, dtype=np.float64))
+
+
+def _times_between_s(one: _MarkerPackets, start_s: float, end_s: float) -> Floats:
+    """Times from start to end of the sequences between packets; none where they are implausibly many. [s]"""
+    pause_s, steps = np.diff(one.time_s), np.diff(one.sequence)
+    known = (pause_s > 0) & (steps > 1)
+    earlier_s, steps = one.time_s[:-1][known], steps[known]
+    step_s = pause_s[known] / steps
+    lowest = np.maximum(np.ceil((start_s - earlier_s) / step_s), 1)
+    highest = np.minimum(np.floor((end_s - earlier_s) / step_s), steps - 1)
+    counts = np.maximum(highest - lowest + 1, 0)
+    if not counts.sum() <= _MAX_TRANSMISSIONS:
+        return np.empty(0)
+    counts = counts.astype(np.int64)
+    row = np.repeat(np.arange(len(counts)), counts)
+    place = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.asarray(earlier_s[row] + (lowest[row] + place) * step_s[row])
 
 
 def _group_packets(

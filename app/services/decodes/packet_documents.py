@@ -32,7 +32,7 @@ from app.services.decodes.packet_task import DriveFiles, LaneResult
 from app.services.decodes.receiver_positions import ReceiverPositions, receiver_positions
 from app.services.decodes.wording import count_of
 
-DECODER_VERSION = "cerpm/2"
+DECODER_VERSION = "cerpm/3"
 MAX_REFUSED = 500
 _MAX_SIGMA_M = 0.25
 MAX_PROFILE = 200
@@ -173,7 +173,7 @@ def packets_document(files: DriveFiles, read: ReadPackets, result: LaneResult) -
     lane = result.lane
     markers = _markers(read, lane)
     unsure = _path_warnings(lane)
-    grade = LocalizationGrade.UNFIT if unsure else read.grade
+    grade = LocalizationGrade.UNFIT if unsure or lane.track_apart else read.grade
     document = lane_document(lane, grade=str(grade))
     document["localization_warnings"] += unsure
     document["localization_warnings"] += read.localization_warnings

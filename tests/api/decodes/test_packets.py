@@ -485,6 +485,18 @@ def test_markers_that_are_all_shifted_against_the_track_do_not_localize(road: tu
     assert any("against the vehicle's track" in text for text in found["lane"]["localization_warnings"])
 
 
+def test_markers_far_from_the_track_do_not_localize(road: tuple[httpx.Client, BuiltLane]) -> None:
+    """So far that nothing can be compared: that is no agreement."""
+    client, built = road
+    heard, _hour = drive(built, 1927)
+    track = replace(heard.track, lon_deg=heard.track.lon_deg + 0.009, lat_deg=heard.track.lat_deg + 0.0065)
+    found = decoded(client, packed(replace(heard, track=track)))
+    assert found["lane"]["refusal"] is None
+    assert found["lane"]["track_agreement"] is None
+    assert found["lane"]["localization_grade"] == "unfit"
+    assert any("does not run beside the path" in text for text in found["lane"]["localization_warnings"])
+
+
 def test_a_path_that_is_not_sure_is_not_for_localization(road: tuple[httpx.Client, BuiltLane]) -> None:
     client, built = road
     heard, _hour = drive(built, 1925)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import tracemalloc
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from time import process_time
 
 import numpy as np
@@ -219,6 +222,56 @@ def test_packets_without_a_strength_or_that_are_not_accepted() -> None:
     assert report.profiles[2].farthest_m > 0
     refused = [VerifiedPacket(p.packet, Verdict.REPLAYED, p.number, p.message) for p in packets]
     assert profile_signals(refused, places, track).profiles == {}
+
+
+def with_times(packets: list[VerifiedPacket], changed: Mapping[int, float]) -> list[VerifiedPacket]:
+    """The packets with other times of reception, by index."""
+    return [
+        replace(p, packet=replace(p.packet, received_at_s=changed[i])) if i in changed else p
+        for i, p in enumerate(packets)
+    ]
+
+
+@pytest.mark.parametrize("off_s", [-1024 * 7 * 86400.0, 1024 * 7 * 86400.0, 1e17, 1e300])
+@pytest.mark.parametrize("which", ["first", "middle", "last"])
+def test_a_clock_that_is_years_off_adds_no_transmissions(off_s: float, which: str) -> None:
+    packets, places, track = drive(1016, markers=8)
+    own = [i for i, p in enumerate(packets) if p.number == 4]
+    at = {"first": own[0], "middle": own[len(own) // 2], "last": own[-1]}[which]
+    honest = profile_signals(packets, places, track)
+    spoilt = with_times(packets, {at: packets[at].packet.received_at_s + off_s})
+    with memory_limit(200_000_000):
+        found = profile_signals(spoilt, places, track)
+    assert found.profiles.keys() == honest.profiles.keys()
+    for number in set(places) - {4}:
+        level, before = found.profiles[number].level_db, honest.profiles[number].level_db
+        assert level is not None
+        assert before is not None
+        assert level.value == pytest.approx(before.value, abs=1.0)
+    assert found.profiles[4].health in (SignalHealth.HEALTHY, SignalHealth.NOT_ENOUGH_DATA)
+
+
+def test_a_sequence_that_jumps_by_billions_adds_no_transmissions() -> None:
+    packets, places, track = drive(1017, markers=8)
+    last = max(i for i, p in enumerate(packets) if p.number == 4)
+    message = packets[last].message
+    assert message is not None
+    spoilt = list(packets)
+    spoilt[last] = replace(packets[last], message=replace(message, sequence=4_000_000_000))
+    with memory_limit(200_000_000):
+        assert profile_signals(spoilt, places, track).profiles.keys() == places.keys()
+
+
+@contextmanager
+def memory_limit(limit: int) -> Iterator[None]:
+    """Fail where more bytes than the limit are in use at a time."""
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < limit
 
 
 def test_rules_are_checked() -> None:
