@@ -13,6 +13,7 @@ import numpy as np
 from app.decoders.plate.reader import decode_plates
 from app.jobs.decoder_process import warm_frame
 from app.jobs.trace_tasks import compile_traces
+from app.lanes.banded_matrix import factor, inverse_band
 from app.lanes.boundary_sides import assign_sides
 from app.services.decodes.trace_task import CompileTracesTask
 from app.tracks import Clock, LanePath, PositionFix, Samples, TrackInput
@@ -34,8 +35,9 @@ def _read_plate() -> None:
 
 
 def _read_trace_and_track() -> None:
-    """Decode a trace, find sides of a lane, and estimate a track."""
+    """Decode a trace, find sides of a lane and its standard deviations, and estimate a track."""
     compile_traces(CompileTracesTask(), None)
+    inverse_band(factor(np.array([[2.0] * 4, [1.0] * 4])))
     assign_sides(_STATIONS_M, np.resize((1.7, -1.7), 4), np.zeros(4, np.int64), wander=0.1, near_track=False)
     estimate_track(_short_track())
 
