@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -33,20 +34,32 @@ def server(tmp_path: Path) -> Iterator[FaultServer]:
 
 
 def test_a_video_whose_server_is_killed_is_decoded_after_the_restart(server: FaultServer) -> None:
+    for frames in (
+        FRAMES,
+        3 * FRAMES,
+        9 * FRAMES,
+    ):  # a fast machine may have decoded it before the kill
+        decode = _decode_with_a_kill(server, frames)
+        assert decode["state"] == "done", decode
+        assert decode["summary"]["frames"] == frames
+        if decode["attempts"] == 2:
+            return
+    pytest.fail("each video was decoded before the server was killed")
+
+
+def _decode_with_a_kill(server: FaultServer, frames: int) -> dict[str, Any]:
+    """The decode of a video that is sent to a server, which is killed after the first frames and started again."""
     context = {"camera": {"width_px": WIDTH, "height_px": HEIGHT, "horizontal_fov_deg": 60.0}}
     with server.client() as client:
-        parts = {"file": ("drive.mp4", video(FRAMES)), "context": (None, json.dumps(context))}
+        parts = {"file": ("drive.mp4", video(frames)), "context": (None, json.dumps(context))}
         answer = client.post("/v1/decodes", files=parts)
         assert answer.status_code == 202, answer.text
         path = answer.headers["location"]
         wait_until(lambda: client.get(path).json()["progress"], "the first frames")
-        assert client.get(path).json()["state"] == "running"
         server.kill()
     server.start()
     with server.client() as client:
-        decode = finished(client, path)
-        assert (decode["state"], decode["attempts"]) == ("done", 2), decode
-        assert decode["summary"]["frames"] == FRAMES
+        return finished(client, path)
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
