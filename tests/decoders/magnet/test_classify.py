@@ -103,3 +103,11 @@ def test_a_moment_unlike_the_others_is_iron() -> None:
     (classification,) = classify_dipoles(odd, [], state, HALF_M)
     assert isinstance(classification, Rejected)
     assert classification.kind is NoiseKind.WRONG_MOMENT
+
+
+@pytest.mark.parametrize("moment", [5.0, 10.0, 20.0])
+def test_iron_far_above_the_road_is_no_likelier_a_magnet(moment: float) -> None:
+    state = MagnetState(2.47, 0.34)
+    (dipole,) = with_log_odds([pole(10, 0, height_m=0.08, moment=moment)], state.prior)
+    (classification,) = classify_dipoles([dipole], [], state, HALF_M)
+    assert isinstance(classification, Rejected)
