@@ -63,9 +63,9 @@ MAX_LOUDNESS, LOUDNESS_M, LOUDNESS = 4.0, 0.3, 12.0
 """Largest strength of a wheel's noise at a sensor over that at the reference beside the wheel: at most the first, and
 the third times the sixth power of the second over the distance across the vehicle. [1, m, 1] Source: 300 wheels of 2 to
 7 random dipoles have up to 3.7 at 0 to 0.2 m, 0.82 at 0.32 m, 0.21 at 0.48 m and 0.06 at 0.64 m."""
-MAX_RISE, MAX_RISE_NEAR = 0.6, 1.2
-"""Largest strength of a wheel's noise at a sensor over that at the noisier of the sensors beside it, as it falls away
-from the wheel; and the same near the wheel. Source: 600 such wheels have up to 0.45 and 1.3 (99 % have up to 0.97)."""
+MAX_RISE, MAX_RISE_NEAR = 0.45, 0.8
+"""Largest strength of a wheel's noise at a sensor over the sum at the two beside it, as it falls away from the wheel;
+and the same near the wheel. Source: 1,000 such wheels have up to 0.42 and 1.09 (99 % have up to 0.77)."""
 FAR_M, NEAR_WHEEL_M = 0.25, 0.1
 """Distance across from a reference from which on `MAX_RISE` holds; up to which neither does. [m] Source: as these."""
 MIN_STRANGE = 0.3
@@ -118,7 +118,7 @@ class _Channels(NamedTuple):
     strength: Floats  # (S, 3) mean square of the noise [uT2]
     residual: Floats  # (S, 3) of the present block [uT]
     regressors: Floats  # (2 W HARMONICS,) of the present block
-    limits: Floats  # (S, 2) largest strength over the loudest reference's, and over that of the noisier neighbour
+    limits: Floats  # (S, 2) largest strength over the loudest reference's, and over the sum of the neighbours'
     neighbours: Integers  # (S, 2) the sensors beside each, -1 where a wheel may be as loud
     gate: Floats  # (2,) 1 while what was learnt is strange, and how much of the noise is taken out
     near: Floats  # (S, W) how much of its noise a sensor can have from each wheel, 1 for the nearest
@@ -373,7 +373,7 @@ def _strangeness(loudest: float, channels: _Channels) -> float:
         most = channels.limits[j, 0] * loudest
         low, high = channels.neighbours[j]
         if low >= 0:
-            most = min(most, channels.limits[j, 1] * max(_strength(low, channels), _strength(high, channels)))
+            most = min(most, channels.limits[j, 1] * (_strength(low, channels) + _strength(high, channels)))
         least = MIN_STRANGE * (error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
         highest = max(highest, _strength(j, channels) / max(most, least))
     return highest
