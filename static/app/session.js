@@ -13,7 +13,7 @@ const PKCE = "waymark-pkce";
 /** The key or token of requests; empty: nobody is signed in. */
 export const key = signal(sessionStorage.getItem(KEY) ?? "");
 
-/** Who the key belongs to; null until the server has said so. @type {import("@preact/signals").Signal<Me | null>} */
+/** The owner of the key; null until the server has answered. @type {import("@preact/signals").Signal<Me | null>} */
 export const me = signal(/** @type {Me | null} */ (null));
 
 /** The server's settings for the pages, public. @type {import("@preact/signals").Signal<PageSettings | null>} */

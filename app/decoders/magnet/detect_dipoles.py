@@ -18,7 +18,17 @@ from app.decoders.magnet.ferrous import is_ferrous
 from app.decoders.magnet.fit_window import SURE_MARGIN, Dipole, FitWindow, Region, SensorArray
 from app.decoders.magnet.matched_filter import BIN_M, HALF_BINS, THRESHOLD, BinScores, FilterBank, score_bins
 from app.decoders.magnet.preprocess import Blocks
-from app.decoders.magnet.reconsider import CLOSE_M, MAX_POLISHED, apart_m, clusters, kind_of_moment, penalty, reconsider
+from app.decoders.magnet.reconsider import (
+    CLOSE_M,
+    MAX_POLISHED,
+    TAG_WIDTH_M,
+    TOGETHER_M,
+    apart_m,
+    clusters,
+    kind_of_moment,
+    penalty,
+    reconsider,
+)
 
 Floats = npt.NDArray[np.float64]
 Floats32 = npt.NDArray[np.float32]
@@ -38,8 +48,8 @@ MAX_FAILED = 3
 MAX_JOINT_FITS, ROW_WIDTH_M = 12, 0.3
 """Joint fits that a region may take if its dipoles do not stand in a row so narrow. [1, m] Source: bounds the delay of
 a streamed trace, `python -m benchmarks.magnets speed`."""
-TOGETHER_M, MAX_TOGETHER = 1.1, 3
-"""Dipoles that are fitted together with a new one: their distance, and their number with it. [m, 1] Source: by hand."""
+MAX_TOGETHER = 3
+"""Dipoles that are fitted together with a new one, with it. Source: by hand."""
 SAME_M = 0.3
 """Dipoles nearer than this are one. [m] Source: chosen by hand, well below `MIN_GAP_M`."""
 CONFIRMED_SHARE = 0.5
@@ -58,9 +68,6 @@ FIELD_M = 2.0
 CHANGE_M, CHANGE_HEIGHTS = 0.9, 3.0
 """Reach of what a dipole changes in the filters' results: metres, and heights more. Source: chosen by hand for
 speed."""
-TAG_WIDTH_M = 0.15
-"""Width of a row of magnets that can be a tag. [m] Source: chosen by hand, a vehicle that heads 2 degrees off over 4
-m."""
 
 
 @dataclass(slots=True, eq=False)

@@ -44,10 +44,11 @@ chi-squared, m] Source: of the dipoles in place of which there were other magnet
 MAX_DOUBTFUL = 2
 """Groups of them in a region that are explained again. Source: bounds the delay of a streamed trace, `python -m
 benchmarks.magnets speed`; with 4, as many tags are read."""
-BESIDE_M = 1.1
-"""The nearest other dipole within this is fitted again with them. [m] Source: as `detect_dipoles.TOGETHER_M`."""
-ROW_WIDTH_M = 0.15
-"""Width of a group. [m] Source: as `detect_dipoles.TAG_WIDTH_M`."""
+TOGETHER_M = 1.1
+"""Dipoles nearer along the road are fitted together. [m] Source: by hand."""
+TAG_WIDTH_M = 0.15
+"""Width of a row of magnets that can be a tag. [m] Source: chosen by hand, a vehicle that heads 2 degrees off over 4
+m."""
 MIN_GAIN = 10.0
 """What a replacement must cost less. [chi-squared] Source: chosen by hand; wrong minima cost 30 to 150 more."""
 
@@ -97,12 +98,12 @@ def _doubtful_groups(found: list[Dipole]) -> list[list[Dipole]]:
     groups: list[list[Dipole]] = []
     for dipole in sorted((d for d in found if d.params[2] > DOUBT_HEIGHT_M), key=lambda d: float(d.params[0])):
         s, y = dipole.params[:2]
-        row = [d for d in found if d is not dipole and abs(d.params[1] - y) < ROW_WIDTH_M]
+        row = [d for d in found if d is not dipole and abs(d.params[1] - y) < TAG_WIDTH_M]
         too_near = any(abs(d.params[0] - s) < CLOSE_M for d in row)
         if dipole.prior_cost < DOUBT_COST and dipole.margin > DOUBT_MARGIN and not too_near:
             continue
         for group in groups:
-            if s - group[0].params[0] < PAIR_ALONE_M and abs(group[0].params[1] - y) < ROW_WIDTH_M:
+            if s - group[0].params[0] < PAIR_ALONE_M and abs(group[0].params[1] - y) < TAG_WIDTH_M:
                 group.append(dipole)
                 break
         else:
@@ -114,7 +115,9 @@ def _explain_again(window: FitWindow, prior: MagnetPrior, found: list[Dipole], g
     """Replace a group by one or two magnets of one kind, if these are likelier; else renew the margin of its kind."""
     s, y = (float(np.mean([d.params[k] for d in group])) for k in (0, 1))
     rest = [d for d in found if all(d is not g for g in group)]
-    beside = sorted((d for d in rest if abs(d.params[0] - s) < BESIDE_M), key=lambda d: abs(float(d.params[0]) - s))[:1]
+    beside = sorted((d for d in rest if abs(d.params[0] - s) < TOGETHER_M), key=lambda d: abs(float(d.params[0]) - s))[
+        :1
+    ]
     far = [d for d in rest if all(d is not b for b in beside)]
     places = [s - PAIR_HALF_GAP_M, s + PAIR_HALF_GAP_M, *(float(d.params[0]) for d in (*group, *beside))]
     span = min(places), max(places)

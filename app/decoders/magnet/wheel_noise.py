@@ -35,8 +35,7 @@ LEARN_M, FIRST_LEARN_M, LEARN_SLOPE = 60.0, 3.0, 0.6
 """Distance over which harmonics are learnt: in the long run, at first, and its growth per distance. [m, m, 1] Source:
 in less, the magnets of a line that are about as far apart as a turn is long are learnt too (decision 0042)."""
 OFFSET_M, FIRST_OFFSET_M = 6.0, 0.5
-"""Distance over which a channel's offset is averaged, in the long run and at first. [m] Source: chosen by hand, three
-turns."""
+"""Distance over which a channel's offset is averaged, in the long run and at first. [m] Source: three turns."""
 STRENGTH_M = 10.0
 """Distance over which the strengths of noise and residual are averaged. [m] Source: chosen by hand, five turns."""
 MIN_PERIODIC, STILL_PERIODIC = 1.8, 1.0
@@ -44,17 +43,13 @@ MIN_PERIODIC, STILL_PERIODIC = 1.8, 1.0
 over what white noise has on average in as many harmonics. Source: the best of 64 trial lengths has 1.7 at most in 90
 drives of 150 m of white noise."""
 START_M = 8.0
-"""Distance before a wheel can count as noisy, and for which a magnet is not looked for. [m] Source: by hand, four
-turns."""
+"""Distance before a wheel can count as noisy, and for which a magnet is not looked for. [m] Source: four turns."""
 FADE_AFTER_M, FADE_M = 3.0, 8.0
-"""The noise is taken out gradually, from so far after a wheel was found noisy, over this. [m] Source: chosen by
-hand."""
+"""The noise is taken out gradually, from so far after a wheel was found noisy, over this. [m] Source: by hand."""
 CLIP, FIRST_CLIP, FIRST_CLIP_M = 3.0, 3.0, 6.0
-"""Residuals count up to so many mean deviations, and so many times that over the first metres. Source: chosen by
-hand."""
+"""Residuals count up to so many mean deviations, and so many times that over the first metres. Source: by hand."""
 MEAN_DEVIATION = 1.25
-"""Standard deviation over mean absolute deviation of Gaussian noise: sqrt(pi / 2) = 1.253. Source: normal
-distribution."""
+"""Standard deviation over mean absolute deviation of Gaussian noise. Source: normal distribution, sqrt(pi / 2)."""
 MEDIAN_DEVIATION, MIN_ERROR_UT = 1.48, 1.0
 """Deviation over median deviation of Gaussian noise, and the least deviation. [1, uT] Source: normal law; a chip's."""
 SMOOTH_M, MIN_STEP_M = 4.0, 0.001
@@ -63,11 +58,12 @@ MAX_LOUDNESS, LOUDNESS_M, LOUDNESS = 4.0, 0.3, 12.0
 """Largest strength of a wheel's noise at a sensor over that at the reference beside the wheel: at most the first, and
 the third times the sixth power of the second over the distance across the vehicle. [1, m, 1] Source: 300 wheels of 2 to
 7 random dipoles have up to 3.7 at 0 to 0.2 m, 0.82 at 0.32 m, 0.21 at 0.48 m and 0.06 at 0.64 m."""
-MAX_RISE, MAX_RISE_NEAR = 0.45, 0.8
-"""Largest strength of a wheel's noise at a sensor over the sum at the two beside it, as it falls away from the wheel;
-and the same near the wheel. Source: 1,000 such wheels have up to 0.42 and 1.09 (99 % have up to 0.77)."""
-FAR_M, NEAR_WHEEL_M = 0.25, 0.1
-"""Distance across from a reference from which on `MAX_RISE` holds; up to which neither does. [m] Source: as these."""
+MAX_RISE, MAX_RISE_NEAR = 0.45, 0.9
+"""Largest strength of a wheel's noise at a sensor over the sum at the two beside it, as it falls away; the same near
+the wheel. Source: 1,000 such wheels have up to 0.42 and 1.09; 99 % have up to 0.77 near the wheel."""
+FAR_M, NEAR_WHEEL_M, APART_M = 0.25, 0.1, 0.12
+"""Distance across from a reference from which on `MAX_RISE` holds, up to which nothing is strange; least distance of
+sensors beside. [m] Source: as these, METRO's spacing of 16 cm: over less, the noise falls less."""
 MIN_STRANGE = 0.3
 """Strength that is never strange, over the residual's variance: white noise is learnt as well. Source: with 0.1, wheels
 with 0.7 A m2 were no longer cancelled at 35 cm."""
@@ -230,9 +226,11 @@ def _limits(positions_m: Floats, references: npt.NDArray[np.intp]) -> tuple[Floa
     across = np.abs(positions_m[:, None, 1] - positions_m[references, 1]).min(axis=1)
     limits[:, 0] = np.minimum(MAX_LOUDNESS, LOUDNESS * (LOUDNESS_M / np.hypot(across, LOUDNESS_M)) ** 6)
     limits[:, 1] = np.where(across >= FAR_M, MAX_RISE, MAX_RISE_NEAR)
-    array = np.setdiff1d(np.argsort(positions_m[:, 1]), references, assume_unique=True)
-    inner = across[array[1:-1]] >= NEAR_WHEEL_M
-    neighbours[array[1:-1][inner]] = np.stack([array[:-2], array[2:]], axis=1)[inner]
+    y = np.where(np.isin(np.arange(sensors), references), np.nan, positions_m[:, 1])  # of array sensors
+    for j in np.flatnonzero(across >= NEAR_WHEEL_M):
+        low, high = np.flatnonzero(y <= y[j] - APART_M), np.flatnonzero(y >= y[j] + APART_M)
+        if low.size and high.size:
+            neighbours[j] = low[np.argmax(y[low])], high[np.argmin(y[high])]
     return limits, neighbours
 
 
@@ -370,10 +368,11 @@ def _strangeness(loudest: float, channels: _Channels) -> float:
     highest = 0.0
     for j in range(channels.strength.shape[0]):
         error = channels.error[j]
-        most = channels.limits[j, 0] * loudest
         low, high = channels.neighbours[j]
-        if low >= 0:
-            most = min(most, channels.limits[j, 1] * (_strength(low, channels) + _strength(high, channels)))
+        if low < 0:
+            continue
+        most = channels.limits[j, 1] * (_strength(low, channels) + _strength(high, channels))
+        most = min(most, channels.limits[j, 0] * loudest)
         least = MIN_STRANGE * (error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
         highest = max(highest, _strength(j, channels) / max(most, least))
     return highest
@@ -398,6 +397,7 @@ def _subtract_noise(x: Floats, step: float, locked_m: float, loudest: float, cha
     channels.gate[1] = min(max(channels.gate[1] + move, 0.0), 1.0)
     fade *= channels.gate[1]
     for j in range(x.shape[0]):
+        wheel = fade if _strength(j, channels) < MAX_LOUDNESS * loudest else 0.0
         for axis in range(3):
             predicted = 0.0
             for k in range(channels.regressors.size):
@@ -407,7 +407,7 @@ def _subtract_noise(x: Floats, step: float, locked_m: float, loudest: float, cha
             outliers += abs(residual) > CLIP * channels.error[j, axis]
             channels.strength[j, axis] += share * (predicted * predicted - channels.strength[j, axis])
             ratio = channels.strength[j, axis] / (channels.error[j, axis] ** 2 + 1e-6)
-            x[j, axis] -= fade * predicted * ratio / (ratio + HALF_GAIN)
+            x[j, axis] -= wheel * predicted * ratio / (ratio + HALF_GAIN)
     return outliers
 
 

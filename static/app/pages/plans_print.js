@@ -11,7 +11,7 @@ import { ChecksTable, LeftOutTable } from "./plans_tables.js";
 
 const MAX_MARKERS = 2000;
 
-/** Whether the page is being printed. Listeners draw it again before the browser lays it out. */
+/** Whether the page is being printed. The components that use it are drawn again before the browser prints. */
 export function usePrinting() {
   const [printing, setPrinting] = useState(false);
   useEffect(() => {

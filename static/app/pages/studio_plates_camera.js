@@ -33,7 +33,7 @@ export function CameraTab({ schema, plate, draft }) {
   const typed = useQueryForm(FIELDS, START, null);
   const body = passBody(typed.values, schema, draft);
   const key = body ? plateText(body) : null;
-  const opened = useRef(false); // what is wrong with the plate is said there
+  const opened = useRef(false); // the details show the errors of the plate, so they open with the first one
   opened.current ||= Boolean(draft.error);
   const found = useLive(async (signal) => {
     const response = await request("/v1/plate-drafts/pass", { ...jsonText(key ?? ""), signal });
