@@ -14,7 +14,7 @@ from app.decoders.magnet.readings import Finding, LineCrossing, MagnetReading, N
 from app.decoders.magnet.recording_check import find_mistakes
 from app.errors import InvalidParameter
 from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
-from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
+from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace, SensorRole
 from app.simulation.magnetic.clutter import ferrous_clutter, town_clutter
 from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
 from app.simulation.magnetic.readout import CanBus, Chip
@@ -254,6 +254,22 @@ def test_other_bars_and_rates() -> None:
     )
     drive = simulate_drive(scene, rng)
     assert right_and_other(drive, decode_trace(drive.trace, bar)) == (12, 0)
+
+
+@pytest.mark.slow
+def test_strong_wheels_are_cancelled_on_bars_with_other_spacings() -> None:
+    metro = MagnetometerBar.metro(forward_m=3.2)
+    places = [(3.2, y, 0.0) for y in (-0.9, -0.75, -0.6, -0.35, -0.3, -0.1, 0.05, 0.12, 0.3, 0.5, 0.55, 0.8, 0.9)]
+    positions = np.array([*places, *metro.positions_m[metro.references].tolist()])
+    roles = (SensorRole.ARRAY,) * len(places) + (SensorRole.REFERENCE,) * 2
+    bar = MagnetometerBar(positions, roles, axis_delay_s=metro.axis_delay_s)
+    rng = np.random.default_rng([7700, 5])
+    magnets = [RoadMagnet(30 + 3.3 * i, 0.15 * (i % 9 - 4), list(Polarity)[i % 2], Orientation.UP) for i in range(40)]
+    vehicle = Vehicle.compact(bar=bar, clearance_m=0.3, wheel_moment_am2=2.0)
+    drive = simulate_drive(Scene(Road(175), vehicle, Course(14.0), lines=magnets), rng)
+    right, other = right_and_other(drive, decode_trace(drive.trace, bar))
+    assert other == 0
+    assert right >= 38
 
 
 def test_missing_samples_and_a_gap_are_survived_and_reported() -> None:
