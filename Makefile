@@ -17,7 +17,7 @@ $(VENV)/.runtime: requirements.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install --quiet --require-hashes -r requirements.txt
 	$(PIP) install --quiet --no-deps -e .
-	$(BIN)/python -m app.jobs.compile_kernels  # once for all processes
+	$(BIN)/waymark compile  # once for all processes
 	@touch $@
 
 $(VENV)/.dev: requirements-dev.txt $(VENV)/.runtime
@@ -30,13 +30,14 @@ demo: $(VENV)/.runtime ## From coordinates, meanings and a road to decoded drive
 serve: $(VENV)/.runtime ## Serve on http://127.0.0.1:8000
 	$(BIN)/waymark serve
 
-PYTEST := $(BIN)/python -m pytest -n 4 --durations=30
+PYTEST := $(BIN)/python -m pytest --durations=30
 
+# A process for each core, each of which imports everything: 50 CPU seconds. Slow tests wait for other processes.
 test: $(VENV)/.dev ## The quick tests; `make check` runs all
-	$(PYTEST) --dist worksteal -m "not slow" $(PYTEST_ARGS)
+	$(PYTEST) -n logical --dist worksteal -m "not slow" -p no:schemathesis $(PYTEST_ARGS)
 
 slow: $(VENV)/.dev
-	$(PYTEST) --dist loadfile -m slow $(PYTEST_ARGS)
+	$(PYTEST) -n 4 --dist loadfile -m slow $(PYTEST_ARGS)
 
 static: $(VENV)/.dev web
 	$(BIN)/ruff format --check .
@@ -71,10 +72,12 @@ lock: $(VENV)/.dev ## Resolve the dependencies again, with hashes
 		--python-version 3.11 -o requirements-dev.txt
 	$(BIN)/uv pip compile pyproject.toml --generate-hashes --no-emit-index-url --universal \
 		--python-version 3.11 -o requirements.txt -c requirements-dev.txt
-	$(BIN)/uv pip compile pyproject.toml --extra s3 --extra tracing --extra bags --generate-hashes --no-emit-index-url \
+	$(BIN)/uv pip compile pyproject.toml --all-extras --generate-hashes --no-emit-index-url \
 		--universal --no-header --python-version 3.11 -o docker/requirements.txt -c requirements-dev.txt
-	$(BIN)/uv pip compile --group guide --generate-hashes --no-emit-index-url --universal --no-header \
-		--python-version 3.11 -o docker/requirements-guide.txt -c requirements-dev.txt
+	for group in build guide; do \
+		$(BIN)/uv pip compile --group $$group --generate-hashes --no-emit-index-url --universal --no-header \
+			--python-version 3.11 -o docker/requirements-$$group.txt -c requirements-dev.txt || exit 1; \
+	done
 
 clean: ## Remove what was built
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

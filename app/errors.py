@@ -59,7 +59,10 @@ class UnsupportedUpload(UnreadableUpload):
 
 
 class ProcessStopped(UnreadableUpload):
-    """An upload stopped the process that worked on it: it crashed, or took more time or memory than a process has."""
+    """The process that worked on an upload ended, or met its limit of time or memory, before it was done with it.
+
+    The cause may lie in the upload or in the server; the message names it where it is known.
+    """
 
 
 class CalibrationRefused(UnreadableUpload):
@@ -150,11 +153,20 @@ class Unavailable(WaymarkError):
     """A part the request needs is busy or down; trying again later can work."""
 
 
+class ClientLeft(Unavailable):
+    """The client has closed its connection, so nobody waits for the answer."""
+
+    def __init__(self) -> None:
+        super().__init__("the client has left", cure="send the request again and wait for its answer")
+
+
 class StorageFull(Unavailable):
     """There is no room for what the request wants to store; nothing of it was stored."""
 
     def __init__(self, where: str) -> None:
-        super().__init__(f"there is no room in {where}", cure="try again when the operator has made room")
+        super().__init__(
+            f"there is no room in {where}, or it is read-only", cure="try again when the operator has made room"
+        )
 
 
 class CommitUnknown(Unavailable):
@@ -166,8 +178,15 @@ class ProofFailed(WaymarkError):
 
 
 def is_disk_full(error: BaseException) -> bool:
-    """Whether an error of the operating system is that of a full disk or quota."""
-    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    """Whether an error of the operating system is that of a full or read-only disk, or of a quota."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+def is_exhausted(error: BaseException) -> bool:
+    """Whether a call failed because its process has no memory left, or may start no further thread."""
+    return isinstance(error, MemoryError) or (
+        isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.ENOMEM)
+    )
 
 
 @contextmanager

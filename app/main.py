@@ -6,24 +6,23 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import timedelta
-from pathlib import Path
 
 import structlog
-from fastapi import Depends, FastAPI, Response
+from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api.access import audit, keys, me
+from app.api.access import agencies, audit, keys, me
 from app.api.decodes import decodes
 from app.api.decodes import details as decode_details
 from app.api.drives import drives
 from app.api.fleet import calibrations, snapshots, vehicles
 from app.api.health import maintenance
 from app.api.http import server_settings, system, ui, web_settings
+from app.api.http.compression import Compressed
 from app.api.http.costs import Budget, Slots
-from app.api.http.dependencies import refuse_unknown_parameters
 from app.api.http.middleware import Guarded, Observed
-from app.api.http.openapi import describe, operation_id
+from app.api.http.openapi import describe
 from app.api.http.permissions import Permissions
 from app.api.http.problems import install_problem_handlers
 from app.api.http.rate_limits import RateLimit
@@ -56,14 +55,16 @@ from app.api.uploads import uploads
 from app.control.metrics import ProcessMetrics
 from app.control.operations import OperatorCases
 from app.control.server import ControlServer
+from app.errors import Unavailable, is_disk_full
 from app.families.plate.frames import decode_plates
 from app.jobs.frame_tasks import DecodePlates
+from app.jobs.local_queue import LocalQueue
 from app.published_settings import other_hosts, page_settings_of, server_settings_of
 from app.registry.database import Database
 from app.services.access.access import Access
 from app.services.ports import utc_now
 from app.settings import Settings
-from app.storage.probe import FolderProbe
+from app.storage.probe import find_folder_fault
 from app.use_cases import UseCases
 from app.wiring import Outside, connect_outside, make_use_cases
 
@@ -108,6 +109,7 @@ ROUTERS = (
     vehicles.router,
     calibrations.router,
     keys.router,
+    agencies.router,
     page_settings.router,
     damage_reports.router,
     me.router,
@@ -128,8 +130,6 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         version=__version__,
         openapi_url=None,  # app/api/http/ui.py has the document and the pages about it
         lifespan=lambda _app: _running(settings, outside, use_cases),
-        default_response_class=Response,
-        generate_unique_id_function=operation_id,
     )
     for name, use_case in use_cases.items():
         setattr(app.state, name, use_case)
@@ -140,11 +140,13 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     )
     app.state.form_limits = FormLimits(settings.max_report_photo_bytes, settings.report_contact_days)
     app.state.public_url = settings.public_url.rstrip("/")
-    app.state.readiness = {
-        "database": outside.database.is_ready,
-        "decoders": outside.pool.is_ready,
-        "storage": FolderProbe(_folders(outside)).is_writable,
-    }
+    app.state.readiness = system.Readiness(
+        {
+            "database": outside.database.find_fault,
+            "decoders": lambda: None if outside.pool.is_ready() else "no decoder process runs",
+            "storage": lambda: _find_storage_fault(outside),
+        }
+    )
     app.state.streams = Streams(use_cases["all_jobs"].watched, use_cases["agency_events"].newest_of)
     app.state.metrics = CollectorRegistry()
     app.state.metrics.register(ProcessMetrics(outside.database, outside.pool, utc_now))
@@ -152,15 +154,27 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     app.state.server_settings = server_settings_of(settings, __version__)
     _add_routes(app)
     ui.mount_static(app, other_hosts(settings), settings.base_map_file, settings.guide_dir)
-    _add_guard(app, settings, app.state.access)
+    app.add_middleware(Compressed)
+    budget = Budget(settings.key_processor_s_per_min, settings.agency_processor_s_per_min)
+    if isinstance(outside.queue, LocalQueue):  # with a broker, jobs run in other processes
+        outside.queue.charge = budget.charge_job
+    _add_guard(app, settings, app.state.access, budget)
     app.add_middleware(Observed, registry=app.state.metrics)
     return app
 
 
-def _folders(outside: Outside) -> set[Path]:
-    """Folders of this machine in which data are stored."""
+def _find_storage_fault(outside: Outside) -> str | None:
+    """Why nothing can be stored: a folder of this machine cannot be written, or the blob store does not take a blob and
+    return it."""
+    if (fault := _find_folder_fault(outside)) is None:
+        outside.blobs.probe()
+    return fault
+
+
+def _find_folder_fault(outside: Outside) -> str | None:
     database = outside.database.path
-    return {folder for folder in (outside.blobs.folder, database.parent if database else None) if folder is not None}
+    folders = {folder for folder in (outside.blobs.folder, database.parent if database else None) if folder is not None}
+    return next(filter(None, map(find_folder_fault, folders)), None)
 
 
 @asynccontextmanager
@@ -174,17 +188,25 @@ async def _running(settings: Settings, outside: Outside, use_cases: UseCases) ->
         outside.database.migrate()
         for warning in outside.database.list_warnings():
             _LOG.warning(warning)
-        outside.blobs.open()
-        outside.spool.open(alone=settings.is_embedded)
-        _show_once(access.ensure_first_key(_admin_key(settings)))
+        left_out = [
+            *_try_to_write("blobs", outside.blobs.open),
+            *_try_to_write("spool", lambda: outside.spool.open(alone=settings.is_embedded)),
+            *_try_to_write("admin key", lambda: _show_once(access.ensure_first_key(_admin_key(settings)))),
+        ]
         if settings.warm_decoders:
             outside.pool.warm()
         outside.queue.open(jobs)
         if control is not None:
-            control.open()
+            left_out += _try_to_write("socket of commands", control.open)
         delivery, job_files = use_cases["webhook_delivery"], use_cases["job_files"]
         if settings.is_embedded:
-            upload_cases.release_all()
+            left_out += _try_to_write("locks of uploads", upload_cases.release_all)
+        fault = _find_folder_fault(outside)
+        if left_out or fault:
+            _LOG.error(
+                "the disk is full or read-only: reads are served, writes are refused until that has changed",
+                fault=fault, left_out=left_out,
+            )  # fmt: skip
         async with (
             _each_minute(access.write_uses),
             _each(timedelta(days=1), unused_blobs.try_to_delete, stop=unused_blobs.stop),
@@ -214,16 +236,14 @@ def _control(database: Database, use_cases: UseCases) -> ControlServer | None:
 
 
 def _add_routes(app: FastAPI) -> None:
-    for router in (ui.router, system.router, pages.router):
-        app.include_router(router)
-    for router in ROUTERS:
-        app.include_router(router, dependencies=[Depends(refuse_unknown_parameters)])
+    for router in (ui.router, system.router, pages.router, *ROUTERS):
+        app.router.routes += router.routes  # `include_router` would build all of them
     mount_ogc(app)
     install_problem_handlers(app)
     describe(app)
 
 
-def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
+def _add_guard(app: FastAPI, settings: Settings, access: Access, budget: Budget) -> None:
     app.add_middleware(
         Guarded,
         authenticate=access.authenticate,
@@ -244,7 +264,7 @@ def _add_guard(app: FastAPI, settings: Settings, access: Access) -> None:
         permissions=Permissions(),
         body_timeout_s=settings.body_timeout_s,
         min_bytes_per_s=settings.min_bytes_per_s,
-        budget=Budget(settings.key_processor_s_per_min, settings.agency_processor_s_per_min),
+        budget=budget,
         slots=Slots(settings.expensive_at_once, settings.expensive_per_agency),
         request_timeout_s=settings.request_timeout_s,
     )
@@ -257,14 +277,14 @@ async def _each_minute(work: Callable[[], None]) -> AsyncIterator[None]:
     async def repeat() -> None:
         while True:
             await asyncio.sleep(60)
-            await asyncio.to_thread(work)
+            await asyncio.to_thread(_attempt, work)
 
     task = asyncio.create_task(repeat())
     try:
         yield
     finally:
         task.cancel()
-        await asyncio.to_thread(work)
+        await asyncio.to_thread(_attempt, work)
 
 
 @asynccontextmanager
@@ -273,7 +293,7 @@ async def _each(wait: timedelta, work: Callable[[], None], *, stop: Callable[[],
 
     async def repeat() -> None:
         while True:
-            await asyncio.to_thread(work)
+            await asyncio.to_thread(_attempt, work)
             await asyncio.sleep(wait.total_seconds())
 
     task = asyncio.create_task(repeat())
@@ -282,6 +302,29 @@ async def _each(wait: timedelta, work: Callable[[], None], *, stop: Callable[[],
     finally:
         stop()
         task.cancel()
+
+
+def _try_to_write(name: str, step: Callable[[], None]) -> list[str]:
+    """Do a step of the start; what a full or read-only disk prevents is returned with the cause."""
+    try:
+        step()
+    except Unavailable as error:
+        return [f"{name}: {error.message}"]
+    except OSError as error:
+        if not is_disk_full(error):
+            raise
+        return [f"{name}: {error.strerror}"]
+    return []
+
+
+def _attempt(work: Callable[[], None]) -> None:
+    """Call `work`; a failure is logged, and does not end the calls after it."""
+    try:
+        work()
+    except Unavailable as error:
+        _LOG.warning("periodic work is tried again later", work=getattr(work, "__qualname__", ""), why=error.message)
+    except Exception:  # noqa: BLE001 - whatever it is, it must not end what comes after it
+        _LOG.exception("periodic work failed; it is tried again", work=getattr(work, "__qualname__", repr(work)))
 
 
 def _nothing() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TypedDict
 
 from app.services.access.access import Access
+from app.services.access.agencies import Agencies
 from app.services.access.audit import AuditLog
 from app.services.access.audit_jobs import AuditVerifications
 from app.services.access.keys import Keys
@@ -59,6 +60,7 @@ class AccessUseCases(TypedDict):
     """Permissions, keys and the audit log."""
 
     access: Access
+    agencies: Agencies
     audit: AuditLog
     audit_verifications: AuditVerifications
     keys: Keys

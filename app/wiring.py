@@ -17,6 +17,7 @@ from app.formats.archives import ArchiveLimits
 from app.formats.images import ImageLimits
 from app.geodesy import use_grids
 from app.jobs.engine import JobEngine
+from app.jobs.export_process import ExportProcesses
 from app.jobs.frame_tasks import DecodePlates
 from app.jobs.local_queue import LocalQueue
 from app.jobs.pool import DecodePool
@@ -26,11 +27,11 @@ from app.markers.reading import PlateReading
 from app.registry.database import Database
 from app.registry.jobs import JobKind
 from app.services.access.access import Access, Bearer
+from app.services.access.agencies import Agencies
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.access.audit import AuditLog
 from app.services.access.audit_jobs import AuditVerifications
 from app.services.access.keys import Keys
-from app.services.access.oidc import Issuer, KeySet, Tokens
 from app.services.decodes.archive_handler import ArchiveHandler
 from app.services.decodes.decodes import Decodes
 from app.services.decodes.details import DecodeDetails
@@ -87,7 +88,6 @@ from app.services.webhooks.delivery import WebhookDelivery
 from app.services.webhooks.webhooks import Webhooks
 from app.settings import Settings
 from app.storage.blobs import Blobs
-from app.storage.jwks import read_jwks
 from app.storage.master_key import load_master_key
 from app.storage.s3_parts import S3Parts
 from app.storage.signing_key import load_signing_keys
@@ -149,7 +149,7 @@ def make_use_cases(settings: Settings, outside: Outside, decode: DecodePlates) -
     master_key = lru_cache(lambda: load_master_key(settings.resolved_master_key_file))
     secrets = AgencySecrets(master_key)
     quotas = _quotas(settings, outside.database)
-    access = _access_use_cases(settings, outside, ttl)
+    access = _access_use_cases(settings, outside, secrets, ttl)
     imports = _import_use_cases(settings, outside, ttl)
     decodes = _decode_use_cases(settings, outside, secrets, quotas)
     plans = _plan_use_cases(settings, outside, ttl)
@@ -188,12 +188,13 @@ def _job_handlers(
     }
 
 
-def _access_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> AccessUseCases:
+def _access_use_cases(settings: Settings, outside: Outside, secrets: AgencySecrets, ttl: timedelta) -> AccessUseCases:
     """Permissions, keys and the audit log."""
     database = outside.database
     access = Access(database, utc_now, _token_check(settings))
     return {
         "access": access,
+        "agencies": Agencies(database, utc_now, secrets, ttl),
         "audit": AuditLog(database),
         "audit_verifications": AuditVerifications(database, utc_now, outside.queue, idempotency_ttl=ttl),
         "keys": Keys(database, utc_now, access),
@@ -309,7 +310,8 @@ def _plan_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> Pla
 def _file_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> FileUseCases:
     """Jobs of every kind, and those that write files."""
     database, queue = outside.database, outside.queue
-    jobs, exports = AllJobs(database, utc_now), Exports(database)
+    jobs = AllJobs(database, utc_now)
+    exports = Exports(database, ExportProcesses(settings.decode_memory_bytes).write)
     files = JobFiles(database, utc_now, outside.blobs, jobs)
     return {
         "all_jobs": jobs,
@@ -388,5 +390,8 @@ def _decode_rules(settings: Settings) -> DecodeRules:
 def _token_check(settings: Settings) -> Callable[[str], Bearer] | None:
     if not settings.oidc_issuer:
         return None
+    from app.services.access.oidc import Issuer, KeySet, Tokens  # here: they load JWT and HTTP libraries
+    from app.storage.jwks import read_jwks
+
     issuer = Issuer(settings.oidc_issuer, settings.oidc_audience, settings.oidc_agency_claim, settings.oidc_scope_claim)
     return Tokens(issuer, KeySet(partial(read_jwks, settings.oidc_jwks))).verify

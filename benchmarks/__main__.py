@@ -1,4 +1,4 @@
-"""``python -m benchmarks [--short]``: all benchmarks, one after the other; what they print is kept in bench-out/.
+"""``python -m benchmarks [--short] [--only NAME]``: benchmarks, one after the other; output is kept in bench-out/.
 
 The exit status is not 0 if a benchmark could not be run; goals that were missed are in the tables.
 """
@@ -18,11 +18,13 @@ def main() -> int:
     """Run them, print what they print, and write it to a file for ``python -m benchmarks.readme``."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--short", action="store_true", help="a sample of everything, a few minutes")
-    short = parser.parse_args().short
+    parser.add_argument("--only", choices=[name for name, *_ in _list_commands(short=False)], help="one of them")
+    chosen = parser.parse_args()
     OUT.mkdir(exist_ok=True)
-    path = OUT / ("short.md" if short else "bench.md")
+    path = OUT / f"{chosen.only or ('short' if chosen.short else 'bench')}.md"
+    commands = [one for one in _list_commands(chosen.short) if chosen.only in (None, one[0])]
     with path.open("w") as file:
-        failed = [name for name, *command in _list_commands(short) if not _run(name, command, file.write)]
+        failed = [name for name, *command in commands if not _run(name, command, file.write)]
     print(f"\nWritten to {path}; `python -m benchmarks.readme {path}` puts the tables into the README.")
     if failed:
         print(f"Could not be run: {', '.join(failed)}", file=sys.stderr)

@@ -12,7 +12,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
-from app import __version__
+from app import __version__, shipped_folder
 from guide.inline import move_inline
 from guide.sources import ROOT, gather_sources
 
@@ -34,7 +34,7 @@ _CONFIGURATION: dict[str, Any] = {
     "html_theme_options": {"top_of_page_buttons": []},
     "html_static_path": [str(_HERE / "static")],
     "html_css_files": ["guide.css"],
-    "html_favicon": str(ROOT / "static" / "favicon.svg"),
+    "html_favicon": str(shipped_folder("static") / "favicon.svg"),
     "html_copy_source": False,
     "html_show_copyright": False,
     "html_use_index": False,

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-import os
-import shutil
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
+import hypothesis
 import pytest
 import sqlalchemy as sa
 import structlog
@@ -25,6 +26,7 @@ from app.decoders.plate.reader import decode_plates
 from app.jobs import resubmission
 from app.jobs.frame_tasks import DecodePlates
 from app.main import create_app
+from app.registry.database import Database
 from app.registry.feature_text import feature_text
 from app.registry.marker_rows import MarkerRow
 from app.registry.rows import row_of
@@ -33,11 +35,14 @@ from app.registry.tenancy import across_agencies
 from app.services.access.access import Scope
 from app.settings import Settings
 from app.worker import running_worker
+from tests import machine
 from tests.brokers import delete_all_queues, find_broker, own_queues
 from tests.databases import PostgresServer, postgres_server
 from tests.documented import DEVIATIONS, CheckedResponses
 from tests.http import WITHIN_S
 
+hypothesis.settings.register_profile("repeatable", derandomize=True)  # on CI it is so; searches are benchmarks
+hypothesis.settings.load_profile("repeatable")
 ADMIN_KEY = "an-admin-key-for-tests-only"
 UNLIMITED: dict[str, Any] = {
     "requests_per_s": 0.0,
@@ -51,8 +56,18 @@ Place = Callable[[], dict[str, Any]]
 """The fixture `place`."""
 
 
+@functools.cache
+def migrated_database() -> bytes:
+    """An SQLite file with the current schema and no rows: migrations take half a second, a copy does not."""
+    with TemporaryDirectory() as folder:
+        database = Database(f"sqlite:///{folder}/waymark.sqlite3")
+        database.migrate()
+        database.close()  # which moves the write-ahead log into the file
+        return Path(folder, "waymark.sqlite3").read_bytes()
+
+
 class LiveServer:
-    """An app behind uvicorn in a thread of this process."""
+    """An app behind uvicorn in a thread of this process, over a migrated SQLite file if there is none."""
 
     def __init__(self, app: FastAPI) -> None:
         self.app = app
@@ -64,6 +79,9 @@ class LiveServer:
         self._thread = threading.Thread(target=self._server.run, daemon=True)
 
     def __enter__(self) -> LiveServer:
+        if (path := self.app.state.database.path) is not None and not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(migrated_database())
         self._thread.start()
         deadline = time.monotonic() + WITHIN_S
         while not self._server.started:
@@ -119,17 +137,7 @@ def postgres() -> Iterator[PostgresServer]:
 @pytest.fixture(scope="session")
 def require_tool() -> Callable[..., str]:
     """Path of a program; without it the test is skipped, on CI it fails."""
-
-    def find(*names: str) -> str:
-        for name in names:
-            if path := shutil.which(name):
-                return path
-        reason = f"none of {', '.join(names)} is installed"
-        if os.environ.get("CI"):
-            pytest.fail(reason)
-        pytest.skip(reason)
-
-    return find
+    return machine.require_tool
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gzip
 import re
 from typing import Any
 
@@ -33,19 +34,21 @@ class CheckedResponses:
         if scope["type"] != "http" or OUTSIDE.fullmatch(scope["path"]):
             await self._app(scope, receive, send)
             return
-        status, media_type, body = 0, "", bytearray()
+        status, media_type, body, is_compressed = 0, "", bytearray(), False
 
         async def send_checked(message: Message) -> None:
-            nonlocal status, media_type
+            nonlocal status, media_type, is_compressed
             if message["type"] == "http.response.start":
                 status = message["status"]
                 headers = dict(message["headers"])
+                is_compressed = headers.get(b"content-encoding") == b"gzip"
                 media_type = headers.get(b"content-type", b"").decode("latin-1").partition(";")[0]
             elif message["type"] == "http.response.body":
                 if _is_json(media_type) or not body:
                     body.extend(message.get("body", b""))
                 if not message.get("more_body"):
-                    self._document.check(scope["method"], scope["path"], status, media_type, bytes(body))
+                    plain = gzip.decompress(body) if is_compressed and _is_json(media_type) else bytes(body)
+                    self._document.check(scope["method"], scope["path"], status, media_type, plain)
             await send(message)
 
         await self._app(scope, receive, send_checked)

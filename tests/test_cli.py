@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import cv2
 import orjson
@@ -15,7 +16,7 @@ from app import __version__, cli
 from app.main import create_app
 from app.markers.plate import PlateCode, PlateScheme
 from app.settings import Settings
-from tests.conftest import LiveServer
+from tests.conftest import ADMIN_KEY, LiveServer
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -57,6 +58,25 @@ def test_a_key_for_another_agency(waymark: Run, tmp_path: Path) -> None:
     status, _, error = waymark("key", "City", "--scope", "everything")
     assert status == 1
     assert "admin, planner, surveyor, viewer, vehicle" in error
+
+
+@pytest.mark.slow
+def test_an_operators_key_is_made_before_and_beside_the_server(waymark: Run, tmp_path: Path) -> None:
+    status, key, _ = waymark("key", "--operator", "--label", "ops")  # on an empty database: it is no agency
+    assert status == 0
+    settings = Settings(data_dir=tmp_path, warm_decoders=False, admin_key=SecretStr(ADMIN_KEY))
+    with LiveServer(create_app(settings)) as server, server.client(key.strip()) as operator:
+        assert [agency["name"] for agency in operator.get("/v1/agencies").json()["items"]] == ["default"]
+        with server.client(ADMIN_KEY) as admin:
+            assert admin.get("/v1/me").json()["agency"] == "default"
+        status, second, _ = waymark("key", "--operator")
+        with server.client(second.splitlines()[-1]) as other:
+            assert other.post("/v1/agencies", json={"name": "Roads"}).status_code == 201
+        assert "an agency's or an operator's" in waymark("key")[2]
+        assert "an agency's or an operator's" in waymark("key", "Roads", "--operator")[2]
+        assert "an agency's or an operator's" in waymark("key", "--operator", "--scope", "admin")[2]
+        assert "reserved" in waymark("key", "(operators)", "--scope", "admin")[2]
+    assert "(operators): 3 entries" in waymark("audit", "verify")[1]
 
 
 @pytest.mark.slow
@@ -210,6 +230,30 @@ def test_a_survey_goes_in_and_markers_come_out(waymark: Run, tmp_path: Path) -> 
     status, printed, _ = waymark(*arguments[:-1], compare, "--dry-run", "--map", str(drawn))
     assert (status, orjson.loads(printed)["comparison"]["matched"]) == (0, 8)
     assert drawn.read_text().startswith("<svg")
+
+
+@pytest.mark.slow
+def test_commands_print_json_and_nothing_else(waymark: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    survey, out, backup = tmp_path / "survey.csv", tmp_path / "out.geojson", tmp_path / "backup.tar"
+    survey.write_text(SURVEY)
+    waymark("key", "Roads")
+
+    def printed(*arguments: str) -> dict[str, Any]:
+        status, text, error = waymark(*arguments, "--json")
+        assert (status, error) == (0, ""), error
+        return dict(orjson.loads(text))
+
+    found = printed("import", str(survey), "--agency", "Roads", "--declaration", DECLARED)
+    assert found["outcome"] == "stored"
+    found = printed("export", str(out), "--agency", "Roads", "--format", "geojson")
+    assert found == {"file": str(out), "left_out": []}
+    written = printed("backup", str(backup))
+    assert {table["name"]: table["rows"] for table in written["manifest"]["tables"]}["markers"] == 8
+    assert printed("backup", str(backup), "--verify") == written
+    monkeypatch.setenv("WAYMARK_DATA_DIR", str(tmp_path / "restored"))
+    restored = printed("restore", str(backup))
+    assert restored["faults"] == []
+    assert restored["manifest"] == written["manifest"]
 
 
 @pytest.mark.slow

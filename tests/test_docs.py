@@ -13,6 +13,7 @@ import pytest
 from typer.main import get_command
 
 from app.cli import cli
+from app.markers.plate import PlateGeometry
 from app.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -74,3 +75,14 @@ def test_the_architecture_page_has_every_folder_the_layers_and_only_paths_that_e
     assert text.split("```text\n")[1].split("\n```")[0].splitlines() == contracts[0]["layers"]
     for path in re.findall(r"\b(?:app|docs|tests|migrations|benchmarks|docker|static)/[\w./-]*[\w/]", text):
         assert (ROOT / path).exists(), path
+
+
+def test_smaller_units_need_as_many_more_rows_as_documented() -> None:
+    coarse, fine = PlateGeometry(n=8, unit_mm=35.0), PlateGeometry(n=10, unit_mm=27.0)
+    assert coarse.side_mm == fine.side_mm
+    stated = re.search(
+        r"plates of the same width need (\d+) % more rows in the frame for units of 27 mm",
+        (ROOT / "docs/artwork.md").read_text(),
+    )
+    assert stated is not None
+    assert int(stated[1]) == round(100 * (coarse.unit_mm / fine.unit_mm - 1))

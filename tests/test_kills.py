@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
 from tests.formats.pictures import png
 from tests.http import finished, wait_until
 from tests.jobs import standin
+from tests.machine import refuse
 
 pytestmark = [
     pytest.mark.slow,
@@ -38,9 +38,7 @@ SEED, WRITE_S = 15, 1.0
 def nodes() -> Iterator[tuple[Broker, PostgresCluster]]:
     """A RabbitMQ node and a PostgreSQL cluster that may be killed."""
     if missing := missing_programs():
-        if os.environ.get("CI") == "true":
-            pytest.fail(f"not installed: {missing}")
-        pytest.skip(f"not installed: {missing}")
+        refuse(f"not installed: {missing}")
     with own_nodes() as made:
         yield made
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +11,7 @@ import pytest
 
 from benchmarks.readme import PAGES, SHORT_MARK, fill_blocks, read_sections
 from tests.http import WITHIN_S
+from tests.machine import require_tool
 from tests.tours import assert_same, read_blocks, run_blocks
 
 pytestmark = pytest.mark.slow
@@ -22,19 +21,11 @@ README = (ROOT / "README.md").read_text()
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 
 
-def require(name: str) -> None:
-    """Skip without a program; on CI fail."""
-    if shutil.which(name) is None:
-        if os.environ.get("CI"):
-            pytest.fail(f"{name} is not installed")
-        pytest.skip(f"{name} is not installed")
-
-
 @pytest.mark.timeout(3600)  # a loaded machine compiles the decoders for minutes
 @pytest.mark.parametrize("name", ["README.md", *(f"docs/tutorials/{path.name}" for path in TUTORIALS)])
 def test_commands_print_what_the_document_shows(tmp_path: Path, name: str) -> None:
-    require("curl")
-    require("bash")
+    require_tool("curl")
+    require_tool("bash")
     text = (ROOT / name).read_text()
     blocks = read_blocks(text)
     assert len(blocks) == len(re.findall(r"^```sh$", text, re.MULTILINE)) >= 6

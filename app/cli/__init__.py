@@ -25,12 +25,13 @@ from app.cli import (
     traces,
     worker,
 )
-from app.errors import WaymarkError
+from app.errors import WaymarkError, is_disk_full
 
 cli = typer.Typer(name="waymark", no_args_is_help=True, add_completion=False, pretty_exceptions_show_locals=False)
 cli.command()(server.serve)
 cli.command()(worker.worker)
 cli.command()(server.demo)
+cli.command("compile")(server.compile_kernels)
 cli.command()(server.migrate)
 cli.command()(server.key)
 cli.command()(backups.backup)
@@ -80,7 +81,7 @@ def main() -> None:
                 typer.echo(f"  {name}: {value}", err=True)
         raise SystemExit(1) from None
     except OSError as error:  # a file that cannot be read or written
-        if error.filename is None:
+        if error.filename is None and not is_disk_full(error):
             raise
-        typer.echo(f"waymark: {error.filename}: {error.strerror}", err=True)
+        typer.echo(f"waymark: {error.filename or 'writing a file'}: {error.strerror}", err=True)
         raise SystemExit(1) from None

@@ -72,7 +72,7 @@ def _read_heads(path: Path) -> dict[str, str]:
         return {}
     try:
         found = json.loads(path.read_bytes())
-    except ValueError:
+    except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict) or not all(isinstance(head, str) for head in found.values()):
         raise InvalidParameter(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from app.cli.database import owned_database, read_settings
-from app.cli.progress import Progress
+from app.cli.progress import JsonOption, Progress
 from app.errors import InvalidParameter, Unavailable
 from app.settings import Settings
 
@@ -43,6 +45,7 @@ def backup(
     with_keys: KeysOption = False,
     reference_blobs: ReferenceOption = False,
     allow_missing: MissingOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Back up the database and the blobs, also while the server runs, and verify the backup."""
     from app.services.backups.backup import BackupOptions
@@ -51,22 +54,28 @@ def backup(
     if verify:
         if not target.exists():
             raise InvalidParameter(f"there is no backup {target}", cure="name a folder or a .tar file")
-        _describe(target, verify_backup(target))
+        _describe(target, verify_backup(target), as_json=as_json)
         return
     options = BackupOptions(with_keys=with_keys, copy_blobs=not reference_blobs, allow_missing=allow_missing)
-    settings = read_settings()
-    _describe(target, _write_backup(settings, target, options))
+    manifest = _write_backup(read_settings(), target, options, quiet=as_json)
+    _describe(target, manifest, as_json=as_json)
 
 
 def restore(
     source: Annotated[Path, typer.Argument(exists=True, help="The backup: a folder, or a .tar file.")],
+    as_json: JsonOption = False,
 ) -> None:
     """Restore a backup into an empty database and store, and verify them. The exit status is 1 if a check fails."""
     from app.services.backups.restore import Restores
 
     settings = read_settings()
-    with owned_database(settings) as database, Progress() as shown:
+    with owned_database(settings) as database, Progress(quiet=as_json) as shown:
         report = Restores(database, _blobs(settings), _key_files(settings)).restore(source, shown.show)
+    if as_json:
+        _print_json({"backup": str(source), "database": database.name, **asdict(report)})
+        if report.faults:
+            raise typer.Exit(1)
+        return
     for fault in report.faults:
         typer.echo(f"waymark: {fault}", err=True)
     for name in report.absent_keys:
@@ -121,13 +130,13 @@ def _wait_for_the_last_client(database: Database) -> None:
         time.sleep(0.1)
 
 
-def _write_backup(settings: Settings, target: Path, options: BackupOptions) -> Manifest:
+def _write_backup(settings: Settings, target: Path, options: BackupOptions, *, quiet: bool = False) -> Manifest:
     from app import __version__
     from app.registry.database import Database
     from app.services.backups.backup import Backups
     from app.services.ports import utc_now
 
-    with closing(Database(settings.resolved_database_url)) as database, Progress() as shown:
+    with closing(Database(settings.resolved_database_url)) as database, Progress(quiet=quiet) as shown:
         backups = Backups(database, _blobs(settings), utc_now, __version__, _key_files(settings))
         return backups.write(target, options, shown.show)
 
@@ -144,8 +153,17 @@ def _key_files(settings: Settings) -> dict[str, Path]:
     return {"master.key": settings.resolved_master_key_file, "signing.key": settings.resolved_signing_key_file}
 
 
-def _describe(path: Path, manifest: Manifest) -> None:
+def _print_json(document: Mapping[str, object]) -> None:
+    import orjson
+
+    typer.echo(orjson.dumps(document, option=orjson.OPT_INDENT_2))
+
+
+def _describe(path: Path, manifest: Manifest, *, as_json: bool = False) -> None:
     """What is in a backup, and what has to be kept apart from it."""
+    if as_json:
+        _print_json({"backup": str(path), "manifest": manifest})
+        return
     rows, blobs = sum(table["rows"] for table in manifest["tables"]), manifest["blobs"]
     where = f"{blobs['bytes']} bytes" if blobs["copied"] else "left in their store"
     typer.echo(

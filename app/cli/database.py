@@ -89,11 +89,15 @@ def readable_database(settings: Settings) -> Iterator[Database]:
         database.close()
 
 
-def perform(settings: Settings, name: str, values: Values, files: Sequence[int] = ()) -> Values:
-    """Carry out an operation of `app.control.operations`, in the server if one owns the database, with its progress."""
+def perform(settings: Settings, name: str, values: Values, files: Sequence[int] = (), *, quiet: bool = False) -> Values:
+    """Carry out an operation of `app.control.operations`, in the server if one owns the database.
+
+    Its progress is shown unless `quiet`.
+    """
     from app.cli.progress import Progress
     from app.control.client import perform as carry_out
     from app.control.operations import OperatorCases
+    from app.formats.json_text import check_values
     from app.services.access.access import Access
     from app.services.ports import utc_now
 
@@ -106,7 +110,8 @@ def perform(settings: Settings, name: str, values: Values, files: Sequence[int] 
             lambda: _exports(database),
         )
 
-    with Progress() as shown:
+    check_values(dict(values), "option")  # arguments that are not UTF-8 have half surrogate pairs
+    with Progress(quiet=quiet) as shown:
         return carry_out(settings.resolved_database_url, name, values, make_cases, files, shown.show)
 
 

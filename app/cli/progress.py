@@ -7,12 +7,15 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from types import TracebackType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
     from rich.progress import TaskID
 
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and no progress.")]
 _LINE_EVERY_S = 5.0
 BYTES = "B"
 """Unit of steps that are counted in bytes; they are shown in kB or MB."""

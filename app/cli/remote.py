@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.progress import Progress
+from app.cli.progress import JsonOption, Progress
 from app.errors import InvalidParameter, Unavailable, WaymarkError
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 ServerOption = Annotated[str, typer.Option(help="Address of the server.")]
 KeyOption = Annotated[str, typer.Option(envvar="WAYMARK_KEY", help="Key to send; better set it in WAYMARK_KEY.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and no progress.")]
 _SERVER = "http://127.0.0.1:8000"
 _PART = 256 * 1024
 _RETRY_S = 1.0

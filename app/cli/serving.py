@@ -30,8 +30,12 @@ _SWITCH_S = 0.0005
 """[s] after which a thread lets others run Python. Source: `python -m benchmarks.service --only overload`: with the
 usual 5 ms a request that passes through several threads while 64 clients upload waits for up to a second."""
 _FILES_PER_CONNECTION = 2
-"""A connection and its upload. Databases, decoder processes and logs take fewer than `_OTHER_FILES`."""
+"""A connection and its upload. Databases, decoder processes and logs take fewer than `_OTHER_FILES`, or half of the
+files where there are few; a server of two decoder processes has 60 open."""
 _OTHER_FILES = 512
+_BACKLOG = 2048
+"""Connections that the kernel accepts before the server does. Source: default of uvicorn."""
+_MIN_CONNECTIONS = 8
 _ARENAS = 2
 """Heaps that the threads share. Each keeps what its threads once used. Source: by hand, one for each of two cores."""
 _M_ARENA_MAX = -8  # glibc's mallopt
@@ -73,14 +77,14 @@ def serve_until_stopped(settings: Settings) -> None:
     with collector_paused():
         from app.main import create_app
 
-    _check_port(settings.host, settings.port)
-    _raise_file_limit(_FILES_PER_CONNECTION * settings.max_connections + _OTHER_FILES)
+    check_port(settings.host, settings.port)
+    total, backlog = _possible_connections(settings.max_connections)
     limits = ConnectionLimits(
         header_s=settings.header_timeout_s,
         stall_s=settings.body_timeout_s,
         min_bytes_per_s=settings.min_bytes_per_s,
-        total=settings.max_connections,
-        per_address=settings.max_connections_per_address,
+        total=total,
+        per_address=max(1, settings.max_connections_per_address * total // settings.max_connections),
         proxies=frozenset(settings.proxies),
     )
     sys.setswitchinterval(_SWITCH_S)
@@ -94,6 +98,7 @@ def serve_until_stopped(settings: Settings) -> None:
         ws="none",
         log_config=None,
         access_log=False,
+        backlog=backlog,
         server_header=False,
         timeout_keep_alive=settings.keep_alive_s,
         timeout_graceful_shutdown=_GRACE_S,
@@ -112,7 +117,7 @@ def _share_heaps() -> None:
         mallopt(_M_ARENA_MAX, _ARENAS)
 
 
-def _check_port(host: str, port: int) -> None:
+def check_port(host: str, port: int) -> None:
     """Refuse a port that another program uses, before the server starts with all its parts."""
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -123,16 +128,30 @@ def _check_port(host: str, port: int) -> None:
         raise InvalidParameter(
             f"the server cannot listen on {host}, port {port}: {error.strerror}",
             field="WAYMARK_PORT",
-            cure="stop the program that uses the port, or choose another: waymark serve --port 8001",
+            cure="stop the program that uses the port, or choose another: WAYMARK_PORT=8001, or serve --port 8001",
         ) from error
 
 
-def _raise_file_limit(files: int) -> None:
-    """Let this process open enough files: many systems start with 1,024."""
+def _possible_connections(wanted: int) -> tuple[int, int]:
+    """How many connections there may be, and how many may wait in the kernel, with the files that may be open.
+
+    Many systems start with 1,024 files: the limit is raised to what is needed, or to the hard limit. Those that wait
+    are accepted all at once, before the first of them is refused, so they need files, too.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = files if hard == resource.RLIM_INFINITY else min(files, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    needed = _FILES_PER_CONNECTION * wanted + _BACKLOG + _OTHER_FILES
+    files = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    if soft != resource.RLIM_INFINITY and soft < files:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
+    left = files - min(_OTHER_FILES, files // 2)
+    backlog = min(_BACKLOG, left // 4)
+    possible = max(_MIN_CONNECTIONS, min(wanted, (left - backlog) // _FILES_PER_CONNECTION))
+    if possible < wanted:
+        _LOG.warning(
+            "fewer connections are allowed than WAYMARK_MAX_CONNECTIONS: raise the limit of open files (ulimit -Hn)",
+            connections=possible, wanted=wanted, open_files=files, needed=needed,
+        )  # fmt: skip
+    return possible, backlog
 
 
 def _end() -> None:

@@ -9,6 +9,7 @@ import typer
 
 from app.cli.database import perform, read_settings
 from app.cli.declarations import read_declaration
+from app.cli.progress import JsonOption
 from app.errors import InvalidParameter
 
 
@@ -18,8 +19,9 @@ def import_survey(
     declared: Annotated[str, typer.Option("--declaration", help="Declaration as JSON; see docs/imports.md.")] = "{}",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Report only; nothing is stored.")] = False,
     map_file: Annotated[Path | None, typer.Option("--map", help="SVG file for the residuals of a comparison.")] = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Import a survey and print the report, also while the server runs. The exit status is 1 if it is refused."""
+    """Import a survey and print the report as JSON, also while the server runs. The exit status is 1 if refused."""
     import orjson
 
     from app.api.surveys.schemas import DeclarationIn
@@ -28,7 +30,7 @@ def import_survey(
     declaration = declaration.model_copy(update={"dry_run": dry_run or declaration.dry_run})
     values = {"agency": agency, "declaration": declaration.declared()}
     with survey.open("rb") as file:
-        report = perform(read_settings(), "import", values, (file.fileno(),))["report"]
+        report = perform(read_settings(), "import", values, (file.fileno(),), quiet=as_json)["report"]
     shown: dict[str, object] = {**report}
     if map_file is not None and report["comparison"] is not None:
         map_file.write_text(report["comparison"]["map_svg"] or "")
@@ -47,9 +49,12 @@ def export_markers(
     family: Annotated[
         str | None, typer.Option(help="Only markers of this family: plate, magnet, cerpm or fiducial.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Write an agency's markers to a file, also while the server runs."""
     from tempfile import TemporaryDirectory
+
+    import orjson
 
     from app.families import FAMILY_NAMES
     from app.markers.status import STATUSES
@@ -68,8 +73,11 @@ def export_markers(
     with TemporaryDirectory(dir=out.parent, prefix=".waymark-") as folder:
         written = Path(folder, out.name)
         with written.open("xb") as file:
-            left_out = perform(read_settings(), "export", values, (file.fileno(),))["left_out"]
+            left_out = perform(read_settings(), "export", values, (file.fileno(),), quiet=as_json)["left_out"]
         written.rename(out)
+    if as_json:
+        typer.echo(orjson.dumps({"file": str(out), "left_out": left_out}, option=orjson.OPT_INDENT_2))
+        return
     if left_out:
         typer.echo(f"left out, too far from the file's UTM zone: {' '.join(left_out)}", err=True)
     typer.echo(out)

@@ -28,7 +28,7 @@ def start_tracing(settings: Settings, service: str) -> Any:
         from opentelemetry.sdk.trace.export import BatchSpanProcessor
     except ImportError as error:
         raise InvalidParameter(
-            "OpenTelemetry is not installed", field="WAYMARK_OTLP_ENDPOINT", cure="pip install waymark[tracing]"
+            "OpenTelemetry is not installed", field="WAYMARK_OTLP_ENDPOINT", cure="pip install waymark-roads[tracing]"
         ) from error
     provider = TracerProvider(resource=Resource.create({"service.name": service}))
     exporter = OTLPSpanExporter(endpoint=settings.otlp_endpoint.rstrip("/") + _PATH)

@@ -56,9 +56,11 @@ def show_nothing(_step: str, _done: float, _total: float) -> None:
 
 
 def create_key(cases: OperatorCases, values: Values, _files: Sequence[int], _report: Report) -> Values:
-    """Create a key for an agency."""
+    """Create a key for an agency, or for an operator where no agency is named."""
     days = values["days"]
     expires_at = cases.clock() + timedelta(days=days) if days else None
+    if values["agency"] is None:
+        return {"key": cases.access.create_operator_key(values["label"], expires_at)}
     with across_agencies():
         key = cases.access.create_key(values["agency"], parse_scope(values["scope"]), values["label"], expires_at)
     return {"key": key}

@@ -18,6 +18,8 @@ from app.demo.free_ports import free_ports
 from app.errors import Unavailable, WaymarkError
 
 _START_TIMEOUT_S = 180.0
+_WILDCARDS = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "[::1]"}
+"""Where this machine reaches a server that listens on all addresses."""
 _PR_SET_PDEATHSIG = 1  # Linux's prctl(2)
 _PRCTL = getattr(ctypes.CDLL(None), "prctl", None)
 
@@ -25,17 +27,26 @@ _PRCTL = getattr(ctypes.CDLL(None), "prctl", None)
 class LocalServer:
     """A server while the block runs.
 
+    Parameters
+    ----------
+    folder : Path
+    host : str, optional
+        Address to listen on.
+    port : int, optional
+        Free port to listen on; without, any.
+
     Attributes
     ----------
     url, key : str
         Where it listens, and its admin key.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, host: str = "127.0.0.1", port: int | None = None) -> None:
         self._folder = folder
+        self._host = host
         self.key = secrets.token_urlsafe(32)
-        (self._port,) = free_ports(1)
-        self.url = f"http://127.0.0.1:{self._port}"
+        self._port = free_ports(1)[0] if port is None else port
+        self.url = f"http://{_WILDCARDS.get(host, f'[{host}]' if ':' in host else host)}:{self._port}"
 
     def __enter__(self) -> LocalServer:
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")}
@@ -44,7 +55,8 @@ class LocalServer:
             "WAYMARK_ADMIN_KEY": self.key,
             "WAYMARK_DECODE_WORKERS": "2",  # frames come one at a time, and a proof drives in both
         }
-        command = [sys.executable, "-c", "from app.cli import main; main()", "serve", "--port", str(self._port)]
+        command = [sys.executable, "-c", "from app.cli import main; main()", "serve", "--host", self._host]
+        command += ["--port", str(self._port)]
         self._log_path = self._folder / "server.log"
         with self._log_path.open("wb") as log:
             self._process = subprocess.Popen(

@@ -29,11 +29,6 @@ _LANE_HEAD = (
     "drive", "markers", "packets", "accepted", "refused", "left out", "path RMS [cm]", "worst [cm]", "coverage",
     "own track [cm]", "steering [cm]",
 )  # fmt: skip
-_KADAV = (
-    ("CERPM paper, route 2", "20", "", "", "", "", "", "", "", "", "42"),
-    ("CERPM paper, route 3", "20", "", "", "", "", "", "", "", "", "38"),
-)
-"""Table 1 of the paper: path error of its controller."""
 _HEAD = ("plate", "scheme", "digits", "in view", "decoded", "wrong", "matched", "position [cm]", "heading [deg]")
 
 
@@ -177,7 +172,7 @@ def draw_trace_table(results: Sequence[TraceResult]) -> str:
 
 
 def draw_lane_table(results: Sequence[LaneResult]) -> str:
-    """Table of drives past CERPMs, with the paper's below."""
+    """Table of drives past CERPMs."""
     rows = [
         (
             r.name,
@@ -194,7 +189,7 @@ def draw_lane_table(results: Sequence[LaneResult]) -> str:
         )
         for r in results
     ]
-    return draw_rows(_LANE_HEAD, rows, _KADAV, left=1)
+    return draw_rows(_LANE_HEAD, rows, left=1)
 
 
 def _trace_row(r: TraceResult) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import sqlalchemy as sa
@@ -30,8 +30,6 @@ class SnapshotRecord(ABC):
     def kind(self, row: MarkerRow) -> dict[str, Any]:
         """What a marker has in common with others of its kind; plain values."""
 
-    def members(
-        self, connection: sa.Connection, agency_id: str, rows: Sequence[MarkerRow]
-    ) -> dict[str, dict[str, Any]]:
-        """Further members of the records of markers, by their ids."""
+    def members(self, connection: sa.Connection, agency_id: str, codes: Sequence[str]) -> Mapping[str, Sequence[Any]]:
+        """Further columns of markers with these codes, by the names of `write_snapshot`; None for a missing value."""
         return {}

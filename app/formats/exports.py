@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -45,11 +47,18 @@ MAX_FROM_MERIDIAN_DEG = 9.0
 of 6 degrees that begins in one zone lies in it whole."""
 
 
-class CadFile(NamedTuple):
-    """A file in one UTM zone, and the ids of the markers that lie too far from it."""
+class WrittenFile(NamedTuple):
+    """A file, and the ids of the markers that lie too far from its UTM zone."""
 
-    content: bytes
-    left_out: tuple[str, ...]
+    path: Path
+    left_out: tuple[str, ...] = ()
+
+
+_DXF_PLACE = (111111.25, 222222.25, 333333.25)
+_DXF_VALUES = (*map(str, _DXF_PLACE), "<CODE>", "<ID>", "<HEIGHT>")
+"""What stands in the reference that is repeated, in the place of a marker's position and texts."""
+_DXF_SECTION_END = "  0\nENDSEC\n"
+_GIS_PAGE = 50_000
 
 
 class _Zone(NamedTuple):
@@ -103,6 +112,28 @@ def _feature(record: Record) -> dict[str, Any]:
 def _ellipsoidal_m(record: Record) -> float | None:
     """Height of a point's geometry, of all formats: above the ellipsoid, or none (RFC 7946, section 4)."""
     return record["height_m"] if is_ellipsoidal(record["vertical_datum"]) else None
+
+
+def write_file(kind: str, pages: Iterable[Sequence[Record]], folder: Path, *, all_heights: bool) -> WrittenFile:
+    """A file of a kind that has to be complete before it can be sent, in an empty folder.
+
+    Parameters
+    ----------
+    kind : str
+        ``gpkg``, ``shapefile``, ``kml``, ``landxml`` or ``dxf``.
+    pages : iterable of sequences of mapping
+        At least one page, with at least one record.
+    all_heights : bool
+        As for `write_gis`.
+    """
+    if kind in ("landxml", "dxf"):
+        path = folder / f"markers.{kind}"
+        write = write_landxml if kind == "landxml" else write_dxf
+        with path.open("wb") as file:
+            return WrittenFile(path, write(list(chain.from_iterable(pages)), file))
+    records = chain.from_iterable(pages)
+    first = iter(lambda: list(islice(records, None if kind == "kml" else _GIS_PAGE)), [])
+    return WrittenFile(write_gis(first, kind, folder, all_heights=all_heights))
 
 
 def write_gis(pages: Iterable[Sequence[Record]], driver: str, folder: Path, *, all_heights: bool) -> Path:
@@ -161,8 +192,11 @@ def _zipped(folder: Path) -> Path:
     return path
 
 
-def write_landxml(records: Sequence[Record]) -> CadFile:
-    """LandXML 1.2 CgPoints (north, east, ellipsoidal height) in the UTM zone of WGS 84 that most markers lie in."""
+def write_landxml(records: Sequence[Record], file: IO[bytes]) -> tuple[str, ...]:
+    """LandXML 1.2 CgPoints (north, east, ellipsoidal height) in the UTM zone of WGS 84 that most markers lie in.
+
+    Returns the ids of the markers that lie too far from it.
+    """
     zone = _utm(records)
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -176,14 +210,18 @@ def write_landxml(records: Sequence[Record]) -> CadFile:
         height = f" {z:.4f}" if z is not None else ""
         name, description = quoteattr(_code(record)), quoteattr("; ".join([str(record["id"]), *_other_height(record)]))
         lines.append(f"<CgPoint name={name} desc={description}>{n:.4f} {e:.4f}{escape(height)}</CgPoint>")
-    return CadFile("\n".join([*lines, "</CgPoints></LandXML>", ""]).encode(), zone.left_out)
+    file.writelines(f"{line}\n".encode() for line in (*lines, "</CgPoints></LandXML>"))
+    return zone.left_out
 
 
-def write_dxf(records: Sequence[Record]) -> CadFile:
+def write_dxf(records: Sequence[Record], file: IO[bytes]) -> tuple[str, ...]:
     """DXF R2010 in metres: a block reference a marker with its code and id, in the UTM zone of WGS 84 that most lie in.
 
     Its z is the ellipsoidal height; 0, the plane of the drawing, where that is unknown: a block always has one. Another
-    height is the attribute HEIGHT, with its datum.
+    height is the attribute HEIGHT, with its datum. Returns the ids of the markers that lie too far from the zone.
+
+    ezdxf writes the drawing with one reference, which is repeated as text for each marker: objects would take 7 kB and
+    a millisecond of processor time for each.
     """
     from ezdxf.filemanagement import new
 
@@ -198,15 +236,30 @@ def write_dxf(records: Sequence[Record]) -> CadFile:
     block.add_point((0, 0))
     for tag in ("CODE", "ID", "HEIGHT"):
         block.add_attdef(tag, (0, 0), dxfattribs={"height": 0.25})
-    space = document.modelspace()
-    for record, e, n in zip(zone.records, zone.east, zone.north, strict=True):
-        place = (float(e), float(n), _ellipsoidal_m(record) or 0.0)
-        reference = space.add_blockref("WAYMARK_MARKER", place, dxfattribs={"layer": layer})
-        height = "".join(_other_height(record))
-        reference.add_auto_attribs({"CODE": _code(record), "ID": str(record["id"]), "HEIGHT": height})
+    reference = document.modelspace().add_blockref("WAYMARK_MARKER", _DXF_PLACE, dxfattribs={"layer": layer})
+    reference.add_auto_attribs({tag: f"<{tag}>" for tag in ("CODE", "ID", "HEIGHT")})
+    parts = (reference, *reference.attribs, reference.seqend)
+    handles = [str(part.dxf.handle) for part in parts if part is not None]
     text = io.StringIO()
     document.write(text)
-    return CadFile(text.getvalue().encode(), zone.left_out)
+    before, start, rest = text.getvalue().partition(f"  0\nINSERT\n  5\n{handles[0]}\n")
+    own, _, after = rest.partition(_DXF_SECTION_END)
+    first_handle, step = int(str(document.entitydb.next_handle()), 16), len(handles)
+    seed = re.compile(r"(\$HANDSEED\n  5\n)[0-9A-F]+")
+    file.write(seed.sub(rf"\g<1>{first_handle + step * len(zone.records):X}", before).encode())
+    changing = "|".join([*(rf"(?<=\n){handle}(?=\n)" for handle in handles), *_DXF_VALUES])
+    template = re.sub(changing, lambda found: f"{{{(*handles, *_DXF_VALUES).index(found[0])}}}", start + own)
+    for k, (record, e, n) in enumerate(zip(zone.records, zone.east.tolist(), zone.north.tolist(), strict=True)):
+        numbers = (f"{first_handle + step * k + j:X}" for j in range(step))
+        texts = (_code(record), str(record["id"]), "".join(_other_height(record)))
+        values = (*numbers, e, n, _ellipsoidal_m(record) or 0.0, *map(_one_line, texts))
+        file.write(template.format(*values).encode())
+    file.write((_DXF_SECTION_END + after).encode())
+    return zone.left_out
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.splitlines())
 
 
 def _code(record: Record) -> str:

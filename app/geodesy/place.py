@@ -341,7 +341,9 @@ def _global_frame(name: str, place_deg: tuple[float, float], realization: str | 
     if epoch is None:
         motion = plate_motion(*place_deg)
         parts_m.append(UNSTATED_YEARS * float((motion.speed_m + motion.accuracy_m)[0]))
+        moved_m, error_m = (UNSTATED_YEARS * float(value[0]) for value in (motion.speed_m, motion.accuracy_m))
         notes.append(
-            f"no epoch is stated, the plate moves by {parts_m[-1]:.2f} m in {UNSTATED_YEARS:g} years: state the epoch"
+            f"no epoch is stated, the plate moves by {moved_m:.2f} m in {UNSTATED_YEARS:g} years, by a model with an "
+            f"error of {error_m:.2f} m: state the epoch"
         )
     return stated, epoch, math.hypot(*parts_m), "; ".join(notes) or None

@@ -8,6 +8,7 @@ import gc
 import os
 import signal
 import time
+from enum import Enum
 from multiprocessing.connection import Connection
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 from pathlib import Path
@@ -16,8 +17,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from app.errors import ProcessStopped
+from app.errors import ProcessStopped, WaymarkError
 from app.jobs.frame_tasks import DecodePlates, use_decoder
+from app.jobs.memory_limit import out_of_memory, ran_short
 from app.jobs.process_limits import (
     ProcessLimits,
     allow_processor_time,
@@ -30,6 +32,17 @@ from app.markers.plate import PlateCode
 from app.services.decoder_processes import Task
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+
+
+class Outcome(Enum):
+    """How a task ended in a decoder process."""
+
+    DONE = "done"
+    FAILED = "failed"
+    RAN_SHORT = "ran short"
+    """The process had no memory or no thread left for it, which may be because of the tasks before."""
+
+
 READY, READY_WITH_NETWORK = "ready", "ready, with network"
 """What a process sends when it can take tasks."""
 # glibc's mallopt: keep freed memory for the next frame, or the kernel clears every page of every frame anew
@@ -43,8 +56,7 @@ def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLim
     """Load everything, work in a folder, send `READY`, and answer tasks until the server closes the connection.
 
     A task comes in steps: (argument, whether it is the last). The function of the argument's type is called with it and
-    the result of the step before. The answer is (whether all succeeded, result or exception, name and times of each
-    step).
+    the result of the step before. The answer is (an `Outcome`, result or exception, name and times of each step).
     """
     from app.jobs.tasks import STEPS  # only here: it loads every decoder
 
@@ -53,7 +65,7 @@ def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLim
     work_in(folder)
     limit_resources(limits)
     connection.send(READY if close_network() else READY_WITH_NETWORK)
-    answer: tuple[bool, Any] = (True, None)
+    answer: tuple[Outcome, Any] = (Outcome.DONE, None)
     times_ns: list[tuple[str, int, int]] = []
     while True:
         try:
@@ -61,23 +73,26 @@ def serve_tasks(connection: Connection, decode: DecodePlates, limits: ProcessLim
         except EOFError:
             return
         began_ns, function = time.time_ns(), STEPS[type(argument)]
-        if answer[0]:
+        if answer[0] is Outcome.DONE:
             allow_processor_time(limits)
             try:
-                answer = (True, function(argument, answer[1]))
+                answer = (Outcome.DONE, function(argument, answer[1]))
             except Exception as error:  # noqa: BLE001 - raised again in the server
-                raised = _limit_of_files(error) or error
-                answer = (False, ExceptionWithTraceback(raised, error.__traceback__))
+                outcome = Outcome.RAN_SHORT if ran_short(error) else Outcome.FAILED
+                raised = _met_limit(error, outcome) or error
+                answer = (outcome, ExceptionWithTraceback(raised, error.__traceback__))
         times_ns.append((function.__name__, began_ns, time.time_ns()))
         if is_last:
             empty_folder(folder)
             connection.send((*answer, times_ns))
-            answer, times_ns = (True, None), []
+            answer, times_ns = (Outcome.DONE, None), []
         del argument  # a frame's memory is free before the next frame comes
 
 
-def _limit_of_files(error: Exception) -> ProcessStopped | None:
-    """What a write means that the limits of this process refused; None if another thing failed."""
+def _met_limit(error: Exception, outcome: Outcome) -> ProcessStopped | None:
+    """What a call means that the limits of this process refused; None if another thing failed, or is known already."""
+    if outcome is Outcome.RAN_SHORT and not isinstance(error, WaymarkError):
+        return out_of_memory("the file", "send it in smaller parts")
     if not isinstance(error, OSError) or error.errno not in (errno.EFBIG, errno.EMFILE):
         return None
     return ProcessStopped(

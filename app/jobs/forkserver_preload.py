@@ -1,11 +1,16 @@
-"""Imported first in the process that decoder processes are forks of: it ends with the server.
+"""Imported in the process that decoder processes are forks of: it ends with the server, and loads what they use.
 
 Python's forkserver notices the end of the server when it waits for requests, but not while it imports the decoders,
 which takes seconds.
+
+The decoders and their compiled kernels are loaded once, here, and the decoder processes share that memory until they
+write to it. A fork has only the thread that made it, so nothing here may start a second one (tests/jobs/test_pool.py).
+The supervisors ask for a forkserver by name, so that this holds on Python 3.11 to 3.13, whatever the default is there.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -25,5 +30,17 @@ def end_with_parent() -> None:
     signal.setitimer(signal.ITIMER_REAL, _CHECK_S, _CHECK_S)
 
 
+def load_decoders() -> None:
+    """Import the tasks, and run the plate decoder once; garbage collection in a fork then leaves all of it alone."""
+    gc.disable()  # it would free nothing and take a fifth of the time
+    from app.families.plate.frames import decode_plates
+    from app.jobs import tasks  # noqa: F401 - for the forks
+    from app.jobs.decoder_process import warm_process
+
+    gc.enable()
+    warm_process(decode_plates)
+
+
 if any("multiprocessing.forkserver" in argument for argument in sys.orig_argv):
     end_with_parent()
+    load_decoders()

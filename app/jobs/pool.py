@@ -1,7 +1,7 @@
 """Decoder processes: children with limits, each behind a thread and a pipe of its own, and outlived by the pool.
 
-Agencies share them: their tasks are taken in turn, and one agency holds at most half of the places while others
-want some.
+Agencies share them: the task of the agency that used least lately is taken next, one agency holds at most half of the
+places while others want some, and its jobs leave one process to others that were there in the last hour.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from app.jobs.supervisor import Pending, WorkerSupervisor
 from app.registry.tenancy import whose_rows
 from app.services.decoder_processes import Task
 from app.services.decodes.trace_task import CompileTracesTask
+from app.services.request_work import current_work
 
 ResultT = TypeVar("ResultT")
 
@@ -67,7 +68,7 @@ class DecodePool:
         self._max_pixels = max_pixels
         self._places = Places(max_waiting)
         self._lock = threading.Lock()
-        self._tasks: FairQueue[Pending[Any]] = FairQueue()
+        self._tasks: FairQueue[Pending[Any]] = FairQueue(jobs_at_once=max(workers - 1, 1))
         self._supervisors: list[WorkerSupervisor] = []
         self._closed = False
 
@@ -123,14 +124,17 @@ class DecodePool:
         agency_id = whose_rows()
         self._places.take(agency_id, wait_s)
         timeout_s = self._limits.trace_timeout_s if task.is_long else self._limits.timeout_s
-        pending: Pending[ResultT] = Pending(task.steps(), self._interrupt, timeout_s)
+        work = current_work()
+        pending: Pending[ResultT] = Pending(
+            task.steps(), self._interrupt, timeout_s, agency_id, is_job=work is not None and work.is_job
+        )
         pending.future.add_done_callback(lambda _future: self._places.give_back(agency_id))
         with self._lock:
             if self._closed:
                 pending.future.cancel()
                 raise Unavailable("the server is stopping", cure="try again in a few seconds")
             self._start_supervisors()
-            self._tasks.put(agency_id, pending)
+            self._tasks.put(agency_id, pending, is_job=pending.is_job)
         return pending
 
     def _interrupt(self, pending: Pending[Any]) -> None:

@@ -20,7 +20,7 @@ import structlog
 
 from app import tracing
 from app.errors import ProcessStopped, Unavailable
-from app.jobs.decoder_process import READY, READY_WITH_NETWORK, serve_tasks
+from app.jobs.decoder_process import READY, READY_WITH_NETWORK, Outcome, serve_tasks
 from app.jobs.fair_queue import FairQueue
 from app.jobs.frame_tasks import DecodePlates
 from app.jobs.process_limits import ProcessLimits, new_folder
@@ -34,8 +34,8 @@ _RETRY_S = 30.0
 _AGAIN_S = 0.2
 _LOG = structlog.get_logger(__name__)
 _PROCESSES = multiprocessing.get_context("forkserver")
-"""One process imports the decoders, and the decoder processes are its forks: each starts in a part of the time."""
-_PROCESSES.set_forkserver_preload(["app.jobs.forkserver_preload", "app.jobs.tasks"])
+"""One process loads the decoders, and the decoder processes are its forks: each starts in a part of the time."""
+_PROCESSES.set_forkserver_preload(["app.jobs.forkserver_preload"])
 
 
 class Pending(Generic[T]):
@@ -49,6 +49,9 @@ class Pending(Generic[T]):
         Stops the process that works on this, if one does.
     timeout_s : float
         Longest time in the process. [s]
+    agency_id : str
+    is_job : bool
+        Whether it is a part of a job, for which nobody waits in a request.
 
     Attributes
     ----------
@@ -56,8 +59,12 @@ class Pending(Generic[T]):
         Time in the process so far, which works on nothing else. [s]
     """
 
-    def __init__(self, steps: tuple[object, ...], interrupt: Callable[[Pending[Any]], None], timeout_s: float) -> None:
+    def __init__(
+        self, steps: tuple[object, ...], interrupt: Callable[[Pending[Any]], None], timeout_s: float,
+        agency_id: str = "", *, is_job: bool = False,
+    ) -> None:  # fmt: skip
         self.steps = steps
+        self.agency_id, self.is_job = agency_id, is_job
         self.future: Future[T] = Future()
         self.timeout_s = timeout_s
         self.stopped = False
@@ -156,40 +163,48 @@ class WorkerSupervisor(threading.Thread):
                 continue
             if pending is None:
                 break
-            if pending.future.set_running_or_notify_cancel():
+            answer: Any = None
+            error: BaseException | None = None
+            is_wanted = pending.future.set_running_or_notify_cancel()
+            if is_wanted:
                 try:
                     answer = self._run_in_process(pending)
-                except BaseException as error:  # noqa: BLE001 - raised again where the task is waited for
-                    pending.future.set_exception(error)
-                else:
-                    pending.future.set_result(answer)
+                except BaseException as raised:  # noqa: BLE001 - raised again where the task is waited for
+                    error = raised
+            self._tasks.done(pending.agency_id, pending.used_s, is_job=pending.is_job)
+            if is_wanted:
+                pending.future.set_result(answer) if error is None else pending.future.set_exception(error)
         self._drop()
 
     # --- one task ---------------------------------------------------------------------------------------------------
 
     def _run_in_process(self, pending: Pending[Any]) -> Any:
-        """Run a task; once more if the process dies, which need not be the task's fault: memory may have run short."""
+        """Run a task; once more in a new process if this one dies or runs short, which need not be the task's fault."""
+        failure: BaseException | None = None
         for _attempt in range(2):
             connection = self._connection if self._is_alive() else self._start()
             if connection is None:
                 raise Unavailable("no decoder process could be started", cure="try again in a few seconds")
             try:
-                succeeded, answer = self._exchange(connection, pending)
+                outcome, answer = self._exchange(connection, pending)
             except (EOFError, OSError):
                 self._drop()
                 if self._closing or pending.stopped:
                     raise _was_stopped() from None
                 continue
-            if succeeded:
+            if outcome is Outcome.DONE:
                 return answer
-            raise answer
-        raise ProcessStopped(
-            "the file stopped the decoder process, twice",
+            if outcome is Outcome.FAILED:
+                raise answer
+            self._drop()
+            failure = answer
+        raise failure or ProcessStopped(
+            "the work was interrupted: the decoder process ended before it was done with the file, twice",
             field="file",
-            cure="send the frame as the camera wrote it; if it is, report it as a defect",
+            cure="send it again; if that fails too, send it in smaller parts, and report it as a defect",
         )
 
-    def _exchange(self, connection: Connection, pending: Pending[Any]) -> tuple[bool, Any]:
+    def _exchange(self, connection: Connection, pending: Pending[Any]) -> tuple[Outcome, Any]:
         with self._lock:
             if self._closing or pending.stopped:
                 raise _was_stopped()
@@ -200,20 +215,20 @@ class WorkerSupervisor(threading.Thread):
                 argument = self._wait_for(step) if isinstance(step, Future) else step
                 connection.send((argument, number == len(pending.steps)))
             if connection.poll(pending.timeout_s):
-                succeeded, result, times_ns = connection.recv()
+                outcome, result, times_ns = connection.recv()
                 for (name, *between), step in zip(times_ns, pending.steps, strict=True):
                     tracing.record(name, pending.traceparent, tuple(between), task=type(step).__name__)
-                return succeeded, result
+                return outcome, result
         finally:
             pending.used_s += time.monotonic() - started_s
             with self._lock:
                 self._current = None
         self._drop()
         raise ProcessStopped(
-            "decoding took too long and was stopped",
+            "reading the file took too long and was stopped",
             field="file",
             limit=f"{pending.timeout_s:g} s a file",
-            cure="send the frame as the camera wrote it, or a shorter recording; if it is, report it as a defect",
+            cure="send it in smaller parts: a shorter recording, fewer rows; if it is short, report it as a defect",
         )
 
     def _wait_for(self, argument: Future[Any]) -> Any:

@@ -5,10 +5,11 @@ LAPACK is called directly: the checks of scipy.linalg cost more than matrices of
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 import scipy
+
+from app.compiled import ieee_kernel
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -77,7 +78,7 @@ def solve(cholesky: Floats, right: Floats) -> Floats:
     return np.asarray(solved)
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def inverse_band(cholesky: Floats) -> Floats:
     """The elements of inv(A) within the band of A, in the same form as its Cholesky factor, shape (band + 1, N).
 

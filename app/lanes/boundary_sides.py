@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 
+from app.compiled import ieee_kernel
 from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints
 
 _GRID_STEP_M = 0.2  # [m] between candidate offsets of the centre; source: by hand, sensitivity 1.00, 1.00
@@ -128,7 +128,7 @@ def _obvious_sides(left_m: Floats, named: Ints) -> SideAssignment | None:
     return SideAssignment(side, off, np.zeros(len(side), bool), width)
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _cheapest_course(cost: Floats, grid: Floats, opening: Floats, reach_m2: Floats) -> tuple[Ints, Ints]:
     """Cheapest course through the grid (Viterbi algorithm): indices of the offset and of the width at each marker.
 

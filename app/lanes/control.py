@@ -10,11 +10,11 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 import scipy
 
+from app.compiled import ieee_kernel
 from app.errors import InvalidParameter
 
 Floats = npt.NDArray[np.float64]
@@ -241,7 +241,7 @@ def plan_speed(
 # --- laws ---------------------------------------------------------------------------------------------------------
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def nearest_on_path(points, x, y, last):  # type: ignore[no-untyped-def]
     """Piece of a path that is nearest to a point, share along it, and left offset of the point.
 
@@ -274,7 +274,7 @@ def nearest_on_path(points, x, y, last):  # type: ignore[no-untyped-def]
     return piece, share, left
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def stanley_rad(points, headings, x, y, yaw, speed, gain, ahead, near, far):  # type: ignore[no-untyped-def]
     """Steering by equation 4, or with ``ahead`` > 0 by equation 5 of the CERPM paper.
 
@@ -312,7 +312,7 @@ def stanley_rad(points, headings, x, y, yaw, speed, gain, ahead, near, far):  # 
     return psi + math.atan(-gain * error / max(speed, _MIN_SPEED_M_S)), left, near, far
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def predict_pose(x, y, yaw, steer, speed, wheelbase, lag, pending, held, dt):  # type: ignore[no-untyped-def]
     """Pose and steering angle after all pending commands have reached the wheels.
 

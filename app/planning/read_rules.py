@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -13,6 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
+from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.tokens import (
     AliasToken,
@@ -23,10 +23,12 @@ from ruamel.yaml.tokens import (
     FlowMappingStartToken,
     FlowSequenceEndToken,
     FlowSequenceStartToken,
+    TagToken,
     Token,
 )
 
-from app.errors import InvalidParameter, UnreadableUpload, naming
+from app.errors import InvalidParameter, MalformedRequest, UnreadableUpload, naming
+from app.formats.json_text import check_values, parse_json
 from app.markers.magnet_design import TagDesign
 from app.markers.plate import PlateGeometry
 from app.planning.magnet_checks import vehicle_clearances
@@ -37,11 +39,19 @@ from app.radio.settings import RadioSettings
 MAX_RULES_BYTES = 200_000
 """Longest document. [bytes] Source: chosen by hand, a hundred times the examples."""
 _MAX_DEPTH = 20  # levels of a document; source: by hand, rules have four
+_MAX_TOKENS = 10_000  # of YAML: source: by hand, 30 times the examples, half a CPU second
 _OPENING = (BlockMappingStartToken, BlockSequenceStartToken, FlowMappingStartToken, FlowSequenceStartToken)
 _CLOSING = (BlockEndToken, FlowMappingEndToken, FlowSequenceEndToken)
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _LONG_LIST = 12  # names that an error lists; source: chosen by hand
 _MAX_FAULTS = 100  # that are listed; source: chosen by hand, more than a person mends at once
+
+
+class _DatesAsTexts(SafeConstructor):
+    """Leaves dates to the rules that have them, as in JSON."""
+
+
+_DatesAsTexts.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
 
 
 @cache
@@ -98,48 +108,49 @@ def _parse(data: bytes) -> object:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise _unreadable(f"the rules are not UTF-8: byte {error.start}", "save them as UTF-8") from error
-    return _parse_json(text) if text.lstrip()[:1] == "{" and '"' in text else _parse_yaml(text)
-
-
-def _parse_json(text: str) -> object:
     try:
-        return json.loads(text, object_pairs_hook=_without_duplicates)
-    except json.JSONDecodeError as error:
-        place = f"line {error.lineno}, column {error.colno}"
-        raise _unreadable(f"the rules are not JSON: {error.msg} at {place}", "correct them there") from error
-    except RecursionError as error:
-        raise _unreadable("the rules are nested too deeply", "see docs/plans for examples") from error
-
-
-def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in found:
-            raise _unreadable(f"the key {key[:60]!r} stands twice in one object", "keep one of the two")
-        found[key] = value
-    return found
+        if text.lstrip()[:1] == "{" and '"' in text:
+            return parse_json(text.encode(), "rules")
+        document = _parse_yaml(text)
+        check_values(document, "rules")
+    except MalformedRequest as error:
+        field, at_value, rest = (error.field or "rules").partition("rules.")
+        kind = InvalidParameter if at_value else UnreadableUpload
+        raise kind(
+            f"the rules cannot be read: {error.message}",
+            field=rest or field,
+            limit=error.limit,
+            cure="correct them there",
+        ) from error
+    return document
 
 
 def _parse_yaml(text: str) -> object:
     try:
         _check_tokens(YAML(typ="safe", pure=True).scan(text))
-        return YAML(typ="safe", pure=True).load(text)
+        reader = YAML(typ="safe", pure=True)
+        reader.Constructor = _DatesAsTexts
+        return reader.load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark is not None else ""
         problem = str(error.problem or error.context or "it cannot be parsed").split("\n")[0][:200]
         raise _unreadable(f"the rules are not YAML 1.2: {problem}{place}", "correct them there") from error
-    except (YAMLError, ValueError, RecursionError) as error:
-        reason = str(error).split("\n")[0][:200] or "nested too deeply"
+    except (YAMLError, ValueError, TypeError, ArithmeticError, RecursionError) as error:
+        reason = str(error).split("\n")[0][:200] or "nested too deeply"  # a list as a key is a TypeError
         raise _unreadable(f"the rules are not YAML 1.2: {reason}", "see docs/plans for examples") from error
 
 
 def _check_tokens(tokens: Iterable[Token]) -> None:
-    """Refuse aliases and deep nesting at the first such token: ruamel.yaml takes minutes for deep ones."""
+    """Refuse aliases, tags, deep nesting and long documents at the first such token, before values are read."""
     depth = 0
-    for token in tokens:
+    for number, token in enumerate(tokens):
+        if number == _MAX_TOKENS:
+            raise _unreadable(f"the rules have more than {_MAX_TOKENS} tokens", "leave out what is not needed")
         if isinstance(token, AliasToken):
             raise _unreadable("the rules have an alias (*name)", "write the values out")
+        if isinstance(token, TagToken):
+            raise _unreadable("the rules have a tag (!name)", "write the values without tags")
         depth += isinstance(token, _OPENING) - isinstance(token, _CLOSING)
         if depth > _MAX_DEPTH:
             place = f"line {token.start_mark.line + 1}, column {token.start_mark.column + 1}"

@@ -131,7 +131,10 @@ class CerpmRules(_Part):
     max_path_error_m: float | None = Field(default=0.05, ge=0.005, le=1.0)
     preview_m: float | None = Field(default=None, ge=1.0, le=2000.0)
     collisions_max: float = Field(default=0.1, ge=0.0, le=1.0)
-    region: Region = Region.US915
+    region: Region | None = Field(
+        default=None,
+        description="Whose rules the radio is checked by. Without, US915; the check names the law of the place.",
+    )
     spreading_factor: int | None = Field(default=None, ge=7, le=12, description="Without, recommended settings.")
     bandwidth_hz: Literal[125_000, 250_000, 500_000] = 500_000
     interval_s: float | None = Field(default=None, ge=0.05, le=3600.0, description="Without, recommended settings.")

@@ -29,6 +29,42 @@ _ERP_DB = 2.15  # [dB] of a dipole over an isotropic antenna; source: ERP and EI
 _20_DB_BANDWIDTH = 1.1  # LoRa's 20 dB bandwidth over its nominal one; source: by hand, no measurement kept
 
 
+LAWS = {
+    Region.US915: "47 CFR 15.247 (United States)",
+    Region.EU868: "ERC/REC 70-03 annex 1 as countries of the CEPT have adopted it",
+}
+"""What settings of a region are checked against."""
+_AREAS: dict[Region, tuple[tuple[float, float, float, float], ...]] = {
+    Region.US915: (
+        (-124.5, 33.0, -122.7, 48.0), (-122.7, 33.0, -95.5, 48.8), (-104.0, 30.0, -93.9, 33.0),
+        (-95.5, 28.5, -83.4, 45.7), (-83.4, 24.4, -79.9, 31.0), (-83.4, 31.0, -75.0, 41.4), (-75.0, 38.0, -69.0, 44.7),
+        (-168.0, 54.0, -141.2, 71.5), (-160.5, 18.8, -154.7, 22.4),
+    ),
+    Region.EU868: (
+        (-9.6, 37.5, 3.4, 44.0), (-11.0, 43.0, 19.0, 54.2), (6.5, 37.6, 19.0, 43.0), (-9.0, 54.2, 19.0, 71.5),
+        (19.0, 66.0, 28.0, 71.5), (21.0, 60.0, 27.0, 66.0), (23.2, 58.0, 26.8, 59.7), (21.5, 55.5, 26.0, 57.8),
+        (19.0, 43.5, 23.0, 54.2), (22.4, 38.0, 28.5, 47.5), (19.2, 36.5, 22.4, 41.7),
+    ),
+}  # fmt: skip
+"""Boxes west, south, east, north in which no other law applies on land. [deg] Source: by hand, from maps: the United
+States without a strip along Canada and Mexico, and members of the CEPT without strips along Belarus, Kosovo, Moldova,
+Morocco, Russia, Tunisia and Ukraine."""
+
+
+def region_at(lon_deg: float, lat_deg: float) -> Region | None:
+    """The region whose rules apply at a place; None near borders, and where the table has no country.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg : float
+        [deg]
+    """
+    for region, boxes in _AREAS.items():
+        if any(west <= lon_deg <= east and south <= lat_deg <= north for west, south, east, north in boxes):
+            return region
+    return None
+
+
 @dataclass(frozen=True, slots=True)
 class SubBand:
     """A part of the European band with its limits: [Hz], share of an hour, [dBm], [dBm in any 100 kHz]."""

@@ -21,6 +21,7 @@ class AgencyRow(NamedTuple):
 
     id: str
     name: str
+    created_at: datetime
 
 
 class KeyRow(NamedTuple):
@@ -40,6 +41,9 @@ class KeyRow(NamedTuple):
 
 OPERATOR = Author("the server's operator")
 """Who makes keys from the command line and at the first start."""
+OPERATORS = "(operators)"
+"""Name of the row of `agencies` to which the keys of operators belong, with their audit log. It is no agency: it has no
+markers, and no other key or token speaks for it."""
 KEYS = Resource("key", KeyRow, api_keys, cure="GET /v1/keys lists yours")
 _KEY = select_rows(KeyRow, api_keys).where(
     api_keys.c.sha256 == sa.bindparam("sha256")
@@ -61,7 +65,14 @@ def key_sha256(key: str) -> str:
 
 def find_agency(connection: sa.Connection, name: str) -> str | None:
     """Id of the agency with a name."""
-    return connection.execute(sa.select(agencies.c.id).where(agencies.c.name == name)).scalar_one_or_none()
+    query = sa.select(agencies.c.id).where(agencies.c.name == name, agencies.c.name != OPERATORS)
+    return connection.execute(query).scalar_one_or_none()
+
+
+def ensure_operators(connection: sa.Connection, now: datetime) -> str:
+    """Id of what the keys of operators belong to; created by the first of them."""
+    query = sa.select(agencies.c.id).where(agencies.c.name == OPERATORS)
+    return connection.execute(query).scalar_one_or_none() or add_agency(connection, OPERATORS, now)
 
 
 def get_agency_name(connection: sa.Connection, agency_id: str) -> str:
@@ -71,12 +82,21 @@ def get_agency_name(connection: sa.Connection, agency_id: str) -> str:
 
 def find_first_agency(connection: sa.Connection) -> str | None:
     """Id of the oldest agency."""
-    return connection.execute(sa.select(agencies.c.id).order_by(agencies.c.id).limit(1)).scalar_one_or_none()
+    query = sa.select(agencies.c.id).where(agencies.c.name != OPERATORS).order_by(agencies.c.id).limit(1)
+    return connection.execute(query).scalar_one_or_none()
 
 
 def list_agencies(connection: sa.Connection) -> list[AgencyRow]:
-    """All agencies, by name."""
+    """All that have an audit log, by name: agencies, and the operators."""
     return fetch_all(connection, select_rows(AgencyRow, agencies).order_by(agencies.c.name), AgencyRow)
+
+
+def page_agencies(connection: sa.Connection, *, after: str | None, limit: int) -> list[AgencyRow]:
+    """Agencies in the order in which they were created, from the one after an id."""
+    query = select_rows(AgencyRow, agencies).where(agencies.c.name != OPERATORS)
+    if after is not None:
+        query = query.where(agencies.c.id > after)
+    return fetch_all(connection, query.order_by(agencies.c.id).limit(limit), AgencyRow)
 
 
 def add_agency(connection: sa.Connection, name: str, now: datetime) -> str:

@@ -15,7 +15,7 @@ from app.registry.columns import Columns, json_objects
 from app.registry.feature_text import feature_texts
 from app.registry.marker_rows import MARKERS, CodeRow, MarkerRow
 from app.registry.markers import MarkerFilter, conditions_of
-from app.registry.rows import fetch_all, row_maker, select_rows
+from app.registry.rows import fetch_all, select_rows
 from app.registry.spatial import Box, box_around, within_box
 from app.registry.tables import marker_versions, markers
 from app.registry.tenancy import seeing_every_agency
@@ -125,9 +125,13 @@ def list_records(
     return [dict(zip(fields, row, strict=True)) for row in rows]
 
 
-def count_records(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> int:
+def count_records(
+    connection: sa.Connection, agency_id: str, filtered: MarkerFilter, *, with_retired: bool = True
+) -> int:
     """Number of the agency's markers that a filter leaves."""
     query = sa.select(sa.func.count()).select_from(markers)
+    if not with_retired:
+        query = query.where(markers.c.status != "retired")
     return int(connection.execute(query.where(markers.c.agency_id == agency_id, *conditions_of(filtered))).scalar_one())
 
 
@@ -138,14 +142,17 @@ def have_ellipsoidal_heights(connection: sa.Connection, agency_id: str, filtered
     return connection.execute(query.limit(1)).first() is None
 
 
-_SNAPSHOT = (
+SNAPSHOT_COLUMNS = (
     "id", "family", "status", "scheme", "digits", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm", "lon_deg",
     "lat_deg", "height_m", "vertical_datum", "heading_deg", "horizontal_rmse_m", "vertical_rmse_m", "heading_rmse_deg",
     "localization_grade", "transform_accuracy_m", "transform_note", "epoch",
 )  # fmt: skip
 
 
-def list_for_snapshot(
+_BLOCK = 5_000
+
+
+def read_for_snapshot(
     connection: sa.Connection,
     agency_id: str,
     family: str,
@@ -153,23 +160,28 @@ def list_for_snapshot(
     *,
     columns: Sequence[sa.ColumnElement[Any]] = (),
     with_retired: bool = False,
-    limit: int,
-) -> list[MarkerRow]:
-    """The agency's markers of a family in a box with what vehicles need of them; None in the columns they do not need.
+) -> Iterator[dict[str, tuple[Any, ...]]]:
+    """The agency's markers of a family in a box with what vehicles need of them, some at a time, by columns.
 
-    With further columns their `spec` has these alone, by their labels.
+    The columns are `spec`, or in its place further `columns` by their labels.
     """
-    wanted = _SNAPSHOT if columns else (*_SNAPSHOT, "spec")
-    shared = (markers.c[name] if name in wanted else sa.null() for name in MarkerRow._fields)
-    query = sa.select(*shared, *columns).where(
-        markers.c.agency_id == agency_id,
-        markers.c.family == family,
-        within_box(box),
-    )
-    if not with_retired:
-        query = query.where(markers.c.status != "retired")
-    make, count, labels = row_maker(MarkerRow), len(MarkerRow._fields), [column.name for column in columns]
-    found = connection.execute(query.limit(limit))
-    if not columns:
-        return list(map(make, found))
-    return [make(row[:count])._replace(spec=dict(zip(labels, row[count:], strict=True))) for row in found]
+    further = columns or (markers.c.spec,)
+    names = (*SNAPSHOT_COLUMNS, *(column.name for column in further))
+    query = sa.select(*(markers.c[name] for name in SNAPSHOT_COLUMNS), *further)
+    query = query.where(*_in_snapshot(agency_id, family, box, with_retired))
+    found = connection.execute(query, execution_options={"stream_results": True})
+    for rows in found.partitions(_BLOCK):
+        yield dict(zip(names, zip(*rows, strict=True), strict=True))
+
+
+def count_for_snapshot(
+    connection: sa.Connection, agency_id: str, family: str, box: Box, *, with_retired: bool, limit: int
+) -> int:
+    """How many `read_for_snapshot` returns; no more than `limit` are counted."""
+    query = sa.select(markers.c.row).where(*_in_snapshot(agency_id, family, box, with_retired)).limit(limit)
+    return int(connection.execute(sa.select(sa.func.count()).select_from(query.subquery())).scalar_one())
+
+
+def _in_snapshot(agency_id: str, family: str, box: Box, with_retired: bool) -> list[sa.ColumnElement[bool]]:
+    conditions = [markers.c.agency_id == agency_id, markers.c.family == family, within_box(box)]
+    return conditions if with_retired else [*conditions, markers.c.status != "retired"]

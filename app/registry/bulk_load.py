@@ -15,7 +15,6 @@ from itertools import chain
 from typing import Any
 
 import orjson
-import psycopg
 import sqlalchemy as sa
 
 from app.registry.columns import Columns, JsonTexts
@@ -205,6 +204,8 @@ def _postpone_postgresql(connection: sa.Connection, table: sa.Table) -> list[Cal
 
 
 def _copy(connection: sa.Connection, table: sa.Table, columns: Columns) -> None:
+    import psycopg  # here: a server on SQLite loads none of it
+
     driver = connection.connection.driver_connection
     assert driver is not None
     names = (*columns.own, *columns.same)

@@ -11,7 +11,7 @@ ID = sa.String(36)
 VERSION_KINDS = ("as-planned", "as-built", "resurvey", "correction", "change")
 JOB_STATES = ("queued", "running", "done", "failed", "cancelled")
 PLAN_STATUSES = ("draft", "checked", "proved", "approved", "committed", "built", "surveyed")
-SCOPES = ("admin", "planner", "surveyor", "viewer", "vehicle")
+SCOPES = ("admin", "planner", "surveyor", "viewer", "vehicle", "operator")
 
 
 class UtcTime(sa.TypeDecorator[datetime]):

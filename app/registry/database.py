@@ -6,21 +6,21 @@ query stays true until it is committed: SQLite's BEGIN IMMEDIATE, PostgreSQL's a
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
+import shutil
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
 
-from app.errors import Unavailable
+from app import shipped_folder
+from app.errors import InvalidParameter, Unavailable
 from app.registry.engines import (
     BUSY_TIMEOUT_S,
     LONG,
@@ -32,11 +32,19 @@ from app.registry.engines import (
     postgres_engine,
     sqlite_asking_engine,
     sqlite_engine,
+    stoppable,
 )
 from app.registry.tenancy import SETTING, across_agencies, set_whose, whose_rows
 
+if TYPE_CHECKING:
+    from alembic.config import Config
+
 Answer = TypeVar("Answer")
-MIGRATIONS = Path(__file__).resolve().parents[2] / "migrations"
+_NEW_BYTES = 8 * 2**20
+"""Room for a new database: 2.5 MB and its log while the schema is made. [byte]"""
+_RESERVE_BYTES = 2**20
+"""Room that is kept in a file, and given up when the disk is full: for the files that SQLite needs to read. [byte]"""
+MIGRATIONS = shipped_folder("migrations")
 
 
 class Database:
@@ -83,6 +91,7 @@ class Database:
         self.writes = 0
         self.waiting_writers = 0
         self._lock_fd: int | None = None
+        self._file: tuple[int, int] | None = None  # device and inode when it was first seen
 
     @property
     def name(self) -> str:
@@ -95,13 +104,63 @@ class Database:
         Raises
         ------
         Unavailable
-            Another process owns the file; the server cannot be reached or has no PostGIS.
+            Another process owns the file; the server cannot be reached or has no PostGIS; the disk has no room for a
+            new database, or for the files that SQLite needs to read one.
         """
         if self.path is None:
             self._see_the_server()
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock_fd = _lock_file(self.path.with_name(self.path.name + ".lock"), self.path)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._lock_fd = _lock_file(self.path.with_name(self.path.name + ".lock"), self.path)
+        except OSError as error:
+            if error.errno != errno.EROFS or not self.path.exists():
+                raise
+            self._read_only()
+            return
+        try:
+            self._check_room(self.path)
+        except BaseException:
+            self.close()
+            raise
+
+    def _read_only(self) -> None:
+        """Read a file on a disk that is mounted read-only: SQLite needs no file beside it then."""
+        assert self.path is not None
+        log = self.path.with_name(self.path.name + "-wal")
+        if log.exists() and log.stat().st_size:
+            raise Unavailable(
+                f"{self.path} is on a read-only disk, and its last changes are still in {log.name}",
+                field="data_dir",
+                cure="mount the disk for writing once, so that they are moved into the file",
+            )
+        query = {"mode": "ro", "immutable": "1", "uri": "true"}
+        url = self.url.set(database=f"file:{self.path.resolve()}", query=query)
+        self.engine, self._asking = sqlite_engine(url), sqlite_asking_engine(url)
+
+    def _check_room(self, path: Path) -> None:
+        """Make sure that SQLite can open the file, with the reserve where the disk is full, and keep a reserve if not.
+
+        Even for reading, SQLite needs a file of 32 kB beside the database, which the last process deleted.
+        """
+        reserve = path.with_name(path.name + ".reserve")
+        free = shutil.disk_usage(path.parent).free
+        if free < _NEW_BYTES and not (path.exists() and path.stat().st_size):
+            raise _no_room(path.parent)
+        if free >= _NEW_BYTES and not reserve.exists():
+            with suppress(OSError):  # a quota may be smaller than what is free
+                reserve.write_bytes(bytes(_RESERVE_BYTES))
+        if not path.exists():  # reading would make an empty one
+            return
+        try:
+            with self.read() as connection:
+                connection.exec_driver_sql("SELECT count(*) FROM sqlite_master")
+        except Unavailable as error:
+            if not reserve.exists():
+                raise _no_room(path.parent) if free < _NEW_BYTES else error from error
+            reserve.unlink()
+            self.disconnect()
+            self._check_room(path)
 
     def pools(self) -> Iterator[tuple[str, sa.QueuePool]]:
         """The pools of connections, by what they are for."""
@@ -133,7 +192,9 @@ class Database:
             Single statements may take as long as they take: verifying a log.
         """
         with busy_is_unavailable(), self.engine.connect() as connection:
-            yield connection.execution_options(**isolation(self.url, write=False), **{LONG: long})
+            connection = connection.execution_options(**isolation(self.url, write=False), **{LONG: long})
+            with stoppable(connection):
+                yield connection
 
     def ask(self, question: Callable[[sa.Connection], Answer]) -> Answer:
         """The result of a single reading statement; `read` is for more than one.
@@ -156,7 +217,8 @@ class Database:
             if self.path is None and connection.info.get(SETTING) != (whose := whose_rows()):
                 set_whose(connection, whose, local=False)  # of the session: each statement is its own transaction
                 connection.info[SETTING] = whose
-            return question(connection)
+            with stoppable(connection):
+                return question(connection)
 
     @contextmanager
     def write(self, *, long: bool = False) -> Iterator[sa.Connection]:
@@ -199,21 +261,38 @@ class Database:
                 yield connection
 
     def migrate(self, revision: str = "head") -> None:
-        """Bring the schema to a revision, up or down, in one transaction."""
+        """Bring the schema to a revision, up or down, in one transaction; nothing is written if it is there already.
+
+        Raises
+        ------
+        InvalidParameter
+            There is no such revision.
+        """
+        target = head_revision() if revision == "head" else revision
+        if target not in ("base", *_revisions()):
+            raise InvalidParameter(
+                f"there is no revision {revision[:40]!r} of the schema",
+                field="revision",
+                limit="head, base, or a file's revision in migrations/versions",
+                cure="run waymark migrate without a revision for the newest schema",
+            )
+        if self.current_revision() == target:
+            return  # without Alembic: loading it takes longer than most parts of a start
         with across_agencies(), self.write(long=True) as connection:
+            from alembic import command
+
             config = alembic_config()
             config.attributes["connection"] = connection
-            now = MigrationContext.configure(connection).get_current_revision()
-            target = ScriptDirectory.from_config(config).get_revision(revision) if revision != "base" else None
-            if now is not None and (target is None or target.revision < now):
-                command.downgrade(config, revision)
+            now = stored_revision(connection)
+            if now is not None and (target == "base" or target < now):
+                command.downgrade(config, target)
             else:
-                command.upgrade(config, revision)
+                command.upgrade(config, target)
 
     def current_revision(self) -> str | None:
         """The revision of the schema; None if there is none."""
         with self.read() as connection:
-            return MigrationContext.configure(connection).get_current_revision()
+            return stored_revision(connection)
 
     def count_other_clients(self) -> int:
         """Connections of other Waymark processes to a PostgreSQL database; an open SQLite file is ours alone."""
@@ -231,12 +310,29 @@ class Database:
             )
 
     def is_ready(self) -> bool:
-        """Whether the schema is current and a write transaction can start."""
+        """Whether requests can be answered."""
+        return self.find_fault() is None
+
+    def find_fault(self) -> str | None:
+        """Why requests cannot be answered: the file is gone, the schema is not the current one, or the database does
+        not answer or takes no changes. None if they can."""
+        if self.path is not None:
+            try:
+                found = self.path.stat()
+            except OSError as error:
+                return f"{self.path}: {error.strerror}"
+            self._file = self._file or (found.st_dev, found.st_ino)
+            if self._file != (found.st_dev, found.st_ino):
+                return f"{self.path} is not the file that was opened"
+        standby = "0" if self.path is not None else "pg_is_in_recovery()"
+        question = f"SELECT version_num, {standby} FROM alembic_version"
         try:
-            with self.write() as connection:
-                return MigrationContext.configure(connection).get_current_revision() == head_revision()
-        except (Unavailable, sa.exc.SQLAlchemyError):
-            return False
+            row = self.ask(lambda connection: connection.exec_driver_sql(question).first())
+        except (Unavailable, sa.exc.SQLAlchemyError) as error:
+            return str(getattr(error, "orig", error))
+        if row is None or row[0] != head_revision():
+            return f"the schema has the revision {row and row[0]}, not {head_revision()}"
+        return "the database is a standby and takes no changes" if row[1] else None
 
     def list_warnings(self) -> list[str]:
         """Warnings for the operator of a PostgreSQL server: row level security does not apply, or searches are slow."""
@@ -279,19 +375,44 @@ class Database:
 
 def alembic_config() -> Config:
     """Alembic's configuration, without a file."""
+    from alembic.config import Config
+
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
     return config
 
 
-def head_revision() -> str | None:
+def stored_revision(connection: sa.Connection) -> str | None:
+    """The revision of a database's schema; None if there is none."""
+    if not sa.inspect(connection).has_table("alembic_version"):
+        return None
+    revision: str | None = connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalar()
+    return revision
+
+
+@cache
+def _revisions() -> tuple[str, ...]:
+    """The revisions of the migrations, the newest last: the numbers with which the names of their files begin."""
+    return tuple(sorted(path.name.partition("_")[0] for path in (MIGRATIONS / "versions").glob("[0-9]*_*.py")))
+
+
+def head_revision() -> str:
     """The newest revision of the migrations."""
-    return ScriptDirectory.from_config(alembic_config()).get_current_head()
+    return _revisions()[-1]
 
 
 def is_known_revision(revision: str) -> bool:
     """Whether the migrations of this version have a revision."""
-    return any(script.revision == revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions())
+    return revision in _revisions()
+
+
+def _no_room(folder: Path) -> Unavailable:
+    return Unavailable(
+        f"the disk of {folder} is full",
+        field="data_dir",
+        limit=f"{_NEW_BYTES // 2**20} MiB for a new database, 1 MiB to open one",
+        cure="make room on this disk (df -h shows it), or set WAYMARK_DATA_DIR to another folder",
+    )
 
 
 def _lock_file(lock: Path, database: Path) -> int:
@@ -308,5 +429,6 @@ def _lock_file(lock: Path, database: Path) -> int:
             cure="stop the other process, or set WAYMARK_DATA_DIR to another folder",
         ) from error
     os.ftruncate(descriptor, 0)
-    os.write(descriptor, f"{os.getpid()}\n".encode())
+    with suppress(OSError):  # the number is for people; on a full disk the lock holds without it
+        os.write(descriptor, f"{os.getpid()}\n".encode())
     return descriptor

@@ -11,17 +11,18 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
-import psycopg
 import sqlalchemy as sa
-from alembic.runtime.migration import MigrationContext
 
 from app.errors import Unavailable
-from app.registry.database import Database
+from app.registry.database import Database, stored_revision
 from app.registry.engines import BUSY_TIMEOUT_S
 from app.registry.spatial import register_functions
+
+if TYPE_CHECKING:
+    import psycopg
 
 _CHUNK_BYTES = 1024**2
 _REVISIONS = "alembic_version"
@@ -210,6 +211,8 @@ def _write_plain_text(connection: sa.Connection) -> None:
 
 @contextmanager
 def _cursor(connection: sa.Connection) -> Iterator[psycopg.Cursor[tuple[object, ...]]]:
+    import psycopg  # here: a server on SQLite loads none of it
+
     driver = connection.connection.driver_connection
     assert isinstance(driver, psycopg.Connection)
     try:
@@ -245,7 +248,7 @@ def _heads(connection: sa.Connection, tables: list[TableDump]) -> dict[str, str]
 
 
 def _revision(connection: sa.Connection) -> str:
-    revision = MigrationContext.configure(connection).get_current_revision()
+    revision = stored_revision(connection)
     if revision is None:
         raise Unavailable("the database has no schema yet", cure="start the server once, or run waymark migrate")
     return revision

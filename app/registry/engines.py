@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+import sys
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import orjson
-import psycopg
 import sqlalchemy as sa
 from sqlalchemy import event
 
-from app.errors import CommitUnknown, StorageFull, Unavailable
+from app.errors import ClientLeft, CommitUnknown, StorageFull, Unavailable
 from app.registry.spatial import register_functions
 from app.registry.tenancy import set_whose, whose_rows
 
@@ -41,8 +43,90 @@ _SQLITE_TEMPORARY = {
     sqlite3.SQLITE_CANTOPEN: _DISK_FAILED,
 }
 """Result codes that say nothing about the request. Source: https://www.sqlite.org/rescode.html"""
-_OPERATIONAL = (sa.exc.OperationalError, sqlite3.OperationalError, psycopg.OperationalError)
-"""As SQLAlchemy raises them, and as the drivers do where they are used without it."""
+
+
+def _operational() -> tuple[type[Exception], ...]:
+    """Failures of the database, as SQLAlchemy raises them and as the drivers do where they are used without it."""
+    own: tuple[type[Exception], ...] = (sa.exc.OperationalError, sqlite3.OperationalError)
+    psycopg = _loaded_psycopg()
+    return own if psycopg is None else (*own, psycopg.OperationalError)
+
+
+def _loaded_psycopg() -> Any:
+    """The driver of PostgreSQL if the process has loaded it: a server on SQLite does not."""
+    return sys.modules.get("psycopg")
+
+
+class Stops:
+    """How to stop what runs for a request, once its client has left. Safe for threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._stops: list[Callable[[], object]] = []
+        self.stopped = False
+
+    def check(self) -> None:
+        """Stop here if the client has left.
+
+        Raises
+        ------
+        ClientLeft
+        """
+        if self.stopped:
+            raise ClientLeft
+
+    @contextmanager
+    def calling(self, stop: Callable[[], object]) -> Iterator[None]:
+        """`stop` is called when the client leaves while the block runs, from another thread, perhaps repeatedly.
+
+        Raises
+        ------
+        ClientLeft
+            It has left already.
+        """
+        with self._lock:
+            self.check()
+            self._stops.append(stop)
+        try:
+            yield
+        finally:
+            with self._lock:  # after it `stop` is not called any more
+                self._stops.remove(stop)
+
+    def stop(self) -> None:
+        """Stop everything. To be called again until the request has ended: a statement may be about to start."""
+        with self._lock:
+            self.stopped = True
+            for stop in self._stops:
+                stop()
+
+
+STOPS: ContextVar[Stops | None] = ContextVar("waymark_stops", default=None)
+"""Of the request for which this thread works; None in jobs and on the command line."""
+
+
+@contextmanager
+def stoppable(connection: sa.Connection) -> Iterator[None]:
+    """Statements on a connection that only reads end with `Unavailable` when the client of the request leaves."""
+    stops, driver = STOPS.get(), connection.connection.driver_connection
+    if stops is None or driver is None:
+        yield
+        return
+    is_sqlite = isinstance(driver, sqlite3.Connection)
+    try:
+        with stops.calling(driver.interrupt if is_sqlite else driver.cancel):
+            yield
+    finally:
+        if stops.stopped and not is_sqlite:
+            connection.invalidate()  # PostgreSQL may cancel what the next request would ask on it
+
+
+def _check_before_statements(engine: sa.Engine) -> None:
+    @event.listens_for(engine, "before_cursor_execute")
+    def check(connection: sa.Connection, *_statement: object) -> None:
+        stops = STOPS.get()
+        if stops is not None and not connection.get_execution_options().get(WRITE, False):
+            stops.check()
 
 
 class _ClosingPool(sa.QueuePool):
@@ -102,15 +186,8 @@ def _sqlite_engine(url: sa.URL, *pragmas: str, **options: Any) -> sa.Engine:
         for pragma in pragmas:
             connection.execute(f"PRAGMA {pragma}")
 
+    _check_before_statements(engine)
     return engine
-
-
-class _BinaryCursor(psycopg.Cursor[Any]):
-    """A cursor that returns numbers and times in binary, not as text."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.format = psycopg.pq.Format.BINARY
 
 
 def postgres_asking_engine(url: sa.URL) -> sa.Engine:
@@ -118,10 +195,19 @@ def postgres_asking_engine(url: sa.URL) -> sa.Engine:
 
     A statement sees one snapshot by itself. Before it a ping, a BEGIN and after it a ROLLBACK cost more than it does.
     """
+    import psycopg  # here: a server on SQLite loads none of it
+
+    class BinaryCursor(psycopg.Cursor[Any]):
+        """A cursor that returns numbers and times in binary, not as text."""
+
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            self.format = psycopg.pq.Format.BINARY
+
     options = _connect_args(url)
-    options["cursor_factory"] = _BinaryCursor
+    options["cursor_factory"] = BinaryCursor
     options["options"] += " -c default_transaction_read_only=on"
-    return sa.create_engine(
+    engine = sa.create_engine(
         url,
         connect_args=options,
         isolation_level="AUTOCOMMIT",
@@ -132,6 +218,8 @@ def postgres_asking_engine(url: sa.URL) -> sa.Engine:
         pool_timeout=BUSY_TIMEOUT_S,
         pool_reset_on_return=None,
     )
+    _check_before_statements(engine)
+    return engine
 
 
 def _connect_args(url: sa.URL) -> dict[str, Any]:
@@ -168,6 +256,7 @@ def postgres_engine(url: sa.URL) -> sa.Engine:
             connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_ONE_WRITER})")
         set_whose(connection, whose_rows())
 
+    _check_before_statements(engine)
     return engine
 
 
@@ -187,7 +276,7 @@ def busy_is_unavailable() -> Iterator[None]:
         yield
     except sa.exc.TimeoutError as error:
         raise Unavailable("every database connection is in use", cure="try again in a few seconds") from error
-    except _OPERATIONAL as error:
+    except _operational() as error:
         failure = _temporary(error)
         if failure is None:
             raise
@@ -199,7 +288,7 @@ def cut_commit_is_unknown() -> Iterator[None]:
     """Raise a failure in the middle of a commit as `CommitUnknown`: it may be durable although nothing confirmed it."""
     try:
         yield
-    except _OPERATIONAL as error:
+    except _operational() as error:
         if isinstance(_temporary(error), StorageFull):
             raise  # the end of the transaction was not written
         raise CommitUnknown(
@@ -216,12 +305,18 @@ def _temporary(error: Exception) -> Unavailable | None:
         code = cause.sqlite_errorcode & 0xFF  # without what the extended code adds
         if code == sqlite3.SQLITE_FULL:
             return StorageFull("the database")
+        if code == sqlite3.SQLITE_INTERRUPT:
+            return ClientLeft()
+        if code == sqlite3.SQLITE_READONLY:
+            return Unavailable("the database is on a read-only disk", cure="try again when the operator has changed it")
         if code not in _SQLITE_TEMPORARY:
             return None
         message = _SQLITE_TEMPORARY[code]
-    elif isinstance(cause, psycopg.Error):
+    elif (psycopg := _loaded_psycopg()) is not None and isinstance(cause, psycopg.Error):
         if cause.sqlstate == "53100":
             return StorageFull("the database")
+        if cause.sqlstate == "57014" and (stops := STOPS.get()) is not None and stops.stopped:
+            return ClientLeft()
         if cause.sqlstate == "57014":
             message = f"the database needed more than {STATEMENT_TIMEOUT_S:.0f} s for one statement"
         elif cause.sqlstate in ("55P03", "40001", "40P01"):

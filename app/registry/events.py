@@ -13,6 +13,7 @@ import sqlalchemy as sa
 
 from app.registry.health_tables import events
 from app.registry.rows import fetch_all, select_rows
+from app.registry.tables import jobs
 
 _E = events.c
 
@@ -66,13 +67,27 @@ def list_events(
     *,
     after: int = 0,
     job_kinds: Sequence[str] | None = None,
+    holder_id: str | None = None,
     limit: int = 100,
 ) -> list[EventRow]:
-    """Events after one, oldest first; where kinds of jobs are named, those of no other jobs."""
+    """Events after one, oldest first.
+
+    Parameters
+    ----------
+    job_kinds : sequence of str, optional
+        Of the events of jobs, those of these kinds only.
+    holder_id : str, optional
+        Events of jobs that this holder asked for, and no others.
+    """
     query = select_rows(EventRow, events).where(_E.agency_id == agency_id, _E.id > after)
     if job_kinds is not None:
         job_kind = _E.detail["job_kind"].as_string()
         query = query.where(sa.or_(_E.kind.not_like("job.%"), job_kind.in_(job_kinds)))
+    if holder_id is not None:
+        own = sa.select(jobs.c.id).where(
+            jobs.c.id == _E.subject_id, jobs.c.agency_id == agency_id, jobs.c.holder_id == holder_id
+        )
+        query = query.where(_E.kind.like("job.%"), own.exists())
     return fetch_all(connection, query.order_by(_E.id).limit(limit), EventRow)
 
 

@@ -35,7 +35,8 @@ _WIDE_DEG2 = 2_500.0  # [deg^2] for larger boxes reading all rows is faster than
 _FEW = 2_000
 _MANY = 4_000
 _ALL = 2**31 - 1
-_HALVINGS = 16
+_SHRINKS = 0.9
+"""Share of its radius to which a circle has to shrink; else all in it are read. Source: by hand."""
 _CHUNK = 500
 _C = markers.c
 _PLACES = (_C.row, _C.lon_deg, _C.lat_deg)
@@ -130,23 +131,25 @@ class _Search:
         return self._circle(min(float(distances.max()), max_m))
 
     def by_radius(self, count: int, max_m: float) -> tuple[_Rows, FloatArray]:
-        """Rows and distances inside a radius that grows until it holds enough."""
-        radius_m, below_m, halvings, counted = min(_FIRST_M, max_m), 0.0, 0, False
+        """Rows and distances inside a radius that grows until it holds enough, and shrinks where it holds too many."""
+        radius_m, limit, counted = min(_FIRST_M, max_m), _MANY + 4 * count, False
         while True:
-            limit = _MANY + 4 * count if halvings < _HALVINGS and radius_m > _FIRST_M else _ALL
-            rows, distances = self._circle(radius_m, limit)
-            if len(rows) == limit:  # too many rows to read: continue between the two radii
-                radius_m, halvings = math.sqrt(max(below_m, 1.0) * radius_m), halvings + 1
+            rows, distances = self._circle(radius_m, limit if radius_m > _FIRST_M else _ALL)
+            if len(rows) == limit and radius_m > _FIRST_M:
+                # too many to read; but whichever of them were read, the nearest are no farther than these
+                bound_m = float(np.partition(distances, count - 1)[count - 1])
+                if bound_m > _SHRINKS * radius_m:
+                    limit = _ALL
+                radius_m = min(radius_m, bound_m)
                 continue
             if len(rows) >= count or radius_m >= max_m:
                 return rows, distances
-            below_m = radius_m
             if radius_m > _FAR_M and not counted:
                 counted = True
                 rows, distances = self._measured(_anywhere(self._narrowed), {"most": _FEW + 1})
                 if len(rows) <= _FEW:
                     return rows[distances <= max_m], distances[distances <= max_m]
-            radius_m = min(radius_m * (4.0 if halvings == 0 else 1.4), max_m)
+            radius_m = min(radius_m * 4.0, max_m)
 
     def rows_of(self, rows: list[int]) -> dict[int, MarkerRow]:
         """Markers by their integer keys."""

@@ -7,11 +7,13 @@ the geodesic distance decide.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import sqlite3
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -68,6 +70,24 @@ class Box:
         return Box(_wrapped(self.west_deg - across_deg), south, _wrapped(self.east_deg + across_deg), north)
 
 
+class _PreparedArea:
+    """Polygons that points are compared with."""
+
+    def __init__(self, wkb: bytes) -> None:
+        self._wkb = wkb
+
+    @cached_property
+    def shape(self) -> shapely.Geometry:
+        """The polygons, prepared when the first point is compared."""
+        shape = shapely.from_wkb(self._wkb)
+        shapely.prepare(shape)
+        return shape
+
+
+_PREPARED: WeakValueDictionary[bytes, _PreparedArea] = WeakValueDictionary()
+"""Polygons of all areas that are in use, by `Area.key`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Area:
     """One polygon or several, with straight edges in longitude and latitude; none spans the antimeridian.
@@ -78,10 +98,20 @@ class Area:
         Well-known binary, little-endian.
     boxes : tuple of Box
         One around each polygon.
+    key : bytes
+        Names the area in statements of SQLite, for which a call of a function with 10,000 vertices takes 0.3 ms.
     """
 
     wkb: bytes
     boxes: tuple[Box, ...]
+    key: bytes = field(init=False, compare=False, repr=False)
+    _prepared: _PreparedArea = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Share the prepared polygons with equal areas; they are kept as long as one of these is."""
+        key = hashlib.blake2b(self.wkb, digest_size=16).digest()
+        object.__setattr__(self, "key", key)
+        object.__setattr__(self, "_prepared", _PREPARED.setdefault(key, _PreparedArea(self.wkb)))
 
 
 def box_around(lon_deg: float, lat_deg: float, radius_m: float) -> Box:
@@ -164,11 +194,12 @@ def _within_part(box: Box, table: sa.Table) -> sa.ColumnElement[bool]:
 
 def within_area(area: Area) -> sa.ColumnElement[bool]:
     """Markers inside an area or on its edge; both databases use GEOS."""
-    return sa.and_(sa.or_(*(within_box(box) for box in area.boxes)), _Covered(sa.literal(area.wkb, sa.LargeBinary)))
+    shape = (sa.literal(area.wkb, sa.LargeBinary), sa.literal(area.key, sa.LargeBinary))
+    return sa.and_(sa.or_(*(within_box(box) for box in area.boxes)), _Covered(*shape))
 
 
 class _Covered(FunctionElement[bool]):
-    """Markers that an area in well-known binary covers."""
+    """Markers that an area covers: its well-known binary, its key."""
 
     name = "waymark_covered"
     type = sa.Boolean()
@@ -181,30 +212,25 @@ class _Covered(FunctionElement[bool]):
 
 @compiles(_Covered, "sqlite")
 def _by_function(element: _Covered, compiler: SQLCompiler, **how: Any) -> str:
-    return compiler.process(sa.func.waymark_covers(*element.clauses, markers.c.lon_deg, markers.c.lat_deg), **how)
+    _wkb, key = element.clauses
+    return compiler.process(sa.func.waymark_covers(key, markers.c.lon_deg, markers.c.lat_deg), **how)
 
 
 @compiles(_Covered, "postgresql")
 def _by_postgis(element: _Covered, compiler: SQLCompiler, **how: Any) -> str:
-    area = sa.func.ST_GeomFromWKB(*element.clauses, sa.literal_column("4326"))
+    wkb, _key = element.clauses
+    area = sa.func.ST_GeomFromWKB(wkb, sa.literal_column("4326"))
     point = sa.table("markers", sa.column("geom")).c.geom
     return compiler.process(sa.func.ST_Covers(area, point), **how)
 
 
 def covers(area: Area, lon_deg: float, lat_deg: float) -> bool:
     """Whether a position is inside an area or on its edge."""
-    return _covers(area.wkb, lon_deg, lat_deg)
+    return _covers(area.key, lon_deg, lat_deg)
 
 
-def _covers(wkb: bytes, lon_deg: float, lat_deg: float) -> bool:
-    return bool(shapely.intersects_xy(_prepared(wkb), lon_deg, lat_deg))
-
-
-@lru_cache(maxsize=8)
-def _prepared(wkb: bytes) -> shapely.Geometry:
-    area = shapely.from_wkb(wkb)
-    shapely.prepare(area)
-    return area
+def _covers(key: bytes, lon_deg: float, lat_deg: float) -> bool:
+    return bool(shapely.intersects_xy(_PREPARED[key].shape, lon_deg, lat_deg))
 
 
 def within_radius(lon_deg: float, lat_deg: float, radius_m: float) -> sa.ColumnElement[bool]:

@@ -6,7 +6,7 @@ from typing import NotRequired, cast
 
 from typing_extensions import TypedDict
 
-from app.errors import ProcessStopped, UnreadableUpload, WaymarkError
+from app.errors import WaymarkError
 
 _MAX_CHARACTER_BYTES = 6  # of JSON; source: RFC 8259 section 7, \u0001
 
@@ -36,13 +36,9 @@ class ErrorDocument(ErrorCause):
 
 
 def error_document(error: WaymarkError) -> ErrorDocument:
-    """An error as it is stored in a job or in a result.
-
-    Clients know `ProcessStopped` as `UnreadableUpload`, as in problem documents.
-    """
-    kind = UnreadableUpload if isinstance(error, ProcessStopped) else type(error)
+    """An error as it is stored in a job or in a result."""
     return {
-        "kind": kind.__name__,
+        "kind": type(error).__name__,
         "detail": error.message,
         **error_cause(error.field, error.limit, error.cure),
     }

@@ -233,8 +233,7 @@ class Jobs:
 
 def _too_many_attempts(attempts: int) -> WaymarkError:
     return ProcessStopped(
-        "the job was started again and again and never finished",
-        field="file",
+        "the job was interrupted each time: the server or its processes ended before it was done",
         limit=f"{attempts} attempts",
-        cure="send the upload in smaller parts",
+        cure="send it again; if that fails too, send it in smaller parts",
     )

@@ -1,14 +1,15 @@
-"""What a request uses and when it must stop: processor time of its threads and decoder processes, and a deadline."""
+"""What a request or a job uses: processor time of its threads and decoder processes; and when a request must stop."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import ParamSpec, TypeVar
 
 from app.errors import Unavailable
+from app.registry.engines import STOPS, Stops
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -16,32 +17,34 @@ T = TypeVar("T")
 
 
 class RequestWork:
-    """The work for one request, shared by all its threads.
+    """The work for one request or job, shared by all its threads.
 
     Parameters
     ----------
     deadline_s : float
         When `check_deadline` stops it, on the monotonic clock. [s]
+    is_job : bool
+        Whether it is a job, for which no client waits.
 
     Attributes
     ----------
     used_s : float
         Processor time so far. [s]
-    abandoned : bool
-        Whether the client has left, so that nobody waits for the answer.
+    stops : Stops
+        What to stop when the client leaves, so that nobody waits for the answer: statements of the database, processes.
     """
 
-    __slots__ = ("_deadline_s", "abandoned", "used_s")
+    __slots__ = ("_deadline_s", "is_job", "stops", "used_s")
 
-    def __init__(self, deadline_s: float) -> None:
+    def __init__(self, deadline_s: float, *, is_job: bool = False) -> None:
         self._deadline_s = deadline_s
+        self.is_job = is_job
         self.used_s = 0.0
-        self.abandoned = False
+        self.stops = Stops()
 
     def check(self) -> None:
         """As `check_deadline`."""
-        if self.abandoned:
-            raise Unavailable("the client has left", cure="send the request again and wait for its answer")
+        self.stops.check()
         if time.monotonic() > self._deadline_s:
             raise Unavailable("the request took too long and was stopped", cure="split the request")
 
@@ -50,18 +53,19 @@ _WORK: ContextVar[RequestWork | None] = ContextVar("waymark_request_work", defau
 
 
 @contextmanager
-def working(timeout_s: float) -> Iterator[RequestWork]:
-    """Account for a request. Threads that are started in this block inherit its account."""
-    work = RequestWork(time.monotonic() + timeout_s)
-    token = _WORK.set(work)
+def working(timeout_s: float, *, is_job: bool = False) -> Iterator[RequestWork]:
+    """Account for a request or a job. Threads that are started in this block inherit its account."""
+    work = RequestWork(time.monotonic() + timeout_s, is_job=is_job)
+    token, stops = _WORK.set(work), STOPS.set(work.stops)
     try:
         yield work
     finally:
+        STOPS.reset(stops)
         _WORK.reset(token)
 
 
 def current_work() -> RequestWork | None:
-    """The request for which this is called; None in jobs and on the command line."""
+    """The request or job for which this is called; None on the command line."""
     return _WORK.get()
 
 
@@ -76,6 +80,12 @@ def check_deadline() -> None:
     work = _WORK.get()
     if work is not None:
         work.check()
+
+
+def stopping(stop: Callable[[], object]) -> AbstractContextManager[None]:
+    """`stop` is called from another thread, perhaps repeatedly, if the client leaves while the block runs."""
+    work = _WORK.get()
+    return nullcontext() if work is None else work.stops.calling(stop)
 
 
 def add_processor_time(used_s: float) -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
+
+from app.compiled import kernel, step
 
 FloatArray = npt.NDArray[np.float32]
 
 
-@numba.njit(cache=True, fastmath=True)
+@kernel
 def accumulate_face(
     rays: Any,
     samples: Any,
@@ -87,7 +88,7 @@ def accumulate_face(
                 cover[i, j] += hit
 
 
-@numba.njit(cache=True, fastmath=True, inline="always")
+@step
 def _ground(
     ray: Any, du: float, dv: float, t: float, motion: Any, spin: Any, height_m: float
 ) -> tuple[float, float]:  # pragma: no cover - compiled
@@ -102,7 +103,7 @@ def _ground(
     return ex * scale + motion[0] * t, ey * scale + motion[1] * t
 
 
-@numba.njit(cache=True, fastmath=True)
+@kernel
 def _misses(
     ray: Any,
     row_time_s: float,
@@ -128,7 +129,7 @@ def _misses(
     return high_x < 0 or high_y < 0 or low_x > size or low_y > size
 
 
-@numba.njit(cache=True, fastmath=True)
+@kernel
 def _bilinear(field: Any, field_from_ground: Any, gx: float, gy: float) -> float:  # pragma: no cover - compiled
     size = field.shape[0]
     if size == 1:
@@ -143,7 +144,7 @@ def _bilinear(field: Any, field_from_ground: Any, gx: float, gy: float) -> float
     return float(top * (1 - q) + low * q)
 
 
-@numba.njit(cache=True, fastmath=True)
+@kernel
 def shade_rays(
     rays: Any, height_m: float, shade: Any, shade_from_ground: Any, out: Any
 ) -> None:  # pragma: no cover - compiled
@@ -158,7 +159,7 @@ def shade_rays(
             out[i, j] = _bilinear(shade, shade_from_ground, rays[i, j, 0] * scale, rays[i, j, 1] * scale)
 
 
-@numba.njit(cache=True, fastmath=True)
+@kernel
 def expose_photo(
     photo: Any, share: Any, encode: Any, sigma: Any, noise: Any, offsets: Any, out: Any
 ) -> None:  # pragma: no cover - compiled

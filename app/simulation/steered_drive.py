@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from app.compiled import ieee_kernel
 from app.lanes.control import Controller, SteeringSettings, nearest_on_path, predict_pose, stanley_rad
 from app.simulation.vehicle import STEP_S, Vehicle, move_vehicle, turn_wheels
 
@@ -116,7 +116,7 @@ def start_on_bend(course: Course, curvature_per_m: float, offset_m: float, wheel
     return State(x, y, yaw, float(course.speeds[0]), 0.0, wheel)
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def drive_course(course, start, errors, law, car):  # type: ignore[no-untyped-def]
     """Simulate a drive.
 
@@ -165,13 +165,13 @@ def drive_course(course, start, errors, law, car):  # type: ignore[no-untyped-de
     return rows, _TOOK_TOO_LONG
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _speed_at(course, station):  # type: ignore[no-untyped-def]
     """Planned speed at a station, of the ends beyond them. [m/s]"""
     return course.speeds[min(max(int(station / course.step_m), 0), course.speeds.shape[0] - 1)]
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _steer(course, state, error, law, car, pending, held, seen, far):  # type: ignore[no-untyped-def]
     """Steering command at a pose with errors; predictive laws first predict the pose at which it takes effect.
 
@@ -197,7 +197,7 @@ def _steer(course, state, error, law, car, pending, held, seen, far):  # type: i
     )
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _step(state, command, target, control, car, first):  # type: ignore[no-untyped-def]
     """State and speed control one step later.
 

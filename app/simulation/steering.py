@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from app.compiled import ieee_kernel
 from app.errors import InvalidParameter
 from app.lanes.control import (
     Controller,
@@ -203,7 +203,7 @@ def _known_controller(controller: Controller | str) -> Controller:
         ) from error
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _errors_along(points, track, first):  # type: ignore[no-untyped-def]
     """Cross-track errors and error vectors of a track from a line; NaN before its start and after its end."""
     out = np.full((track.shape[0], 3), np.nan)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from app.compiled import ieee_kernel
 from app.lanes.control import check_range
 
 Floats = npt.NDArray[np.float64]
@@ -101,7 +101,7 @@ def draw_pose_errors(noise: PoseNoise | None, count: int, rng: np.random.Generat
     return errors
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _correlate(values, keep):  # type: ignore[no-untyped-def]
     out = values.copy()
     for k in range(1, out.shape[0]):
@@ -109,7 +109,7 @@ def _correlate(values, keep):  # type: ignore[no-untyped-def]
     return out
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def turn_wheels(steer, command, lag, max_rate, max_steer, dt):  # type: ignore[no-untyped-def]
     """Angle of the front wheels one step later. [rad]"""
     rate = (command - steer) / max(lag, dt)
@@ -117,7 +117,7 @@ def turn_wheels(steer, command, lag, max_rate, max_steer, dt):  # type: ignore[n
     return min(max(steer + rate * dt, -max_steer), max_steer)
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def move_vehicle(x, y, yaw, speed, steer, wheelbase, dt):  # type: ignore[no-untyped-def]
     """Rear axle's centre and heading one step later: a kinematic bicycle on the chord of its arc. [m, m, rad]"""
     turn = speed * math.tan(steer) / wheelbase * dt

@@ -256,6 +256,22 @@ class Blobs:
         except (BaseError, OSError) as error:
             raise _failure(error) from error
 
+    def probe(self) -> None:
+        """Write a small blob, read it and delete it.
+
+        Raises
+        ------
+        StorageFull, Unavailable
+            One of these failed.
+        """
+        key = f"probe/00/{uuid.uuid4().hex}"
+        self.put(key, b"waymark")
+        try:
+            if self.get(key) != b"waymark":
+                raise Unavailable("the blob store does not return what was written")
+        finally:
+            self.delete(key)
+
     def list_keys(self, before: datetime | None = None) -> Iterator[str]:
         """Keys of all blobs, or of those that were written before a time."""
         try:

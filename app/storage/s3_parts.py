@@ -103,7 +103,7 @@ class S3Parts:
             try:
                 import boto3  # type: ignore[import-untyped]
             except ImportError as error:
-                raise Unavailable("the extra s3 is not installed", cure="pip install waymark[s3]") from error
+                raise Unavailable("the extra s3 is not installed", cure="pip install waymark-roads[s3]") from error
             self._made = boto3.client("s3")
         return self._made
 
@@ -114,7 +114,7 @@ def _answering() -> Iterator[None]:
     try:
         from botocore.exceptions import BotoCoreError, ClientError
     except ImportError as error:
-        raise Unavailable("the extra s3 is not installed", cure="pip install waymark[s3]") from error
+        raise Unavailable("the extra s3 is not installed", cure="pip install waymark-roads[s3]") from error
     try:
         yield
     except (BotoCoreError, ClientError) as error:

@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from app.compiled import ieee_kernel
 from app.tracks.motion import lengths, minus, move_rows, plus, predict, wrap
 from app.tracks.types import BIAS, EAST, HEADING, NORTH, SCALE, SPEED, WANDER, YAW_RATE
 
@@ -66,14 +66,14 @@ class Measurements(NamedTuple):
 # --- measurements ---------------------------------------------------------------------------------------------------
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _after_s(m, i, state):  # type: ignore[no-untyped-def]
     """Time from the node to a measurement, by the clock's offset in the state."""
     k = m.clock[i]
     return m.after_s[i] + (state[k] - m.assumed_s[i] if k >= 0 else 0.0)
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def fix_model(m, i, state, rows, residual):  # type: ignore[no-untyped-def]
     """Residual of a fix at a state [m, m, rad], and the derivatives of its prediction, rows (3, n)."""
     after = _after_s(m, i, state)
@@ -99,7 +99,7 @@ def fix_model(m, i, state, rows, residual):  # type: ignore[no-untyped-def]
             rows[2, k] = m.rate[i, 2] if is_known else state[YAW_RATE]
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def fix_noise(m, i, noise):  # type: ignore[no-untyped-def]
     """Covariance of a fix, (3, 3)."""
     noise[0, 0], noise[0, 1], noise[0, 2] = m.noise[i, 0], m.noise[i, 1], m.noise[i, 2]
@@ -107,7 +107,7 @@ def fix_noise(m, i, noise):  # type: ignore[no-untyped-def]
     noise[1, 0], noise[2, 0], noise[2, 1] = noise[0, 1], noise[0, 2], noise[1, 2]
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _sample_model(m, i, state, row):  # type: ignore[no-untyped-def]
     """Residual of a sample of speed or heading, or of a path, and the derivatives of its prediction (n,)."""
     row[:] = 0.0
@@ -129,7 +129,7 @@ def _sample_model(m, i, state, row):  # type: ignore[no-untyped-def]
     return state[WANDER] - (off_e * left_e + off_n * left_n)
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _use_sample(m, i, at, state, cov, scratch):  # type: ignore[no-untyped-def]
     n = state.shape[0]
     row, gain, error = scratch[0], scratch[1], scratch[2]
@@ -158,7 +158,7 @@ def _use_sample(m, i, at, state, cov, scratch):  # type: ignore[no-untyped-def]
             cov[j, k] -= gain[j] * gain[k] / spread
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _factor(matrix):  # type: ignore[no-untyped-def]
     """Cholesky factor in place, in the lower triangle."""
     n = matrix.shape[0]
@@ -172,7 +172,7 @@ def _factor(matrix):  # type: ignore[no-untyped-def]
             matrix[i, j] /= matrix[j, j]
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _solve(factor, columns):  # type: ignore[no-untyped-def]
     """Solve for each column, in place, by the factor of `_factor`."""
     n = factor.shape[0]
@@ -187,7 +187,7 @@ def _solve(factor, columns):  # type: ignore[no-untyped-def]
             columns[a, j] /= factor[a, a]
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _spread(rows, cov, crossed, spread):  # type: ignore[no-untyped-def]
     """H P (3, n) and H P H' (3, 3) of a fix."""
     n = cov.shape[0]
@@ -205,7 +205,7 @@ def _spread(rows, cov, crossed, spread):  # type: ignore[no-untyped-def]
             spread[a, b] = total
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _use_fix(m, i, at, state, cov, scratch, fix):  # type: ignore[no-untyped-def]
     """Update with a fix; `fix` is working memory, (4, 3, n) with n >= 6."""
     n = state.shape[0]
@@ -242,7 +242,7 @@ def _use_fix(m, i, at, state, cov, scratch, fix):  # type: ignore[no-untyped-def
 # --- passes ---------------------------------------------------------------------------------------------------------
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def filter_track(step_s, start, start_cov, around, m, motion):  # type: ignore[no-untyped-def]
     """States (N, n) and covariances (N, n, n) of the nodes, each by the measurements up to it.
 
@@ -282,7 +282,7 @@ def filter_track(step_s, start, start_cov, around, m, motion):  # type: ignore[n
     return states, covs
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def smooth_track(step_s, states, covs, around, motion):  # type: ignore[no-untyped-def]
     """Turn the results of `filter_track`, in place, into those by all measurements."""
     count, n = states.shape
@@ -324,7 +324,7 @@ def smooth_track(step_s, states, covs, around, motion):  # type: ignore[no-untyp
                 covs[k, j, a] = covs[k, a, j]
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def fix_distances(m, which, states, covs):  # type: ignore[no-untyped-def]
     """Squared Mahalanobis distance of fixes to the track by all others (K,), and residuals from it (K, 3).
 

@@ -17,8 +17,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba as nb
-
+from app.compiled import ieee_kernel
 from app.tracks.types import BIAS, CLOCKS, EAST, HEADING, NORTH, SCALE, SPEED, WANDER, YAW_RATE
 
 _TURN_S = 3.0  # [s] in which a yaw rate fades; source: by hand, half a bend
@@ -45,19 +44,19 @@ class Motion(NamedTuple):
     wander_length_m: float
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def lengths(lat):  # type: ignore[no-untyped-def]
     """East and north metres of a radian at a latitude."""
     curve = 1.0 - _E2 * math.sin(lat) ** 2
     return math.cos(lat) * _A / math.sqrt(curve), _A * (1.0 - _E2) / curve**1.5
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def wrap(angle):  # type: ignore[no-untyped-def]
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def minus(a, b, out):  # type: ignore[no-untyped-def]
     """Error of state a from state b."""
     east, north = lengths(b[NORTH])
@@ -67,7 +66,7 @@ def minus(a, b, out):  # type: ignore[no-untyped-def]
     out[NORTH] *= north
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def plus(a, error, out):  # type: ignore[no-untyped-def]
     """State a with an error added."""
     east, north = lengths(a[NORTH])
@@ -77,7 +76,7 @@ def plus(a, error, out):  # type: ignore[no-untyped-def]
     out[NORTH] = min(max(a[NORTH] + error[NORTH] / north, -1.5697), 1.5697)
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _move(state, dt, wander_length, out):  # type: ignore[no-untyped-def]
     """State after a time at constant speed and yaw rate."""
     for i in range(state.shape[0]):
@@ -92,7 +91,7 @@ def _move(state, dt, wander_length, out):  # type: ignore[no-untyped-def]
     out[WANDER] *= math.exp(-abs(state[SPEED]) * dt / wander_length)
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def move_rows(state, dt, wander_length, matrix):  # type: ignore[no-untyped-def]
     """Multiply a matrix from the left with the derivative of `_move`, in place."""
     turn = state[HEADING] + state[YAW_RATE] * dt / 2
@@ -109,7 +108,7 @@ def move_rows(state, dt, wander_length, matrix):  # type: ignore[no-untyped-def]
         matrix[WANDER, j] *= phi
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _add_noise(state, dt, motion, cov):  # type: ignore[no-untyped-def]
     turn = state[HEADING]
     s, c = math.sin(turn), math.cos(turn)
@@ -140,7 +139,7 @@ def _add_noise(state, dt, motion, cov):  # type: ignore[no-untyped-def]
     cov[WANDER, WANDER] += (1 - phi * phi) * motion.wander_m**2 + 1e-12
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def _transposed(matrix):  # type: ignore[no-untyped-def]
     n = matrix.shape[0]
     for i in range(n):
@@ -148,7 +147,7 @@ def _transposed(matrix):  # type: ignore[no-untyped-def]
             matrix[i, j], matrix[j, i] = matrix[j, i], matrix[i, j]
 
 
-@nb.njit(cache=True)
+@ieee_kernel
 def predict(state, cov, around, dt, motion, out, out_cov, scratch):  # type: ignore[no-untyped-def]
     """State and covariance one node on, linearised at `around`."""
     _move(around, dt, motion.wander_length_m, out)

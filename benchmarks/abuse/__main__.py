@@ -1,7 +1,9 @@
-"""``python -m benchmarks.abuse [--short] [--slack N]``: the most expensive request of each route.
+"""``python -m benchmarks.abuse [--short] [--slack N] [--only NAME ...]``: the most expensive request of each route, and
+attacks of many requests.
 
 The exit status is 1 if a request broke a limit: 5 s of processor time, 200 MB of memory, 1 MB of error answer, 250 ms
-of delay of /healthz. `--slack` multiplies the limits in time, for a machine that does other work.
+of delay of /healthz; or if an attack broke one of its own limits or succeeded. `--slack` multiplies the limits in time,
+for a machine that does other work. `--only` takes `requests`, `attacks`, or names of attacks.
 """
 
 from __future__ import annotations
@@ -16,9 +18,12 @@ from typing import Any, NamedTuple
 
 import httpx
 
+from benchmarks.abuse import protocol as protocol  # adds its attacks
+from benchmarks.abuse.attacks import ATTACKS, run_attacks
 from benchmarks.abuse.cases import Case, list_cases
 from benchmarks.abuse.json_bodies import list_bodies, list_json_routes
 from benchmarks.abuse.server import Cost, ObservedServer, running_server
+from benchmarks.abuse.texts import list_text_cases
 
 MAX_CPU_S, MAX_MEMORY_MB, MAX_ERROR_BYTES, MAX_HEALTH_MS = 5.0, 200.0, 1_000_000, 250.0
 WITH_DEADLINE = {"POST /v1/artwork": 300.0}
@@ -57,17 +62,32 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.abuse", description=__doc__)
     parser.add_argument("--short", action="store_true", help="fewer and smaller cases, under a minute")
     parser.add_argument("--slack", type=float, default=1.0, help="factor of the limits in time")
+    parser.add_argument("--only", action="append", choices=["requests", "attacks", *ATTACKS], help="what to run")
     arguments = parser.parse_args()
+    only, short = arguments.only or ["requests", "attacks"], arguments.short
+    chosen = [ATTACKS[name] for name in ATTACKS if name in only or "attacks" in only]
+    outcomes: list[Outcome] = []
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder)) as server:
-        ids = _make_resources(server.client)
-        outcomes = [_send(server, case) for case in _all_cases(server, ids, short=arguments.short)]
-    print(f"### abuse\n\n{'Short' if arguments.short else 'Long'} mode, {len(outcomes)} requests.\n")
+        mode = "Short" if short else "Long"
+        print(f"### abuse\n\n{mode} mode.\n")
+        faults = run_attacks(server, chosen, arguments.slack, short=short)
+        if "requests" in only:
+            ids = _make_resources(server.client)
+            outcomes = [_send(server, case) for case in _all_cases(server, ids, short=short)]
+    if outcomes:
+        faults += _print_requests(outcomes, arguments.slack)
+    print(f"\n{faults} requests or attacks broke a limit.")
+    return 1 if faults else 0
+
+
+def _print_requests(outcomes: list[Outcome], slack: float) -> int:
+    """Print the table and the requests that broke a limit; returns how many."""
+    print(f"{len(outcomes)} requests:\n")
     _print_table(outcomes)
-    faults = [(outcome, broken) for outcome in outcomes if (broken := outcome.broken(arguments.slack))]
+    faults = [(outcome, broken) for outcome in outcomes if (broken := outcome.broken(slack))]
     for outcome, broken in faults:
         print(f"- {outcome.case.route}, {outcome.case.name}: {', '.join(broken)} ({_figures(outcome)})")
-    print(f"\n{len(faults)} requests broke a limit.")
-    return 1 if faults else 0
+    return len(faults)
 
 
 def _make_resources(client: httpx.Client) -> dict[str, str]:
@@ -87,6 +107,7 @@ def _make_resources(client: httpx.Client) -> dict[str, str]:
 
 def _all_cases(server: ObservedServer, ids: dict[str, str], *, short: bool) -> Iterator[Case]:
     yield from list_cases(ids, short=short)
+    yield from list_text_cases(short=short)
     document: dict[str, Any] = server.client.get("/openapi.json").json()
     for route in list_json_routes(document):
         path = re.sub(r"\{(\w+)\}", lambda name: ids.get(name[1], NOBODY), route.path)

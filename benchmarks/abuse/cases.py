@@ -46,7 +46,8 @@ def _zigzag(vertices: int) -> list[list[float]]:
     return [[456_000 + 0.3 * k, 5_427_000 + 40.0 * (k % 2)] for k in range(vertices)]
 
 
-def _star(vertices: int) -> list[list[float]]:
+def star(vertices: int) -> list[list[float]]:
+    """A closed ring of a star about 8.4, 49.0, 0.2 degrees to its points."""
     ring = [
         [8.4 + (0.1 + 0.1 * (k % 2)) * math.cos(angle), 49.0 + (0.1 + 0.1 * (k % 2)) * math.sin(angle)]
         for k, angle in enumerate(np.linspace(0, 2 * math.pi, vertices - 1, endpoint=False).tolist())
@@ -57,7 +58,7 @@ def _star(vertices: int) -> list[list[float]]:
 def _documents(ids: dict[str, str], *, short: bool) -> Iterator[Case]:
     vertices = 4_000 if short else 40_000
     yield _json(
-        "/v1/markers/search", "a star of vertices", {"polygon": {"type": "Polygon", "coordinates": [_star(9_999)]}}
+        "/v1/markers/search", "a star of vertices", {"polygon": {"type": "Polygon", "coordinates": [star(9_999)]}}
     )
     line = {"type": "LineString", "coordinates": [[8.4 + 1e-5 * k, 49.0 + 1e-5 * (k % 2)] for k in range(vertices)]}
     yield _json("/v1/markers/search", "along a zigzag", {"along": {"geometry": line, "corridor_m": 100}})
@@ -101,8 +102,8 @@ def _line_magnets(number: int) -> dict[str, Any]:
 
 
 def _queries(*, short: bool) -> Iterator[Case]:
-    star = ", ".join(f"{x:.4f} {y:.4f}" for x, y in _star(350))
-    yield _get("/v1/markers", "a polygon", polygon=f"POLYGON (({star}))")
+    ring = ", ".join(f"{x:.4f} {y:.4f}" for x, y in star(350))
+    yield _get("/v1/markers", "a polygon", polygon=f"POLYGON (({ring}))")
     items = "/ogc/collections/{collection}/items"
     path = items.format(collection="markers")
     nested = "(" * 900 + "code='1'" + ")" * 900

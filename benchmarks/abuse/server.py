@@ -21,18 +21,35 @@ from app.demo.free_ports import free_ports
 
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _POLL_S = 0.02
+_POLLER = "127.0.0.9"
+"""Address of the client that asks for /healthz: no attacker has it."""
 _START_S = 300.0
-_IDLE_S = 0.1
+_BUSY_S = 120.0
+"""Longest wait for a server to become idle. [s]"""
+_IDLE_S = 0.2
 """Processor time of an idle server in a second: /healthz is asked all the time. [s]"""
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What a request cost: processor time [s], growth of memory [MB], greatest delay of /healthz [ms]."""
+    """What a request or an attack cost.
+
+    Attributes
+    ----------
+    cpu_s : float
+        Processor time. [s]
+    memory_mb : float
+        Growth of memory at its peak. [MB]
+    health_ms : float
+        Greatest delay of /healthz for another address. [ms]
+    failed : int
+        Requests of /healthz without an answer of 200.
+    """
 
     cpu_s: float
     memory_mb: float
     health_ms: float
+    failed: int
 
 
 class ObservedServer:
@@ -44,7 +61,8 @@ class ObservedServer:
             base_url=f"http://127.0.0.1:{port}", headers={"X-API-Key": key}, timeout=600, trust_env=False
         )
         self._slowest_s: Synchronized[float] = multiprocessing.Value("d", 0.0)
-        self._poller = multiprocessing.Process(target=_poll, args=(port, self._slowest_s), daemon=True)
+        self._failed: Synchronized[int] = multiprocessing.Value("i", 0)
+        self._poller = multiprocessing.Process(target=_poll, args=(port, self._slowest_s, self._failed), daemon=True)
         self._poller.start()
 
     @contextmanager
@@ -53,17 +71,25 @@ class ObservedServer:
         before, memory = self._cpu_s(), self._memory_kb("VmRSS")
         for pid in self._pids():
             _reset_peak(pid)
-        self._slowest_s.value = 0.0
+        self._slowest_s.value, self._failed.value = 0.0, 0
         costs: list[Cost] = []
         yield costs
         time.sleep(2 * _POLL_S)  # a delay is known when it is over
         peak = self._memory_kb("VmHWM")
-        costs.append(Cost(self._cpu_s() - before, max(0, peak - memory) / 1000, self._slowest_s.value * 1000))
+        costs.append(
+            Cost(
+                self._cpu_s() - before,
+                max(0, peak - memory) / 1000,
+                self._slowest_s.value * 1000,
+                self._failed.value,
+            )
+        )
 
     def wait_until_idle(self) -> None:
-        """Wait until the decoder processes have started and compiled."""
+        """Wait until the decoder processes have started and compiled, or a request or an attack has ended."""
         before_s = -1.0
-        while (now_s := self._cpu_s()) - before_s > _IDLE_S:
+        deadline_s = time.monotonic() + _BUSY_S
+        while (now_s := self._cpu_s()) - before_s > _IDLE_S and time.monotonic() < deadline_s:
             before_s = now_s
             time.sleep(1.0)
 
@@ -118,23 +144,25 @@ def _reset_peak(pid: int) -> None:
         return
 
 
-def _poll(port: int, slowest_s: Synchronized[float]) -> None:
-    connection = http.client.HTTPConnection("127.0.0.1", port)
+def _poll(port: int, slowest_s: Synchronized[float], failed: Synchronized[int]) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60, source_address=(_POLLER, 0))
     while True:
         started_s = time.monotonic()
         try:
             connection.request("GET", "/healthz")
-            connection.getresponse().read()
-        except OSError:
+            answer = connection.getresponse()
+            answer.read()
+            failed.value += answer.status != 200
+        except (OSError, http.client.HTTPException):
             connection.close()
-            continue
+            failed.value += 1
         slowest_s.value = max(slowest_s.value, time.monotonic() - started_s)
         time.sleep(_POLL_S)
 
 
 @contextmanager
-def running_server(folder: Path) -> Iterator[ObservedServer]:
-    """`waymark serve` on an empty folder, without limits on rates: single requests are measured."""
+def running_server(folder: Path, **settings: str) -> Iterator[ObservedServer]:
+    """`waymark serve` on a folder, without limits on rates: single requests are measured. `settings` are variables."""
     key = secrets.token_hex(16)
     (port,) = free_ports(1)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("WAYMARK_")} | {
@@ -145,6 +173,7 @@ def running_server(folder: Path) -> Iterator[ObservedServer]:
         "WAYMARK_KEY_PROCESSOR_S_PER_MIN": "0",
         "WAYMARK_AGENCY_PROCESSOR_S_PER_MIN": "0",
         "WAYMARK_LOG_LEVEL": "ERROR",
+        **settings,
     }
     command = [sys.executable, "-c", "from app.cli import main; main()", "serve"]
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)

@@ -181,7 +181,6 @@ def _all_sent(drive: SimulatedDrive, installed: InstalledMarkers) -> list[Receiv
 def run_tracking(seed: int, short: bool) -> Result:
     """A simulated car along decoded paths, against the true centre line."""
     rows: list[Sequence[object]] = []
-    paper_m = f"{paper_figure('controller path error route 2')}, {paper_figure('controller path error route 3')}"
     cases = (
         ("40 ft, predictive", None, Controller.PREDICTIVE, (0.001, 0.03)),
         ("40 ft, Stanley", None, Controller.STANLEY, None),
@@ -211,11 +210,11 @@ def run_tracking(seed: int, short: bool) -> Result:
             (
                 name, f"{rms:.3f}", f"{worst:.2f}", f"{max(rms_runs):.3f}", f"{mse:.5f}", f"{max(mses):.5f}",
                 "-" if goal is None else f"{goal[0]}" + (f", RMS {goal[1]}" if goal[1] else ""),
-                "-" if goal is None else met(good), paper_m,
+                "-" if goal is None else met(good),
             )
         )  # fmt: skip
     head = (
-        "path, controller", "RMS [m]", "max [m]", "worst run", "MSE [m2]", "worst run", "goal", "met", "paper",
+        "path, controller", "RMS [m]", "max [m]", "worst run", "MSE [m2]", "worst run", "goal", "met",
     )  # fmt: skip
     return (
         "Distance of the front axle from the true centre line; poses with RTK noise; at most 25 mph in bends. The "

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -72,12 +72,12 @@ class FaultServer:
         assert self.process is not None
         return self.process.pid
 
-    def start(self) -> float:
-        """Start the process; returns the seconds until `/readyz` was 200."""
+    def start(self, preexec: Callable[[], None] | None = None) -> float:
+        """Start the process, and call something in it first; returns the seconds until `/readyz` was 200."""
         began = time.monotonic()
         with self.log.open("ab") as log:
             command = [*_COMMAND, "serve", "--port", str(self.port)]
-            self.process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=log)
+            self.process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=log, preexec_fn=preexec)
         if not self.wait_until_ready():
             raise RuntimeError(f"the server did not start; see {self.log}")
         return time.monotonic() - began

@@ -15,7 +15,6 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, given, settings
 
-from app.api.http.strict_json import parse_json
 from app.api.ogc.cql2 import Reader
 from app.decoders.cerpm.payload import decode_message
 from app.encoders.cerpm.payload import encode_message
@@ -23,6 +22,7 @@ from app.errors import WaymarkError
 from app.formats.alignments.read import read_alignment
 from app.formats.archives import read_members
 from app.formats.image_headers import ImageLimits, scan_image
+from app.formats.json_text import parse_json
 from app.formats.kinds import detect_drive_file, guess_kind
 from app.formats.packets.read import read_packets
 from app.formats.poses.read import read_poses

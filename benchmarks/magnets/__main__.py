@@ -128,9 +128,9 @@ def run_tags(seed: int, short: bool) -> Result:
     default = TagFormat(3, 4.0, 1.0)
     cases: list[tuple[str, TagFormat, tuple[int, ...], tuple[float, ...], float, str]] = [
         (f"M 3, L 4 m, Seg_d 1 m, {c} cm", default, (c,), (20, 40, 60), g, p)
-        for c, g, p in ((16, 0.99, "1.0"), (30, 0.99, "0.97"), (35, 0.95, "0.5"), (40, 0.85, "-"))
+        for c, g, p in ((16, 0.99, "1.0"), (30, 0.99, "-"), (35, 0.95, "0.5"), (40, 0.85, "-"))
     ]
-    cases.append(("Seg_d 0.02 m, 16 cm", TagFormat(3, 4.0, 0.02), (16,), (30, 30, 30), 0.98, "0.3"))
+    cases.append(("Seg_d 0.02 m, 16 cm", TagFormat(3, 4.0, 0.02), (16,), (30, 30, 30), 0.98, "-"))
     cases.append(("five magnets 0.5 m apart", TagFormat(5, 2.0, 0.5), (16,), (20, 30, 50), 0.95, "-"))
     for name, form, clearances, speeds, goal, paper in cases:
         ours, peer = TagTally(), TagTally()
@@ -148,7 +148,8 @@ def run_tags(seed: int, short: bool) -> Result:
     peer = score_tags(drive, _metro(drive), segment_m=0.1)
     rows.append(_tag_row(f"drive of {drive.trace.t_s[-1] / 60:.0f} min, Seg_d 0.1 m", ours, 0.98, peer, "-"))
     return (
-        "The decoder knows the format of the tags, but not their codes.",
+        "The decoder knows the format of the tags, but not their codes. Of tags at 30 cm the paper states the accuracy "
+        "of their polarities only, more than 97 % (section 7.3). Its 1.0 is from a rough road.",
         ("tags", "n", "right", "wrong", "goal", "met", "metro", "paper"),
         rows,
     )

@@ -13,7 +13,7 @@ import signal
 import sys
 from collections.abc import Callable
 
-from benchmarks.service import kills, limits, malformed, overload, soak, throughput
+from benchmarks.service import kills, limits, malformed, overload, soak, start, throughput
 
 
 def _engines() -> tuple[str, ...]:
@@ -34,6 +34,7 @@ def _soak(short: bool) -> str:
 
 
 PARTS: dict[str, tuple[str, Callable[[bool], str]]] = {
+    "start": ("Start of a server, and its memory when it is idle", start.tables),
     "throughput": ("Throughput beside two bare decoder processes", _throughput),
     "limits": ("Limits of the database, and what a fleet needs", limits.tables),
     "overload": ("64 clients at once, and slow connections", overload.tables),

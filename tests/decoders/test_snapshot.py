@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from app.decoders.magnet.identify import TagFormat
 from app.decoders.snapshot import Snapshot, open_snapshot
-from app.encoders.snapshot import write_snapshot
+from app.encoders.snapshot import kind_text, write_snapshot
 from app.errors import InvalidParameter
 from app.markers import snapshot as layout
 from app.markers.magnet import parse_tag
@@ -55,7 +55,14 @@ def _tag(text: str, lon_deg: float, lat_deg: float, **more: Any) -> dict[str, An
 
 def _write(markers: list[dict[str, Any]], hours: float = 24.0, made_at: datetime = NOW, **more: Any) -> bytes:
     stated = {"agency_id": AGENCY, "area_deg": AREA, "key": KEY, **more}
-    return write_snapshot(markers, made_at=made_at, expires_at=made_at + timedelta(hours=hours), **stated)
+    blocks = [_block(markers[k : k + 3]) for k in range(0, len(markers), 3)]
+    return write_snapshot(blocks, made_at=made_at, expires_at=made_at + timedelta(hours=hours), **stated)
+
+
+def _block(markers: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    kinds = [kind_text(marker["family"], marker["kind"]) for marker in markers]
+    names = {name for marker in markers for name in marker} - {"family"}
+    return {name: [marker.get(name) for marker in markers] for name in names} | {"kind": kinds}
 
 
 def _open(data: bytes, now: datetime = NOW, newest_made_at_ms: int | None = None) -> Snapshot:

@@ -18,7 +18,9 @@ import yaml
 
 from app.cli.database import read_settings
 from app.demo.free_ports import free_ports
+from app.main import create_app
 from app.settings import Settings
+from tests.api.http.test_permissions import list_routes
 from tests.conftest import ADMIN_KEY
 from tests.databases import PostgresServer
 from tests.docker.test_image import serving
@@ -118,8 +120,7 @@ def proxy(folder: Path, servers: list[str], find: Callable[..., str]) -> Iterato
         text = text.replace(name, url.removeprefix("http://"))
     text = text.replace("rate=200r/s", "rate=1r/s").replace("burst=1000", "burst=30").replace("/tmp/", f"{folder}/")
     (folder / "nginx.conf").write_text(text)
-    nginx = find("nginx", "/usr/sbin/nginx")
-    command = [nginx, "-p", str(folder), "-c", "nginx.conf", "-g", "daemon off;"]
+    command = [find("nginx"), "-p", str(folder), "-c", "nginx.conf", "-g", "daemon off;"]
     checked = subprocess.run([*command[:-2], "-t"], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stderr
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
@@ -184,6 +185,55 @@ def served(url: str) -> float:
     text = httpx.get(f"{url}/metrics", trust_env=False, timeout=WITHIN_S).text
     pattern = r'^waymark_http_requests_total\{.*route="/v1/markers/\{marker_id\}".*\} ([\d.]+)$'
     return sum(map(float, re.findall(pattern, text, re.MULTILINE)))
+
+
+# --- routes through the proxies -------------------------------------------------------------------------------------
+
+INSIDE = {"/metrics", "/readyz"}
+"""For Prometheus and the kubelet, not for clients: the ingress does not route them."""
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """Path templates of all that the server answers, from the application itself."""
+    settings = Settings(data_dir=tmp_path_factory.mktemp("routes"), admin_key=ADMIN_KEY)
+    return {route.partition(" ")[2] for route in list_routes(create_app(settings))}
+
+
+def routed_by_ingress(path: str) -> bool:
+    """Whether the ingress sends a path to the server: Exact by characters, Prefix by whole elements."""
+    (ingress,) = (document for document in manifests() if document["kind"] == "Ingress")
+    for rule in ingress["spec"]["rules"]:
+        for entry in rule["http"]["paths"]:
+            assert entry["backend"]["service"] == {"name": "waymark-api", "port": {"name": "http"}}
+            is_prefix = entry["pathType"] == "Prefix"
+            if path == entry["path"] or (is_prefix and path.startswith(entry["path"].rstrip("/") + "/")):
+                return True
+    return False
+
+
+def location_of(configuration: str, path: str) -> str:
+    """The body of nginx's location for a path: an exact one, or else that with the longest prefix."""
+    found = re.findall(r"^ +location (=?) *(/\S*) \{(.*?)^ +\}", configuration, re.MULTILINE | re.DOTALL)
+    exact = [body for kind, name, body in found if kind == "=" and name == path]
+    prefixes = {name: body for kind, name, body in found if not kind and path.startswith(name)}
+    return exact[0] if exact else prefixes[max(prefixes, key=len)]
+
+
+def test_the_ingress_routes_every_path_of_the_server(paths: set[str]) -> None:
+    asked = {re.sub(r"\{\w+(:\w+)?\}", "x", path) for path in paths}
+    assert {path for path in asked if not routed_by_ingress(path)} == INSIDE
+    assert routed_by_ingress("/static/app/main.js")
+    assert routed_by_ingress("/guide/index.html")
+    assert not routed_by_ingress("/metricsx")
+
+
+@pytest.mark.parametrize("name", ["docker/nginx.conf", "docker/fleet/nginx.conf"])
+def test_nginx_routes_every_path_of_the_server(paths: set[str], name: str) -> None:
+    text = (ROOT / name).read_text()
+    asked = {re.sub(r"\{\w+(:\w+)?\}", "x", path) for path in paths}
+    unrouted = {path for path in asked if "proxy_pass http://waymark;" not in location_of(text, path)}
+    assert unrouted <= {"/metrics"}, name
 
 
 # --- Kubernetes -----------------------------------------------------------------------------------------------------

@@ -1,90 +1,63 @@
-"""The server starts from the files that `.dockerignore` and `docker/Dockerfile` put into the image."""
+"""The image's files, built as docker/Dockerfile does, serve and work as its user and decode every kind of upload."""
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import re
+import runpy
+import secrets
 import shutil
 import signal
 import subprocess
 import sys
 import threading
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from fnmatch import fnmatchcase
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import av
+import cv2
 import httpx
 import pytest
+import sqlalchemy as sa
 
+from app import __version__
 from app.api.http.connections import MAX_HEADER_BYTES
+from app.formats.traces.declaration import TraceDeclaration
+from app.formats.traces.read import read_trace
+from app.sensors.magnetometer_bar import MagnetTrace
 from app.settings import Settings
-from tests.http import WITHIN_S
+from app.simulation.magnetic.recorder import write_array_stream
+from tests.brokers import find_broker, own_queues
+from tests.databases import PostgresServer
+from tests.docker.image_build import build_image, command_of, context_files, settings_of
+from tests.formats.traces.recordings import zipped
+from tests.formats.traces.test_can import log as can_log
+from tests.formats.traces.test_tables import parquet
+from tests.http import WITHIN_S, finished, wait_until
+from tests.machine import require_tool
 
 ROOT = Path(__file__).resolve().parents[2]
-NOT_IN_A_CLONE = {".git", ".venv", "var", "demo-out", "bench-out", "build", "dist", ".hypothesis"}
 USER = 10001
-KEY = {"Authorization": "Bearer an-admin-key-for-the-image-only"}
+KEY = "an-admin-key-for-the-image-only"
+VIDEO_FRAMES = 60
 STARTED = re.compile(r"Uvicorn running on (http://[\d.:]+)")
 
 
-def ignore_rules() -> list[tuple[bool, list[str]]]:
-    """Patterns of `.dockerignore` in order: whether one excludes, and its path in parts."""
-    lines = (line.strip() for line in (ROOT / ".dockerignore").read_text().splitlines())
-    return [
-        (not line.startswith("!"), line.removeprefix("!").strip("/").split("/")) for line in lines if line[:1] != "#"
-    ]
-
-
-def matches(pattern: list[str], path: tuple[str, ...]) -> bool:
-    """Whether a pattern is the path; `**` stands for any number of folders."""
-    if not pattern:
-        return not path
-    if pattern[0] == "**":
-        return any(matches(pattern[1:], path[k:]) for k in range(len(path) + 1))
-    return bool(path) and fnmatchcase(path[0], pattern[0]) and matches(pattern[1:], path[1:])
-
-
-def is_in_context(path: Path) -> bool:
-    """Docker's rule: the last pattern that matches the path or a folder above it decides."""
-    parts, included = path.parts, True
-    for excludes, pattern in ignore_rules():
-        if any(matches(pattern, parts[:k]) for k in range(1, len(parts) + 1)):
-            included = not excludes
-    return included
-
-
-def context_files() -> list[Path]:
-    """Files that `docker build` sends, relative to the root."""
-    found = []
-    for folder, folders, names in os.walk(ROOT):
-        here = Path(folder).relative_to(ROOT)
-        folders[:] = [name for name in folders if here != Path() or name not in NOT_IN_A_CLONE]
-        found += [here / name for name in names if is_in_context(here / name)]
-    return found
-
-
-def copies(stage: str) -> list[tuple[list[str], str]]:
-    """Sources and target of each COPY from the context in a stage of the build."""
-    text = re.split(rf"^FROM \S+ AS {stage}$", (ROOT / "docker/Dockerfile").read_text(), flags=re.MULTILINE)[1]
-    lines = re.findall(r"^COPY (?!--from)(.+)$", text.split("\nFROM ")[0], re.MULTILINE)
-    return [(words[:-1], words[-1]) for words in (line.split() for line in lines)]
-
-
-def assemble(image: Path, *stages: str) -> None:
-    """Copy to `image` what the COPY lines copy from the context; a source that is missing there fails the build."""
-    context = context_files()
-    for sources, target in (copy for stage in stages for copy in copies(stage)):
-        for source in sources:
-            files = [path for path in context if path == Path(source) or Path(source) in path.parents]
-            assert files, f"COPY {source}: .dockerignore excludes it"
-            inside = target.lstrip("/")  # of the image, not of this machine
-            for path in files:
-                below = path.relative_to(source) if path != Path(source) else Path()
-                copy = image / (Path(inside) / path.name if target.endswith("/") else Path(inside) / below)
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(ROOT / path, copy)
+def can_mount() -> bool:
+    """Whether this user may mount file systems that only a process and its children see."""
+    unshare = shutil.which("unshare")
+    return (
+        unshare is not None
+        and os.geteuid() == 0
+        and subprocess.run([unshare, "--mount", "true"], check=False).returncode == 0
+    )
 
 
 def as_the_images_user(data: Path) -> list[str]:
@@ -100,10 +73,6 @@ def as_the_images_user(data: Path) -> list[str]:
     os.chown(data, USER, USER)
     may = "--inh-caps=-all,+dac_read_search --ambient-caps=-all,+dac_read_search --bounding-set=-all,+dac_read_search"
     return [setpriv, f"--reuid={USER}", f"--regid={USER}", "--clear-groups", *may.split(), "--no-new-privs"]
-
-
-def files_of(tree: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(tree)): path.read_bytes() for path in tree.rglob("*") if path.is_file()}
 
 
 @contextmanager
@@ -142,20 +111,12 @@ def serving(image: Path, data: Path, *, drop: bool = True, **more: str) -> Itera
             process.kill()
 
 
-@pytest.fixture
-def root() -> Iterator[Path]:
-    """A folder that every user can reach, unlike `tmp_path`."""
-    with TemporaryDirectory(prefix="waymark-image-") as folder:
-        Path(folder).chmod(0o755)
-        yield Path(folder)
-
-
 @pytest.mark.slow
 def test_the_command_copies_the_compiled_decoders_once(tmp_path: Path) -> None:
     kernels, numba = tmp_path / "kernels", tmp_path / "numba"
     (kernels / "plate").mkdir(parents=True)
     (kernels / "plate/fit.nbi").write_bytes(b"compiled")
-    script = (ROOT / "docker/waymark").read_text().replace("/opt/waymark/kernels", str(kernels))
+    script = (ROOT / "docker/waymark").read_text().replace("sys.prefix", repr(str(tmp_path)))
     environment = os.environ | {"NUMBA_CACHE_DIR": str(numba)}
     for stored in (b"compiled", b"compiled later"):
         done = subprocess.run(
@@ -166,50 +127,218 @@ def test_the_command_copies_the_compiled_decoders_once(tmp_path: Path) -> None:
         (numba / "plate/fit.nbi").write_bytes(b"compiled later")
 
 
-@pytest.mark.slow
-def test_the_image_has_what_the_server_needs(root: Path) -> None:
-    assemble(root, "build")
-    image = root / "opt/waymark/src"
-    assert (root / "tmp/requirements.txt").is_file()
-    assert not list(image.glob("**/__pycache__"))
-    assert {path.name for path in image.iterdir()} == {"app", "migrations", "static", "LICENSE"}
-    for path in (image, *image.rglob("*")):
-        path.chmod(0o555 if path.is_dir() else 0o444)  # the image is read-only, also for the owner of these files
-    before = files_of(image)
-    key = {"WAYMARK_ADMIN_KEY": KEY["Authorization"].removeprefix("Bearer ")}
-    with (
-        serving(image, root / "var", **key) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=WITHIN_S) as client,
-    ):
-        assert client.get("/healthz").status_code == 200
-        page = client.get("/")
-        assert page.status_code == 200
-        assert "<title>Waymark</title>" in page.text
-        for name in re.findall(r'(?:src|href)="(/static/[^"]+)"', page.text):
-            assert client.get(name).content == (image / name.removeprefix("/")).read_bytes()
-        created = client.post("/v1/markers", json={"position": {"lon_deg": 8.4, "lat_deg": 49.0}}, headers=KEY)
-        assert created.status_code == 201, created.text
-    assert files_of(image) == before
+def test_a_process_of_the_image_does_not_start_the_command_again() -> None:
+    """Python runs the script once more in every decoder process, under another name."""
+    runpy.run_path(str(ROOT / "docker/waymark"), run_name="__mp_main__")
+
+
+# --- the image, built -----------------------------------------------------------------------------------------------
+
+
+def recording() -> MagnetTrace:
+    """The trace of the README's drive."""
+    with zipfile.ZipFile(ROOT / "docs/images/drive.zip") as archive:
+        return read_trace({name: archive.read(name) for name in archive.namelist()}, TraceDeclaration()).trace
+
+
+def uploads(folder: Path) -> Iterator[tuple[str, bytes, dict[str, Any]]]:
+    """Name, content and context of a file of each kind."""
+    pictures = ROOT / "docs/images"
+    place = json.loads((pictures / "frame.json").read_text())
+    yield "frame.jpg", (pictures / "frame.jpg").read_bytes(), place
+    picture = cv2.resize(cv2.imread(str(pictures / "frame.jpg")), (960, 540))
+    film, camera = io.BytesIO(), place["camera"] | {"width_px": 960, "height_px": 540}
+    with av.open(film, "w", format="mp4") as container:
+        stream: Any = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 960, 540, "yuv420p", 20_000_000
+        for _ in range(VIDEO_FRAMES):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+    yield "drive.mp4", film.getvalue(), place | {"camera": camera}
+    near = {"coarse_position": {"lon_deg": 8.417, "lat_deg": 49.006, "accuracy_m": 50}}
+    near |= {"captured_at": "2026-06-01T08:00:00Z"}
+    yield "drive.zip", (pictures / "drive.zip").read_bytes(), near | {"trace": {}}
+    yield "packets.csv", (pictures / "packets.csv").read_bytes(), {"packets": {"accept_clear": True}}
+    trace = recording()
+    straight = replace(trace, heading_t_s=trace.speed_t_s, heading_deg=0.0 * trace.speed_t_s)  # the log has headings
+    files = {"array.bin": write_array_stream(trace), "drive.log": can_log(straight, "log", folder)}
+    speed = {"arbitration_id": 0x36A, "start_bit": 23, "length": 12, "byte_order": "big", "factor": 1 / 64}
+    can = {"speed": speed | {"unit": "km/h", "maximum": 300}, "offset_s": 0.0}
+    yield "can.zip", zipped(files), near | {"trace": {"can": can}}
+    yield "drive.parquet", parquet(trace), near | {"trace": {"unit": "uT", "axes": "ISO8855"}}
+
+
+def found_in(name: str, decode: dict[str, Any]) -> int:
+    """Number of tags, of points of a lane, of frames decoded of a video, or of plates in a frame."""
+    if "lane" in decode:
+        return len(decode["lane"]["stations"]["confidence"])
+    return len(decode["frames" if name.endswith(".mp4") else "tags" if "tags" in decode else "readings"])
+
+
+@contextmanager
+def running(image: Path, log: Path, *arguments: str, **more: str) -> Iterator[subprocess.Popen[bytes]]:
+    """The image's own program with its own environment, as its user and with a root that is read-only where possible.
+
+    Only root can become another user and mount; another user runs it as itself, on files without the right to write.
+    """
+    data, temporary = image / "var/lib/waymark", image / "tmp"
+    environment = {n: v for n, v in os.environ.items() if not n.startswith(("WAYMARK_", "PYTHON", "NUMBA_"))}
+    environment |= settings_of(image) | {"HOME": str(data), "TMPDIR": str(temporary)} | more
+    command = [*as_the_images_user(data), command_of(image)[0], *arguments]
     if os.geteuid() == 0:
-        assert (root / "var/waymark.sqlite3").stat().st_uid == USER
-    for path in (image, *(path for path in image.rglob("*") if path.is_dir())):
-        path.chmod(0o755)  # for pytest, which removes it
+        os.chown(temporary, USER, USER)
+    if can_mount():
+        mounts = [f"mount --bind {folder} {folder}" for folder in (data, temporary)]
+        script = " && ".join(["mount --make-rprivate /", *mounts, "mount -o remount,bind,ro /", 'exec "$@"'])
+        command = ["unshare", "--mount", "sh", "-c", script, "sh", *command]
+    with log.open("wb") as out, subprocess.Popen(command, cwd="/", env=environment, stdout=out, stderr=out) as process:
+        try:
+            yield process
+            assert process.poll() is None, log.read_text()[-5000:]
+            process.send_signal(signal.SIGTERM)
+            process.wait(WITHIN_S)
+        finally:
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def image() -> Iterator[Path]:
+    """The image, in a folder that every user can reach, unlike those of pytest."""
+    with TemporaryDirectory(prefix="waymark-image-") as folder:
+        Path(folder).chmod(0o755)
+        built = build_image(Path(folder))
+        code = [path for path in (built / "opt/waymark/lib").rglob("*") if not path.is_symlink()]
+        for path in code:  # as the user of the image finds it, also where the tests run without root
+            path.chmod(path.stat().st_mode & ~0o222)
+        yield built
+        for path in code:
+            if path.is_dir():
+                path.chmod(0o755)
+
+
+def started(process: subprocess.Popen[bytes], log: Path) -> str:
+    """Address of a server, as soon as its log has it."""
+
+    def address() -> str | None:
+        assert process.poll() is None, log.read_text()[-5000:]
+        found = STARTED.search(log.read_text())
+        return found[1] if found else None
+
+    return wait_until(address, "the server", 2 * WITHIN_S)
+
+
+def decode_all(client: httpx.Client, folder: Path, **headers: str) -> dict[str, int]:
+    """Upload a file of each kind; what was found in each."""
+    found = {}
+    for name, content, context in uploads(folder):
+        parts = {"file": (name, content), "context": (None, json.dumps(context), "application/json")}
+        answer = client.post("/v1/decodes", files=parts, headers=headers)
+        assert answer.status_code in (201, 202), f"{name}: {answer.text}"
+        decode = answer.json()
+        if answer.status_code == 202:
+            decode = finished(client, answer.headers["location"])
+            assert decode["state"] == "done", f"{name}: {decode}"
+        found[name] = found_in(name, decode)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)  # a loaded machine compiles the decoders for minutes
+def test_the_server_of_the_image_decodes_every_kind_of_upload(image: Path, tmp_path: Path) -> None:
+    pip = [str(image / "opt/waymark/bin/python"), "-m", "pip", "show", "waymark-roads"]
+    assert f"Version: {__version__}" in subprocess.run(pip, capture_output=True, text=True, check=True).stdout
+    kernels = {path.name.split("-")[0] for path in (image / "opt/waymark/kernels").rglob("*.nbi")}
+    assert kernels == declared_kernels(), "`waymark compile` does not compile all kernels"
+    before = {path: path.lstat().st_mtime_ns for path in (image / "opt").rglob("*")}
+    own = {"WAYMARK_ADMIN_KEY": KEY, "WAYMARK_HOST": "127.0.0.1", "WAYMARK_DECODE_TIMEOUT_S": "600"}
+    log = tmp_path / "server"
+    with running(image, log, *command_of(image)[1:], "--port", "0", **own) as process:
+        url = started(process, log)
+        with httpx.Client(base_url=url, headers={"X-API-Key": KEY}, trust_env=False, timeout=2 * WITHIN_S) as client:
+            page = client.get("/").text
+            assert "<title>Waymark</title>" in page
+            for name in re.findall(r'(?:src|href)="(/static/[^"]+)"', page):
+                assert client.get(name).status_code == 200
+            assert_all_found(decode_all(client, tmp_path))
+            ready = client.get("/readyz")
+            assert ready.status_code == 200, ready.text
+    text = log.read_text()
+    assert len(STARTED.findall(text)) == 1, "a decoder process started the server again"
+    assert "kernels are compiled" not in text
+    assert {path: path.lstat().st_mtime_ns for path in (image / "opt").rglob("*")} == before
+    if os.geteuid() == 0:
+        assert (image / "var/lib/waymark/waymark.sqlite3").stat().st_uid == USER
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_worker_of_the_image_decodes_every_kind_of_upload(
+    image: Path, tmp_path: Path, postgres: PostgresServer
+) -> None:
+    log, other = tmp_path / "server", tmp_path / "worker"
+    with login(postgres) as database_url, own_queues(broker_url := find_broker()) as prefix:
+        own = {"WAYMARK_ADMIN_KEY": KEY, "WAYMARK_HOST": "127.0.0.1", "WAYMARK_DECODE_TIMEOUT_S": "600"}
+        own |= {"WAYMARK_DATABASE_URL": database_url, "WAYMARK_BROKER_URL": broker_url, "WAYMARK_BROKER_PREFIX": prefix}
+        own |= {"WAYMARK_BLOBS_SHARED": "true", "WAYMARK_WORKER_METRICS_PORT": "0"}
+        with running(image, log, "serve", "--port", "0", **own, WAYMARK_WARM_DECODERS="false") as process:
+            url = started(process, log)
+            with (
+                running(image, other, "worker", **own),
+                httpx.Client(base_url=url, headers={"X-API-Key": KEY}, trust_env=False, timeout=WITHIN_S) as client,
+            ):
+                assert_all_found(decode_all(client, tmp_path, Prefer="respond-async"))
+    assert "kernels are compiled" not in other.read_text()
+
+
+def assert_all_found(found: dict[str, int]) -> None:
+    assert found.pop("drive.mp4") == VIDEO_FRAMES
+    assert len(found) == 5
+    assert min(found.values()) > 0, found
+    assert found["can.zip"] == found["drive.parquet"] == found["drive.zip"]
+
+
+@contextmanager
+def login(postgres: PostgresServer) -> Iterator[str]:
+    """URL of an empty database for a role with a password: the image's user is none of the server's machine."""
+    url = sa.make_url(postgres.empty())
+    role, password = f"waymark_image_{secrets.token_hex(4)}", secrets.token_hex(16)
+    options = str(url.query["options"])
+    owner = options.rsplit("role=", 1)[1]
+    engine = sa.create_engine(postgres.url, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.exec_driver_sql(f"CREATE ROLE {role} LOGIN PASSWORD '{password}' IN ROLE {owner}")
+        port = int(connection.exec_driver_sql("SHOW port").scalar_one())
+        try:
+            yield sa.URL.create(
+                url.drivername, role, password, "127.0.0.1", port, url.database, {"options": options}
+            ).render_as_string(hide_password=False)
+        finally:
+            connection.exec_driver_sql(f"DROP ROLE {role}")
+    engine.dispose()
+
+
+def declared_kernels() -> set[str]:
+    """Module and name of every function whose compiled code is cached, as the names of the cache's files begin."""
+    declared = r"^@(?:ieee_)?(?:loop_)?kernel\ndef (\w+)"
+    files = (ROOT / "app").rglob("*.py")
+    return {f"{path.stem}.{name}" for path in files for name in re.findall(declared, path.read_text(), re.M)}
 
 
 def test_the_base_is_pinned_and_nothing_is_downloaded_without_a_hash() -> None:
     lines = (ROOT / "docker/Dockerfile").read_text()
     bases = set(re.findall(r"^FROM (\S+)", lines, re.MULTILINE))
-    assert bases == {"${PYTHON}", "build"}
+    assert bases == {"${PYTHON}", "build"}  # stages and the pinned base
     assert re.search(r"^ARG PYTHON=python:3\.11-slim-bookworm@sha256:[0-9a-f]{64}$", lines, re.MULTILINE)
     runs = re.findall(r"^RUN (.+?[^\\])$", lines, re.MULTILINE | re.DOTALL)
-    assert len(runs) == 6
+    assert len(runs) == 10
     for run in runs:
         assert not re.search(r"\b(apt|apt-get|curl|wget|git)\b", run)
-        assert "pip" not in run or "--require-hashes" in run
+        assert "bin/pip" not in run or "--require-hashes" in run or "--no-index" in run
     pattern = r"^[a-z0-9][^\n]*==[^\n]*(?:\n +[^\n]*)*"
     wanted = re.findall(pattern, (ROOT / "docker/requirements.txt").read_text(), re.M)
     assert len(wanted) > 80
-    wanted += re.findall(pattern, (ROOT / "docker/requirements-guide.txt").read_text(), re.M)
+    for other in ("guide", "build"):
+        wanted += re.findall(pattern, (ROOT / f"docker/requirements-{other}.txt").read_text(), re.M)
     assert len(wanted) > 100
     assert all("--hash=sha256:" in requirement for requirement in wanted)
 
@@ -219,7 +348,8 @@ def test_the_images_requirements_are_those_of_the_tests() -> None:
         return set(re.findall(r"^([a-z0-9][\w.-]*==\S+)", (ROOT / path).read_text(), re.MULTILINE))
 
     assert versions("requirements.txt") <= versions("docker/requirements.txt") <= versions("requirements-dev.txt")
-    assert versions("docker/requirements-guide.txt") <= versions("requirements-dev.txt")
+    for other in ("guide", "build"):
+        assert versions(f"docker/requirements-{other}.txt") <= versions("requirements-dev.txt")
 
 
 def test_what_the_build_does_not_need_stays_outside() -> None:
@@ -243,8 +373,6 @@ def test_the_proxy_has_the_limits_of_the_server(tmp_path: Path) -> None:
     ):
         assert re.search(rf"^ *{directive} {expected};", text, re.MULTILINE), directive
     (tmp_path / "nginx.conf").write_text(text.replace("server waymark:8000", "server 127.0.0.1:8000"))
-    if (nginx := shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin")) is None:
-        pytest.skip("nginx is not installed")
-    command = [nginx, "-t", "-p", str(tmp_path), "-c", "nginx.conf"]
+    command = [require_tool("nginx"), "-t", "-p", str(tmp_path), "-c", "nginx.conf"]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stderr

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import io
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
-import cairosvg
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +18,7 @@ from app.encoders.plate import ArtworkFormat, write_artwork
 from app.errors import InvalidParameter
 from app.sensors.calibration_board import CalibrationBoard
 from tests.http import WITHIN_S
+from tests.machine import require_module, require_tool
 
 BOARDS = (CalibrationBoard(), CalibrationBoard(12, 9, 40.0, 30.0), CalibrationBoard(5, 4, 15.0, 9.0))
 Grey = npt.NDArray[np.uint8]
@@ -55,16 +54,14 @@ def test_a_svg_is_the_board_in_millimetres(board: CalibrationBoard) -> None:
     assert head is not None
     width, height, box_width, box_height = (float(value) for value in head.groups())
     assert (width, height) == (box_width, box_height) == (drawing.width_mm, drawing.height_mm)
-    png = cairosvg.svg2png(svg, output_width=round(width * 6))
+    png = require_module("cairosvg", "libcairo").svg2png(svg, output_width=round(width * 6))
     grey = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     _check(grey, board, width)
 
 
 @pytest.mark.parametrize("board", BOARDS[:2], ids=str)
 def test_a_pdf_is_the_board_in_millimetres(board: CalibrationBoard, tmp_path: Path) -> None:
-    program = shutil.which("pdftoppm")
-    if program is None:
-        pytest.skip("poppler-utils are not installed")
+    program = require_tool("pdftoppm")
     drawing = encode_board(board)
     content = write_artwork(drawing, ArtworkFormat.PDF).content
     with pikepdf.open(io.BytesIO(content)) as document:

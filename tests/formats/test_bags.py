@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import io
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("mcap", reason="the extra bags is not installed")
-pytest.importorskip("rosbags", reason="the extra bags is not installed")
-
-from mcap.writer import Writer
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.typesys import Stores, get_typestore
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.bags import messages as bag_messages
@@ -26,6 +20,12 @@ from app.formats.video.container import VideoFile, VideoKind, detect_video
 from app.formats.video.frames import ReadReport, read_frames
 from app.formats.video.index import VideoIndex, index_video
 from tests.formats.pictures import jpeg
+from tests.machine import require_module
+
+mcap_writer = require_module("mcap.writer", "the extra bags")
+Writer, CompressionType = mcap_writer.Writer, mcap_writer.CompressionType
+Ros1Writer = require_module("rosbags.rosbag1", "the extra bags").Writer
+typesys = require_module("rosbags.typesys", "the extra bags")
 
 START_NS = 1_777_883_400_000_000_000
 STEP_NS = 100_000_000
@@ -103,7 +103,7 @@ def _raw(store: Any) -> list[tuple[str, str, int, Any]]:
 
 def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None, padding: int = 0) -> bytes:
     """A ROS 2 bag in SQLite, with the tables of rosbag2_storage_sqlite3 and some bytes that no reader asks for."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     database = sqlite3.connect(path)
     database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
     database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
@@ -123,7 +123,7 @@ def sqlite_bag(path: Path, listed: list[tuple[str, str, int, Any]] | None = None
 
 def mcap() -> bytes:
     """An MCAP file with pictures, positions and text."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     out = io.BytesIO()
     writer = Writer(out, chunk_size=4096)
     writer.start(profile="ros2")
@@ -139,7 +139,7 @@ def mcap() -> bytes:
 
 def ros1(path: Path) -> bytes:
     """The same as a ROS 1 bag."""
-    store = get_typestore(Stores.ROS1_NOETIC)
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
     with Ros1Writer(path) as writer:
         connections: dict[str, Any] = {}
         for topic, kind, at, message in _messages(store):
@@ -186,7 +186,39 @@ def test_bags_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     with pytest.raises(UnsupportedUpload) as refused:
         _indexed(data)
-    assert "waymark[bags]" in refused.value.cure
+    assert "waymark-roads[bags]" in refused.value.cure
+
+
+def bomb(chunks: int, *, repeats: int = 1, expanded: int | None = None, time_ns: int = START_NS) -> bytes:
+    """An MCAP of chunks of 3 MB of zeros; its index names each several times, and may state a false size."""
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=1024, compression=CompressionType.ZSTD)
+    writer.start(profile="ros2")
+    schema = writer.register_schema("sensor_msgs/msg/CompressedImage", "ros2msg", b"")
+    channel = writer.register_channel("/camera", "cdr", schema)
+    for _ in range(chunks):
+        writer.add_message(channel, time_ns, bytes(3_000_000), time_ns)
+    index = writer._Writer__chunk_indices if hasattr(writer, "_Writer__chunk_indices") else writer._chunk_indices
+    index[:] = [replace(entry, uncompressed_size=expanded or entry.uncompressed_size) for entry in index * repeats]
+    writer.finish()
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (bomb(2, repeats=100), "names a chunk twice"),
+        (bomb(2, expanded=100), "another size than it has"),
+        (bomb(100), "expand from"),
+        (bomb(1, time_ns=2**63), "has the time 9223372036854775808 ns"),
+        (bomb(1, time_ns=2**64 - 1), "has the time 18446744073709551615 ns"),
+    ],
+)
+def test_an_index_that_expands_to_too_much_is_refused_before_a_chunk_is_read(data: bytes, why: str) -> None:
+    assert len(data) < 100_000
+    with pytest.raises((UnreadableUpload, UploadTooLarge), match=why) as refused:
+        _indexed(data)
+    assert (refused.value.field, bool(refused.value.limit), bool(refused.value.cure)) == ("file", True, True)
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -230,14 +262,14 @@ CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 
 
 
 def test_raw_pictures(tmp_path: Path) -> None:
-    index = _indexed(sqlite_bag(tmp_path / "a.db3", _raw(get_typestore(Stores.ROS2_HUMBLE))))
+    index = _indexed(sqlite_bag(tmp_path / "a.db3", _raw(typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))))
     assert (index.width_px, index.height_px) == (34, 20)
     frames = list(read_frames(index, index.segments[0], ReadReport()))
     assert [frame.bgr()[19, 33].tolist() for frame in frames] == [[0, 0, 200]] * 3
 
 
 def test_magnetometers_are_a_trace(tmp_path: Path) -> None:
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     data = sqlite_bag(tmp_path / "a.db3", bag_fields(store, 3, 600))
     declared = TraceDeclaration(sensors=3, axes=AxisConvention.ISO8855, references=())
     with (tmp_path / "a.db3").open("rb") as stream:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import struct
 import tempfile
@@ -12,6 +13,7 @@ from typing import Any
 
 import av
 import numpy as np
+import psutil
 import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
@@ -35,16 +37,18 @@ def picture(number: int) -> np.ndarray[Any, Any]:
 
 def video(
     frames: int = 20, *, codec: str = "mpeg4", form: str = "mp4", stamps: list[int] | None = None, group: int = 5,
-    rotation: int | None = None,
+    between: int = 0,
 ) -> bytes:  # fmt: skip
-    """An encoded video at 10 Hz; `stamps` are times in tenths of a second."""
+    """An encoded video at 10 Hz; `stamps` are times in tenths of a second, `between` the B-frames in a row."""
     out = io.BytesIO()
     with av.open(out, "w", format=form) as container:
         stream: Any = container.add_stream(codec, rate=10)
+        stream.codec_context.max_b_frames = between
         stream.width, stream.height = WIDTH, HEIGHT
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
         if codec == "libx264":
-            stream.options = {"preset": "ultrafast", "x264-params": f"log-level=none:scenecut=0:keyint={group}"}
+            x264 = f"log-level=none:scenecut=0:keyint={group}:bframes={between}:b-adapt=0:open-gop=1"
+            stream.options = {"preset": "ultrafast", "x264-params": x264}
         for number in range(frames):
             frame = av.VideoFrame.from_ndarray(picture(number), format="bgr24")
             frame.pts, frame.time_base = (stamps or list(range(frames)))[number], Fraction(1, 10)
@@ -138,6 +142,92 @@ def test_segments_begin_at_key_frames_and_cover_all_frames() -> None:
 def test_limits(limits: VideoLimits) -> None:
     with pytest.raises(UploadTooLarge):
         indexed(video(), limits=limits)
+
+
+def levels(index: VideoIndex) -> list[tuple[int, int]]:
+    """Number and level (`picture`) of each frame, segment by segment."""
+    return [
+        (frame.number, round(int(frame.bgr()[60, 120, 1]) / 8))
+        for segment in index.segments
+        for frame in read_frames(index, segment, ReadReport())
+    ]
+
+
+@pytest.mark.parametrize("codec", ["mpeg4", "libx264"])
+@pytest.mark.parametrize(("form", "kind"), [("mp4", VideoKind.MP4), ("avi", VideoKind.AVI)])
+def test_frames_are_numbered_in_the_order_in_which_they_are_shown(codec: str, form: str, kind: VideoKind) -> None:
+    """B-frames are decoded after a later frame; AVI states no time at which a frame is shown."""
+    index = indexed(video(300, codec=codec, form=form, group=50, between=2), kind)
+    assert len(index.segments) == 3
+    for number, level in levels(index):
+        assert abs(number % 30 - level) <= 1, (number, level)
+    assert [number for number, _level in levels(index)] == list(range(300))
+
+
+def trimmed(data: bytes, frames: int) -> bytes:
+    """The video without its first frames, as ``ffmpeg -ss -c copy`` cuts it: an edit list leaves them out."""
+    out = io.BytesIO()
+    options = {"use_editlist": "1", "avoid_negative_ts": "disabled"}
+    with av.open(io.BytesIO(data)) as source, av.open(out, "w", format="mp4", options=options) as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None and packet.pts is not None:
+                shift = round(Fraction(frames, 10) / packet.time_base)
+                packet.pts, packet.dts, packet.stream = packet.pts - shift, packet.dts - shift, stream
+                target.mux(packet)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("between", [0, 2])
+def test_frames_that_the_edit_list_leaves_out_are_not_shown(between: int) -> None:
+    index = indexed(trimmed(video(40, codec="libx264", group=20, between=between), 3))
+    assert index.time_s == pytest.approx(np.arange(37) / 10, abs=1e-3)
+    shown = levels(index)
+    assert [number for number, _level in shown] == list(range(37))
+    for number, level in shown:
+        assert abs((number + 3) % 30 - level) <= 1, (number, level)
+    assert index.gaps == ()
+
+
+@pytest.mark.parametrize(("form", "kind"), [("mp4", VideoKind.MP4), ("avi", VideoKind.AVI)])
+@pytest.mark.parametrize("seed", range(6))
+def test_every_frame_of_a_damaged_video_is_shown_or_counted(form: str, kind: VideoKind, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    whole = video(150, codec="libx264", form=form, group=40, between=2)
+    data = bytearray(whole)
+    with av.open(io.BytesIO(whole)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    for k in rng.choice(np.arange(1, len(packets)), 20, replace=False):
+        at, size = packets[int(k)]
+        data[at + 4 : at + size] = rng.bytes(size - 4)
+    index = indexed(bytes(data), kind)
+    failed = 0
+    for segment in index.segments:
+        report = ReadReport()
+        shown = list(read_frames(index, segment, report, beyond=10))
+        own = [frame.number for frame in shown if frame.number < segment.end]
+        assert len(own) + report.damaged + report.other_size == segment.end - segment.first
+        assert own == sorted(set(own))
+        failed += report.damaged
+    assert 0 < failed < len(index.stamps)
+
+
+def test_reading_starts_no_thread_and_leaves_no_frames_in_memory() -> None:
+    """A converter with threads of its own for each frame, and frames in reference cycles, filled decoder processes."""
+    index = indexed(video(40))
+    process, threads = psutil.Process(), set()
+    gc.collect()
+    gc.disable()
+    try:
+        before = process.num_threads()
+        for frame in read_frames(index, VideoSegment(0, 40), ReadReport()):
+            frame.bgr()
+            threads.add(process.num_threads())
+        kept = sum(isinstance(thing, av.VideoFrame) for thing in gc.get_objects())
+    finally:
+        gc.enable()
+    assert threads == {before}
+    assert kept <= 2  # the last one, and the small copy whose display matrix was read
 
 
 # --- files that lead elsewhere ----------------------------------------------------------------------------------------

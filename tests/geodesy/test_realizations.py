@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pyproj import Geod, Transformer
@@ -100,3 +102,17 @@ def test_other_vertical_datums_are_refused(text: str) -> None:
     with pytest.raises(ReferenceSystemError, match="vertical datum") as caught:
         normalize_vertical_datum(text)
     assert "EPSG:5703" in (caught.value.cure or "")
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "moved_m"), [("Karlsruhe", KARLSRUHE, 0.25), ("Michigan", (-85.6436, 42.2531), 0.16)]
+)
+def test_motion_without_an_epoch_is_stated_beside_the_error_of_its_model(
+    name: str, place: tuple[float, float], moved_m: float
+) -> None:
+    placed = place_position(*place, realization="ITRF2014")
+    assert placed.note is not None
+    assert f"moves by {moved_m:.2f} m in 10 years, by a model with an error of 0.02 m" in placed.note
+    assert placed.transform_accuracy_m == pytest.approx(moved_m + 0.02, abs=0.005)
+    page = (Path(__file__).resolve().parents[2] / "docs/positions.md").read_text()
+    assert f"{moved_m:.2f} + 0.02 m in {name}" in page

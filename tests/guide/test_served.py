@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import socket
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from app.settings import Settings
 from tests.browser import Browser
 from tests.conftest import ADMIN_KEY, LiveServer
 from tests.http import refused
+from tests.machine import require_tool
 
 pytestmark = pytest.mark.slow
 
@@ -66,11 +65,7 @@ def test_no_file_outside_the_folder_is_sent(guide_server: LiveServer, site: Path
 
 
 def test_the_search_works_in_a_browser_and_the_policy_refuses_nothing(guide_server: LiveServer, tmp_path: Path) -> None:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        if os.environ.get("CI"):
-            pytest.fail("chromium is not installed")
-        pytest.skip("chromium is not installed")
+    chromium = require_tool("chromium")
     with Browser(chromium, tmp_path / "profile") as browser:
         browser.open(f"{guide_server.url}/guide/")
         assert "Planner" in browser.run("document.querySelector('.sidebar-tree').innerText").title()

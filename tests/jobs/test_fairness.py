@@ -16,7 +16,8 @@ from app.jobs.places import Places
 from app.registry.jobs import JobKind, UnfinishedJob
 from app.registry.tenancy import EVERY_AGENCY
 from app.services.job_queues import QUEUES
-from tests.http import WITHIN_S
+from app.services.request_work import add_processor_time
+from tests.http import WITHIN_S, wait_until
 
 
 def test_owners_are_served_in_turn_each_in_its_order() -> None:
@@ -30,6 +31,75 @@ def test_owners_are_served_in_turn_each_in_its_order() -> None:
     assert [queue.get() for _ in range(4)] == ["c0", "b1", "a2", "a3"]
     with pytest.raises(Empty):
         queue.get(0.0)
+
+
+def test_the_owner_that_used_least_lately_is_next() -> None:
+    now_s = 0.0
+    queue: FairQueue[str] = FairQueue(now_s=lambda: now_s)
+    for number in range(3):
+        queue.put("a", f"a{number}")
+        queue.put("b", f"b{number}")
+    assert queue.get() == "a0"
+    queue.done("a", 10.0)
+    for expected in ("b0", "b1"):  # 4 and 8 s are less than 10
+        assert queue.get() == expected
+        queue.done("b", 4.0)
+    assert queue.get() == "b2"
+    queue.done("b", 4.0)
+    assert queue.get() == "a1"
+    queue.put("c", "c0")
+    assert queue.get() == "c0"
+    queue.done("c", 1.0)
+    now_s = 3600.0  # what was used an hour ago counts no more than the last turn
+    queue.put("c", "c1")
+    queue.done("a", 0.5)
+    assert queue.get() == "c1"
+
+
+def test_jobs_of_an_owner_leave_room_for_others_that_were_there_lately() -> None:
+    now_s = 0.0
+    queue: FairQueue[str] = FairQueue(jobs_at_once=1, now_s=lambda: now_s)
+    for number in range(4):
+        queue.put("a", f"a{number}", is_job=True)
+    assert [queue.get(), queue.get()] == ["a0", "a1"]  # nobody else is there
+    queue.put("b", "b0", is_job=True)
+    assert queue.get() == "b0"
+    queue.done("b", is_job=True)
+    queue.done("a", is_job=True)
+    with pytest.raises(Empty):
+        queue.get(0.0)  # one of a's jobs runs, and b was there
+    queue.put("a", "at once")
+    assert queue.get() == "at once"  # what a client waits for is no job
+    queue.done("a")
+    now_s = 4000.0
+    assert queue.get() == "a2"
+
+
+def test_work_of_the_server_itself_is_no_other_owner() -> None:
+    queue: FairQueue[str] = FairQueue(jobs_at_once=1)
+    for owner in ("", EVERY_AGENCY):
+        queue.put(owner, owner)
+        queue.get()
+    queue.put("a", "a0", is_job=True)
+    queue.put("a", "a1", is_job=True)
+    assert [queue.get(0.0), queue.get(0.0)] == ["a0", "a1"]
+
+
+def test_the_time_of_jobs_that_somebody_waits_for_is_charged_to_their_agency() -> None:
+    charged: dict[str, float] = {}
+    ended = threading.Event()
+    jobs = LocalQueue()
+    jobs.charge = charged.__setitem__
+    jobs.open(Run(lambda job_id: add_processor_time(7.0) if job_id == "video" else ended.set()))
+    try:
+        jobs.submit("proof", "one", JobKind.PROOF)
+        jobs.submit("video", "two", JobKind.DECODE)
+        wait_until(lambda: "two" in charged, "the charge")
+        assert ended.wait(WITHIN_S)
+    finally:
+        jobs.close()
+    assert list(charged) == ["two"]
+    assert charged["two"] >= 7.0
 
 
 def test_a_closed_queue_ends_when_it_is_empty() -> None:
@@ -62,16 +132,17 @@ class Run:
 
 
 @pytest.mark.parametrize("at_start", [False, True], ids=["submitted", "unfinished at the start"])
-def test_a_job_waits_for_the_running_one_not_for_a_thousand_of_another_agency(at_start: bool) -> None:
+def test_a_job_runs_beside_that_of_another_agency_which_has_a_thousand_waiting(at_start: bool) -> None:
     ran: list[str] = []
     may_go_on, first, second = threading.Event(), threading.Event(), threading.Event()
 
     def run(job_id: str) -> None:
         ran.append(job_id)
-        first.set()
-        assert may_go_on.wait(WITHIN_S)
         if job_id == "other":
             second.set()
+        else:
+            first.set()
+            assert may_go_on.wait(WITHIN_S)
 
     many = [UnfinishedJob(f"one {number}", "one", JobKind.DECODE) for number in range(1000)]
     jobs = LocalQueue()
@@ -80,11 +151,11 @@ def test_a_job_waits_for_the_running_one_not_for_a_thousand_of_another_agency(at
         assert first.wait(WITHIN_S)
         if not at_start:
             jobs.submit("other", "two", JobKind.DECODE)
-        may_go_on.set()
         assert second.wait(WITHIN_S)
+        assert sorted(ran) == ["one 0", "other"]  # one of each agency, though the first one still runs
+        may_go_on.set()
     finally:
         jobs.close()
-    assert ran[:2] == ["one 0", "other"]
 
 
 def test_an_agency_alone_has_all_places_and_beside_another_half() -> None:

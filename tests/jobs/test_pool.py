@@ -16,10 +16,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from app.errors import InvalidParameter, Unavailable, UnreadableUpload
+from app.errors import InvalidParameter, ProcessStopped, Unavailable, UnreadableUpload
 from app.families.plate.frames import PlateSearch
 from app.formats.spooled_file import SpooledFile
-from app.jobs import supervisor
+from app.jobs import decoder_process, supervisor
 from app.jobs.pool import DecodePool
 from app.jobs.process_limits import ProcessLimits
 from app.jobs.supervisor import Pending, WorkerSupervisor
@@ -100,7 +100,7 @@ def test_a_killed_process_loses_only_its_own_frame(pool: DecodePool) -> None:
     bad = start(pool, standin.DIE)
     more = [start(pool, standin.OBEY) for _ in range(4)]
     assert [p.result().readings[0].digits for p in good] == [CODE.digits] * 4
-    with pytest.raises(UnreadableUpload, match="stopped the decoder process"):
+    with pytest.raises(UnreadableUpload, match="interrupted: the decoder process ended"):
         bad.result()
     assert [p.result().readings[0].digits for p in more] == [CODE.digits] * 4
 
@@ -182,6 +182,27 @@ def test_the_process_that_imports_the_decoders_ends_with_the_server() -> None:
         wait_until(lambda: is_gone(child.pid), "the child to end")
 
 
+def test_the_process_that_decoder_processes_are_forks_of_has_one_thread(pool: DecodePool) -> None:
+    """A fork has none of the other threads, but the locks that they hold."""
+    forked = psutil.Process(child_of(pool)).parent()
+    assert forked is not None
+    assert forked.num_threads() == 1
+
+
+@pytest.mark.slow
+def test_decoders_and_their_kernels_are_loaded_before_a_process_is_forked() -> None:
+    """Else each decoder process has its own 90 MB of them; the collector would copy them, page by page."""
+    program = (
+        "import gc, os\nfrom app.jobs.forkserver_preload import load_decoders\nload_decoders()\n"
+        "from app.decoders.plate.gauss_newton import minimize\n"
+        "print(len(minimize.signatures) > 0, gc.get_freeze_count() > 100_000, gc.isenabled(),"
+        " len(os.listdir('/proc/self/task')))"
+    )
+    environment = os.environ | decoder_process.ONE_THREAD
+    run = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["True", "True", "True", "1"]
+
+
 def test_a_frame_that_takes_too_long_is_stopped() -> None:
     made = DecodePool(standin.decode, workers=1, limits=ProcessLimits(timeout_s=2.0))
     made.open()
@@ -207,6 +228,27 @@ def test_a_running_frame_can_be_cancelled(tmp_path: Path) -> None:
             pending.result()
         (tmp_path / "go").touch()
         assert child_of(made) != victim
+    finally:
+        made.close()
+
+
+@pytest.mark.parametrize("what", [standin.NO_THREAD, standin.NO_MEMORY])
+def test_a_process_that_ran_short_is_replaced_and_the_frame_tried_once_more(tmp_path: Path, what: int) -> None:
+    """What fills a process need not be the frame at which it shows: that one is read, and so is the next."""
+    made = DecodePool(partial(standin.run_short_once, tmp_path), workers=1)
+    made.open()
+    try:
+        first = child_of(made)
+        assert start(made, what).result().readings[0].digits == CODE.digits
+        assert made.describe().starts == 2
+        assert child_of(made) != first
+        (tmp_path / "short").unlink()
+        (tmp_path / "always").touch()
+        with pytest.raises(ProcessStopped, match="more memory"):
+            start(made, what).result()
+        (tmp_path / "always").unlink()
+        assert start(made, standin.OBEY).result().readings[0].digits == CODE.digits
+        assert made.describe().starts == 4
     finally:
         made.close()
 

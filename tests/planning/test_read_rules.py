@@ -37,9 +37,9 @@ def test_there_are_three_examples_and_they_are_read() -> None:
 
 
 def test_of_very_many_faults_the_first_are_named() -> None:
-    """Each was once looked up in a schema that was made anew: twenty minutes for this document."""
+    """Each was once looked up in a schema that was made anew: minutes for this document."""
     with pytest.raises(InvalidParameter) as caught:
-        read_rules(json.dumps({"version": 1, **{f"rule{k}": 1 for k in range(12_000)}}).encode())
+        read_rules(json.dumps({"version": 1, **{f"rule{k}": 1 for k in range(990)}}).encode())
     assert [part.field for part in caught.value.parts] == [f"rule{k}" for k in range(100)]
 
 
@@ -88,7 +88,12 @@ def test_yaml_is_version_1_2() -> None:
         (f"{BASE}applies: {{speed_kmh: [100, 50]}}", "applies", "correct"),
         (f"{BASE}temporary: {{from: 2026-05-01, to: 2026-04-01}}", "temporary", "correct"),
         (f"{BASE}cameras: [{{name: a}}, {{name: a}}]\n", "rules", "correct"),
-        (f"{BASE}1: 2", "[1]", "correct"),
+        (f"{BASE}temporary: {{from: 2026-13-01, to: 2026-14-01}}", "temporary.from", "correct"),
+        (f"{BASE}costs: {{currency: 0x{'f' * 4000}}}", "costs.currency", "correct"),
+        (f"version: 0x{'f' * 4000}", "version", "correct"),
+        ('{"version": 1, "plates": {"spacing_m": 1e400}}', "plates.spacing_m", "correct"),
+        (f'{BASE}name: "\\ud800"', "name", "correct"),
+        (f'{BASE}name: "\\0"', "name", "correct"),
     ],
 )
 def test_a_value_that_is_not_allowed_is_named(text: str, field: str, cure: str) -> None:
@@ -103,15 +108,20 @@ def test_a_value_that_is_not_allowed_is_named(text: str, field: str, cure: str) 
     ("text", "part"),
     [
         (f"{BASE}plates: {{}}", "line 3"),
-        ('{"version": 1, "plates": {}, "plates": {}}', "'plates' stands twice"),
+        ('{"version": 1, "plates": {}, "plates": {}}', "'plates' appears twice"),
         (f"{BASE}costs: [", "line 3"),
         ('{"version": 1,, }', "line 1, column 15"),
         ("a: &x [1]\nb: *x", "alias"),
         ("---\na: 1\n---\nb: 1", "another document"),
         ("[" * 150_000, "at most 20 levels: line 1, column 21"),
         ("- " * 90_000, "at most 20 levels"),
-        ("version: !!python/object:os.system 1", "constructor"),
+        ("version: !!python/object:os.system 1", "tag"),
         ("a: \x00", "YAML"),
+        (f"{BASE}1: 2", "a key is no text"),
+        ("? [1, {a: 1}]\n: x", "unhashable"),
+        (f"version: {'9' * 4301}", "4300 digits"),
+        ('{"version": ' + "9" * 4301 + "}", "beyond 64 bits"),
+        ("[" + "a," * 20_000 + "]", "10000 tokens"),
         (" " * (MAX_RULES_BYTES + 1), "bytes"),
     ],
 )

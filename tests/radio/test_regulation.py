@@ -9,7 +9,7 @@ import pytest
 from app.errors import InvalidParameter
 from app.markers.checks import RadioFinding, Verdict
 from app.radio.lorawan import Region
-from app.radio.regulation import FIELD_EIRP_DBM, check_legal, check_transmitter, is_permitted
+from app.radio.regulation import FIELD_EIRP_DBM, check_legal, check_transmitter, is_permitted, region_at
 from app.radio.settings import RadioSettings
 
 HOPPING = RadioSettings(
@@ -188,3 +188,26 @@ def test_the_transmitter_sends_one_percent_of_the_time_above_17_dbm() -> None:
 
 def test_the_default_settings_are_permitted_where_their_frequency_is() -> None:
     assert is_permitted(RadioSettings(), Region.US915)
+
+
+def test_the_region_of_a_place_is_known_inside_of_it_only() -> None:
+    places = {
+        Region.US915: {"Kalamazoo": (-85.6, 42.3), "Detroit suburbs": (-83.5, 42.4), "Seattle": (-122.3, 47.6),
+                       "Miami": (-80.2, 25.8), "New York": (-74.0, 40.7), "Anchorage": (-149.9, 61.2),
+                       "Honolulu": (-157.9, 21.3), "Houston": (-95.4, 29.8)},
+        Region.EU868: {"Karlsruhe": (8.4, 49.0), "Gothenburg": (12.0, 57.6), "Madrid": (-3.7, 40.4),
+                       "London": (-0.1, 51.5), "Warsaw": (21.0, 52.2), "Athens": (23.7, 38.0), "Rome": (12.5, 41.9),
+                       "Riga": (24.1, 56.9), "Tampere": (23.8, 61.5), "Bucharest": (26.1, 44.4)},
+        None: {"Toronto": (-79.4, 43.7), "Vancouver": (-123.1, 49.3), "Victoria": (-123.4, 48.4),
+               "Windsor": (-83.0, 42.3), "Kingston": (-76.5, 44.2), "Montreal": (-73.6, 45.5),
+               "Sault Ste. Marie": (-84.3, 46.5), "Thunder Bay": (-89.2, 48.4), "Tijuana": (-117.0, 32.5),
+               "Ciudad Juarez": (-106.5, 31.7), "Nuevo Laredo": (-99.5, 27.5), "Matamoros": (-97.5, 25.9),
+               "Nassau": (-77.3, 25.1), "Freeport": (-78.7, 26.5), "Havana": (-82.4, 23.1),
+               "Kaliningrad": (20.5, 54.7), "Minsk": (27.6, 53.9), "Brest": (23.7, 52.1), "Grodno": (23.8, 53.7),
+               "Pskov": (28.3, 57.8), "Saint Petersburg": (30.3, 59.9), "Murmansk": (33.1, 69.0),
+               "Chisinau": (28.9, 47.0), "Pristina": (21.2, 42.7), "Tunis": (10.2, 36.8), "Algiers": (3.1, 36.8),
+               "Tangier": (-5.8, 35.8), "Hong Kong": (114.2, 22.3), "Sydney": (151.2, -33.9)},
+    }  # fmt: skip
+    for region, found in places.items():
+        for name, (lon_deg, lat_deg) in found.items():
+            assert region_at(lon_deg, lat_deg) is region, name

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextvars import copy_context
 from datetime import UTC, datetime
 
 import pytest
@@ -12,7 +13,7 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
-from app.errors import CodeTaken, Unavailable
+from app.errors import ClientLeft, CodeTaken, Unavailable
 from app.families.inputs import PositionIn
 from app.families.plate.registration import CodeInput, NewPlate
 from app.markers.plate import PlateScheme
@@ -22,6 +23,7 @@ from app.registry.tables import metadata
 from app.registry.tenancy import across_agencies
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
+from app.services.request_work import working
 from tests.http import WITHIN_S
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
@@ -181,3 +183,35 @@ def test_other_urls_are_refused(url: str) -> None:
     with pytest.raises(Unavailable) as refused:
         Database(url)
     assert refused.value.field == "database_url"
+
+
+@pytest.mark.parametrize("question", [False, True], ids=["read", "ask"])
+def test_a_statement_ends_when_the_client_leaves(database: Database, question: bool) -> None:
+    """One that runs is interrupted, a further one does not start, and the next request has a connection that works."""
+    endless = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT count(*) FROM n"
+    statement = sa.text(endless if database.path is not None else "SELECT pg_sleep(600)")
+
+    def run(connection: sa.Connection) -> None:
+        started.set()
+        connection.execute(statement).all()
+
+    def ask() -> None:
+        if question:
+            database.ask(run)
+            return
+        with database.read() as connection:
+            run(connection)
+
+    started = threading.Event()
+    with working(600.0) as work, ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(copy_context().run, ask)
+        assert started.wait(WITHIN_S)
+        while not asked.done():  # the first time may be before the statement starts
+            work.stops.stop()
+            wait([asked], 0.01)
+        with pytest.raises(ClientLeft):
+            asked.result()
+        with pytest.raises(ClientLeft):
+            ask()
+    assert database.current_revision() == head_revision()
+    assert database.ask(lambda connection: connection.execute(sa.text("SELECT 1")).scalar_one()) == 1

@@ -13,6 +13,7 @@ import sqlalchemy as sa
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pyproj import Geod
+from sqlalchemy import event
 
 from app.registry import agencies, nearest
 from app.registry.database import Database
@@ -169,3 +170,22 @@ def test_polygons_hold_what_is_inside_or_on_the_edge(store: Store, rings: list[l
     inside = shapely.intersects_xy(shapely.from_wkb(area.wkb), spots[:, 0], spots[:, 1])
     assert inside.sum() > 20
     assert sorted((row.lon_deg, row.lat_deg) for row in rows) == sorted(map(tuple, spots[inside].tolist()))
+
+
+def test_vertices_are_not_passed_for_each_marker(store: Store) -> None:
+    """SQLite calls a function for each marker: 160 kB of vertices as its argument would be copied each time."""
+    database, agency_id, _, _ = store
+    if database.path is None:
+        return
+    angles = np.linspace(0.0, 2 * np.pi, 9_999)
+    ring = np.column_stack((8.4 + np.cos(angles), 49.0 + np.sin(angles)))
+    ring[-1] = ring[0]
+    sent: list[object] = []
+    remember = event.listens_for(database.engine, "before_cursor_execute")
+    remember(lambda _connection, _cursor, _statement, values, *_: sent.extend(values))
+    with database.read() as connection:
+        areas = [area_of([[ring.tolist()]]) for _ in range(2)]
+        del areas[0]  # an equal area that is no longer in use takes nothing from the other one
+        rows = list_markers(connection, agency_id, MarkerFilter(area=areas[0]), after=None, limit=10_000)
+    assert rows
+    assert max(len(value) for value in sent if isinstance(value, bytes | str)) < 100

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 import subprocess
 import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cairosvg
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +31,7 @@ from app.errors import ProofFailed
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading
 from tests.http import WITHIN_S
+from tests.machine import require_module, require_tool
 
 URL = "https://waymark.example/v1/markers/3f0c8a52-6a0c-7d1e-9f52-0123456789ab"
 CAMERA_PX_PER_MM = 1.0  # a plate some 1.5 m in front of a 1080p camera
@@ -92,10 +91,9 @@ def test_files_are_read_by_the_decoder_through_other_renderers(kind: str, tmp_pa
     if kind == "png":
         picture = write_png(drawing, dpi=150)
     elif kind == "svg":
-        picture = cairosvg.svg2png(write_svg(drawing), dpi=96)
+        picture = require_module("cairosvg", "libcairo").svg2png(write_svg(drawing), dpi=96)
     else:
-        if not (pdftoppm := shutil.which("pdftoppm")):
-            pytest.skip("pdftoppm is not installed")
+        pdftoppm = require_tool("pdftoppm")
         (tmp_path / "plate.pdf").write_bytes(write_pdf(drawing))
         command = [pdftoppm, "-r", "150", "-singlefile", "-png", "plate.pdf", "page"]
         subprocess.run(command, cwd=tmp_path, check=True, timeout=WITHIN_S)

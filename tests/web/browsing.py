@@ -5,16 +5,15 @@ Pages change at any time, so what a test asserts of one is waited for: `expect`,
 
 from __future__ import annotations
 
-import os
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
-import pytest
 from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect, sync_playwright
+
+from tests.machine import require_tool
 
 WITHIN_MS = 120_000
 """How long a page may take until it shows what a test waits for. Generous: the suite runs beside other work."""
@@ -34,11 +33,7 @@ _KEY = "waymark-key"
 @contextmanager
 def chromium() -> Iterator[Browser]:
     """The browser of the operating system; without it the test is skipped, on CI it fails."""
-    path = shutil.which("chromium") or shutil.which("chromium-browser")
-    if path is None:
-        if os.environ.get("CI"):
-            pytest.fail("chromium is not installed")
-        pytest.skip("chromium is not installed")
+    path = require_tool("chromium", "chromium-browser")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=_FLAGS)
         yield browser

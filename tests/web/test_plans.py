@@ -6,11 +6,11 @@ import json
 import re
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import urlencode
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Locator, expect
 from ruamel.yaml import YAML
 
 from app.services.access.access import Scope
@@ -67,6 +67,47 @@ def strip_text(watched: Watched, start: str) -> str:
     return strip.get_attribute("aria-valuetext") or ""
 
 
+def check_rows_of(table: Locator) -> None:
+    """The rows of a table are rows, below one another, with their cells beside one another in common columns."""
+    table.locator("tbody tr").nth(1).wait_for()
+    script = """table => [...table.rows].map(row => ({
+        display: getComputedStyle(row).display, top: row.getBoundingClientRect().top,
+        cells: [...row.cells].map(cell => (({ left, top }) => ({ left, top }))(cell.getBoundingClientRect())) }))"""
+    rows = table.evaluate(script)
+    assert table.evaluate("table => getComputedStyle(table).display") == "table"
+    assert {row["display"] for row in rows} == {"table-row"}
+    assert [row["top"] for row in rows] == sorted({row["top"] for row in rows})
+    for row in rows:
+        assert len({cell["top"] for cell in row["cells"]}) == 1
+        assert [cell["left"] for cell in row["cells"]] == [cell["left"] for cell in rows[0]["cells"]]
+
+
+def contrast_of(part: Locator) -> float:
+    """Contrast of an element's text with its own background, by WCAG 2.2."""
+    colours = part.evaluate("e => [getComputedStyle(e).color, getComputedStyle(e).backgroundColor]")
+    found = []
+    for colour in colours:
+        assert re.fullmatch(r"rgb\(\d+, \d+, \d+\)", colour), "opaque"
+        linear = [
+            c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
+            for c in (int(level) / 255 for level in re.findall(r"\d+", colour))
+        ]
+        found.append(0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2])
+    return float((max(found) + 0.05) / (min(found) + 0.05))
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_buttons_can_be_read_under_the_pointer(watched: Watched, scheme: Literal["light", "dark"]) -> None:
+    page = watched.page
+    page.emulate_media(color_scheme=scheme)
+    watched.open("/roads")
+    for pressed in ("true", "false"):
+        button = page.locator(f".segments button[aria-pressed={pressed}]").first
+        button.hover()
+        until(page, f"document.querySelector('.segments button[aria-pressed={pressed}]').matches(':hover')")
+        assert contrast_of(button) >= 4.5, pressed
+
+
 def test_a_road_is_uploaded_and_planned_by_rules(watched: Watched, tmp_path: Path) -> None:
     start = {**RULES, "lines": {}}
     page = watched.open(f"/plans/new?{urlencode({'rules': json.dumps(start)})}")
@@ -89,6 +130,7 @@ def test_a_road_is_uploaded_and_planned_by_rules(watched: Watched, tmp_path: Pat
     page.locator("[name='+lines']").uncheck()
     preview = page.locator(".preview[aria-busy=false]")
     preview.get_by_text("plates", exact=True).wait_for()
+    check_rows_of(preview.locator("table.figures"))
     (tmp_path / "wrong.yaml").write_text("version: 1\nplatse: {}\n")
     page.get_by_label("Rules from a file").set_input_files(tmp_path / "wrong.yaml")
     page.locator(".problem", has_text="platse").wait_for()
@@ -232,7 +274,7 @@ def test_a_plan_is_proved_approved_committed_and_packed(
     page.get_by_role("button", name="Start the proof").click()
     page.locator(".job").wait_for()
     page.get_by_text("No reading was wrong.").wait_for()
-    page.locator(".rates tbody tr").first.wait_for()
+    check_rows_of(page.locator("table.rates"))
     expect(page.locator(".way [aria-current=step]")).to_have_text(re.compile(r"proved$"))
     expect(page.get_by_role("button", name="Commit")).to_have_count(0)
     page.get_by_role("button", name="Approve").click()

@@ -134,7 +134,7 @@ def test_the_camera_calculator_shows_frames_rates_and_a_picture(watched: Watched
     with server.client() as client:
         camera = {"width_px": 960, "height_px": 540}
         found = client.post("/v1/plate-drafts/pass", json={"camera": camera, "speed_kmh": 50}).json()
-    figures = page.locator(".figures .figure")
+    figures = page.locator(".figure-tiles .figure")
     frames = found["readable_frames_per_pass"]
     expect(figures.nth(0)).to_have_text(f"{frames:.{1 if frames < 10 else 0}f}")
     expect(figures.nth(1)).to_have_text(f"{found['best_unit_px']:.1f}\u00a0px")
@@ -240,10 +240,10 @@ def test_the_capacity_follows_the_format_and_a_codebook_is_made(watched: Watched
     with server.client() as client:
         draft = client.post("/v1/codebook-drafts", json={"design": design, "rules": {"wrong_way_safe": True}}).json()
     figures = draft["figures"]
-    page.locator(".figures .figure", has_text=re.compile(f"^{figures['capacity_under_rules']}$")).wait_for()
+    page.locator(".figure-tiles .figure", has_text=re.compile(f"^{figures['capacity_under_rules']}$")).wait_for()
     expect(page.locator("[name='rules.wrong_way_safe']")).to_be_checked()
     page.locator("[name='rules.wrong_way_safe']").uncheck()
-    page.locator(".figures .figure", has_text=re.compile(f"^{figures['capacity_under_rules']}$")).wait_for(
+    page.locator(".figure-tiles .figure", has_text=re.compile(f"^{figures['capacity_under_rules']}$")).wait_for(
         state="detached"
     )
     field(page, "design.length_m", "3.2")

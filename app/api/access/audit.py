@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Body, Depends, Path, Query, Request, Response
-from pydantic import AwareDatetime
 
 from app.api.http.dependencies import Caller, Idempotency, Identifier, PageSize, Text, use_cases
 from app.api.http.responses import created_response, document_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
+from app.api.http.times import Time
 from app.registry.audit import EntryFilter
 from app.services.access.audit import AuditLog
 from app.services.access.audit_jobs import AuditVerifications, VerificationDocument, VerificationInput
@@ -28,8 +28,8 @@ async def get_entry_filter(
         Query(max_length=80, description="What was done; with `*` at the end all that begin so.", examples=["key.*"]),
     ] = None,
     subject: Annotated[Text | None, Query(max_length=200, description="Id or name of what it was done to.")] = None,
-    since: Annotated[AwareDatetime | None, Query(description="At this time or later.")] = None,
-    until: Annotated[AwareDatetime | None, Query(description="Before this time.")] = None,
+    since: Annotated[Time | None, Query(description="At this time or later.")] = None,
+    until: Annotated[Time | None, Query(description="Before this time.")] = None,
 ) -> EntryFilter:
     """The filter in a query."""
     return EntryFilter(who, action, subject, since, until)

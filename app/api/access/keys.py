@@ -1,4 +1,4 @@
-"""/v1/keys: the keys of the agency, for its admins."""
+"""/v1/keys: the keys of the agency, for its admins; those of operators, for operators."""
 
 from __future__ import annotations
 
@@ -6,28 +6,35 @@ from datetime import timedelta
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
-from pydantic import AfterValidator, AwareDatetime, ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, Whole, use_cases
 from app.api.http.problems import problem_responses
 from app.api.http.responses import document_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
+from app.api.http.times import Time
 from app.families.inputs import StrictModel
-from app.services.access.access import Scope
+from app.services.access.access import AGENCY_SCOPES, Scope
 from app.services.access.documents import KeyDocument, KeyPage, NewKeyDocument
 from app.services.access.keys import MAX_OVERLAP, Keys, NewKey
 
 router = APIRouter(prefix="/v1/keys", tags=["access"], route_class=StrictRoute)
 
 _DAY_S = 86_400
-_NO_STORE = {"Cache-Control": "private, no-store"}
+NO_STORE = {"Cache-Control": "private, no-store"}
 KeyId = Annotated[Identifier, Path(description="Id of the key.")]
 
 
-def _is_label(label: str) -> str:
+def is_label(label: str) -> str:
     if not label.strip() or not label.isprintable():
         raise ValueError("a label is printable and not blank")
     return label
+
+
+def _is_of_agencies(scope: Scope) -> Scope:
+    if scope not in AGENCY_SCOPES:
+        raise ValueError("keys of operators are created on the server's machine: waymark key --operator")
+    return scope
 
 
 class KeyIn(StrictModel):
@@ -37,11 +44,11 @@ class KeyIn(StrictModel):
         json_schema_extra={"examples": [{"scope": "vehicle", "label": "BUS-7", "expires_at": "2027-06-30T00:00:00Z"}]},
     )
 
-    scope: Scope
-    label: Annotated[Text, AfterValidator(_is_label)] = Field(
+    scope: Annotated[Scope, AfterValidator(_is_of_agencies)] = Field(description="Any but `operator`.")
+    label: Annotated[Text, AfterValidator(is_label)] = Field(
         min_length=1, max_length=200, description="Who holds it; histories call the holder by it."
     )
-    expires_at: AwareDatetime | None = Field(None, description="When it ends; null: it does not.")
+    expires_at: Time | None = Field(None, description="When it ends; null: it does not.")
 
 
 class RotationIn(StrictModel):
@@ -52,7 +59,7 @@ class RotationIn(StrictModel):
     overlap_s: Whole = Field(
         _DAY_S, ge=0, le=int(MAX_OVERLAP.total_seconds()), description="How long the old key stays valid. [s]"
     )
-    expires_at: AwareDatetime | None = Field(
+    expires_at: Time | None = Field(
         None, description="When the new key ends; null: after as long as the old one was made for."
     )
 
@@ -94,4 +101,4 @@ def revoke_key(key_id: KeyId, caller: Caller, keys: Service) -> Response:
 
 
 def _shown_once(document: NewKeyDocument) -> Response:
-    return json_response(document, 201, {"Location": f"/v1/keys/{document['id']}", **_NO_STORE})
+    return json_response(document, 201, {"Location": f"/v1/keys/{document['id']}", **NO_STORE})

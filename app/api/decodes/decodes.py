@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
-from pydantic import AwareDatetime
 
 from app.api.decodes.schemas import CONTEXT_EXAMPLE, ContextIn
 from app.api.decodes.uploads import RAW_TYPES, Upload
@@ -23,6 +22,7 @@ from app.api.http.responses import (
     page_response,
 )
 from app.api.http.strict_json import StrictRoute
+from app.api.http.times import Time
 from app.registry.decodes import DecodeFilter
 from app.registry.jobs import JobState
 from app.services.decodes.decodes import Decodes as DecodesService
@@ -88,8 +88,8 @@ def list_decodes(
     state: JobState | None = None,
     kind: DecodeKind | None = None,
     vehicle: Annotated[Text | None, Query(max_length=80, description="Name or id of the vehicle.")] = None,
-    since: Annotated[AwareDatetime | None, Query(description="Uploaded then or later.")] = None,
-    until: Annotated[AwareDatetime | None, Query(description="Uploaded before then.")] = None,
+    since: Annotated[Time | None, Query(description="Uploaded then or later.")] = None,
+    until: Annotated[Time | None, Query(description="Uploaded before then.")] = None,
     limit: PageSize = 100,
     before: LastId = None,
 ) -> Response:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AwareDatetime, ConfigDict, Field, JsonValue
+from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.decodes.schemas_packets import PacketsIn, PosesIn
 from app.api.decodes.schemas_traces import TraceIn
 from app.api.http.dependencies import Number, Text, Whole
+from app.api.http.times import Time
 from app.families.inputs import Flag, StrictModel
 from app.services.decodes.context import ContextInput
 
@@ -63,7 +64,7 @@ class FramesIn(StrictModel):
 
     rate_hz: Number | None = Field(
         None,
-        gt=0,
+        ge=0.001,
         le=1000,
         description="Frames a second from captured_at on, where the files state no times. A JPEG with it is a raw "
         "MJPEG stream. [Hz]",
@@ -83,9 +84,7 @@ class ContextIn(StrictModel):
     thermal_range: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = Field(
         None, description="Counts of 16-bit thermal frames that become 0 and 255."
     )
-    captured_at: AwareDatetime | None = Field(
-        None, description="When the frame was taken, or the trace or the video began."
-    )
+    captured_at: Time | None = Field(None, description="When the frame was taken, or the trace or the video began.")
     frames: FramesIn | None = Field(None, description="The frames of a drive: their rate, and where they were taken.")
     trace: TraceIn | None = Field(None, description="The file is a magnetometer trace; {} for METRO's own formats.")
     packets: PacketsIn | None = Field(

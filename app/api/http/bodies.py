@@ -10,10 +10,10 @@ import anyio
 from anyio import to_thread
 from fastapi import Request
 from starlette.datastructures import FormData, Headers, UploadFile
-from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 
 from app.api.http.turns import Turns
+from app.errors import MalformedRequest
 from app.formats.spooled_file import SpooledFile
 from app.storage.spool import Spool, SpoolWriter
 
@@ -115,8 +115,8 @@ async def received_form(
 
     Raises
     ------
-    HTTPException
-        The form is malformed.
+    MalformedRequest
+        The form is malformed, or a field is too long.
     StorageFull
         There is no room for it.
     """
@@ -125,7 +125,12 @@ async def received_form(
     try:
         form = await parser.parse()
     except MultiPartException as error:
-        raise HTTPException(400, error.message) from error
+        raise MalformedRequest(
+            f"the form cannot be read: {error.message}",
+            field="body",
+            limit=f"multipart/form-data of at most {max_files} files and {max_fields} fields of {max_part_size} bytes",
+            cure="send large content as a file, with a file name",
+        ) from error
     try:
         yield form
     finally:

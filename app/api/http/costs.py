@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import select
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial, wraps
 from inspect import iscoroutinefunction
-from typing import Any, NamedTuple
+from threading import Lock
+from typing import Any
 
 import anyio
 from anyio import to_thread
@@ -25,6 +27,7 @@ from app.services.request_work import RequestWork, counted, working
 EXPENSIVE = frozenset(
     {
         "POST /v1/markers/bulk",
+        "POST /v1/markers/search",
         "POST /v1/artwork",
         "POST /v1/programs",
         "POST /v1/radio-checks",
@@ -62,6 +65,12 @@ MAX_WAITING = 16
 SLOT_WAIT_S = 20.0
 """Longest wait for a slot. [s]"""
 _MINUTES_AT_ONCE = 10
+_WATCHED_AFTER_S = 0.1
+"""Requests that take longer are watched for the end of their connection. [s] Source: by hand; few take as long."""
+_LOOK_EVERY_S = 0.25
+_CLOSED = getattr(select, "POLLRDHUP", 0)
+"""The client has closed its side, even where it sent more that nobody has read. Source: man 2 poll; Linux only, others
+report POLLHUP, which needs no flag."""
 Endpoint = Callable[..., Any]
 
 
@@ -126,7 +135,7 @@ class Slots:
 
 
 class Budget:
-    """Processor time that keys and agencies may use, charged after each request.
+    """Processor time that keys and agencies may use, charged after each request, and after each job to its agency.
 
     Parameters
     ----------
@@ -135,6 +144,7 @@ class Budget:
     """
 
     def __init__(self, key_s_per_min: float, agency_s_per_min: float) -> None:
+        self._lock = Lock()
         self._limits = [
             (_limit(per_min, owner), of)
             for per_min, owner, of in (
@@ -152,13 +162,22 @@ class Budget:
         TooManyRequests
             With the time until there is some again.
         """
-        for limit, of in self._limits:
-            limit.check(of(caller))
+        with self._lock:
+            for limit, of in self._limits:
+                limit.check(of(caller))
 
     def charge(self, caller: Caller, used_s: float) -> None:
         """Charge a request. [s]"""
-        for limit, of in self._limits:
-            limit.charge(of(caller), used_s)
+        with self._lock:
+            for limit, of in self._limits:
+                limit.charge(of(caller), used_s)
+
+    def charge_job(self, agency_id: str, used_s: float) -> None:
+        """Charge a job of an agency, from any thread. [s]"""
+        with self._lock:
+            for limit, of in self._limits:
+                if of is _agency_of:
+                    limit.charge(agency_id, used_s)
 
 
 def _key_of(caller: Caller) -> str:
@@ -174,7 +193,8 @@ def _limit(per_min: float, owner: str) -> RateLimit:
         per_min / 60,
         max(1, round(per_min * _MINUTES_AT_ONCE)),
         name=f"{owner}-processor-seconds",
-        message=f"the requests of this {owner} used too much processor time",
+        message=f"the requests of this {owner} used too much processor time"
+        + (", those of its jobs included" if owner == "agency" else ""),
         cure="wait for the time in Retry-After, and send smaller requests, or fewer",
     )
 
@@ -182,56 +202,101 @@ def _limit(per_min: float, owner: str) -> RateLimit:
 # --- around the endpoints -----------------------------------------------------------------------------------------
 
 
-class _Admitted(NamedTuple):
-    slots: Slots
-    agency_id: str
-    work: RequestWork
-    receive: Receive
+class _Admitted:
+    """A request whose body is not yet read."""
+
+    def __init__(self, slots: Slots, agency_id: str, work: RequestWork, receive: Receive, transport: Any) -> None:
+        self.slots, self.agency_id, self.work = slots, agency_id, work
+        self._receive, self._transport = receive, transport
+        self._watching: asyncio.TimerHandle | asyncio.Task[None] | None = None
+
+    def watch(self) -> None:
+        """Stop the work when the client leaves. The body has been read, so the next message is its end."""
+        if self._watching is None:
+            self._watching = asyncio.get_running_loop().call_later(_WATCHED_AFTER_S, self._begin)
+
+    def end(self) -> None:
+        """The request has ended."""
+        if self._watching is not None:
+            self._watching.cancel()
+
+    def _begin(self) -> None:
+        self._watching = asyncio.create_task(self._stop_when_left())
+
+    async def _stop_when_left(self) -> None:
+        left = asyncio.create_task(self._wait_for_disconnect())
+        try:
+            while not left.done() and not _is_disconnected(self._transport):
+                await asyncio.wait((left,), timeout=_LOOK_EVERY_S)
+            while True:
+                await asyncio.to_thread(self.work.stops.stop)
+                await asyncio.sleep(_LOOK_EVERY_S)
+        finally:
+            left.cancel()
+
+    async def _wait_for_disconnect(self) -> None:
+        with suppress(HTTPException):
+            while (await self._receive())["type"] != "http.disconnect":
+                pass
 
 
 _ADMITTED: ContextVar[_Admitted | None] = ContextVar("waymark_admitted", default=None)
 
 
 @contextmanager
-def admitted(slots: Slots, agency_id: str, timeout_s: float, receive: Receive) -> Iterator[RequestWork]:
-    """Account for a request, and give its endpoint the server's slots."""
+def admitted(
+    slots: Slots, agency_id: str, timeout_s: float, receive: Receive, transport: Any = None
+) -> Iterator[RequestWork]:
+    """Account for a request, give its endpoint the server's slots, and stop its work when its client leaves.
+
+    `transport` is that of its connection, where the server has one.
+    """
     with working(timeout_s) as work:
-        token = _ADMITTED.set(_Admitted(slots, agency_id, work, receive))
+        request = _Admitted(slots, agency_id, work, receive, transport)
+        token = _ADMITTED.set(request)
         try:
             yield work
         finally:
+            request.end()
             _ADMITTED.reset(token)
 
 
-def bounded(endpoint: Endpoint, *, expensive: bool) -> Endpoint:
-    """An endpoint that runs in a thread whose time is counted; an expensive one in a slot, while its client waits."""
+def _is_disconnected(transport: Any) -> bool:
+    """Whether the client has closed a connection.
+
+    While a further request of the client waits, uvicorn neither reads from the connection nor reports its end.
+    """
+    if transport is None or transport.is_closing():
+        return transport is not None
+    poll = select.poll()
+    poll.register(transport.get_extra_info("socket").fileno(), _CLOSED)
+    return bool(poll.poll(0))
+
+
+def watch_client() -> None:
+    """Stop the work for the current request when its client leaves; for endpoints that have read the body."""
+    if (request := _ADMITTED.get()) is not None:
+        request.watch()
+
+
+def bounded(endpoint: Endpoint, *, expensive: bool, watched: bool = True) -> Endpoint:
+    """An endpoint that runs in a thread whose time is counted; an expensive one in a slot.
+
+    A watched one runs while its client waits. Others go on: a vehicle may send a frame and lose the connection.
+    """
     if iscoroutinefunction(endpoint):
         return endpoint
 
     @wraps(endpoint)
     async def run(**values: Any) -> Response:
         call = partial(counted, endpoint, **values)
+        if watched:
+            watch_client()
         request = _ADMITTED.get()
         if request is None or not expensive:
             return await to_thread.run_sync(call)
-        async with request.slots.slot(request.agency_id), _watched(request):
+        async with request.slots.slot(request.agency_id):
+            request.work.check()
             return await to_thread.run_sync(call)
 
     return run
-
-
-@asynccontextmanager
-async def _watched(request: _Admitted) -> AsyncIterator[None]:
-    """Note it when the client leaves. The body was read before, so the next message is its end."""
-
-    async def watch() -> None:
-        with suppress(HTTPException):
-            while (await request.receive())["type"] != "http.disconnect":
-                pass
-        request.work.abandoned = True
-
-    task = asyncio.create_task(watch())
-    try:
-        yield
-    finally:
-        task.cancel()

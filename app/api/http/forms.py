@@ -16,8 +16,9 @@ from starlette.datastructures import FormData, UploadFile
 from app.api.http.bodies import received_form
 from app.api.http.components import reference
 from app.api.http.dependencies import caller_of, checked_idempotency_key
-from app.api.http.strict_json import in_thread_if_large, parse_json, validated
+from app.api.http.strict_json import in_thread_if_large, validated
 from app.errors import MalformedRequest, UnsupportedUpload
+from app.formats.json_text import parse_json
 from app.formats.spooled_file import SpooledFile
 from app.services.idempotency import IdempotencyKey
 

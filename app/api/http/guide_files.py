@@ -9,9 +9,10 @@ from starlette.datastructures import MutableHeaders
 from starlette.staticfiles import StaticFiles
 from starlette.types import Message, Receive, Scope, Send
 
+from app import shipped_folder
 from app.errors import NotFound
 
-GUIDE = Path(__file__).resolve().parents[3] / "build" / "guide"
+GUIDE = shipped_folder("build/guide")
 """Where `make docs` writes it."""
 
 

@@ -6,6 +6,7 @@ import re
 import time
 import uuid
 from collections.abc import Callable, Mapping
+from http import HTTPStatus
 
 import anyio
 import structlog
@@ -13,6 +14,7 @@ from anyio import to_thread
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -23,7 +25,7 @@ from app.api.http.permissions import Permissions
 from app.api.http.problems import BodyRefused, problem_from, unexpected
 from app.api.http.rate_limits import RateLimit, address_of
 from app.api.public_pages.negotiation import accepts_html
-from app.errors import MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
+from app.errors import ClientLeft, MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
 from app.registry.tenancy import acting_for
 from app.services.access.access import Caller
 
@@ -36,7 +38,14 @@ _UNKNOWN_PER_S = 20.0
 that an operator chose has 24 characters or more, and 20/s are 600 million guesses a year."""
 _ID = re.compile(r"[0-9a-f]{8}(-?[0-9a-f]{4}){3}-?[0-9a-f]{12}")
 _RECORD = re.compile(r"/v1/markers/([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})")
+_UNLOGGED = ("/healthz", "/readyz")
+"""Routes that are asked every few seconds: their answers of 200 are in the metrics, not in the log."""
+_CLIENT_LEFT = 499
+"""Status in logs and metrics of a request whose client left before its body had come. Source: nginx."""
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_ACTIVE_TYPES = frozenset({"image/svg+xml", "text/html", "application/xhtml+xml", "application/xml", "text/xml"})
+_FILE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
+"""Policy of files in which browsers run scripts, where a route sets none: artwork and plots as SVG."""
 _LOG = structlog.get_logger("waymark.access")
 
 
@@ -81,10 +90,13 @@ class Observed:
         with tracing.span("request", parent=sent, method=scope["method"], request_id=request_id) as attributes:
             try:
                 await self._app(scope, receive, send_with_id)
+            except ClientDisconnect:
+                status = status or _CLIENT_LEFT
             except Exception as error:
-                if status:
+                if not status:
+                    await unexpected(error, scope)(scope, receive, send_with_id)
+                elif not isinstance(error.__cause__, ClientLeft):  # in the middle of a response that nobody reads
                     raise
-                await unexpected(error, scope)(scope, receive, send_with_id)
             finally:
                 self._record(scope, status, time.perf_counter() - started)
                 attributes |= {"http.route": _route_of(scope), "http.response.status_code": str(status)}
@@ -94,6 +106,8 @@ class Observed:
         method = scope["method"] if scope["method"] in _METHODS else "other"
         self._count.labels(method, route, str(status)).inc()
         self._seconds.labels(method, route).observe(seconds)
+        if route in _UNLOGGED and status == HTTPStatus.OK:
+            return
         _LOG.info(
             "request",
             method=scope["method"],
@@ -121,6 +135,8 @@ def _protect(headers: MutableHeaders) -> None:
     """No cache may give a response to another key, and no browser may guess its type (docs/access.md, "Caches")."""
     headers.setdefault("Cache-Control", "private, no-cache" if "ETag" in headers else "private, no-store")
     headers.setdefault("X-Content-Type-Options", "nosniff")
+    if headers.get("content-type", "").partition(";")[0].strip().lower() in _ACTIVE_TYPES:
+        headers.setdefault("Content-Security-Policy", _FILE_POLICY)
     headers.add_vary_header("Authorization, X-API-Key")
 
 
@@ -206,7 +222,8 @@ class Guarded:
             response.headers["Connection"] = "close"
             await response(scope, receive, send)
             return
-        await self._answer(scope, self._limited(receive, limit), send)
+        transport = getattr(getattr(receive, "__self__", None), "transport", None)  # uvicorn's, of the connection
+        await self._answer(scope, self._limited(receive, limit), send, transport)
 
     def _limited(self, receive: Receive, limit: int) -> Receive:
         """A `receive` that stops a body that is too large or too slow. Only the time spent waiting for it counts."""
@@ -239,12 +256,13 @@ class Guarded:
         )
         return HTTPException(408, f"the body arrived too slowly: {limit} ({seen} bytes came)", {"Connection": "close"})
 
-    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _answer(self, scope: Scope, receive: Receive, send: Send, transport: object) -> None:
         """Let the app answer a request, and charge what that costs."""
         state = scope.get("state", {})
         agency_id: str = state.get("agency_id", "")
         caller: Caller | None = state.get("caller")
-        with acting_for(agency_id), admitted(self._slots, agency_id, self._request_timeout_s, receive) as work:
+        accounted = admitted(self._slots, agency_id, self._request_timeout_s, receive, transport)
+        with acting_for(agency_id), accounted as work:
             try:
                 await self._app(scope, receive, send)
             finally:

@@ -1,7 +1,13 @@
-"""The OpenAPI document: keys and problems are described once, for every route."""
+"""The OpenAPI document: keys and problems are described once, for every route.
+
+The server sends a stored copy: making the document takes seconds. `python -m tests.stored_openapi` writes the copy, and
+a test compares it with the app's own document, which does not depend on settings.
+"""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
@@ -12,6 +18,7 @@ from app.api.http.components import component_schemas
 from app.api.http.credentials import SECURITY, SECURITY_SCHEMES
 from app.api.http.middleware import is_protected
 
+STORED = Path(__file__).with_name("data") / "openapi.json"
 DESCRIPTION = """The registry of machine-readable roads: coded plates, magnet tags, radio markers (CERPMs) and fiducial
 signs, from the plan of a road to artwork and surveys, and to the decoded uploads and drives of vehicles.
 
@@ -42,7 +49,11 @@ _TAGS = {
     "fleet": "Vehicles, cameras and their calibrations.",
     "snapshots": "Files of the registry for vehicles that decode offline.",
     "audit": "The log of all changes, chained by hashes.",
-    "access": "Keys and agencies.",
+    "access": (
+        "Keys and agencies. An admin of an agency manages its keys at `/v1/keys`. The server's operator creates an"
+        " agency and its first admin key with `POST /v1/agencies`, using a key that `waymark key --operator` printed on"
+        " the server's machine."
+    ),
     "ogc": "OGC API Features and Tiles, for GIS clients.",
     "system": "Health of the server, and what it runs.",
 }
@@ -64,7 +75,8 @@ def describe(app: FastAPI) -> None:
                 tags=[{"name": name, "description": description} for name, description in _TAGS.items()],
             )  # fmt: skip
             components = document.setdefault("components", {})
-            components.setdefault("schemas", {}).update(component_schemas())
+            schemas = components.get("schemas", {}) | component_schemas()
+            components["schemas"] = dict(sorted(schemas.items()))  # else in the order of the first requests
             components["securitySchemes"] = SECURITY_SCHEMES
             _require_keys(document)
             _describe_headers(document)
@@ -72,6 +84,11 @@ def describe(app: FastAPI) -> None:
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+def stored_text(document: dict[str, Any]) -> str:
+    """The document as it is stored: each value on a line, for readable differences between versions."""
+    return json.dumps(document, ensure_ascii=False, indent=0, separators=(",", ":")) + "\n"
 
 
 _LICENSE = {"name": "Apache-2.0", "identifier": "Apache-2.0"}

@@ -13,19 +13,21 @@ from re import Pattern
 from starlette.routing import compile_path
 
 from app.api.http.page_addresses import PAGES
-from app.services.access.access import Scope
+from app.services.access.access import AGENCY_SCOPES, Scope
 
 Allowed = frozenset[Scope]
 
 PUBLIC: Allowed = frozenset()
 """Scopes of routes that need no key."""
-EVERYBODY: Allowed = frozenset(Scope)
-"""Any scope. Vehicles see only their own rows through such a route."""
+EVERYBODY: Allowed = frozenset(AGENCY_SCOPES)
+"""Any key of an agency. Vehicles see only their own rows through such a route."""
 READERS: Allowed = EVERYBODY - {Scope.VEHICLE}
 UPLOADERS: Allowed = EVERYBODY - {Scope.VIEWER}
 SURVEYORS: Allowed = READERS - {Scope.VIEWER}
 PLANNERS: Allowed = frozenset({Scope.PLANNER, Scope.ADMIN})
 ADMINS: Allowed = frozenset({Scope.ADMIN})
+OPERATORS: Allowed = frozenset({Scope.OPERATOR})
+"""Keys of the server's operators. They read no agency's rows; of keys and the audit log they see the operators' own."""
 
 _OGC_ITEMS = "/ogc/collections/{collection}/items"
 _OGC_TILES = "/ogc/collections/{collection}/tiles"
@@ -88,7 +90,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "GET /v1/exports/{kind}": READERS,
     "GET /v1/snapshots": EVERYBODY,  # vehicles without a connection decode with it
     "GET /v1/snapshots/trust": EVERYBODY,
-    "GET /v1/audit": ADMINS,
+    "GET /v1/audit": ADMINS | OPERATORS,
     "POST /v1/audit/verifications": ADMINS,
     "GET /v1/audit/verifications/{verification_id}": ADMINS,
     # --- plans
@@ -131,7 +133,7 @@ PERMISSIONS: dict[str, Allowed] = {
     "POST /v1/reprocessings/{reprocessing_id}/cancel": ADMINS,
     "POST /v1/reprocessings/{reprocessing_id}/accept": ADMINS,
     "GET /v1/decodes/{decode_id}/versions": EVERYBODY,
-    "GET /v1/events": READERS,
+    "GET /v1/events": EVERYBODY,
     "GET /v1/webhooks": PLANNERS,
     "POST /v1/webhooks": PLANNERS,
     "GET /v1/webhooks/{webhook_id}": PLANNERS,
@@ -209,12 +211,14 @@ PERMISSIONS: dict[str, Allowed] = {
     "DELETE /v1/vehicles/{vehicle_id}/keys/{key_id}": ADMINS,
     # --- keys
     "GET /v1/server-settings": ADMINS,
-    "GET /v1/me": EVERYBODY,
-    "GET /v1/keys": ADMINS,
-    "POST /v1/keys": ADMINS,
-    "GET /v1/keys/{key_id}": ADMINS,
-    "POST /v1/keys/{key_id}/rotate": ADMINS,
-    "DELETE /v1/keys/{key_id}": ADMINS,
+    "GET /v1/me": EVERYBODY | OPERATORS,
+    "GET /v1/agencies": OPERATORS,
+    "POST /v1/agencies": OPERATORS,
+    "GET /v1/keys": ADMINS | OPERATORS,
+    "POST /v1/keys": ADMINS,  # an operator's key is created on the server's machine only
+    "GET /v1/keys/{key_id}": ADMINS | OPERATORS,
+    "POST /v1/keys/{key_id}/rotate": ADMINS | OPERATORS,
+    "DELETE /v1/keys/{key_id}": ADMINS | OPERATORS,
     # --- OGC API
     "GET /ogc": READERS,
     "GET /ogc/": READERS,

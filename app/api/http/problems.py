@@ -66,6 +66,7 @@ PROBLEMS: dict[type[errors.WaymarkError], ProblemKind] = {
         422, "calibration-refused", "The camera cannot be calibrated from these photos"
     ),
     errors.PrintNotGraded: ProblemKind(422, "print-not-graded", "The print cannot be graded from this photo"),
+    errors.ProcessStopped: ProblemKind(422, "process-stopped", "The work on the upload was stopped before its end"),
     errors.UnreadableUpload: ProblemKind(422, "unreadable-upload", "The upload cannot be read"),
     errors.VersionRequired: ProblemKind(428, "version-required", "The change must state the version it is based on"),
     errors.TooManyRequests: ProblemKind(429, "too-many-requests", "Too many requests in a short time"),
@@ -223,7 +224,7 @@ def problem_from(error: errors.WaymarkError, scope: Any) -> Response:
     kind = kind_of(error)
     if kind is None:
         return unexpected(error, scope)
-    if kind.status >= 500:
+    if kind.status >= 500 and not isinstance(error, errors.ClientLeft):
         _LOG.error("request failed", error=type(error).__name__, detail=error.message)
     faults = [FieldError(field=e.field, detail=e.message, limit=e.limit, cure=e.cure) for e in (error, *error.parts)]
     wait = {"Retry-After": str(error.retry_after_s)} if isinstance(error, errors.TooManyRequests) else None

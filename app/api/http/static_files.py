@@ -1,11 +1,15 @@
-"""The files of `static/`: compressed, and those of other people's programs kept by browsers for ever."""
+"""The files of `static/`: compressed, and those of other people's programs kept by browsers for ever.
+
+They are sent from memory, read when they are first requested and again when they have changed: a client that does not
+read its response holds no file open.
+"""
 
 from __future__ import annotations
 
-import gzip
 import os
 import re
 from collections.abc import Mapping
+from gzip import compress
 from pathlib import Path
 
 from starlette.datastructures import Headers
@@ -40,7 +44,7 @@ class CompressedFiles(StaticFiles):
         super().__init__(directory=directory)
         self._others = dict(others)
         self._headers = dict(headers)
-        self._kept: dict[str, tuple[float, bytes]] = {}
+        self._kept: dict[tuple[str, bool], tuple[int, bytes]] = {}
 
     def lookup_path(self, path: str) -> tuple[str, os.stat_result | None]:
         """The file behind a path, if there is one."""
@@ -57,30 +61,30 @@ class CompressedFiles(StaticFiles):
         headers = self._headers | {"Vary": "Accept-Encoding"}
         if _VERSIONED.search(path):
             headers["Cache-Control"] = _FOR_EVER
+        kept = "range" not in request and stat_result.st_size < _MAX_KEPT_BYTES
         response: Response
         accepted = {part.partition(";")[0].strip() for part in request.get("accept-encoding", "").split(",")}
         made = next((e for e in _ENCODINGS if e[0] in accepted and Path(path + e[1]).is_file()), None)
         if made is not None and "range" not in request:
-            headers["Content-Encoding"], beside = made[0], path + made[1]
-            response = FileResponse(
-                beside, status_code, headers, media_type=media_type, stat_result=Path(beside).stat()
-            )
-        elif (
-            media_type is not None and "gzip" in accepted and "range" not in request
-            and stat_result.st_size < _MAX_KEPT_BYTES
-        ):  # fmt: skip
+            headers["Content-Encoding"], path = made[0], path + made[1]
+            stat_result = Path(path).stat()
+            kept = stat_result.st_size < _MAX_KEPT_BYTES
+        if made is None and kept and media_type is not None and "gzip" in accepted:
             etag = f'"{stat_result.st_mtime_ns:x}-{stat_result.st_size:x}-gzip"'
             headers |= {"Content-Encoding": "gzip", "ETag": etag}
-            response = Response(self._compressed(path, stat_result.st_mtime), status_code, headers, media_type)
+            response = Response(self._content(path, stat_result, gzip=True), status_code, headers, media_type)
         else:
             response = FileResponse(path, status_code, headers, media_type=media_type, stat_result=stat_result)
         if self.is_not_modified(response.headers, request):
             return NotModifiedResponse(response.headers)
+        if kept and isinstance(response, FileResponse):
+            return Response(self._content(path, stat_result), status_code, response.headers)
         return response
 
-    def _compressed(self, path: str, modified: float) -> bytes:
-        kept = self._kept.get(path)
-        if kept is None or kept[0] != modified:
-            kept = (modified, gzip.compress(Path(path).read_bytes(), 6, mtime=0))
-            self._kept[path] = kept
+    def _content(self, path: str, stat: os.stat_result, *, gzip: bool = False) -> bytes:
+        kept = self._kept.get((path, gzip))
+        if kept is None or kept[0] != stat.st_mtime_ns:
+            content = Path(path).read_bytes()
+            kept = (stat.st_mtime_ns, compress(content, 6, mtime=0) if gzip else content)
+            self._kept[path, gzip] = kept
         return kept[1]

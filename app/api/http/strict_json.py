@@ -4,35 +4,30 @@ from __future__ import annotations
 
 import asyncio
 import difflib
-import json
-import math
-import re
-from collections import Counter
 from collections.abc import Callable, Collection, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import cache, partial
-from typing import Any, NoReturn, TypeVar
+from threading import RLock
+from typing import Any, TypeVar
 
-from fastapi import Request, Response
+from fastapi import Depends, Request, Response
+from fastapi.datastructures import DefaultPlaceholder
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
+from starlette.routing import compile_path, get_name
 
 from app.api.http.components import with_reference
 from app.api.http.costs import EXPENSIVE, bounded
-from app.errors import MalformedRequest, UnsupportedUpload
+from app.api.http.dependencies import refuse_unknown_parameters
+from app.api.http.openapi import operation_id
+from app.errors import UnsupportedUpload
+from app.formats.json_text import parse_json
 from app.services.request_work import counted
 
 T = TypeVar("T")
-MAX_DEPTH = 32
-MAX_VALUES = 200_000
-"""Values in one document. Source: a road of 1 MiB, the largest body, has 50,000 vertices of three values each."""
-MAX_MEMBERS = 1_000
-"""Members of one object. Source: chosen by hand, the largest that a route takes has about 40."""
-_MAX_INT = 2**64
-_MAX_INT_DIGITS = 20
 _UNKNOWN = "extra_forbidden"
 _NEAR = 0.75
 """How similar a name is that is proposed for an unknown one (`difflib`). Source: chosen by hand, on single slips."""
@@ -42,22 +37,49 @@ _READER = ThreadPoolExecutor(1, "json")
 """Reading holds the interpreter's lock, so a second thread would only delay the event loop further."""
 _MAX_LISTED = 10_000
 """Errors that are listed. Source: by measurement, listing more keeps the interpreter's lock for over 20 ms."""
-_SUSPECT = re.compile(rb"\\u(?:0000|[dD][89a-fA-F])")
-"""Escapes of NUL and of halves of surrogate pairs; unescaped, neither is JSON in UTF-8."""
-_EMPTY = re.compile(rb"[\[{][ \t\r\n]*+[\]}]")
-_TEXT = re.compile(rb'"(?:[^"\\]|\\.)*+(?:"|\Z)', re.DOTALL)
+_BUILD = RLock()
 
 
 class StrictRoute(APIRoute):
     """A route whose endpoint is `bounded`, and whose JSON body goes through `parse_json`: a large one in a thread.
 
-    The schemas of its responses are made for the OpenAPI document only, not when the server starts.
+    Routes below /v1 refuse query parameters that they do not know. A route is built, its dependencies analysed and the
+    models of its body compiled, when it is first used: by a request, or when the OpenAPI document is made. All routes
+    together take a fifth of the time of a start. The schemas of its responses are made for the OpenAPI document only.
     """
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
-        expensive = any(f"{method} {path}" in EXPENSIVE for method in options.get("methods") or ())
-        described = {status: with_reference(response) for status, response in (options.pop("responses") or {}).items()}
-        super().__init__(path, bounded(endpoint, expensive=expensive), responses=described, **options)
+        self._declared: tuple[Callable[..., Any], dict[str, Any]] | None = (endpoint, options)
+        self.path, self.endpoint = path, endpoint
+        self.name = options.get("name") or get_name(endpoint)
+        self.methods = {method.upper() for method in options.get("methods") or ("GET",)}
+        self.path_regex, self.path_format, self.param_convertors = compile_path(path)
+
+    def __getattr__(self, name: str) -> Any:
+        """Build the route: this is called for attributes that it does not have yet."""
+        with _BUILD:
+            declared = self.__dict__.get("_declared")
+            if declared is not None:
+                self._declared = None
+                self._build(*declared)
+        if name not in self.__dict__:
+            raise AttributeError(f"a route has no {name}")
+        return self.__dict__[name]
+
+    def _build(self, endpoint: Callable[..., Any], options: dict[str, Any]) -> None:
+        methods = self.methods or set()
+        expensive = any(f"{method} {self.path}" in EXPENSIVE for method in methods)
+        described = {status: with_reference(response) for status, response in (options["responses"] or {}).items()}
+        refused = [Depends(refuse_unknown_parameters)] if self.path.startswith("/v1/") else []
+        shown = options["response_class"]
+        own: dict[str, Any] = {
+            "responses": described,
+            "dependencies": [*refused, *(options["dependencies"] or ())],
+            "generate_unique_id_function": operation_id,
+            "response_class": Response if isinstance(shown, DefaultPlaceholder) else shown,
+        }
+        run = bounded(endpoint, expensive=expensive, watched=expensive or methods <= {"GET", "HEAD"})
+        super().__init__(self.path, run, **options | own)
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """Handle the request with a strict reader of its body."""
@@ -140,142 +162,3 @@ def _names_in(adapter: TypeAdapter[Any]) -> tuple[str, ...]:
     return tuple(
         sorted({name for model in (schema, *schema.get("$defs", {}).values()) for name in model.get("properties", ())})
     )
-
-
-def parse_json(raw: bytes, field: str = "body") -> Any:
-    """Parse JSON, refusing what the standard or the store cannot hold. The time is linear in the size.
-
-    Parameters
-    ----------
-    raw : bytes
-        UTF-8 text.
-    field : str
-        Name of the input in the error.
-
-    Raises
-    ------
-    MalformedRequest
-        Not UTF-8, not JSON, NaN or infinity, a number beyond double precision or 64 bits, a duplicate key, more than 32
-        levels, `MAX_VALUES` values or `MAX_MEMBERS` members of an object, a lone surrogate or a NUL in a text.
-    """
-    _check_count(raw, field)
-    try:
-        text = raw.decode("utf-8")
-    except UnicodeDecodeError as error:
-        _refuse("the body is not UTF-8", field, "UTF-8", error)
-    try:
-        value = json.loads(
-            text,
-            object_pairs_hook=_unique,
-            parse_constant=lambda name: _refuse(f"{name} is not a JSON number", field, "finite numbers"),
-            parse_float=_finite,
-            parse_int=_bounded,
-        )
-    except json.JSONDecodeError as error:
-        _refuse(f"not JSON: {error.msg} at character {error.pos}", field, "RFC 8259", error)
-    except RecursionError as error:
-        _refuse("the JSON is nested too deeply", field, f"{MAX_DEPTH} levels", error)
-    if _is_deep(value) or _SUSPECT.search(raw):
-        _check_tree(value, field)
-    return value
-
-
-def _refuse(message: str, field: str, limit: str, cause: Exception | None = None) -> NoReturn:
-    raise MalformedRequest(message, field=field, limit=limit, cure="correct the body and send it again") from cause
-
-
-def _check_count(raw: bytes, field: str) -> None:
-    """Refuse too many values before one of them is read: each follows a comma, or is the first of what holds it."""
-    if _count_marks(raw) >= MAX_VALUES:
-        bare = _TEXT.sub(b"0", raw)
-        if _count_marks(bare) - _EMPTY.subn(b"", bare)[1] >= MAX_VALUES:
-            _refuse(f"the JSON has more than {MAX_VALUES} values", field, f"{MAX_VALUES} values")
-
-
-def _count_marks(raw: bytes) -> int:
-    return raw.count(b",") + raw.count(b"[") + raw.count(b"{")
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if len(pairs) > MAX_MEMBERS:
-        _refuse(f"an object has {len(pairs)} members", "body", f"{MAX_MEMBERS} members of an object")
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        double = Counter(name for name, _ in pairs).most_common(1)[0][0]
-        _refuse(f"the key {double[:80]!r} appears twice in one object", _printable(double), "unique keys")
-    return found
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        _refuse(f"the number {text[:40]} is beyond double precision", "body", "1.8e308")
-    return value
-
-
-def _bounded(text: str) -> int:
-    if len(text.lstrip("-")) > _MAX_INT_DIGITS or not -_MAX_INT < int(text) < _MAX_INT:
-        _refuse(f"the integer {text[:40]} is beyond 64 bits", "body", "64 bits")
-    return int(text)
-
-
-class _Step:
-    """The way from the root to a value: its name in what holds it, and the way there."""
-
-    __slots__ = ("above", "depth", "name")
-
-    def __init__(self, name: str | int, above: _Step | None = None) -> None:
-        self.name, self.above = name, above
-        self.depth: int = 0 if above is None else above.depth + 1
-
-    def path(self) -> str:
-        names = [str(self.name)[:200]]
-        step = self.above
-        while step is not None:
-            names.append(str(step.name)[:200])
-            step = step.above
-        return _printable(".".join(reversed(names)))
-
-
-def _is_deep(root: Any) -> bool:
-    """Whether there are more than `MAX_DEPTH` levels: level by level, which costs a tenth of a walk with paths."""
-    level = [root]
-    for _depth in range(MAX_DEPTH):
-        level = [
-            item
-            for value in level
-            for item in (value.values() if isinstance(value, dict) else value if isinstance(value, list) else ())
-            if isinstance(item, dict | list)
-        ]
-        if not level:
-            return False
-    return True
-
-
-def _check_tree(root: Any, field: str) -> None:
-    """Refuse what is too deep, and texts that the store cannot hold."""
-    waiting = [(root, _Step(field))]
-    while waiting:
-        value, step = waiting.pop()
-        if isinstance(value, str):
-            _check_text(value, step)
-        elif isinstance(value, dict | list):
-            if step.depth == MAX_DEPTH:
-                _refuse("the JSON is nested too deeply", step.path(), f"{MAX_DEPTH} levels")
-            for name in value if isinstance(value, dict) else ():
-                _check_text(name, step)
-            items = value.items() if isinstance(value, dict) else enumerate(value)
-            waiting += [(item, _Step(name, step)) for name, item in items if isinstance(item, dict | list | str)]
-
-
-def _check_text(text: str, step: _Step) -> None:
-    if "\x00" in text:
-        _refuse("a text holds NUL", step.path(), "no U+0000")
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError as error:
-        _refuse("a text holds half a surrogate pair", step.path(), "valid Unicode", error)
-
-
-def _printable(path: str) -> str:
-    return path[:200].encode("utf-8", "replace").decode().replace("\x00", "?")

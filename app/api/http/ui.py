@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
-import orjson
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import FileResponse
 
+from app import shipped_folder
 from app.api.http.guide_files import GUIDE, GuideFiles
+from app.api.http.openapi import STORED
 from app.api.http.page_addresses import PAGES
 from app.api.http.page_policy import content_security_policy, import_map_hashes
 from app.api.http.static_files import CompressedFiles
+from app.api.http.strict_json import StrictRoute
 
-STATIC = Path(__file__).resolve().parents[3] / "static"
+STATIC = shipped_folder("static")
 BASE_MAP = "base-map.pmtiles"
 """Name under /static of the operator's base map."""
 _REDOC_STYLES = (
@@ -22,7 +25,7 @@ _REDOC_STYLES = (
 )
 """Hashes of the two style elements that Redoc makes: an empty one, which its script fills, and that of its menu."""
 
-router = APIRouter()
+router = APIRouter(route_class=StrictRoute)
 
 
 def page_headers(policy: str) -> dict[str, str]:
@@ -60,13 +63,15 @@ def get_redoc() -> FileResponse:
     return FileResponse(STATIC / "redoc.html", headers=page_headers(content_security_policy(styles=_REDOC_STYLES)))
 
 
-@router.get("/openapi.json", include_in_schema=False)
-def get_openapi_document(request: Request) -> Response:
-    """The OpenAPI document, written once: it takes the server longer than most requests."""
-    state = request.app.state
-    if not hasattr(state, "openapi_json"):
-        state.openapi_json = orjson.dumps(request.app.openapi())
-    return Response(state.openapi_json, media_type="application/json", headers={"Cache-Control": "no-cache"})
+@router.api_route("/openapi.json", methods=["GET", "HEAD"], include_in_schema=False)
+def get_openapi_document() -> Response:
+    """The stored OpenAPI document."""
+    return Response(_openapi_document(), media_type="application/json", headers={"Cache-Control": "no-cache"})
+
+
+@cache
+def _openapi_document() -> bytes:
+    return STORED.read_bytes()
 
 
 def mount_static(

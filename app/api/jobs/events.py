@@ -48,6 +48,8 @@ async def get_events(
 ) -> Response:
     """What happens in the agency, oldest first: jobs that end, markers that become suspect.
 
+    A vehicle gets the events of the jobs that its key asked for.
+
     With `Accept: text/event-stream` it is a stream of events as they happen: all since `Last-Event-ID`, or without it
     new ones only. It ends after 15 minutes at the latest; clients connect again. Events are kept for 30 days.
     """

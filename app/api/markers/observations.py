@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import AfterValidator, AwareDatetime
 
 from app.api.http.dependencies import Caller, MarkerId, PageSize, Text, use_cases
 from app.api.http.responses import document_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
-from app.errors import InvalidParameter
+from app.api.http.times import Time
 from app.services.markers.observations import ObservationPage, ObservationSummary, place_of
 from app.services.markers.observations import Observations as ObservationsService
 
 router = APIRouter(prefix="/v1/markers/{marker_id}/observations", tags=["markers"], route_class=StrictRoute)
 
 
-def _storable(time: datetime) -> datetime:
-    if not 1900 <= time.year <= 2200:
-        raise InvalidParameter(
-            "the time is too far away", limit="years 1900 to 2200", cure="send an RFC 3339 time with its offset"
-        )
-    return time
-
-
-Time = Annotated[AwareDatetime, AfterValidator(_storable)]
 Observations = Annotated[ObservationsService, use_cases("observations")]
 
 

@@ -15,7 +15,7 @@ from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.routing import APIRoute
 
 from app.api.http.components import reference
-from app.api.http.openapi import operation_id
+from app.api.http.costs import watch_client
 from app.api.http.problems import Described, problem_responses
 from app.api.http.responses import file_response
 from app.api.http.strict_json import StrictRoute
@@ -51,6 +51,7 @@ def _in_own_threads(answer: Callable[..., Response]) -> Callable[..., Awaitable[
 
     @wraps(answer)
     async def endpoint(request: Request, **values: Any) -> Response:
+        watch_client()
         threads: ThreadPoolExecutor = request.app.state.ogc_threads
         run = partial(copy_context().run, partial(counted, answer, **values))
         return await asyncio.get_running_loop().run_in_executor(threads, run)
@@ -109,9 +110,7 @@ def _add_heads(router: APIRouter) -> None:
 
 
 def _router() -> APIRouter:
-    router = APIRouter(
-        route_class=StrictRoute, tags=["ogc"], default_response_class=Response, generate_unique_id_function=operation_id
-    )
+    router = APIRouter(route_class=StrictRoute, tags=["ogc"])
     read, edit = partial(_add_read, router), partial(_add_edit, router)
     read(_ITEMS, _in_own_threads(items.list_items), _json(FeaturePage, GEOJSON), (*OF_ITEMS, *_filters()))
     read(

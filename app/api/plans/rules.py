@@ -6,16 +6,16 @@ from functools import cache
 from typing import Annotated, Any
 
 import orjson
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Query, Request, Response
 
 from app.api.http.dependencies import Caller, use_cases
 from app.api.http.problems import problem_responses
-from app.api.http.responses import document_response, json_response
+from app.api.http.responses import document_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
 from app.api.plans.schemas import PlanPreviewIn, RulesTextIn
 from app.planning.read_rules import read_rules, rules_schema
 from app.services.plans.documents import PlanPreview, ReadRules
-from app.services.plans.previews import PlanPreviews
+from app.services.plans.previews import MAX_MARKERS, PlanPreviews
 
 router = APIRouter(prefix="/v1", tags=["plans"], route_class=StrictRoute)
 
@@ -40,13 +40,20 @@ def post_rules_text(wanted: RulesTextIn, caller: Caller) -> Response:
 
 @router.post("/plan-previews", responses=document_response(PlanPreview, 404))
 def post_plan_preview(
-    wanted: PlanPreviewIn, caller: Caller, previews: Annotated[PlanPreviews, use_cases("plan_previews")]
+    request: Request,
+    wanted: PlanPreviewIn,
+    caller: Caller,
+    previews: Annotated[PlanPreviews, use_cases("plan_previews")],
+    after: Annotated[int, Query(ge=0, le=10**7, description="Markers of the pages before.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=MAX_MARKERS)] = 1000,
 ) -> Response:
     """Place and check what rules ask for on an alignment, and store nothing: to compare rules before a plan is made.
 
-    On at most 20 km of lanes. Markers have no codes.
+    On at most 20 km of lanes. Markers have no codes. The counts are those of all markers; `markers` is a page of them,
+    and a Link header names the next one, which is requested with the same body.
     """
-    return json_response(previews.preview(caller, wanted.alignment_id, wanted.rules))
+    page, onward = previews.preview(caller, wanted.alignment_id, wanted.rules, after=after, limit=limit)
+    return page_response(request, page, after=onward)
 
 
 @cache

@@ -6,12 +6,13 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.responses import StreamingResponse
-from pydantic import AwareDatetime, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from app.api.http.dependencies import Caller, Identifier, LastId, Number, PageSize, Text, use_cases
 from app.api.http.problems import problem_responses
 from app.api.http.responses import created_response, document_response, file_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
+from app.api.http.times import Time
 from app.families.inputs import StrictModel
 from app.services.decodes.kinds import DecodeKind
 from app.services.markers.search_boxes import checked_box
@@ -36,8 +37,8 @@ class ReprocessingIn(StrictModel):
     model_config = ConfigDict(json_schema_extra={"examples": [{"kinds": ["frame", "archive"], "older_than": "0.3.0"}]})
 
     kinds: list[DecodeKind] | None = Field(None, min_length=1, max_length=20)
-    since: AwareDatetime | None = Field(None, description="Uploaded at this time or later.")
-    until: AwareDatetime | None = Field(None, description="Uploaded before this time.")
+    since: Time | None = Field(None, description="Uploaded at this time or later.")
+    until: Time | None = Field(None, description="Uploaded before this time.")
     vehicle_id: Identifier | None = None
     bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
         None, description="west, south, east, north of the coarse positions. [deg]"

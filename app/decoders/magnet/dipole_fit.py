@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from app.compiled import ieee_kernel, ieee_routine, kernel, routine
 from app.decoders.magnet.dipole_model import (
     PARAMETERS,
     FitData,
@@ -19,7 +20,6 @@ from app.decoders.magnet.dipole_model import (
     dipole_field,
     remove_background,
 )
-from app.decoders.magnet.kernels import entry, exact_entry, exact_step, step
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -103,13 +103,13 @@ class FittedDipoles(NamedTuple):
 # --- priors ---------------------------------------------------------------------------------------------------------
 
 
-@exact_step
+@ieee_routine
 def _axis_std(kind: int, axis: int, prior: MagnetPrior) -> float:
     """Standard deviation of a moment's component across the magnet's own axis. [A m2]"""
     return prior.yaw_std_am2 if kind == 0 and axis == 1 else prior.tilt_std_am2
 
 
-@exact_entry
+@ieee_kernel
 def prior_cost(dipole: Floats, kind: int, prior: MagnetPrior) -> float:
     """-2 log likelihood of a dipole's moment, clearance and axis under the prior, but for a constant."""
     moment = math.sqrt(dipole[3] ** 2 + dipole[4] ** 2 + dipole[5] ** 2) + 1e-12
@@ -121,7 +121,7 @@ def prior_cost(dipole: Floats, kind: int, prior: MagnetPrior) -> float:
     return float(cost)
 
 
-@exact_step
+@ieee_routine
 def _add_prior_slope(
     dipole: Floats, kind: int, prior: MagnetPrior, gradient: Floats, hessian: Floats, first: int
 ) -> None:
@@ -160,7 +160,7 @@ class _Work(NamedTuple):
     trial: Floats  # (n, 6)
 
 
-@exact_step
+@ieee_routine
 def _make_work(shape: tuple[int, int, int], n: int) -> _Work:
     sensors, _, blocks = shape
     size = PARAMETERS * n
@@ -179,7 +179,7 @@ def _make_work(shape: tuple[int, int, int], n: int) -> _Work:
     )
 
 
-@step
+@routine
 def _set_residual(dipoles: Floats, data: FitData, work: _Work) -> None:
     """What the dipoles (n, 6) leave of the data, and the strength of their field."""
     work.total[:] = 0.0
@@ -199,7 +199,7 @@ def _set_residual(dipoles: Floats, data: FitData, work: _Work) -> None:
                 work.residual[j, axis, k] = data.field[j, axis, k] - work.total[j, axis, k]
 
 
-@step
+@routine
 def _set_jacobian(dipoles: Floats, data: FitData, work: _Work) -> None:
     """Derivatives of the model by all parameters, background removed as in the data."""
     rows = work.jacobian.shape[1]
@@ -212,7 +212,7 @@ def _set_jacobian(dipoles: Floats, data: FitData, work: _Work) -> None:
                 target[r] = source[r]
 
 
-@step
+@routine
 def _set_row_weights(data: FitData, work: _Work) -> None:
     """1 for noise alone; less where the field is strong, as the model errs, or a sample is far off (Huber)."""
     for j in range(work.residual.shape[0]):
@@ -224,7 +224,7 @@ def _set_row_weights(data: FitData, work: _Work) -> None:
                 work.row_weight[j, axis, k] = weight if data.weight[j, axis, k] != 0 else 0.0
 
 
-@step
+@routine
 def _weighted_squares(work: _Work) -> float:
     """Cost of the residual under the row weights as they are."""
     cost = 0.0
@@ -235,7 +235,7 @@ def _weighted_squares(work: _Work) -> float:
     return cost
 
 
-@step
+@routine
 def _set_normal_equations(work: _Work) -> None:
     """Gradient J W r and Hessian J W J'. Written out: a library's sums depend on its number of threads."""
     rows = work.jacobian.shape[1]
@@ -254,7 +254,7 @@ def _set_normal_equations(work: _Work) -> None:
             work.hessian[a, b] = work.hessian[b, a] = h
 
 
-@step
+@routine
 def _solve(matrix: Floats, damping: float, rhs: Floats, out: Floats) -> None:
     """Solve (matrix + damping diag(matrix) + 1e-9) out = rhs for a positive definite matrix, by Cholesky factors."""
     n = rhs.size
@@ -277,7 +277,7 @@ def _solve(matrix: Floats, damping: float, rhs: Floats, out: Floats) -> None:
         out[i] = value / factor[i, i]
 
 
-@step
+@routine
 def _linearize(dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: FitData, work: _Work) -> float:
     """Normal equations at the dipoles with the prior; returns the cost there."""
     _set_residual(dipoles, data, work)
@@ -291,7 +291,7 @@ def _linearize(dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: FitDa
     return cost
 
 
-@step
+@routine
 def _solve_moments(dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: FitData, work: _Work) -> None:
     """Moments by linear least squares, the places as they are; in place."""
     _set_residual(dipoles, data, work)
@@ -318,7 +318,7 @@ def _solve_moments(dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: F
             dipoles[i, q] *= min(max(moment, low), high) / max(moment, 1e-9)
 
 
-@step
+@routine
 def _take_step(
     dipoles: Floats, kinds: Integers, prior: MagnetPrior, data: FitData, work: _Work, cost: float, damping: float
 ) -> tuple[float, float]:
@@ -349,7 +349,7 @@ def _take_step(
 # --- the fit and its figures --------------------------------------------------------------------------------------
 
 
-@exact_entry
+@ieee_kernel
 def fit_dipoles(data: FitData, start: Floats, kinds: Integers, prior: MagnetPrior) -> FittedDipoles:
     """Fit n dipoles together.
 
@@ -387,7 +387,7 @@ def fit_dipoles(data: FitData, start: Floats, kinds: Integers, prior: MagnetPrio
     return result
 
 
-@step
+@routine
 def _set_covariance(i: int, work: _Work, covariance: Floats) -> None:
     """Diagonal block of a dipole in the inverse Hessian of the last step."""
     unit = np.zeros(work.gradient.size)
@@ -399,7 +399,7 @@ def _set_covariance(i: int, work: _Work, covariance: Floats) -> None:
             covariance[r, q] = work.step[PARAMETERS * i + r]
 
 
-@step
+@routine
 def _set_residual_figures(i: int, data: FitData, work: _Work, result: FittedDipoles) -> None:
     """Energy that dipole i explains, and the residual about it."""
     dipole = result.dipoles[i]
@@ -417,7 +417,7 @@ def _set_residual_figures(i: int, data: FitData, work: _Work, result: FittedDipo
                     result.local_rows[i] += 1
 
 
-@entry
+@kernel
 def residual_cost(data: FitData, dipoles: Floats) -> float:
     """-2 log likelihood of what dipoles (n, 6) leave of the data, by Huber's loss, but for a constant."""
     work = _make_work(data.field.shape, 0)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.kernels import entry, step
+from app.compiled import kernel, routine
 from app.decoders.magnet.matched_filter import BIN_M
 from app.markers.magnet import FIELD_UT_M3
 
@@ -83,7 +83,7 @@ class Samples(NamedTuple):
     common_share: Floats
 
 
-@entry
+@kernel
 def whiten(
     samples: Samples, low: int, high: int, noise_ut: Floats, known: Floats32, degree: int
 ) -> tuple[Floats, Floats, Floats]:
@@ -111,7 +111,7 @@ def whiten(
     return field, weight, basis
 
 
-@step
+@routine
 def background_basis(s_m: Floats, scale: Floats, degree: int) -> Floats:
     """Orthonormal scale, scale s, scale s2 .. up to the degree (Gram-Schmidt), shape (degree + 1, K)."""
     mid = (s_m[0] + s_m[-1]) / 2
@@ -131,7 +131,7 @@ def background_basis(s_m: Floats, scale: Floats, degree: int) -> Floats:
     return basis
 
 
-@step
+@routine
 def _project_out(row: Floats, unit: Floats) -> None:
     """Take a unit vector's share out of a row, in place."""
     dot = 0.0
@@ -141,7 +141,7 @@ def _project_out(row: Floats, unit: Floats) -> None:
         row[k] -= dot * unit[k]
 
 
-@step
+@routine
 def remove_background(field: Floats, basis: Floats, common_share: Floats) -> None:
     """Take the share of the common mode, then the background, out of a field (S, 3, K), in place."""
     sensors, blocks = field.shape[0], field.shape[2]
@@ -161,7 +161,7 @@ def remove_background(field: Floats, basis: Floats, common_share: Floats) -> Non
                 _project_out(field[j, axis], basis[q])
 
 
-@step
+@routine
 def dipole_field(dipole: Floats, data: FitData, out: Floats) -> None:
     """Whitened field of a dipole (6,) into out (S, 3, K).
 
@@ -186,7 +186,7 @@ def dipole_field(dipole: Floats, data: FitData, out: Floats) -> None:
                 field[k] = f * (3 * (ex * x + ey * y + ez * z) * mr - em * r2)
 
 
-@step
+@routine
 def dipole_derivatives(dipole: Floats, data: FitData, out: Floats) -> None:
     """Derivatives of `dipole_field` by the six parameters into out (6, S, 3, K)."""
     for j in range(out.shape[1]):
@@ -213,7 +213,7 @@ def dipole_derivatives(dipole: Floats, data: FitData, out: Floats) -> None:
                 by_mz[k] = f * (3 * er * z - r2 * ez)
 
 
-@entry
+@kernel
 def add_dipole_field(
     dipole: Floats, s_m: Floats, positions_m: Floats, sign: float, common_share: Floats, out: Floats32
 ) -> None:

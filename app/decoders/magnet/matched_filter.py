@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.kernels import entry, exact_step, step
+from app.compiled import ieee_routine, kernel, routine
 from app.markers.magnet import FIELD_UT_M3
 
 Floats = npt.NDArray[np.float64]
@@ -216,7 +216,7 @@ class _Projection(NamedTuple):
     cell: Counts  # (2, B) its cell
 
 
-@exact_step
+@ieee_routine
 def _make_projection(bank: FilterBank, channels: int, most_bins: int) -> _Projection:
     half, distances, cells = bank.kernels.shape[2], bank.kernels.shape[1], bank.squared.shape[2]
     bins = min(most_bins, BLOCK_BINS)
@@ -235,7 +235,7 @@ def _make_projection(bank: FilterBank, channels: int, most_bins: int) -> _Projec
     )
 
 
-@step
+@routine
 def _project(x: Floats32, start: int, bins: int, bank: FilterBank, p: _Projection) -> None:
     """Fold the channels x (bins, 3 S) about bins from start on, as the kernels are even or odd, and multiply."""
     channels = x.shape[1]
@@ -267,7 +267,7 @@ def _project(x: Floats32, start: int, bins: int, bank: FilterBank, p: _Projectio
                 e1[c] += k1 * odd[c]
 
 
-@step
+@routine
 def _sum_sites(p: _Projection, bins: int, sensors: int, bank: FilterBank) -> None:
     """Set `sums` of the projection: what the filters of all cells are made of."""
     for d in range(bank.kernels.shape[1]):
@@ -287,7 +287,7 @@ def _sum_sites(p: _Projection, bins: int, sensors: int, bank: FilterBank) -> Non
                 sums[6, i] = a[3 * j + 2] * iz
 
 
-@step
+@routine
 def _sum_squared(p: _Projection, bins: int, bank: FilterBank) -> None:
     """Set `squared` of the projection."""
     of_bin = p.of_bin
@@ -303,7 +303,7 @@ def _sum_squared(p: _Projection, bins: int, bank: FilterBank) -> None:
                 p.squared[kind, cell, i] = of_bin[cell]
 
 
-@step
+@routine
 def _score(p: _Projection, bins: int, sensors: int, bank: FilterBank, statistic: Floats32, cells: Integers) -> None:
     """Largest statistic b2 / g over the cells and its cell, for forward (0) and upright (1) magnets at each bin.
 
@@ -330,7 +330,7 @@ def _score(p: _Projection, bins: int, sensors: int, bank: FilterBank, statistic:
             statistic[i, kind], cells[i, kind] = p.best[kind, i], p.cell[kind, i]
 
 
-@step
+@routine
 def _keep_best(b: Floats32, g: Floats32, cell: int, bins: int, best: Floats32, best_cell: Counts) -> None:
     """Keep a cell's statistic at each bin where it is the largest yet."""
     number = np.int32(cell)
@@ -341,7 +341,7 @@ def _keep_best(b: Floats32, g: Floats32, cell: int, bins: int, best: Floats32, b
         best_cell[i] = number if larger else best_cell[i]
 
 
-@step
+@routine
 def _track_variance(p: _Projection, at: int, bank: FilterBank, variance: Floats32, factors: Floats) -> None:
     """Move each variance (nD, 3) towards the median square of its filters' results: magnets are few, noise is all.
 
@@ -362,13 +362,13 @@ def _track_variance(p: _Projection, at: int, bank: FilterBank, variance: Floats3
             variance[d, axis] *= factors[above]
 
 
-@step
+@routine
 def _factors(rate: float, sensors: int) -> Floats:
     """Factors of a variance, for each number of results above the median out of two for each sensor."""
     return np.exp(rate * (np.arange(2 * sensors + 1) / (2 * sensors) - 0.5))
 
 
-@entry
+@kernel
 def score_bins(x: Floats32, start: int, bank: FilterBank, variance: Floats32, scores: BinScores) -> None:
     """Score the bins of x (bins, 3 S) from start on, as many as the scores; each has HALF_BINS neighbours each side."""
     count, sensors = scores.statistic.shape[0], x.shape[1] // 3
@@ -380,7 +380,7 @@ def score_bins(x: Floats32, start: int, bank: FilterBank, variance: Floats32, sc
         _score(p, bins, sensors, bank, scores.statistic[first:], scores.cell[first:])
 
 
-@entry
+@kernel
 def scan_bins(x: Floats32, start: int, bank: FilterBank, variance: Floats32, state: Integers, scores: BinScores) -> int:
     """Score bins and track the noise until a region is complete; returns the number of bins scored.
 

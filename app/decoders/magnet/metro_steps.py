@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 import scipy
 
+from app.compiled import ieee_kernel
 from app.decoders.magnet.readings import MagnetReading
 
 Floats = npt.NDArray[np.float64]
@@ -79,7 +79,7 @@ def scale_reference(reference: Floats, front: Floats, quiet: int) -> Floats:
     return scaled
 
 
-@nb.njit(cache=True, nogil=True)
+@ieee_kernel
 def cancel_wheel_noise(
     front: Floats, reference: Floats, taps: int = LMS_TAPS, rate: float = LMS_RATE, window: int = LMS_WINDOW
 ) -> Floats:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.kernels import exact_entry, exact_step
+from app.compiled import ieee_kernel, ieee_routine
 from app.decoders.magnet.readings import NoiseFinding, NoiseKind
 from app.errors import InvalidParameter
 from app.sensors.magnetometer_bar import MAX_FIELD_UT, MagnetometerBar, MagnetTrace, SensorRole
@@ -263,18 +263,18 @@ class _OpenBlock(NamedTuple):
     drive: Floats  # (6,) samples, s of the first, sums of s [m], t [s], v [m/s], yaw [rad]
 
 
-@exact_step
+@ieee_routine
 def _in_range(x: Floats) -> bool:
     """Whether a sample (3,) is within the chip's range; NaN is not."""
     return bool(abs(x[0]) < MAX_FIELD_UT and abs(x[1]) < MAX_FIELD_UT and abs(x[2]) < MAX_FIELD_UT)
 
 
-@exact_step
+@ieee_routine
 def _is_same(a: Floats, b: Floats) -> bool:
     return bool(a[0] == b[0] and a[1] == b[1] and a[2] == b[2])
 
 
-@exact_step
+@ieee_routine
 def _next_sample(raw: Floats, i: int, j: int, usable: bool, repair: _Repair) -> int:
     """Samples to the one that the prediction uses: 2 if the next one is out of range, a repeat or a spike."""
     if not _in_range(raw[i + 1, j]) or _is_same(raw[i + 1, j], raw[i, j]):
@@ -289,7 +289,7 @@ def _next_sample(raw: Floats, i: int, j: int, usable: bool, repair: _Repair) -> 
     return 2 if one > two / 4 else 1
 
 
-@exact_step
+@ieee_routine
 def _check_sample(raw: Floats, i: int, repair: _Repair, check: _Check) -> None:
     """Compare sample i of every sensor with its prediction."""
     for j in range(raw.shape[1]):
@@ -312,7 +312,7 @@ def _check_sample(raw: Floats, i: int, repair: _Repair, check: _Check) -> None:
         check.deviation[j] = math.sqrt(square) if usable and check.next_usable[j] else 0.0
 
 
-@exact_step
+@ieee_routine
 def _is_spike(j: int, repair: _Repair, check: _Check) -> bool:
     """Whether a sample is off by itself: in time by its second difference, across the bar by its neighbours."""
     deviation = check.deviation[j]
@@ -331,7 +331,7 @@ def _is_spike(j: int, repair: _Repair, check: _Check) -> bool:
     return bool(alone and deviation > SPIKE_RATIO * around)
 
 
-@exact_step
+@ieee_routine
 def _add_sample(sample: Floats, drive: Floats, repair: _Repair, check: _Check, block: _OpenBlock) -> None:
     """Repair a sample (S, 3) taken at drive (4,) and add it to the open block."""
     if block.drive[0] == 0:
@@ -354,7 +354,7 @@ def _add_sample(sample: Floats, drive: Floats, repair: _Repair, check: _Check, b
         block.good[j] += good
 
 
-@exact_step
+@ieee_routine
 def _close_block(block: _OpenBlock, out: _OpenBlock, at: int) -> None:
     """Write the means of the open block to the place `at` of the output, and empty it."""
     count = block.drive[0]
@@ -367,7 +367,7 @@ def _close_block(block: _OpenBlock, out: _OpenBlock, at: int) -> None:
     block.drive[0] = 0.0
 
 
-@exact_entry
+@ieee_kernel
 def _repair_and_average(raw: Floats, drive: Floats, repair: _Repair, block: _OpenBlock, out: _OpenBlock) -> int:
     """Repair samples raw (N + AHEAD, S, 3) taken at drive (N, 4): s, t, v, yaw; average them; return how many."""
     sensors, closed = raw.shape[1], 0

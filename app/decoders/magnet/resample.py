@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.kernels import exact_entry, exact_step
+from app.compiled import ieee_kernel, ieee_routine
 from app.decoders.magnet.matched_filter import BIN_M
 
 Floats = npt.NDArray[np.float64]
@@ -116,7 +116,7 @@ def _empty_bins(count: int, sensors: int) -> _Bins:
     )
 
 
-@exact_step
+@ieee_routine
 def _median(values: Floats) -> float:
     """Median of values, which are sorted in place (np.median takes two seconds to compile)."""
     n = values.size
@@ -129,13 +129,13 @@ def _median(values: Floats) -> float:
     return float((values[(n - 1) // 2] + values[n // 2]) / 2)
 
 
-@exact_step
+@ieee_routine
 def _bend(recent: Floats, sensor: int, axis: int) -> float:
     """Second difference of a channel over 2 LAG_BINS. [uT]"""
     return float(recent[LAG_BINS, sensor, axis] - (recent[0, sensor, axis] + recent[-1, sensor, axis]) / 2)
 
 
-@exact_step
+@ieee_routine
 def _track_noise(axis: int, noise: _Noise) -> float:
     """Renew the mean squares of an axis; returns the share of the common mode that is noise of all sensors alike."""
     sensors = noise.channel.shape[0]
@@ -157,7 +157,7 @@ def _track_noise(axis: int, noise: _Noise) -> float:
     return float(max(0.0, 1 - OWN_NOISE_FACTOR * alone / max(noise.common[axis], MIN_VARIANCE)))
 
 
-@exact_step
+@ieee_routine
 def _write_bin(at: int, value: Floats, shift: Integers, bins: _Bins, noise: _Noise) -> None:
     """Write one bin (A, 3), its common mode removed; sensors further ahead go into later bins."""
     sensors = value.shape[0]
@@ -183,7 +183,7 @@ def _write_bin(at: int, value: Floats, shift: Integers, bins: _Bins, noise: _Noi
             bins.x[at + shift[j], 3 * j + axis] = value[j, axis] - mean
 
 
-@exact_step
+@ieee_routine
 def _begin(number: int, s: float, block: Floats, noise: _Noise, opened: _OpenBin) -> None:
     """Open the first bin; the bins before it are taken to be like its first block."""
     opened.state[0], opened.state[2], opened.state[3] = number, s, 1.0
@@ -194,7 +194,7 @@ def _begin(number: int, s: float, block: Floats, noise: _Noise, opened: _OpenBin
                 noise.recent[k, j, axis] = block[j, axis]
 
 
-@exact_step
+@ieee_routine
 def _set_value(s: float, block: Floats, opened: _OpenBin, value: Floats) -> None:
     """Value of the open bin: the mean of two or more blocks, else interpolated to its middle."""
     middle = (opened.state[0] + 0.5) * BIN_M
@@ -208,7 +208,7 @@ def _set_value(s: float, block: Floats, opened: _OpenBin, value: Floats) -> None
                 value[j, axis] = before + u * (block[j, axis] - before)
 
 
-@exact_entry
+@ieee_kernel
 def _bin_blocks(
     s: Floats, blocks: Floats, shift: Integers, start: int, bins: _Bins, noise: _Noise, opened: _OpenBin
 ) -> int:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.kernels import entry, step
+from app.compiled import kernel, routine
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -234,7 +234,7 @@ def _limits(positions_m: Floats, references: npt.NDArray[np.intp]) -> tuple[Floa
     return limits, neighbours
 
 
-@entry
+@kernel
 def _cancel(s: Floats, yaw: Floats, x: Floats, turns: _Turns, channels: _Channels, drive: Floats) -> None:
     """Follow the turns, take the noise out of each block and learn from what is left."""
     for i in range(s.size):
@@ -262,7 +262,7 @@ def _cancel(s: Floats, yaw: Floats, x: Floats, turns: _Turns, channels: _Channel
             _learn(step, locked_m, outliers >= OUTLIER_CHANNELS and known, channels)
 
 
-@step
+@routine
 def _track_offset(x: Floats, rate: float, channels: _Channels) -> None:
     """Move each channel's offset towards a block (S, 3)."""
     for j in range(x.shape[0]):
@@ -270,7 +270,7 @@ def _track_offset(x: Floats, rate: float, channels: _Channels) -> None:
             channels.offset[j, axis] += rate * (x[j, axis] - channels.offset[j, axis])
 
 
-@step
+@routine
 def _follow_turn(w: int, step: float, driven_m: float, x: Floats, turns: _Turns, channels: _Channels) -> None:
     """Advance a wheel's phase by what it rolled for a block (S, 3), and set its regressors: 0 unless it is noisy."""
     reference, pending = turns.references[w], turns.pending[w]
@@ -292,7 +292,7 @@ def _follow_turn(w: int, step: float, driven_m: float, x: Floats, turns: _Turns,
         cosine_h, sine_h = cosine_h * cosine - sine_h * sine, sine_h * cosine + cosine_h * sine
 
 
-@step
+@routine
 def _renew_length(w: int, s: float, turns: _Turns) -> None:
     """Add the pending piece of a reference's signal to its bank, and find the length of a turn in it.
 
@@ -328,7 +328,7 @@ def _renew_length(w: int, s: float, turns: _Turns) -> None:
             turns.length_m[w] *= (lengths[1] / lengths[0]) ** (0.5 * (energy[at - 1] - energy[at + 1]) / bend)
 
 
-@step
+@routine
 def _set_turns(s: float, turns: _Turns) -> None:
     """Set cosine and sine of the turn at an odometer for each trial length.
 
@@ -346,7 +346,7 @@ def _set_turns(s: float, turns: _Turns) -> None:
         cosine[c], sine[c] = x, y
 
 
-@step
+@routine
 def _loudest(turns: _Turns, channels: _Channels) -> float:
     """Strength of the noise at the reference that has most. [uT2]"""
     loudest = 0.0
@@ -355,14 +355,14 @@ def _loudest(turns: _Turns, channels: _Channels) -> float:
     return loudest
 
 
-@step
+@routine
 def _strength(j: int, channels: _Channels) -> float:
     """Strength of the noise at a sensor. [uT2]"""
     total: float = channels.strength[j, 0] + channels.strength[j, 1] + channels.strength[j, 2]
     return total
 
 
-@step
+@routine
 def _strangeness(loudest: float, channels: _Channels) -> float:
     """Strength of the noise at a sensor over the most that a wheel can have there, at the sensor with the highest."""
     highest = 0.0
@@ -378,7 +378,7 @@ def _strangeness(loudest: float, channels: _Channels) -> float:
     return highest
 
 
-@step
+@routine
 def _subtract_noise(x: Floats, step: float, locked_m: float, loudest: float, channels: _Channels) -> int:
     """Take the predicted noise out of a block (S, 3), less where it is weak; returns the channels that are far off.
 
@@ -411,7 +411,7 @@ def _subtract_noise(x: Floats, step: float, locked_m: float, loudest: float, cha
     return outliers
 
 
-@step
+@routine
 def _steer(step: float, turns: _Turns, channels: _Channels) -> None:
     """Move the phase of each wheel by what is left of its noise at its reference, where magnets are weak."""
     harmonics = channels.regressors.size // (2 * turns.phase.size)
@@ -432,7 +432,7 @@ def _steer(step: float, turns: _Turns, channels: _Channels) -> None:
         turns.phase[w] += min(step / STEER_M, 0.5) * along / (information + 1.0)
 
 
-@step
+@routine
 def _learn(step: float, locked_m: float, over_magnet: bool, channels: _Channels) -> None:
     """Renew the residual's deviation, and the weights by least mean squares unless a magnet is passed."""
     gain = 2 * step / min(LEARN_M, FIRST_LEARN_M + LEARN_SLOPE * locked_m)

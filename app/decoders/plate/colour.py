@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel, kernel
+from app.compiled import ieee_kernel, kernel
 
 BLOCK = 16
 """[pixels of the signal] side of a block, for which one threshold holds. Source: chosen by hand."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_loop, ieee_loop_kernel, step, trailing_zeros
+from app.compiled import ieee_loop, ieee_loop_kernel, step, trailing_zeros
 from app.decoders.plate.colour import BLOCK, MarkerSignal
 
 Floats = npt.NDArray[np.float64]

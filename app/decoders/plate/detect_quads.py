@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel, step
+from app.compiled import ieee_kernel, step
 from app.decoders.plate.colour import MarkerSignal
 from app.decoders.plate.detect_blobs import AREA, PEAK, SIGN, find_blobs
 from app.decoders.plate.join_quads import (

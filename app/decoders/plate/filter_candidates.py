@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel, step
+from app.compiled import ieee_kernel, step
 from app.decoders.plate.colour import MarkerSignal
 from app.decoders.plate.detect_quads import MARKER_RATIO, MarkerQuad
 from app.decoders.plate.join_quads import FOUND_ALL

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.decoders.compiled import ieee_routine, kernel, step
+from app.compiled import ieee_routine, kernel, step
 from app.decoders.plate.homography import set_corners
 from app.decoders.plate.linear import factorize, solve_factorized, substitute
 from app.decoders.plate.normal_equations import NormalEquations, PatchArea, PixelSums, set_normal_equations

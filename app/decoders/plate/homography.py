@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import kernel, routine
+from app.compiled import kernel, routine
 
 Array = npt.NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import kernel, routine, step
+from app.compiled import kernel, routine, step
 from app.decoders.plate.linear import subtract_rows
 from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
 from app.decoders.plate.profiles import Floats, Ints

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_loop, ieee_loop_kernel, step
+from app.compiled import ieee_loop, ieee_loop_kernel, step
 from app.decoders.plate.detect_blobs import AREA, PEAK, X0, X1, XX, XY, Y0, Y1, YY, X, Y
 
 Floats = npt.NDArray[np.float64]

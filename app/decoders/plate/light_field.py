@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import kernel, loop, step
+from app.compiled import kernel, loop, step
 from app.decoders.plate.linear import factorize, solve_factorized, substitute
 from app.decoders.plate.plate_pixels import PlatePixels
 from app.decoders.plate.profiles import Floats, Ints

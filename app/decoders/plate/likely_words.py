@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel
+from app.compiled import ieee_kernel
 from app.markers.plate import PlateScheme, code_cells, is_codeword, numbers, reed_solomon_words
 from app.markers.reed_solomon import ReedSolomonWord, gf16_products
 

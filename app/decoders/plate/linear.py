@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import kernel, routine
+from app.compiled import kernel, routine
 
 Array = npt.NDArray[np.float64]
 

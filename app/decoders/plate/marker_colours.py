@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel
+from app.compiled import ieee_kernel
 from app.decoders.plate.colour import MarkerSignal
 from app.decoders.plate.homography import project
 from app.decoders.plate.layout import unit_edges

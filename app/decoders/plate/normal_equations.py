@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.decoders.compiled import loop, step
+from app.compiled import loop, step
 from app.decoders.plate.profiles import Floats, Ints
 from app.decoders.plate.quadrature import Quadrature
 from app.decoders.plate.synthesis import (

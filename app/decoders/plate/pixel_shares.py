@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from app.decoders.compiled import kernel, loop
+from app.compiled import kernel, loop
 from app.decoders.plate.profiles import Floats, Ints
 from app.decoders.plate.quadrature import Quadrature, blur_quadrature
 from app.decoders.plate.synthesis import (

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import loop
+from app.compiled import loop
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from app.decoders.compiled import routine, step
+from app.compiled import routine, step
 from app.decoders.plate.profiles import Floats
 
 UPRIGHT_SINE = 0.35

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import loop, routine, step
+from app.compiled import loop, routine, step
 from app.decoders.plate.profiles import AxisBlur, AxisProfiles, Floats, Ints, normal, set_profiles
 from app.decoders.plate.quadrature import Quadrature
 

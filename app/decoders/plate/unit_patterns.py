@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.compiled import ieee_kernel, ieee_routine, step
+from app.compiled import ieee_kernel, ieee_routine, step
 
 Floats = npt.NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import sqlalchemy as sa
@@ -11,6 +11,8 @@ from app.families.snapshot import SnapshotRecord
 from app.registry import cerpms
 from app.registry.marker_rows import MarkerRow
 from app.registry.tables import markers
+
+_HEARD = ("first_sequence", "last_sequence", "first_heard_s", "last_heard_s")
 
 
 class CerpmSnapshot(SnapshotRecord):
@@ -38,9 +40,8 @@ class CerpmSnapshot(SnapshotRecord):
         min_interval_s = spec["interval_s"] * (1 - spec["jitter_share"])
         return {"side": spec["side"], "speed_limit": spec["speed_limit"], "min_interval_s": min_interval_s}
 
-    def members(
-        self, connection: sa.Connection, agency_id: str, rows: Sequence[MarkerRow]
-    ) -> dict[str, dict[str, Any]]:
+    def members(self, connection: sa.Connection, agency_id: str, codes: Sequence[str]) -> Mapping[str, Sequence[Any]]:
         """First and last transmission that was heard of each."""
-        heard = cerpms.list_span_ends(connection, agency_id, [int(row.digits) for row in rows])
-        return {row.id: heard[n]._asdict() for row in rows if (n := int(row.digits)) in heard}
+        heard = cerpms.list_span_ends(connection, agency_id, map(int, codes))
+        ends = [heard.get(int(code)) for code in codes]
+        return {name: [None if end is None else getattr(end, name) for end in ends] for name in _HEARD}

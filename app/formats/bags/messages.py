@@ -6,6 +6,7 @@ The libraries are an extra of Waymark: `bags`.
 from __future__ import annotations
 
 import importlib.util
+import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +19,11 @@ from app.formats.spooled_file import SpooledFile
 FIELD = "file"
 MAX_CHUNK_BYTES = 256 * 1024**2
 """[byte] of a chunk once it is expanded. Source: chosen by hand; recorders write 0.8 to 8 MB."""
+MAX_EXPANSION = 20
+"""[1] by which the chunks of a bag expand together, beyond `MAX_CHUNK_BYTES`. Source: by hand; recordings expand 1 to 5
+times, and each expanded byte is read two or three times."""
+_CHUNK_HEAD, _RECORD_HEAD_BYTES = struct.Struct("<BQQQQ"), 9
+_SIZES = "compressed_size", "uncompressed_size"
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _SQLITE_MAGIC = b"SQLite format 3\0"
@@ -111,18 +117,18 @@ class Bag:
                 known = {topic.name: topic for topic in self.topics}
                 options = {"topics": list(topics), "starting_at": start_ns, "ending_before": end_ns}
                 for _schema, channel, message in self._reader.iter_messages(**options):
-                    yield BagMessage(known[channel.topic], int(message.log_time), bytes(message.data))
+                    yield _message(known[channel.topic], int(message.log_time), message.data)
                 return
             if self._kind is BagKind.SQLITE:
                 known = {topic.name: topic for topic in self.topics}
                 for name, time_ns, data in self._reader.messages(topics, start_ns, end_ns):
-                    yield BagMessage(known[name], time_ns, data)
+                    yield _message(known[name], time_ns, data)
                 return
             connections = [c for c in self._reader.connections if c.topic in topics]
             if connections:
                 for connection, time_ns, data in self._reader.messages(connections, start_ns, end_ns):
                     topic = Topic(connection.topic, connection.msgtype, "ros1")
-                    yield BagMessage(topic, int(time_ns), bytes(data))
+                    yield _message(topic, int(time_ns), data)
 
     def decode(self, message: BagMessage) -> Any:
         """The message as an object with the fields of its type."""
@@ -147,15 +153,48 @@ class Bag:
             summary = self._reader.get_summary()
             if summary is None:
                 raise _damaged()
-            largest = max((chunk.uncompressed_size for chunk in summary.chunk_indexes), default=0)
-            if largest > MAX_CHUNK_BYTES:
-                raise UploadTooLarge(
-                    f"a chunk of the bag expands to {largest} bytes", field=FIELD, limit=f"{MAX_CHUNK_BYTES} bytes",
-                    cure="record with smaller chunks",
-                )  # fmt: skip
             for channel in summary.channels.values():
                 schema = summary.schemas.get(channel.schema_id)
                 yield Topic(channel.topic, schema.name if schema else "", channel.message_encoding)
+
+
+def _message(topic: Topic, time_ns: int, data: Any) -> BagMessage:
+    if not 0 <= time_ns < 1 << 63:
+        raise UnreadableUpload(
+            f"a message of {topic.name[:80]} has the time {time_ns} ns", field=FIELD,
+            limit="0 to 2^63 - 1 ns since 1970", cure="record with the clock set",
+        )  # fmt: skip
+    return BagMessage(topic, time_ns, bytes(data))
+
+
+def _check_chunks(chunks: list[Any], stream: BinaryIO) -> None:
+    """Refuse an index of chunks that expand to too much, each or together, that names one twice, or is false.
+
+    Reads the head of each chunk only: opcode, length, two times and the expanded size (MCAP specification, `Chunk`).
+    """
+    largest = max((chunk.uncompressed_size for chunk in chunks), default=0)
+    if largest > MAX_CHUNK_BYTES:
+        raise UploadTooLarge(
+            f"a chunk of the bag expands to {largest} bytes", field=FIELD, limit=f"{MAX_CHUNK_BYTES} bytes",
+            cure="record with smaller chunks",
+        )  # fmt: skip
+    end = 0
+    for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):
+        stream.seek(chunk.chunk_start_offset)
+        _opcode, length, _first, _last, expanded = _CHUNK_HEAD.unpack(stream.read(_CHUNK_HEAD.size))
+        if chunk.chunk_start_offset < end or expanded != chunk.uncompressed_size:
+            raise UnreadableUpload(
+                "the bag's index names a chunk twice, or with another size than it has", field=FIELD,
+                limit="each chunk once", cure="write the index again with mcap recover",
+            )  # fmt: skip
+        end = chunk.chunk_start_offset + _RECORD_HEAD_BYTES + length
+    packed, expanded = (sum(getattr(chunk, size) for chunk in chunks) for size in _SIZES)
+    if expanded > MAX_CHUNK_BYTES + MAX_EXPANSION * packed:
+        raise UploadTooLarge(
+            f"the bag's chunks expand from {packed} to {expanded} bytes", field=FIELD,
+            limit=f"{MAX_EXPANSION} times their size, and {MAX_CHUNK_BYTES} bytes",
+            cure="record compressed pictures and no constant data",
+        )  # fmt: skip
 
 
 @contextmanager
@@ -176,6 +215,9 @@ def open_bag(file: SpooledFile, kind: BagKind) -> Iterator[Bag]:
         with file.open() as stream:
             with _defects():
                 reader: Any = SeekingReader(stream, record_size_limit=MAX_CHUNK_BYTES)
+                summary = reader.get_summary()
+                if summary is not None:
+                    _check_chunks(summary.chunk_indexes, stream)
             yield Bag(kind, reader)
         return
     if kind is BagKind.SQLITE:
@@ -205,7 +247,7 @@ def check_installed() -> None:
     if any(importlib.util.find_spec(name) is None for name in ("mcap", "rosbags")):
         raise UnsupportedUpload(
             "this server does not read bags", field=FIELD, limit="the extra `bags` of Waymark",
-            cure="ask its operator to install waymark[bags], or send the camera's video or a ZIP of frames",
+            cure="ask its operator to install waymark-roads[bags], or send the camera's video or a ZIP of frames",
         )  # fmt: skip
 
 

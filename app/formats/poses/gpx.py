@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from typing import Any
-
-import gpxpy
-import gpxpy.gpx
+from typing import TYPE_CHECKING, Any
 
 from app.errors import UnreadableUpload, UnsupportedUpload
 from app.formats.delimited import read_number
 from app.formats.poses.declaration import FIELD, PoseSource, too_many_points
 from app.formats.poses.points import PosePoint
+
+if TYPE_CHECKING:
+    import gpxpy.gpx
 
 _HEAD_CHARS = 1 << 14  # [character] in which the root element stands; chosen by hand
 
@@ -46,6 +46,9 @@ def read_gpx(source: PoseSource) -> Iterator[PosePoint]:
         raise UnsupportedUpload(
             f"{name} is XML, but no GPX", field=FIELD, limit="GPX 1.0 or 1.1", cure="export the track as GPX"
         )
+    import gpxpy  # here: only a decoder process reads files
+    import gpxpy.gpx
+
     try:
         gpx = gpxpy.parse(re.sub(r"\A\s*<\?xml[^>]*\?>", "", text.lstrip("\ufeff")))
     except (gpxpy.gpx.GPXException, ValueError, TypeError, LookupError, RecursionError) as error:

@@ -10,9 +10,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, time, timedelta
 from typing import Any
 
-import pynmeagps
-from pynmeagps import NMEAReader
-
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.formats.log_report import LogReport
 from app.formats.log_times import LogClock
@@ -72,6 +69,8 @@ def read_nmea(source: PoseSource) -> Iterator[PosePoint]:
     InvalidParameter
         Times have no date, and none was declared.
     """
+    import pynmeagps  # here: only a decoder process reads files
+
     text, declaration, report = source.sample.text, source.declaration, source.report
     reading = _Reading(report)
     sentences = list(_find_sentences(text, report))
@@ -89,7 +88,7 @@ def read_nmea(source: PoseSource) -> Iterator[PosePoint]:
         ):  # RMC has the same position, and the date
             continue
         try:
-            parsed = NMEAReader.parse(sentence, validate=pynmeagps.VALNONE)
+            parsed = pynmeagps.NMEAReader.parse(sentence, validate=pynmeagps.VALNONE)
         except (pynmeagps.NMEAParseError, pynmeagps.NMEATypeError, pynmeagps.NMEAMessageError, ValueError) as error:
             report.leave_out(entry, "malformed", f"a {kind} sentence that cannot be read: {str(error)[:120]}")
             continue

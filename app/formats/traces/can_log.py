@@ -149,7 +149,7 @@ def _messages(part: Part) -> Iterator[Any]:
         raise UnsupportedUpload(
             "this server reads no CAN logs: python-can is not installed",
             field=part.name,
-            cure="send speed as CSV, or install waymark[can]",
+            cure="send speed as CSV, or install waymark-roads[can]",
         ) from error
     content = part.content()
     if content.startswith(b"LOGG"):
@@ -204,7 +204,7 @@ def _load_signals(dbc: Sequence[Part], name: str, field: str) -> dict[str, tuple
         raise UnsupportedUpload(
             "this server reads no DBC: cantools is not installed",
             field=field,
-            cure="declare identifier, bits and scaling, or install waymark[can]",
+            cure="declare identifier, bits and scaling, or install waymark-roads[can]",
         ) from error
     if not dbc:
         raise InvalidParameter(

@@ -79,7 +79,7 @@ def read_parquet(part: Part, declaration: TraceDeclaration, limits: TraceLimits,
         raise UnsupportedUpload(
             "this server reads no Parquet: pyarrow is not installed",
             field=part.name,
-            cure="send CSV, or install waymark[parquet]",
+            cure="send CSV, or install waymark-roads[parquet]",
         ) from error
     defects = (pyarrow.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError)
     content = part.content()

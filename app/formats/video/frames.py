@@ -12,15 +12,18 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.errors import UnsupportedUpload
+from app.errors import UnsupportedUpload, is_exhausted
 from app.formats.video.container import BAGS, FIELD, VideoKind
-from app.formats.video.index import VideoIndex, VideoSegment
+from app.formats.video.index import VideoIndex, VideoSegment, is_counted, stamp_of
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.packet import Packet
     from av.video.frame import VideoFrame
+    from av.video.reformatter import VideoReformatter
     from av.video.stream import VideoStream
 
+_COPY_PX = (16, 16)
 _PLANAR = ("yuv420p", "yuvj420p")
 _ROTATIONS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 Pixels = npt.NDArray[np.uint8]
@@ -44,6 +47,7 @@ class DecodedFrame:
     time_s: float
     rotation_deg: int
     _frame: VideoFrame
+    _reformatter: VideoReformatter
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -65,11 +69,15 @@ class DecodedFrame:
 
     def bgr(self) -> Pixels:
         """Blue, green, red, shape (H, W, 3)."""
-        return self._upright(_uint8(self._frame.to_ndarray(format="bgr24")))
+        return self._upright(self._converted("bgr24"))
 
     def grey(self) -> Pixels:
         """Grey levels, shape (H, W)."""
-        return self._upright(_uint8(self._frame.to_ndarray(format="gray")))
+        return self._upright(self._converted("gray"))
+
+    def _converted(self, form: str) -> Pixels:
+        # `to_ndarray(format=...)` makes a converter with a thread for each core for every frame
+        return _uint8(self._reformatter.reformat(self._frame, format=form, threads=1).to_ndarray())
 
     def _upright(self, pixels: Pixels) -> Pixels:
         return _uint8(cv2.rotate(pixels, _ROTATIONS[self.rotation_deg])) if self.rotation_deg else pixels
@@ -107,7 +115,15 @@ AnyFrame = DecodedFrame | PictureFrame
 
 @dataclass(slots=True)
 class ReadReport:
-    """Frames that could not be decoded."""
+    """Frames of a segment that are not among those that were read: together they are all of the segment.
+
+    Attributes
+    ----------
+    damaged : int
+        Frames that could not be decoded.
+    other_size : int
+        Frames that have another size than the video.
+    """
 
     damaged: int = 0
     other_size: int = 0
@@ -121,7 +137,7 @@ def read_frames(index: VideoIndex, segment: VideoSegment, report: ReadReport, *,
     index : VideoIndex
     segment : VideoSegment
     report : ReadReport
-        Filled while frames are read.
+        Filled while frames are read; complete when the first frame beyond the segment comes, or none is left.
     beyond : int
         Frames after the segment's end that are read too. [frame]
 
@@ -129,6 +145,8 @@ def read_frames(index: VideoIndex, segment: VideoSegment, report: ReadReport, *,
     ------
     UnsupportedUpload
         The video is mirrored, or turned by no multiple of 90 degrees.
+    MemoryError, BlockingIOError
+        This process has no memory, or no thread, left for the codec.
     """
     last = min(segment.end + beyond, len(index.stamps))
     if index.file.kind in BAGS:
@@ -136,35 +154,67 @@ def read_frames(index: VideoIndex, segment: VideoSegment, report: ReadReport, *,
 
         yield from read_pictures(index, segment, report, last)
         return
+    from av.video.reformatter import VideoReformatter
+
     with index.file.open() as container:
         stream = container.streams.video[0]
         stream.thread_type = "NONE"
         stream.codec_context.thread_count = 1
+        reformatter = VideoReformatter()
+        turn = _Turn(VideoReformatter())
         done = segment.first - 1
-        for frame, stamp in _decode(index, segment, container, stream, report):
-            number = int(np.searchsorted(index.stamps, stamp))
+        for frame, number in _decode(index, segment, container, stream):
+            if number <= done:
+                continue  # before the segment
+            report.damaged += max(min(number, segment.end) - done - 1, 0)
+            done = number
             if number >= last:
                 return
-            known = number < len(index.stamps) and index.stamps[number] == stamp
-            if not known or number <= done:
-                continue  # before the segment, or not in the index
-            done = number
             if (frame.width, frame.height) != (index.width_px, index.height_px):
-                report.other_size += 1
+                report.other_size += number < segment.end
                 continue
-            yield DecodedFrame(number, float(index.time_s[number]), rotation_of(frame), frame)
+            yield DecodedFrame(number, float(index.time_s[number]), turn.of(frame), frame, reformatter)
+        report.damaged += max(segment.end - done - 1, 0)
 
 
 def _decode(
-    index: VideoIndex, segment: VideoSegment, container: InputContainer, stream: VideoStream, report: ReadReport
+    index: VideoIndex, segment: VideoSegment, container: InputContainer, stream: VideoStream
 ) -> Iterator[tuple[VideoFrame, int]]:
-    """Decoded frames with their times as the index has them, from the segment's key frame on."""
+    """Decoded frames with their numbers, from where decoding of the segment begins."""
     from av.error import FFmpegError
 
-    is_stream = index.file.kind is VideoKind.MJPEG
-    start = int(index.stamps[segment.first])
-    skip = index.file.kind is not VideoKind.MP4
-    if not skip and segment.first > 0:
+    counted = is_counted(index.file.kind, index.codec)
+    failed = shown = 0  # of the segment, where frames are counted
+    for packet, stamp in _packets(index, segment, container, stream):
+        try:
+            frames = packet.decode() if packet.size else stream.codec_context.decode(None)
+        except FFmpegError as error:
+            if is_exhausted(error):
+                raise
+            failed += stamp is not None and stamp >= index.stamps[segment.first]
+            continue
+        for frame in frames:
+            at = frame.pts if frame.pts is not None else frame.dts
+            number = int(np.searchsorted(index.stamps, at)) if at is not None else len(index.stamps)
+            if number == len(index.stamps) or index.stamps[number] != at:
+                continue  # not in the index
+            if counted:
+                if number < segment.first:
+                    continue
+                number = segment.first + failed + shown
+                shown += 1
+            yield frame, number
+
+
+def _packets(
+    index: VideoIndex, segment: VideoSegment, container: InputContainer, stream: VideoStream
+) -> Iterator[tuple[Packet[Any], int | None]]:
+    """Packets from where decoding of the segment begins, with their times in the index; the last one is empty."""
+    from av.error import FFmpegError
+
+    kind = index.file.kind
+    start = int(index.stamps[segment.first if segment.decode_from is None else segment.decode_from])
+    if kind is VideoKind.MP4 and segment.first > 0:
         container.seek(start, stream=stream, backward=True, any_frame=False)
     packets = enumerate(container.demux(stream))
     while True:
@@ -172,22 +222,37 @@ def _decode(
             number, packet = next(packets)
         except StopIteration:
             return
-        except FFmpegError:
+        except FFmpegError as error:
+            if is_exhausted(error):
+                raise
             return  # the file ends here; the index states the gap
-        stamp = number if is_stream else packet.pts if packet.pts is not None else packet.dts
-        if skip and packet.size and stamp is not None and stamp < start:
-            continue  # these containers have no index that can be trusted, and reading is cheap
-        try:
-            frames = packet.decode() if packet.size else stream.codec_context.decode(None)
-        except FFmpegError:
-            report.damaged += 1
-            continue
-        for frame in frames:
-            at = stamp if is_stream else frame.pts if frame.pts is not None else frame.dts
-            if at is not None:
-                yield frame, int(at)
+        stamp = stamp_of(packet, number, kind)
+        if kind is not VideoKind.MP4 and packet.size:
+            if stamp is None or stamp < start:
+                continue  # these containers have no index that can be trusted, and reading is cheap
+            packet.pts = stamp  # that of the frame that is in this packet
+        yield packet, stamp
         if not packet.size:
             return
+
+
+class _Turn:
+    """Rotation of the frames of a video.
+
+    The display matrix is read once for each rotation, from a small copy of the frame: what PyAV returns for it refers
+    to the frame and the frame to it, so that both, and the codec's buffers, stay until a full garbage collection.
+    """
+
+    def __init__(self, reformatter: VideoReformatter) -> None:
+        self._reformatter = reformatter
+        self._by_pyav: dict[int, int] = {}
+
+    def of(self, frame: VideoFrame) -> int:
+        """As `rotation_of`."""
+        if frame.rotation not in self._by_pyav:
+            copy = self._reformatter.reformat(frame, *_COPY_PX, format="gray", threads=1)
+            self._by_pyav[frame.rotation] = rotation_of(copy)
+        return self._by_pyav[frame.rotation]
 
 
 def rotation_of(frame: VideoFrame) -> int:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, is_exhausted
 from app.formats.video.container import BAGS, EXPECTED, FIELD, VideoFile, VideoKind
 from app.sensors.pose_track import PoseTrack
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.packet import Packet
     from av.video.stream import VideoStream
 
 CODECS = ("h264", "hevc", "mpeg4", "mjpeg")
@@ -70,10 +71,14 @@ class VideoSegment:
     ----------
     first, end : int
         Its frames: numbers in the order of their times, the end is not included.
+    decode_from : int or None
+        Where decoding has to begin: at the key frame before, where frames are counted (`is_counted`). None: at the
+        first.
     """
 
     first: int
     end: int
+    decode_from: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,13 +153,13 @@ def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: 
         return index_bag(file, limits)
     if file.kind is VideoKind.MJPEG and rate_hz is None:
         raise InvalidParameter(
-            "a raw MJPEG stream has no times", field="frames.rate_hz", limit="above 0, to 1000 Hz",
+            "a raw MJPEG stream has no times", field="frames.rate_hz", limit="0.001 to 1000 Hz",
             cure="declare the frame rate, or send an MP4 or AVI",
         )  # fmt: skip
     with file.open() as container:
         stream = _stream_of(container, limits)
         width_px, height_px = _check_size(stream, limits)
-        stamps, is_key, damaged = _list_packets(container, stream, file.kind, limits)
+        stamps, is_key, damaged, missing = _list_packets(container, stream, file.kind, limits)
         time_base = Fraction(1) / Fraction(rate_hz or 1) if file.kind is VideoKind.MJPEG else stream.time_base
         expected_s = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else None
         created_at = _created_at(container)
@@ -182,8 +187,14 @@ def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: 
         warnings.append("frames.rate_hz is not used: the video has times of its own")
     if damaged:
         warnings.append(f"{damaged} packets without a time are left out")
-    gaps = _find_gaps(time_s, expected_s)
+    gaps = _find_gaps(time_s, expected_s, missing)
     segments = cut_segments(time_s, keys, limits)
+    if is_counted(file.kind, codec):
+        # frames that are shown before a key frame and decoded after it need the frames before the key frame, too
+        key_numbers = np.flatnonzero(keys)
+        segments = tuple(
+            replace(part, decode_from=int(max(key_numbers[key_numbers < part.first], default=0))) for part in segments
+        )
     return VideoIndex(
         file, codec, width_px, height_px, ordered, time_s, segments, created_at, tuple(gaps), tuple(warnings)
     )
@@ -229,18 +240,19 @@ def _check_size(stream: VideoStream, limits: VideoLimits) -> tuple[int, int]:
 
 def _list_packets(
     container: InputContainer, stream: VideoStream, kind: VideoKind, limits: VideoLimits
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_], int]:
-    """Time and key flag of each packet in the order of the file, and how many packets have no time."""
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_], int, int]:
+    """Time and key flag of each packet in the order of the file; packets without a time, and those that are missing."""
     from av.error import FFmpegError
 
     stamps: list[int] = []
     keys: list[bool] = []
-    damaged = 0
+    damaged = there = 0
     try:
         for number, packet in enumerate(container.demux(stream)):
-            if packet.size == 0:
-                continue
-            stamp = number if kind is VideoKind.MJPEG else packet.pts if packet.pts is not None else packet.dts
+            there += packet.size > 0
+            if packet.size == 0 or packet.is_discard:
+                continue  # the edit list shows frames of discarded packets never: they are decoded for others
+            stamp = stamp_of(packet, number, kind)
             if stamp is None or abs(stamp) > 1 << 60:
                 damaged += 1
                 continue
@@ -248,11 +260,28 @@ def _list_packets(
             keys.append(bool(packet.is_keyframe))
             if len(stamps) > limits.frames:
                 raise UploadTooLarge("the video has too many frames", field=FIELD, limit=f"{limits.frames} frames")
-    except FFmpegError:
-        pass  # what can be read is read; the gap at the end is stated
+    except FFmpegError as error:
+        if is_exhausted(error):
+            raise
+        # what can be read is read; the gap at the end is stated
     if not stamps:
         raise UnreadableUpload("the video holds no frame with a time", field=FIELD, cure="send the file whole")
-    return np.array(stamps, np.int64), np.array(keys, bool), damaged
+    return np.array(stamps, np.int64), np.array(keys, bool), damaged, max(stream.frames - there, 0)
+
+
+def stamp_of(packet: Packet[Any], number: int, kind: VideoKind) -> int | None:
+    """Time of a packet in the container's unit, or its number in a stream without times; None if it has none.
+
+    AVI has times in the order of decoding only; those of presentation that the demuxer adds to them are guesses.
+    """
+    if kind is VideoKind.MJPEG:
+        return number
+    return packet.pts if packet.pts is not None and kind is not VideoKind.AVI else packet.dts
+
+
+def is_counted(kind: VideoKind, codec: str) -> bool:
+    """Whether frames have no time of presentation, and are numbered in the order in which the decoder shows them."""
+    return kind is VideoKind.AVI and codec != "mjpeg"
 
 
 def _created_at(container: InputContainer) -> datetime | None:
@@ -276,12 +305,13 @@ def find_time_gaps(time_s: npt.NDArray[np.float64]) -> list[VideoGap]:
     ]
 
 
-def _find_gaps(time_s: npt.NDArray[np.float64], expected_s: float | None) -> list[VideoGap]:
+def _find_gaps(time_s: npt.NDArray[np.float64], expected_s: float | None, missing: int) -> list[VideoGap]:
     gaps = find_time_gaps(time_s)
     usual_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     missing_s = (expected_s or 0.0) - (float(time_s[-1]) + usual_s)
     if missing_s > max(0.5, 3 * usual_s):
-        reason = "the file ends before the video does"
+        frames = f": {missing} frames that it declares are missing" if missing else ""
+        reason = f"the file ends before the video does{frames}"
         gaps.append(VideoGap(len(time_s) - 1, None, round(missing_s, 3), reason))
     return gaps
 

@@ -18,9 +18,13 @@ from app.planning.radio_checks import PreviewRule, RadioCheck, RadioPlan, check_
 from app.planning.radio_recommendation import INTERVALS_S, recommend_settings
 from app.planning.rules import CerpmRules
 from app.radio.airtime import SPREADING_FACTORS
+from app.radio.lorawan import Region
 from app.radio.reception import MAX_MARKERS, SPACINGS_M, Air, RoadMarkers
+from app.radio.regulation import LAWS, region_at
 from app.radio.settings import RadioSettings
 
+_DEFAULT_REGION = Region.US915  # of the CERPM paper's markers
+_EU_SETTINGS = RadioSettings(frequency_hz=868_300_000, power_dbm=14.0)  # source: by hand, within band M
 _CARRIAGEWAY_M = 30.0  # [m] across; markers farther aside are farther along a bend; source: by hand, a motorway
 
 
@@ -69,7 +73,8 @@ def _shifts_m(lane: Lane, cerpms: Sequence[PlannedMarker]) -> Floats:
 
 def _radio(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterator[PlanFinding]:
     """The radio checks where most markers are in reach of each other, with the real markers of the plan."""
-    radio = _radio_plan(plan, cerpms, rules, plan.radio or RadioSettings())
+    yield _law(cerpms, rules)
+    radio = _radio_plan(plan, cerpms, rules, plan.radio or _first_settings(rules))
     markers, busiest = _busiest(cerpms, radio.air)
     check = check_radio(replace(radio, markers=markers))
     settings = radio.settings
@@ -84,6 +89,26 @@ def _radio(plan: Plan, cerpms: list[PlannedMarker], rules: CerpmRules) -> Iterat
     yield _collisions(check, rules, busiest)
 
 
+def _law(cerpms: list[PlannedMarker], rules: CerpmRules) -> PlanFinding:
+    """Whether the rules that the radio is checked by apply where the markers are."""
+    checked = rules.region or _DEFAULT_REGION
+    found = [region_at(marker.lon_deg, marker.lat_deg) for marker in cerpms]
+    elsewhere = [marker for marker, region in zip(cerpms, found, strict=True) if region is not checked]
+    how = "as declared" if rules.region else "because no region is declared"
+    sentence = f"CERPMs at places where other rules may apply; checked by {checked}, {LAWS[checked]}, {how}"
+    if others := [region for region in Region if region in found and region is not checked]:
+        sentence += "; some are under " + " and ".join(f"{region}, {LAWS[region]}" for region in others)
+    if None in found:
+        sentence += "; of some the law is unknown here, near a border or in another country"
+    if elsewhere:
+        cure = "ask the authority before installing"
+        sentence += f": {cure}" if rules.region else f": declare cerpm.region, and {cure}"
+    return compare(
+        "radio law", len(elsewhere), "<=", 0, "CERPMs", "positions of the CERPMs; app/radio/regulation.py", sentence,
+        elsewhere[0] if elsewhere else None, missed=Verdict.WARN,
+    )  # fmt: skip
+
+
 def radio_settings(plan: Plan) -> RadioSettings | None:
     """Settings of the plan's CERPMs: those of the rules, or recommended ones; None without CERPMs.
 
@@ -95,10 +120,11 @@ def radio_settings(plan: Plan) -> RadioSettings | None:
     if rules is None or not cerpms:
         return None
     if rules.spreading_factor is not None and rules.interval_s is not None:
-        return RadioSettings(
-            spreading_factor=rules.spreading_factor, interval_s=rules.interval_s, bandwidth_hz=rules.bandwidth_hz
-        )
-    mean = _radio_plan(plan, cerpms, rules, RadioSettings())
+        return replace(
+            _first_settings(rules), spreading_factor=rules.spreading_factor, interval_s=rules.interval_s,
+            bandwidth_hz=rules.bandwidth_hz,
+        )  # fmt: skip
+    mean = _radio_plan(plan, cerpms, rules, _first_settings(rules))
     found = _recommended(mean)
     markers, _marker = _busiest(cerpms, found.air)
     real = replace(found, markers=markers)
@@ -109,12 +135,17 @@ def radio_settings(plan: Plan) -> RadioSettings | None:
     return _recommended(replace(mean, markers=markers)).settings
 
 
+def _first_settings(rules: CerpmRules) -> RadioSettings:
+    """Settings to begin with, on a frequency and with a power of the region."""
+    return _EU_SETTINGS if rules.region is Region.EU868 else RadioSettings()
+
+
 def _radio_plan(plan: Plan, cerpms: Sequence[PlannedMarker], rules: CerpmRules, settings: RadioSettings) -> RadioPlan:
     lanes = {marker.lane for marker in cerpms}
     length_m = sum(plan.alignment.lane(name).length_m for name in lanes)
     spacing_m = min(max(2 * length_m / len(cerpms) / len(lanes), SPACINGS_M[0]), SPACINGS_M[1])
     made = RadioPlan(
-        settings, rules.region, spacing_m=spacing_m,
+        settings, rules.region or _DEFAULT_REGION, spacing_m=spacing_m,
         design_speed_mps=max(float(lane.design_speed_mps.max()) for lane in plan.alignment.lanes),
         preview=PreviewRule(distance_m=rules.preview_m),
     )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -31,19 +32,52 @@ class Scope(StrEnum):
     SURVEYOR = "surveyor"
     VIEWER = "viewer"
     VEHICLE = "vehicle"
+    OPERATOR = "operator"
+
+
+AGENCY_SCOPES = tuple(scope for scope in Scope if scope is not Scope.OPERATOR)
+"""Scopes of an agency's keys. A key of an operator creates agencies and belongs to none."""
+MAX_AGENCY_NAME = 200
 
 
 def parse_scope(name: str) -> Scope:
-    """The scope with a name.
+    """The scope of an agency's key with a name.
 
     Raises
     ------
     InvalidParameter
         There is none.
     """
-    if name not in list(Scope):
-        raise InvalidParameter(f"there is no scope {name!r}", field="scope", limit=", ".join(Scope))
+    if name not in AGENCY_SCOPES:
+        raise InvalidParameter(f"there is no scope {name!r}", field="scope", limit=", ".join(AGENCY_SCOPES))
     return Scope(name)
+
+
+def check_agency_name(name: str, *, field: str) -> None:
+    """Refuse a name that an agency cannot have.
+
+    Raises
+    ------
+    InvalidParameter
+        It is empty or too long, has characters that cannot be seen, or could be mistaken for another name.
+    """
+    limit = f"1 to {MAX_AGENCY_NAME} characters"
+    cure = "choose a name that can be printed and typed"
+    if not 1 <= len(name) <= MAX_AGENCY_NAME:
+        message = f"the name of an agency cannot have {len(name)} characters"
+    elif not name.isprintable():  # control and format characters, surrogates, separators other than the space
+        character = next(character for character in name if not character.isprintable())
+        message, limit = f"the name has the character U+{ord(character):04X}", "printable characters"
+    elif not unicodedata.is_normalized("NFC", name):
+        message, limit, cure = "the name is not in Unicode's form NFC", "NFC", "send the name normalized to NFC"
+    elif name != " ".join(name.split()):
+        message, limit = "the name begins or ends with a space, or has several in a row", "single spaces between words"
+        cure = "remove the superfluous spaces"
+    elif name == agencies.OPERATORS:
+        message, limit = f"{name} is reserved for keys of the server's operators", f"any name but {name}"
+    else:
+        return
+    raise InvalidParameter(message, field=field, limit=limit, cure=cure)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +110,13 @@ class Caller:
         """
         if self.scope not in allowed:
             limit = " or ".join(scope for scope in Scope if scope in allowed) or "nobody"
-            raise NotAllowed(
-                f"a key with the scope {self.scope} may not do this",
-                limit=f"scope {limit}",
-                cure="ask an admin of your agency for a key with such a scope",
-            )
+            if self.scope is Scope.OPERATOR:
+                cure = "use a key of an agency; POST /v1/agencies creates an agency with its first key"
+            elif Scope.OPERATOR in allowed and Scope.ADMIN not in allowed:
+                cure = "ask the server's operator, who creates agencies with a key from waymark key --operator"
+            else:
+                cure = "ask an admin of your agency for a key with such a scope"
+            raise NotAllowed(f"a key with the scope {self.scope} may not do this", limit=f"scope {limit}", cure=cure)
 
     @property
     def own_key_id(self) -> str | None:
@@ -239,13 +275,29 @@ class Access:
 
     def create_key(self, agency: str, scope: Scope, label: str, expires_at: datetime | None = None) -> str:
         """A new key for an agency, which is created if there is none of that name. Shown once, stored as a hash."""
-        if not agency.strip() or len(agency) > 200:
-            raise InvalidParameter("an agency's name has 1 to 200 characters", field="agency", limit="1 to 200")
+        if scope not in AGENCY_SCOPES:
+            raise InvalidParameter(
+                f"an agency has no key with the scope {scope}", field="scope", limit=", ".join(AGENCY_SCOPES)
+            )
         now = self._clock()
         key = new_key()
         with across_agencies(), self._database.write() as connection:
-            agency_id = agencies.find_agency(connection, agency) or agencies.add_agency(connection, agency, now)
+            agency_id = agencies.find_agency(connection, agency)
+            if agency_id is None:
+                check_agency_name(agency, field="agency")
+                agency_id = agencies.add_agency(connection, agency, now)
             add_key(connection, key, agency_id=agency_id, scope=scope, label=label, now=now, expires_at=expires_at)
+        return key
+
+    def create_operator_key(self, label: str, expires_at: datetime | None = None) -> str:
+        """A new key with which an operator creates agencies over HTTP. Shown once, stored as a hash."""
+        now = self._clock()
+        key = new_key()
+        with across_agencies(), self._database.write() as connection:
+            agency_id = agencies.ensure_operators(connection, now)
+            add_key(
+                connection, key, agency_id=agency_id, scope=Scope.OPERATOR, label=label, now=now, expires_at=expires_at
+            )
         return key
 
 

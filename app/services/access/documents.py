@@ -38,6 +38,27 @@ class KeyPage(TypedDict):
     items: list[KeyDocument]
 
 
+class AgencyDocument(TypedDict):
+    """An agency."""
+
+    id: str
+    name: str
+    created_at: datetime
+
+
+class NewAgencyDocument(AgencyDocument):
+    """An agency with its first key. The key's text is shown only in this response, and where the request is repeated
+    with its Idempotency-Key."""
+
+    admin_key: NewKeyDocument
+
+
+class AgencyPage(TypedDict):
+    """A page of agencies, oldest first; the Link header leads to the next one."""
+
+    items: list[AgencyDocument]
+
+
 class AuditHead(TypedDict):
     """The newest entry of a log. Compare it with a copy that is stored elsewhere: a log that was cut differs."""
 

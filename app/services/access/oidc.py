@@ -15,7 +15,7 @@ import jwt
 import structlog
 
 from app.errors import NotAllowed, NotAuthenticated, Unavailable
-from app.services.access.access import Bearer, Scope
+from app.services.access.access import AGENCY_SCOPES, Bearer, Scope
 
 _LOG = structlog.get_logger(__name__)
 MAX_TOKEN_CHARACTERS = 8192
@@ -122,9 +122,9 @@ class Tokens:
             raise _without(self._issuer.agency_claim, "the name of an agency")
         given = _claim(claims, self._issuer.scope_claim)
         names = given.split() if isinstance(given, str) else given if isinstance(given, list) else []
-        scopes = {Scope(name) for name in names if isinstance(name, str) and name in list(Scope)}
+        scopes = {Scope(name) for name in names if isinstance(name, str) and name in AGENCY_SCOPES}
         if len(scopes) != 1:
-            raise _without(self._issuer.scope_claim, f"one of {', '.join(Scope)}")
+            raise _without(self._issuer.scope_claim, f"one of {', '.join(AGENCY_SCOPES)}")
         subject = str(claims["sub"])
         digest = hashlib.sha256(f"{self._issuer.issuer}\n{subject}".encode("utf-8", "replace")).hexdigest()
         return Bearer(agency, f"oidc:{digest[:32]}", _label(claims, subject), scopes.pop(), _ends_at(claims))

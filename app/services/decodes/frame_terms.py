@@ -36,8 +36,8 @@ def frame_terms(declared: Mapping[str, Any]) -> FrameTerms:
         A figure is out of its limits; the field is below ``frames``.
     """
     rate_hz = declared.get("rate_hz")
-    if rate_hz is not None and not 0 < rate_hz <= 1000:
-        raise InvalidParameter(f"the frame rate is {rate_hz:g}", field="frames.rate_hz", limit="above 0, to 1000 Hz")
+    if rate_hz is not None and not 0.001 <= rate_hz <= 1000:
+        raise InvalidParameter(f"the frame rate is {rate_hz:g}", field="frames.rate_hz", limit="0.001 to 1000 Hz")
     try:
         return FrameTerms(rate_hz, pose_declaration(declared.get("poses") or {}))
     except InvalidParameter as error:

@@ -49,6 +49,8 @@ POSE_EVERY_S = 0.5
 PART_EVERY = timedelta(seconds=10)
 """Shortest time between two partial results. Source: chosen by hand: each is written whole."""
 
+_DAMAGED, _OTHER_SIZE = "could not be decoded", "have another size than the video"
+
 
 @dataclass(slots=True)
 class VideoSignal:
@@ -58,6 +60,8 @@ class VideoSignal:
     plates: list[SeenPlateDocument] = field(default_factory=list)
     codebook: set[str] = field(default_factory=set)
     searched: int = 0
+    damaged: int = 0
+    other_size: int = 0
     gaps: list[GapDocument] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     receiver: ReceiverPositions | None = None
@@ -131,6 +135,11 @@ class StartedVideo:
         while self._waiting:
             done = self._finish(index, self._waiting.popleft())
             self._report(done, len(index.stamps))
+        for count, what in ((self._signal.damaged, _DAMAGED), (self._signal.other_size, _OTHER_SIZE)):
+            if count:
+                self._signal.warnings.append(
+                    f"{count} of {len(index.stamps)} frames {what}; {self._signal.searched} were searched"
+                )
         self._signal.warnings += [text for text in self._places.warnings if text not in self._signal.warnings]
         return self._signal
 
@@ -206,13 +215,14 @@ class StartedVideo:
         """Match what a segment shows; returns the number of the frame after it."""
         result, signal = waiting.pending.result(), self._signal
         signal.searched += result.frames
-        if result.damaged or result.other_size:
-            what = "could not be decoded" if result.damaged else "have another size than the video"
-            reason = f"{result.damaged or result.other_size} frames {what}"
-            signal.gaps.append(
-                {"after_frame": waiting.segment.first, "before_frame": waiting.segment.end, "seconds": None,
-                 "reason": reason}
-            )  # fmt: skip
+        signal.damaged += result.damaged
+        signal.other_size += result.other_size
+        for count, what in ((result.damaged, _DAMAGED), (result.other_size, _OTHER_SIZE)):
+            if count:
+                signal.gaps.append(
+                    {"after_frame": waiting.segment.first, "before_frame": waiting.segment.end, "seconds": None,
+                     "reason": f"{count} frames {what}"}
+                )  # fmt: skip
         plates = [plate for plate in result.plates if not _was_followed(plate, self._last)]
         self._last = [plate for plate in result.plates if plate.seen[-1].frame >= waiting.segment.end - 1]
         by_frame = _by_frame(plates, result.others)

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import hashlib
+import threading
+from collections import OrderedDict
 from typing import Any, cast
+
+import orjson
 
 from app.errors import InvalidParameter
 from app.services.access.access import Caller
 from app.services.plans.documents import PlanPreview, PreviewedMarker
 from app.services.plans.making import IMMEDIATE_LANES_M, PlanMaking
 from app.services.plans.plans import Plans
+from app.services.plans.tasks import MadePlan
 
 _NAME = "preview"
+MAX_MARKERS = 10_000
+"""Markers of a page: 1.7 MB. Source: chosen by hand, as pages of features."""
+_KEPT = 4  # previews whose further pages need no computation; a large one takes 5 MB compressed; chosen by hand
 
 
 class PlanPreviews:
@@ -25,9 +34,24 @@ class PlanPreviews:
 
     def __init__(self, plans: Plans, making: PlanMaking) -> None:
         self._plans, self._making = plans, making
+        self._kept: OrderedDict[bytes, MadePlan] = OrderedDict()
+        self._lock = threading.Lock()
 
-    def preview(self, caller: Caller, alignment_id: str, rules: dict[str, Any]) -> PlanPreview:
-        """Counts, checks, costs and markers of a plan by these rules.
+    def preview(
+        self, caller: Caller, alignment_id: str, rules: dict[str, Any], *, after: int = 0, limit: int = MAX_MARKERS
+    ) -> tuple[PlanPreview, int | None]:
+        """Counts, checks, costs and a page of markers of a plan by these rules, and where the next page begins.
+
+        Parameters
+        ----------
+        caller : Caller
+        alignment_id : str
+        rules : dict
+        after : int, optional
+            Markers of the pages before. The first page is always computed anew; the pages after it are those of the
+            last preview with the same rules, as long as this process keeps it.
+        limit : int, optional
+            Most markers of the page.
 
         Raises
         ------
@@ -43,9 +67,20 @@ class PlanPreviews:
                 limit=f"{IMMEDIATE_LANES_M / 1000:g} km of lanes",
                 cure="make the plan, which is a job then",
             )
-        made = self._plans.place(caller, _NAME, alignment_id, rules)
-        members = PreviewedMarker.__annotations__ if made.features.count else ()
-        columns = {name: made.features.values(name) for name in members}
+        key = hashlib.sha256(orjson.dumps([caller.agency_id, alignment_id, rules])).digest()
+        with self._lock:
+            made = self._kept.get(key) if after else None
+        if made is None:
+            made = self._plans.place(caller, _NAME, alignment_id, rules)
+            with self._lock:
+                self._kept[key] = made
+                self._kept.move_to_end(key)
+                if len(self._kept) > _KEPT:
+                    self._kept.popitem(last=False)
+        count = made.features.count
+        members = PreviewedMarker.__annotations__ if count else ()
+        columns = {name: made.features.values(name)[after : after + limit] for name in members}
         rows = zip(*columns.values(), strict=True)
         markers = [dict(zip(columns, row, strict=True)) for row in rows]
-        return cast("PlanPreview", {**made.summary, "markers": markers})
+        onward = after + limit if after + limit < count else None
+        return cast("PlanPreview", {**made.summary, "markers": markers}), onward

@@ -44,10 +44,13 @@ class AgencyEvents:
             return store.newest_event(connection, caller.agency_id)
 
     def list(self, caller: Caller, after: int, limit: int = 100) -> list[EventDocument]:
-        """Events after one, oldest first; those of jobs only where the caller may read jobs of the kind."""
+        """Events after one, oldest first; of jobs those that the caller may read. A vehicle sees nothing else."""
         kinds = visible_kinds(caller)
         with self._database.read() as connection:
-            rows = store.list_events(connection, caller.agency_id, after=after, job_kinds=kinds, limit=limit)
+            rows = store.list_events(
+                connection, caller.agency_id,
+                after=after, job_kinds=kinds, holder_id=caller.own_key_id, limit=limit,
+            )  # fmt: skip
         return [cast("EventDocument", row._asdict()) for row in rows]
 
     def newest_of(self, agency_ids: Sequence[str]) -> dict[str, int]:

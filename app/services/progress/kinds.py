@@ -6,10 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from app.registry.jobs import JobKind, JobRow
-from app.services.access.access import Caller, Scope
+from app.services.access.access import AGENCY_SCOPES, Caller, Scope
 from app.services.surveys.imports import SETTLED
 
-_READERS = frozenset(Scope) - {Scope.VEHICLE}
+_EVERYBODY = frozenset(AGENCY_SCOPES)
+_READERS = _EVERYBODY - {Scope.VEHICLE}
 _SURVEYORS = _READERS - {Scope.VIEWER}
 _PLANNERS = frozenset({Scope.PLANNER, Scope.ADMIN})
 
@@ -40,7 +41,7 @@ def _about_plan(end: str) -> Callable[[JobRow], str | None]:
 
 RULES: dict[str, JobRules] = {
     JobKind.DECODE: JobRules(
-        frozenset(Scope), frozenset(Scope) - {Scope.VIEWER}, lambda job: f"/v1/decodes/{job.id}"
+        _EVERYBODY, _EVERYBODY - {Scope.VIEWER}, lambda job: f"/v1/decodes/{job.id}"
     ),
     JobKind.IMPORT: JobRules(_SURVEYORS, _SURVEYORS, lambda job: f"/v1/imports/{job.id}", SETTLED),
     JobKind.PLAN: JobRules(_READERS, _PLANNERS, _about_plan("")),
@@ -52,7 +53,7 @@ RULES: dict[str, JobRules] = {
         frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), lambda job: f"/v1/reprocessings/{job.subject_id}"
     ),
     JobKind.DRIVE: JobRules(
-        frozenset(Scope), frozenset(Scope) - {Scope.VIEWER}, lambda job: f"/v1/drives/{job.id}"
+        _EVERYBODY, _EVERYBODY - {Scope.VIEWER}, lambda job: f"/v1/drives/{job.id}"
     ),
     JobKind.AUDIT: JobRules(
         frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), lambda job: f"/v1/audit/verifications/{job.id}"

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from itertools import chain, islice
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Protocol
 
 from app.errors import InvalidParameter
 from app.families.rules import RETIRED
 from app.formats import exports as write
+from app.formats.exports import WrittenFile
 from app.registry import bulk
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter
 from app.services.access.access import Caller
+from app.services.request_work import check_deadline
 
 STREAMED = {"csv": "text/csv; charset=utf-8", "geojson": "application/geo+json"}
 WHOLE = {
@@ -26,16 +27,31 @@ WHOLE = {
 }
 KINDS = (*STREAMED, *WHOLE)
 MAX_WHOLE = {"gpkg": 10_000_000, "shapefile": 2_000_000, "kml": 200_000, "landxml": 200_000, "dxf": 200_000}
-_PAGE = 5_000
-_GIS_PAGE = 50_000
+_PAGE = 2_000
 _BLOCK = 2**20
 
 
-class Exports:
-    """Use cases on exports; each page is read by itself, so an export holds no transaction open."""
+class FileWriter(Protocol):
+    """As `app.formats.exports.write_file`."""
 
-    def __init__(self, database: Database) -> None:
-        self._database = database
+    def __call__(
+        self, kind: str, pages: Iterable[Sequence[write.Record]], folder: Path, *, all_heights: bool
+    ) -> WrittenFile:
+        """Write a file from pages of markers."""
+
+
+class Exports:
+    """Use cases on exports; each page is read by itself, so an export holds no transaction open.
+
+    Parameters
+    ----------
+    database : Database
+    write : callable
+        Writes a file of a kind of `WHOLE`, here or in another process.
+    """
+
+    def __init__(self, database: Database, write: FileWriter = write.write_file) -> None:
+        self._database, self._write = database, write
 
     def stream(self, caller: Caller, kind: str, filtered: MarkerFilter) -> Iterator[bytes]:
         """CSV or GeoJSON in the order of the ids, at flat memory."""
@@ -61,7 +77,7 @@ class Exports:
     def write_file(
         self, caller: Caller, kind: str, filtered: MarkerFilter, folder: Path,
         report: Callable[[int], None] = lambda _markers: None,
-    ) -> tuple[Path, tuple[str, ...]]:  # fmt: skip
+    ) -> WrittenFile:  # fmt: skip
         """One file of any kind, in an empty folder, and the ids of markers left out of it; raises as `whole`.
 
         `report` is called with the number of markers that were read so far; what it raises stops the export.
@@ -74,48 +90,38 @@ class Exports:
             with path.open("wb") as file:
                 pages = _reported(self._pages(caller, filtered), report)
                 file.writelines(write.write_csv(pages) if kind == "csv" else write.write_geojson(pages))
-            return path, ()
-        in_zone = kind in ("landxml", "dxf")
-        pages = _reported(self._pages(caller, filtered, most=MAX_WHOLE[kind], with_retired=not in_zone), report)
-        first = next(pages, None)
-        if first is None:
+            return WrittenFile(path)
+        with_retired = kind not in ("landxml", "dxf") or filtered.status is not None
+        with self._database.read() as connection:
+            count = bulk.count_records(connection, caller.agency_id, filtered, with_retired=with_retired)
+            all_heights = bulk.have_ellipsoidal_heights(connection, caller.agency_id, filtered)
+        if not count:
             raise InvalidParameter(
                 "no marker is in the selection", field="bbox", limit="one at least", cure="widen the filter"
             )
-        records = chain.from_iterable(chain((first,), pages))
-        if in_zone:
-            path = folder / f"markers.{kind}"
-            made = (write.write_landxml if kind == "landxml" else write.write_dxf)(list(records))
-            path.write_bytes(made.content)
-            return path, made.left_out
-        with self._database.read() as connection:
-            all_heights = bulk.have_ellipsoidal_heights(connection, caller.agency_id, filtered)
-        batches = _batched(records, MAX_WHOLE["kml"] if kind == "kml" else _GIS_PAGE)
-        return write.write_gis(batches, kind, folder, all_heights=all_heights), ()
+        if count > MAX_WHOLE[kind]:
+            raise InvalidParameter(
+                f"{count} markers are too many for one file",
+                field="bbox",
+                limit=f"{MAX_WHOLE[kind]} markers",
+                cure="export a smaller box, or CSV or GeoJSON",
+            )
+        pages = _reported(self._pages(caller, filtered, with_retired=with_retired), report)
+        return self._write(kind, pages, folder, all_heights=all_heights)
 
     def _pages(
-        self, caller: Caller, filtered: MarkerFilter, *, most: int | None = None, with_retired: bool = True
+        self, caller: Caller, filtered: MarkerFilter, *, with_retired: bool = True
     ) -> Iterator[list[dict[str, Any]]]:
         after: str | None = None
-        count = 0
         while True:
+            check_deadline()
             with self._database.read() as connection:
                 page = bulk.list_records(connection, caller.agency_id, filtered, write.FIELDS, after=after, limit=_PAGE)
             if not page:
                 return
             after = page[-1]["id"]
-            if not with_retired and filtered.status is None:
+            if not with_retired:
                 page = [record for record in page if record["status"] != RETIRED]
-                if not page:
-                    continue
-            count += len(page)
-            if most is not None and count > most:
-                raise InvalidParameter(
-                    "too many markers for one file",
-                    field="bbox",
-                    limit=f"{most} markers",
-                    cure="export a smaller box, or CSV or GeoJSON",
-                )
             for record in page:
                 record["updated_at"] = record["updated_at"].isoformat()
             yield page
@@ -127,11 +133,6 @@ def _reported(pages: Iterator[list[dict[str, Any]]], report: Callable[[int], Non
         yield page
         count += len(page)
         report(count)
-
-
-def _batched(records: Iterator[dict[str, Any]], count: int) -> Iterator[list[dict[str, Any]]]:
-    while batch := list(islice(records, count)):
-        yield batch
 
 
 def _blocks(path: Path, folder: TemporaryDirectory[str]) -> Iterator[bytes]:

@@ -175,11 +175,14 @@ class WebhookDelivery:
     async def _send_one(self, delivery: DeliveryRow, webhook: WebhookRow) -> Outcome:
         try:
             secret = self._secrets.unseal(secret_owner(webhook.agency_id, webhook.id), webhook.sealed_secret)
+            body = delivery.body.encode()
+            headers = signed_headers(secret, delivery.id, int(self._clock().timestamp()), body)
+            return await self._sender.send(webhook.url, headers, body)
         except Unavailable as error:
             return Unsent(error.message)
-        body = delivery.body.encode()
-        headers = signed_headers(secret, delivery.id, int(self._clock().timestamp()), body)
-        return await self._sender.send(webhook.url, headers, body)
+        except Exception as error:  # noqa: BLE001 - one delivery must not end those of other agencies
+            _LOG.exception("a delivery failed by a defect of the server", webhook_id=webhook.id)
+            return Unsent(f"a defect of the server: {type(error).__name__}")
 
     def _record(self, delivery: DeliveryRow, webhook: WebhookRow, outcome: Outcome | None) -> None:
         now = self._clock()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from app.compiled import kernel
 from app.markers.magnet import FIELD_UT_M3
 
 Floats = npt.NDArray[np.float64]
@@ -34,7 +34,7 @@ def dipole_field_ut(points_m: Floats, dipole_m: Floats, moment_am2: Floats) -> F
     return field
 
 
-@nb.njit(cache=True, nogil=True, fastmath=True)
+@kernel
 def add_static_field(out, points, axes, chainage, dipoles, at, reach):  # type: ignore[no-untyped-def]
     """Add what dipoles in the road give along one axis of each sensor.
 

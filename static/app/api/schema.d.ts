@@ -418,6 +418,24 @@ export interface paths {
         patch?: never;
         trace?: never;
     };
+    "/v1/agencies": {
+        parameters: {
+            query?: never;
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        /** List Agencies */
+        get: operations["list_agencies"];
+        put?: never;
+        /** Post Agency */
+        post: operations["post_agency"];
+        delete?: never;
+        options?: never;
+        head?: never;
+        patch?: never;
+        trace?: never;
+    };
     "/v1/alignments": {
         parameters: {
             query?: never;
@@ -2593,6 +2611,20 @@ export interface components {
             nssda: components["schemas"]["NssdaDocument"];
             vertical_rmse_m: number | null;
         };
+        AgencyDocument: {
+            /** Format: date-time */
+            created_at: string;
+            id: string;
+            name: string;
+        };
+        AgencyIn: {
+            /** @default first admin key */
+            key_label?: string;
+            name: string;
+        };
+        AgencyPage: {
+            items: components["schemas"]["AgencyDocument"][];
+        };
         AlignmentDocument: {
             areas: number;
             /** Format: date-time */
@@ -4763,6 +4795,13 @@ export interface components {
              */
             type: "MultiPolygon";
         };
+        NewAgencyDocument: {
+            admin_key: components["schemas"]["NewKeyDocument"];
+            /** Format: date-time */
+            created_at: string;
+            id: string;
+            name: string;
+        };
         NewFeature: {
             geometry?: {
                 [key: string]: components["schemas"]["JsonValue"];
@@ -6149,7 +6188,7 @@ export interface components {
             values: (number | null)[];
         };
         /** @enum {string} */
-        Scope: "admin" | "planner" | "surveyor" | "viewer" | "vehicle";
+        Scope: "admin" | "planner" | "surveyor" | "viewer" | "vehicle" | "operator";
         SearchIn: {
             along?: components["schemas"]["AlongIn"] | null;
             bbox?: number[] | null;
@@ -7602,6 +7641,55 @@ export interface operations {
                 };
                 content: {
                     "application/json": components["schemas"]["ReadinessDocument"];
+                };
+            };
+        };
+    };
+    list_agencies: {
+        parameters: {
+            query?: {
+                after?: string | null;
+                limit?: number;
+            };
+            header?: never;
+            path?: never;
+            cookie?: never;
+        };
+        requestBody?: never;
+        responses: {
+            /** @description Successful Response */
+            200: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["AgencyPage"];
+                };
+            };
+        };
+    };
+    post_agency: {
+        parameters: {
+            query?: never;
+            header?: {
+                "Idempotency-Key"?: string;
+            };
+            path?: never;
+            cookie?: never;
+        };
+        requestBody: {
+            content: {
+                "application/json": components["schemas"]["AgencyIn"];
+            };
+        };
+        responses: {
+            /** @description Successful Response */
+            201: {
+                headers: {
+                    [name: string]: unknown;
+                };
+                content: {
+                    "application/json": components["schemas"]["NewAgencyDocument"];
                 };
             };
         };
@@ -10080,7 +10168,10 @@ export interface operations {
     };
     post_plan_preview: {
         parameters: {
-            query?: never;
+            query?: {
+                after?: number;
+                limit?: number;
+            };
             header?: never;
             path?: never;
             cookie?: never;

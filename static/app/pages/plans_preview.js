@@ -12,6 +12,7 @@ import { t, textOr } from "../texts/index.js";
 import { checkName } from "./plans_view.js";
 
 const PAUSE_MS = 600;
+const PAGE = 10_000;
 export const LEVELS = /** @type {Record<string, "good" | "warn" | "bad">} */ ({ ok: "good", warn: "warn", fail: "bad" });
 
 /** @typedef {import("../api/schema.js").components["schemas"]["PlanPreview"]} Preview */
@@ -35,7 +36,7 @@ export function usePreview(alignmentId, rules) {
     const abort = new AbortController();
     setState((old) => ({ ...old, loading: true }));
     const timer = setTimeout(() => {
-      ok(api.POST("/v1/plan-previews", { body: { alignment_id: alignmentId, rules: JSON.parse(text) }, signal: abort.signal })).then(
+      allPages({ alignment_id: alignmentId, rules: JSON.parse(text) }, abort.signal).then(
         (preview) => abort.signal.aborted || setState({ preview, error: null, loading: false }),
         (error) => abort.signal.aborted || isAborted(error) || setState((old) => ({ preview: old.preview, error, loading: false })),
       );
@@ -46,6 +47,25 @@ export function usePreview(alignmentId, rules) {
     };
   }, [alignmentId, text]);
   return { ...state, errors: fieldErrors(state.error) };
+}
+
+/**
+ * A preview with the markers of all its pages.
+ *
+ * @param {{ alignment_id: string, rules: any }} body
+ * @param {AbortSignal} signal
+ * @returns {Promise<Preview>}
+ */
+async function allPages(body, signal) {
+  const page = (/** @type {number} */ after) => ok(api.POST("/v1/plan-previews", { body, signal, params: { query: { after, limit: PAGE } } }));
+  const first = await page(0);
+  const markers = [...first.markers];
+  for (let length = markers.length; length === PAGE; ) {
+    const next = (await page(markers.length)).markers;
+    markers.push(...next);
+    length = next.length;
+  }
+  return { ...first, markers };
 }
 
 /** @param {Figures} figures */

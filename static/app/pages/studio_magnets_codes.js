@@ -113,7 +113,7 @@ export function Capacity({ codes }) {
   return html`
     <section class=${codes.error ? "card stale" : "card"} aria-label=${t("magnets.capacity")}>
       <h2>${t("magnets.capacity")}</h2>
-      <div class="figures">
+      <div class="figure-tiles">
         <div class="tile"><p class="hint">${t("magnets.fit")}</p><p class="figure">${figures.capacity_is_exact ? number(under) : `≥ ${number(under)}`}</p>
           <p class="hint"><${Verdict} level=${under ? "good" : "bad"}>${t(under ? "magnets.fits" : "magnets.fits_none")}</${Verdict}>${!figures.capacity_is_exact && ` ${t("magnets.counted", { most: number(under) })}`}</p></div>
         ${!isDraft && html`<div class="tile"><p class="hint">${t("magnets.used")}</p><p class="figure">${number(list.length)}</p><p class="hint">${t("magnets.used_note")}</p></div>`}

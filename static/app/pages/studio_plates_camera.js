@@ -110,7 +110,7 @@ function CameraForm({ schema, typed }) {
 function Figures({ pass, stale }) {
   const day = pass.read_rates.find(({ condition }) => condition === "day");
   return html`
-    <div class=${stale ? "figures stale" : "figures"} role="group" aria-label=${t("studio.figures")}>
+    <div class=${stale ? "figure-tiles stale" : "figure-tiles"} role="group" aria-label=${t("studio.figures")}>
       <${Figure} name=${t("studio.frames_per_pass")} value=${number(pass.readable_frames_per_pass, pass.readable_frames_per_pass < 10 ? 1 : 0)}
         note=${pass.near_m === null ? t("studio.never_readable") : t("studio.frames_between", { near: number(pass.near_m, 1, "m"), far: number(pass.far_m, 1, "m"), step: number(pass.step_m, 2, "m") })} />
       <${Figure} name=${t("studio.unit_rows")} value=${number(pass.best_unit_px, 1, "px")} note=${t("studio.unit_rows_note")} />

@@ -1829,12 +1829,14 @@ export default {
   "scheme_hint.position-robust": "Die Platte trägt ihre Position auf 0,1 m. Sie hat 10 × 10 oder 12 × 12 Einheiten.",
 
   "scope.admin": "Administrator",
+  "scope.operator": "Betreiber des Servers",
   "scope.planner": "Planer",
   "scope.surveyor": "Vermesser",
   "scope.vehicle": "Fahrzeug",
   "scope.viewer": "Leser",
 
   "scope_text.admin": "Alles, auch Schlüssel und das Protokoll.",
+  "scope_text.operator": "Legt Behörden an; liest keine Daten von Behörden.",
   "scope_text.planner": "Legt Marker an und nimmt sie außer Betrieb; macht Pläne, Codebücher und Fahrzeuge.",
   "scope_text.surveyor": "Importiert Vermessungen und ändert Marker.",
   "scope_text.vehicle": "Lädt Decodierungen hoch und liest die eigenen.",

@@ -1829,12 +1829,14 @@ export default {
   "scheme_hint.position-robust": "The plate carries its position to 0.1 m. It has 10 × 10 or 12 × 12 units.",
 
   "scope.admin": "Admin",
+  "scope.operator": "Operator of the server",
   "scope.planner": "Planner",
   "scope.surveyor": "Surveyor",
   "scope.vehicle": "Vehicle",
   "scope.viewer": "Viewer",
 
   "scope_text.admin": "Everything, also keys and the audit log.",
+  "scope_text.operator": "Creates agencies; reads no agency's data.",
   "scope_text.planner": "Registers and retires markers; makes plans, codebooks and vehicles.",
   "scope_text.surveyor": "Imports surveys and changes markers.",
   "scope_text.vehicle": "Uploads decodes and reads its own.",

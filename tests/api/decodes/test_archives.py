@@ -115,8 +115,8 @@ def test_a_member_that_cannot_be_read_is_named_and_the_rest_goes_on(impatient: h
         "nested.zip": "UnsupportedUpload",
         "lying.png": "UnreadableUpload",
         "huge.png": "UploadTooLarge",
-        "deadly.png": "UnreadableUpload",
-        "slow.png": "UnreadableUpload",
+        "deadly.png": "ProcessStopped",
+        "slow.png": "ProcessStopped",
         "empty.png": "UnreadableUpload",
         "z.jpg": None,
     }

@@ -60,7 +60,11 @@ def test_every_scheme_proves_itself(real_client: httpx.Client, place: Place, sch
 
 
 def test_true_size(real_client: httpx.Client, marker: dict[str, Any]) -> None:
-    svg = ET.fromstring(real_client.get(f"/v1/markers/{marker['id']}/artwork.svg").content)
+    answer = real_client.get(f"/v1/markers/{marker['id']}/artwork.svg")
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    policy = {part.strip() for part in answer.headers["content-security-policy"].split(";")}
+    assert {"sandbox", "default-src 'none'", "style-src 'unsafe-inline'"} <= policy  # opened by itself, it runs nothing
+    svg = ET.fromstring(answer.content)
     assert svg.get("width", "").endswith("mm")
     png = real_client.get(f"/v1/markers/{marker['id']}/artwork.png?resolution_dpi=100").content
     at = png.index(b"pHYs")

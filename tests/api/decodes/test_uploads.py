@@ -147,8 +147,8 @@ def test_retired_plates_are_no_codebook(client: httpx.Client, plate: dict[str, A
         (png(corner_frame(20, 20)), 422, "unreadable-upload"),
         (b"ffconcat version 1.0\nfile other.avi", 415, "unsupported-upload"),
         (b"#EXTM3U\nfile:///etc/passwd", 415, "unsupported-upload"),
-        (png(standin.frame_that(standin.DIE)), 422, "unreadable-upload"),
-        (png(standin.frame_that(standin.HOG)), 422, "unreadable-upload"),
+        (png(standin.frame_that(standin.DIE)), 422, "process-stopped"),
+        (png(standin.frame_that(standin.HOG)), 422, "process-stopped"),
     ],
     ids=[
         "empty", "text", "lying-length", "huge", "cut-jpeg", "cut-png", "mirrored", "cmyk", "tiny", "ffconcat", "m3u8",
@@ -181,13 +181,13 @@ def test_a_frame_that_takes_too_long_is_refused(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "var", admin_key=ADMIN_KEY, decode_timeout_s=1.0)
     with LiveServer(create_app(settings, decode=standin.decode)) as server, server.client() as client:
         answer = post_frame(client, png(standin.frame_that(standin.SLEEP)))
-        assert check_problem(answer, 422, "unreadable-upload", "file")["limit"] == "1 s a file"
+        assert check_problem(answer, 422, "process-stopped", "file")["limit"] == "1 s a file"
         assert not any(Stored(tmp_path / "var").counts().values())
 
 
 @pytest.mark.usefixtures("unchanged")
 def test_a_killed_process_disturbs_nobody_else(client: httpx.Client) -> None:
-    check_problem(post_frame(client, png(standin.frame_that(standin.DIE))), 422, "unreadable-upload", "file")
+    check_problem(post_frame(client, png(standin.frame_that(standin.DIE))), 422, "process-stopped", "file")
 
 
 @pytest.mark.slow
@@ -205,8 +205,8 @@ FOV = {"horizontal_fov_deg": 70.0}
 @pytest.mark.parametrize(
     ("context", "status", "field"),
     [
-        ('{"heading_deg": NaN}', 400, "context"),
-        ('{"heading_deg": 1e999}', 400, "body"),
+        ('{"heading_deg": NaN}', 400, "context.heading_deg"),
+        ('{"heading_deg": 1e999}', 400, "context.heading_deg"),
         ('{"heading_deg": "nan"}', 422, "heading_deg"),
         ('{"heading_deg": 361}', 422, "heading_deg"),
         ('{"heading_deg": 1, "heading_deg": 2}', 400, "heading_deg"),

@@ -146,7 +146,7 @@ def test_what_is_not_good_enough_is_refused_with_each_photos_reason(fleet: httpx
     ("declaration", "status", "field"),
     [
         ("{", 400, "declaration"),
-        ('{"board": {"columns": NaN}}', 400, "declaration"),
+        ('{"board": {"columns": NaN}}', 400, "declaration.board.columns"),
         ("[]", 422, "declaration"),
         ('{"board": {"columns": 3}}', 422, "board.columns"),
         ('{"board": {"columns": 1000000000}}', 422, "board.columns"),

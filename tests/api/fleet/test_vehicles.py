@@ -147,7 +147,7 @@ def test_a_profile_that_cannot_be_used_is_refused(client: httpx.Client, profile:
         ('{"name": "019cb624-0000-7000-8000-00000000aaaa"}', "name"),
         (f'{{"name": "{"x" * 81}"}}', "name"),
         ('{"profile": {}}', "name"),
-        ('{"name": "A", "profile": {"camera": {"height_m": NaN}}}', "body"),
+        ('{"name": "A", "profile": {"camera": {"height_m": NaN}}}', "body.profile.camera.height_m"),
         ('{"name": "A", "profile": {"camera": {"width_px": 123456789012345678901234}}}', "body"),
         ('{"name": "\\ud800"}', "body.name"),
         ('{"name": "A\\u0000"}', "body.name"),

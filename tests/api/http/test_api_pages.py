@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 
 import pytest
 
 from tests.browser import Browser
 from tests.conftest import LiveServer
+from tests.machine import require_tool
 
 pytestmark = pytest.mark.slow
 
@@ -18,11 +17,7 @@ pytestmark = pytest.mark.slow
 def test_the_api_is_described_without_another_host(
     server: LiveServer, tmp_path: Path, path: str, operations: str
 ) -> None:
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        if os.environ.get("CI"):
-            pytest.fail("chromium is not installed")
-        pytest.skip("chromium is not installed")
+    chromium = require_tool("chromium")
     with server.client(None) as client:
         policy = client.get(path).headers["content-security-policy"]
     assert "default-src 'none'; script-src 'self';" in policy

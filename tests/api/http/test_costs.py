@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
@@ -15,14 +17,15 @@ from app.api.http.costs import EXPENSIVE, MAX_WAITING, Budget, Slots, admitted, 
 from app.api.http.permissions import PERMISSIONS
 from app.api.http.rate_limits import RateLimit
 from app.api.http.strict_json import StrictRoute
-from app.errors import TooManyRequests, Unavailable
+from app.errors import ClientLeft, TooManyRequests, Unavailable
 from app.jobs.supervisor import Pending
 from app.main import ROUTERS
+from app.registry.database import Database
 from app.services.access.access import Caller, Scope
 from app.services.request_work import RequestWork, check_deadline, counted_steps, working
 from app.settings import Settings
-from tests.conftest import LiveServer
-from tests.http import refused
+from tests.conftest import ADMIN_KEY, LiveServer
+from tests.http import WITHIN_S, refused
 
 CALLER = Caller("agency", "key", "label", Scope.ADMIN)
 
@@ -128,6 +131,73 @@ def test_work_stops_when_the_client_leaves() -> None:
     assert _run(_work_without_end, _leaves).message == "the client has left"
 
 
+@pytest.mark.parametrize("further", [b"", b"GET /healthz HTTP/1.1\r\nHost: a\r\n\r\n"], ids=["alone", "pipelined"])
+def test_requests_end_when_their_clients_leave(fresh_server: LiveServer, further: bytes) -> None:
+    """Also where the client sent a further request, which keeps uvicorn from reading the end of the connection."""
+    state = fresh_server.app.state
+    for use_case, call, path in (
+        (state.searches, "page", "/v1/markers"),
+        (state.features, "page", "/ogc/collections/markers/items"),
+        (state.features, "tile", "/ogc/collections/markers/tiles/WebMercatorQuad/0/0/0"),
+        (state.snapshots, "make", "/v1/snapshots?bbox=8,48,9,50"),
+        (state.exports, "stream", "/v1/exports/csv"),
+    ):
+        endless = _Endless(state.database)
+        setattr(use_case, call, endless)
+        request = f"GET {path} HTTP/1.1\r\nHost: a\r\nX-API-Key: {ADMIN_KEY}\r\n\r\n".encode()
+        with socket.create_connection(("127.0.0.1", int(fresh_server.url.rpartition(":")[2]))) as client:
+            client.sendall(request)
+            assert endless.started.wait(WITHIN_S)
+            client.sendall(further)
+            client.settimeout(0.4)
+            with pytest.raises(TimeoutError):  # while the client waits, the work goes on
+                client.recv(1)
+            assert not endless.ended.is_set()
+        assert endless.ended.wait(WITHIN_S), path
+
+
+def test_a_response_that_nobody_reads_ends_without_a_line_in_the_log(
+    fresh_server: LiveServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    ended = threading.Event()
+
+    def chunks(*_arguments: object) -> Iterator[bytes]:
+        yield b"x"
+        try:
+            _work_without_end()
+        finally:
+            ended.set()
+
+    fresh_server.app.state.exports.stream = chunks
+    with (
+        fresh_server.client() as client,
+        client.stream("GET", "/v1/exports/csv", headers={"Accept-Encoding": "identity"}) as response,
+    ):
+        assert next(response.iter_raw()) == b"x"
+    assert ended.wait(WITHIN_S)
+    fresh_server.__exit__()
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+class _Endless:
+    """A use case that asks the database for what it never finds."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self.started, self.ended = threading.Event(), threading.Event()
+
+    def __call__(self, *_arguments: object, **_options: object) -> None:
+        try:
+            with self._database.read() as connection:
+                self.started.set()
+                connection.exec_driver_sql(
+                    "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT count(*) FROM n"
+                ).all()
+        except ClientLeft:
+            self.ended.set()
+            raise
+
+
 def test_work_stops_at_its_deadline() -> None:
     assert "too long" in _run(_work_without_end, _nothing, timeout_s=0.01).message
 
@@ -153,7 +223,7 @@ def test_a_task_of_a_client_that_left_is_cancelled() -> None:
     assert pending.future.set_running_or_notify_cancel()
     pending.used_s = 1.5
     with working(60.0) as work:
-        work.abandoned = True
+        work.stops.stop()
         with pytest.raises(Unavailable):
             pending.result()
     assert interrupted == [pending]
@@ -195,3 +265,13 @@ def test_a_key_that_used_up_its_time_is_refused(serve: Callable[[Settings], Live
         assert int(refusal.headers["Retry-After"]) >= 1
         assert "processor time" in problem["detail"]
         assert client.get("/healthz").status_code == 200
+
+
+def test_a_job_is_charged_to_its_agency_and_to_no_key() -> None:
+    budget = Budget(key_s_per_min=60.0, agency_s_per_min=120.0)
+    budget.charge_job("agency", 1000.0)
+    budget.check(CALLER)
+    budget.charge_job("agency", 1000.0)
+    with pytest.raises(TooManyRequests, match="the requests of this agency"):
+        budget.check(CALLER)
+    budget.check(Caller("another", "key", "label", Scope.ADMIN))

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from app.api.http.openapi import STORED, stored_text
 from app.main import create_app
 from app.settings import Settings
 from tests.conftest import LiveServer
@@ -17,6 +18,13 @@ from tests.documented import DEVIATIONS
 def test_the_document_does_not_depend_on_settings(server: LiveServer, tmp_path: Path) -> None:
     other = create_app(Settings(data_dir=tmp_path, public_url="https://example.org", max_upload_bytes=1 << 20))
     assert other.openapi() == server.app.openapi()
+
+
+def test_the_stored_document_is_that_of_the_app(server: LiveServer) -> None:
+    """If it is not: python -m tests.stored_openapi."""
+    assert STORED.read_text("utf-8") == stored_text(server.app.openapi())
+    with server.client(None) as anyone:
+        assert anyone.get("/openapi.json").content == STORED.read_bytes()
 
 
 def _headers(document: dict[str, Any], path: str, method: str) -> dict[str, bool]:

@@ -11,8 +11,10 @@ from typing import Any
 import httpx
 import pytest
 
+from app.services.access.access import Scope
 from app.settings import Settings
 from tests.conftest import ADMIN_KEY, LiveServer
+from tests.formats.pictures import png
 from tests.http import WITHIN_S
 
 JSON = {"Content-Type": "application/json"}
@@ -336,3 +338,25 @@ def test_parameters_that_a_route_does_not_know_are_refused(client: httpx.Client,
     response = client.get(path)
     assert response.status_code == 422, response.text
     assert response.json()["field"] in ("stauts", "Limit", "x")
+
+
+@pytest.mark.parametrize("year", ["0001-01-01T00:00:00", "9999-12-31T23:59:59"])
+@pytest.mark.parametrize("zone", ["Z", "+14:00", "-14:00"])
+def test_times_beyond_the_calendar_are_refused(server: LiveServer, year: str, zone: str) -> None:
+    time = year + zone
+    context = json.dumps({"captured_at": time, "frames": {"rate_hz": 5}})
+    with server.agency("calendar", Scope.ADMIN) as client:
+        answers = {
+            "captured_at": client.post("/v1/decodes", files={"file": ("a.png", png())}, data={"context": context}),
+            "expires_at": client.post("/v1/keys", json={"scope": "viewer", "label": "a", "expires_at": time}),
+        }
+        for field in ("since", "until"):
+            answers[f"audit {field}"] = client.get("/v1/audit", params={field: time})
+            answers[f"decodes {field}"] = client.get("/v1/decodes", params={field: time})
+            answers[f"reprocessings {field}"] = client.post("/v1/reprocessings", json={field: time})
+    for name, answer in answers.items():
+        assert answer.status_code == 422, (name, answer.text)
+        problem = answer.json()
+        assert problem["field"] == name.split()[-1]
+        assert problem["limit"] == "years 1900 to 2199"
+        assert problem["cure"]

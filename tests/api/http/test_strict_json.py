@@ -9,8 +9,8 @@ import httpx
 import pytest
 
 from app.api.http.problems import MAX_ERRORS
-from app.api.http.strict_json import MAX_DEPTH, MAX_MEMBERS, MAX_VALUES, parse_json
 from app.errors import MalformedRequest
+from app.formats.json_text import MAX_DEPTH, MAX_MEMBERS, MAX_VALUES, parse_json
 from app.services.error_documents import cut_text
 
 JSON = {"Content-Type": "application/json"}

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import logging
 import os
 import re
+import socket
+import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -19,11 +23,12 @@ from fastapi.routing import APIRoute
 from app.api.http.middleware import PROTECTED
 from app.api.http.page_addresses import PAGES
 from app.api.http.problems import MEDIA_TYPE, PROBLEMS, kind_of
+from app.api.http.system import Readiness
 from app.errors import StorageFull, WaymarkError
 from app.logs import configure_logs
 from app.settings import Settings
 from app.storage import probe
-from tests.conftest import LiveServer
+from tests.conftest import ADMIN_KEY, LiveServer
 from tests.http import refused, wait_until
 
 OPEN = {"/", "/healthz", "/readyz", "/metrics", "/docs", "/docs/oauth2-redirect", "/redoc", "/openapi.json"}
@@ -34,7 +39,7 @@ def _descendants(kind: type) -> set[type]:
 
 
 def test_every_error_of_the_domain_is_in_the_table() -> None:
-    missing = {kind for kind in _descendants(WaymarkError) if kind_of(kind("x")) is None}
+    missing = {kind for kind in _descendants(WaymarkError) if kind_of(kind.__new__(kind)) is None}
     assert missing == {WaymarkError}
     assert len({kind.slug for kind in PROBLEMS.values()}) == len(PROBLEMS)
 
@@ -42,7 +47,7 @@ def test_every_error_of_the_domain_is_in_the_table() -> None:
 def test_not_ready_while_nothing_can_be_written(
     fresh_server: LiveServer, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(probe, "_VALID_S", 0.0)
+    fresh_server.app.state.readiness.valid_s = 0.0
 
     def fail(_descriptor: int) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
@@ -70,6 +75,7 @@ def test_a_full_disk_is_507_with_a_time_to_try_again(fresh_server: LiveServer, e
 
 
 def test_ready_only_while_the_database_is_migrated(fresh_server: LiveServer, settings: Settings) -> None:
+    fresh_server.app.state.readiness.valid_s = 0.0
     with fresh_server.client(None) as anyone:
         assert anyone.get("/healthz").json() == {"status": "ok"}
         ready = anyone.get("/readyz")
@@ -84,12 +90,83 @@ def test_ready_only_while_the_database_is_migrated(fresh_server: LiveServer, set
         assert anyone.get("/healthz").status_code == 200
 
 
+def test_not_ready_without_the_file_of_the_database(fresh_server: LiveServer, settings: Settings) -> None:
+    if not settings.resolved_database_url.startswith("sqlite"):
+        pytest.skip("this database is no file")
+    fresh_server.app.state.readiness.valid_s = 0.0
+    path = Path(settings.resolved_database_url.removeprefix("sqlite:///"))
+    with fresh_server.client(None) as anyone:
+        assert anyone.get("/readyz").status_code == 200
+        path.rename(path.with_suffix(".away"))
+        assert anyone.get("/readyz").json()["parts"]["database"] is False
+        path.write_bytes(path.with_suffix(".away").read_bytes())  # another file of the same name
+        assert anyone.get("/readyz").json()["parts"]["database"] is False
+        path.with_suffix(".away").rename(path)
+        assert anyone.get("/readyz").status_code == 200
+
+
+def test_not_ready_without_the_blob_store(serve: Callable[[Settings], LiveServer], settings: Settings) -> None:
+    nowhere = settings.model_copy(update={"blobs_url": "s3://nope/x"})
+    with serve(nowhere).client(None) as anyone:
+        late = anyone.get("/readyz")
+        assert (late.status_code, late.json()["parts"]["storage"]) == (503, False)
+        assert late.json()["parts"]["database"] is True
+
+
 def test_readiness_asks_every_part(fresh_server: LiveServer) -> None:
-    fresh_server.app.state.readiness["workers"] = lambda: False
+    fresh_server.app.state.readiness.checks["workers"] = lambda: "they have ended"
     with fresh_server.client(None) as anyone:
         answer = anyone.get("/readyz")
     assert answer.status_code == 503
     assert answer.json()["status"] == "not ready"
+
+
+def test_checks_run_once_for_all_who_ask_and_the_log_names_the_cause() -> None:
+    calls, cause = [], ["the disk is gone"]
+
+    def check() -> str | None:
+        calls.append(1)
+        return cause[0]
+
+    async def ask() -> None:
+        asked = Readiness({"storage": check, "hangs": lambda: hang.wait() and None})
+        asked.within_s, hang = 0.05, threading.Event()
+        for found in await asyncio.gather(*(asked.parts() for _ in range(100))):
+            assert found == {"storage": False, "hangs": False}
+        asked.valid_s, asked._until_s = 0.0, 0.0
+        hang.set()
+        cause[0] = None
+        assert await asked.parts() == {"storage": True, "hangs": True}
+
+    with structlog.testing.capture_logs() as lines:
+        asyncio.run(ask())
+    assert len(calls) == 2
+    assert [(line["event"], line["part"], line["cause"]) for line in lines] == [
+        ("not ready", "storage", "the disk is gone"),
+        ("not ready", "hangs", "no answer within 0.05 s"),
+        ("ready again", "storage", None),
+        ("ready again", "hangs", None),
+    ]
+
+
+def test_a_client_that_leaves_is_one_line(fresh_server: LiveServer) -> None:
+    head = f"POST /v1/markers HTTP/1.1\r\nHost: x\r\nX-API-Key: {ADMIN_KEY}\r\n"
+    body = "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{"
+    with structlog.testing.capture_logs() as lines:
+        address = httpx.URL(fresh_server.url)
+        with socket.create_connection((address.host, address.port)) as client:
+            client.sendall((head + body).encode())
+        line = wait_until(lambda: next((each for each in lines if each["event"] == "request"), None), "a line")
+    assert (line["path"], line["log_level"]) == ("/v1/markers", "info")
+    assert len(lines) == 1, lines
+
+
+def test_answers_to_probes_are_not_logged(fresh_server: LiveServer) -> None:
+    with structlog.testing.capture_logs() as lines, fresh_server.client(None) as anyone:
+        for path in ("/readyz", "/healthz", "/openapi.json"):
+            assert anyone.get(path).status_code == 200
+        wait_until(lambda: any(line.get("path") == "/openapi.json" for line in lines), "a line")
+    assert [line.get("path") for line in lines] == ["/openapi.json"]
 
 
 @pytest.mark.slow

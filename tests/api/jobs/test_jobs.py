@@ -17,6 +17,7 @@ from app.api.http import event_stream
 from app.errors import UnreadableUpload
 from app.registry import job_leases
 from app.registry import jobs as store
+from app.registry.events import add_event
 from app.registry.ids import new_id
 from app.registry.jobs import JobKind, JobRow, new_job
 from app.registry.tenancy import across_agencies
@@ -294,7 +295,19 @@ def test_events_of_jobs_are_for_the_scopes_that_may_read_them(server: LiveServer
             stream = Reader(reader, "/v1/events", **sse)
             assert [stream.next()["data"]["detail"]["job_kind"] for _ in seen] == seen
             stream.leave()
-        refused(vehicle.get("/v1/events"), 403, "not-allowed")
+        own = add(server, vehicle, JobKind.DECODE)
+        finish(server, own)
+        assert [event["subject_id"] for event in vehicle.get("/v1/events").json()["items"]] == [own.id]
+        stream = Reader(vehicle, "/v1/events", **sse)
+        assert stream.next()["data"]["subject_id"] == own.id
+        stream.leave()
+        with server.app.state.database.write() as connection:
+            add_event(connection, own.agency_id, "maintenance.suspect", subject_id=own.id, at=own.created_at)
+        assert len(viewer.get("/v1/events").json()["items"]) == 3
+        assert len(vehicle.get("/v1/events").json()["items"]) == 1
+        progress = Reader(vehicle, f"/v1/jobs/{own.id}/events")
+        assert progress.next()["event"] == "done"
+        progress.leave()
 
 
 def test_dead_letters_are_listed_with_their_reasons(server: LiveServer, client: httpx.Client) -> None:

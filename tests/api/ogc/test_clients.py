@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -21,6 +20,7 @@ from app.services.access.access import Scope
 from tests.api.ogc.test_features import ROW, add
 from tests.conftest import LiveServer
 from tests.http import WITHIN_S
+from tests.machine import require_tool
 
 pytestmark = pytest.mark.both_databases
 
@@ -92,13 +92,9 @@ def test_gdal_with_a_wrong_key_is_told_so(gdal: Gdal) -> None:
 
 
 def _ogrinfo(url: str, key: str, *arguments: str) -> str:
-    if shutil.which("ogrinfo") is None:
-        if os.environ.get("CI"):
-            pytest.fail("ogrinfo is missing; it is in gdal-bin")
-        pytest.skip("needs ogrinfo, which is in gdal-bin")
     environment = {**os.environ, "GDAL_HTTP_HEADERS": f"Authorization: Bearer {key}"}
     done = subprocess.run(
-        ["ogrinfo", "-ro", *arguments, f"OAPIF:{url}/ogc", "markers"],
+        [require_tool("ogrinfo"), "-ro", *arguments, f"OAPIF:{url}/ogc", "markers"],
         env=environment,
         capture_output=True,
         text=True,

@@ -170,6 +170,16 @@ def test_what_cannot_be_read_is_refused(roads: httpx.Client, expression: str, la
     assert response.json()["errors"][0]["limit"]
 
 
+def test_patterns_are_limited_and_the_refusal_has_the_limit_and_the_cure(roads: httpx.Client) -> None:
+    patterns = [f"road LIKE '%{k}%a%b%'" for k in range(21)]
+    assert roads.get(ITEMS, params={"filter": " OR ".join(patterns[:20])}).status_code == 200
+    answer = roads.get(ITEMS, params={"filter": " OR ".join(f"NOT ({pattern})" for pattern in patterns)})
+    assert answer.status_code == 400
+    error = answer.json()["errors"][0]
+    assert (error["field"], error["limit"]) == ("filter", "20 of them")
+    assert "IN or =" in error["cure"]
+
+
 @pytest.mark.parametrize("expression", [text for text in TEXTS if "updated_at" not in text])
 def test_values_in_hand_are_filtered_as_both_databases_do(roads: httpx.Client, expression: str) -> None:
     """Lines are put together before they are filtered, so no database does it."""

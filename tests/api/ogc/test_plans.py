@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import shutil
 import subprocess
 from typing import Any
 
@@ -19,6 +18,7 @@ from tests.api.ogc.test_features import MERCATOR, get, ids
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import LiveServer
 from tests.http import WITHIN_S, created, refused
+from tests.machine import require_tool
 from tests.registry.test_tiles import read_tile
 
 pytestmark = pytest.mark.both_databases
@@ -215,12 +215,8 @@ def planner_key(server: LiveServer, start: tuple[float, float]) -> str:
 
 
 def _ogrinfo(url: str, key: str, layer: str, *arguments: str) -> str:
-    if shutil.which("ogrinfo") is None:
-        if os.environ.get("CI"):
-            pytest.fail("ogrinfo is missing; it is in gdal-bin")
-        pytest.skip("needs ogrinfo, which is in gdal-bin")
     environment = {**os.environ, "GDAL_HTTP_HEADERS": f"Authorization: Bearer {key}"}
-    command = ["ogrinfo", "-ro", *arguments, f"OAPIF:{url}/ogc", layer]
+    command = [require_tool("ogrinfo"), "-ro", *arguments, f"OAPIF:{url}/ogc", layer]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=WITHIN_S, check=False)
     assert done.returncode == 0, done.stderr
     assert "ERROR" not in done.stderr, done.stderr

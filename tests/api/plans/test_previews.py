@@ -118,6 +118,19 @@ def test_a_preview_is_the_plan_that_is_made_then_and_nothing_is_stored(
     for one, other in zip(preview["markers"], placed, strict=True):
         assert (one["number"], one["family"], one["lane"]) == (other["number"], other["family"], other["lane"])
         assert one["chainage_m"] == pytest.approx(other["chainage_m"], abs=1e-3)
+    paged: list[Any] = []
+    url: str | None = "/v1/plan-previews?limit=3"
+    while url:
+        response = client.post(url, json=wanted)
+        page = response.json()
+        assert {name: page[name] for name in same} == {name: plan[name] for name in same}
+        assert len(page["markers"]) <= 3
+        paged += page["markers"]
+        url = response.links["next"]["url"] if "next" in response.links else None
+    assert paged == preview["markers"]
+    assert len(paged) > 6
+    assert client.post("/v1/plan-previews?after=10000", json=wanted).json()["markers"] == []
+    refused(client.post("/v1/plan-previews?limit=10001", json=wanted), 422)
     closer = {**RULES, "plates": {"spacing_m": 50}}
     again = client.post("/v1/plan-previews", json=wanted | {"rules": closer}).json()
     assert again["cost"] > preview["cost"]

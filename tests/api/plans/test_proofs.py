@@ -332,8 +332,8 @@ def test_a_draft_stays_a_draft_and_a_wrong_reading_takes_the_proof_back(
     [
         ('{"drives": 0}', 422, "drives"),
         ('{"drives": true}', 422, "drives"),
-        ('{"lost_share": NaN}', 400, "body"),
-        ('{"lost_share": 1e999}', 400, "body"),
+        ('{"lost_share": NaN}', 400, "body.lost_share"),
+        ('{"lost_share": 1e999}', 400, "body.lost_share"),
         ('{"conditions": ["fog"]}', 422, "conditions"),
         ('{"conditions": []}', 422, "conditions"),
         ('{"cameras": []}', 422, "cameras"),

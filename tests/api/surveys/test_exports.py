@@ -17,11 +17,15 @@ import pytest
 import shapely
 from pyogrio import raw, read_info
 
+from app.formats import exports as formats
 from app.formats.exports import FIELDS, SHAPEFILE_NAMES, write_csv
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
+from app.registry import bulk
 from app.services.surveys import exports
 from app.surveys.georeference import georeference_survey
+from tests.conftest import LiveServer
+from tests.machine import require_tool
 
 pytestmark = pytest.mark.both_databases
 
@@ -104,6 +108,22 @@ def test_dxf_is_in_metres(client: httpx.Client, markers: list[dict[str, float]])
     document = ezdxf.read(io.StringIO(client.get("/v1/exports/dxf").text))
     assert document.header["$INSUNITS"] == 6
     assert len(document.modelspace()) == 3
+    audited = document.audit()
+    assert (audited.errors, audited.fixes) == ([], [])
+    texts = [{a.dxf.tag: (a.dxf.text, a.dxf.insert) for a in inserted.attribs} for inserted in document.modelspace()]
+    assert [text["CODE"][0] for text in texts] == ["1", "2", "3"]
+    assert [text["CODE"][1].z for text in texts] == [160.25, 161.25, 162.25]
+    assert len({inserted.dxf.handle for inserted in document.modelspace()}) == 3
+
+
+def test_too_many_markers_are_refused_before_one_is_read(
+    client: httpx.Client, markers: list[dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(exports.MAX_WHOLE, "kml", 2)
+    monkeypatch.delattr(bulk, "list_records")
+    problem = client.get("/v1/exports/kml").json()
+    assert (problem["status"], problem["field"], problem["limit"]) == (422, "bbox", "2 markers")
+    assert problem["detail"] == "3 markers are too many for one file"
 
 
 @pytest.mark.slow
@@ -136,10 +156,14 @@ def test_the_filters_are_those_of_the_list(client: httpx.Client, markers: list[d
 
 @pytest.mark.parametrize("kind", ["gpkg", "shapefile"])
 def test_files_of_several_pages_hold_every_value(
-    client: httpx.Client, markers: list[dict[str, float]], kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+    server: LiveServer, client: httpx.Client, markers: list[dict[str, float]], kind: str,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:  # fmt: skip
     monkeypatch.setattr(exports, "_PAGE", 2)
-    monkeypatch.setattr(exports, "_GIS_PAGE", 2)
+    monkeypatch.setattr(formats, "_GIS_PAGE", 2)
+    monkeypatch.setattr(
+        server.app.state.exports, "_write", formats.write_file
+    )  # other processes have another _GIS_PAGE
     low = {"family": "cerpm", "position": {"lon_deg": -77.15, "lat_deg": -1e-9}, "road": "Straße =1"}
     assert client.post("/v1/markers", json=low).status_code == 201
     path = tmp_path / ("markers.gpkg" if kind == "gpkg" else "markers.zip")
@@ -176,7 +200,8 @@ def test_only_ellipsoidal_heights_are_in_geometries(client: httpx.Client, tmp_pa
         path = tmp_path / name
         path.write_bytes(client.get(f"/v1/exports/{kind}").content)
         source = f"/vsizip/{path}" if kind == "shapefile" else str(path)
-        found = subprocess.run(["ogrinfo", "-q", "-al", source], capture_output=True, text=True, check=True).stdout
+        command = [require_tool("ogrinfo"), "-q", "-al", source]
+        found = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         shown[kind] = re.findall(r"^ +(POINT.*?) \(", found, re.MULTILINE)
         assert found.count("160.5") == (2 if kind == "shapefile" else 3), found  # attributes of two, z of one
     assert shown == {"gpkg": ["POINT Z", "POINT", "POINT"], "geojson": ["POINT Z", "POINT", "POINT"],

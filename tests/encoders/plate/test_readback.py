@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-import cairosvg
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +17,7 @@ from app.encoders.plate.drawing import Layer, Modules, Text
 from app.markers.plate import PlateCode, PlateGeometry
 from tests.encoders.plate.artwork_reading import marker_colours, read_digits, read_qr, rendering
 from tests.http import WITHIN_S
+from tests.machine import require_module
 
 CODES = [
     PlateCode("023792168411"),
@@ -42,7 +42,7 @@ def _from_png(order: PlateOrder, options: ArtworkOptions, folder: Path, tool: Ca
 
 
 def _from_svg(order: PlateOrder, options: ArtworkOptions, folder: Path, tool: Callable[..., str]):
-    return _decode(cairosvg.svg2png(write_svg(encode_plate(order, options)), dpi=96))
+    return _decode(require_module("cairosvg", "libcairo").svg2png(write_svg(encode_plate(order, options)), dpi=96))
 
 
 def _from_pdf(order: PlateOrder, options: ArtworkOptions, folder: Path, tool: Callable[..., str]):

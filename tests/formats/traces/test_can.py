@@ -26,9 +26,10 @@ from app.simulation.magnetic.recorder import write_array_stream
 from app.simulation.magnetic.road import Road
 from app.simulation.magnetic.vehicle import Course, Vehicle
 from tests.formats.traces.recordings import make_trace
+from tests.machine import require_module
 
-can = pytest.importorskip("can")
-cantools = pytest.importorskip("cantools")
+can = require_module("can", "the extra can")
+cantools = require_module("cantools", "the extra can")
 
 DBC = b"""VERSION ""
 NS_ :
@@ -236,4 +237,4 @@ def test_without_the_libraries(library: str, tmp_path: Path, monkeypatch: pytest
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(UnsupportedUpload) as error:
         read(trace, "a.log", content, declared(speed=CanSignal(name="Speed") if library == "cantools" else SPEED))
-    assert "waymark[can]" in (error.value.cure or "")
+    assert "waymark-roads[can]" in (error.value.cure or "")

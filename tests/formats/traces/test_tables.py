@@ -23,6 +23,7 @@ from app.formats.traces.declaration import (
 from app.formats.traces.read import read_trace
 from app.formats.traces.report import TraceFile
 from tests.formats.traces.recordings import make_trace, plain_csv
+from tests.machine import require_module
 
 DECLARED = TraceDeclaration(unit=FieldUnit.MICROTESLA, axes=AxisConvention.ISO8855)
 
@@ -284,9 +285,10 @@ def test_dead_sensors_are_named() -> None:
     assert any("sensor 6 " in text and "no values" in text for text in result.report.warnings)
 
 
-def _parquet(trace: Any, **changes: Any) -> bytes:
-    pa = pytest.importorskip("pyarrow")
-    pq = pytest.importorskip("pyarrow.parquet")
+def parquet(trace: Any, **changes: Any) -> bytes:
+    """A trace as a table of Parquet."""
+    pa = require_module("pyarrow", "the extra parquet")
+    pq = require_module("pyarrow.parquet", "the extra parquet")
     flat = trace.field_ut.reshape(len(trace.t_s), -1)
     names = [f"s{i}_{axis}" for i in range(1, trace.field_ut.shape[1] + 1) for axis in "xyz"]
     columns: dict[str, Any] = {"t_s": trace.t_s, **{n: flat[:, i] for i, n in enumerate(names)}}
@@ -298,30 +300,30 @@ def _parquet(trace: Any, **changes: Any) -> bytes:
 
 def test_parquet_comes_back() -> None:
     trace = make_trace(1000)
-    result = read(_parquet(trace), name="drive.parquet")
+    result = read(parquet(trace), name="drive.parquet")
     assert np.array_equal(result.trace.field_ut, trace.field_ut)
     stamps = (trace.t_s * 1e9).astype("datetime64[ns]") + np.timedelta64(1_700_000_000, "s")
-    result = read(_parquet(trace, t_s=stamps), name="drive.parquet")
+    result = read(parquet(trace, t_s=stamps), name="drive.parquet")
     assert np.abs(result.trace.t_s - trace.t_s).max() < 1e-6
 
 
 def test_parquet_that_is_damaged_or_holds_text() -> None:
-    content = _parquet(make_trace(1000))
+    content = parquet(make_trace(1000))
     for damaged in (content[: len(content) // 2], content[:4] + content[5000:], b"PAR1" + bytes(100) + b"PAR1"):
         with pytest.raises(UnreadableUpload):
             read(damaged, name="drive.parquet")
     with pytest.raises(InvalidParameter, match="'s1_x' holds string"):
-        read(_parquet(make_trace(50), s1_x=["a"] * 50), name="drive.parquet")
+        read(parquet(make_trace(50), s1_x=["a"] * 50), name="drive.parquet")
     with pytest.raises(UploadTooLarge):
         read_trace({"drive.parquet": content}, DECLARED, TraceLimits(rows=500))
 
 
 def test_rows_of_parquet_are_counted_whatever_its_footer_says() -> None:
-    content = _parquet(make_trace(20_000))
+    content = parquet(make_trace(20_000))
     footer = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
     at = content.index(_thrift_i64(20_000), footer)  # the first is that of the file, before those of its columns
     lying = content[:at] + _thrift_i64(9_000) + content[at + 3 :]
-    pq = pytest.importorskip("pyarrow.parquet")
+    pq = require_module("pyarrow.parquet", "the extra parquet")
     assert pq.ParquetFile(io.BytesIO(lying)).metadata.num_rows == 9_000
     with pytest.raises(UploadTooLarge):
         read_trace({"drive.parquet": lying}, DECLARED, TraceLimits(rows=10_000))
@@ -334,11 +336,11 @@ def _thrift_i64(value: int) -> bytes:
 
 
 def test_parquet_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
-    content = _parquet(make_trace(50))
+    content = parquet(make_trace(50))
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(UnsupportedUpload) as error:
         read(content, name="drive.parquet")
-    assert "waymark[parquet]" in (error.value.cure or "")
+    assert "waymark-roads[parquet]" in (error.value.cure or "")
 
 
 def test_any_damage_to_a_csv_ends_in_a_trace_or_a_refusal() -> None:

@@ -19,6 +19,7 @@ from app.planning.outputs.drawing_sheet import PAGE_MM, TitleBlock
 from app.planning.outputs.strip_layout import ROW_MM, SCALES, STRIP_MM, Strip, cut_strips
 from app.planning.outputs.strip_map import NOT_SURVEYED, DrawingOptions, Drawings
 from app.planning.plan import Plan
+from tests.machine import require_tool
 from tests.planning.outputs.made import ALL, full_plan, plan_of
 from tests.planning.roads import GEOD, bend, lane_of_curvature, opposite, road, straight
 
@@ -27,7 +28,7 @@ def texts(data: bytes, tmp_path: Path) -> list[str]:
     """Text of each page by poppler."""
     path = tmp_path / "drawings.pdf"
     path.write_bytes(data)
-    run = subprocess.run(["pdftotext", "-raw", path, "-"], capture_output=True, text=True, check=True)
+    run = subprocess.run([require_tool("pdftotext"), "-raw", path, "-"], capture_output=True, text=True, check=True)
     return [" ".join(page.split()) for page in run.stdout.split("\f")[:-1]]
 
 
@@ -142,7 +143,8 @@ def test_a_surveyed_road_has_no_warning(tmp_path: Path) -> None:
 def test_pages_are_printed_inside_the_frame(tmp_path: Path) -> None:
     path = tmp_path / "drawings.pdf"
     path.write_bytes(drawn(plan_of(road(bend(60), opposite(bend(60), "2")), **ALL), scale=250))
-    run = subprocess.run(["pdftoppm", "-r", "50", "-gray", path, tmp_path / "page"], capture_output=True, check=True)
+    command = [require_tool("pdftoppm"), "-r", "50", "-gray", path, tmp_path / "page"]
+    run = subprocess.run(command, capture_output=True, check=True)
     assert not run.stderr
     pictures = sorted(tmp_path.glob("page*.pgm"))
     assert pictures

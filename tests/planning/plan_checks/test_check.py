@@ -124,6 +124,28 @@ def test_busy_radio_fails_at_the_busiest_place() -> None:
 
 
 @pytest.mark.slow
+def test_the_law_of_the_place_is_named() -> None:
+    lane = straight(400, speed_kmh=30.0)
+    inside = road(lane)
+    shift = np.array([-85.6 - lane.lon_deg[0], 42.3 - lane.lat_deg[0]])
+    there = road(replace(lane, lon_deg=lane.lon_deg + shift[0], lat_deg=lane.lat_deg + shift[1]))
+    nowhere = road(replace(lane, lon_deg=lane.lon_deg + 140.0, lat_deg=lane.lat_deg))
+    undeclared = finding(checked(inside, cerpm={}), "radio law")
+    assert undeclared.verdict is Verdict.WARN
+    assert "EU868" in undeclared.sentence
+    assert "no region is declared" in undeclared.sentence
+    assert finding(checked(inside, cerpm={"region": "US915"}), "radio law").verdict is Verdict.WARN
+    assert finding(checked(there, cerpm={}), "radio law").verdict is Verdict.OK
+    unknown = finding(checked(nowhere, cerpm={}), "radio law")
+    assert unknown.verdict is Verdict.WARN
+    assert "unknown" in unknown.sentence
+    assert "EU868" not in unknown.sentence
+    lawful = checked(inside, cerpm={"region": "EU868"})
+    names = ("radio law", "radio band", "radio duty-cycle", "radio power")
+    assert {finding(lawful, name).verdict for name in names} == {Verdict.OK}
+    assert finding(lawful, "radio read-in-time").verdict is not Verdict.OK  # no lawful settings read 99 % in time
+
+
 def test_radio_settings_are_recommended_for_the_busiest_place() -> None:
     """On the straights pairs are far apart, and settings for the mean spacing lose most packets in the bend."""
     rules = {"max_path_error_m": 0.01}

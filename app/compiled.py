@@ -1,4 +1,4 @@
-"""How the decoders' numerical kernels are compiled.
+"""How numerical kernels are compiled, and for which processors. Only this module imports Numba.
 
 Three kinds of compiled function, so that as little as possible is compiled on first use:
 
@@ -8,16 +8,50 @@ Three kinds of compiled function, so that as little as possible is compiled on f
 
 Arguments that belong together are passed as one `NamedTuple` of arrays. All kernels release the interpreter's lock.
 Numba's cache is keyed by the file of the kernel: after editing a routine or a step in another file, delete the cache.
+
+The cache is keyed by the processor, too. Kernels are compiled for a level that nearly all processors have, so that a
+cache which one machine wrote (an image, a shared folder) serves the others. benchmarks/processors.py measures the cost.
 """
 
 from __future__ import annotations
 
+import logging
+import os
+import platform
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import numba as nb
-from llvmlite import ir
-from numba.extending import intrinsic
+from llvmlite import binding, ir
+
+_LOG = logging.getLogger(__name__)
+_TARGET_SETTINGS = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NUMBA_ENABLE_AVX")
+_X86_64_V3 = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
+"""Extensions of the level x86-64-v3, which Intel has since 2013 and AMD since 2015 (System V ABI, section 3.1.1)."""
+
+
+def portable_target(machine: str, extensions: dict[str, bool]) -> dict[str, str]:
+    """Numba's settings for the target of a processor: a level that others share, or none for its own type.
+
+    Parameters
+    ----------
+    machine : str
+        Architecture, as `platform.machine()` names it.
+    extensions : dict
+        Instruction set extensions in LLVM's names, and whether the processor has them.
+    """
+    if machine.lower() in ("aarch64", "arm64"):
+        return {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    if machine.lower() in ("x86_64", "amd64") and all(extensions.get(name) for name in _X86_64_V3):
+        return {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
+    return {}
+
+
+if not any(name in os.environ for name in _TARGET_SETTINGS):  # those of the operator come first
+    os.environ.update(portable_target(platform.machine(), dict(binding.get_host_cpu_features())))
+
+import numba as nb  # noqa: E402 - it reads its settings when it is imported
+from numba.core import event  # noqa: E402
+from numba.extending import intrinsic  # noqa: E402
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -92,3 +126,32 @@ def _trailing_zeros(_context: Any, word: Any) -> Any:
 
 
 trailing_zeros: Any = intrinsic(_trailing_zeros)
+
+
+class _CompileNotice(event.Listener):
+    """Logs the first kernel that this process compiles instead of loading it from the cache."""
+
+    is_due = True
+
+    def on_start(self, event: Any) -> None:
+        compiled = event.data["dispatcher"].py_func
+        if self.is_due and compiled.__module__.startswith("app."):
+            self.is_due = False
+            _LOG.warning(
+                "kernels are compiled, which can take half a minute of processor time (first: %s.%s); "
+                "run `waymark compile` once, as a user who may write the cache, to compile all of them in advance",
+                compiled.__module__,
+                compiled.__name__,
+            )
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+_NOTICE = _CompileNotice()
+event.register("numba:compile", _NOTICE)
+
+
+def expect_compilation() -> None:
+    """Log no notice of compiled kernels in this process."""
+    _NOTICE.is_due = False
