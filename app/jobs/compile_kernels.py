@@ -22,6 +22,9 @@ from app.lanes.control import Controller
 from app.sensors.camera import Camera
 from app.services.decodes.trace_task import CompileTracesTask
 from app.simulation.camera import render_plate_scene
+from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.road import Road
+from app.simulation.magnetic.vehicle import Course, Vehicle
 from app.simulation.plate_face import Face
 from app.simulation.plate_scene import PlacedFace, PlateScene, Shadow
 from app.simulation.steering import check_steering
@@ -50,8 +53,9 @@ def _render_and_read_plate() -> None:
 
 
 def _read_trace_and_track() -> None:
-    """Decode a trace, cancel wheel noise, compute a lane's sides, deviations and steering, and estimate a track."""
+    """Decode a trace, simulate one, cancel wheel noise, compute a lane's sides and steering, estimate a track."""
     compile_traces(CompileTracesTask(), None)
+    simulate_drive(Scene(Road(40.0), Vehicle.compact(), Course()), np.random.default_rng(1))
     inverse_band(factor(np.array([[2.0] * 4, [1.0] * 4])))
     assign_sides(_STATIONS_M, np.resize((1.7, -1.7), 4), np.zeros(4, np.int64), wander=0.1, near_track=False)
     path_m = np.column_stack((np.zeros(100), np.arange(100.0)))

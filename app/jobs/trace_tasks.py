@@ -14,7 +14,7 @@ from app.decoders.magnet.recording_check import find_mistakes
 from app.formats.traces.read import read_trace
 from app.formats.traces.series import NEAR_S
 from app.jobs.memory_limit import memory_is_the_limit
-from app.markers.magnet import InformationTag, parse_tag
+from app.markers.magnet import MOMENT_AM2, InformationTag, Orientation, parse_tag
 from app.plots.trace import plot_trace
 from app.sensors.magnetometer_bar import MagnetTrace
 from app.services.decodes.trace_task import (
@@ -26,11 +26,14 @@ from app.services.decodes.trace_task import (
     TraceTerms,
     trace_terms,
 )
+from app.simulation.magnetic.dipoles import dipole_field_ut
 
 _MOTION_STEP_S = 0.1  # [s] source: app/tracks/time_base.py has a node every 0.1 s
 _MOTION_VALUES = 36_000  # at most; source: by hand, an hour, 0.5 MB of JSON
 
-_COMPILED_M = 40.0
+# the drive that is decoded to compile the kernels
+_COMPILED_M, _COMPILED_M_S, _COMPILED_STEP_S, _COMPILED_CLEARANCE_M = 40.0, 12.0, 0.005, 0.2
+_EARTH_UT, _NOISE_UT = (20.0, 0.0, -43.0), 1.0
 
 
 def decode_recording(task: TraceTask, _before: None) -> TraceResult:
@@ -40,16 +43,24 @@ def decode_recording(task: TraceTask, _before: None) -> TraceResult:
 
 
 def compile_traces(_task: CompileTracesTask, _before: None) -> None:
-    """Decode a drive over one tag: the kernels are compiled, or loaded from numba's cache."""
-    from app.simulation.magnetic.drive import Scene, simulate_drive  # only here: takes half of a second to load
-    from app.simulation.magnetic.road import PlacedTag, Road
-    from app.simulation.magnetic.vehicle import Course, Vehicle
+    """Decode a drive over one tag: the kernels are compiled, or loaded from numba's cache.
 
+    The drive is straight and even. One of `app.simulation` would do, but holds 50 MB of scipy in an idle process.
+    """
     tag = parse_tag("SNS_4_0.1_10-30")
     assert isinstance(tag, InformationTag)
-    scene = Scene(Road(_COMPILED_M), Vehicle.compact(), Course(speed_m_s=12.0), tags=[PlacedTag(tag, 20.0, 0.05)])
-    trace = simulate_drive(scene, np.random.default_rng(1)).trace
-    decode_trace(trace, trace_terms({}).bar, candidates=TagCandidates(tags=[tag]))
+    bar = trace_terms({}).bar
+    rng = np.random.default_rng(1)
+    t_s = np.arange(0.0, _COMPILED_M / _COMPILED_M_S, _COMPILED_STEP_S)
+    travelled_m = _COMPILED_M_S * t_s[:, None] * (1.0, 0.0, 0.0)
+    points_m = (travelled_m[:, None] + bar.positions_m + (0.0, 0.0, _COMPILED_CLEARANCE_M)).reshape(-1, 3)
+    field_ut = rng.normal(_EARTH_UT, _NOISE_UT, points_m.shape)
+    for magnet in tag.magnets:
+        place_m = np.array([_COMPILED_M / 2 + magnet.along_m, magnet.lateral_m, 0.0])
+        axis = (0.0, 0.0, 1.0) if magnet.orientation is Orientation.UP else (1.0, 0.0, 0.0)
+        field_ut += dipole_field_ut(points_m, place_m, magnet.polarity.sign * MOMENT_AM2 * np.array(axis))
+    trace = MagnetTrace(t_s, field_ut.reshape(t_s.size, -1, 3), t_s, np.full(t_s.size, _COMPILED_M_S))
+    decode_trace(trace, bar, candidates=TagCandidates(tags=[tag]))
 
 
 def _decode_recording(task: TraceTask) -> TraceResult:
