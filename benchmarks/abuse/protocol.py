@@ -14,8 +14,8 @@ from contextlib import ExitStack, suppress
 from benchmarks.abuse.attacks import AttackSucceeded, attack
 from benchmarks.abuse.server import ObservedServer
 
-ATTACKERS = tuple(f"127.0.0.{number}" for number in range(1, 6))
-OTHER = "127.0.0.6"
+ATTACKERS = tuple(f"127.0.0.{number}" for number in range(2, 7))
+OTHER = "127.0.0.7"
 """Address of an honest client."""
 _TRAILERS = b"GET /healthz HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n"
 _HEALTH = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"

@@ -45,6 +45,10 @@ _HOST = re.compile(rb"[A-Za-z0-9._~!$&'()*+,;=%:\[\]-]*")
 _ESTABLISHED = 1
 """State of a connection whose client is there. Source: linux/tcp.h."""
 _MALFORMED = "this is no request of HTTP/1.1"
+_SEND_BUFFER_BYTES = 256 * 1024
+"""What the kernel takes of an answer before its client has read it. [byte] Without a limit it is whole answers: a
+client that reads nothing, with a small window, then costs 1 MB of the kernel's memory and 4 ms of it
+(`python -m benchmarks.abuse --only "unread answers"`). Linux doubles it: 5 MB/s at a round trip of 100 ms."""
 _CHECK_S = 1.0
 _LINGER_S = 2.0
 """How long a client may still send after its response. [s] Source: by hand; nginx waits 5 s (lingering_timeout)."""
@@ -119,6 +123,7 @@ class LimitedConnection(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Admit a connection, or refuse it."""
         super().connection_made(transport)
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
         self.flow: _HeldFlow = _HeldFlow(transport)
         self._address = address_of(self.client[0]) if self.client else "unknown"
         self._headers_since_s: float | None = self.loop.time()
@@ -233,6 +238,11 @@ class LimitedConnection(HttpToolsProtocol):
         if (end := scope.get("state", {}).get(STOP)) is not None:
             end()
         super().shutdown()
+
+    def pause_writing(self) -> None:
+        """The client does not keep up."""
+        super().pause_writing()
+        self._unread_since = self.loop.time(), self.transport.get_write_buffer_size()
 
     def resume_writing(self) -> None:
         """The client has read most of what was waiting."""
