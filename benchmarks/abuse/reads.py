@@ -81,8 +81,9 @@ class Outcome(NamedTuple):
 
     def broken(self, slack: float) -> list[str]:
         """The limits that it broke."""
+        max_cpu_s = MAX_PROCESS_CPU_S if self.name in _IN_A_PROCESS else MAX_CPU_S
         limits = (
-            (self.cost.cpu_s, (MAX_PROCESS_CPU_S if self.name in _IN_A_PROCESS else MAX_CPU_S) * slack, "processor time"),
+            (self.cost.cpu_s, max_cpu_s * slack, "processor time"),
             (self.cost.memory_mb, MAX_MEMORY_MB, "memory"),
             (self.cost.health_ms, MAX_HEALTH_MS * slack, "delay of /healthz"),
             (self.after_s, MAX_AFTER_S, "works on after its client has left"),
