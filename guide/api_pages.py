@@ -111,7 +111,7 @@ def _first_page(document: dict[str, Any], tags: dict[str, str], operations: dict
         f"Version {document['info']['version']}. These pages are made from the document that the server sends at "
         "`/openapi.json`; a running server also shows it at `/docs`, where requests can be tried out. "
         "[A client can be generated from it](../../generated-client.md), "
-        "[scopes](../../access.md) say which key may call what.\n\n"
+        "[scopes](../../access.md) determine which key may call what.\n\n"
         + table(("part", "content", "operations"), rows)
         + f"[Schemas that several parts share]({_SHARED}.md). "
         + f"[The document of the OGC API]({_OGC_DOCUMENT}.md), which GIS clients read.\n\n"
@@ -170,9 +170,9 @@ def _problems_page() -> str:
         for kind in sorted(set(PROBLEMS.values()), key=lambda kind: (kind.status, kind.slug))
     ]
     return (
-        "# Problems\n\nAn error is answered with a problem document of RFC 9457, `application/problem+json`. `detail` "
-        "says what is wrong; `field`, `limit` and `cure` name the input, what is allowed, and what helps; `errors` has "
-        "all faults of the request. The members are those of [`Problem`](api/schemas.md#problem).\n\n"
+        "# Problems\n\nThe response to an error is a problem document of RFC 9457, `application/problem+json`. "
+        "`detail` states what is wrong; `field`, `limit` and `cure` give the input, the allowed values, and the cure; "
+        "`errors` lists all faults of the request. The members are those of [`Problem`](api/schemas.md#problem).\n\n"
         + table(("status", "type", "title"), rows)
     )
 
