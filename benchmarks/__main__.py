@@ -25,7 +25,7 @@ def main() -> int:
     commands = [one for one in _list_commands(chosen.short) if chosen.only in (None, one[0])]
     with path.open("w") as file:
         failed = [name for name, *command in commands if not _run(name, command, file.write)]
-    print(f"\nWritten to {path}; `python -m benchmarks.readme {path}` puts the tables into the README.")
+    print(f"\nWritten to {path}; `python -m benchmarks.readme {path}` puts the tables into the documents.")
     if failed:
         print(f"Could not be run: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.pictures``: make the README's pictures in docs/images. Needs Chromium for the page's."""
+"""``python -m benchmarks.pictures``: make the pictures in docs/images. Needs Chromium for those of pages."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""``python -m benchmarks.readme FILE``: put what the benchmarks printed into the README and docs/benchmarks.md.
+"""``python -m benchmarks.readme FILE``: put what the benchmarks printed into docs/ and the README.
 
 A section ``### NAME`` of the file replaces what stands between ``<!-- bench:NAME -->`` and ``<!-- /bench -->``; blocks
-without a section stay as they are. Where the file comes from a short mode, each of its blocks says so.
+without a section stay as they are. Where the file comes from a short mode, each of its blocks says so. The README shows
+some lines of docs/demo.md, which then have the figures of the new run.
 """
 
 from __future__ import annotations
@@ -11,9 +12,16 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md")
+README = ROOT / "README.md"
+DEMO = ROOT / "docs" / "demo.md"
+PAGES = (DEMO, ROOT / "docs" / "benchmarks.md")
 SHORT_MARK = "*Short mode: a sample of the scenes.*"
+GAP = "..."
+"""Stands in the README's lines of the demo where others are left out."""
 _BLOCK = re.compile(r"(<!-- bench:(?P<name>[\w-]+) -->\n)(?P<body>.*?)(<!-- /bench -->)", re.DOTALL)
+_DEMO = re.compile(r"<!-- bench:demo -->\s+```text\n(?P<lines>.*?)```", re.DOTALL)
+_EXCERPT = re.compile(r"(?<=<!-- lines of docs/demo.md -->\n\n```text\n)(?P<lines>.*?)(?=```)", re.DOTALL)
+_NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?")
 
 
 def read_sections(text: str) -> dict[str, str]:
@@ -33,6 +41,48 @@ def fill_blocks(page: str, sections: dict[str, str]) -> str:
     return _BLOCK.sub(fill, page)
 
 
+def find_demo(page: str) -> str:
+    """What the demo printed, as docs/demo.md shows it."""
+    found = _DEMO.search(page)
+    assert found is not None, "no block of the demo"
+    return found["lines"]
+
+
+def fill_excerpt(readme: str, demo: str) -> str:
+    """The README with the figures of `demo` in its lines of the demo.
+
+    Each is the first line with the same text, numbers apart, after the one before.
+
+    Raises
+    ------
+    ValueError
+        The demo no longer prints one of the lines, or prints them in another order.
+    """
+    lines = [line for line in demo.splitlines() if re.search(r"\w", line)]
+
+    def fill(excerpt: re.Match[str]) -> str:
+        shown, after = [], 0
+        for wanted in excerpt["lines"].splitlines():
+            if wanted == GAP:
+                continue
+            at = next((i for i in range(after, len(lines)) if _shape(lines[i]) == _shape(wanted)), None)
+            if at is None:
+                raise ValueError(f"the demo does not print this line of the README, or not in this order: {wanted}")
+            shown += [GAP] * (at > after) + [lines[at]]
+            after = at + 1
+        return "".join(f"{line}\n" for line in shown + [GAP] * (after < len(lines)))
+
+    filled, count = _EXCERPT.subn(fill, readme)
+    if count != 1:
+        raise ValueError("the README does not have its lines of the demo once")
+    return filled
+
+
+def _shape(line: str) -> str:
+    """A line without its numbers."""
+    return " ".join(_NUMBER.sub("#", line).split())
+
+
 def _without_lists(body: str) -> str:
     """The section up to the lists of single frames that may follow the last table."""
     return re.split(r"^(?:Wrong digits:|Not decoded at )", body, flags=re.MULTILINE)[0].strip()
@@ -50,6 +100,8 @@ def main() -> None:
         page.write_text(fill_blocks(text, sections))
         filled = [block["name"] for block in _BLOCK.finditer(text) if block["name"] in sections]
         print(f"{page.name}: {', '.join(filled) or 'nothing'}")
+    README.write_text(fill_excerpt(README.read_text(), find_demo(DEMO.read_text())))
+    print("README.md: lines of the demo; compare its table with docs/benchmarks.md (tests/test_docs.py does)")
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from app.demo.traces import drive_and_judge, judge_drive
 from app.geodesy import enu_from_wgs84
 from app.markers.plate import PlateCode
 from app.simulation.magnetic.drive import simulate_drive
+from benchmarks.readme import DEMO, find_demo
 from tests.http import WITHIN_S
 
 pytestmark = pytest.mark.slow
@@ -43,14 +44,13 @@ def comparable(text: str) -> list[tuple[str, list[float]]]:
     return [(number.sub("#", line), [float(n.replace(",", "")) for n in number.findall(line)]) for line in lines]
 
 
-def assert_shown_in_readme(printed: str) -> None:
-    """The README shows what the demo prints: the same lines, with figures within 30 % or 2.5 of their last unit.
+def assert_documented(printed: str) -> None:
+    """docs/demo.md shows what the demo prints: the same lines, with figures within 30 % or 2.5 of their last unit.
 
-    ``python -m benchmarks --only demo`` and ``python -m benchmarks.readme bench-out/demo.md`` put it there.
+    The README shows some of these lines as they are there (`tests/test_docs.py`). ``python -m benchmarks --only demo``
+    and ``python -m benchmarks.readme bench-out/demo.md`` put them into both.
     """
-    block = re.search(r"<!-- bench:demo -->\s+```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert block is not None
-    shown, got = comparable(block[1]), comparable(printed)
+    shown, got = comparable(find_demo(DEMO.read_text())), comparable(printed)
     assert [line for line, _ in got] == [line for line, _ in shown]
     for (line, expected), (_, numbers) in zip(shown, got, strict=True):
         assert numbers == pytest.approx(expected, rel=0.3, abs=2.5), line
@@ -65,19 +65,18 @@ def assert_shown_in_readme(printed: str) -> None:
         ("0 failed", "4 failed"),
     ],
 )
-def test_a_stale_demo_in_the_readme_is_noticed(old: str, new: str) -> None:
-    block = re.search(r"<!-- bench:demo -->\s+```text\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert block is not None
-    assert_shown_in_readme(block[1].replace("127.0.0.1:2", "127.0.0.1:3"))
+def test_a_stale_demo_in_the_documents_is_noticed(old: str, new: str) -> None:
+    shown = find_demo(DEMO.read_text())
+    assert_documented(shown.replace("127.0.0.1:2", "127.0.0.1:3"))
     with pytest.raises(AssertionError):
-        assert_shown_in_readme(block[1].replace(old, new, 1))
+        assert_documented(shown.replace(old, new, 1))
 
 
 def test_the_demo_reads_every_plate_and_tag(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from app.cli import main; main()", "demo", "--out", str(tmp_path / "out")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WITHIN_S)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert_shown_in_readme(done.stdout.replace(str(tmp_path / "out"), "demo-out"))
+    assert_documented(done.stdout.replace(str(tmp_path / "out"), "demo-out"))
     rows = re.findall(r"^\d +[\w-]+ +\w+ +(\d+) +(\d+) +(\d+) +(\d+) +([\d.]+)", done.stdout, re.MULTILINE)
     assert len(rows) == 6
     for in_view, decoded, wrong, matched, error_cm in rows:

@@ -15,9 +15,12 @@ from typer.main import get_command
 from app.cli import cli
 from app.markers.plate import PlateGeometry
 from app.settings import Settings
+from benchmarks.readme import DEMO, fill_excerpt, find_demo
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+_HEADING = re.compile(r"^(#{2,4}) (.+)$", re.MULTILINE)
+_FIGURE = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*\d)")
 
 
 def test_every_setting_is_documented_with_its_default() -> None:
@@ -75,6 +78,30 @@ def test_the_architecture_page_has_every_folder_the_layers_and_only_paths_that_e
     assert text.split("```text\n")[1].split("\n```")[0].splitlines() == contracts[0]["layers"]
     for path in re.findall(r"\b(?:app|docs|tests|migrations|benchmarks|docker|static)/[\w./-]*[\w/]", text):
         assert (ROOT / path).exists(), path
+
+
+def test_the_readme_is_short_and_shows_lines_of_the_demo() -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert len(readme.splitlines()) <= 300, "tables and details belong into docs/"
+    assert fill_excerpt(readme, find_demo(DEMO.read_text())) == readme
+
+
+def test_the_figures_of_the_readme_are_those_of_the_benchmarks() -> None:
+    text = (ROOT / "docs/benchmarks.md").read_text()
+    headings = [
+        (m.start(), m[1], re.sub(r"[^\w -]", "", m[2]).lower().replace(" ", "-")) for m in _HEADING.finditer(text)
+    ]
+    sections = {}
+    for start, level, anchor in headings:
+        end = next((at for at, other, _ in headings if at > start and len(other) <= len(level)), len(text))
+        sections[anchor] = set(_FIGURE.findall(text[start:end]))
+    table = (ROOT / "README.md").read_text().split("## How good it is")[1].split("\n## ")[0]
+    rows = [line.split(" | ") for line in table.splitlines() if "docs/benchmarks.md#" in line and line.startswith("|")]
+    assert 8 <= len(rows) <= 12
+    for what, *cells in rows:
+        (anchor,) = re.findall(r"docs/benchmarks\.md#([\w-]+)", what)
+        for figure in _FIGURE.findall(" ".join(cells)):
+            assert figure in sections[anchor], f"{figure} is not in docs/benchmarks.md#{anchor}: {what}"
 
 
 def test_smaller_units_need_as_many_more_rows_as_documented() -> None:

@@ -134,7 +134,7 @@ def _files(*patterns: str) -> list[bytes]:
 
 
 def _short_recording() -> bytes:
-    """The first seconds of the recording in the README, as an archive."""
+    """The first seconds of the recording in docs/images, as an archive."""
     short = io.BytesIO()
     with zipfile.ZipFile(ROOT / "docs" / "images" / "drive.zip") as drive, zipfile.ZipFile(short, "w") as archive:
         for name in drive.namelist():

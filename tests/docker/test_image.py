@@ -136,7 +136,7 @@ def test_a_process_of_the_image_does_not_start_the_command_again() -> None:
 
 
 def recording() -> MagnetTrace:
-    """The trace of the README's drive."""
+    """The trace of the drive in docs/images."""
     with zipfile.ZipFile(ROOT / "docs/images/drive.zip") as archive:
         return read_trace({name: archive.read(name) for name in archive.namelist()}, TraceDeclaration()).trace
 
