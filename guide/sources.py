@@ -1,7 +1,8 @@
 """Gathers the sources of the guide: documents as they are, generated references, and the navigation.
 
 docs/index.md is the navigation: each of its headings is a group, each link of its lists a page. It is also the page
-that the repository shows, so it has no directives; they are added to the copy.
+that the repository shows, so it has no directives; they are added to the copy. docs/decisions/README.md does the same
+for the decision records.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def gather_sources(folder: Path) -> None:
     for path in DOCS.rglob("*.md"):
         copy = folder / path.relative_to(DOCS)
         copy.write_text(_with_moved_links(path, copy.read_text()))
-    _write_decisions(folder)
+    decisions = folder / "decisions" / "README.md"
+    decisions.write_text(with_navigation(decisions.read_text()))
     generated = [*write_api_pages(folder), write_command_page(folder)]
     index = folder / "index.md"
     text = index.read_text()
@@ -65,7 +67,7 @@ def _with_moved_links(document: Path, text: str) -> str:
         if target in OUTSIDE:
             place = DOCS / OUTSIDE[target]
         elif target.is_dir() and DOCS in target.parents:
-            place = target / "index.md"
+            place = target / "README.md"
         elif DOCS in target.parents:
             place = target
         else:
@@ -74,13 +76,3 @@ def _with_moved_links(document: Path, text: str) -> str:
         return f"{found['before']}{os.path.relpath(place, start)}{found['anchor'] or ''}{found['after']}"
 
     return _LINK.sub(moved, text)
-
-
-def _write_decisions(folder: Path) -> None:
-    """A page that lists the decision records."""
-    paths = sorted((folder / "decisions").glob("[0-9]*.md"))
-    titles = [path.read_text().splitlines()[0].removeprefix("# ") for path in paths]
-    listed = "".join(f"- [{title}]({path.name})\n" for path, title in zip(paths, titles, strict=True))
-    menu = "\n".join(["```{toctree}", ":hidden:", "", *(path.stem for path in paths), "```", ""])
-    page = "# Decisions\n\nOne page for each choice between alternatives: context, decision, what was rejected.\n"
-    (folder / "decisions" / "index.md").write_text(f"{page}\n{listed}\n{menu}")

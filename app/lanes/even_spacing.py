@@ -27,7 +27,7 @@ _MAX_EXCESS_SHARE = 0.1  # of the distance; source: by hand, sensitivity 1.00, 1
 _MOVED_M = (
     0.1  # [m] opposite errors of neighbouring lengths above this show a moved pair; source: 3 x `_LENGTH_SIGMA_M`
 )
-_SHORT_M = 40.0  # [m] on longer stretches bends make opposite errors too; source: decision 0045, rows of ten a side
+_SHORT_M = 40.0  # [m] on longer stretches bends make opposite errors too; source: decision 0016, rows of ten a side
 _CANCEL_SHARE = 0.3  # of the errors, which their sum must be below on longer stretches; source: as above
 _CLEARLY_BETTER = 0.5  # of the squared misfit along the second best line; source: by hand, sensitivity 0.93, 1.28
 

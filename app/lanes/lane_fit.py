@@ -34,7 +34,7 @@ _MAX_REJECTIONS = 12  # of outliers beside one line; source: by hand, sensitivit
 _MAX_GROWTH = 2.0  # of the length of the initial line; more is a line that winds between outliers; source: by hand
 _REJECTION_STRETCH_M = 60.0  # [m] within it one outlier at a time; source: by hand, sensitivity 1.00, 1.00
 _PAIR_SIGMAS = (
-    5.0  # from which on a pair does not agree with the lane; source: decision 0045, 3 loses pairs of tight bends
+    5.0  # from which on a pair does not agree with the lane; source: decision 0016, 3 loses pairs of tight bends
 )
 _MIN_SLOPE_SHARE = 0.05  # of a pair's variance that others explain; source: by hand, keeps the division by it finite
 _SCATTERS = (1.6, 2.5, 4.0)  # of markers, in their stated accuracy; source: by hand: 3.5, 5.5, 9 cm for the usual 2.2

@@ -46,7 +46,7 @@ _MIN_ROW_STAGGER_M = 0.1  # [m] of one row ahead of the other; source: by hand, 
 _ROW_STAGGER_Z = 3.0  # and by this many standard errors; source: three sigma, one false alarm in 370
 _MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745
 _NEIGHBOURS = 5  # pairs that a pair is compared with, itself included; source: two of five may be wrong
-_NEIGHBOURS_WITHIN_M = 120.0  # [m] further apart, the lane bends between them; source: decision 0045, five at 24.4 m
+_NEIGHBOURS_WITHIN_M = 120.0  # [m] further apart, the lane bends between them; source: decision 0016, five at 24.4 m
 _OUTLIER_SIGMAS = 3.0  # from which on a pair counts less; source: three sigma, one false alarm in 370
 
 

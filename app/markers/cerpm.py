@@ -28,7 +28,7 @@ from app.geodesy import check_lon_lat
 
 VERSION = 1
 MESSAGE_BYTES = 24  # [bytes] source: the longest packet of SF10 at 125 kHz within the 400 ms of 47 CFR 15.247
-TAG_BYTES = 4  # [bytes] source: as long as LoRaWAN's integrity code (docs/decisions/0009-cerpms.md)
+TAG_BYTES = 4  # [bytes] source: as long as LoRaWAN's integrity code (docs/decisions/0015-cerpm-messages.md)
 BODY_BYTES = MESSAGE_BYTES - TAG_BYTES
 KEY_BYTES = 16  # [bytes] source: AES-128
 MAX_NUMBER = 2**32 - 1  # source: four bytes

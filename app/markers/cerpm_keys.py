@@ -1,7 +1,7 @@
 """Keys of CERPMs and the tag of their messages: AES-CMAC throughout, the same for both directions.
 
 Sources: RFC 4493 (AES-CMAC), NIST SP 800-108r1 section 4.1 (key derivation in counter mode), NIST SP 800-38B appendix A
-(short tags). Decision 0020 has the reasons for the length of the tag and the limits on guesses.
+(short tags). Decision 0015 has the reasons for the length of the tag and the limits on guesses.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ AGENCY_KEY_BYTES = (16, 32)  # [bytes] source: AES-128 and AES-256
 KEY_LABEL = b"waymark cerpm v1"  # purpose of the derived keys; another message version needs another label
 MAX_INVALID_TAGS_PER_LOG = 1_000
 """Tags that may fail in one log before the rest is left unchecked. Source: one transmitter at SF7 and 125 kHz sends 972
-messages of 24 bytes in a minute, about as long as a vehicle is within its range (decision 0020)."""
+messages of 24 bytes in a minute, about as long as a vehicle is within its range (decision 0015)."""
 MAX_INVALID_TAGS_PER_DAY = 10_000
 """The same for all logs of one API key in a day (UTC). Source: ten logs as above; with it one key forges a message in a
-year with a probability of 0.085 % (decision 0020)."""
+year with a probability of 0.085 % (decision 0015)."""
 _COUNTER_BYTES = 4  # [bytes] source: NIST SP 800-108r1, section 4.1, r = 32
 
 
@@ -96,7 +96,7 @@ def message_tag(key: bytes, body: bytes) -> bytes:
 
     Notes
     -----
-    RFC 4493, section 2.4, which recommends at least 64 bits. The message has room for 32 (decision 0020): one guess in
+    RFC 4493, section 2.4, which recommends at least 64 bits. The message has room for 32 (decision 0015): one guess in
     2^32 is right, and the number of guesses is limited.
     """
     for name, value, length in (("key", key, KEY_BYTES), ("body", body, BODY_BYTES)):

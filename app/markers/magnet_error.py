@@ -24,7 +24,7 @@ from app.markers.magnet_design import TagDesign
 FloatArray = npt.NDArray[np.float64]
 MAX_PLACEMENTS = 4000
 """Placements that are examined at most; of larger designs, so many at equal ranks. Source: chosen by hand for speed
-(docs/decisions/0007-magnets-in-the-registry.md has the times)."""
+(docs/decisions/0013-magnet-tags.md has the times)."""
 
 
 def _check_fields(values: MagnetErrorModel | OdometerError, may_be_zero: tuple[str, ...]) -> None:

@@ -75,7 +75,7 @@ THRESHOLDS = {
     PrintParameterName.UNUSED_ERROR_CORRECTION: PrintThresholds((0.62, 0.50, 0.37, 0.25), "1", True, _ISO),
     PrintParameterName.DECODE: PrintThresholds((1, 1, 1, 1), "1", True, _ISO),
 }
-"""Thresholds of all parameters. Sources: docs/decisions/0030-print-grades.md."""
+"""Thresholds of all parameters. Sources: docs/decisions/0009-plate-artwork.md."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from typing import Final
 from app.markers.plate import PlateGeometry, PlateScheme, check_size
 
 RECOMMENDED_SCHEME: Final = PlateScheme.ID
-"""Of a plate that the registry knows. Source: docs/decisions/0031-codes-that-survive-dirt.md."""
+"""Of a plate that the registry knows. Source: docs/decisions/0008-plate-codes.md."""
 RECOMMENDED_POSITION_SCHEME: Final = PlateScheme.POSITION_ROBUST
 """Of a plate that must carry its position itself. Source: the same."""
 ROBUST_GEOMETRY = PlateGeometry(n=10, unit_mm=27.0, gap_mm=5.0)

@@ -1,6 +1,6 @@
 """The snapshot of an area: what vehicles without a connection know of its markers, signed by their server.
 
-docs/snapshots.md has the format byte by byte, and decision 0012 why it is so. A server writes it
+docs/snapshots.md has the format byte by byte, and decision 0020 why it is so. A server writes it
 (`app.encoders.snapshot`), a vehicle reads it (`app.decoders.snapshot`); both know it from here.
 """
 
@@ -22,7 +22,7 @@ VERSION: Final = 3
 """Of the format. Files of other versions are refused."""
 MAX_VALIDITY: Final = timedelta(days=7)
 """From creation to expiry, checked by the writer and by the reader. It limits how long somebody who withholds new
-snapshots can keep a vehicle on an old one (freeze attack; The Update Framework 1.0, section 5.4.4). Decision 0012 chose
+snapshots can keep a vehicle on an old one (freeze attack; The Update Framework 1.0, section 5.4.4). Decision 0020 chose
 the length."""
 MAX_KEYS: Final = 2
 """That a reader trusts at the same time: the one in use, and its predecessor or successor during a rotation."""

@@ -3,7 +3,7 @@
 An entry stands for one operation. It counts the versions of markers that were written and covers them by a digest over
 their hashes, so that one entry is enough for an import of a million. `audit_check` finds what was changed since.
 
-Writes come one after another on both databases (decision 0010), so nobody else appends to a chain meanwhile.
+Writes come one after another on both databases (decision 0002), so nobody else appends to a chain meanwhile.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """A marker's GeoJSON feature, as the row keeps it beside its columns: pages are read a thousand times a second, and
-putting a hundred features together for each takes longer than all the rest (decision 0013).
+putting a hundred features together for each takes longer than all the rest (decision 0006).
 
 Whatever writes a marker writes this with it. A property that is added to `FIELDS` needs a migration that writes all
 texts anew.

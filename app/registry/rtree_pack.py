@@ -4,7 +4,7 @@ SQLite keeps an R*Tree in three ordinary tables (https://www.sqlite.org/rtree.ht
 its depth (of the root, else zero) and its number of cells as two big-endian 16-bit numbers, then cells of a 64-bit id
 (of a row, or of the node below) and the box as 32-bit floats: minimum and maximum of each axis, rounded outward.
 Packing: Leutenegger, Lopez, Edgington, "STR: a simple and efficient algorithm for R-tree packing", ICDE 1997.
-What it gains is in docs/decisions/0017-packed-rtree.md.
+What it gains is in docs/decisions/0002-registry-store.md.
 """
 
 from __future__ import annotations

@@ -25,6 +25,24 @@ def test_every_document_is_in_the_index_once() -> None:
     assert GENERATED_MARK in index
 
 
+def test_every_decision_record_is_in_their_index_once_in_order_with_its_topics() -> None:
+    folder = ROOT / "docs/decisions"
+    listed = re.findall(r"^- \[(\d{4}): [^\]]+\]\(([^)#]+)\): \S", (folder / "README.md").read_text(), re.MULTILINE)
+    records = sorted(path.name for path in folder.glob("*.md") if path.name != "README.md")
+    assert [name for _, name in listed] == records
+    assert [number for number, _ in listed] == [f"{k:04d}" for k in range(1, len(records) + 1)]
+    for number, name in listed:
+        text = (folder / name).read_text()
+        assert name.startswith(f"{number}-")
+        assert text.startswith(f"# {number}: ")
+        assert re.findall(r"^## (.+)", text, re.MULTILINE) in (
+            ["Context", "Decision", "Rejected", "Measured"],
+            ["Context", "Decision", "Rejected", "Measured", "Limits"],
+        ), name
+        assert len(text.splitlines()) <= 150, name
+        assert max(map(len, text.splitlines())) <= 120, name
+
+
 def test_each_group_of_the_index_becomes_a_menu() -> None:
     index = "# Top\n\nText\n\n## One\n\n- [A page](a.md): text\n- [B](x/b.md): text\n\n## Two\n\nno pages\n"
     text = with_navigation(index)

@@ -106,7 +106,7 @@ def test_tags_are_made_with_a_key_over_a_body_only(key: int, body: int, field: s
 
 
 def test_the_forgery_budget_of_the_docs() -> None:
-    """docs/cerpm-message.md and decision 0020 state these figures; 1 - exp(-n / 2^32) by hand."""
+    """docs/cerpm-message.md and decision 0015 state these figures; 1 - exp(-n / 2^32) by hand."""
     year = 365
     assert forgery_probability(2**32) == pytest.approx(1 - math.exp(-1), rel=1e-9)
     assert forgery_probability(year * MAX_INVALID_TAGS_PER_DAY) == pytest.approx(8.495e-4, rel=1e-3)

@@ -28,7 +28,7 @@ SURE_CONFIDENCE = 0.99
 MIN_MAGNETS = 4
 """[magnets] that another declaration must give. Source: by hand: a tag has three, and iron gives one now and then."""
 USUAL_STRENGTH = (0.65, 1.25)
-"""[nominal moment] Strengths that the magnets of a recording have. Source: drives of the scene hunter (decision 0043):
+"""[nominal moment] Strengths that the magnets of a recording have. Source: drives of the scene hunter (decision 0014):
 speeds that are 1.6 times too low make it 0.4 to 0.6, speeds that are 1.6 times too high 1.1 to 1.5."""
 MIN_RATIO, MIN_SHARE = 4.0, 0.9
 """[1] Energy that the magnets of another declaration must explain, over that of the declared one: where few were

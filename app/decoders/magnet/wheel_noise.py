@@ -33,7 +33,7 @@ RENEW_M = 0.1
 """Distance after which the bank of trial lengths is renewed. [m] Source: chosen by hand for speed."""
 LEARN_M, FIRST_LEARN_M, LEARN_SLOPE = 60.0, 3.0, 0.6
 """Distance over which harmonics are learnt: in the long run, at first, and its growth per distance. [m, m, 1] Source:
-in less, the magnets of a line that are about as far apart as a turn is long are learnt too (decision 0042)."""
+in less, the magnets of a line that are about as far apart as a turn is long are learnt too (decision 0014)."""
 OFFSET_M, FIRST_OFFSET_M = 6.0, 0.5
 """Distance over which a channel's offset is averaged, in the long run and at first. [m] Source: three turns."""
 STRENGTH_M = 10.0

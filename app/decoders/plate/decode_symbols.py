@@ -46,7 +46,7 @@ effect: `python -m benchmarks.plates.thresholds`."""
 MAX_DECIMAL_COST = 12.0
 """[cost] of reading letters as digits up to which a plate may be a decimal one. Source: chosen by hand."""
 CHANCE_LOG_ODDS = math.log(1e6)
-"""[log] number of look-alikes that a match with the codebook must beat. Source: decision record 0005, rule 5."""
+"""[log] number of look-alikes that a match with the codebook must beat. Source: decision record 0010, rule 6."""
 MIN_LIKELY = 0.5
 """[probability] from which an unsure codeword is the likely one. Source: it is likelier than all others together."""
 UNCERTAIN_CELL = 0.99

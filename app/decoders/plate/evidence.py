@@ -18,7 +18,7 @@ from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading
 
 MIN_CONFIDENCE = 0.9995
-"""[probability] from which digits are returned. Source: no wrong digits (decision record 0005, rule 4)."""
+"""[probability] from which digits are returned. Source: no wrong digits (decision record 0010, rule 5)."""
 MIN_EXPLAINED_ALONE = 0.83
 """[1] the same for digits that no registry confirms. Source: chosen by hand; effect: `python -m
 benchmarks.plates.thresholds`."""
@@ -33,14 +33,14 @@ CLEAN_EXPLAINED = 0.93
 -m benchmarks.plates.thresholds`."""
 MAX_ERROR = 1e-4
 """[probability] of an error by the pixels, below which digits are returned. Source: trials in shade, under painted
-stains and in fair light (decision record 0029)."""
+stains and in fair light (decision record 0011)."""
 MAX_SMALL_ERROR = 1e-3
 """[probability] the same on units below `VERIFIED_UNIT_PX` that look usual; others have `MAX_ERROR`. Source: the same
-trials, and plates under painted stains (decision record 0029)."""
+trials, and plates under painted stains (decision record 0011)."""
 MAX_VEILED_ERROR = 2e-5
 """[probability] the same under a veil of glare, which is one unknown field more. Source: a
 tenth of `MAX_ERROR`, with which test plates in glare with paint over one whole unit are misread no more often than
-without the veil (decision record 0029)."""
+without the veil (decision record 0011)."""
 PLAIN_OUTLIER, PLAIN_RESIDUAL = 3.0, 0.08
 """[1, contrast] `UnitEvidence.outlier_ratio` and `level_residual` below which nothing on a plate is unusual, and its
 pixels are not compared. Source: the same trials; the wrong readings had a residual of 0.063 to 0.127."""
@@ -55,7 +55,7 @@ same trials: with the residual of larger units 36 of 49 plates of 11 to 24 rows 
 MAX_TENTATIVE_ERROR, TENTATIVE_CONFIDENCE, TENTATIVE_EXPONENT = 0.1, 0.9, 2.0
 """[probability, probability, 1] of an error by the pixels up to which a refused code is returned as tentative, the most
 that its confidence is, and how often the probability of no error by the pixels counts. Source: of 125 tentative
-readings 94, 89, 92 and 78 % are right at an error of up to 1e-3, 0.01, 0.03 and 0.1 by the pixels (record 0029)."""
+readings 94, 89, 92 and 78 % are right at an error of up to 1e-3, 0.01, 0.03 and 0.1 by the pixels (record 0011)."""
 SURE_CELL = 0.9
 """[probability] of each cell above which a refusal is `unsure`, below it `cells-undecodable`. Source: chosen by
 hand."""

@@ -51,7 +51,7 @@ MAX_RANK, USUAL_SIZE = 12.0, 3.5
 """[log odds, log10 px^2] rank above which none counts more, and size about which the squares are taken. Source: chosen
 by hand."""
 MIN_LOG_ODDS = -5.0
-"""[log odds] below which a candidate is not fitted. Source: decision record 0032."""
+"""[log odds] below which a candidate is not fitted. Source: decision record 0010."""
 WEIGHTS = np.array(
     [
         3.004,  # weakest margin

@@ -13,7 +13,7 @@ from app.decoders.plate.filter_candidates import MIN_LOG_ODDS, candidate_log_odd
 from app.markers.plate import SIZES, PlateGeometry
 
 SIGNALS = (difference_signal, ratio_signal, coarse_ratio_signal)
-"""Signals that are searched, one after the other until a plate is read. Source: decision record 0032."""
+"""Signals that are searched, one after the other until a plate is read. Source: decision record 0010."""
 MAX_FITS = 5
 """[candidates] that are fitted for one signal. Source: chosen by hand, for speed."""
 LOG_ODDS_RANGE = 4.0

@@ -37,7 +37,7 @@ CORNER_SCATTER = 3.0
 FINE_CORNER_SCATTER = 4.5
 """[1] the same where more pixels are used: neighbours share the errors of the colour mosaic, of sharpening and of JPEG.
 Source: half as much again as that of the coarser stages, so that 95 % of the positions' errors are below two standard
-deviations (decision record 0033; chosen on seeds 301 to 304, checked on 401 to 403)."""
+deviations (decision record 0012; chosen on seeds 301 to 304, checked on 401 to 403)."""
 
 
 @dataclass(slots=True)
@@ -115,13 +115,13 @@ class _Stage:
 
 
 _QUICK = (_Stage(1.8, 1, 6), _Stage(2.8, 4, 4))
-"""Stages of colour frames. Source: two, then three pixels a unit (decision record 0005, rule 2); steps chosen by
+"""Stages of colour frames. Source: two, then three pixels a unit (decision record 0010, rule 3); steps chosen by
 hand."""
 _THOROUGH = (_Stage(2.4, 2, 6), _Stage(3.5, 4, 4))
 """Stages of thermal frames, whose plates are few and faint. Source: chosen by hand."""
 
 _FINE = _Stage(4.5, 4, 2, is_skewed=True)
-"""Stage of the corners of read plates. Source: decision record 0033; 6 px a unit take 0.7 ms more, and only plates of
+"""Stage of the corners of read plates. Source: decision record 0012; 6 px a unit take 0.7 ms more, and only plates of
 48 rows and more gain by it."""
 
 

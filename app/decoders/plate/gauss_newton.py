@@ -31,7 +31,7 @@ plate. Source: chosen by hand."""
 MIN_FINE_EXPLAINED = 0.7
 """[1] the same of the values and the pose found, from the second fine step on. Source: chosen by hand."""
 MAX_STEP = 0.06
-"""[extent of the plate's image] by which a step may move a corner. Source: decision record 0005, rule 2."""
+"""[extent of the plate's image] by which a step may move a corner. Source: decision record 0010, rule 3."""
 NEAR, LOST = 0.02, 0.03
 """[extent of the plate's image] corners that move less are near rest; that move more in the last coarse step, lost.
 Source: chosen by hand."""

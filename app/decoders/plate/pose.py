@@ -40,7 +40,7 @@ REDUNDANT = 5
 SCATTER_WEIGHT = 5.0
 """[residuals] that the reported covariance of the corners counts for when the residuals of a pose scale it. Source: of
 2, 5, 10, 20 and infinity, 2 and 5 make the position errors of seeds 111 and 112 likeliest (by 0.4 nats a frame over
-infinity), and with 5 the error of 95 % is below two standard deviations on each axis (decision record 0033)."""
+infinity), and with 5 the error of 95 % is below two standard deviations on each axis (decision record 0012)."""
 
 
 @dataclass(frozen=True, slots=True)

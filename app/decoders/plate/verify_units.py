@@ -50,10 +50,10 @@ NODES = 4
 WHITE_SPREAD, SPREAD_FACTOR, DARK_SHARE_OF_SPREAD = (0.03, 0.09), 2.0, 0.55
 """[white, 1, 1] least and greatest standard deviation of light units' own reflectances, the same over
 `UnitEvidence.spread`, and that of dark units over it: where units are even, a spot of paint stands out. Source: plates
-under painted stains (decision record 0029)."""
+under painted stains (decision record 0011)."""
 VEIL_ERROR = 0.05
 """[light level] standard deviation of the error of a veil of glare. Source: chosen by hand; with none, 51 of 100
-frames in glare are read in place of 52 (decision record 0029)."""
+frames in glare are read in place of 52 (decision record 0011)."""
 SPOTS_MM = ((17, 17, 0), (22, 22, 0), (30, 30, 0), (26, 17, 0), (17, 26, 0), (28, 20, 45), (28, 20, 135))
 """[mm, mm, deg] half axes and turns of the spots of paint; each lies at nine places around the unit's centre. Source:
 chosen by hand; smaller ones leave a part of the unit in view."""

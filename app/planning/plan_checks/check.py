@@ -49,7 +49,7 @@ def _places(plan: Plan) -> Iterator[PlanFinding]:
     )  # fmt: skip
     unfit = plan.alignment.grade is LocalizationGrade.UNFIT
     yield compare(
-        "positions", float(unfit), "<=", 0, "roads", "docs/decisions/0002-positions.md",
+        "positions", float(unfit), "<=", 0, "roads", "docs/decisions/0003-positions.md",
         "the road is placed by an origin or without a stated accuracy: survey the markers before they localize"
         if unfit
         else "the road's reference system has a stated accuracy",

@@ -17,7 +17,7 @@ from app.sensors.camera import Camera
 
 ROWS_PER_UNIT = 2.0
 """Rows of the image that a unit must cover to be readable. [px] Source: the decoder's bound of 1.5 rows for digits that
-nothing else confirms (docs/decisions/0005), with a third in reserve."""
+nothing else confirms (docs/decisions/0010), with a third in reserve."""
 MAX_BLUR_UNITS = 1.0
 """Units that a plate may move during the exposure. Source: PolyU trials (docs/benchmarks.md): 80 km/h with 1/1000 s is
 0.6 units and read."""
@@ -94,7 +94,7 @@ def _frames(plan: Plan, plates: Sequence[PlannedMarker], camera: CameraRules, ru
     )
     if frames < rules.min_frames:
         sentence += "; a faster, higher or steeper camera, a shorter exposure or larger units give more"
-    source = "geometry of the camera; rows per unit from docs/decisions/0005, blur from docs/benchmarks.md"
+    source = "geometry of the camera; rows per unit from docs/decisions/0010, blur from docs/benchmarks.md"
     return compare(f"frames-per-pass {camera.name}", frames, ">=", rules.min_frames, "frames", source, sentence, worst)
 
 

@@ -21,7 +21,7 @@ import { PlateDrawing } from "./studio_plates_drawing.js";
 /** @typedef {import("./studio_plates_draft.js").Draft} Draft */
 
 const SCHEMES = /** @type {const} */ (["id", "position-robust", "position-check", "position"]);
-/** Units along a side and their size, for plates of 325 mm: docs/decisions/0031-codes-that-survive-dirt.md. @type {Record<string, [string, string]>} */
+/** Units along a side and their size, for plates of 325 mm: docs/decisions/0008-plate-codes.md. @type {Record<string, [string, string]>} */
 const SIZES = { "position-robust": ["10", "27"] };
 const FORMATS = ["pdf", "svg", "dxf", "png"];
 const DRAWN = ["side", "unit", "gap", "border", "pitch", "marker", "thickness", "diagonal"]; // dimensions in the drawing
