@@ -12,59 +12,45 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api.access import agencies, audit, keys, me
+from app.api import access as agencies
+from app.api import access as audit
+from app.api import access as keys
+from app.api import access as me
+from app.api import drives, fleet, health, reprocessing, roads, uploads
+from app.api import jobs as events
+from app.api import jobs as files
+from app.api import jobs as job_routes
+from app.api import jobs as webhooks
 from app.api.decodes import decodes
-from app.api.decodes import details as decode_details
-from app.api.drives import drives
-from app.api.fleet import calibrations, snapshots, vehicles
-from app.api.health import maintenance
-from app.api.http import server_settings, system, ui, web_settings
+from app.api.decodes import decodes as decode_details
+from app.api.http import system, ui
 from app.api.http.compression import Compressed
-from app.api.http.costs import Budget, Slots
+from app.api.http.limits import Budget, RateLimit, Slots
 from app.api.http.middleware import Guarded, Observed
 from app.api.http.openapi import describe
 from app.api.http.permissions import Permissions
 from app.api.http.problems import install_problem_handlers
-from app.api.http.rate_limits import RateLimit
-from app.api.jobs import events, files, webhooks
-from app.api.jobs import jobs as job_routes
-from app.api.jobs.streams import Streams
-from app.api.markers import (
-    artwork,
-    bulk,
-    cerpms,
-    codebook_drafts,
-    codebooks,
-    layouts,
-    markers,
-    observations,
-    plate_drafts,
-    print_grades,
-    searches,
-)
+from app.api.jobs import Streams
+from app.api.markers import artwork, codebooks, markers, plates, searches
 from app.api.ogc import mount_ogc
-from app.api.plans import alignments, packages, plan_jobs, plans, proofs, radio_checks, rules
-from app.api.public_pages import damage_reports, page_settings, pages
-from app.api.public_pages.forms import MAX_FIELD_BYTES
-from app.api.public_pages.limits import public_limits
+from app.api.plans import alignments, plans, radio_checks
+from app.api.public_pages import damage_reports, pages
+from app.api.public_pages.forms import MAX_FIELD_BYTES, public_limits
 from app.api.public_pages.pages import FormLimits
-from app.api.reprocessing import reprocessings
-from app.api.roads import roads
-from app.api.surveys import exports, imports
-from app.api.uploads import uploads
+from app.api.surveys import surveys
 from app.control.metrics import ProcessMetrics
 from app.control.operations import OperatorCases
 from app.control.server import ControlServer
 from app.errors import Unavailable, is_disk_full
 from app.families.plate.frames import decode_plates
 from app.jobs.frame_tasks import DecodePlates
-from app.jobs.local_queue import LocalQueue
+from app.jobs.queues import LocalQueue
 from app.published_settings import other_hosts, page_settings_of, server_settings_of
 from app.registry.database import Database
 from app.services.access.access import Access
 from app.services.ports import utc_now
 from app.settings import Settings
-from app.storage.probe import find_folder_fault
+from app.storage.spool import find_folder_fault
 from app.use_cases import UseCases
 from app.wiring import Outside, connect_outside, make_use_cases
 
@@ -73,48 +59,48 @@ _FORM_BYTES = MAX_FIELD_BYTES * 16
 """Of a damage report besides the photo; a larger photo, up to here, is answered with the form. [byte]"""
 ROUTERS = (
     searches.router,
-    bulk.router,
-    observations.router,
-    maintenance.router,
+    markers.bulk_router,
+    markers.observation_router,
+    health.router,
     roads.router,
     markers.router,
     artwork.router,
-    plate_drafts.router,
-    print_grades.router,
-    layouts.router,
-    cerpms.router,
+    plates.draft_router,
+    plates.print_grade_router,
+    artwork.layout_router,
+    artwork.program_router,
     radio_checks.router,
     alignments.router,
-    rules.router,
+    plans.rule_router,
     plans.router,
-    proofs.router,
-    packages.router,
-    plan_jobs.router,
+    plans.proof_router,
+    plans.package_router,
+    plans.job_router,
     job_routes.router,
-    files.router,
-    webhooks.router,
-    events.router,
-    reprocessings.router,
-    reprocessings.decode_versions,
+    files.file_router,
+    webhooks.webhook_router,
+    events.event_router,
+    reprocessing.router,
+    reprocessing.decode_versions,
     codebooks.router,
-    codebook_drafts.router,
+    codebooks.draft_router,
     decodes.router,
-    decode_details.router,
+    decode_details.detail_router,
     uploads.router,
     drives.router,
-    imports.router,
-    exports.router,
-    snapshots.router,
-    audit.router,
-    vehicles.router,
-    calibrations.router,
-    keys.router,
-    agencies.router,
-    page_settings.router,
+    surveys.import_router,
+    surveys.export_router,
+    fleet.snapshot_router,
+    audit.audit_router,
+    fleet.vehicle_router,
+    fleet.calibration_router,
+    keys.key_router,
+    agencies.agency_router,
+    damage_reports.settings_router,
     damage_reports.router,
-    me.router,
-    web_settings.router,
-    server_settings.router,
+    me.me_router,
+    system.page_settings_router,
+    system.server_settings_router,
 )
 
 

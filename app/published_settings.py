@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from app.api.http.guide_files import GUIDE
-from app.api.http.page_policy import origin_of
-from app.api.http.server_settings import NumberSetting, ServerSettings
-from app.api.http.ui import BASE_MAP
-from app.api.http.web_settings import BaseMap, PageSettings, SignInOptions
+from app.api.http.system import BaseMap, NumberSetting, PageSettings, ServerSettings, SignInOptions
+from app.api.http.ui import BASE_MAP, GUIDE, origin_of
 from app.settings import Settings
 
 _PLACES = ("port", "worker_metrics_port")

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import TypedDict
 
 from app.services.access.access import Access
-from app.services.access.agencies import Agencies
 from app.services.access.audit import AuditLog
 from app.services.access.audit_jobs import AuditVerifications
-from app.services.access.keys import Keys
-from app.services.decodes.decodes import Decodes
-from app.services.decodes.details import DecodeDetails
+from app.services.access.keys import Agencies, Keys
+from app.services.blobs import UnusedBlobs
+from app.services.decodes.decodes import DecodeDetails, Decodes
 from app.services.decodes.outputs import DecodeOutputs
 from app.services.drives.drives import Drives
 from app.services.fleet.calibrations import Calibrations
@@ -18,42 +17,31 @@ from app.services.fleet.snapshots import Snapshots
 from app.services.fleet.vehicles import Vehicles
 from app.services.health.maintenance import Maintenance
 from app.services.jobs import Jobs
-from app.services.markers.artwork import Artworks
-from app.services.markers.artwork_jobs import ArtworkJobs
+from app.services.markers.artwork import ArtworkJobs, Artworks
 from app.services.markers.bulk import BulkMarkers
-from app.services.markers.cerpm_programs import CerpmPrograms
 from app.services.markers.codebooks import Codebooks
 from app.services.markers.features import Features
-from app.services.markers.layouts import Layouts
-from app.services.markers.markers import Markers
-from app.services.markers.observations import Observations
+from app.services.markers.markers import Markers, Observations
 from app.services.markers.plate_drafts import PlateDrafts
 from app.services.markers.print_grades import PrintGrades
+from app.services.markers.programs import CerpmPrograms, Layouts
 from app.services.markers.searches import Searches
 from app.services.plans.alignments import Alignments
-from app.services.plans.making import PlanMaking
+from app.services.plans.making import PlanMaking, PlanPreviews
 from app.services.plans.packages import Packages
-from app.services.plans.plan_jobs import PlanJobs
 from app.services.plans.plans import Plans
-from app.services.plans.previews import PlanPreviews
-from app.services.plans.proofs import Proofs
-from app.services.progress.events import AgencyEvents
-from app.services.progress.jobs import AllJobs
-from app.services.progress.results import JobFiles
-from app.services.public_pages.form_tokens import FormTokens
-from app.services.public_pages.pages import PublicPages
+from app.services.plans.proofs import PlanJobs, Proofs
+from app.services.progress import AgencyEvents, AllJobs, JobFiles
+from app.services.public_pages.pages import FormTokens, PublicPages
 from app.services.public_pages.reports import DamageReports
-from app.services.reprocessing.reprocessings import Reprocessings
+from app.services.reprocessing import Reprocessings
 from app.services.roads.roads import Roads
-from app.services.surveys.export_jobs import ExportJobs
-from app.services.surveys.exports import Exports
+from app.services.surveys.exports import ExportJobs, Exports
 from app.services.surveys.import_jobs import ImportJobs
 from app.services.surveys.imports import Imports
-from app.services.unused_blobs import UnusedBlobs
 from app.services.uploads.quotas import Quotas
 from app.services.uploads.uploads import Uploads
-from app.services.webhooks.delivery import WebhookDelivery
-from app.services.webhooks.webhooks import Webhooks
+from app.services.webhooks import WebhookDelivery, Webhooks
 
 
 class AccessUseCases(TypedDict):

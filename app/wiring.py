@@ -12,34 +12,30 @@ import numpy as np
 import numpy.typing as npt
 
 from app.encoders.plate import PlateReader
-from app.families.rules import MarkerRules
-from app.formats.archives import ArchiveLimits
+from app.families.surveys import MarkerRules
+from app.formats.format import ArchiveLimits
 from app.formats.images import ImageLimits
 from app.geodesy import use_grids
-from app.jobs.engine import JobEngine
+from app.jobs.decoder_process import ProcessLimits
 from app.jobs.export_process import ExportProcesses
 from app.jobs.frame_tasks import DecodePlates
-from app.jobs.local_queue import LocalQueue
 from app.jobs.pool import DecodePool
-from app.jobs.process_limits import ProcessLimits
+from app.jobs.queues import JobEngine, LocalQueue
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlateReading
 from app.registry.database import Database
 from app.registry.jobs import JobKind
 from app.services.access.access import Access, Bearer
-from app.services.access.agencies import Agencies
 from app.services.access.agency_secrets import AgencySecrets
 from app.services.access.audit import AuditLog
 from app.services.access.audit_jobs import AuditVerifications
-from app.services.access.keys import Keys
-from app.services.decodes.archive_handler import ArchiveHandler
-from app.services.decodes.decodes import Decodes
-from app.services.decodes.details import DecodeDetails
-from app.services.decodes.frame_handler import FrameHandler
+from app.services.access.keys import Agencies, Keys
+from app.services.blobs import UnusedBlobs
+from app.services.decodes.context import DecodeRules
+from app.services.decodes.decodes import DecodeDetails, Decodes
+from app.services.decodes.frames import ArchiveHandler, FrameHandler
 from app.services.decodes.outputs import DecodeOutputs
-from app.services.decodes.packet_handler import PacketHandler
-from app.services.decodes.rules import DecodeRules
-from app.services.decodes.trace_handler import TraceHandler
+from app.services.decodes.recordings import PacketHandler, TraceHandler
 from app.services.decodes.upload_path import UploadHandler
 from app.services.decodes.video_handler import VideoHandler
 from app.services.drives.drives import Drives
@@ -48,49 +44,36 @@ from app.services.fleet.snapshots import Snapshots
 from app.services.fleet.vehicles import Vehicles
 from app.services.health.maintenance import Maintenance
 from app.services.jobs import JobHandler, Jobs
-from app.services.markers.artwork import Artworks
-from app.services.markers.artwork_jobs import ArtworkJobs
+from app.services.markers.artwork import ArtworkJobs, Artworks
 from app.services.markers.bulk import BulkMarkers
-from app.services.markers.cerpm_programs import CerpmPrograms
 from app.services.markers.codebooks import Codebooks
 from app.services.markers.features import Features
-from app.services.markers.layouts import Layouts
-from app.services.markers.markers import Markers
-from app.services.markers.observations import Observations
+from app.services.markers.markers import Markers, Observations
 from app.services.markers.plate_drafts import PlateDrafts
 from app.services.markers.print_grades import PrintGrades
+from app.services.markers.programs import CerpmPrograms, Layouts
 from app.services.markers.searches import Searches
 from app.services.plans.alignments import Alignments
-from app.services.plans.making import PlanMaking
+from app.services.plans.making import PlanMaking, PlanPreviews
 from app.services.plans.packages import Packages
-from app.services.plans.plan_jobs import PlanJobs
 from app.services.plans.plans import Plans
-from app.services.plans.previews import PlanPreviews
-from app.services.plans.proofs import Proofs
+from app.services.plans.proofs import PlanJobs, Proofs
 from app.services.ports import utc_now
-from app.services.progress.events import AgencyEvents
-from app.services.progress.jobs import AllJobs
-from app.services.progress.results import JobFiles
-from app.services.public_pages.form_tokens import FormTokens
-from app.services.public_pages.pages import PublicPages
+from app.services.progress import AgencyEvents, AllJobs, JobFiles
+from app.services.public_pages.pages import FormTokens, PublicPages
 from app.services.public_pages.reports import DamageReports
-from app.services.reprocessing.reprocessings import Reprocessings
+from app.services.reprocessing import Reprocessings
 from app.services.request_work import check_deadline
 from app.services.roads.roads import Roads
-from app.services.surveys.export_jobs import ExportJobs
-from app.services.surveys.exports import Exports
+from app.services.surveys.exports import ExportJobs, Exports
 from app.services.surveys.import_jobs import ImportJobs
 from app.services.surveys.imports import Imports
-from app.services.unused_blobs import UnusedBlobs
 from app.services.uploads.quotas import QuotaRules, Quotas, UploadRules
 from app.services.uploads.uploads import Uploads
-from app.services.webhooks.delivery import WebhookDelivery
-from app.services.webhooks.webhooks import Webhooks
+from app.services.webhooks import WebhookDelivery, Webhooks
 from app.settings import Settings
-from app.storage.blobs import Blobs
-from app.storage.master_key import load_master_key
-from app.storage.s3_parts import S3Parts
-from app.storage.signing_key import load_signing_keys
+from app.storage.blobs import Blobs, S3Parts
+from app.storage.keys import load_master_key, load_signing_keys
 from app.storage.spool import Spool
 from app.storage.webhook_sender import WebhookSender
 from app.use_cases import (
@@ -137,8 +120,10 @@ def _job_queue(settings: Settings) -> JobEngine:
     """The engine that runs jobs: threads of this process, or workers that a broker reaches."""
     if not settings.broker_url:
         return LocalQueue()
-    from app.jobs.celery_app import make_celery  # Celery takes 0.2 s to import, and most servers need none
-    from app.jobs.celery_queue import CeleryQueue
+    from app.jobs.celery_queue import (
+        CeleryQueue,
+        make_celery,  # Celery takes 0.2 s to import, and most servers need none
+    )
 
     return CeleryQueue(make_celery(settings.broker_url, settings.broker_prefix), settings.broker_prefix)
 

@@ -15,7 +15,7 @@ from app.jobs.celery_queue import CeleryQueue
 from app.jobs.celery_worker import CeleryWorker
 from app.jobs.frame_tasks import DecodePlates
 from app.registry.database import Database, head_revision
-from app.services.job_queues import QueueName
+from app.services.jobs import QueueName
 from app.services.ports import utc_now
 from app.settings import Settings
 from app.wiring import Outside, connect_outside, make_use_cases

@@ -29,11 +29,10 @@ import cv2
 import numpy as np
 
 from app.decoders.plate.reader import decode_plates
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 from app.formats.images import load_image
 from app.jobs.decoder_process import keep_memory
-from app.markers.plate import PlateCode
-from app.markers.recommended_plate import EXPECTED_GEOMETRIES
+from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode
 from app.sensors.camera import Camera
 
 KEY = "benchmark-key-that-is-long-enough"

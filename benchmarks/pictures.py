@@ -23,14 +23,13 @@ from app.demo.cerpms import build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import drive_over, list_plates, registered_code
 from app.demo.road_plan import ORIGIN_DEG, ROAD, RULES, plan_road
 from app.demo.server import LocalServer
-from app.formats.spooled_file import SpooledFile
-from app.jobs.trace_tasks import decode_recording
+from app.formats.format import SpooledFile
+from app.jobs.drive_tasks import decode_recording
 from app.markers.magnet import InformationTag, Polarity, parse_tag
-from app.services.decodes.trace_task import TraceTask
-from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.services.decodes.tasks import TraceTask
+from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
-from app.simulation.magnetic.vehicle import Course, Vehicle
 from app.simulation.radio.drive import drive_past
 from tests.web.browsing import chromium, watched_page
 

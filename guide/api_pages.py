@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from app.api.http.permissions import PERMISSIONS
 from app.api.http.problems import PROBLEMS
-from app.api.ogc.openapi import api_document
+from app.api.ogc.documents import api_document
 from app.main import create_app
 from app.services.access.access import Scope
 from app.settings import Settings

@@ -9,8 +9,8 @@ from contextlib import contextmanager, suppress
 
 from kombu import Connection
 
-from app.jobs.celery_app import dead_letter_name, queue_name
-from app.services.job_queues import QueueName
+from app.jobs.celery_queue import dead_letter_name, queue_name
+from app.services.jobs import QueueName
 from tests.machine import refuse
 
 LOCAL_BROKER = "amqp://guest:guest@127.0.0.1:5672"

@@ -23,15 +23,15 @@ from fastapi import FastAPI
 
 from app.api.http.connections import ConnectionLimits, limited_connections
 from app.decoders.plate.reader import decode_plates
-from app.jobs import resubmission
+from app.jobs import queues
 from app.jobs.frame_tasks import DecodePlates
 from app.main import create_app
+from app.registry.column_types import row_of
 from app.registry.database import Database
-from app.registry.feature_text import feature_text
+from app.registry.engines import across_agencies
+from app.registry.features import feature_text
 from app.registry.marker_rows import MarkerRow
-from app.registry.rows import row_of
 from app.registry.tables import markers
-from app.registry.tenancy import across_agencies
 from app.services.access.access import Scope
 from app.settings import Settings
 from app.worker import running_worker
@@ -195,7 +195,7 @@ def _no_queues_left() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _no_resubmission() -> None:
     """Tests put jobs into the database that nothing may run; those about resubmission call it themselves."""
-    resubmission.RESUBMIT_S = 3600.0
+    queues.RESUBMIT_S = 3600.0
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -15,7 +15,7 @@ from app.compiled import portable_target
 
 NEWER = {"avx": True, "avx2": True, "bmi": True, "bmi2": True, "f16c": True, "fma": True, "lzcnt": True, "movbe": True}
 _TWO_KERNELS = """
-from app.tracks.motion import lengths, wrap
+from app.tracks.kernel import lengths, wrap
 wrap(7.0), lengths(0.8)
 import numba
 print(numba.config.CPU_NAME)

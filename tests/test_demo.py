@@ -19,12 +19,10 @@ import httpx
 import numpy as np
 import pytest
 
-from app.demo.drive import DATA, drive_over, list_plates
-from app.demo.lane import list_lane_places
-from app.demo.magnets import LENGTH_M, TAGS_M, Built, Lane, build, list_drives
+from app.demo.drive import DATA, drive_over, list_lane_places, list_plates
+from app.demo.magnets import LENGTH_M, TAGS_M, Built, Lane, build, drive_and_judge, judge_drive, list_drives
 from app.demo.server import LocalServer
 from app.demo.table import Pass, draw_table, draw_trace_table
-from app.demo.traces import drive_and_judge, judge_drive
 from app.geodesy import enu_from_wgs84
 from app.markers.plate import PlateCode
 from app.simulation.magnetic.drive import simulate_drive

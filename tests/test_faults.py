@@ -17,13 +17,13 @@ import sqlalchemy as sa
 from typer.testing import CliRunner
 
 from app.cli import cli
-from app.cli.audit import _read_heads
-from app.demo.free_ports import free_ports
+from app.cli.backups import _read_heads
+from app.demo.server import free_ports
 from app.errors import InvalidParameter, MalformedRequest
 from app.registry import agencies
 from app.registry import decodes as store
+from app.registry.column_types import new_id
 from app.registry.decodes import DecodeRow
-from app.registry.ids import new_id
 from app.registry.tables import markers
 from app.storage.blobs import new_blob_key
 from benchmarks.faults.stored import Stored

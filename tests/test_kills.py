@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from kombu import Connection
 
-from app.jobs import resubmission
-from app.jobs.celery_app import queue_name
+from app.jobs import queues
+from app.jobs.celery_queue import queue_name
 from app.main import create_app
-from app.services.job_queues import QueueName
+from app.services.jobs import QueueName
 from app.settings import Settings
 from app.worker import running_worker
 from benchmarks.service.kills import Fleet, Result, measure_embedded, measure_fleet, own_nodes
@@ -62,7 +62,7 @@ def test_a_fleet_of_which_everything_is_killed_loses_nothing(nodes: tuple[Broker
 def test_uploads_wait_for_a_broker_that_is_away(
     nodes: tuple[Broker, PostgresCluster], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(resubmission, "RESUBMIT_S", 0.2)
+    monkeypatch.setattr(queues, "RESUBMIT_S", 0.2)
     broker, cluster = nodes
     cluster.make_database()
     settings = Settings(

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 
 ROOT = Path(__file__).resolve().parents[1]
 _BLOCK = re.compile(

@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.calibration.board_view import BoardView, ViewFault
-from app.calibration.results import CalibrationRules, CameraCalibration, Photo, ViewReport
+from app.calibration.board_view import BoardView, CalibrationRules, CameraCalibration, Photo, ViewFault, ViewReport
 from app.errors import CalibrationRefused, InvalidParameter, UnreadableUpload, WaymarkError
-from app.sensors.calibration_board import CalibrationBoard
+from app.sensors.camera import CalibrationBoard
 
 Floats = npt.NDArray[np.float64]
 

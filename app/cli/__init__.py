@@ -10,26 +10,12 @@ from typing import Annotated
 import typer
 
 from app import __version__
-from app.cli import (
-    audit,
-    backups,
-    ingest,
-    plans,
-    plates,
-    proof,
-    remote,
-    rules,
-    server,
-    snapshots,
-    surveys,
-    traces,
-    worker,
-)
+from app.cli import backups, plans, plates, proof, remote, server, snapshots, surveys
 from app.errors import WaymarkError, is_disk_full
 
 cli = typer.Typer(name="waymark", no_args_is_help=True, add_completion=False, pretty_exceptions_show_locals=False)
 cli.command()(server.serve)
-cli.command()(worker.worker)
+cli.command()(server.worker)
 cli.command()(server.demo)
 cli.command("compile")(server.compile_kernels)
 cli.command()(server.migrate)
@@ -40,19 +26,19 @@ cli.command()(backups.upgrade)
 cli.command("import")(surveys.import_survey)
 cli.command("export")(surveys.export_markers)
 cli.add_typer(snapshots.cli, name="snapshot")
-cli.add_typer(audit.cli, name="audit")
+cli.add_typer(backups.audit_cli, name="audit")
 cli.command()(plates.encode)
 cli.command()(plates.board)
 cli.command()(plates.decode)
 cli.command()(plates.grade_print)
-cli.command()(traces.decode_trace)
-cli.add_typer(ingest.cli, name="ingest")
+cli.command()(plates.decode_trace)
+cli.add_typer(server.ingest_cli, name="ingest")
 cli.command()(remote.upload)
 cli.command()(remote.artwork)
 cli.command()(remote.reprocess)
 cli.command()(plans.plan)
 cli.command()(proof.proof)
-cli.add_typer(rules.cli, name="rules")
+cli.add_typer(plans.rules_cli, name="rules")
 
 
 def _show_version(asked: bool) -> None:

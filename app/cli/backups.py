@@ -1,7 +1,9 @@
-"""Commands that back up, verify, restore and upgrade: the drills of docs/operation.md."""
+"""Commands that back up, verify, restore and upgrade, the drills of docs/operation.md, and verify the audit log."""
 
 from __future__ import annotations
 
+import json
+import os
 import time
 from collections.abc import Mapping
 from contextlib import closing
@@ -11,16 +13,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.database import owned_database, read_settings
-from app.cli.progress import JsonOption, Progress
+from app.cli.database import owned_database, read_settings, readable_database
+from app.cli.terminal import JsonOption, Progress
 from app.errors import InvalidParameter, Unavailable
 from app.settings import Settings
 
 if TYPE_CHECKING:
     from app.registry.database import Database
-    from app.services.backups.backup import BackupOptions
-    from app.services.backups.manifest import Manifest
+    from app.services.backups import BackupOptions, Manifest
     from app.storage.blobs import Blobs
+
 
 _PATIENCE_S = 3.0
 """How long connections of servers that have just stopped are waited for. [s] Source: by hand."""
@@ -48,8 +50,7 @@ def backup(
     as_json: JsonOption = False,
 ) -> None:
     """Back up the database and the blobs, also while the server runs, and verify the backup."""
-    from app.services.backups.backup import BackupOptions
-    from app.services.backups.manifest import verify_backup
+    from app.services.backups import BackupOptions, verify_backup
 
     if verify:
         if not target.exists():
@@ -66,7 +67,7 @@ def restore(
     as_json: JsonOption = False,
 ) -> None:
     """Restore a backup into an empty database and store, and verify them. The exit status is 1 if a check fails."""
-    from app.services.backups.restore import Restores
+    from app.services.backups import Restores
 
     settings = read_settings()
     with owned_database(settings) as database, Progress(quiet=as_json) as shown:
@@ -95,7 +96,7 @@ def upgrade(
     """Back up, migrate to this version's schema, and verify. Stop all servers and workers of the database first."""
     from app.registry.database import head_revision
     from app.services.access.audit import AuditLog
-    from app.services.backups.backup import BackupOptions
+    from app.services.backups import BackupOptions
 
     settings = read_settings()
     with owned_database(settings) as database:
@@ -133,7 +134,7 @@ def _wait_for_the_last_client(database: Database) -> None:
 def _write_backup(settings: Settings, target: Path, options: BackupOptions, *, quiet: bool = False) -> Manifest:
     from app import __version__
     from app.registry.database import Database
-    from app.services.backups.backup import Backups
+    from app.services.backups import Backups
     from app.services.ports import utc_now
 
     with closing(Database(settings.resolved_database_url)) as database, Progress(quiet=quiet) as shown:
@@ -180,3 +181,75 @@ def _describe(path: Path, manifest: Manifest, *, as_json: bool = False) -> None:
         typer.echo(f"does not contain {', '.join(apart)}: keep copies apart; without them secrets cannot be read")
     if blobs["missing"]:
         typer.echo(f"{len(blobs['missing'])} blobs are lost, as {blobs['missing'][0]}", err=True)
+
+
+# === The command that verifies the audit log.
+
+
+_HELP = "The audit log: every change of the registry, chained by hashes."
+audit_cli = typer.Typer(no_args_is_help=True, help=_HELP)
+
+
+@audit_cli.callback(help=_HELP)
+def audit() -> None:
+    """Group the commands `waymark audit ...`."""
+
+
+@audit_cli.command("verify")
+def verify_log(
+    agency: Annotated[str | None, typer.Argument(help="Name of one agency. Default: all agencies.")] = None,
+    expect_head: Annotated[
+        str | None, typer.Option(help="NUMBER:HASH of an entry that an earlier run printed; needs an agency.")
+    ] = None,
+    heads: Annotated[
+        Path | None,
+        typer.Option(help="File with the last entry of each agency that was verified: check only what follows it."),
+    ] = None,
+) -> None:
+    """Compute every hash of the history again and print each fault. The exit status is 1 if there is any.
+
+    With --heads only what was written since the last check is checked. The file is written anew where no fault was
+    found; without it, or for an agency that it does not name, the whole history is checked.
+    """
+    from app.services.access.audit import AuditLog, parse_head
+
+    if expect_head is not None and agency is None:
+        raise InvalidParameter("a head belongs to one agency's log", field="expect-head", cure="name the agency")
+    expected = parse_head(expect_head) if expect_head is not None else None
+    verified = _read_heads(heads) if heads is not None else {}
+    known = {name: parse_head(head) for name, head in verified.items()}
+    is_good = True
+    with readable_database(read_settings()) as database:
+        for name, report, faults in AuditLog(database).verify(agency, expected, known):
+            count = 0
+            for fault in faults:
+                count += 1
+                typer.echo(f"{name}: {fault.where}: {fault.what}")
+            head = f"{report.head[0]}:{report.head[1]}" if report.head is not None else None
+            since = f" after entry {report.since}" if report.since else ""
+            shown = f", head {head}" if head is not None else ""
+            typer.echo(f"{name}: {report.entries} entries, {report.versions} versions{since}{shown}")
+            is_good &= count == 0
+            if not count and head is not None:
+                verified[name] = head
+    if heads is not None:
+        written = heads.with_name(f"{heads.name}.new")
+        written.write_text(json.dumps(verified, indent=2) + "\n", encoding="utf-8")
+        os.replace(written, heads)
+    if not is_good:
+        raise typer.Exit(1)
+
+
+def _read_heads(path: Path) -> dict[str, str]:
+    """Heads by the names of agencies; none where there is no such file yet."""
+    if not path.exists():
+        return {}
+    try:
+        found = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or not all(isinstance(head, str) for head in found.values()):
+        raise InvalidParameter(
+            f"{path.name} has no heads", field="heads", limit="a file that verify wrote", cure="name another file"
+        )
+    return found

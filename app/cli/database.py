@@ -58,7 +58,7 @@ def _check_names() -> None:
 def owned_database(settings: Settings) -> Iterator[Database]:
     """The database for reading and writing; an SQLite file that another process owns is refused."""
     from app.registry.database import Database
-    from app.registry.tenancy import across_agencies
+    from app.registry.engines import across_agencies
 
     database = Database(settings.resolved_database_url)
     database.open()
@@ -73,7 +73,7 @@ def owned_database(settings: Settings) -> Iterator[Database]:
 def readable_database(settings: Settings) -> Iterator[Database]:
     """The database for reading only, also while a server runs on it."""
     from app.registry.database import Database, head_revision
-    from app.registry.tenancy import across_agencies
+    from app.registry.engines import across_agencies
 
     database = Database(settings.resolved_database_url)
     if database.path is not None and not database.path.exists():
@@ -94,7 +94,7 @@ def perform(settings: Settings, name: str, values: Values, files: Sequence[int] 
 
     Its progress is shown unless `quiet`.
     """
-    from app.cli.progress import Progress
+    from app.cli.terminal import Progress
     from app.control.client import perform as carry_out
     from app.control.operations import OperatorCases
     from app.formats.json_text import check_values

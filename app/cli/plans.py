@@ -1,4 +1,4 @@
-"""The command that plans a road without a server: from a file with lanes to a folder with all outputs."""
+"""Commands that plan a road without a server, from a file with lanes to a folder with all outputs, and check rules."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.errors import bad_input
+from app.cli.terminal import bad_input
 from app.errors import InvalidParameter
-from app.geodesy.vertical import normalize_vertical_datum
+from app.geodesy.systems import normalize_vertical_datum
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
     from app.markers.plate import PlateGeometry
     from app.markers.reading import PlateReading
-    from app.planning.outputs.files import OutputOptions
+    from app.planning.outputs.package import OutputOptions
     from app.planning.plan import Plan
+
 
 RoadArgument = Annotated[
     Path, typer.Argument(exists=True, dir_okay=False, help="GeoJSON, GeoPackage, Shapefile, LandXML, DXF, ...")
@@ -70,9 +71,9 @@ def plan(
     """
     from rich.console import Console
 
-    from app.planning.alignment_declaration import AlignmentDeclaration
+    from app.planning.alignment import AlignmentDeclaration
     from app.planning.outputs.drawing_sheet import TitleBlock
-    from app.planning.outputs.files import OutputOptions
+    from app.planning.outputs.package import OutputOptions
     from app.planning.outputs.strip_map import DrawingOptions
 
     console = Console(stderr=True)
@@ -122,10 +123,10 @@ def _check_folder(out: Path) -> None:
 def _make(console: Console, road: Path, rules_file: Path, declaration: object, name: str) -> Plan:
     """Read, place and check, each with its line of progress."""
     from app.formats.alignments.read import read_alignment
-    from app.planning.alignment_declaration import AlignmentDeclaration
+    from app.planning.alignment import AlignmentDeclaration
     from app.planning.build_alignment import build_alignment
     from app.planning.planner import make_plan
-    from app.planning.read_rules import read_rules
+    from app.planning.rules import read_rules
 
     assert isinstance(declaration, AlignmentDeclaration)
     with console.status("Reading the rules") as status:
@@ -151,7 +152,7 @@ def _write(console: Console, made: Plan, out: Path, options: OutputOptions, *, a
 
     from app.encoders.packer import file_entry
     from app.planning.outputs.package import MANIFEST, Package, PackageOptions, PartKind
-    from app.plots.trade_off import draw_trade_off
+    from app.plots.track import draw_trade_off
 
     package = Package(made, PackageOptions(replace(options, draw_trade_off=draw_trade_off)))
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -178,7 +179,7 @@ def _write(console: Console, made: Plan, out: Path, options: OutputOptions, *, a
 
 def _read_face(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> Sequence[PlateReading]:
     """The plate decoder, imported with the first plate: it takes seconds."""
-    from app.jobs.package_tasks import read_face
+    from app.jobs.plan_tasks import read_face
 
     return read_face(image, geometry)
 
@@ -193,10 +194,15 @@ def _print(made: Plan, out: Path) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from app.markers.checks import Verdict
-    from app.planning.outputs.bill import plan_bill
-    from app.planning.outputs.report import counts_sentence, finding_figures, finding_place, verdict_counts
-    from app.planning.outputs.trade_off import optimum_sentence
+    from app.markers.reading import Verdict
+    from app.planning.outputs.bill import (
+        counts_sentence,
+        finding_figures,
+        finding_place,
+        optimum_sentence,
+        plan_bill,
+        verdict_counts,
+    )
 
     console = Console()
     road = made.alignment
@@ -230,3 +236,38 @@ def _print(made: Plan, out: Path) -> None:
     if made.left_out:
         console.print(f"  {removed} places left out, {len(made.left_out) - removed} markers moved; see report.md")
     console.print(f"  files: {escape(str(out))}")
+
+
+# === Commands for the rules of plans.
+
+
+_HELP = "The rules of plans: their JSON Schema, and a check of a document."
+rules_cli = typer.Typer(no_args_is_help=True, help=_HELP)
+
+
+@rules_cli.callback(help=_HELP)
+def rules() -> None:
+    """Group the commands `waymark rules ...`."""
+
+
+@rules_cli.command()
+def schema() -> None:
+    """Print the JSON Schema (draft 2020-12) of the rules."""
+    import orjson
+
+    from app.planning.rules import rules_schema
+
+    typer.echo(orjson.dumps(rules_schema(), option=orjson.OPT_INDENT_2))
+
+
+@rules_cli.command()
+def check(
+    file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Rules as YAML or JSON.")],
+) -> None:
+    """Read rules and print them with their defaults as JSON. The exit status is 2 if they are refused."""
+    from app.cli.terminal import bad_input
+    from app.planning.rules import read_rules
+
+    with bad_input():
+        read = read_rules(file.read_bytes())
+    typer.echo(read.model_dump_json(indent=2, by_alias=True))

@@ -1,4 +1,4 @@
-"""Commands for plates and pictures that need no server: artwork, calibration boards, decoding, print grades."""
+"""Commands that need no server: artwork, calibration boards, decoding of pictures and traces, print grades."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from app.cli.database import read_settings
+from app.cli.surveys import read_declaration
 from app.errors import InvalidParameter
 
 if TYPE_CHECKING:
     from app.encoders.plate import ArtworkFormat
+
 
 OutOption = Annotated[Path, typer.Option(help="Folder for the files; created if it does not exist.")]
 FormatOption = Annotated[list[str] | None, typer.Option("--format", help="svg, pdf, dxf or png; may be repeated.")]
@@ -73,7 +75,7 @@ def board(
     """Write a board for calibrating cameras, at true size; print it at 100 %."""
     from app.encoders.calibration_board import encode_board
     from app.encoders.plate import write_artwork
-    from app.sensors.calibration_board import CalibrationBoard
+    from app.sensors.camera import CalibrationBoard
 
     formats = _formats(form or ("pdf",))
     drawing = encode_board(CalibrationBoard(columns, rows, square_mm, marker_mm))
@@ -114,13 +116,12 @@ def grade_print(
     """Grade a printed plate by a photo, and print the grade as JSON."""
     import orjson
 
+    from app.formats.format import SpooledFile
     from app.formats.images import ImageLimits
-    from app.formats.spooled_file import SpooledFile
-    from app.jobs.print_tasks import grade_photo
-    from app.markers.plate import PlateCode, PlateScheme
-    from app.markers.recommended_plate import recommended_geometry
+    from app.jobs.picture_tasks import grade_photo
+    from app.markers.plate import PlateCode, PlateScheme, recommended_geometry
     from app.planning.rules import CameraRules
-    from app.services.markers.print_task import PrintGradeTask
+    from app.services.markers.tasks import PrintGradeTask
 
     if scheme not in list(PlateScheme):
         raise InvalidParameter(f"there is no scheme {scheme}", limit=", ".join(PlateScheme))
@@ -150,3 +151,30 @@ def _formats(names: list[str] | tuple[str, ...]) -> list[ArtworkFormat]:
     if unknown:
         raise InvalidParameter(f"there is no format {unknown[0]}", limit=", ".join(ArtworkFormat))
     return [ArtworkFormat(name) for name in names]
+
+
+# === The command that decodes a magnetometer trace without a server.
+
+
+def decode_trace(
+    recording: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A file, or a ZIP of one recording.")],
+    declared: Annotated[str, typer.Option("--declaration", help="Declaration as JSON; see docs/magnets.md.")] = "{}",
+    plot: Annotated[Path | None, typer.Option(help="SVG file for the plot.")] = None,
+) -> None:
+    """Decode the magnets and tags in a magnetometer trace, and print one JSON object."""
+    import orjson
+
+    from app.api.decodes.schemas import TraceIn
+    from app.decoders.magnet.identify import match_tags
+    from app.formats.format import SpooledFile
+    from app.jobs.drive_tasks import decode_recording
+    from app.services.decodes.tasks import TraceTask, trace_terms
+    from app.services.decodes.trace_documents import trace_document
+
+    terms = read_declaration(TraceIn, declared, "docs/magnets.md").model_dump(exclude_unset=True)
+    result = decode_recording(TraceTask(recording.name, SpooledFile.at(recording), terms), None)
+    trace = match_tags(result.findings, (), trace_terms(terms).bar)
+    if plot is not None:
+        plot.write_bytes(result.plot)
+    document = trace_document(result, trace, codebook_tags=0)
+    typer.echo(orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY))

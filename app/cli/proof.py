@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.errors import bad_input
+from app.cli.terminal import bad_input
 from app.errors import InvalidParameter
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def proof(
     from rich.progress import Progress as ProgressBar
 
     from app.cli.proof_runner import run_proof
-    from app.planning.proof.documents import markers_csv, report_document
+    from app.planning.proof.report import markers_csv, report_document
 
     options = {
         "drives": drives, "seed": seed, "lost_share": lost, "speed_share": speed,

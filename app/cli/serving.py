@@ -17,7 +17,7 @@ import structlog
 import uvicorn
 
 from app.api.http.connections import ConnectionLimits, limited_connections
-from app.cli.loading import collector_paused
+from app.cli.terminal import collector_paused
 from app.errors import InvalidParameter
 from app.settings import Settings
 

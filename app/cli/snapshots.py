@@ -36,7 +36,7 @@ def make_snapshot(
     """Write the signed snapshot of an area."""
     from app.control.operations import operator
     from app.services.fleet.snapshots import Snapshots
-    from app.services.markers.search_boxes import parse_box
+    from app.services.markers.searches import parse_box
     from app.services.ports import utc_now
 
     _refuse_existing(out)
@@ -81,8 +81,7 @@ def verify_snapshot(
     """Verify a snapshot as a vehicle does, and print what it contains. The exit status is 1 if it is refused."""
     import orjson
 
-    from app.decoders.newest_snapshot import open_newest_snapshot
-    from app.decoders.snapshot import open_snapshot
+    from app.decoders.snapshot import open_newest_snapshot, open_snapshot
     from app.markers.snapshot import Trust
     from app.services.ports import utc_now
 
@@ -117,7 +116,7 @@ def rotate_keys(
     ],
 ) -> None:
     """Change this server's signing keys, and print the public keys, that of the signing key first."""
-    from app.storage.signing_key import add_signing_key, load_signing_keys, remove_signing_key, switch_signing_keys
+    from app.storage.keys import add_signing_key, load_signing_keys, remove_signing_key, switch_signing_keys
 
     steps = {Step.ADD: add_signing_key, Step.SWITCH: switch_signing_keys, Step.REMOVE: remove_signing_key}
     path = read_settings().resolved_signing_key_file
@@ -132,6 +131,6 @@ def _refuse_existing(out: Path) -> None:
 
 
 def _signing_keys(settings: Settings) -> Callable[[], tuple[Ed25519PrivateKey, ...]]:
-    from app.storage.signing_key import load_signing_keys
+    from app.storage.keys import load_signing_keys
 
     return partial(load_signing_keys, settings.resolved_signing_key_file)

@@ -3,14 +3,46 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
+from pydantic import BaseModel, ValidationError
 
 from app.cli.database import perform, read_settings
-from app.cli.declarations import read_declaration
-from app.cli.progress import JsonOption
+from app.cli.terminal import JsonOption
 from app.errors import InvalidParameter
+
+# === Declarations that commands get as JSON: the same schemas as over HTTP.
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_declaration(schema: type[Model], declared: str, guide: str) -> Model:
+    """A declaration checked by its schema.
+
+    Parameters
+    ----------
+    schema : type of BaseModel
+    declared : str
+        JSON.
+    guide : str
+        Document that explains the declaration.
+
+    Raises
+    ------
+    InvalidParameter
+        It is not JSON, or not as the schema has it.
+    """
+    try:
+        return schema.model_validate_json(declared)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InvalidParameter(f"--declaration {place}: {first['msg']}", cure=f"see {guide}") from error
+
+
+# === Commands that import surveys and export markers, for files of any size.
 
 
 def import_survey(
@@ -57,7 +89,7 @@ def export_markers(
     import orjson
 
     from app.families import FAMILY_NAMES
-    from app.markers.status import STATUSES
+    from app.markers.reading import STATUSES
     from app.services.surveys.exports import KINDS
 
     for name, given, allowed in (

@@ -19,10 +19,10 @@ from prometheus_client.registry import Collector
 from app.errors import Unavailable
 from app.jobs.pool import DecodePool
 from app.registry.database import Database
-from app.registry.job_counts import JobCount, count_unfinished
-from app.registry.tenancy import across_agencies
-from app.services.decodes.measures import written_metrics
-from app.services.job_queues import QUEUES
+from app.registry.engines import across_agencies
+from app.registry.jobs import JobCount, count_unfinished
+from app.services.decodes.upload_path import written_metrics
+from app.services.jobs import QUEUES
 from app.services.ports import Clock
 
 _VALID_S = 5.0

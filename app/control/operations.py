@@ -17,12 +17,11 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from app.errors import InvalidParameter
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.registry.agencies import find_agency
-from app.registry.bulk import count_records
 from app.registry.database import Database
-from app.registry.markers import MarkerFilter
-from app.registry.tenancy import across_agencies, acting_for
+from app.registry.engines import across_agencies, acting_for
+from app.registry.markers import MarkerFilter, count_records
 from app.services.access.access import Access, Caller, Scope, parse_scope
 from app.services.ports import Clock
 
@@ -68,7 +67,7 @@ def create_key(cases: OperatorCases, values: Values, _files: Sequence[int], _rep
 
 def import_survey(cases: OperatorCases, values: Values, files: Sequence[int], report: Report) -> Values:
     """Import the survey in the first file."""
-    from app.services.surveys.declarations import import_input
+    from app.services.surveys.import_report import import_input
     from app.services.surveys.imports import SETTLED
 
     with TemporaryDirectory(prefix="waymark-import-") as folder, operator(cases.database, values["agency"]) as caller:
@@ -84,7 +83,7 @@ def import_survey(cases: OperatorCases, values: Values, files: Sequence[int], re
 
 def export_markers(cases: OperatorCases, values: Values, files: Sequence[int], report: Report) -> Values:
     """Write an agency's markers into the first file."""
-    from app.services.markers.search_boxes import parse_box
+    from app.services.markers.searches import parse_box
 
     box = parse_box(values["bbox"]) if values["bbox"] else None
     filtered = MarkerFilter(box=box, status=values["status"], family=values["family"])

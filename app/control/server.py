@@ -14,8 +14,8 @@ from pathlib import Path
 import orjson
 import structlog
 
+from app.control.client import MAX_FILES, MAX_REQUEST_BYTES, receive_all, short_address, socket_path
 from app.control.operations import OPERATIONS, OperatorCases, Report, show_nothing
-from app.control.sockets import MAX_FILES, MAX_REQUEST_BYTES, receive_all, short_address, socket_path
 from app.errors import InvalidParameter, Unavailable, WaymarkError
 
 _LOG = structlog.get_logger("waymark.control")

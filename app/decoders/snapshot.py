@@ -6,13 +6,17 @@ clock. `open_snapshot` verifies before it reads, and refuses by a named error wh
 
 from __future__ import annotations
 
+import fcntl
 import math
+import os
 import uuid
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,20 +26,18 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from pyproj import Geod
 
-from app.decoders.cerpm.freshness import SequenceSpan
-from app.decoders.cerpm.match import KnownCerpms
-from app.decoders.cerpm.merged_markers import RegisteredMarker
-from app.decoders.magnet.identify import TagCandidates, TagFormat
-from app.decoders.magnet.match import tag_candidates
-from app.decoders.magnet.registered_tag import RegisteredTag
+from app.decoders.cerpm.merge import KnownCerpms, RegisteredMarker
+from app.decoders.cerpm.verify import SequenceSpan
+from app.decoders.magnet.identify import RegisteredTag, TagCandidates, TagFormat, tag_candidates
+from app.errors import UnreadableUpload
 from app.geodesy import LocalizationGrade, grade_accuracy
 from app.markers import snapshot as layout
 from app.markers.cerpm import LaneSide
-from app.markers.localization_warnings import position_warnings
 from app.markers.magnet import InformationTag, parse_tag
-from app.markers.magnet_codebook import Codebook, Meaning
+from app.markers.magnet_design import Codebook, Meaning
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
-from app.markers.status import STATUSES
+from app.markers.reading import STATUSES, position_warnings
+from app.markers.snapshot import Trust
 
 _GEOD = Geod(ellps="WGS84")
 _M_PER_DEG = 110_574.0  # [m] least length of a degree of latitude; source: WGS 84 at the equator
@@ -268,7 +270,7 @@ class Snapshot:
 def open_snapshot(data: bytes, trust: layout.Trust, now: datetime, *, newest_made_at_ms: int | None = None) -> Snapshot:
     """Verify a snapshot and read it.
 
-    `app.decoders.newest_snapshot` calls it with what the reader remembers.
+    `app.decoders.snapshot` calls it with what the reader remembers.
 
     Parameters
     ----------
@@ -407,3 +409,81 @@ def _times_ms(column: Mapping[str, Any]) -> tuple[Any, Any]:
 
 def _value(steps: Any, step: float) -> float | None:
     return None if int(steps) == layout.NO_RMSE else round(int(steps) * step, 6)
+
+
+# === Open snapshots, and remember the newest one: a reader that has seen it refuses older ones.
+#
+# The memory is a small file. Everything that decides is in `app.decoders.snapshot`.
+
+
+class UnreadableMemory(UnreadableUpload):
+    """The file that remembers the newest snapshot cannot be read; without it a rollback cannot be detected."""
+
+
+def open_newest_snapshot(data: bytes, trust: Trust, now: datetime, memory: Path) -> Snapshot:
+    """Verify a snapshot and read it, unless a newer one of the agency was opened before with the same memory.
+
+    A reader that uses snapshots of several areas keeps one memory for each area: snapshots of different areas were made
+    at different times.
+
+    Parameters
+    ----------
+    data, trust, now
+        As of `app.decoders.snapshot.open_snapshot`.
+    memory : Path
+        File with the time of the newest snapshot of each agency; created if it is missing. It is replaced atomically,
+        and is on the disk before the snapshot is returned. Processes may share it.
+
+    Raises
+    ------
+    SnapshotRefused
+        As of `open_snapshot`. The memory is unchanged.
+    UnreadableMemory
+        The memory is damaged.
+    OSError
+        The memory cannot be read or written.
+    """
+    with _locked(memory.parent) as folder:
+        newest = _read_newest_snapshot(memory)
+        snapshot = open_snapshot(data, trust, now, newest_made_at_ms=newest.get(trust.agency_id))
+        if newest.get(trust.agency_id) != snapshot.made_at_ms:
+            _replace(memory, {**newest, trust.agency_id: snapshot.made_at_ms}, folder)
+    return snapshot
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[int]:
+    """Descriptor of a folder that no other process locks meanwhile."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _read_newest_snapshot(memory: Path) -> dict[str, int]:
+    try:
+        newest = orjson.loads(memory.read_bytes())
+    except FileNotFoundError:
+        return {}
+    except orjson.JSONDecodeError:
+        newest = None
+    if not isinstance(newest, dict) or not all(type(made_at_ms) is int for made_at_ms in newest.values()):
+        raise UnreadableMemory(
+            f"{memory} is damaged",
+            limit="an object of times by agency",
+            cure="restore it; or remove it, and open a snapshot that was just fetched from the server",
+        )
+    return newest
+
+
+def _replace(memory: Path, newest: dict[str, int], folder: int) -> None:
+    """Write the file so that it is either the old or the new one after a loss of power."""
+    fresh = memory.with_name(memory.name + ".new")
+    with fresh.open("wb") as file:
+        file.write(orjson.dumps(newest))
+        file.flush()
+        os.fsync(file.fileno())
+    fresh.replace(memory)
+    os.fsync(folder)

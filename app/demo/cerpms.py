@@ -19,21 +19,17 @@ import numpy.typing as npt
 
 from app.demo.server import checked
 from app.demo.table import LaneResult
-from app.encoders.cerpm.payload import encode_message
+from app.encoders.cerpm import encode_message
 from app.lanes.overlay import VehiclePose, lane_in_frame, ned_from_enu
 from app.markers.cerpm import CerpmMessage, LaneSide
 from app.planning.cerpm_placement import place_markers
 from app.sensors.camera import Camera
-from app.sensors.pose_track import PoseTrack
-from app.sensors.receiver import ReceivedPacket
+from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from app.simulation.radio.attacks import forge_packets, move_claim, number_entries, replay_packets
-from app.simulation.radio.drive import SimulatedDrive, drive_past
-from app.simulation.radio.driving import SatelliteReceiver
-from app.simulation.radio.lanes import TrueLane, lane_from_wgs84
+from app.simulation.radio.drive import SatelliteReceiver, SimulatedDrive, drive_past
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_from_wgs84
 from app.simulation.radio.link import Radio
-from app.simulation.radio.markers import InstalledMarkers, install_markers
-from app.simulation.steering import check_steering
-from app.simulation.vehicle import PoseNoise
+from app.simulation.steering import PoseNoise, check_steering
 
 Floats = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import httpx
 from app.demo.server import checked
 from app.demo.table import draw_rows
 from app.errors import WaymarkError
-from app.planning.read_rules import read_rules
+from app.planning.rules import read_rules
 
 ROAD, RULES = "e6.xodr", "e6-rules.yaml"
 ORIGIN_DEG = (12.0, 57.6)  # near the E6 in Sweden; source: by hand, the file's own system cannot be used

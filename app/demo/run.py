@@ -17,14 +17,13 @@ import numpy as np
 
 from app.demo.cerpms import INTERVAL_S, build_lane, drive_lane_and_judge, list_lane_drives
 from app.demo.drive import FPS, MIN_ROWS, SPEED_KMH, DemoFrame, DemoPlate, drive_over, list_plates, registered_code
-from app.demo.magnets import BOOK, LENGTH_M, build, list_drives
+from app.demo.magnets import BOOK, LENGTH_M, build, drive_and_judge, list_drives
 from app.demo.road_plan import FILES, PlanResult, describe_plan, describe_proof, draw_plan_table, plan_road, prove_road
 from app.demo.server import LocalServer, checked
 from app.demo.table import LaneResult, Pass, TraceResult, draw_lane_table, draw_table, draw_trace_table
-from app.demo.traces import drive_and_judge
 from app.errors import WaymarkError
 from app.geodesy import enu_from_wgs84
-from app.sensors.receiver import ReceivedPacket
+from app.sensors.pose_track import ReceivedPacket
 
 _SEED = 7
 _FORMATS = ("svg", "pdf", "dxf", "png")

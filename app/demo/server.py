@@ -4,18 +4,57 @@ from __future__ import annotations
 
 import ctypes
 import os
+import random
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
 import httpx
 
-from app.demo.free_ports import free_ports
 from app.errors import Unavailable, WaymarkError
+
+# === Ports for servers that the demo, benchmarks and tests start.
+
+
+FIRST, LAST = 20_000, 32_000
+"""Below the ports that systems hand out to clients (Linux from 32768, others from 49152 on): a connection to somewhere
+else cannot take a port before its server starts, nor while the server is started again."""
+
+
+def free_ports(number: int) -> list[int]:
+    """Different ports of this machine that nothing listens at.
+
+    Parameters
+    ----------
+    number : int
+
+    Raises
+    ------
+    OSError
+        No port is free.
+    """
+    found: list[int] = []
+    with ExitStack() as probes:
+        for port in random.SystemRandom().sample(range(FIRST, LAST), LAST - FIRST):
+            if len(found) == number:
+                return found
+            probe = probes.enter_context(socket.socket())
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            found.append(port)
+    raise OSError(f"fewer than {number} of the ports {FIRST} to {LAST} are free")
+
+
+# === `waymark serve` in a process of its own, on a free loopback port, with a folder of its own.
+
 
 _START_TIMEOUT_S = 180.0
 _WILDCARDS = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "[::1]"}

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.encoders.plate.drawing import Boxes, Drawing, Layer, Modules, Part, Text
-from app.encoders.plate.lettering import fitted_height_mm
-from app.sensors.calibration_board import MODULES, CalibrationBoard, marker_is_dark
+from app.encoders.plate.drawing import Boxes, Drawing, Layer, Modules, Part, Text, fitted_height_mm
+from app.sensors.camera import MODULES, CalibrationBoard, marker_is_dark
 
 A_SIZES_MM = ((210.0, 297.0), (297.0, 420.0), (420.0, 594.0), (594.0, 841.0), (841.0, 1189.0))
 MARGIN_MM = 10.0

@@ -7,16 +7,150 @@ its clauses. The same calls always give the same bytes.
 
 from __future__ import annotations
 
+import hashlib
 import math
+import re
+import uuid
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
 from io import BytesIO
+from typing import Any
+from xml.sax.saxutils import escape
 
 from fontTools.ttLib import TTFont
 
-from app.encoders import pdf_x
-from app.encoders.typeface import load_typeface
+# === The typeface of everything that is built: Bitstream Vera, read from the installed reportlab.
+#
+# Its licence allows embedding and redistribution.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Typeface:
+    """One weight of the typeface.
+
+    Attributes
+    ----------
+    content : bytes
+        The TrueType file.
+    font : fontTools.ttLib.TTFont
+    glyphs : mapping of str to glyph
+        Outlines by the names of glyphs.
+    names : dict of int to str
+        Name of the glyph of each character that the typeface has.
+    """
+
+    content: bytes
+    font: Any
+    glyphs: Any
+    names: dict[int, str]
+
+    @property
+    def units_per_em(self) -> int:
+        """Font units to the em."""
+        return int(self.font["head"].unitsPerEm)
+
+    def advance_units(self, name: str) -> int:
+        """Width of a glyph. [font unit]"""
+        return int(self.font["hmtx"][name][0])
+
+    def glyph_name(self, character: str, missing: str) -> str:
+        """Name of a character's glyph; `missing` if the typeface lacks it."""
+        return self.names.get(ord(character), missing)
+
+
+@lru_cache(maxsize=2)
+def load_typeface(*, bold: bool = False) -> Typeface:
+    """One weight, read once."""
+    content = (resources.files("reportlab") / "fonts" / ("VeraBd.ttf" if bold else "Vera.ttf")).read_bytes()
+    font = TTFont(BytesIO(content), lazy=False)
+    return Typeface(content, font, font.getGlyphSet(), font.getBestCmap())
+
+
+# === What makes a PDF a PDF/X-4 (ISO 15930-7:2010): metadata as XMP, and an output intent with an embedded ICC profile.
+#
+# X-4 asks for dates and ids, and the same drawing must always give the same bytes. So the dates are those of the
+# writer, and the ids are hashes of the content.
+
+
+VERSION = "PDF/X-4"
+WRITTEN = "2026-11-25T00:00:00Z"
+"""When the writer of artwork changed last. Every file names it as the time of its creation and its last change."""
+PDF_DATE = f"D:{re.sub('[^0-9]', '', WRITTEN)}Z"
+CONDITION = "FOGRA39"
+"""Identifier of the printing condition in the ICC's registry: offset on coated paper, ISO 12647-2:2004. Plates are
+printed in spot inks; the condition defines the colours of their process-colour substitutes on a proof."""
+_CONDITION_TEXT = "Coated FOGRA39 (ISO 12647-2:2004)"
+_REGISTRY = "http://www.color.org"
+_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def xml_text(text: str) -> str:
+    """A text without the characters that XML cannot have; the document's properties must agree with the XMP."""
+    return _NOT_XML.sub("?", text)
+
+
+def document_id(objects: Iterable[bytes]) -> uuid.UUID:
+    """The id of a document with some content."""
+    digest = hashlib.sha256()
+    for body in objects:
+        digest.update(body)
+    return uuid.UUID(bytes=digest.digest()[:16], version=4)
+
+
+@lru_cache(maxsize=1)
+def profile_stream() -> bytes:
+    """The ICC profile of the printing condition as a stream (ISO 32000-1, 8.6.5.5), deflated once."""
+    packed = zlib.compress(resources.files("app.encoders").joinpath("data/fogra39-coated.icc").read_bytes(), 9)
+    return b"<< /N 4 /Filter /FlateDecode /Length %d >>\nstream\n%b\nendstream" % (len(packed), packed)
+
+
+def output_intent(profile: int) -> bytes:
+    """The output intent (14.11.5), with the number of the profile's object. X-4 embeds it; X-4p would refer to it."""
+    return (
+        f"<< /Type /OutputIntent /S /GTS_PDFX /OutputConditionIdentifier ({CONDITION}) /RegistryName ({_REGISTRY}) "
+        f"/OutputCondition ({_CONDITION_TEXT.replace('(', chr(92) + '(').replace(')', chr(92) + ')')}) "
+        f"/DestOutputProfile {profile} 0 R >>"
+    ).encode("ascii")
+
+
+def metadata_stream(title: str, tool: str, document: uuid.UUID) -> bytes:
+    """The XMP packet (14.3.2), which is not compressed: tools find it without reading the PDF."""
+    packet = _PACKET.format(
+        title=escape(title), tool=escape(tool), version=VERSION, date=WRITTEN, document=f"uuid:{document}"
+    ).encode()
+    return b"<< /Type /Metadata /Subtype /XML /Length %d >>\nstream\n%b\nendstream" % (len(packet), packet)
+
+
+_PACKET = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/">
+<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" xmlns:dc="http://purl.org/dc/elements/1.1/" xmlns:xmp="http://ns.adobe.com/xap/1.0/"
+ xmlns:xmpMM="http://ns.adobe.com/xap/1.0/mm/" xmlns:pdf="http://ns.adobe.com/pdf/1.3/"
+ xmlns:pdfxid="http://www.npes.org/pdfx/ns/id/">
+<pdfxid:GTS_PDFXVersion>{version}</pdfxid:GTS_PDFXVersion>
+<dc:format>application/pdf</dc:format>
+<dc:title><rdf:Alt><rdf:li xml:lang="x-default">{title}</rdf:li></rdf:Alt></dc:title>
+<xmp:CreatorTool>{tool}</xmp:CreatorTool>
+<xmp:CreateDate>{date}</xmp:CreateDate>
+<xmp:ModifyDate>{date}</xmp:ModifyDate>
+<xmp:MetadataDate>{date}</xmp:MetadataDate>
+<xmpMM:DocumentID>{document}</xmpMM:DocumentID>
+<xmpMM:VersionID>1</xmpMM:VersionID>
+<xmpMM:RenditionClass>default</xmpMM:RenditionClass>
+<pdf:Producer>{tool}</pdf:Producer>
+<pdf:Trapped>False</pdf:Trapped>
+</rdf:Description>
+</rdf:RDF>
+</x:xmpmeta>
+<?xpacket end="r"?>"""
+
+
+# === PDF 1.4 and PDF/X-4 at true size.
+
 
 POINTS_PER_MM = 72.0 / 25.4
 """A point is 1/72 inch, an inch is 25.4 mm. [point/mm]"""
@@ -43,9 +177,9 @@ class PdfFile:
 
     def __init__(self, title: str, *, compress: bool = True, print_ready: bool = False) -> None:
         self.compress = compress
-        self._title = pdf_x.xml_text(title)
+        self._title = xml_text(title)
         self._print_ready = print_ready
-        dates = f" /CreationDate ({pdf_x.PDF_DATE}) /ModDate ({pdf_x.PDF_DATE})" if print_ready else ""
+        dates = f" /CreationDate ({PDF_DATE}) /ModDate ({PDF_DATE})" if print_ready else ""
         names = f"/Creator ({_TOOL}) /Producer ({_TOOL})"
         properties = f"<< /Title {text_string(self._title)} {names}{dates} /Trapped /False >>"
         self._objects: list[bytes] = [b"", b"", properties.encode()]
@@ -89,12 +223,12 @@ class PdfFile:
         objects = [b"", pages, *self._objects[2:]]
         version, extra, file_id = b"1.4", "", ""
         if self._print_ready:
-            document = pdf_x.document_id(objects)
+            document = document_id(objects)
             profile = len(objects) + 1
             objects += [
-                pdf_x.profile_stream(),
-                pdf_x.output_intent(profile),
-                pdf_x.metadata_stream(self._title, _TOOL, document),
+                profile_stream(),
+                output_intent(profile),
+                metadata_stream(self._title, _TOOL, document),
             ]
             version, extra = b"1.6", f" /OutputIntents [{profile + 1} 0 R] /Metadata {profile + 2} 0 R"
             file_id = f" /ID [<{document.hex}> <{document.hex}>]"

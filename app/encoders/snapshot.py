@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from app.errors import InvalidParameter
 from app.markers import snapshot as layout
-from app.markers.status import STATUSES
+from app.markers.reading import STATUSES
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _HEIGHT_LIMIT_MM = 2**31 - 1

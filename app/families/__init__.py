@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Literal
 
-from app.families.cerpm.cerpms import CERPM
+from app.families.cerpm import CERPM
 from app.families.family import Family
-from app.families.fiducial.fiducials import FIDUCIAL
+from app.families.fiducial import FIDUCIAL
 from app.families.magnet.magnets import MAGNET
 from app.families.plate.plates import PLATE
 

@@ -1,25 +1,187 @@
-"""How the points of a survey become markers of a family, thousands at a time."""
+"""How the points of a survey or a plan become markers of a family, thousands at a time."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import sqlalchemy as sa
 from pydantic import BaseModel
 
-from app.families.rules import MarkerRules
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Texts
-from app.markers.plate_digits import Digits
-from app.registry.columns import Columns
-from app.registry.marker_rows import CodeRow
+from app.markers.plate import Digits
+from app.planning.alignment import Alignment
+from app.planning.plan import PlannedMarker
+from app.radio.settings import RadioSettings
+from app.registry.bulk_load import Columns
+from app.registry.conditions import grade_columns
+from app.registry.marker_rows import CodeRow, MarkerRow
 from app.surveys.georeference import GeoreferencedSurvey
+
+# === Limits that a deployment can set for markers, and the states that their rules ask about.
+
+
+PLANNED = "planned"
+RETIRED = "retired"
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerRules:
+    """Limits that a deployment can set."""
+
+    explicit_code_radius_m: float = 20_000.0
+    position_code_radius_m: float = 1_000.0
+    crs_accuracy_m: float = 0.1
+    idempotency_ttl: timedelta = timedelta(hours=24)
+
+
+def is_placed_anew(row: MarkerRow, values: dict[str, Any]) -> bool:
+    """Whether a change gives a position, or puts a retired marker back into use."""
+    return "lon_deg" in values or (row.status == RETIRED and values.get("status", RETIRED) != RETIRED)
+
+
+# === A marker that is to be registered: what every family asks for.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NewMarker:
+    """Members that markers of every family have; each family adds its own.
+
+    Attributes
+    ----------
+    family : str
+        Name of the family.
+    status : str
+    heading_rmse_deg : float or None
+    road : str or None
+    measure_m, offset_m : float or None
+    kind, reason : str or None
+        Kind of the first version in the marker's history, and why it was made.
+    """
+
+    family: ClassVar[str]
+    status: str = PLANNED
+    heading_rmse_deg: float | None = None
+    road: str | None = None
+    measure_m: float | None = None
+    offset_m: float | None = None
+    kind: str | None = None
+    reason: str | None = None
+
+    @property
+    def part_count(self) -> int:
+        """Things in the road that the marker has at most, e.g. magnets: what its registration costs."""
+        return 1
+
+
+# === How the markers of a plan become rows of the registry, thousands at a time.
+
+
+PLAN_METHOD = "placed by a plan"
+"""Survey method of markers that nobody has surveyed yet."""
+
+
+class PlannedRow(NamedTuple):
+    """A row of `markers`: `covered` planned markers, the first of which has the number."""
+
+    number: int
+    columns: dict[str, Any]
+    covered: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Commitment:
+    """What a family needs to know of a plan that is committed.
+
+    Attributes
+    ----------
+    plan_id : str
+    alignment : Alignment
+    rules : MarkerRules
+    now : datetime
+    codebook_id : str or None
+        Of the tags.
+    radio : RadioSettings
+        Of the CERPMs.
+    """
+
+    plan_id: str
+    alignment: Alignment
+    rules: MarkerRules
+    now: datetime
+    codebook_id: str | None = None
+    radio: RadioSettings = field(default_factory=RadioSettings)
+
+    def original(self, marker: PlannedMarker) -> dict[str, Any]:
+        """Where a planned marker's position comes from."""
+        return {
+            "lon_deg": marker.lon_deg,
+            "lat_deg": marker.lat_deg,
+            **({"height_m": marker.height_m} if marker.height_m is not None else {}),
+            "plan": {
+                "id": self.plan_id, "number": marker.number, "lane": marker.lane, "chainage_m": marker.chainage_m,
+                "offset_m": marker.offset_m,
+            },
+        }  # fmt: skip
+
+    def position(self, marker: PlannedMarker) -> dict[str, Any]:
+        """Columns of a planned marker's position, and its place on the road."""
+        road = self.alignment
+        return {
+            "lon_deg": marker.lon_deg,
+            "lat_deg": marker.lat_deg,
+            "height_m": marker.height_m,
+            "vertical_datum": (road.vertical_datum or "ellipsoid") if marker.height_m is not None else None,
+            "heading_deg": marker.heading_deg,
+            "crs": "EPSG:4326",
+            "realization": road.realization,
+            "epoch": road.epoch,
+            "survey_method": PLAN_METHOD,
+            "original": self.original(marker),
+            **grade_columns(None, road.transform_accuracy_m, None),
+        }
+
+
+class PlannedMarkers(ABC):
+    """The part of committing a plan that only one family knows.
+
+    Attributes
+    ----------
+    needs_index : bool
+        Whether `Family.index` stores something for these markers.
+    """
+
+    needs_index: ClassVar[bool] = False
+
+    @abstractmethod
+    def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
+        """Rows of the planned markers of this family, in the order of their numbers.
+
+        A row has the columns that differ from those of an empty marker.
+        """
+
+    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
+        """Registry numbers that planned markers may not have, because stored ones have them.
+
+        Parameters
+        ----------
+        agency_id : str
+            Of the plan.
+        known : iterable of rows
+            As `app.registry.markers.list_by_digits` returns them for the codes of the plan.
+        """
+        return set()
+
+
+# === How the points of a survey become markers of a family, thousands at a time.
+
 
 Rows = npt.NDArray[np.intp]
 Flags = npt.NDArray[np.bool_]

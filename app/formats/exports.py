@@ -18,8 +18,8 @@ import orjson
 import shapely
 from pyproj import Transformer
 
-from app.formats.spreadsheet import TableWriter
-from app.geodesy.vertical import is_ellipsoidal
+from app.formats.text import TableWriter
+from app.geodesy.systems import is_ellipsoidal
 
 Record = Mapping[str, Any]
 

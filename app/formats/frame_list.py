@@ -15,15 +15,10 @@ from typing import Any
 import numpy as np
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
-from app.formats.archives import NAME_LENGTH
-from app.formats.columns import match_columns
-from app.formats.delimited import read_number
-from app.formats.format import Sample
-from app.formats.log_report import LogReport
-from app.formats.poses.datum import check_datum
-from app.formats.poses.declaration import ALIASES, PoseDeclaration
-from app.formats.poses.points import find_jumps
-from app.formats.text import clean_text
+from app.formats.format import NAME_LENGTH, Sample
+from app.formats.logs import LogReport
+from app.formats.poses import ALIASES, PoseDeclaration, check_datum, find_jumps
+from app.formats.text import clean_text, match_columns, read_number
 
 FRAME_LISTS = ("frames.csv", "frames.json")
 """Names of the files, in any folder of an archive."""

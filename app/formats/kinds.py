@@ -5,21 +5,18 @@ from __future__ import annotations
 from enum import StrEnum
 
 from app.errors import WaymarkError
-from app.formats.alignments.formats import ALIGNMENT_FORMATS
-from app.formats.archives import is_archive
-from app.formats.format import Confidence, Format, Sample, Use, detect_format
+from app.formats.alignments.read import ALIGNMENT_FORMATS
+from app.formats.format import Confidence, Format, Sample, SpooledFile, Use, detect_format, is_archive
 from app.formats.frame_list import is_frame_list
 from app.formats.images import FRAME_FORMATS
-from app.formats.packets.formats import PACKET_FORMATS
-from app.formats.poses.formats import POSE_FORMATS
-from app.formats.spooled_file import SpooledFile
-from app.formats.surveys.formats import SURVEY_FORMATS
+from app.formats.packets.read import PACKET_FORMATS
+from app.formats.poses import POSE_FORMATS
+from app.formats.surveys.read import SURVEY_FORMATS
 from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.formats import TRACE_FORMATS
 from app.formats.traces.parts import open_parts
-from app.formats.video.archive import holds_video
-from app.formats.video.container import EXPECTED as VIDEOS
-from app.formats.video.container import detect_video
+from app.formats.video import EXPECTED as VIDEOS
+from app.formats.video import detect_video, holds_video
 
 FORMATS: tuple[Format[object], ...] = (
     *FRAME_FORMATS,

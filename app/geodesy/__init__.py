@@ -1,15 +1,18 @@
 """Coordinate reference systems, transformations with a stated accuracy, local frames and bearings."""
 
 from app.geodesy.frames import check_lon_lat, enu_from_heading, enu_from_wgs84, lon_lat_from_enu, wgs84_from_enu
-from app.geodesy.grades import UNFIT_TEXT, LocalizationGrade, grade_accuracy, total_accuracy_m, worst_grade
-from app.geodesy.operations import use_grids
+from app.geodesy.operations import decimal_year, move_to_epoch, plate_motion, use_grids
 from app.geodesy.place import (
+    UNFIT_TEXT,
+    LocalizationGrade,
     PlacedPosition,
     PlacedPositions,
+    grade_accuracy,
     place_position,
     place_positions,
+    total_accuracy_m,
+    worst_grade,
 )
-from app.geodesy.plate_motion import decimal_year, move_to_epoch, plate_motion
 from app.geodesy.systems import normalize_crs, reference_system
 
 __all__ = [

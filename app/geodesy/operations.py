@@ -1,18 +1,23 @@
-"""Transformations to ITRF2014 with a stated accuracy, and their grids."""
+"""Transformations to ITRF2014 with a stated accuracy, their grids, and the motion of plates."""
 
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import lru_cache
+from importlib import resources
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pyproj import Transformer, datadir, network
 from pyproj.transformer import TransformerGroup
 
+from app.geodesy.frames import ecef_from_wgs84, metres_per_radian
 from app.geodesy.systems import best_effort, covers, named_system
 
 _ITRF2014_2D, _ITRF2014_3D = "EPSG:9000", "EPSG:7912"
@@ -118,3 +123,133 @@ def use_grids(folder: Path | None) -> None:
 @lru_cache(maxsize=1)
 def _own_folders() -> str:
     return datadir.get_data_dir()
+
+
+# === Motion of the ground in the ITRF by a plate motion model, and positions moved from one epoch to another.
+#
+# Velocities are those of the ITRF2014 plate motion model (Altamimi, Metivier, Rebischung, Rouby, Collilieux: ITRF2014
+# plate motion model, Geophysical Journal International 209, 2017, table 1). Which plate a place is on is from the
+# plates and orogens of PB2002 (Bird: An updated digital model of plate boundaries, Geochemistry Geophysics Geosystems
+# 4, 2003), in cells of one degree: `data/plates.txt` (made from github.com/fraxen/tectonicplates, ODC-By 1.0).
+
+
+Floats = npt.NDArray[np.float64]
+
+ANGULAR_VELOCITY_MAS = {
+    "ANTA": (-0.248, -0.324, 0.675), "ARAB": (1.154, -0.136, 1.444), "AUST": (1.510, 1.182, 1.215),
+    "EURA": (-0.085, -0.531, 0.770), "INDI": (1.154, -0.005, 1.454), "NAZC": (-0.333, -1.544, 1.623),
+    "NOAM": (0.024, -0.694, -0.063), "NUBI": (0.099, -0.614, 0.733), "PCFC": (-0.409, 1.047, -2.169),
+    "SOAM": (-0.270, -0.301, -0.140), "SOMA": (-0.121, -0.794, 0.884),
+}  # fmt: skip
+"""About the axes X, Y, Z of the ITRF. [mas/year] Source: Altamimi et al. 2017, table 1."""
+RATE_ACCURACY_M = (0.002, 0.010, 0.030)
+"""RMSE of a predicted velocity by the class of the cell. [m/year]
+
+0: inside a plate. The model fits its stations to 0.3 mm/year (Altamimi et al. 2017); intraplate motion, and rates of
+plate-fixed frames that differ from those of their plate, such as NAD83(2011), stay below 2 mm/year.
+1: the Alps orogen, the plates Amur, Okhotsk, Sunda and Yangtze, which the model lacks and which move at up to 10 mm a
+year against the plate beside them (Bird 2003, table 1), and 300 km to both sides of a boundary that slips as slowly.
+2: other orogens, other plates that the model lacks (the Aegean moves at 30 mm/year against Eurasia: McClusky et al.
+2000), and 300 km to both sides of faster boundaries.
+"""
+_RADIANS_PER_MAS = np.pi / (180 * 3600 * 1000)
+_CELLS = re.compile(r"([A-Z]{4})([012])x([0-9]+)")
+
+
+class PlateMotion(NamedTuple):
+    """Horizontal velocity of places in the ITRF, each of shape (N,).
+
+    east_m, north_m: velocity [m/year]; accuracy_m: its RMSE [m/year].
+    """
+
+    east_m: Floats
+    north_m: Floats
+    accuracy_m: Floats
+
+    @property
+    def speed_m(self) -> Floats:
+        """[m/year]"""
+        return np.hypot(self.east_m, self.north_m)
+
+
+@dataclass(frozen=True, slots=True)
+class MovedPositions:
+    """Positions at another epoch, each of shape (N,).
+
+    Attributes
+    ----------
+    lon_deg, lat_deg : ndarray
+    accuracy_m : ndarray
+        RMSE that the move adds. [m]
+    """
+
+    lon_deg: Floats
+    lat_deg: Floats
+    accuracy_m: Floats
+
+
+def plate_motion(lon_deg: npt.ArrayLike, lat_deg: npt.ArrayLike) -> PlateMotion:
+    """Velocity of the ground in the ITRF.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg : array_like, shape (N,)
+        [deg]
+
+    Notes
+    -----
+    v = omega x r with the plate's angular velocity. The radial part, which comes of the ellipsoid, is left out.
+    """
+    lon, lat = (np.atleast_1d(np.asarray(values, dtype=np.float64)) for values in (lon_deg, lat_deg))
+    plates, classes = _grid()
+    row = np.clip(np.floor(90.0 - np.nan_to_num(lat)), 0, 179).astype(np.intp)
+    column = np.floor(np.nan_to_num(lon) + 180.0).astype(np.intp) % 360
+    omega = np.array(list(ANGULAR_VELOCITY_MAS.values())) * _RADIANS_PER_MAS
+    lon_rad, lat_rad = np.radians(lon), np.radians(lat)
+    velocity = np.cross(omega[plates[row, column]], ecef_from_wgs84(lon, lat))
+    east = np.stack([-np.sin(lon_rad), np.cos(lon_rad), np.zeros_like(lon_rad)], axis=-1)
+    south_parts = [np.sin(lat_rad) * np.cos(lon_rad), np.sin(lat_rad) * np.sin(lon_rad), -np.cos(lat_rad)]
+    north = -np.stack(south_parts, axis=-1)
+    accuracy = np.array(RATE_ACCURACY_M)[classes[row, column]]
+    return PlateMotion((velocity * east).sum(axis=-1), (velocity * north).sum(axis=-1), accuracy)
+
+
+def move_to_epoch(
+    lon_deg: npt.ArrayLike, lat_deg: npt.ArrayLike, from_epoch: npt.ArrayLike, to_epoch: float
+) -> MovedPositions:
+    """Positions in the ITRF at another epoch, by the motion of their plates; heights do not change.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg : array_like, shape (N,)
+        [deg]
+    from_epoch : array_like, shape (N,) or ()
+        Epoch of the positions. [decimal year]
+    to_epoch : float
+        [decimal year]
+    """
+    lon, lat = (np.atleast_1d(np.asarray(values, dtype=np.float64)) for values in (lon_deg, lat_deg))
+    years = to_epoch - np.asarray(from_epoch, dtype=np.float64)
+    motion = plate_motion(lon, lat)
+    east_m, north_m = metres_per_radian(np.radians(lat))
+    moved_lon = lon + np.degrees(motion.east_m * years / np.maximum(east_m, 1.0))
+    moved_lat = lat + np.degrees(motion.north_m * years / north_m)
+    return MovedPositions((moved_lon + 180.0) % 360.0 - 180.0, moved_lat, np.abs(years) * motion.accuracy_m)
+
+
+def decimal_year(at: datetime) -> float:
+    """The epoch of a time, as coordinate epochs are written."""
+    utc = at.astimezone(UTC)
+    start = datetime(utc.year, 1, 1, tzinfo=UTC)
+    return utc.year + (utc - start) / (datetime(utc.year + 1, 1, 1, tzinfo=UTC) - start)
+
+
+@lru_cache(maxsize=1)
+def _grid() -> tuple[npt.NDArray[np.int8], npt.NDArray[np.int8]]:
+    """Plate and class of each cell, shape (180, 360): from north to south and from -180 degrees eastwards."""
+    text = resources.files("app.geodesy").joinpath("data", "plates.txt").read_text("ascii")
+    names = {name: number for number, name in enumerate(ANGULAR_VELOCITY_MAS)}
+    rows = [_CELLS.findall(line) for line in text.splitlines()]
+    plates = [np.repeat([names[name] for name, _, _ in row], [int(count) for _, _, count in row]) for row in rows]
+    classes = [np.repeat([int(grade) for _, grade, _ in row], [int(count) for _, _, count in row]) for row in rows]
+    return np.array(plates, dtype=np.int8), np.array(classes, dtype=np.int8)

@@ -3,34 +3,81 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from pyproj.enums import TransformDirection
 
 from app.errors import InvalidParameter, ReferenceSystemError
 from app.geodesy.frames import check_lon_lat
-from app.geodesy.grades import LocalizationGrade, grade_accuracy
-from app.geodesy.operations import BoundedOperation, list_operations
-from app.geodesy.plate_motion import plate_motion
-from app.geodesy.realizations import (
+from app.geodesy.operations import BoundedOperation, list_operations, plate_motion
+from app.geodesy.systems import (
     TARGET,
     accuracy_of_global,
-    has_realizations,
-    is_stated,
-    realization_of_system,
-    system_of_realization,
-)
-from app.geodesy.systems import (
+    best_effort,
     check_area,
+    covers,
     geographic_from,
+    has_realizations,
     inside_area,
     is_global,
+    is_stated,
     many_wgs84,
     named_system,
     normalize_crs,
+    realization_of_system,
+    system_of_realization,
     wgs84_without_bound,
 )
+
+# === What a position is good enough for, by its accuracy (docs/positions.md).
+
+
+Grade = Literal["cm", "dm", "m", "unfit"]
+
+
+class LocalizationGrade(StrEnum):
+    """Order of magnitude of a position's horizontal accuracy; UNFIT may not be used to localize a vehicle."""
+
+    CM = "cm"
+    DM = "dm"
+    M = "m"
+    UNFIT = "unfit"
+
+
+UNFIT_TEXT = "not for localization"
+"""What people read where a position is UNFIT."""
+GRADE_LIMITS_M = {LocalizationGrade.CM: 0.1, LocalizationGrade.DM: 1.0, LocalizationGrade.M: 10.0}
+"""RMSE below which a position has a grade. [m] Source: the unit in which the RMSE is written with one digit before the
+point."""
+
+
+def total_accuracy_m(horizontal_rmse_m: float | None, transform_accuracy_m: float | None) -> float | None:
+    """Horizontal RMSE of a position in the ITRF, by its survey and its reference frame; None if one is unknown. [m]"""
+    if horizontal_rmse_m is None or transform_accuracy_m is None:
+        return None
+    return math.hypot(horizontal_rmse_m, transform_accuracy_m)
+
+
+def grade_accuracy(rmse_m: float | None) -> LocalizationGrade:
+    """Grade of a position with a horizontal RMSE in the ITRF; None is unknown. [m]"""
+    if rmse_m is None:
+        return LocalizationGrade.UNFIT
+    found = (grade for grade, limit_m in GRADE_LIMITS_M.items() if rmse_m < limit_m)
+    return next(found, LocalizationGrade.UNFIT)
+
+
+def worst_grade(grades: Iterable[LocalizationGrade]) -> LocalizationGrade:
+    """The least accurate of at least one grade."""
+    return max(grades, key=list(LocalizationGrade).index)
+
+
+# === Positions in any reference system to WGS 84 / ITRF, with the transformation and its accuracy.
+
 
 PLATE_FIXED_EPOCH = 2020.0
 """Epoch in the ITRF for which plate-fixed coordinates without an epoch are transformed. [decimal year]
@@ -347,3 +394,159 @@ def _global_frame(name: str, place_deg: tuple[float, float], realization: str | 
             f"error of {error_m:.2f} m: state the epoch"
         )
     return stated, epoch, math.hypot(*parts_m), "; ".join(notes) or None
+
+
+# === Positions in WGS 84 / ITRF to any reference system, with the accuracy of the transformation.
+
+
+Floats = npt.NDArray[np.float64]
+
+_INVERSE = TransformDirection.INVERSE
+_OUTSIDE_DEG = 1.0  # [deg] margin about an area of use; source: as for positions that come in
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """How positions came to WGS 84 / ITRF.
+
+    Attributes
+    ----------
+    crs : str
+        System that they were submitted in.
+    stated : bool
+        Transformed with a stated accuracy, or global from the start.
+    epoch : float or None
+        Of the positions. [decimal year]
+    ellipsoidal_height : bool
+        Heights are above the ellipsoid.
+    realization : str or None
+        Realization of `crs` that they were submitted in, as it was stated.
+    """
+
+    crs: str
+    stated: bool
+    epoch: float | None
+    ellipsoidal_height: bool
+    realization: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SystemPositions:
+    """Positions in a reference system.
+
+    Attributes
+    ----------
+    first, second : ndarray, shape (N,)
+        Longitude and latitude [deg], or easting and northing in the unit of the system.
+    height_m : ndarray, shape (N,)
+        NaN where unknown. [m]
+    accuracy_m : float
+        Stated accuracy of the transformation; 0 without one. [m]
+    note : str
+        The transformation, for people.
+    """
+
+    first: Floats
+    second: Floats
+    height_m: Floats
+    accuracy_m: float
+    note: str
+
+
+def positions_in_system(
+    lon_deg: Floats, lat_deg: Floats, height_m: Floats, crs: str, *, origin: Origin
+) -> SystemPositions:
+    """Transform positions in WGS 84 / ITRF to a reference system.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg, height_m : ndarray, shape (N,)
+        Height is NaN where unknown.
+    crs : str
+        Of the result, in any form of `normalize_crs`.
+    origin : Origin
+
+    Raises
+    ------
+    ReferenceSystemError
+        The system is unknown, not made for this place, or has no transformation with a stated accuracy.
+
+    Notes
+    -----
+    A system on a global datum is reached by a projection alone. Into the datum that the positions came in, the
+    transformation by which they came is undone. Any other datum is reached by the most accurate operation that states
+    its accuracy there.
+    """
+    name = normalize_crs(crs)
+    system = named_system(name)
+    if not covers(system.area_of_use, lon_deg, lat_deg, _OUTSIDE_DEG).all():
+        area = system.area_of_use
+        raise ReferenceSystemError(
+            f"the road lies outside the area of use of {name} ({system.name})",
+            field="crs",
+            limit=f"west, south, east, north: {', '.join(f'{v:g}' for v in area.bounds)} deg" if area else None,
+            cure="choose a system of this place",
+        )
+    if is_global(system):
+        first, second = _projected(name, lon_deg, lat_deg)
+        return SystemPositions(first, second, height_m, 0.0, f"{name} is on a global datum: no datum transformation")
+    returns = _same_datum(name, origin.crs)
+    if returns and not origin.stated:
+        first, second = best_effort(name).transform(lon_deg, lat_deg, direction=_INVERSE)
+        note = f"the road came in {origin.crs} without a stated accuracy, which is undone: exact in its own datum"
+        return SystemPositions(np.asarray(first), np.asarray(second), height_m, 0.0, note)
+    return _transformed(name, lon_deg, lat_deg, height_m, origin, returns)
+
+
+def _transformed(
+    name: str, lon_deg: Floats, lat_deg: Floats, height_m: Floats, origin: Origin, returns: bool
+) -> SystemPositions:
+    """By an operation with a stated accuracy, backwards."""
+    three_d = origin.ellipsoidal_height and bool(np.isfinite(height_m).all())
+    middle = int(np.argsort(lon_deg)[len(lon_deg) // 2])
+    place = float(lon_deg[middle]), float(lat_deg[middle])
+    source = (system_of_realization(name, origin.realization) if returns else None) or name
+    operations = list_operations(source, *place, three_d=three_d, accuracy_m=np.inf)
+    if not isinstance(operations, str) and origin.epoch is None:
+        known = [operation for operation in operations if not operation.needs_epoch]
+        operations = known or "the transformation depends on time, and the epoch of the positions is not known"
+    if isinstance(operations, str):
+        raise ReferenceSystemError(
+            f"positions cannot be staked in {name}: {operations}",
+            field="crs",
+            limit="a transformation with a stated accuracy",
+            cure="choose a system on WGS 84 or on the road's own datum, declare the epoch, or add the grids",
+        )
+    heights = np.where(np.isfinite(height_m), height_m, 0.0) if three_d else np.zeros_like(lon_deg)
+    epochs = np.full_like(lon_deg, origin.epoch or 0.0)
+    for operation in operations:
+        x, y, z, _ = operation.transformer.transform(lon_deg, lat_deg, heights, epochs, direction=_INVERSE)
+        if np.isfinite(x).all() and np.isfinite(y).all():
+            first, second = _projected(name, np.asarray(x), np.asarray(y))
+            up = np.asarray(z) if three_d else height_m
+            note = f"transformed to {name}, stated accuracy {operation.bound_m:g} m: {operation.name}"
+            if returns:
+                note += "; it undoes the transformation of the road"
+            return SystemPositions(first, second, up, 0.0 if returns else operation.bound_m, note)
+    raise ReferenceSystemError(
+        f"no transformation to {name} reaches all positions",
+        field="crs",
+        limit="a transformation that covers the road",
+        cure="choose another system",
+    )
+
+
+def _projected(name: str, lon_deg: Floats, lat_deg: Floats) -> tuple[Floats, Floats]:
+    unproject = geographic_from(name)
+    if unproject is None:
+        return lon_deg, lat_deg
+    first, second = unproject.transform(lon_deg, lat_deg, direction=_INVERSE)
+    return np.asarray(first), np.asarray(second)
+
+
+def _same_datum(name: str, other: str) -> bool:
+    try:
+        one, two = named_system(name).geodetic_crs, named_system(normalize_crs(other)).geodetic_crs
+    except ReferenceSystemError:
+        return False
+    return one is not None and two is not None and one.datum == two.datum

@@ -1,4 +1,4 @@
-"""Coordinate reference systems: names in their usual forms, and areas of use."""
+"""Coordinate reference systems: names in their usual forms, areas of use, realizations and vertical parts."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from pyproj import CRS, Transformer
+from pyproj.database import query_crs_info
+from pyproj.enums import PJType
 from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, ReferenceSystemError
@@ -163,3 +165,147 @@ def inside_area(
     inside = (np.abs(lon_deg) <= 180.0) & (np.abs(lat_deg) <= 90.0)
     inside &= covers(system.area_of_use, lon_deg, lat_deg, _OUTSIDE_DEG)
     return np.where(inside, lon_deg, np.nan), np.where(inside, lat_deg, np.nan)
+
+
+# === Realizations of reference systems: which one is stated, and how far apart those of a system are.
+
+
+TARGET = "ITRF2014"
+WGS84_ENSEMBLE_M = 2.0
+"""Accuracy of WGS 84 without a realization. [m] Source: EPSG registry, datum ensemble 6326."""
+_RECENT_M, _OLD_M = 0.01, 0.2
+"""Horizontal distance of a realization from ITRF2014: since ITRF2005, IGS05 and WGS 84 (G1674), and before. [m]
+Source: parameters from ITRF2014 to past ITRFs (itrf.ign.fr), at most 3 mm and 1 ppb back to ITRF2005 and 155 mm and 11
+ppb back to ITRF88."""
+_RECENT_YEAR, _RECENT_WEEK = 2005, 1674
+_ITRF = re.compile(r"(?:ITRF|IGS|IGB)(?P<year>\d{4}|\d{2})(?:@.*)?")
+_WGS84 = re.compile(r"(?:WGS84)?\(?G(?P<week>\d{3,4})\)?")
+_UNSTATED = ("WGS84", "ITRF", "ITRS", "WGS1984")
+
+
+def accuracy_of_global(realization: str | None) -> float | None:
+    """Distance of a realization of WGS 84 or the ITRS from ITRF2014; None if it is not one of these. [m]
+
+    Without a realization, it is that of WGS 84 with all its realizations.
+    """
+    name = _plain(realization or "WGS84")
+    if name in _UNSTATED:
+        return WGS84_ENSEMBLE_M
+    if name == TARGET:
+        return 0.0
+    if found := _ITRF.fullmatch(name):
+        year = int(found["year"])
+        if year < 100:
+            year += 1900 if year > 80 else 2000
+        return _RECENT_M if year >= _RECENT_YEAR else _OLD_M
+    if found := _WGS84.fullmatch(name):
+        return _RECENT_M if int(found["week"]) >= _RECENT_WEEK else _OLD_M
+    return None
+
+
+def is_stated(realization: str | None) -> bool:
+    """Whether it names more than the system."""
+    return realization is not None and _plain(realization) not in _UNSTATED
+
+
+def realization_of_system(name: str) -> str | None:
+    """Realization that a global system is by itself, such as that of EPSG:7912; None of WGS 84."""
+    geodetic = named_system(name).geodetic_crs
+    if geodetic is None or geodetic.datum is None or geodetic.datum.type_name == "Datum Ensemble":
+        return None
+    return str(geodetic.name)
+
+
+def has_realizations(name: str) -> bool:
+    """Whether a system is a datum ensemble, such as ETRS89: its realizations differ, and coordinates may be in any."""
+    geodetic = named_system(name).geodetic_crs
+    return geodetic is not None and geodetic.datum is not None and geodetic.datum.type_name == "Datum Ensemble"
+
+
+def system_of_realization(name: str, realization: str | None) -> str | None:
+    """Geographic system of a realization of a regional system: EPSG:9067 of ETRS89 and ``ETRF2000``.
+
+    Returns
+    -------
+    str or None
+        ``EPSG:code``; None if there is no such realization of this system.
+    """
+    if realization is None or is_global(named_system(name)):
+        return None
+    geodetic = named_system(name).geodetic_crs
+    found = _geographic_systems().get(_plain(realization))
+    if geodetic is None or geodetic.datum is None or found is None:
+        return None
+    own = _plain(geodetic.name)
+    if _plain(realization).startswith((f"{own}/", f"{own}(")) or _plain(realization) == own:
+        return found
+    members = {member["name"] for member in geodetic.datum.to_json_dict().get("members", ())}
+    datum = named_system(found).datum
+    return found if datum is not None and datum.name in members else None
+
+
+@lru_cache(maxsize=1)
+def _geographic_systems() -> dict[str, str]:
+    systems = query_crs_info("EPSG", PJType.GEOGRAPHIC_2D_CRS)
+    return {_plain(info.name): f"EPSG:{info.code}" for info in systems}
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\s_-]", "", name).upper()
+
+
+# === Vertical datums: what a height is above.
+
+
+ELLIPSOID = "ellipsoid"
+VERTICAL_RULE = "ellipsoid, or a vertical CRS of the EPSG registry in metres upwards, by code or name"
+_CODE = re.compile(r"(?:EPSG:|urn:ogc:def:crs:EPSG:[0-9.]*:)(?P<code>[0-9]{4,6})", re.IGNORECASE)
+
+
+def is_ellipsoidal(vertical_datum: str | None) -> bool:
+    """Whether heights above a datum, as markers keep it, are ellipsoidal; without a datum they are."""
+    return vertical_datum in (None, ELLIPSOID)
+
+
+def normalize_vertical_datum(text: str) -> str:
+    """``ellipsoid``, or ``EPSG:code`` of a vertical CRS, from the usual forms of its name.
+
+    Raises
+    ------
+    ReferenceSystemError
+        It is none of these: other names, depths, feet.
+    """
+    plain = _plain(text)
+    if plain == _plain(ELLIPSOID):
+        return ELLIPSOID
+    found = _CODE.fullmatch(text.strip())
+    code = found["code"] if found else _codes().get(plain)
+    if code is None or not _is_height_in_metres(int(code)):
+        raise ReferenceSystemError(
+            f"{text[:64]!r} is not a vertical datum that is known here",
+            field="vertical_datum",
+            limit=VERTICAL_RULE,
+            cure="send ellipsoid, EPSG:5703 (NAVD88), EPSG:7837 (DHHN2016), EPSG:3855 (EGM2008), ...",
+        )
+    return f"EPSG:{int(code)}"
+
+
+@lru_cache(maxsize=256)
+def _is_height_in_metres(code: int) -> bool:
+    try:
+        system = CRS.from_epsg(code)
+    except CRSError:
+        return False
+    if not system.is_vertical or system.is_compound or len(system.axis_info) != 1:
+        return False
+    axis = system.axis_info[0]
+    return axis.direction == "up" and axis.unit_conversion_factor == 1.0
+
+
+@lru_cache(maxsize=1)
+def _codes() -> dict[str, str]:
+    """Codes of vertical systems by name, with and without the word height."""
+    codes: dict[str, str] = {}
+    for info in query_crs_info("EPSG", PJType.VERTICAL_CRS):
+        codes[_plain(info.name)] = codes[_plain(info.name.removesuffix(" height"))] = info.code
+    return codes

@@ -4,14 +4,14 @@ A drive's passes are first judged together (`judge_drive`), so that the vehicle'
 then adds evidence to the tests of its marker (`update_marker`). docs/health.md describes the model.
 """
 
-from app.health.drive import JudgedDrive as JudgedDrive
-from app.health.drive import judge_drive as judge_drive
+from app.health.marker_tests import JudgedDrive as JudgedDrive
+from app.health.marker_tests import judge_drive as judge_drive
 from app.health.marker_tests import update_marker as update_marker
 from app.health.marker_tests import update_unregistered as update_unregistered
-from app.health.passes import Evidence as Evidence
-from app.health.passes import Pass as Pass
-from app.health.rules import Fault as Fault
-from app.health.rules import HealthRules as HealthRules
+from app.health.states import Evidence as Evidence
+from app.health.states import Fault as Fault
+from app.health.states import HealthRules as HealthRules
 from app.health.states import MarkerState as MarkerState
+from app.health.states import Pass as Pass
 from app.health.states import VehicleState as VehicleState
-from app.health.verdicts import Verdict as Verdict
+from app.health.states import Verdict as Verdict

@@ -1,13 +1,220 @@
-"""State of the tests of a marker and of a vehicle's own errors, as they are stored."""
+"""Rules, results and stored states of the tests of a marker, and of a vehicle's own errors."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from typing import Any
 
-from app.health.passes import LonLat
-from app.health.rules import READING_LEVELS
+# === Faults of markers, and the limits of the tests for them.
+
+
+class Fault(StrEnum):
+    """What can be wrong with a marker, or with what is registered of it."""
+
+    MISSING = "missing"
+    MOVED = "moved"
+    CLONED = "cloned"
+    WRONG_WAY = "wrong-way"
+    FADING = "fading"
+    UNREGISTERED = "unregistered"
+
+
+TESTED = (Fault.MISSING, Fault.MOVED, Fault.CLONED, Fault.WRONG_WAY, Fault.FADING)
+"""Tests of a registered marker; the sixth fault is of a code that is not registered."""
+
+CLEAN, DIRTY = (1.0,), ((1.0, 0.6, 0.3), (0.90, 0.08, 0.02))
+READING_LEVELS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "plate": DIRTY,
+    "fiducial": DIRTY,
+    "magnet": (CLEAN, CLEAN),
+    "cerpm": ((1.0, 0.5), (0.95, 0.05)),
+}
+"""Factors on the reading probability of a healthy marker and how common they are: dirt on faces, weak batteries;
+nothing covers a magnet. Source: chosen by hand; `python -m benchmarks.health` draws its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class HealthRules:
+    """Error rates and bounds of the tests.
+
+    Attributes
+    ----------
+    false_alarm_share : float
+        Share of healthy markers that become suspects in a month of traffic, at most.
+    lower : float
+        Logarithm of the ratio at which a marker is accepted as healthy, and the test starts anew. [nat]
+    vehicles : int
+        Distinct vehicles without which no marker becomes a suspect.
+    vehicle_bound : float
+        What one vehicle adds to a test at most, however often it passes. [nat]
+    month_passes : float
+        Passes in a month that are assumed at least.
+    moved_test_starts : float
+        Share of the passes of healthy markers with which a test for a displacement begins.
+    moved_m : float
+        Smallest estimated displacement of a suspect. [m]
+    disc_m : float
+        A marker that stands this near to its registered position has not moved; two standard deviations of the survey
+        where they are more. [m]
+    """
+
+    false_alarm_share: float = 1e-3  # source: the registry's requirement, one marker in a thousand
+    lower: float = 0.0  # [nat] source: Page, Biometrika 41, 1954: tests in a row find a fault whenever it begins
+    vehicles: int = 3  # source: chosen by hand; two may share a workshop, and so a wrong calibration
+    vehicle_bound: float = 5.0  # [nat] source: by hand; at 10,000 passes a month four vehicles are needed, and five do
+    month_passes: float = 100.0  # source: chosen by hand, three vehicles a day
+    moved_test_starts: float = 0.01  # source: the scenes of `python -m benchmarks.health`: 0.6 to 1.2 %, once 2.3 %
+    moved_m: float = 0.75  # [m] source: `python -m benchmarks.health`, finds 1.0 m in five passes
+    disc_m: float = 0.25  # [m] source: by hand, what crews and surveys of roads are good to
+
+    def upper(self, fault: Fault, month_passes: float) -> float:
+        """Logarithm of the ratio from which a fault is suspected. [nat]
+
+        Notes
+        -----
+        By Ville's inequality a likelihood ratio of a healthy marker ever exceeds 1/alpha with probability alpha at
+        most. A test starts with a pass at the earliest, so there are no more tests in a month than passes, and
+        alpha is the allowed share over passes and kinds of tests. A test for a displacement starts only with an offset
+        that lies outside of the disc.
+        """
+        starts = self.moved_test_starts if fault is Fault.MOVED else 1.0
+        tests = len(TESTED) * max(month_passes, self.month_passes) * starts
+        return math.log(tests / self.false_alarm_share)
+
+
+RULES = HealthRules()
+
+
+# === What one upload shows of a marker, and what remains of it as evidence after the vehicle's own errors.
+
+
+LonLat = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """What one upload of a vehicle shows of one marker.
+
+    Attributes
+    ----------
+    marker_id, family : str
+    read : bool
+        Whether the marker was read.
+    expected : float
+        Probability that a healthy, clean marker is read in such a pass; 0 where it is not known.
+    along : float
+        Order in the drive: time, frame or odometer.
+    offset_m : (float, float) or None
+        Observed less registered position by the vehicle's own position, east and north. [m]
+    sigma_m : float
+        Standard deviation of the observation relative to the vehicle, each axis. [m]
+    position_sigma_m : float or None
+        Standard deviation of the vehicle's own position, each axis; None if unknown. [m]
+    offset_is_absolute : bool
+        The offset rests on no position of the vehicle: by a marker's own message.
+    survey_m : float
+        Standard deviation of the registered position, each axis. [m]
+    heading_deg : float or None
+        Of the vehicle. [deg]
+    reversed : bool or None
+        Whether it was met against its direction; None where it shows none.
+    quality : float or None
+        Signal or grade less the nominal one, in standard deviations.
+    quality_is_relative : bool
+        The quality is compared with the other markers of the drive already.
+    elsewhere : (float, float) or None
+        Where it was read, far from its place: longitude and latitude. [deg]
+    two_places : bool
+        One drive received it from two places.
+    """
+
+    marker_id: str
+    family: str
+    read: bool
+    expected: float = 0.0
+    along: float = 0.0
+    offset_m: tuple[float, float] | None = None
+    sigma_m: float = 0.0
+    position_sigma_m: float | None = None
+    offset_is_absolute: bool = False
+    survey_m: float = 0.0
+    heading_deg: float | None = None
+    reversed: bool | None = None
+    quality: float | None = None
+    quality_is_relative: bool = False
+    elsewhere: LonLat | None = None
+    two_places: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Evidence of a pass on its marker after the vehicle's own errors.
+
+    Attributes
+    ----------
+    read_probability : float
+        That this vehicle reads a healthy, clean marker in this pass; 0 where a miss is no evidence.
+    offset_m, sigma_m : (float, float) or None, float
+        Less the drive's common shift, east and north, and the standard deviation of each with that of the shift. [m]
+    reversed : bool or None
+        Against the direction of the other markers of the drive.
+    alone : bool
+        The drive shows no other direction to compare with.
+    quality : float or None
+        Less that of the drive's other markers, in standard deviations.
+    """
+
+    marker_id: str
+    family: str
+    read: bool
+    read_probability: float
+    offset_m: tuple[float, float] | None = None
+    sigma_m: float = 0.0
+    survey_m: float = 0.0
+    reversed: bool | None = None
+    alone: bool = False
+    quality: float | None = None
+    elsewhere: LonLat | None = None
+    two_places: bool = False
+
+
+# === What the tests of a marker find.
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A fault that is suspected by the evidence of several vehicles.
+
+    Attributes
+    ----------
+    fault : Fault
+    ratio, limit : float
+        Logarithm of the likelihood ratio, and the limit that it has passed. [nat]
+    vehicles, passes : int
+        That added to it, and their passes where these are kept.
+    since_s : float
+        When the evidence began. [s since 1970]
+    offset_m : (float, float) or None
+        Estimated displacement, east and north. [m]
+    elsewhere : (float, float) or None
+        Where it was read, far from its place. [deg]
+    """
+
+    fault: Fault
+    ratio: float
+    limit: float
+    vehicles: int
+    passes: int
+    since_s: float
+    offset_m: tuple[float, float] | None = None
+    elsewhere: LonLat | None = None
+
+
+# === State of the tests of a marker and of a vehicle's own errors, as they are stored.
+
 
 MONTH_S = 30 * 86_400.0
 _BY_FAULT = ("ratios", "shares", "since")

@@ -15,10 +15,9 @@ from celery.worker import WorkController, state
 from celery.worker.consumer import Consumer
 
 from app.errors import Unavailable
-from app.jobs.celery_app import TASK, queue_name
-from app.jobs.celery_queue import CeleryQueue
+from app.jobs.celery_queue import TASK, CeleryQueue, queue_name
 from app.registry.jobs import JobKind
-from app.services.job_queues import QueueName, kinds_in
+from app.services.jobs import QueueName, kinds_in
 
 _LOG = structlog.get_logger(__name__)
 _RETRY_S = 2.0

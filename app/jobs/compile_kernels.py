@@ -11,24 +11,22 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 
 from app.compiled import expect_compilation
-from app.decoders.magnet.metro_steps import cancel_wheel_noise
-from app.decoders.plate.colour import half_planes, ratio_signal
+from app.decoders.magnet.metro import cancel_wheel_noise
+from app.decoders.plate.detect_blobs import half_planes, ratio_signal
 from app.decoders.plate.reader import decode_plates
 from app.jobs.decoder_process import warm_frame
-from app.jobs.trace_tasks import compile_traces
-from app.lanes.banded_matrix import factor, inverse_band
-from app.lanes.boundary_sides import assign_sides
+from app.jobs.drive_tasks import compile_traces
 from app.lanes.control import Controller
+from app.lanes.lane_fit import assign_sides
+from app.lanes.least_squares import factor, inverse_band
 from app.sensors.camera import Camera
-from app.services.decodes.trace_task import CompileTracesTask
+from app.services.decodes.tasks import CompileTracesTask
 from app.simulation.camera import render_plate_scene
-from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.road import Road
-from app.simulation.magnetic.vehicle import Course, Vehicle
 from app.simulation.plate_face import Face
 from app.simulation.plate_scene import PlacedFace, PlateScene, Shadow
-from app.simulation.steering import check_steering
-from app.simulation.vehicle import PoseNoise
+from app.simulation.steering import PoseNoise, check_steering
 from app.tracks import Clock, LanePath, PositionFix, Samples, TrackInput
 from app.tracks.estimate import estimate_track
 

@@ -5,46 +5,68 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from app.jobs.artwork_tasks import draw_plate, write_sheets
-from app.jobs.calibration_tasks import calibrate_photos
 from app.jobs.decoder_process import ProcessIdTask, process_id
-from app.jobs.frame_list_tasks import read_frame_lists
+from app.jobs.drive_tasks import compile_traces, decode_recording, draw_overlay, estimate_lane, read_drive, write_track
 from app.jobs.frame_tasks import annotate_frame, decode_run, find_markers, load_frame
-from app.jobs.package_tasks import list_package_parts, write_package_manifest, write_package_part
-from app.jobs.packet_tasks import draw_overlay, estimate_lane, read_drive
-from app.jobs.plan_tasks import compare_plan, make_plan, profile_road, summarize_road, write_file_of_plan, write_map
-from app.jobs.print_tasks import grade_photo
-from app.jobs.proof_tasks import list_proof_units, prove_unit, write_proof
-from app.jobs.report_photo_tasks import write_report_photo
-from app.jobs.sample_tasks import draw_video_frame, read_samples
-from app.jobs.survey_tasks import read_survey_file
-from app.jobs.trace_tasks import compile_traces, decode_recording
-from app.jobs.track_tasks import write_track
-from app.jobs.video_tasks import decode_segment, index_frames
-from app.jobs.view_tasks import render_camera_view
-from app.services.decoder_processes import Task
+from app.jobs.picture_tasks import (
+    calibrate_photos,
+    draw_plate,
+    grade_photo,
+    render_camera_view,
+    write_report_photo,
+    write_sheets,
+)
+from app.jobs.plan_tasks import (
+    compare_plan,
+    list_package_parts,
+    list_proof_units,
+    make_plan,
+    profile_road,
+    prove_unit,
+    read_survey_file,
+    summarize_road,
+    write_file_of_plan,
+    write_map,
+    write_package_manifest,
+    write_package_part,
+    write_proof,
+)
+from app.jobs.video_tasks import decode_segment, draw_video_frame, index_frames, read_frame_lists, read_samples
 from app.services.decodes.frame_poses import FrameListTask
-from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameRunTask, FrameSearch
-from app.services.decodes.packet_task import DriveTask, LaneTask, OverlayTask
-from app.services.decodes.sample_task import SamplesTask, VideoFrameTask
-from app.services.decodes.trace_task import CompileTracesTask, TraceTask
-from app.services.decodes.video_task import IndexVideoTask, SegmentTask
-from app.services.drives.track_task import TrackTask
+from app.services.decodes.tasks import (
+    AnnotationTask,
+    CompileTracesTask,
+    DriveTask,
+    FramePicture,
+    FrameRunTask,
+    FrameSearch,
+    IndexVideoTask,
+    LaneTask,
+    OverlayTask,
+    SamplesTask,
+    SegmentTask,
+    TraceTask,
+    VideoFrameTask,
+)
+from app.services.drives.documents import TrackTask
 from app.services.fleet.calibrations import CalibrationTask
-from app.services.markers.artwork_tasks import DrawPlateTask, WriteSheetsTask
-from app.services.markers.print_task import PrintGradeTask
-from app.services.markers.view_task import CameraViewTask
-from app.services.plans.package_tasks import ListPartsTask, WriteManifestTask, WritePartTask
-from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask
+from app.services.markers.tasks import CameraViewTask, DrawPlateTask, PrintGradeTask, WriteSheetsTask
 from app.services.plans.tasks import (
     CompareTask,
+    ListPartsTask,
+    ListUnitsTask,
     MakePlanTask,
     ProfileRoadTask,
+    ProveUnitTask,
     SummarizeRoadTask,
+    WriteManifestTask,
     WriteMapTask,
+    WritePartTask,
     WritePlanFileTask,
+    WriteProofTask,
 )
-from app.services.public_pages.report_photo import ReportPhotoTask
+from app.services.ports import Task
+from app.services.public_pages.pages import ReportPhotoTask
 from app.services.surveys.imports import SurveyTask
 
 ResultT = TypeVar("ResultT")

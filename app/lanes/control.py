@@ -61,8 +61,8 @@ class SteeringSettings:
 
     gain_per_s: float = 1.0  # [1/s] source: by hand, `suited_to`
     lookahead_m: float = 15.0  # [m] source: CERPM paper, section 2.3.2
-    latency_s: float = 0.12  # [s] source: `simulation.vehicle.Vehicle`
-    lag_s: float = 0.10  # [s] source: `simulation.vehicle.Vehicle`
+    latency_s: float = 0.12  # [s] source: `simulation.steering.Vehicle`
+    lag_s: float = 0.10  # [s] source: `simulation.steering.Vehicle`
     wheelbase_m: float = 2.70  # [m] source: Kia Niro, the paper's car
     integral_per_m_s: float = 0.06  # [rad/(m s)] source: by hand, no measurement kept
 

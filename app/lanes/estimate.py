@@ -9,15 +9,18 @@ import numpy as np
 
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
-from app.lanes.driven_line import TRUSTED_TRACK_M, DrivenLine, driven_line_from_track
-from app.lanes.initial_line import fit_initial_line, is_single_row, largest_group
+from app.lanes.initial_line import (
+    TRUSTED_TRACK_M,
+    DrivenLine,
+    driven_line_from_track,
+    fit_initial_line,
+    is_single_row,
+    largest_group,
+)
 from app.lanes.lane_fit import LaneFit
-from app.lanes.lane_path import path_from_fit, path_from_splines, refused_path
-from app.lanes.local_plane import plane_from_wgs84
+from app.lanes.lane_path import compare_with_track, path_from_fit, path_from_splines, refused_path, runs_apart
 from app.lanes.observations import LaneObservations, distinct_places, observations_from_markers
-from app.lanes.paper_spline import boundaries_by_splines
-from app.lanes.smooth_line import SmoothLine
-from app.lanes.track_agreement import compare_with_track, runs_apart
+from app.lanes.smooth_line import SmoothLine, boundaries_by_splines, plane_from_wgs84
 from app.lanes.types import (
     LEFT,
     RIGHT,

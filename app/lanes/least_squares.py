@@ -10,7 +10,7 @@ c + w / 2, one of the right boundary c - w / 2, a fix of the vehicle c + v. Betw
 
 The strength of each of these is chosen by the likelihood of the measurements (`choose_hyperparameters`).
 
-Without a track the third field sums up the length of the centre on stretches of known length (`even_spacing`).
+Without a track the third field sums up the length of the centre on stretches of known length (`observations`).
 """
 
 from __future__ import annotations
@@ -21,26 +21,127 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import scipy
 
-from app.lanes.banded_matrix import (
-    apply,
-    difference_gram,
-    factor,
-    gather,
-    gram,
-    inverse_band,
-    log_determinant,
-    solve,
-    variances,
-)
-from app.lanes.even_spacing import NO_KNOWN_LENGTHS, KnownLengths
+from app.compiled import ieee_kernel
+from app.lanes.observations import NO_KNOWN_LENGTHS, KnownLengths
 from app.lanes.smooth_line import SmoothLine, left_normals
-from app.lanes.types import Floats, Ints
+from app.lanes.types import Floats as TypesFloats
+from app.lanes.types import Ints as TypesInts
+
+# === Least squares with unknowns along a line: the matrices are banded, so the cost is linear in the line's length.
+#
+# LAPACK is called directly: the checks of scipy.linalg cost more than matrices of this size.
+
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+_DIFFERENCES = ([1.0], [-1.0, 1.0], [1.0, -2.0, 1.0], [-1.0, 3.0, -3.0, 1.0])
+_LIFT, _LIFT_OF_LARGEST = 1e-9, 1e-12  # diagonal shares added against rounding; source: above float64, 2.2e-16
+
+
+def gram(index: Ints, value: Floats, weight: Floats, size: int, band: int) -> Floats:
+    """Weighted sum of the outer products of sparse rows, in LAPACK's lower banded form, shape (band + 1, size).
+
+    Parameters
+    ----------
+    index : ndarray of int, shape (R, M)
+        Unknowns of each row, no two further apart than `band`.
+    value : ndarray, shape (R, M)
+        Their coefficients.
+    weight : ndarray, shape (R,)
+    """
+    total = np.zeros((band + 1) * size)
+    for a in range(index.shape[1]):
+        for b in range(a + 1):
+            low, high = np.minimum(index[:, a], index[:, b]), np.maximum(index[:, a], index[:, b])
+            total += np.bincount((high - low) * size + low, weight * value[:, a] * value[:, b], (band + 1) * size)
+    return total.reshape(band + 1, size)
+
+
+def gather(index: Ints, value: Floats, target: Floats, size: int) -> Floats:
+    """Sum of sparse rows times their (weighted) targets, shape (size,)."""
+    return np.asarray(np.bincount(index.ravel(), (value * target[:, None]).ravel(), size), float)
+
+
+def difference_gram(order: int, count: int, band: int) -> Floats:
+    """Sum of the squared differences of an order of `count` unknowns, as a banded matrix, shape (band + 1, count)."""
+    value = np.array(_DIFFERENCES[order])
+    k = np.arange(count - order)[:, None] + np.arange(order + 1)
+    return gram(k, np.broadcast_to(value, k.shape), np.ones(len(k)), count, band)
+
+
+def apply(index: Ints, value: Floats, x: Floats) -> Floats:
+    """Sparse rows times x, shape (R,)."""
+    return np.asarray(np.sum(value * x[index], 1))
+
+
+def log_determinant(cholesky: Floats) -> float:
+    """Log determinant of the matrix with this banded Cholesky factor."""
+    return 2.0 * float(np.sum(np.log(cholesky[0])))
+
+
+def factor(matrix: Floats) -> Floats:
+    """Banded Cholesky factor, lower form, of a matrix that is positive definite except for rounding."""
+    found, info = scipy.linalg.lapack.dpbtrf(matrix, lower=1)
+    if info:
+        lifted = matrix.copy()
+        lifted[0] *= 1 + _LIFT
+        lifted[0] += _LIFT_OF_LARGEST * matrix[0].max()
+        found, info = scipy.linalg.lapack.dpbtrf(lifted, lower=1)
+    if info:
+        raise np.linalg.LinAlgError("normal matrix is not positive definite")
+    return np.asarray(found)
+
+
+def solve(cholesky: Floats, right: Floats) -> Floats:
+    """Solution for one right-hand side (N,) or many (N, G)."""
+    solved, _ = scipy.linalg.lapack.dpbtrs(cholesky, right, lower=1)
+    return np.asarray(solved)
+
+
+@ieee_kernel
+def inverse_band(cholesky: Floats) -> Floats:
+    """The elements of inv(A) within the band of A, in the same form as its Cholesky factor, shape (band + 1, N).
+
+    Source: Takahashi, Fagan and Chen (1973), Formation of a sparse bus impedance matrix; with A = L L' and l = the part
+    of a column of L below its diagonal over its diagonal d, the inverse Z has the column -Z l below the diagonal and
+    1 / d^2 + l' Z l on it.
+    """
+    band, size = cholesky.shape[0] - 1, cholesky.shape[1]
+    inverse = np.zeros((band + 1, size))
+    share = np.zeros(band + 1)
+    for j in range(size - 1, -1, -1):
+        below = min(band, size - 1 - j)
+        for q in range(1, below + 1):
+            share[q] = cholesky[q, j] / cholesky[0, j]
+        total = 1.0 / cholesky[0, j] ** 2
+        for p in range(1, below + 1):
+            column = 0.0
+            for q in range(1, below + 1):
+                column += inverse[abs(p - q), j + min(p, q)] * share[q]
+            inverse[p, j] = -column
+            total += share[p] * column
+        inverse[0, j] = total
+    return inverse
+
+
+def variances(inverse: Floats, index: Ints, value: Floats) -> Floats:
+    """a' inv(A) a for sparse rows a, by the band of inv(A) that they are within, shape (R,)."""
+    low = np.minimum(index[:, :, None], index[:, None, :])
+    high = np.maximum(index[:, :, None], index[:, None, :])
+    return np.asarray(np.einsum("ra,rb,rab->r", value, value, inverse[high - low, low]))
+
+
+# === Centre, width and the vehicle's offset along a line, in one least-squares problem.
+
 
 KNOT_M = 3.0  # [m] between knots; source: by hand, sensitivity 0.95, 1.02
 _MIN_KNOTS = 5  # source: third differences need four
 _BAND = 9  # source: a third difference spans four knots of three fields: 3 x 3
-_LENGTH_SUM_SIGMA_M = 1e-3  # [m] of one step of the summed length; source: a 30th of `even_spacing._LENGTH_SIGMA_M`
+_LENGTH_SUM_SIGMA_M = 1e-3  # [m] of one step of the summed length; source: a 30th of `observations._LENGTH_SIGMA_M`
 _MIN_VARIANCE_SHARE = 1e-9  # source: keeps the division by 1 - h finite
 
 
@@ -88,16 +189,16 @@ class Measurements:
     known_lengths : KnownLengths
     """
 
-    station_m: Floats
-    left_m: Floats
-    sigma_m: Floats
-    sign: Floats
-    fix_station_m: Floats
-    fix_left_m: Floats
-    fix_sigma_m: Floats
-    pair_station_m: Floats
-    pair_slope: Floats
-    pair_sigma: Floats
+    station_m: TypesFloats
+    left_m: TypesFloats
+    sigma_m: TypesFloats
+    sign: TypesFloats
+    fix_station_m: TypesFloats
+    fix_left_m: TypesFloats
+    fix_sigma_m: TypesFloats
+    pair_station_m: TypesFloats
+    pair_slope: TypesFloats
+    pair_sigma: TypesFloats
     known_lengths: KnownLengths = NO_KNOWN_LENGTHS
 
 
@@ -119,10 +220,10 @@ class LaneProblem:
         self.knot_m = (end_m - start_m) / (self.count - 1)
         self.start_m = start_m
         self.size = self.fields * self.count
-        self.station_m: Floats = start_m + self.knot_m * np.arange(self.count, dtype=np.float64)
+        self.station_m: TypesFloats = start_m + self.knot_m * np.arange(self.count, dtype=np.float64)
         self.measured = measured
-        self.data: Floats = np.zeros((_BAND + 1, self.size))
-        self.right: Floats = np.zeros(self.size)
+        self.data: TypesFloats = np.zeros((_BAND + 1, self.size))
+        self.right: TypesFloats = np.zeros(self.size)
         self.energy = 0.0
         self.marker_index, self.marker_value = self._rows(measured.station_m, [1.0, None], measured.sign / 2)
         self._add(self.marker_index, self.marker_value, measured.sigma_m, measured.left_m)
@@ -133,7 +234,9 @@ class LaneProblem:
         if self.fields == 3 and not self.tracked:
             self._add_known_lengths(line)
 
-    def _rows(self, station_m: Floats, parts: list[float | None], varying: Floats | None = None) -> tuple[Ints, Floats]:
+    def _rows(
+        self, station_m: TypesFloats, parts: list[float | None], varying: TypesFloats | None = None
+    ) -> tuple[TypesInts, TypesFloats]:
         """Sparse rows for a linear combination of the fields at stations.
 
         Parameters
@@ -153,7 +256,7 @@ class LaneProblem:
             value += [scale * (1 - share), scale * share]
         return np.stack(index, 1), np.stack(value, 1)
 
-    def _add(self, index: Ints, value: Floats, sigma: Floats, target: Floats) -> None:
+    def _add(self, index: TypesInts, value: TypesFloats, sigma: TypesFloats, target: TypesFloats) -> None:
         """Add measurements to the normal equations."""
         weight = sigma**-2.0
         self.data += gram(index, value, weight, self.size, _BAND)
@@ -171,7 +274,7 @@ class LaneProblem:
         index, value = self.slope_rows(self.measured.pair_station_m)
         self._add(index, value, self.measured.pair_sigma, self.measured.pair_slope)
 
-    def slope_rows(self, station_m: Floats) -> tuple[Ints, Floats]:
+    def slope_rows(self, station_m: TypesFloats) -> tuple[TypesInts, TypesFloats]:
         """Sparse rows for the slope of c at stations."""
         place = (station_m - self.start_m) / self.knot_m
         knot = np.clip(place.astype(np.int64), 0, self.count - 2)
@@ -225,14 +328,14 @@ class LaneProblem:
         self.right[3 * ends + 2] += weight * e.excess_m[apart]
         self.energy += float(np.sum(weight * e.excess_m[apart] ** 2))
 
-    def _squared_derivative(self, order: int, field: int) -> Floats:
+    def _squared_derivative(self, order: int, field: int) -> TypesFloats:
         """Integral of the squared derivative of a field."""
         own = difference_gram(order, self.count, order)
         spread = np.zeros((_BAND + 1, self.size))
         spread[: self.fields * order + 1 : self.fields, field :: self.fields] = own
         return spread * self.knot_m ** (1 - 2 * order)
 
-    def matrix(self, s: Hyperparameters) -> tuple[Floats, Floats, float]:
+    def matrix(self, s: Hyperparameters) -> tuple[TypesFloats, TypesFloats, float]:
         """Normal matrix, right-hand side, and the sum of squares at zero."""
         width = _width_weights(s)
         total = self.data + self.bend / s.bend**2
@@ -274,22 +377,22 @@ class LaneProblem:
 class LaneSolution:
     """A solved problem."""
 
-    def __init__(self, problem: LaneProblem, cholesky: Floats, x: Floats) -> None:
+    def __init__(self, problem: LaneProblem, cholesky: TypesFloats, x: TypesFloats) -> None:
         self.problem, self._cholesky, self._x = problem, cholesky, x
         self.centre_m = x[:: problem.fields]
         self.width_m = x[1 :: problem.fields]
 
     @cached_property
-    def _inverse(self) -> Floats:
+    def _inverse(self) -> TypesFloats:
         """Covariance of unknowns that are near each other."""
         return np.asarray(inverse_band(self._cholesky))
 
-    def residuals(self) -> Floats:
+    def residuals(self) -> TypesFloats:
         """Distance of each marker left of its boundary. [m]"""
         p = self.problem
         return p.measured.left_m - apply(p.marker_index, p.marker_value, self._x)
 
-    def residual_variance_shares(self) -> Floats:
+    def residual_variance_shares(self) -> TypesFloats:
         """1 - h of each marker, where its leverage h is the share of its own measurement in the prediction.
 
         Against the prediction of the other markers alone its residual is r / (1 - h), with the standard deviation
@@ -299,13 +402,13 @@ class LaneSolution:
         variance = variances(self._inverse, p.marker_index, p.marker_value)
         return np.maximum(1 - variance / p.measured.sigma_m**2, _MIN_VARIANCE_SHARE)
 
-    def slopes(self, station_m: Floats) -> tuple[Floats, Floats]:
+    def slopes(self, station_m: TypesFloats) -> tuple[TypesFloats, TypesFloats]:
         """Slope of the centre against the line at stations, and its standard deviation."""
         index, value = self.problem.slope_rows(station_m)
         variance = variances(self._inverse, index, value)
         return apply(index, value, self._x), np.sqrt(np.maximum(variance, 0.0))
 
-    def sigmas(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    def sigmas(self) -> tuple[TypesFloats, TypesFloats, TypesFloats, TypesFloats, TypesFloats]:
         """The knots, and standard deviations there of the centre, left boundary, right boundary and width. [m]"""
         p, inverse = self.problem, self._inverse
         cc, cw, ww = inverse[0, :: p.fields], inverse[1, :: p.fields], inverse[0, 1 :: p.fields]

@@ -2,10 +2,54 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import pymap3d
 import scipy
 
-from app.lanes.types import LEFT, RIGHT, Floats, Ints
+from app.geodesy.frames import WGS84_A_M, metres_per_radian
+from app.lanes.types import LEFT, RIGHT, UNKNOWN, Bools, Floats, Ints
+
+# === WGS 84 positions in a local plane, and back.
+
+
+def median_place(lon_deg: Floats, lat_deg: Floats) -> tuple[float, float]:
+    """Longitude and latitude of the coordinate-wise median of places, which a few outliers do not move. [deg]"""
+    x, y, z = pymap3d.geodetic2ecef(lat_deg, lon_deg, np.zeros_like(lon_deg))
+    lat, lon, _ = pymap3d.ecef2geodetic(float(np.median(x)), float(np.median(y)), float(np.median(z)))
+    return float(lon), float(lat)
+
+
+def plane_from_wgs84(lon_deg: Floats, lat_deg: Floats, origin: tuple[float, float]) -> Floats:
+    """East and north of places on the ellipsoid from an origin (lon_deg, lat_deg), shape (N, 2). [m]"""
+    east, north, _ = pymap3d.geodetic2enu(lat_deg, lon_deg, np.zeros_like(lon_deg), origin[1], origin[0], 0.0)
+    return np.stack([np.asarray(east, float), np.asarray(north, float)], 1)
+
+
+def wgs84_from_plane(position_m: Floats, origin: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Longitude and latitude of the places on the ellipsoid below points of the plane. [deg]"""
+    east, north = position_m[:, 0], position_m[:, 1]
+    up = -(east**2 + north**2) / (2 * WGS84_A_M)
+    for _ in range(8):
+        lat, lon, height = pymap3d.enu2geodetic(east, north, up, origin[1], origin[0], 0.0)
+        if not len(up) or np.abs(height).max() < 1e-3:
+            break
+        up = up - height
+    lon = (np.asarray(lon, float) + 180.0) % 360.0 - 180.0
+    return lon, np.asarray(lat, float)
+
+
+def headings_deg(lon_deg: Floats, lat_deg: Floats) -> Floats:
+    """Heading along ordered places, clockwise from true north at each, shape (N,). [deg]"""
+    lon = np.unwrap(lon_deg, period=360.0)
+    east_per_rad, north_per_rad = metres_per_radian(np.radians(lat_deg))
+    east, north = np.gradient(lon) * east_per_rad, np.gradient(lat_deg) * north_per_rad
+    return np.asarray(np.degrees(np.arctan2(east, north)) % 360.0)
+
+
+# === A smooth line in the plane, with positions along it (stations) and across it (left offsets).
+
 
 STEP_M = 1.0  # [m] between stations; source: the published path has a station each metre (docs/cerpms.md)
 _SEPARATE_LEG_M = 20.0  # [m] along the line between two legs; source: by hand, sensitivity 1.00, 1.00
@@ -123,3 +167,57 @@ def _boundary_error(left_m: Floats, side: Ints, half_width_m: float) -> Floats:
     """Distance of offsets from the boundary of the side, or from the nearer boundary where the side is unknown. [m]"""
     to_left, to_right = np.abs(left_m - half_width_m), np.abs(left_m + half_width_m)
     return np.where(side == LEFT, to_left, np.where(side == RIGHT, to_right, np.minimum(to_left, to_right)))
+
+
+# === The lane as the CERPM paper fits it: a cubic spline through the markers of each side, and midpoints.
+#
+# Source: Kadav et al., Sensors 2024, 24, 2327, section 2.2 (Data Processing) with equation 1. Every marker is used, and
+# every spline runs through all markers of its side; where markers are missing, the spline interpolates. The paper does
+# not define the order of markers: here it is their station along the track, or along the other markers.
+
+
+_HALF_WIDTH_M = 1.65  # [m] source: half of `LaneRules.usual_width_m`
+
+
+class SplineBoundaries(NamedTuple):
+    """Left and right boundary, shape (N, 2) each [m], and the side of each marker, shape (M,)."""
+
+    left_m: Floats
+    right_m: Floats
+    side: Ints
+
+
+def boundaries_by_splines(points_m: Floats, side: Ints, taken: Bools, line: SmoothLine) -> SplineBoundaries | None:
+    """Boundaries with equal numbers of points; None where a side has fewer than two markers.
+
+    Parameters
+    ----------
+    points_m : ndarray, shape (M, 2)
+        Markers in the plane. [m]
+    side : ndarray of int, shape (M,)
+        `LaneSide` as sent; where it is unknown, the side of the line on which the marker is.
+    taken : ndarray of bool, shape (M,)
+        Markers no two of which share a place.
+    line : SmoothLine
+        Along the lane, in the direction of travel.
+    """
+    station, left = line.project_markers(points_m, side, _HALF_WIDTH_M)
+    found = np.where(side != UNKNOWN, side, np.where(left > 0, LEFT, RIGHT))
+    chains = [_chain(points_m, station, taken & (found == which)) for which in (LEFT, RIGHT)]
+    if min(len(chain) for chain in chains) < 2:
+        return None
+    count = max(int(max(lengths_along(chain)[-1] for chain in chains) / STEP_M), 2) + 1
+    left_m, right_m = (_spline(chain, count) for chain in chains)
+    return SplineBoundaries(left_m, right_m, np.where(taken, found, UNKNOWN))
+
+
+def _chain(points_m: Floats, station_m: Floats, which: Bools) -> Floats:
+    """Some markers, by station."""
+    rows = np.flatnonzero(which)
+    return points_m[rows[np.argsort(station_m[rows], kind="stable")]]
+
+
+def _spline(chain_m: Floats, count: int) -> Floats:
+    """Equation 1 over the length of the chain, at even steps."""
+    along = lengths_along(chain_m)
+    return np.asarray(scipy.interpolate.CubicSpline(along, chain_m, axis=0)(np.linspace(0, along[-1], count)))

@@ -19,13 +19,117 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_EVEN, Decimal
 from enum import StrEnum
 from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import reedsolo
 
 from app.errors import CodeMismatch, InvalidParameter
 from app.geodesy import check_lon_lat
-from app.markers.reed_solomon import ReedSolomonWord, coset_mask
+
+# === Reed-Solomon words over GF(16) on the cells of a plate.
+#
+# Source: I.S. Reed and G. Solomon, "Polynomial codes over certain finite fields", J. SIAM 8 (1960), with the field x^4
+# + x + 1 and the roots alpha^0, alpha^1, ... A word holds at most 15 symbols, so that larger plates interleave two.
+
+
+Array = npt.NDArray[Any]
+
+FIELD = 0x13
+"""[1] x^4 + x + 1, the polynomial of the field. Source: the id scheme's first plates."""
+MAX_SYMBOLS = 15
+"""[symbols] of one word. Source: a Reed-Solomon word over GF(q) has q - 1 symbols at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReedSolomonWord:
+    """One word of a plate: where its symbols stand and how many are data.
+
+    Attributes
+    ----------
+    cells : tuple of int
+        Indices of the cells in reading order, data first.
+    digits : tuple of int
+        Places of its data among the hexadecimal digits of the plate's number; the other symbols are checks.
+    mask : tuple of int
+        XORed on the symbols, so that words of another scheme, and blank faces, are far from those of this one.
+    """
+
+    cells: tuple[int, ...]
+    digits: tuple[int, ...]
+    mask: tuple[int, ...]
+
+    @property
+    def data(self) -> int:
+        """Symbols of data."""
+        return len(self.digits)
+
+    @property
+    def checks(self) -> int:
+        """Check symbols: half as many wrong cells, or as many unreadable ones, can be corrected."""
+        return len(self.cells) - self.data
+
+    def encode(self, data: Sequence[int]) -> list[int]:
+        """Symbols of the word in the order of its cells, shape (cells,)."""
+        return [s ^ m for s, m in zip(_codec(self.checks).encode(list(data)), self.mask, strict=True)]
+
+    def decode(self, symbols: Sequence[int]) -> list[int]:
+        """Data of a plate's symbols, which must satisfy the checks, shape (data,)."""
+        return [symbols[cell] ^ mask for cell, mask in zip(self.cells[: self.data], self.mask, strict=False)]
+
+    def holds(self, symbols: Sequence[int]) -> bool:
+        """Whether a plate's symbols satisfy the checks of the word."""
+        word = [symbols[cell] ^ mask for cell, mask in zip(self.cells, self.mask, strict=True)]
+        return all(_codec(self.checks).check(word))
+
+    @property
+    def generator(self) -> Array:
+        """Generator matrix of the word without its mask, shape (data, cells)."""
+        return _generator(len(self.cells), self.data)
+
+
+def coset_mask(length: int, checks: int) -> tuple[int, ...]:
+    """A mask that no word of the code with `checks` check symbols comes near.
+
+    Notes
+    -----
+    It is the generator polynomial of the code with one check symbol less: a word of that code, and none of the code
+    itself. The difference of masked and plain words is then a nonzero word of the code with one check less, and differs
+    from zero in at least `checks` symbols, the distance of that code.
+    """
+    generator = [int(c) for c in _codec(checks - 1).encode([1])]
+    return (*[0] * (length - len(generator)), *generator)
+
+
+@lru_cache
+def _codec(checks: int) -> reedsolo.RSCodec:
+    return reedsolo.RSCodec(checks, nsize=MAX_SYMBOLS, c_exp=4, prim=FIELD)
+
+
+@lru_cache
+def _generator(length: int, data: int) -> Array:
+    rows = [list(_codec(length - data).encode([int(k == i) for k in range(data)])) for i in range(data)]
+    return np.array(rows, dtype=np.uint8)
+
+
+@lru_cache
+def gf16_products() -> Array:
+    """Products in the field, shape (16, 16)."""
+    table = np.zeros((16, 16), dtype=np.uint8)
+    power = 1
+    powers = []
+    for _ in range(15):
+        powers.append(power)
+        power = power << 1 ^ (FIELD if power & 8 else 0)
+    for i, a in enumerate(powers):
+        for k, b in enumerate(powers):
+            table[a, b] = powers[(i + k) % 15]
+    return table
+
+
+# === The coded plate.
+
 
 SIZES = (8, 10, 12)
 UNIT_MM = (20.0, 50.0)
@@ -445,3 +549,217 @@ def numbers(n: int, scheme: PlateScheme) -> int:
     if scheme is PlateScheme.ID:
         return int(16 ** _layout(n, scheme, 1).data)
     return int(10 ** sum(position_decimals(n, scheme)))
+
+
+# === Full coordinates of a position plate, whose code holds the decimals only, and the schemes that digits may have.
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedPosition:
+    """A position plate's full coordinates.
+
+    Attributes
+    ----------
+    lon_deg, lat_deg : float
+        The candidate nearest to the coarse position. [deg]
+    distance_deg : float
+        How far it is from the coarse position, per axis at most. [deg]
+    next_distance_deg : float
+        How far the second candidate is on the axis where the two are closest. [deg]
+    """
+
+    lon_deg: float
+    lat_deg: float
+    distance_deg: float
+    next_distance_deg: float
+
+
+def resolve_position(code: PlateCode, coarse_lon_deg: float, coarse_lat_deg: float) -> ResolvedPosition:
+    """Complete a position plate's decimals with the integer degrees and sign from a coarse position.
+
+    Notes
+    -----
+    The decimals are those of the magnitude, and rounding may have carried into the integer, so the neighbouring
+    integers of both signs are tried and the nearest is taken; longitude wraps at the antimeridian.
+    """
+    check_lon_lat(coarse_lon_deg, coarse_lat_deg, field="coarse_position")
+    lon_decimals, lat_decimals = code.decimals
+    lon, lon_d, lon_next = _nearest_degree(lon_decimals, coarse_lon_deg, 180.0, wraps=True)
+    lat, lat_d, lat_next = _nearest_degree(lat_decimals, coarse_lat_deg, 90.0, wraps=False)
+    return ResolvedPosition(lon, lat, max(lon_d, lat_d), min(lon_next, lat_next))
+
+
+def _nearest_degree(decimals: str, coarse_deg: float, bound: float, *, wraps: bool) -> tuple[float, float, float]:
+    whole = int(abs(coarse_deg))
+    candidates: dict[float, float] = {}
+    for integer in range(max(whole - 1, 0), whole + 2):
+        for sign in (1.0, -1.0):
+            value = sign * float(f"{integer}.{decimals}")
+            if abs(value) > bound:
+                continue
+            if wraps and value == -bound:
+                value = bound
+            difference = abs(value - coarse_deg)
+            candidates[value + 0.0] = min(difference, 360.0 - difference) if wraps else difference
+    ranked = sorted(candidates.items(), key=lambda item: item[1])
+    return ranked[0][0], ranked[0][1], ranked[1][1] if len(ranked) > 1 else float("inf")
+
+
+def decimal_codes(symbols: Sequence[int], n: int = 8) -> tuple[PlateCode, ...]:
+    """Codes of the schemes without Reed-Solomon checks that show these symbols, the one with fewest check digits first.
+
+    The plate does not say which it is: one check digit holds by accident for one plain position in ten, two for one in
+    a hundred.
+    """
+    kinds = ((PlateScheme.POSITION, 1), (PlateScheme.POSITION_CHECK, 1), (PlateScheme.POSITION_CHECK, 2))
+    return tuple(
+        PlateCode.from_symbols(symbols, scheme, n, checks)
+        for scheme, checks in kinds
+        if is_codeword(symbols, scheme, n, checks)
+    )
+
+
+# === Digits of many plates in one call, the same as `PlateCode` makes one by one: for imports of a million.
+
+
+Digits = npt.NDArray[np.bytes_]
+_NEAR_TIE = 0.02
+_ASCII = np.frombuffer(b"0123456789ABCDEF", dtype=np.uint8)
+
+
+def position_digits(
+    lon_deg: npt.NDArray[np.float64],
+    lat_deg: npt.NDArray[np.float64],
+    *,
+    n: int = 8,
+    scheme: PlateScheme = PlateScheme.POSITION,
+    check_digits: int = 0,
+) -> Digits:
+    """Digits of position plates, each as `PlateCode.from_position` gives them, shape (N,).
+
+    Notes
+    -----
+    A coordinate whose next decimal is near 5 goes through exact decimal arithmetic; all others round alike in both.
+    """
+    if scheme is PlateScheme.POSITION_CHECK:
+        check_digits = check_digits or 1
+    places = position_decimals(n, scheme, check_digits)
+    lon, lon_exact = _decimals_of_many(lon_deg, places[0])
+    lat, lat_exact = _decimals_of_many(lat_deg, places[1])
+    if scheme.corrects:
+        symbols = _encoded(lon * np.uint64(10 ** places[1]) + lat, n, scheme)
+    else:
+        symbols = _decimal_symbols(lon, lat, places, check_digits, len(code_cells(n)))
+    digits = _joined(symbols)
+    for k in np.flatnonzero(lon_exact | lat_exact).tolist():
+        code = PlateCode.from_position(
+            float(lon_deg[k]), float(lat_deg[k]), n=n, scheme=scheme, check_digits=check_digits
+        )
+        digits[k] = code.digits.encode()
+    return digits
+
+
+def _decimals_of_many(
+    degrees: npt.NDArray[np.float64], places: int
+) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
+    """Decimals of |degrees| as numbers, and which of them need exact arithmetic."""
+    scaled = np.abs(degrees) * 10.0**places
+    decimals = np.rint(scaled).astype(np.uint64) % np.uint64(10**places)
+    return decimals, np.abs(scaled - np.floor(scaled) - 0.5) < _NEAR_TIE
+
+
+def _decimal_symbols(
+    lon: npt.NDArray[np.uint64], lat: npt.NDArray[np.uint64], places: tuple[int, int], check_digits: int, cells: int
+) -> npt.NDArray[np.uint8]:
+    symbols = np.zeros((len(lon), cells), dtype=np.uint8)
+    start = 0
+    for decimals, count in zip((lon, lat), places, strict=True):
+        symbols[:, start : start + count] = _decimal_digits(decimals, count)
+        start += count
+    total: npt.NDArray[np.uint64] = symbols.sum(axis=1, dtype=np.uint64)
+    symbols[:, start : start + check_digits] = _decimal_digits(total, check_digits)
+    return symbols
+
+
+def _decimal_digits(numbers: npt.NDArray[np.uint64], count: int) -> npt.NDArray[np.uint8]:
+    powers = 10 ** np.arange(count, dtype=np.uint64)[::-1]
+    return (numbers[:, None] // powers % np.uint64(10)).astype(np.uint8)
+
+
+def id_digits(numbers: npt.NDArray[np.uint64], *, n: int = 8) -> Digits:
+    """Digits of id plates, each as `PlateCode.from_registry_number` gives them, shape (N,); every number fits."""
+    return _joined(_encoded(numbers, n, PlateScheme.ID))
+
+
+def registry_number_bits(n: int) -> int:
+    """Bits of the number that an id plate carries."""
+    return round(plate_capacity(n, PlateScheme.ID).bits)
+
+
+def _encoded(numbers: npt.NDArray[np.uint64], n: int, scheme: PlateScheme) -> npt.NDArray[np.uint8]:
+    """Symbols of numbers in a scheme with Reed-Solomon words, shape (N, cells)."""
+    zero, table = _linear(n, scheme)
+    symbols = np.repeat(zero[None], len(numbers), axis=0)
+    for k, changes in enumerate(table):
+        nibble = (numbers >> np.uint64(4 * (len(table) - 1 - k))).astype(np.uint8) & 0xF
+        symbols ^= changes[nibble]
+    return symbols
+
+
+@lru_cache
+def _linear(n: int, scheme: PlateScheme) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """Codeword of zero, and what each value of each hexadecimal digit changes in it: the code is linear but for it."""
+    count = plate_capacity(n, scheme).data_symbols
+    zero = np.array(encode_number(0, n, scheme), dtype=np.uint8)
+    words = [[encode_number(value << 4 * (count - 1 - k), n, scheme) for value in range(16)] for k in range(count)]
+    return zero, np.array(words, dtype=np.uint8) ^ zero
+
+
+def _joined(symbols: npt.NDArray[np.uint8]) -> Digits:
+    return np.ascontiguousarray(_ASCII[symbols]).view(f"S{symbols.shape[1]}").ravel()
+
+
+# === The plates that are recommended: one size on the road, 325 mm, and checks that survive dirt.
+
+
+RECOMMENDED_SCHEME: Final = PlateScheme.ID
+"""Of a plate that the registry knows. Source: docs/decisions/0008-plate-codes.md."""
+RECOMMENDED_POSITION_SCHEME: Final = PlateScheme.POSITION_ROBUST
+"""Of a plate that must carry its position itself. Source: the same."""
+ROBUST_GEOMETRY = PlateGeometry(n=10, unit_mm=27.0, gap_mm=5.0)
+"""325 mm, as the paper's 8 x 8 units of 35 mm. Source: the same."""
+EXPECTED_GEOMETRIES = (PlateGeometry(8), ROBUST_GEOMETRY, PlateGeometry(12))
+"""Of plates that no registry names. Source: the recommended ones, and 12 x 12 units of 35 mm."""
+
+
+def recommended_geometry(
+    scheme: PlateScheme,
+    *,
+    n: int | None = None,
+    unit_mm: float | None = None,
+    gap_mm: float = 5.0,
+    thickness_mm: float = 20.0,
+) -> PlateGeometry:
+    """Dimensions of a plate of a scheme, where some of them are chosen.
+
+    Parameters
+    ----------
+    scheme : PlateScheme
+    n : int, optional
+        Units along a side; without, 10 for ``position-robust`` and 8 for the others.
+    unit_mm : float, optional
+        Side of a unit; without, 27 for ``position-robust`` on 10 x 10 and 35 for the others. [mm]
+    gap_mm, thickness_mm : float
+        [mm]
+
+    Raises
+    ------
+    InvalidParameter
+        A dimension is outside the limits, or the scheme does not exist on this size.
+    """
+    usual = ROBUST_GEOMETRY if scheme is PlateScheme.POSITION_ROBUST else PlateGeometry()
+    n = usual.n if n is None else n
+    check_size(n, scheme)
+    if unit_mm is None:
+        unit_mm = usual.unit_mm if n == usual.n else PlateGeometry().unit_mm
+    return PlateGeometry(n, unit_mm, gap_mm, thickness_mm)

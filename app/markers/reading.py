@@ -1,15 +1,126 @@
-"""Outcomes of reading a marker."""
+"""Outcomes of reading a marker, with status, checks and localization warnings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
+from app.geodesy import UNFIT_TEXT, LocalizationGrade
 from app.markers.plate import PlateCode, PlateGeometry
+
+# === Status of a marker: from the plan to the end of its use.
+
+
+Status = Literal["planned", "built", "surveyed", "active", "suspect", "retired"]
+STATUSES: tuple[Status, ...] = get_args(Status)
+
+
+# === Reasons why a marker's position is unfit for localization.
+
+
+SURVEYED = ("surveyed", "active")
+
+
+def position_warnings(what: str, *, grade: str, transform_note: str | None, status: str) -> list[str]:
+    """Warnings about the position of a marker; none if it is fit for localization.
+
+    Parameters
+    ----------
+    what : str
+        What the marker is called: plate, tag.
+    grade : str
+        A `LocalizationGrade`.
+    transform_note : str or None
+        Note on the transformation of its position.
+    status : str
+    """
+    localization_warnings = []
+    if grade == LocalizationGrade.UNFIT:
+        localization_warnings.append(transform_note or f"the {what}'s position is {UNFIT_TEXT}")
+    if status not in SURVEYED:
+        localization_warnings.append(f"the {what} is {status}, its position is not surveyed")
+    return localization_warnings
+
+
+# === The result of one design check: its figure, the limit and the limit's source.
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedFigure:
+    """A figure beside its limit.
+
+    Attributes
+    ----------
+    name : str
+        Which check, e.g. ``magnet-spacing`` or ``dwell-time``.
+    figure : float
+        What the layout or the plan has, in `unit`.
+    relation : ">=" or "<="
+        How the figure must compare with the limit.
+    limit : float
+    unit : str
+    source : str
+        Where the limit comes from.
+    """
+
+    name: str
+    figure: float
+    relation: Literal[">=", "<="]
+    limit: float
+    unit: str
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Check(ComparedFigure):
+    """One check of a magnet layout; `note` describes the figure for people."""
+
+    passed: bool
+    note: str
+
+
+class Verdict(StrEnum):
+    """How a check ended."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
+
+
+@dataclass(frozen=True, slots=True)
+class RadioFinding(ComparedFigure):
+    """One check of a radio plan, which may end between passed and failed; `sentence` gives the result for people."""
+
+    verdict: Verdict
+    sentence: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is wrong."""
+        return self.verdict is Verdict.OK
+
+
+def at_most(
+    name: str, figure: float, limit: float, unit: str, source: str, sentence: str, *, worst: Verdict = Verdict.FAIL
+) -> RadioFinding:
+    """A finding that is well where the figure is no more than the limit, else `worst`."""
+    met = figure <= limit * (1 + 1e-9)
+    return RadioFinding(name, figure, "<=", limit, unit, source, Verdict.OK if met else worst, sentence)
+
+
+def at_least(
+    name: str, figure: float, limit: float, unit: str, source: str, sentence: str, *, worst: Verdict = Verdict.FAIL
+) -> RadioFinding:
+    """A finding that is well where the figure is no less than the limit, else `worst`."""
+    met = figure >= limit - 1e-9 * abs(limit)
+    return RadioFinding(name, figure, ">=", limit, unit, source, Verdict.OK if met else worst, sentence)
+
+
+# === Outcomes of reading a marker.
 
 
 class PlateOutcome(StrEnum):

@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
-from app.planning.alignment import Alignment, AvoidedArea, Lane
-from app.planning.alignment_declaration import AlignmentDeclaration
-from app.planning.road.checks import (
+from app.planning.alignment import Alignment, AlignmentDeclaration, AvoidedArea, Lane
+from app.planning.road.events import find_events
+from app.planning.road.ground_line import DenseLine, GroundLine, densify, make_ground_line
+from app.planning.road.lanes import (
     check_curvature,
     check_length,
     check_line,
@@ -22,10 +23,8 @@ from app.planning.road.checks import (
     check_speed,
     clear_width,
     lane_errors,
+    make_lane,
 )
-from app.planning.road.events import find_events
-from app.planning.road.ground_line import DenseLine, GroundLine, densify, make_ground_line
-from app.planning.road.lanes import make_lane
 from app.planning.road.reference import PlacedRoad, RoadReference, find_reference
 from app.planning.rules import RoadRules
 
@@ -83,7 +82,7 @@ def build_alignment(
     Notes
     -----
     Chainages are distances on the ellipsoid. Where the file defines curvature, samples lie within 1 mm of its curves;
-    polylines are kept, and their directions and curvatures are estimated (`app.planning.road.direction`).
+    polylines are kept, and their directions and curvatures are estimated (`app.planning.road.ground_line`).
     """
     rules, declaration = rules or RoadRules(), declaration or AlignmentDeclaration()
     geometries = _chosen(file, rules)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from app.errors import InvalidParameter
 from app.lanes.cross_sections import CrossSections, cut_lane
-from app.lanes.marker_place import MarkerPlace
+from app.lanes.types import MarkerPlace
 from app.markers.cerpm import LaneSide
 
 Floats = npt.NDArray[np.float64]
@@ -58,7 +58,7 @@ def place_markers(
     -----
     The spacing follows the US practice for raised markers: N = 40 ft, the cycle of a broken line, and in sharp curves
     half of what the straight has (MUTCD 2009, sections 3B.11 to 3B.14, 3B.14 to 3B.17 in the edition of 2023).
-    Only plans of whole roads (`app.planning.placement.cerpms`) are closer on transitions too.
+    Only plans of whole roads (`app.planning.placement.place`) are closer on transitions too.
     Pairs stand across from each other as in the paper's section 3.2 (Kadav et al., Sensors 2024, 24, 2327).
     """
     lane = cut_lane(left_m, right_m)

@@ -1,22 +1,61 @@
-"""What is checked before a layout is drilled: each check with its figure, its limit and where the limit comes from."""
+"""What is checked before a layout is drilled, with figures, limits and their sources; costs and drilling sheet."""
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from importlib import resources
 
 import numpy as np
 import scipy
 
-from app.encoders.magnet.layout import MagnetLayout
+from app.encoders.magnet.layout import PAINT, Bill, CostRow, DrillingSheet, MagnetLayout, UnitCost
 from app.errors import InvalidParameter
 from app.geodesy import check_lon_lat
-from app.markers.checks import Check
 from app.markers.magnet import MAX_LINE_SPACING_M, MIN_GAP_M, InformationTag, LineTag, Orientation
-from app.markers.magnet_codebook import check_name
-from app.planning.paper_figures import read_figures
+from app.markers.magnet_design import check_name
+from app.markers.reading import Check
+
+# === Tables of figures that the papers give.
+
+
+def read_figures(name: str) -> list[dict[str, str]]:
+    """Lines of a table in `data`, by column."""
+    text = (resources.files("app.planning") / "data" / name).read_text("utf-8")
+    return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+
+
+# === Bill of materials of a layout, compared with what else could mark the road.
+
+
+_MAGNET = "magnet with shell"
+_RFID = "rugged RFID tag"
+
+
+@lru_cache(maxsize=1)
+def unit_costs() -> dict[str, UnitCost]:
+    """Unit costs that the METRO paper gives, by item (section 8.1 and table 2)."""
+    costs = (
+        UnitCost(cost["item"], cost["unit"], float(cost["low"]), float(cost["high"]), cost["source"])
+        for cost in read_figures("costs.csv")
+    )
+    return {cost.item: cost for cost in costs}
+
+
+def bill_of_materials(layout: MagnetLayout) -> Bill:
+    """What a layout costs in materials, beside paint of the same length."""
+    costs = unit_costs()
+    alternatives = [CostRow(costs[PAINT], round(layout.length_m, 2))]
+    if isinstance(layout.tag, InformationTag):
+        alternatives.append(CostRow(costs[_RFID], 1))
+    return Bill((CostRow(costs[_MAGNET], len(layout.holes)),), tuple(alternatives))
+
+
+# === What is checked before a layout is drilled: each check with its figure, its limit and where the limit comes from.
+
 
 READABLE_CLEARANCE_M = 0.30
 """Clearance up to which tags are read. [m] Source: METRO section 7.3."""
@@ -234,3 +273,11 @@ def _neighbours(layout: MagnetLayout, neighbours: Sequence[Neighbour]) -> list[C
         _at_least(limits[alike][0], distance, limits[alike][1], "m", limits[alike][2], f"nearest is {name}")
         for alike, (distance, name) in sorted(nearest.items(), reverse=True)
     ]
+
+
+# === A layout with its checks and its bill of materials: what the writers of drilling sheets take.
+
+
+def drilling_sheet(layout: MagnetLayout, site: Site | None = None) -> DrillingSheet:
+    """Check a layout and count its materials."""
+    return DrillingSheet(layout, check_layout(layout, site or Site()), bill_of_materials(layout))

@@ -1,21 +1,94 @@
-"""A plan: the markers placed on an alignment by rules, and the findings of its checks."""
+"""A plan: the markers placed on an alignment by rules, the findings of its checks, its markers as built, its costs."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from pyproj import Geod
 
 from app.formats.alignments.geometry import BoundaryStyle
 from app.markers.cerpm import LaneSide, SpeedLimit
-from app.markers.checks import ComparedFigure, Verdict
 from app.markers.magnet import InformationTag, LineTag
-from app.markers.magnet_codebook import Codebook, Meaning
+from app.markers.magnet_design import Codebook, Meaning
 from app.markers.plate import PlateCode, PlateGeometry
+from app.markers.reading import ComparedFigure, Verdict
 from app.planning.alignment import Alignment, RoadEvent
-from app.planning.rules import PlanRules
-from app.planning.trade_off import Optimum
+from app.planning.rules import PlanRules, Quality
 from app.radio.settings import RadioSettings
+
+# === Cost against quality: a table of requirements, with what they cost and what even spacing costs.
+
+
+@dataclass(frozen=True, slots=True)
+class TradeOffPoint:
+    """One requirement and the cheapest plan found for it.
+
+    Attributes
+    ----------
+    fix_every_m : float
+        [m]
+    path_error_m : float or None
+        Greatest path error; None where none is required. [m]
+    cost : float
+        Of the whole plan, in the currency of the rules.
+    bound : float
+        No plan that has the same pairs along the path is cheaper.
+    even_cost : float or None
+        With even spacing at equal quality; None where no even spacing has it.
+    counts : tuple of (str, int)
+        Markers by family.
+    """
+
+    fix_every_m: float
+    path_error_m: float | None
+    cost: float
+    bound: float
+    even_cost: float | None
+    counts: tuple[tuple[str, int], ...]
+
+    def is_better(self, other: TradeOffPoint) -> bool:
+        """Whether it is at least as good in all and better in one of cost, fixes and path error."""
+        mine, others = (self._figures(), other._figures())
+        return all(a <= b for a, b in zip(mine, others, strict=True)) and mine != others
+
+    def _figures(self) -> tuple[float, float, float]:
+        return self.cost, self.fix_every_m, self.path_error_m or 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Optimum:
+    """How a plan was optimised.
+
+    Attributes
+    ----------
+    quality : Quality
+        As required; `fix_every_m` is the best that the budget buys, where there is one.
+    cost : float
+        Of the whole plan, in the currency of the rules; working days are not rounded, and there is one more.
+    bound : float
+        No plan with the same pairs along the path and the same markers ahead of events is cheaper.
+    table : tuple of TradeOffPoint
+        The required quality first.
+    """
+
+    quality: Quality
+    cost: float
+    bound: float
+    table: tuple[TradeOffPoint, ...]
+
+
+def pareto_points(points: Sequence[TradeOffPoint]) -> tuple[TradeOffPoint, ...]:
+    """Points that no other point is better than, by cost."""
+    best = [point for point in points if not any(other.is_better(point) for other in points)]
+    return tuple(sorted(best, key=lambda point: point.cost))
+
+
+# === A plan: the markers placed on an alignment by rules, and the findings of its checks.
 
 
 class Purpose(StrEnum):
@@ -188,3 +261,93 @@ class Plan:
     def counts(self) -> dict[str, int]:
         """Markers by family."""
         return dict(sorted(Counter(marker.family for marker in self.markers).items()))
+
+
+# === A plan with its markers where they were surveyed, to check it again.
+
+
+_OFFSET_STEP_M = 0.01  # [m] of a plate's offset, because cameras are computed for each offset; source: a survey's error
+_GEOD = Geod(ellps="WGS84")
+
+
+class SurveyedPlace(NamedTuple):
+    """Where a marker of a plan was surveyed; `heading_deg` is None where it was not."""
+
+    lon_deg: float
+    lat_deg: float
+    heading_deg: float | None = None
+
+
+class Residual(NamedTuple):
+    """A surveyed marker against its planned place. [m, deg]
+
+    Attributes
+    ----------
+    along_m : float
+        Ahead of its planned place in the direction of travel.
+    across_m : float
+        To the left of it.
+    heading_deg : float or None
+        Clockwise of the planned heading, -180 to 180.
+    """
+
+    along_m: float
+    across_m: float
+    heading_deg: float | None
+
+
+def residual_of(marker: PlannedMarker, surveyed: SurveyedPlace) -> Residual:
+    """Residual of a surveyed marker along and across the direction of travel."""
+    azimuth, _, distance = _GEOD.inv(marker.lon_deg, marker.lat_deg, surveyed.lon_deg, surveyed.lat_deg)
+    angle = np.radians(azimuth - marker.heading_deg)
+    turned = None
+    if surveyed.heading_deg is not None:
+        turned = (surveyed.heading_deg - marker.heading_deg + 180.0) % 360.0 - 180.0
+    return Residual(float(distance * np.cos(angle)), float(-distance * np.sin(angle)), turned)
+
+
+def plan_as_built(plan: Plan, surveyed: Mapping[int, SurveyedPlace]) -> Plan:
+    """The plan with surveyed positions in place of planned ones, without findings.
+
+    Parameters
+    ----------
+    plan : Plan
+    surveyed : mapping of int to SurveyedPlace
+        By the markers' numbers; markers that are not in it stay where they are planned.
+
+    Notes
+    -----
+    Chainage and offset change by the residual along and across. The magnets of a tag move with the first one. A line of
+    magnets has no single place that could be surveyed, so its magnets stay.
+    """
+    markers = [
+        _moved(plan, marker, surveyed[marker.number])
+        if marker.number in surveyed and not isinstance(marker.detail, PlannedLineMagnet)
+        else marker
+        for marker in plan.markers
+    ]
+    return replace(plan, markers=tuple(markers), findings=())
+
+
+def _moved(plan: Plan, marker: PlannedMarker, surveyed: SurveyedPlace) -> PlannedMarker:
+    lane = plan.alignment.lane(marker.lane)
+    residual = residual_of(marker, surveyed)
+    offset_m = marker.offset_m + residual.across_m
+    detail = marker.detail
+    if isinstance(detail, PlannedPlate):
+        offset_m = round(offset_m / _OFFSET_STEP_M) * _OFFSET_STEP_M
+    if isinstance(detail, PlannedTag):
+        chainages = np.array([chainage for chainage, _, _ in detail.magnets]) + residual.along_m
+        lon, lat = lane.position_at(chainages, offset_m)
+        detail = replace(detail, magnets=tuple(zip(chainages.tolist(), lon.tolist(), lat.tolist(), strict=True)))
+    chainage = min(max(marker.chainage_m + residual.along_m, 0.0), lane.length_m)
+    return replace(
+        marker,
+        lon_deg=surveyed.lon_deg,
+        lat_deg=surveyed.lat_deg,
+        heading_deg=marker.heading_deg if surveyed.heading_deg is None else surveyed.heading_deg,
+        chainage_m=chainage,
+        station_m=float(lane.value_at(lane.station_m, chainage)),
+        offset_m=offset_m,
+        detail=detail,
+    )

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from app.markers.magnet_codebook import Codebook
+from app.markers.magnet_design import Codebook
 from app.planning.alignment import Alignment
-from app.planning.optimise.models import optimise_by_prediction
+from app.planning.optimise.plan import optimise_by_prediction
 from app.planning.placement import place_plan
-from app.planning.placement.codes import NumberSource
-from app.planning.plan import Plan
+from app.planning.placement.place import NumberSource
+from app.planning.plan import Optimum, Plan
 from app.planning.plan_checks import ExistingMarker, check_plan
 from app.planning.rules import PlanRules
-from app.planning.trade_off import Optimum
 
 
 def make_plan(

@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from app.markers.checks import RadioFinding, Verdict, at_least, at_most
-from app.radio.lorawan import Region
-from app.radio.settings import CONTINUOUS_POWER_DBM, FULL_POWER_DUTY_CYCLE, RadioSettings
+from app.markers.reading import RadioFinding, Verdict, at_least, at_most
+from app.radio.settings import CONTINUOUS_POWER_DBM, FULL_POWER_DUTY_CYCLE, RadioSettings, Region
 
 US_BAND_HZ = (902_000_000, 928_000_000)  # [Hz] source: 47 CFR 15.247(a)
 DWELL_S = 0.4  # [s] source: 47 CFR 15.247(a)(1)(i)

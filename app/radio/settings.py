@@ -2,19 +2,167 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from enum import StrEnum
 
 from app.errors import InvalidParameter
 from app.markers.cerpm import MESSAGE_BYTES
-from app.radio.airtime import (
-    CODING_RATES,
-    PREAMBLE_SYMBOLS,
-    check_between,
-    check_modulation,
-    check_whole,
-    time_on_air_s,
-)
-from app.radio.lorawan import LORAWAN_BYTES
+
+# === Time on air of LoRa packets.
+
+
+SPREADING_FACTORS = (6, 7, 8, 9, 10, 11, 12)  # 6 only without a header; source: SX1276 data sheet, 4.1.1.2
+BANDWIDTHS_HZ = (125_000, 250_000, 500_000)  # [Hz] source: SX1276 data sheet, table 10, sensitivities near 900 MHz
+CODING_RATES = (5, 6, 7, 8)  # bits sent for four of data; source: SX1276 data sheet, 4.1.1.3
+MAX_PAYLOAD_BYTES = 255  # [bytes] source: one byte of length in the header
+PREAMBLE_SYMBOLS = (6, 65535)  # shortest and longest; source: SX1276 data sheet, 4.1.1.6
+LONG_SYMBOL_S = 0.016  # [s] longer symbols need the low data rate optimisation; source: SX1276 data sheet, 4.1.1.6
+_SYNC_SYMBOLS = 4.25  # that the radio adds to the preamble; source: SX1276 data sheet, 4.1.1.7
+
+
+def time_on_air_s(
+    payload_bytes: int,
+    spreading_factor: int,
+    bandwidth_hz: int,
+    *,
+    coding_rate: int = 5,
+    preamble_symbols: int = 8,
+    crc: bool = True,
+    explicit_header: bool = True,
+    low_data_rate: bool | None = None,
+) -> float:
+    """Time on air of one packet.
+
+    Parameters
+    ----------
+    payload_bytes : int
+        All bytes that the radio sends, 0 to 255; with LoRaWAN its 13 bytes too. [bytes]
+    spreading_factor : int
+        6 to 12; 6 needs `explicit_header` false.
+    bandwidth_hz : int
+        125,000, 250,000 or 500,000. [Hz]
+    coding_rate : int
+        Bits sent for four of data, 5 to 8: 5 is 4/5.
+    preamble_symbols : int
+        As programmed, 6 to 65,535; the radio adds 4.25.
+    crc, explicit_header : bool
+    low_data_rate : bool, optional
+        Low data rate optimisation; by default where a symbol lasts over 16 ms.
+
+    Returns
+    -------
+    float
+        [s]
+
+    Raises
+    ------
+    InvalidParameter
+        A value is outside its limits.
+
+    Notes
+    -----
+    Semtech SX1276/77/78/79 data sheet, revision 7, section 4.1.1.7.
+    """
+    check_modulation(spreading_factor, bandwidth_hz, explicit_header=explicit_header)
+    check_whole("payload_bytes", payload_bytes, 0, MAX_PAYLOAD_BYTES, "bytes")
+    check_whole("coding_rate", coding_rate, CODING_RATES[0], CODING_RATES[-1], "bits for four of data")
+    check_whole("preamble_symbols", preamble_symbols, *PREAMBLE_SYMBOLS, "symbols")
+    symbol_s = symbol_time_s(spreading_factor, bandwidth_hz)
+    optimised = symbol_s > LONG_SYMBOL_S if low_data_rate is None else low_data_rate
+    bits = 8 * payload_bytes - 4 * spreading_factor + 28 + 16 * crc - 20 * (not explicit_header)
+    blocks = math.ceil(bits / (4 * (spreading_factor - 2 * optimised)))
+    payload_symbols = 8 + max(blocks * coding_rate, 0)
+    return (preamble_symbols + _SYNC_SYMBOLS + payload_symbols) * symbol_s
+
+
+def symbol_time_s(spreading_factor: int, bandwidth_hz: int) -> float:
+    """Duration of one symbol. [s]"""
+    return float(2**spreading_factor / bandwidth_hz)
+
+
+def check_modulation(spreading_factor: int, bandwidth_hz: int, *, explicit_header: bool = True) -> None:
+    """Raises InvalidParameter if the radio does not have the spreading factor or the bandwidth."""
+    check_whole("spreading_factor", spreading_factor, SPREADING_FACTORS[0], SPREADING_FACTORS[-1], "")
+    if bandwidth_hz not in BANDWIDTHS_HZ:
+        raise InvalidParameter(
+            f"bandwidth_hz is {bandwidth_hz}",
+            field="bandwidth_hz",
+            limit=", ".join(f"{hz:d}" for hz in BANDWIDTHS_HZ) + " Hz",
+            cure="give the bandwidth in hertz",
+        )
+    if spreading_factor == SPREADING_FACTORS[0] and explicit_header:
+        raise InvalidParameter(
+            "spreading factor 6 has no room for a header",
+            field="spreading_factor",
+            limit="7 to 12 with a header",
+            cure="leave the header out, which fixes the length of packets, or use 7",
+        )
+
+
+def check_whole(name: str, value: float, low: int, high: int, unit: str) -> None:
+    """Raises InvalidParameter if a value is not a whole number within limits."""
+    if not low <= value <= high or value != int(value):
+        raise InvalidParameter(
+            f"{name} is {value:g}", field=name, limit=f"a whole number from {low} to {high} {unit}".rstrip()
+        )
+
+
+def check_between(name: str, value: float, low: float, high: float, unit: str) -> None:
+    """Raises InvalidParameter if a value is outside its limits or NaN."""
+    if not low <= value <= high:
+        raise InvalidParameter(
+            f"{name} is {value:g} {unit}".rstrip(), field=name, limit=f"{low:g} to {high:g} {unit}".rstrip()
+        )
+
+
+# === CERPM messages as LoRaWAN application payload: overhead, and data rates with enough room.
+
+
+F_PORT = 24  # of CERPM messages, by hand; 1 to 223 are the application's; source: LoRaWAN 1.0.4, section 4.3.2
+LORAWAN_BYTES = 13  # [bytes] MHDR 1, DevAddr 4, FCtrl 1, FCnt 2, FPort 1, MIC 4; source: LoRaWAN 1.0.4, section 4
+
+
+class Region(StrEnum):
+    """Region of a marker: determines the regulation and the channels of its radio."""
+
+    US915 = "US915"
+    EU868 = "EU868"
+
+
+@dataclass(frozen=True, slots=True)
+class DataRate:
+    """A LoRa uplink data rate: its modulation, and the longest application payload without MAC commands."""
+
+    spreading_factor: int
+    bandwidth_hz: int
+    payload_bytes: int
+
+
+DATA_RATES: dict[Region, tuple[DataRate, ...]] = {
+    Region.US915: (
+        DataRate(10, 125_000, 11),
+        DataRate(9, 125_000, 53),
+        DataRate(8, 125_000, 125),
+        DataRate(7, 125_000, 242),
+        DataRate(8, 500_000, 242),
+    ),
+    Region.EU868: (
+        DataRate(12, 125_000, 51),
+        DataRate(11, 125_000, 51),
+        DataRate(10, 125_000, 51),
+        DataRate(9, 125_000, 115),
+        DataRate(8, 125_000, 242),
+        DataRate(7, 125_000, 242),
+        DataRate(7, 250_000, 242),
+    ),
+}
+"""LoRa uplink data rates by number, without repeaters. LoRaWAN Regional Parameters 1.0.3 revision A, sections 2.2 and
+2.3 (the same in RP002-1.0.4)."""
+
+
+# === Settings of a marker's radio.
+
 
 FREQUENCIES_HZ = (779_000_000, 1_020_000_000)  # [Hz] source: SX1276 data sheet, its highest band
 POWER_DBM = (-4.0, 20.0)  # [dBm] source: SX1276 data sheet, section 5.4, both outputs
@@ -134,3 +282,69 @@ class RadioSettings:
     def eirp_dbm(self) -> float:
         """Radiated power, relative to an isotropic antenna. [dBm]"""
         return self.power_dbm + self.antenna_gain_dbi
+
+
+# === Battery life of a marker.
+
+
+CAPACITY_MAH = 1000.0  # [mAh] at 3.7 V; source: CERPM paper, section 2.2
+_TRANSMIT_MA = ((7.0, 20.0), (13.0, 29.0), (17.0, 87.0), (20.0, 120.0))  # [dBm, mA] source: SX1276 data sheet, table 6
+
+
+@dataclass(frozen=True, slots=True)
+class Battery:
+    """A marker's battery and its loads.
+
+    Parameters
+    ----------
+    capacity_mah : float
+        10 to 1,000,000. [mAh]
+    usable_share : float
+        Share left by cold, age and self-discharge, 0.1 to 1.
+    sleep_ma : float
+        Whole marker between packets, 0 to 1,000. The default is the maker's figure for the paper's board (WiFi LoRa 32,
+        deep sleep); a purpose-built board needs a hundredth. [mA]
+    awake_ma, awake_s : float
+        Its processor while it makes a packet, and the time for that besides the time on air: assumed. [mA], [s]
+    transmit_ma : float, optional
+        Radio while it sends, 1 to 1,000; by the SX1276's data sheet from the power by default. [mA]
+
+    Raises
+    ------
+    InvalidParameter
+        A value is outside its limits.
+    """
+
+    capacity_mah: float = CAPACITY_MAH
+    usable_share: float = 0.8  # source: assumed, no measurement kept
+    sleep_ma: float = 0.8  # [mA] source: the maker's figure for the WiFi LoRa 32, deep sleep
+    awake_ma: float = 40.0  # [mA] source: assumed, no measurement kept
+    awake_s: float = 0.01  # [s] source: assumed, no measurement kept
+    transmit_ma: float | None = None
+
+    def __post_init__(self) -> None:
+        check_between("battery.capacity_mah", self.capacity_mah, 10.0, 1e6, "mAh")
+        check_between("battery.usable_share", self.usable_share, 0.1, 1.0, "")
+        check_between("battery.sleep_ma", self.sleep_ma, 0.0, 1000.0, "mA")
+        check_between("battery.awake_ma", self.awake_ma, 0.0, 1000.0, "mA")
+        check_between("battery.awake_s", self.awake_s, 0.0, 10.0, "s")
+        if self.transmit_ma is not None:
+            check_between("battery.transmit_ma", self.transmit_ma, 1.0, 1000.0, "mA")
+
+
+def mean_current_ma(settings: RadioSettings, battery: Battery) -> float:
+    """Average supply current of a marker: asleep, and for each packet awake and sending. [mA]"""
+    sending_ma = transmit_current_ma(settings.power_dbm) if battery.transmit_ma is None else battery.transmit_ma
+    airtime_s = settings.time_on_air_s
+    packet_mas = airtime_s * sending_ma + (airtime_s + battery.awake_s) * battery.awake_ma
+    return battery.sleep_ma + packet_mas / settings.interval_s
+
+
+def battery_life_days(settings: RadioSettings, battery: Battery) -> float:
+    """Battery life without charging. [day]"""
+    return battery.capacity_mah * battery.usable_share / max(mean_current_ma(settings, battery), 1e-9) / 24
+
+
+def transmit_current_ma(power_dbm: float) -> float:
+    """Supply current of a sending SX1276: that of the next higher power in its data sheet. [mA]"""
+    return next((current for power, current in _TRANSMIT_MA if power_dbm <= power), _TRANSMIT_MA[-1][1])

@@ -1,4 +1,4 @@
-"""Agencies and their keys. A key is stored as the SHA-256 of its text; only what names it can be shown again."""
+"""Agencies, their keys, and Idempotency-Keys. A key is stored as the SHA-256 of its text; only its name is shown."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from app.registry.audit import Author, record
-from app.registry.ids import new_id
+from app.registry.column_types import fetch_all, find_one, new_id, select_rows
 from app.registry.resources import Resource
-from app.registry.rows import fetch_all, find_one, select_rows
-from app.registry.tables import agencies, api_keys
+from app.registry.tables import agencies, api_keys, idempotency_keys
 
 
 class AgencyRow(NamedTuple):
@@ -197,3 +196,52 @@ def revoke_keys_labelled(connection: sa.Connection, label: str, now: datetime) -
 def restore_key(connection: sa.Connection, key_id: str) -> None:
     """Make a revoked key valid again."""
     connection.execute(sa.update(api_keys).where(api_keys.c.id == key_id).values(revoked_at=None))
+
+
+# === Answers that were given under an Idempotency-Key.
+
+
+class ResponseRow(NamedTuple):
+    """An answer, and the hash of the request that it was given to."""
+
+    request_sha256: str
+    response: Any
+
+
+def find_response(
+    connection: sa.Connection, agency_id: str, holder_id: str, key: str, now: datetime
+) -> ResponseRow | None:
+    """The answer that this holder was given under this key, unless it has expired."""
+    query = select_rows(ResponseRow, idempotency_keys).where(
+        idempotency_keys.c.agency_id == agency_id,
+        idempotency_keys.c.holder_id == holder_id,
+        idempotency_keys.c.key == key,
+        idempotency_keys.c.expires_at > now,
+    )
+    return find_one(connection, query, ResponseRow)
+
+
+def add_response(
+    connection: sa.Connection,
+    agency_id: str,
+    holder_id: str,
+    key: str,
+    *,
+    request_sha256: str,
+    response: dict[str, Any],
+    now: datetime,
+    expires_at: datetime,
+) -> None:
+    """Remember an answer, and forget all that have expired."""
+    connection.execute(sa.delete(idempotency_keys).where(idempotency_keys.c.expires_at <= now))
+    connection.execute(
+        sa.insert(idempotency_keys).values(
+            agency_id=agency_id,
+            holder_id=holder_id,
+            key=key,
+            request_sha256=request_sha256,
+            response=response,
+            created_at=now,
+            expires_at=expires_at,
+        )
+    )

@@ -9,11 +9,16 @@ from typing import Any
 import sqlalchemy as sa
 
 from app.registry.jobs import JobKind
-from app.registry.plan_tables import alignments, plans
-from app.registry.public_tables import damage_reports
-from app.registry.reprocessing_tables import decode_versions, reprocessed_decodes
 from app.registry.tables import decodes, jobs
-from app.registry.upload_tables import upload_parts, uploads
+from app.registry.work_tables import (
+    alignments,
+    damage_reports,
+    decode_versions,
+    plans,
+    reprocessed_decodes,
+    upload_parts,
+    uploads,
+)
 
 COLUMNS = (
     decodes.c.upload_key,

@@ -24,17 +24,20 @@ from app.errors import InvalidParameter, Unavailable
 from app.registry.engines import (
     BUSY_TIMEOUT_S,
     LONG,
+    SETTING,
     WRITE,
+    across_agencies,
     busy_is_unavailable,
     cut_commit_is_unknown,
     isolation,
     postgres_asking_engine,
     postgres_engine,
+    set_whose,
     sqlite_asking_engine,
     sqlite_engine,
     stoppable,
+    whose_rows,
 )
-from app.registry.tenancy import SETTING, across_agencies, set_whose, whose_rows
 
 if TYPE_CHECKING:
     from alembic.config import Config

@@ -9,10 +9,10 @@ from typing import Any, cast
 import sqlalchemy as sa
 
 from app.errors import NotFound
-from app.registry.grade_columns import is_graded, regraded
+from app.registry.column_types import fetch_all, row_of, select_rows
+from app.registry.conditions import is_graded, regraded
 from app.registry.marker_rows import MARKERS, MarkerRow, VersionRow
 from app.registry.markers import MarkerFilter, conditions_of
-from app.registry.rows import fetch_all, row_of, select_rows
 from app.registry.spatial import covers, distance_m
 from app.registry.tables import marker_versions, markers
 

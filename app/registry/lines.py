@@ -1,13 +1,16 @@
 """Lines that markers make along a road, for GIS clients.
 
-Each family that makes lines has a source of them: painted lines of magnets (`magnet_lines`), runs of CERPMs
-(`cerpm_runs`). A line's id is that of its first marker.
+Each family that makes lines has a source of them: painted lines of magnets, runs of CERPMs. A line's id is that
+of its first marker.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -16,8 +19,8 @@ from pyproj import Geod
 
 from app.errors import MalformedRequest
 from app.registry.features import Field
-from app.registry.spatial import Box, box_around
-from app.registry.tables import markers
+from app.registry.spatial import Box, box_around, within_box
+from app.registry.tables import magnets, markers
 
 MAX_GAP_M = 100.0
 """Neighbours in a run of CERPMs are at most so far apart by measure. [m]"""
@@ -188,3 +191,191 @@ def widened(box: Box) -> list[Box]:
         west, east = max(part.west_deg - reach, -180.0), min(part.east_deg + reach, 180.0)
         widened.append(Box(west, max(lat[0], -90.0), east, min(lat[1], 90.0)))
     return widened
+
+
+# === Runs of CERPMs along one side of a lane.
+#
+# A run is two or more CERPMs of one road and one side of the lane, in the order of their measures, no two neighbours
+# more than `MAX_GAP_M` apart by measure. Retired ones, and those without a road or a measure, are in none.
+
+
+_STREAMED = {"stream_results": True, "yield_per": 1000}
+
+
+class CerpmRuns:
+    """The source of runs of CERPMs, in the order of roads and measures."""
+
+    def begins_line(self, place: LinePlace) -> bool:
+        """Only a CERPM with a measure on a road can begin a run."""
+        return None not in (place.road, place.measure_m)
+
+    def read_lines(
+        self,
+        connection: sa.Connection,
+        agency_id: str,
+        *,
+        box: Box | None,
+        pinned: Mapping[str, Any],
+        after: LinePlace | None,
+    ) -> Iterator[Line]:
+        """Runs in the order of roads and measures."""
+        for run in _runs(connection, agency_id, box, road=pinned.get("road"), after=after):
+            yield _line_of_run(run)
+
+    def find_line(self, connection: sa.Connection, agency_id: str, place: LinePlace) -> Line | None:
+        """The run that begins with a CERPM."""
+        if not self.begins_line(place):
+            return None
+        with closing(_runs(connection, agency_id, None, road=place.road, first=place)) as runs:
+            run = next(runs, None)
+        return _line_of_run(run) if run is not None and run[0].id == place.id else None
+
+
+@dataclass(slots=True)
+class _Run:
+    """A run that is being read; of one that is not wanted only the last row is kept."""
+
+    is_wanted: bool
+    rows: list[Any]
+
+
+def _runs(
+    connection: sa.Connection,
+    agency_id: str,
+    box: Box | None,
+    *,
+    road: str | None = None,
+    after: Any = None,
+    first: Any = None,
+) -> Generator[list[Any]]:
+    """Runs in the order of the roads, measures and ids of their first CERPMs: all, or from one on, or after one."""
+    side = _C.spec["side"].as_string().label("side")
+    listed = [
+        _C.agency_id == agency_id,
+        _C.family == "cerpm",
+        _C.status != "retired",
+        _C.road.is_not(None),
+        _C.measure_m.is_not(None),
+    ]
+    if road is not None:
+        listed.append(_C.road == road)
+    query = sa.select(_C.id, _C.road, _C.status, _C.lon_deg, _C.lat_deg, _C.measure_m, side).where(*listed)
+    if box is not None:
+        near = sa.or_(*(within_box(part) for part in widened(box)))
+        roads = connection.execute(sa.select(_C.road).where(*listed, near).distinct()).scalars().all()
+        query = query.where(_C.road.in_(roads))
+    begin = after or first
+    if begin is not None:  # what belongs to a run that began before has a neighbour at most a gap before
+        earliest = sa.tuple_(sa.literal(begin.road), sa.literal(begin.measure_m - MAX_GAP_M))
+        query = query.where(sa.tuple_(_C.road, _C.measure_m) >= earliest)
+    rows = connection.execute(query.order_by(_C.road, _C.measure_m, _C.id), execution_options=_STREAMED)
+    with closing(rows):
+        yield from _cut(rows, lambda row: _is_before(row, begin, or_at=after is not None))
+
+
+def _is_before(row: Any, begin: Any, *, or_at: bool) -> bool:
+    if begin is None or row.road != begin.road:
+        return False
+    at, limit = (row.measure_m, row.id), (begin.measure_m, begin.id)
+    return bool(at <= limit if or_at else at < limit)
+
+
+def _cut(rows: Iterable[Any], is_before: Callable[[Any], bool]) -> Iterator[list[Any]]:
+    """Runs of rows in the order of roads and measures, but those that begin before; each as soon as it is complete."""
+    begun: deque[_Run] = deque()
+    growing: dict[str, _Run] = {}
+    road = None
+    for row in rows:
+        if row.road != road:
+            road = row.road
+            growing.clear()
+        run = growing.get(row.side)
+        if run is None or row.measure_m - run.rows[-1].measure_m > MAX_GAP_M:
+            run = growing[row.side] = _Run(not is_before(row), [])
+            begun.append(run)
+        if run.is_wanted:
+            run.rows.append(row)
+        else:
+            run.rows = [row]
+        while begun and _is_complete(begun[0], growing, row):
+            yield from _wanted(begun.popleft())
+    while begun:
+        yield from _wanted(begun.popleft())
+
+
+def _is_complete(run: _Run, growing: Mapping[str, _Run], row: Any) -> bool:
+    last = run.rows[-1]
+    return growing.get(last.side) is not run or row.measure_m - last.measure_m > MAX_GAP_M
+
+
+def _wanted(run: _Run) -> Iterator[list[Any]]:
+    if run.is_wanted and len(run.rows) >= 2:
+        yield run.rows
+
+
+def _line_of_run(run: list[Any]) -> Line:
+    measures = (run[0].measure_m, run[-1].measure_m)
+    return make_line(run[0].id, run, family="cerpm", code=None, side=run[0].side, measures=measures)
+
+
+# === Painted lines of magnets.
+
+
+_PAINTED = (_C.family == "magnet", _C.scheme == "line-tag", _C.status != "retired")
+_MAGNET_LINES = 100
+"""Number of lines whose magnets are read in one query. Chosen by hand."""
+
+
+class MagnetLines:
+    """The source of painted lines of magnets, in the order of their ids."""
+
+    def begins_line(self, place: LinePlace) -> bool:
+        """Any magnet marker may be a line."""
+        return True
+
+    def read_lines(
+        self,
+        connection: sa.Connection,
+        agency_id: str,
+        *,
+        box: Box | None,
+        pinned: Mapping[str, Any],
+        after: LinePlace | None,
+    ) -> Iterator[Line]:
+        """Lines in the order of their ids."""
+        yield from _lines(connection, agency_id, box, None if after is None else after.id)
+
+    def find_line(self, connection: sa.Connection, agency_id: str, place: LinePlace) -> Line | None:
+        """The line of a marker."""
+        rows = connection.execute(_magnets_of(agency_id).where(_C.id == place.id)).all()
+        return _line_of(rows) if len(rows) >= 2 else None
+
+
+def _lines(connection: sa.Connection, agency_id: str, box: Box | None, after: str | None) -> Iterator[Line]:
+    ids = sa.select(_C.id).where(_C.agency_id == agency_id, *_PAINTED).order_by(_C.id).limit(_MAGNET_LINES)
+    if box is not None:
+        near = sa.or_(*(within_box(part, magnets) for part in widened(box)))
+        ids = ids.where(_C.id.in_(sa.select(magnets.c.marker_id).where(magnets.c.agency_id == agency_id, near)))
+    while True:
+        chunk = connection.execute(ids if after is None else ids.where(_C.id > after)).scalars().all()
+        if not chunk:
+            return
+        rows = connection.execute(_magnets_of(agency_id).where(_C.id.in_(chunk))).all()
+        for _, group in groupby(rows, key=lambda row: row.id):
+            if len(line := list(group)) >= 2:
+                yield _line_of(line)
+        after = chunk[-1]
+
+
+def _magnets_of(agency_id: str) -> sa.Select[Any]:
+    return (
+        sa.select(_C.id, _C.digits, _C.road, _C.status, magnets.c.lon_deg, magnets.c.lat_deg)
+        .join(magnets, magnets.c.marker_id == _C.id)
+        .where(_C.agency_id == agency_id, *_PAINTED)
+        .order_by(_C.id, magnets.c.number)
+    )
+
+
+def _line_of(rows: Sequence[Any]) -> Line:
+    first = rows[0]
+    return make_line(first.id, rows, family="magnet", code=first.digits, side=None, measures=(None, None))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from app.geodesy.grades import Grade
-from app.markers.status import Status
-from app.registry.rows import columns_of, select_rows
+from app.geodesy.place import Grade
+from app.markers.reading import Status
+from app.registry.column_types import columns_of, select_rows
 from app.registry.tables import markers
 
 

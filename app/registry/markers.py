@@ -1,19 +1,26 @@
-"""Queries on markers. All but `find_code_near` see one agency only."""
+"""Queries on markers, and on what single families add. All but `find_code_near` see one agency only."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from datetime import datetime
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
 from app.errors import NotFound, StaleVersion
+from app.geodesy.systems import ELLIPSOID
+from app.markers.magnet_design import CODEBOOK_FORMAT, Codebook
 from app.registry.audit import AuditEntry, add_versions
-from app.registry.feature_text import feature_text
+from app.registry.bulk_load import Columns, json_objects, large_load, load_columns
+from app.registry.column_types import fetch_all, fetch_in, find_one, row_of, select_rows
+from app.registry.engines import seeing_every_agency
+from app.registry.features import feature_text, feature_texts
 from app.registry.marker_rows import MARKERS, CodeRow, MarkerRow
-from app.registry.rows import fetch_all, fetch_in, find_one, row_of, select_rows
+from app.registry.resources import Resource
 from app.registry.spatial import (
     Area,
     Box,
@@ -24,8 +31,184 @@ from app.registry.spatial import (
     within_box,
     within_radius,
 )
-from app.registry.tables import markers
-from app.registry.tenancy import seeing_every_agency
+from app.registry.tables import agency_secrets, cerpm_spans, codebooks, magnets, marker_versions, markers
+
+# === Codebooks as they are stored.
+
+
+class CodebookRow(NamedTuple):
+    """A codebook; its design, rules, figures and entries are JSON."""
+
+    id: str
+    name: str
+    design: Any
+    rules: Any
+    figures: Any
+    entries: Any
+    version: int
+    created_at: datetime
+    updated_at: datetime
+
+
+CODEBOOKS = Resource("codebook", CodebookRow, codebooks)
+
+
+def book_of(row: CodebookRow) -> Codebook:
+    """The codebook that a row stores."""
+    return Codebook.from_document(
+        {"format": CODEBOOK_FORMAT, "name": row.name, "design": row.design, "entries": row.entries}
+    )
+
+
+# === Where single magnets lie. Their rows follow from the layouts of their markers.
+
+
+class MagnetRow(NamedTuple):
+    """Where a magnet of a marker lies."""
+
+    row: int
+    marker_id: str
+    number: int
+    agency_id: str
+    lon_deg: float
+    lat_deg: float
+    phi_deg: int
+
+
+def replace_magnets(
+    connection: sa.Connection, agency_id: str, marker_id: str, holes: Sequence[Mapping[str, Any]]
+) -> None:
+    """Store where the magnets of a marker lie: number, lon_deg, lat_deg, polarity, phi_deg of each."""
+    connection.execute(
+        sa.delete(magnets).where(magnets.c.marker_id == marker_id, magnets.c.agency_id == agency_id),
+    )
+    connection.execute(sa.insert(magnets), [{"marker_id": marker_id, "agency_id": agency_id, **hole} for hole in holes])
+
+
+def list_magnets_in(connection: sa.Connection, box: Box, *, ignoring: str | None = None) -> list[MagnetRow]:
+    """Magnets of any agency inside a box that may be in the road, but for those of one marker."""
+    query = (
+        select_rows(MagnetRow, magnets)
+        .join(markers, markers.c.id == magnets.c.marker_id)
+        .where(within_box(box, magnets), markers.c.status != "retired")
+    )
+    if ignoring is not None:
+        query = query.where(magnets.c.marker_id != ignoring)
+    with seeing_every_agency(connection):
+        return fetch_all(connection, query, MagnetRow)
+
+
+# === Queries on CERPMs: their numbers, their agency's secret, and which transmissions were heard.
+
+
+_CHUNK = 500
+
+
+class SpanRow(NamedTuple):
+    """Transmissions of a CERPM that one upload had; times are seconds since 1970-01-01 UTC, None without a clock."""
+
+    row: int
+    number: int
+    first_sequence: int
+    last_sequence: int
+    first_heard_s: float | None
+    last_heard_s: float | None
+
+
+def find_secret(connection: sa.Connection, agency_id: str) -> bytes | None:
+    """The agency's wrapped key, if it has one."""
+    query = sa.select(agency_secrets.c.wrapped).where(agency_secrets.c.agency_id == agency_id)
+    return connection.execute(query).scalar_one_or_none()
+
+
+def add_secret(connection: sa.Connection, agency_id: str, wrapped: bytes, now: datetime) -> None:
+    """Keep the agency's wrapped key."""
+    connection.execute(sa.insert(agency_secrets).values(agency_id=agency_id, wrapped=wrapped, created_at=now))
+
+
+def find_number(connection: sa.Connection, agency_id: str, number: int) -> MarkerRow | None:
+    """The agency's marker that carries, or once carried, this number."""
+    query = MARKERS.where(
+        markers.c.agency_id == agency_id, markers.c.family == "cerpm", markers.c.digits == str(number)
+    )
+    return find_one(connection, query, MarkerRow)
+
+
+def last_number(connection: sa.Connection, agency_id: str) -> int:
+    """The highest number of the agency; 0 without any."""
+    number = sa.cast(markers.c.digits, sa.BigInteger)
+    query = sa.select(sa.func.max(number)).where(markers.c.agency_id == agency_id, markers.c.family == "cerpm")
+    return int(connection.execute(query).scalar_one() or 0)
+
+
+def list_by_number(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, MarkerRow]:
+    """The agency's markers with these numbers, retired ones too."""
+    query = MARKERS.where(markers.c.agency_id == agency_id, markers.c.family == "cerpm")
+    found = fetch_in(connection, query, MarkerRow, markers.c.digits, map(str, numbers))
+    return {int(row.digits): row for row in found}
+
+
+def list_spans(
+    connection: sa.Connection, agency_id: str, numbers: Iterable[int], before_decode: str | None = None
+) -> dict[int, list[SpanRow]]:
+    """What was heard of each of these markers before, or before a decode, in the order it was uploaded."""
+    query = select_rows(SpanRow, cerpm_spans).where(cerpm_spans.c.agency_id == agency_id).order_by(cerpm_spans.c.row)
+    if before_decode is not None:
+        query = query.where(cerpm_spans.c.decode_id < before_decode)
+    found: dict[int, list[SpanRow]] = {}
+    for row in fetch_in(connection, query, SpanRow, cerpm_spans.c.number, numbers):
+        found.setdefault(row.number, []).append(row)
+    return found
+
+
+def newest_row(spans: Mapping[int, Sequence[SpanRow]]) -> int:
+    """Key of the span that was stored last; 0 without any."""
+    return max((span.row for of_marker in spans.values() for span in of_marker), default=0)
+
+
+def list_span_ends(connection: sa.Connection, agency_id: str, numbers: Iterable[int]) -> dict[int, SpanRow]:
+    """From the first to the last transmission that was ever heard of each of these markers, by number.
+
+    Only of markers that were heard; `row` is that of the span that was stored last.
+    """
+    wanted, mine = list(numbers), cerpm_spans.c
+    first, last = sa.func.min(mine.first_sequence), sa.func.max(mine.last_sequence)
+    found: dict[int, SpanRow] = {}
+    for start in range(0, len(wanted), _CHUNK):
+        chosen = (mine.agency_id == agency_id, mine.number.in_(wanted[start : start + _CHUNK]))
+        ends = sa.select(mine.number, first.label("first"), last.label("last")).where(*chosen).group_by(mine.number)
+        end = ends.subquery()
+        query = (
+            sa.select(
+                sa.func.max(mine.row),
+                mine.number,
+                end.c.first,
+                end.c.last,
+                _time_of(mine.first_sequence == end.c.first, mine.first_heard_s),
+                _time_of(mine.last_sequence == end.c.last, mine.last_heard_s),
+            )
+            .join(end, end.c.number == mine.number)
+            .where(*chosen)
+            .group_by(mine.number, end.c.first, end.c.last)
+        )
+        found.update({row.number: row for row in fetch_all(connection, query, SpanRow)})
+    return found
+
+
+def _time_of(end: sa.ColumnElement[bool], heard_s: sa.ColumnElement[float]) -> sa.ColumnElement[float | None]:
+    """When an end was heard first; null where one log that has it had no times."""
+    untimed = sa.func.count(sa.case((sa.and_(end, heard_s.is_(None)), 1)))
+    return sa.case((untimed > 0, None), else_=sa.func.min(sa.case((end, heard_s))))
+
+
+def add_spans(connection: sa.Connection, agency_id: str, decode_id: str, spans: Sequence[Mapping[str, Any]]) -> None:
+    """Keep what a decode heard: number, first_sequence, last_sequence, first_heard_s, last_heard_s of each."""
+    if spans:
+        rows = [{"agency_id": agency_id, "decode_id": decode_id, **span} for span in spans]
+        connection.execute(sa.insert(cerpm_spans), rows)
+
+
+# === Queries on markers. All but `find_code_near` see one agency only.
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,3 +412,170 @@ def _recorded(connection: sa.Connection, entry: AuditEntry, marker_id: str, *, k
     row = get_marker(connection, entry.agency_id, marker_id)
     add_versions(connection, [entry.version(marker_id, row.version, row._asdict(), kind=kind, why=why)])
     return row
+
+
+# === Markers by the thousand: looked up by box, by digits and by number, and stored a chunk at a time.
+
+
+class PlaceRow(NamedTuple):
+    """Where a marker is, and the row of the survey that it comes from."""
+
+    lon_deg: float
+    lat_deg: float
+    height_m: float | None
+    vertical_datum: str | None
+    id: str
+    family: str
+    survey_file_sha256: str | None
+    point: str | None
+
+
+def list_places_in(
+    connection: sa.Connection, agency_id: str, box: Box, *, limit: int, ignoring: str = ""
+) -> list[PlaceRow]:
+    """Places and heights of the agency's markers, but one, in a box that may be on the road."""
+    own = {"point": markers.c.original["point"].as_string().label("point")}
+    columns = [own[name] if name in own else markers.c[name] for name in PlaceRow._fields]
+    query = sa.select(*columns).where(
+        markers.c.agency_id == agency_id, markers.c.status != "retired", markers.c.id != ignoring, within_box(box)
+    )
+    return fetch_all(connection, query.limit(limit), PlaceRow)
+
+
+def is_any_near(
+    connection: sa.Connection, agency_id: str, lon_deg: float, lat_deg: float, radius_m: float, *, ignoring: str = ""
+) -> bool:
+    """Whether the agency has a marker, besides one, in the box around a circle."""
+    query = sa.select(markers.c.row).where(
+        markers.c.agency_id == agency_id,
+        markers.c.id != ignoring,
+        within_box(box_around(lon_deg, lat_deg, radius_m)),
+    )
+    return connection.execute(query.limit(1)).first() is not None
+
+
+def list_markers_in(connection: sa.Connection, agency_id: str, family: str, box: Box, *, limit: int) -> list[MarkerRow]:
+    """The agency's markers of a family in a box that may be on the road."""
+    query = MARKERS.where(
+        markers.c.agency_id == agency_id,
+        markers.c.family == family,
+        markers.c.status != "retired",
+        within_box(box),
+    )
+    return fetch_all(connection, query.limit(limit), MarkerRow)
+
+
+def list_by_digits(connection: sa.Connection, family: str, digits: Sequence[str]) -> Iterator[CodeRow]:
+    """Any agency's markers with these digits."""
+    known = sa.select(sa.literal(1)).where(markers.c.family == family).limit(1)
+    with seeing_every_agency(connection):
+        wanted = sorted(set(digits)) if digits and connection.execute(known).first() is not None else []
+    for start in range(0, len(wanted), _CHUNK):
+        query = select_rows(CodeRow, markers).where(
+            markers.c.digits.in_(wanted[start : start + _CHUNK]), markers.c.family == family
+        )
+        with seeing_every_agency(connection):
+            found = fetch_all(connection, query, CodeRow)
+        yield from found
+
+
+def add_markers(
+    connection: sa.Connection, entry: AuditEntry, columns: Columns, *, kind: Callable[[str], str], why: str | None
+) -> None:
+    """Store new markers of the entry's agency, each with the first version of its history.
+
+    The columns are those of `MarkerRow`, the rows in the order of their ids; `kind` gives a version's kind from
+    the status.
+    """
+    kinds = [str(kind(status)) for status in columns.values("status")]
+    versions = entry.first_versions(columns.values("id"), json_objects(columns), kinds=kinds, why=why)
+    same = {**columns.same, "agency_id": entry.agency_id}
+    owned = Columns(columns.count, same, {**columns.own, "feature": feature_texts(columns)})
+    load_columns(connection, markers, owned)
+    load_columns(connection, marker_versions, versions)
+
+
+def many_markers(connection: sa.Connection, rows: int) -> AbstractContextManager[None]:
+    """Within it `add_markers` stores about this many, in several calls; the indexes may be filled at its end."""
+    return large_load(connection, (markers, marker_versions), rows)
+
+
+def list_records(
+    connection: sa.Connection,
+    agency_id: str,
+    filtered: MarkerFilter,
+    fields: Sequence[str],
+    *,
+    after: str | None,
+    limit: int,
+) -> list[dict[str, Any]]:
+    """Markers in the order of their ids as flat records of these fields: columns, `code`, and `side` of CERPMs."""
+    own = {"code": markers.c.digits, "side": markers.c.spec["side"].as_string()}
+    columns = [own[name].label(name) if name in own else markers.c[name] for name in fields]
+    query = sa.select(*columns).where(markers.c.agency_id == agency_id, *conditions_of(filtered))
+    if after is not None:
+        query = query.where(markers.c.id > after)
+    rows = connection.execute(query.order_by(markers.c.id).limit(limit)).all()
+    return [dict(zip(fields, row, strict=True)) for row in rows]
+
+
+def count_records(
+    connection: sa.Connection, agency_id: str, filtered: MarkerFilter, *, with_retired: bool = True
+) -> int:
+    """Number of the agency's markers that a filter leaves."""
+    query = sa.select(sa.func.count()).select_from(markers)
+    if not with_retired:
+        query = query.where(markers.c.status != "retired")
+    return int(connection.execute(query.where(markers.c.agency_id == agency_id, *conditions_of(filtered))).scalar_one())
+
+
+def have_ellipsoidal_heights(connection: sa.Connection, agency_id: str, filtered: MarkerFilter) -> bool:
+    """Whether every marker of the filter has an ellipsoidal height."""
+    lacks = sa.or_(markers.c.height_m.is_(None), markers.c.vertical_datum != ELLIPSOID)
+    query = sa.select(markers.c.row).where(markers.c.agency_id == agency_id, lacks, *conditions_of(filtered))
+    return connection.execute(query.limit(1)).first() is None
+
+
+SNAPSHOT_COLUMNS = (
+    "id", "family", "status", "scheme", "digits", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm", "lon_deg",
+    "lat_deg", "height_m", "vertical_datum", "heading_deg", "horizontal_rmse_m", "vertical_rmse_m", "heading_rmse_deg",
+    "localization_grade", "transform_accuracy_m", "transform_note", "epoch",
+)  # fmt: skip
+
+
+_BLOCK = 5_000
+
+
+def read_for_snapshot(
+    connection: sa.Connection,
+    agency_id: str,
+    family: str,
+    box: Box,
+    *,
+    columns: Sequence[sa.ColumnElement[Any]] = (),
+    with_retired: bool = False,
+) -> Iterator[dict[str, tuple[Any, ...]]]:
+    """The agency's markers of a family in a box with what vehicles need of them, some at a time, by columns.
+
+    The columns are `spec`, or in its place further `columns` by their labels.
+    """
+    further = columns or (markers.c.spec,)
+    names = (*SNAPSHOT_COLUMNS, *(column.name for column in further))
+    query = sa.select(*(markers.c[name] for name in SNAPSHOT_COLUMNS), *further)
+    query = query.where(*_in_snapshot(agency_id, family, box, with_retired))
+    found = connection.execute(query, execution_options={"stream_results": True})
+    for rows in found.partitions(_BLOCK):
+        yield dict(zip(names, zip(*rows, strict=True), strict=True))
+
+
+def count_for_snapshot(
+    connection: sa.Connection, agency_id: str, family: str, box: Box, *, with_retired: bool, limit: int
+) -> int:
+    """How many `read_for_snapshot` returns; no more than `limit` are counted."""
+    query = sa.select(markers.c.row).where(*_in_snapshot(agency_id, family, box, with_retired)).limit(limit)
+    return int(connection.execute(sa.select(sa.func.count()).select_from(query.subquery())).scalar_one())
+
+
+def _in_snapshot(agency_id: str, family: str, box: Box, with_retired: bool) -> list[sa.ColumnElement[bool]]:
+    conditions = [markers.c.agency_id == agency_id, markers.c.family == family, within_box(box)]
+    return conditions if with_retired else [*conditions, markers.c.status != "retired"]

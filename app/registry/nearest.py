@@ -9,6 +9,7 @@ vehicles and crews ask for, are mostly found by one statement; `list_nearest` fi
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -17,12 +18,42 @@ import numpy as np
 import numpy.typing as npt
 import sqlalchemy as sa
 
+from app.registry.column_types import row_maker
 from app.registry.features import in_box
 from app.registry.marker_rows import PUBLIC, MarkerRow
 from app.registry.markers import MarkerFilter, conditions_of
-from app.registry.rows import row_maker
-from app.registry.spatial import Box, FloatArray, box_around, distances_m
+from app.registry.spatial import Box, FloatArray, box_around, distances_m, within_box
 from app.registry.tables import markers
+
+# === Places of markers in many circles.
+
+
+def list_places(
+    connection: sa.Connection,
+    agency_id: str,
+    filtered: MarkerFilter,
+    circles: Iterable[tuple[float, float, float]],
+    *,
+    limit: int,
+) -> list[tuple[str, float, float]]:
+    """Id, longitude and latitude of the markers in the boxes of circles (lon_deg, lat_deg, radius_m), each once.
+
+    No more than about `limit` are read.
+    """
+    places = sa.select(markers.c.id, markers.c.lon_deg, markers.c.lat_deg).where(
+        markers.c.agency_id == agency_id, *conditions_of(filtered)
+    )
+    found: dict[str, tuple[str, float, float]] = {}
+    for circle in circles:
+        query = places.where(within_box(box_around(*circle))).limit(limit)
+        found.update({row[0]: (row[0], row[1], row[2]) for row in connection.execute(query)})
+        if len(found) >= limit:
+            break
+    return list(found.values())
+
+
+# === The markers nearest to a position, by geodesic distance, from the spatial index of either database.
+
 
 Found = list[tuple[MarkerRow, float]]
 _Rows = npt.NDArray[np.int64]

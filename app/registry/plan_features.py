@@ -10,8 +10,7 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
-from app.registry.bulk_load import load_columns
-from app.registry.columns import Columns
+from app.registry.bulk_load import Columns, load_columns
 from app.registry.features import Extent, FeatureFilter, FeatureTable, Field
 from app.registry.lines import Line
 from app.registry.plan_states import BUILT, COMMITTED, SURVEYED

@@ -1,16 +1,17 @@
-"""Queries on public pages: what an agency releases, and what is known of a marker whose page is asked for."""
+"""Queries on public pages and damage reports: what an agency releases, and what is known of a page's marker."""
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
-from app.markers.status import Status
-from app.registry.public_tables import public_pages
-from app.registry.rows import find_one, select_rows
+from app.errors import NotFound
+from app.markers.reading import Status
+from app.registry.column_types import columns_of, find_one, select_rows
 from app.registry.tables import agencies, markers
+from app.registry.work_tables import damage_report_contacts, damage_reports, public_pages
 
 FIELDS = ("code", "agency", "status", "revision", "road", "measure")
 """What an agency can release of a marker."""
@@ -93,3 +94,154 @@ def put_public_page(connection: sa.Connection, agency_id: str, row: PublicPageRo
         connection.execute(sa.insert(public_pages).values(agency_id=agency_id, **row._asdict()))
         return
     connection.execute(sa.update(public_pages).where(_P.agency_id == agency_id).values(**row._asdict()))
+
+
+# === Queries on damage reports, and on the contacts of those who sent them.
+
+
+_R, _C = damage_reports.c, damage_report_contacts.c
+NO_CONTACT_CURE = "has_contact of the report is true if there is one"
+
+
+class StoredReport(NamedTuple):
+    """A damage report as it is stored.
+
+    Attributes
+    ----------
+    form_nonce : str
+        Of the form that it was sent with.
+    kind, text, language : str, str or None, str
+        What the sender chose and wrote, and the language of the page.
+    photo_key, photo_bytes : str or None, int or None
+        Blob of the photo.
+    state, note : str, str or None
+        new, accepted or rejected; and why.
+    item_id : str or None
+        Item of the work list that it was accepted into.
+    """
+
+    id: str
+    agency_id: str
+    marker_id: str
+    form_nonce: str
+    kind: str
+    text: str | None
+    language: str
+    photo_key: str | None
+    photo_bytes: int | None
+    state: str
+    note: str | None
+    item_id: str | None
+    decided_by: str | None
+    decided_at: datetime | None
+    created_at: datetime
+
+
+class ReportRow(NamedTuple):
+    """A damage report, and whether the sender left a contact."""
+
+    report: StoredReport
+    has_contact: bool
+
+
+_HAS_CONTACT = sa.exists().where(_C.report_id == _R.id)
+_REPORTS = sa.select(*columns_of(StoredReport, damage_reports), _HAS_CONTACT.label("has_contact"))
+
+
+def _row(found: Any) -> ReportRow:
+    return ReportRow(StoredReport(*found[:-1]), bool(found[-1]))
+
+
+def add_report(connection: sa.Connection, report: StoredReport, email: str | None) -> None:
+    """Store a new report, and the contact."""
+    connection.execute(sa.insert(damage_reports), report._asdict())
+    if email is not None:
+        values = {"report_id": report.id, "agency_id": report.agency_id, "email": email}
+        connection.execute(sa.insert(damage_report_contacts).values(**values, created_at=report.created_at))
+
+
+def find_sent(connection: sa.Connection, agency_id: str, marker_id: str, form_nonce: str) -> str | None:
+    """Id of the report that a form was sent with before."""
+    query = sa.select(_R.id).where(_R.agency_id == agency_id, _R.marker_id == marker_id, _R.form_nonce == form_nonce)
+    return connection.execute(query).scalar_one_or_none()
+
+
+def count_new(connection: sa.Connection, agency_id: str, marker_id: str | None = None) -> int:
+    """Number of reports that nobody has decided on, of an agency or of one of its markers."""
+    query = sa.select(sa.func.count()).select_from(damage_reports)
+    query = query.where(_R.agency_id == agency_id, _R.state == "new")
+    if marker_id is not None:
+        query = query.where(_R.marker_id == marker_id)
+    return int(connection.execute(query).scalar_one())
+
+
+def get_report(connection: sa.Connection, agency_id: str, report_id: str) -> ReportRow:
+    """One report.
+
+    Raises
+    ------
+    NotFound
+        There is none with this id, or it belongs to another agency.
+    """
+    found = connection.execute(_REPORTS.where(_R.id == report_id, _R.agency_id == agency_id)).one_or_none()
+    if found is None:
+        raise NotFound(
+            f"there is no damage report {report_id}", field="report_id", cure="GET /v1/damage-reports lists yours"
+        )
+    return _row(found)
+
+
+def list_reports(
+    connection: sa.Connection, agency_id: str, *, state: str | None = None, marker_id: str | None = None,
+    before: str | None = None, limit: int = 100,
+) -> list[ReportRow]:  # fmt: skip
+    """Reports, newest first."""
+    query = _REPORTS.where(_R.agency_id == agency_id)
+    for column, value in ((_R.state, state), (_R.marker_id, marker_id)):
+        if value is not None:
+            query = query.where(column == value)
+    if before is not None:
+        query = query.where(_R.id < before)
+    return [_row(found) for found in connection.execute(query.order_by(_R.id.desc()).limit(limit))]
+
+
+def change_report(connection: sa.Connection, agency_id: str, report_id: str, **values: Any) -> None:
+    """Set columns of a report."""
+    own = sa.update(damage_reports).where(_R.id == report_id, _R.agency_id == agency_id)
+    connection.execute(own.values(**values))
+
+
+class ContactRow(NamedTuple):
+    """How the sender of a report can be reached."""
+
+    report_id: str
+    email: str
+    created_at: datetime
+
+
+_CONTACTS = sa.select(*columns_of(ContactRow, damage_report_contacts))
+
+
+def get_contact(connection: sa.Connection, agency_id: str, report_id: str) -> ContactRow:
+    """The contact of a report.
+
+    Raises
+    ------
+    NotFound
+        There is none, or it belongs to another agency.
+    """
+    row = find_one(connection, _CONTACTS.where(_C.report_id == report_id, _C.agency_id == agency_id), ContactRow)
+    if row is None:
+        raise NotFound(f"there is no contact of a report {report_id}", field="report_id", cure=NO_CONTACT_CURE)
+    return row
+
+
+def delete_contact(connection: sa.Connection, agency_id: str, report_id: str) -> bool:
+    """Delete the contact of a report; False if there is none."""
+    own = sa.delete(damage_report_contacts).where(_C.report_id == report_id, _C.agency_id == agency_id)
+    return connection.execute(own).rowcount == 1
+
+
+def delete_old_contacts(connection: sa.Connection, before: datetime) -> int:
+    """Delete the contacts of all agencies that are from before a time; returns their number."""
+    return connection.execute(sa.delete(damage_report_contacts).where(_C.created_at < before)).rowcount

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.registry.column_types import fetch_all, select_rows
 from app.registry.jobs import JobKind, request_cancel
-from app.registry.reprocessing_tables import decode_versions, reprocessed_decodes, reprocessings
 from app.registry.resources import Resource
-from app.registry.rows import fetch_all, select_rows
 from app.registry.tables import decodes, jobs, vehicle_uploads
+from app.registry.work_tables import decode_versions, reprocessed_decodes, reprocessings
 
 _R, _D = reprocessed_decodes.c, decodes.c
 _ROWS = 1_000

@@ -10,8 +10,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import sqlalchemy as sa
 
 from app.errors import Conflict, NotFound, StaleVersion
-from app.registry.ids import new_id
-from app.registry.rows import fetch_all, find_one, select_rows
+from app.registry.column_types import fetch_all, find_one, new_id, select_rows
 
 RowT = TypeVar("RowT", bound=tuple[Any, ...])
 

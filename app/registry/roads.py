@@ -10,10 +10,10 @@ import sqlalchemy as sa
 from typing_extensions import TypedDict
 
 from app.registry.audit import AuditEntry, add_versions
-from app.registry.feature_text import feature_text
+from app.registry.column_types import fetch_all
+from app.registry.features import feature_text
 from app.registry.marker_rows import MARKERS, MarkerRow
 from app.registry.resources import Resource
-from app.registry.rows import fetch_all
 from app.registry.tables import markers, road_versions, roads
 
 _CHUNK = 1000

@@ -4,32 +4,32 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
-from app.markers.status import STATUSES
+from app.markers.reading import STATUSES
 from app.registry import column_types
 from app.registry.column_types import ID, UtcTime, agency_column, one_of
-from app.registry.health_tables import events as events
-from app.registry.health_tables import maintenance_items as maintenance_items
-from app.registry.health_tables import marker_health as marker_health
-from app.registry.health_tables import unregistered_readings as unregistered_readings
-from app.registry.metadata import metadata as metadata
-from app.registry.plan_feature_tables import alignment_lanes as alignment_lanes
-from app.registry.plan_feature_tables import planned_markers as planned_markers
-from app.registry.plan_tables import alignments as alignments
-from app.registry.plan_tables import plan_markers as plan_markers
-from app.registry.plan_tables import plan_versions as plan_versions
-from app.registry.plan_tables import plans as plans
-from app.registry.plan_tables import proof_units as proof_units
-from app.registry.public_tables import damage_report_contacts as damage_report_contacts
-from app.registry.public_tables import damage_reports as damage_reports
-from app.registry.public_tables import public_pages as public_pages
-from app.registry.reprocessing_tables import decode_versions as decode_versions
-from app.registry.reprocessing_tables import reprocessed_decodes as reprocessed_decodes
-from app.registry.reprocessing_tables import reprocessings as reprocessings
-from app.registry.upload_tables import stored_bytes as stored_bytes
-from app.registry.upload_tables import upload_parts as upload_parts
-from app.registry.upload_tables import uploads as uploads
-from app.registry.webhook_tables import webhook_deliveries as webhook_deliveries
-from app.registry.webhook_tables import webhooks as webhooks
+from app.registry.column_types import metadata as metadata
+from app.registry.work_tables import alignment_lanes as alignment_lanes
+from app.registry.work_tables import alignments as alignments
+from app.registry.work_tables import damage_report_contacts as damage_report_contacts
+from app.registry.work_tables import damage_reports as damage_reports
+from app.registry.work_tables import decode_versions as decode_versions
+from app.registry.work_tables import events as events
+from app.registry.work_tables import maintenance_items as maintenance_items
+from app.registry.work_tables import marker_health as marker_health
+from app.registry.work_tables import plan_markers as plan_markers
+from app.registry.work_tables import plan_versions as plan_versions
+from app.registry.work_tables import planned_markers as planned_markers
+from app.registry.work_tables import plans as plans
+from app.registry.work_tables import proof_units as proof_units
+from app.registry.work_tables import public_pages as public_pages
+from app.registry.work_tables import reprocessed_decodes as reprocessed_decodes
+from app.registry.work_tables import reprocessings as reprocessings
+from app.registry.work_tables import stored_bytes as stored_bytes
+from app.registry.work_tables import unregistered_readings as unregistered_readings
+from app.registry.work_tables import upload_parts as upload_parts
+from app.registry.work_tables import uploads as uploads
+from app.registry.work_tables import webhook_deliveries as webhook_deliveries
+from app.registry.work_tables import webhooks as webhooks
 
 agencies = sa.Table(
     "agencies",
@@ -101,7 +101,7 @@ markers = sa.Table(
     sa.Column("version", sa.Integer, nullable=False),
     sa.Column("created_at", UtcTime, nullable=False),
     sa.Column("updated_at", UtcTime, nullable=False),
-    # the GeoJSON feature that GIS clients read, written with every change of the row: registry/feature_text.py
+    # the GeoJSON feature that GIS clients read, written with every change of the row: registry/features.py
     sa.Column("feature", sa.Text, nullable=False, server_default=""),
     one_of("status", STATUSES),
     sa.CheckConstraint("lon_deg BETWEEN -180 AND 180 AND lat_deg BETWEEN -90 AND 90", name="position"),

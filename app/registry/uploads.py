@@ -9,8 +9,8 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from app.errors import NotFound
-from app.registry.rows import fetch_all, find_one, select_rows
-from app.registry.upload_tables import stored_bytes, upload_parts, uploads
+from app.registry.column_types import fetch_all, find_one, select_rows
+from app.registry.work_tables import stored_bytes, upload_parts, uploads
 
 _U, _P = uploads.c, upload_parts.c
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from app.registry.column_types import columns_of, row_maker
 from app.registry.resources import Resource
-from app.registry.rows import columns_of, row_maker
 from app.registry.tables import api_keys, calibrations, vehicle_keys, vehicle_uploads, vehicle_versions, vehicles
 
 

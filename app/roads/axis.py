@@ -24,7 +24,7 @@ import scipy
 from pyproj import Geod
 
 from app.errors import InvalidParameter
-from app.geodesy.ellipsoid import ecef_from_wgs84
+from app.geodesy.frames import ecef_from_wgs84
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]

@@ -23,7 +23,7 @@ MAX_DELAY_S = 0.01
 METRO."""
 
 MIN_CLEARANCE_M, MAX_CLEARANCE_M = 0.1, 0.6
-"""Clearances that can be declared. [m] Source: as those that are estimated, `app.decoders.magnet.magnet_state`, less
+"""Clearances that can be declared. [m] Source: as those that are estimated, `app.decoders.magnet.classify`, less
 room for the load."""
 
 

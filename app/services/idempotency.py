@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 
 from app.errors import IdempotencyConflict
-from app.registry import idempotency
+from app.registry import agencies
 from app.registry.database import Database
 
 ResponseT = TypeVar("ResponseT")
@@ -73,7 +73,7 @@ def idempotent(
     answer = Answer(find_response(connection, agency_id, key, now))
     yield answer
     if key is not None and not answer.replayed and answer.response is not None:
-        idempotency.add_response(
+        agencies.add_response(
             connection,
             agency_id,
             key.holder_id,
@@ -118,7 +118,7 @@ def find_response(connection: sa.Connection, agency_id: str, key: IdempotencyKey
     """As `find_earlier`, in a transaction that does more."""
     if key is None:
         return None
-    answer = idempotency.find_response(connection, agency_id, key.holder_id, key.key, now)
+    answer = agencies.find_response(connection, agency_id, key.holder_id, key.key, now)
     if answer is None:
         return None
     if answer.request_sha256 != key.request_sha256:

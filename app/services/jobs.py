@@ -1,10 +1,15 @@
-"""Jobs: one place starts them, notices that they were cancelled, and records how they ended."""
+"""Jobs: their queues, leases and cancellation; one place starts them and records how they ended."""
 
 from __future__ import annotations
 
+import os
+import socket
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from enum import StrEnum
+from itertools import count
 from typing import Protocol
 
 import sqlalchemy as sa
@@ -12,20 +17,106 @@ import structlog
 
 from app import tracing
 from app.errors import ProcessStopped, StorageFull, Unavailable, WaymarkError, is_disk_full
-from app.registry import job_leases as leases
+from app.registry import jobs as leases
 from app.registry import jobs as store
 from app.registry.database import Database
+from app.registry.engines import across_agencies, acting_for
 from app.registry.jobs import JobKind, JobRow, JobState, UnfinishedJob
-from app.registry.tenancy import across_agencies, acting_for
-from app.services.error_documents import error_document
-from app.services.job_leases import LeaseKeeper
+from app.services.documents import error_document
 from app.services.ports import Clock, DeadLetters
+
+# === The queue that each kind of job waits in, on both engines.
+
+
+class QueueName(StrEnum):
+    """Queues of jobs; workers can be started for some of them only."""
+
+    ONLINE = "online"
+    """A vehicle or a person waits for the result within seconds."""
+    PROOF = "proof"
+    """Plans and what is computed from them, up to hours."""
+    ARCHIVE = "archive"
+    """Work over what is stored, which gives way to all other."""
+
+
+QUEUES: Mapping[JobKind, QueueName] = {
+    JobKind.DECODE: QueueName.ONLINE,
+    JobKind.IMPORT: QueueName.ONLINE,
+    JobKind.PLAN: QueueName.PROOF,
+    JobKind.PROOF: QueueName.PROOF,
+    JobKind.PACKAGE: QueueName.PROOF,
+    JobKind.ARTWORK: QueueName.PROOF,
+    JobKind.EXPORT: QueueName.PROOF,
+    JobKind.REPROCESS: QueueName.ARCHIVE,
+    JobKind.DRIVE: QueueName.ONLINE,
+    JobKind.AUDIT: QueueName.ARCHIVE,
+}
+
+
+def kinds_in(queue: QueueName) -> tuple[JobKind, ...]:
+    """Kinds of the jobs that wait in a queue."""
+    return tuple(kind for kind, name in QUEUES.items() if name is queue)
+
+
+# === Keeps the leases of the jobs that run in this process, so that no other process starts them too.
+
+
+RENEW_S = store.LEASE.total_seconds() / 3
+_LOG = structlog.get_logger(__name__)
+_HOST_CHARACTERS = 60  # the column has 100
+
+
+class LeaseKeeper:
+    """A thread that renews the leases of running jobs; it lives as long as one runs."""
+
+    def __init__(self, database: Database, clock: Clock) -> None:
+        self._database, self._clock = database, clock
+        self._lock = threading.Lock()
+        self._runners: set[str] = set()
+        self._numbers = count(1)
+        self._ended = threading.Event()
+
+    def new_runner(self) -> str:
+        """Name of a run of a job, which no other has."""
+        return f"{socket.gethostname()[:_HOST_CHARACTERS]}:{os.getpid()}:{next(self._numbers)}:{os.urandom(4).hex()}"
+
+    @contextmanager
+    def keep(self, runner: str) -> Iterator[None]:
+        """Renew the lease of a run until the block ends."""
+        if self._database.path is not None:
+            yield  # this process owns the database
+            return
+        with self._lock:
+            self._runners.add(runner)
+            if len(self._runners) == 1:
+                self._ended = threading.Event()
+                threading.Thread(target=self._renew, args=(self._ended,), name="job-leases", daemon=True).start()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._runners.discard(runner)
+                if not self._runners:
+                    self._ended.set()
+
+    def _renew(self, ended: threading.Event) -> None:
+        while not ended.wait(RENEW_S):
+            with self._lock:
+                runners = sorted(self._runners)
+            try:
+                with across_agencies(), self._database.write_aside() as connection:
+                    store.renew_leases(connection, runners, self._clock())
+            except Unavailable as error:
+                _LOG.warning("the leases of jobs were not renewed", why=error.message)
+
+
+# === Jobs: one place starts them, notices that they were cancelled, and records how they ended.
+
 
 MAX_ATTEMPTS = 10
 """How often a job is started; one that never ends then fails. Starts that ended because the server was stopped, or a
 store was full or did not answer, are not counted: such a job waits. Kills of the server count; a file that kills its
 decoder process fails its job at once. Source: chosen by hand; with 3, one of 179 jobs was not done after 50 kills."""
-_LOG = structlog.get_logger(__name__)
 
 
 class JobCancelled(Exception):

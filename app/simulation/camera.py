@@ -9,38 +9,498 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from app.compiled import kernel, step
 from app.errors import InvalidParameter
-from app.simulation.footprint import (
-    Window,
-    directions,
-    exposure_samples,
-    list_windows,
-    motion_blur_px,
-    pixel_rays,
-    sample_count,
-)
-from app.simulation.plate_scene import FaceTruth, PlateScene, face_truth
-from app.simulation.raster import accumulate_face, expose_photo, shade_rays
-from app.simulation.sensor import (
-    blurred,
-    develop,
-    encode_jpeg,
-    linear_from_srgb,
-    noise_sigma,
-    shift_colours,
-    through_air,
-    tone,
-)
-from app.simulation.shade import Shade, shade_map
+from app.simulation.plate_face import smooth_noise
+from app.simulation.plate_scene import Air, FaceTruth, PlacedFace, PlateScene, Sensor, Shadow, face_truth
+
+# === Shadows: how much light arrives on each spot of the road.
+
 
 FloatArray = npt.NDArray[np.float32]
-Image = npt.NDArray[np.uint8]
 Matrix = npt.NDArray[np.float64]
+_CELLS, _CELL_M = 600, 0.015
+
+
+@dataclass(frozen=True, slots=True)
+class Shade:
+    """Light on a square patch of road; beyond it the values of its border hold.
+
+    Attributes
+    ----------
+    share : ndarray of float32, shape (N, N)
+        Of the full light, 0 to 1; a single value is everywhere.
+    cell_from_ground : ndarray, shape (2, 3)
+        Affine map from the ground frame to columns and rows.
+    """
+
+    share: FloatArray
+    cell_from_ground: Matrix
+
+    @property
+    def varies(self) -> bool:
+        """There are shadows."""
+        return self.share.size > 1
+
+
+NO_SHADE = Shade(np.ones((1, 1), np.float32), np.zeros((2, 3)))
+
+
+def shade_map(scene: PlateScene) -> Shade:
+    """Light on the road around a scene's first face."""
+    if scene.shadow.is_none or not scene.faces:
+        return NO_SHADE
+    first = scene.faces[0]
+    centre = np.array([_CELLS / 2 - first.ahead_m / _CELL_M, _CELLS / 2 - first.left_m / _CELL_M])
+    return Shade(_shade_field(scene.shadow), np.column_stack([np.eye(2) / _CELL_M, centre]))
+
+
+@lru_cache(maxsize=8)
+def _shade_field(shadow: Shadow) -> FloatArray:
+    """Share of light, columns ahead, rows to the left."""
+    at_m = (np.arange(_CELLS, dtype=np.float32) - _CELLS / 2) * np.float32(_CELL_M)
+    field = np.ones((_CELLS, _CELLS), np.float32)
+    if shadow.edge_light < 1:
+        angle = math.radians(shadow.edge_angle_deg)
+        across = at_m[None, :] * math.cos(angle) + at_m[:, None] * math.sin(angle) - shadow.edge_offset_m
+        lit = 1 / (1 + np.exp(np.clip(-across / max(shadow.penumbra_m / 2, 1e-3), -40, 40)))
+        field *= np.asarray(shadow.edge_light + (1 - shadow.edge_light) * lit, np.float32)
+    if shadow.dapple_light < 1:
+        rng = np.random.default_rng(shadow.seed)
+        leaves = 0.7 * smooth_noise((_CELLS, _CELLS), shadow.dapple_m / _CELL_M, rng)
+        leaves += 0.3 * smooth_noise((_CELLS, _CELLS), max(shadow.dapple_m / _CELL_M / 2.5, 2), rng)
+        gaps = 1 / (1 + np.exp(-(leaves - 0.5) / max(shadow.dapple_softness, 0.02) * 2))
+        field *= np.asarray(shadow.dapple_light + (1 - shadow.dapple_light) * gaps, np.float32)
+    return field
+
+
+# === Compiled inner loops of the camera simulation: area sampling of squares on the road, and the sensor's noise.
+
+
+@kernel
+def accumulate_face(
+    rays: Any,
+    samples: Any,
+    row_time_s: Any,
+    motion: Any,
+    spin: Any,
+    height_m: float,
+    face_from_ground: Any,
+    reflectance: Any,
+    emission: Any,
+    light: Any,
+    shade: Any,
+    shade_from_ground: Any,
+    out: Any,
+    cover: Any,
+) -> None:  # pragma: no cover - compiled
+    """Integrate what each pixel sees of a square on the road over its area and the exposure.
+
+    Parameters
+    ----------
+    rays : float64 (H, W, 3, 3)
+        Of each pixel in the vehicle frame: direction at its centre, and its derivatives by column and by row.
+    samples : float64 (S, 3)
+        Column and row offset within the pixel [px], time from mid-exposure [s].
+    row_time_s : float64 (H,)
+        Mid-exposure of each row. [s]
+    motion, spin : float64 (3,)
+        Velocity [m/s] and angular rate [rad/s] of the camera, vehicle frame.
+    height_m : float
+        Camera above the road. [m]
+    face_from_ground : float64 (2, 3)
+        To columns and rows of the texture, texel edges at integers.
+    reflectance, emission : float32 (T, T, 3)
+        ``emission`` may have no texels.
+    light : float32 (3,)
+        Radiance of a white diffuser in full light.
+    shade : float32 (N, N), shade_from_ground : float64 (2, 3)
+        Share of the light that arrives, by bilinear lookup.
+    out, cover : float32 (H, W, 3), (H, W)
+        Added to: radiance from the square, and the share of the footprint that it fills.
+    """
+    rows, cols = out.shape[0], out.shape[1]
+    count, size = samples.shape[0], reflectance.shape[0]
+    glows = emission.shape[0] > 0
+    weight = 1.0 / count
+    begin, end = samples[:, 2].min(), samples[:, 2].max()
+    for i in range(rows):
+        for j in range(cols):
+            if _misses(rays[i, j], row_time_s[i], begin, end, motion, spin, height_m, face_from_ground, size):
+                continue
+            blue = green = red = hit = 0.0
+            for s in range(count):
+                du, dv, t = samples[s, 0], samples[s, 1], samples[s, 2] + row_time_s[i]
+                gx, gy = _ground(rays[i, j], du, dv, t, motion, spin, height_m)
+                fx = face_from_ground[0, 0] * gx + face_from_ground[0, 1] * gy + face_from_ground[0, 2]
+                fy = face_from_ground[1, 0] * gx + face_from_ground[1, 1] * gy + face_from_ground[1, 2]
+                if fx < 0 or fy < 0 or fx >= size or fy >= size:
+                    continue
+                a, b = int(fy), int(fx)
+                lit = weight * _bilinear(shade, shade_from_ground, gx, gy)
+                blue += lit * light[0] * reflectance[a, b, 0]
+                green += lit * light[1] * reflectance[a, b, 1]
+                red += lit * light[2] * reflectance[a, b, 2]
+                if glows:
+                    blue += weight * emission[a, b, 0]
+                    green += weight * emission[a, b, 1]
+                    red += weight * emission[a, b, 2]
+                hit += weight
+            if hit > 0:
+                out[i, j, 0] += blue
+                out[i, j, 1] += green
+                out[i, j, 2] += red
+                cover[i, j] += hit
+
+
+@step
+def _ground(
+    ray: Any, du: float, dv: float, t: float, motion: Any, spin: Any, height_m: float
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Where a spot of a pixel looks at the road at time t; far away above the horizon."""
+    dx = ray[0, 0] + du * ray[1, 0] + dv * ray[2, 0]
+    dy = ray[0, 1] + du * ray[1, 1] + dv * ray[2, 1]
+    dz = ray[0, 2] + du * ray[1, 2] + dv * ray[2, 2]
+    ex = dx + t * (spin[1] * dz - spin[2] * dy)
+    ey = dy + t * (spin[2] * dx - spin[0] * dz)
+    ez = dz + t * (spin[0] * dy - spin[1] * dx)
+    scale = (height_m + motion[2] * t) / max(-ez, 1e-6)
+    return ex * scale + motion[0] * t, ey * scale + motion[1] * t
+
+
+@kernel
+def _misses(
+    ray: Any,
+    row_time_s: float,
+    begin: float,
+    end: float,
+    motion: Any,
+    spin: Any,
+    height_m: float,
+    face_from_ground: Any,
+    size: int,
+) -> bool:  # pragma: no cover - compiled
+    """Whether the corners of a pixel's footprint at both ends of the exposure all lie beyond one side of the face."""
+    low_x = low_y = 1e30  # fastmath knows no infinity
+    high_x = high_y = -1e30
+    for du in (-0.6, 0.6):
+        for dv in (-0.6, 0.6):
+            for t in (begin, end):
+                gx, gy = _ground(ray, du, dv, row_time_s + t, motion, spin, height_m)
+                fx = face_from_ground[0, 0] * gx + face_from_ground[0, 1] * gy + face_from_ground[0, 2]
+                fy = face_from_ground[1, 0] * gx + face_from_ground[1, 1] * gy + face_from_ground[1, 2]
+                low_x, high_x = min(low_x, fx), max(high_x, fx)
+                low_y, high_y = min(low_y, fy), max(high_y, fy)
+    return high_x < 0 or high_y < 0 or low_x > size or low_y > size
+
+
+@kernel
+def _bilinear(field: Any, field_from_ground: Any, gx: float, gy: float) -> float:  # pragma: no cover - compiled
+    size = field.shape[0]
+    if size == 1:
+        return float(field[0, 0])
+    u = field_from_ground[0, 0] * gx + field_from_ground[0, 1] * gy + field_from_ground[0, 2]
+    v = field_from_ground[1, 0] * gx + field_from_ground[1, 1] * gy + field_from_ground[1, 2]
+    u, v = min(max(u, 0.0), size - 1.001), min(max(v, 0.0), size - 1.001)
+    c, r = int(u), int(v)
+    p, q = u - c, v - r
+    top = field[r, c] * (1 - p) + field[r, c + 1] * p
+    low = field[r + 1, c] * (1 - p) + field[r + 1, c + 1] * p
+    return float(top * (1 - q) + low * q)
+
+
+@kernel
+def shade_rays(
+    rays: Any, height_m: float, shade: Any, shade_from_ground: Any, out: Any
+) -> None:  # pragma: no cover - compiled
+    """Share of the light that arrives where each ray meets the road; 1 above the horizon. ``out``: float32 (H, W)."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            dz = rays[i, j, 2]
+            if dz > -0.02:
+                out[i, j] = 1.0
+                continue
+            scale = height_m / -dz
+            out[i, j] = _bilinear(shade, shade_from_ground, rays[i, j, 0] * scale, rays[i, j, 1] * scale)
+
+
+@kernel
+def expose_photo(
+    photo: Any, share: Any, encode: Any, sigma: Any, noise: Any, offsets: Any, out: Any
+) -> None:  # pragma: no cover - compiled
+    """Give a photo the camera's tone and noise.
+
+    Parameters
+    ----------
+    photo, out : uint8 (H, W, C)
+    share : float32 (h, w)
+        Light that arrives, 0 to 1, at every fourth row and column; a single value stands for all.
+    encode, sigma : float32 (L, C, 256)
+        Encoded value and noise of a photo's value at L even steps of light from 0 to 1. [grey levels]
+    noise : float32 (M,)
+        Standard normal numbers; ``offsets`` : int64 (H,), where each row starts in them.
+    """
+    rows, cols, channels = photo.shape
+    top_level = encode.shape[0] - 1
+    even = share.size == 1
+    level = int(share[0, 0] * top_level + 0.5)
+    for i in range(rows):
+        k = offsets[i]
+        r, q = i >> 2, (i & 3) * 0.25
+        for j in range(cols):
+            if not even:
+                c0, p = j >> 2, (j & 3) * 0.25
+                top = share[r, c0] * (1 - p) + share[r, c0 + 1] * p
+                low = share[r + 1, c0] * (1 - p) + share[r + 1, c0 + 1] * p
+                level = int((top * (1 - q) + low * q) * top_level + 0.5)
+            for c in range(channels):
+                v = photo[i, j, c]
+                x = encode[level, c, v] + sigma[level, c, v] * noise[k] + 0.5
+                k += 1
+                out[i, j, c] = 0 if x < 0 else (255 if x >= 255.5 else int(x))
+
+
+# === The part of the road that each pixel sees, and when.
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Part of an image, half open. [px]"""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    @property
+    def grid(self) -> tuple[Matrix, Matrix]:
+        """Row and column numbers."""
+        return np.arange(self.top, self.bottom, dtype=float), np.arange(self.left, self.right, dtype=float)
+
+    def overlaps(self, other: Window) -> bool:
+        """Whether the two share pixels."""
+        across = self.left < other.right and other.left < self.right
+        return across and self.top < other.bottom and other.top < self.bottom
+
+    def union(self, other: Window) -> Window:
+        """Smallest window around both."""
+        return Window(
+            min(self.left, other.left), min(self.top, other.top), max(self.right, other.right),
+            max(self.bottom, other.bottom),
+        )  # fmt: skip
+
+
+def list_windows(scene: PlateScene, truths: tuple[FaceTruth, ...]) -> list[tuple[Window, list[int]]]:
+    """Parts of the image that faces touch, with the faces in each; those that overlap are one."""
+    groups: list[tuple[Window, list[int]]] = []
+    for index, (placed, truth) in enumerate(zip(scene.faces, truths, strict=True)):
+        window, members = _window(scene, placed, truth), [index]
+        if window is None:
+            continue
+        while other := next((g for g in groups if g[0].overlaps(window)), None):
+            groups.remove(other)
+            window, members = window.union(other[0]), other[1] + members
+        groups.append((window, members))
+    return groups
+
+
+def _window(scene: PlateScene, placed: PlacedFace, truth: FaceTruth) -> Window | None:
+    """Part of the image that a face touches during the exposure, with room for the lens's blur."""
+    if not truth.partly_in_view:
+        return None
+    margin = (
+        motion_blur_px(scene, placed, scene.exposure_s)
+        + 4 * scene.sensor.blur_px
+        + abs(scene.sensor.colour_shift_px)
+        + 6
+    )
+    low, high = truth.corners_px.min(axis=0) - margin, truth.corners_px.max(axis=0) + margin
+    left, top = max(int(low[0]) // 2 * 2, 0), max(int(low[1]) // 2 * 2, 0)
+    right, bottom = min(int(high[0]) + 2, scene.camera.width_px), min(int(high[1]) + 2, scene.camera.height_px)
+    right, bottom = right - (right - left) % 2, bottom - (bottom - top) % 2
+    return Window(left, top, right, bottom) if right - left > 1 and bottom - top > 1 else None
+
+
+def motion_blur_px(scene: PlateScene, placed: PlacedFace, exposure_s: float) -> float:
+    """Longest path of a corner in the image during an exposure. [px]"""
+    if not scene.speed_m_s and not any(scene.spin_deg_s):
+        return 0.0
+    corners = placed.corners_ground_m
+    half = np.full(4, exposure_s / 2)
+    way = np.linalg.norm(scene.project_at(corners, half) - scene.project_at(corners, -half), axis=1)
+    return min(float(np.nanmax(way)), 400.0) if np.isfinite(way).any() else 0.0
+
+
+def sample_count(pixels: int, blur_px: float) -> int:
+    """Samples a pixel: at least four for each pixel of motion, more where a window is small, fewer where it is vast."""
+    wanted = max(3_000_000 / max(pixels, 1), 4 * blur_px + 12, 24)
+    return int(max(min(wanted, 160, 16_000_000 / max(pixels, 1)), 16))
+
+
+@lru_cache(maxsize=64)
+def _unit_samples(count: int) -> Matrix:
+    """Points spread evenly over the unit cube (Kronecker sequence of the plastic number), mean exactly 0.5."""
+    g = 1.2207440846057596
+    points = np.mod(0.5 + np.arange(1, count + 1)[:, None] / g ** np.arange(1, 4), 1.0)
+    points += 0.5 - points.mean(axis=0)
+    return points
+
+
+def exposure_samples(count: int, exposure_s: float, lag_s: float = 0.0) -> Matrix:
+    """Where and when a pixel gathers light.
+
+    Parameters
+    ----------
+    count : int
+    exposure_s : float
+        Light is gathered evenly over it. [s]
+    lag_s : float
+        Time constant with which a slow sensor forgets, in place of the exposure; 0 is none. [s]
+
+    Returns
+    -------
+    ndarray, shape (count, 3)
+        Column and row offset from the pixel's centre [px], time from mid-exposure [s].
+    """
+    unit = _unit_samples(count)
+    when = lag_s * np.log(np.clip(unit[:, 2], 1e-6, 1)) if lag_s > 0 else (unit[:, 2] - 0.5) * exposure_s
+    return np.column_stack([unit[:, :2] - 0.5, when])
+
+
+def directions(scene: PlateScene, cols: Matrix, rows: Matrix) -> Matrix:
+    """Direction in the ground frame of image points, any shape (...,) to (..., 3)."""
+    camera = scene.camera
+    points = np.stack([cols, rows], axis=-1).astype(np.float64)
+    if camera.distortion:
+        ideal = cv2.undistortPoints(points.reshape(-1, 1, 2), camera.matrix, np.array(camera.distortion))
+        ideal = ideal.reshape(points.shape)
+    else:
+        ideal = (points - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
+    rotation = scene.camera_from_ground
+    towards: Matrix = ideal @ rotation[:2] + rotation[2]
+    return towards
+
+
+def pixel_rays(scene: PlateScene, window: Window) -> Matrix:
+    """Directions of a window's pixels and their derivatives by column and row, shape (H, W, 3, 3)."""
+    cols = np.arange(window.left, window.right + 1) - 0.5
+    rows = np.arange(window.top, window.bottom + 1) - 0.5
+    edges = directions(scene, *np.meshgrid(cols, rows))
+    rays = np.empty((len(rows) - 1, len(cols) - 1, 3, 3))
+    a, b, c, d = edges[:-1, :-1], edges[:-1, 1:], edges[1:, :-1], edges[1:, 1:]
+    rays[:, :, 0] = (a + b + c + d) / 4
+    rays[:, :, 1] = (b + d - a - c) / 2
+    rays[:, :, 2] = (c + d - a - b) / 2
+    return rays
+
+
+# === Radiance to grey levels: noise, colour mosaic, gains, tone, sharpening, JPEG.
+#
+# Radiance is linear, 1 = the sensor's saturation; channels are blue, green, red.
+
+
+Image = npt.NDArray[np.uint8]
+
+
+@lru_cache(maxsize=1)
+def linear_from_srgb() -> FloatArray:
+    """Radiance of each value of an 8-bit photo, shape (256,)."""
+    v = np.arange(256) / 255
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def tone(radiance: FloatArray, sensor: Sensor) -> FloatArray:
+    """Encoded value, 0 to 255 and not rounded, of a radiance after gains: shoulder, clipping, gamma."""
+    knee = sensor.shoulder
+    x = np.clip(radiance, 0, None)
+    if knee < 1:
+        x = np.where(x > knee, knee + (1 - knee) * (1 - np.exp(-np.maximum(x - knee, 0) / (1 - knee))), x)
+    x = np.minimum(x, 1)
+    toe = 0.0031308
+    encoded = np.where(x <= toe, 12.92 * x, 1.055 * np.power(np.maximum(x, toe), 1 / (sensor.gamma + 0.2)) - 0.055)
+    return np.asarray(255 * encoded, np.float32)
+
+
+def noise_sigma(radiance: FloatArray, sensor: Sensor) -> FloatArray:
+    """Standard deviation of the sensor's noise before gains, as a share of saturation: shot and read noise."""
+    electrons = np.clip(radiance, 0, None) * sensor.full_well_e + sensor.read_noise_e**2
+    return np.asarray(np.sqrt(electrons) / sensor.full_well_e, np.float32)
+
+
+def through_air(radiance: FloatArray, air: Air) -> FloatArray:
+    """Radiance that reaches the lens through haze."""
+    return np.asarray(radiance * (1 - air.haze) + air.airlight * air.haze, np.float32)
+
+
+def develop(radiance: FloatArray, air: Air, sensor: Sensor, rng: np.random.Generator) -> Image:
+    """Frame of a radiance, shape (H, W, 3): air, noise, colour mosaic, gains, tone, sharpening.
+
+    The mosaic's first pixel is red, so a part of a frame must start at an even row and column.
+    """
+    light = through_air(radiance, air) * np.float32(sensor.gain)
+    gains = np.array(sensor.white_balance, np.float32)
+    if sensor.bayer:
+        raw = _mosaic(light)
+        raw = raw + noise_sigma(raw, sensor) * rng.standard_normal(raw.shape, dtype=np.float32)
+        raw = raw * _mosaic(np.broadcast_to(gains, light.shape))
+        codes = np.clip(raw * 16000 + 2000.5, 0, 65535).astype(np.uint16)  # an offset keeps the noise of black
+        light = (cv2.cvtColor(codes, cv2.COLOR_BayerRGGB2BGR_EA).astype(np.float32) - 2000) / 16000
+    else:
+        light = light + noise_sigma(light, sensor) * rng.standard_normal(light.shape, dtype=np.float32)
+        light = light * gains
+    encoded = tone(light, sensor)
+    if sensor.sharpen:
+        encoded = encoded + sensor.sharpen * (encoded - cv2.GaussianBlur(encoded, (0, 0), 1.0))
+    return np.asarray(np.clip(encoded + 0.5, 0, 255), np.uint8)
+
+
+def _mosaic(light: FloatArray) -> FloatArray:
+    """One colour a pixel: red top-left, blue bottom-right, green else."""
+    raw = light[..., 1].copy()
+    raw[0::2, 0::2] = light[0::2, 0::2, 2]
+    raw[1::2, 1::2] = light[1::2, 1::2, 0]
+    return raw
+
+
+def blurred(light: FloatArray, sigma_px: float) -> FloatArray:
+    """Light spread by a Gaussian lens."""
+    return np.asarray(cv2.GaussianBlur(light, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
+def shift_colours(radiance: FloatArray, shift_px: float) -> FloatArray:
+    """Move blue and red sideways against each other."""
+    out = radiance.copy()
+    size = (radiance.shape[1], radiance.shape[0])
+    for channel, sign in ((0, 0.5), (2, -0.5)):
+        move = np.array([[1, 0, sign * shift_px], [0, 1, 0]])
+        plane = np.ascontiguousarray(radiance[..., channel])
+        out[..., channel] = cv2.warpAffine(plane, move, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return out
+
+
+def encode_jpeg(image: Image, quality: int) -> Image:
+    """JPEG with colour at half resolution (4:2:0), as cameras write it."""
+    sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    done, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling])
+    if not done:
+        raise InvalidParameter("the image cannot be coded as JPEG", field="image")
+    return np.asarray(jpeg, np.uint8)
+
+
+# === Scene to frame.
+
+
 _SHADE_STEPS = 129
 _NOISE_LENGTH = 1 << 20
 _NO_EMISSION = np.empty((0, 0, 3), np.float32)

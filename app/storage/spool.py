@@ -18,7 +18,35 @@ from pathlib import Path
 from typing import BinaryIO
 
 from app.errors import StorageFull, Unavailable, is_disk_full
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
+
+# === Whether a folder can be written: there is room, and a file in it can be made durable.
+
+
+MIN_FREE_BYTES = 1024**2
+"""Room below which a folder counts as full. [byte] Chosen by hand: more than most requests store."""
+_FILE = ".probe"
+
+
+def find_folder_fault(folder: Path) -> str | None:
+    """Why a folder cannot be written; None if it can: a small file is written, made durable and deleted."""
+    try:
+        status = os.statvfs(folder)
+        if (free := status.f_bavail * status.f_frsize) < MIN_FREE_BYTES:
+            return f"{folder} has {free} bytes left, fewer than {MIN_FREE_BYTES}"
+        path = folder / _FILE
+        with path.open("wb") as file:
+            file.write(b"waymark")
+            file.flush()
+            os.fsync(file.fileno())
+        path.unlink()
+    except OSError as error:
+        return f"{folder}: {error.strerror}"
+    return None
+
+
+# === The spool folder.
+
 
 IN_MEMORY_BYTES = 1 << 20
 """Largest body that is held in memory. [byte] Source: chosen by hand; a JPEG of 1080p has 0.2 to 0.8 MB."""
@@ -28,7 +56,7 @@ docs/uploads.md states for the server process."""
 BLOCK_BYTES = 1 << 18
 """Bytes that are collected before they are written. [byte] Source: chosen by hand; 64 clients hold 16 MiB."""
 MIN_AGE_S = 6 * 3600.0
-"""Age from which a file that nobody writes belongs to a server that was killed. [s] Source: `unused_blobs.MIN_AGE`."""
+"""Age from which a file that nobody writes belongs to a server that was killed. [s] Source: `blobs.MIN_AGE`."""
 KEPT_FREE_BYTES = 64 << 20
 """Room that uploads leave on the disk, for the database. [byte] Source: chosen by hand."""
 

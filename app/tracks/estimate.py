@@ -10,28 +10,27 @@ import scipy
 
 from app.errors import InvalidParameter
 from app.tracks import kernel
-from app.tracks.clock_jumps import find_jump, split_where_time_falls
-from app.tracks.dead_reckoning import DeadReckoning, dead_reckon
-from app.tracks.kernel import HEADING_SAMPLE, SPEED_SAMPLE
-from app.tracks.left_out import count_passages, stretches_left_out
+from app.tracks.kernel import HEADING_SAMPLE, SPEED_SAMPLE, Motion
 from app.tracks.measure import (
     FixArrays,
     PathIndex,
     averaged_rates,
+    count_passages,
     fix_arrays,
     fix_rows,
     in_order,
+    is_receiver,
     passage_distances,
     path_index,
     path_rows,
+    receiver_results,
     sample_rows,
+    stretches_left_out,
+    with_estimated_accuracy,
 )
-from app.tracks.motion import Motion
-from app.tracks.receiver import is_receiver, receiver_results, with_estimated_accuracy
 from app.tracks.results import collect_track
-from app.tracks.speed_alignment import align_clocks
-from app.tracks.start import start_set, start_state
-from app.tracks.time_base import TimeBase, checked_clocks, time_base
+from app.tracks.start import DeadReckoning, dead_reckon, start_set, start_state
+from app.tracks.time_base import TimeBase, align_clocks, checked_clocks, find_jump, split_where_time_falls, time_base
 from app.tracks.types import (
     CLOCKS,
     HEADING,
@@ -53,7 +52,7 @@ _READMIT = 0.8  # of the gate: no fix goes in and out in turn; source: by hand
 _NEIGHBOURS_S = 20.0  # [s] one outlier at a time is left out of this; source: by hand, it spoils what is near
 MAX_JUMPS = 4
 """Steps of clocks at most. Source: by hand."""
-_MIN_LEFT_OUT = 3  # fixes, from which on a step of a clock may be the cause; source: app/tracks/clock_jumps.py
+_MIN_LEFT_OUT = 3  # fixes, from which on a step of a clock may be the cause; source: app/tracks/time_base.py
 _EXPLORED_S = 0.02  # [s2/s] by which offsets may change while steps are looked for; source: by hand, 0.5 s in 12 s
 _EXPLORING_ROUNDS = 3
 _MOTION = Motion(

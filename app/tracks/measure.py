@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
-from app.geodesy.ellipsoid import ecef_from_wgs84, metres_per_radian
+from app.geodesy.frames import ecef_from_wgs84, metres_per_radian
 from app.tracks.kernel import FIX, HEADING_SAMPLE, PATH, Measurements
 from app.tracks.time_base import TimeBase
 from app.tracks.types import (
@@ -21,9 +22,56 @@ from app.tracks.types import (
     Ints,
     LanePath,
     PositionFix,
+    ReceiverResult,
     Samples,
     TrackRules,
 )
+
+if TYPE_CHECKING:
+    from app.tracks.estimate import Smoothed
+
+
+# === Markers that were left out one after another: there the track may have lost its way, not the markers.
+
+
+MIN_PASSAGES = 3
+"""Markers in a row. Source: by hand; where one in ten is wrong, three in a row are so once in 1000."""
+
+
+def stretches_left_out(used: Bools, markers: Bools, passage: Ints) -> list[Ints]:
+    """Rows of the fixes of each stretch in which `MIN_PASSAGES` markers or more were left out and none was used.
+
+    Parameters
+    ----------
+    used, markers : ndarray of bool, shape (K,)
+        In the order of the times.
+    passage : ndarray of int, shape (K,)
+    """
+    rows = np.flatnonzero(markers)
+    left = ~used[rows]
+    edges = np.flatnonzero(np.diff(np.r_[False, left, False].astype(np.int8)))
+    runs = [rows[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [run for run in runs if np.unique(passage[run]).size >= MIN_PASSAGES]
+
+
+def count_passages(used: Bools, passage: Ints) -> int:
+    """Passes of markers that are used: the frames of one pass are one witness."""
+    return int(np.unique(passage[used]).size)
+
+
+def times_lost(time_s: Floats, used: Bools, markers: Bools, passage: Ints) -> list[tuple[float, float]]:
+    """Stretches of time around such stretches, from the marker used before to the one used after. [s]"""
+    kept = np.sort(time_s[used & markers])
+    found = []
+    for run in stretches_left_out(used, markers, passage):
+        first, last = float(time_s[run].min()), float(time_s[run].max())
+        before, after = kept[kept < first], kept[kept > last]
+        found.append((float(before[-1]) if before.size else -np.inf, float(after[0]) if after.size else np.inf))
+    return found
+
+
+# === All that is known of a drive as measurements at the nodes of the time base.
+
 
 COMMON_POSE_SHARE = 0.1
 """Part of the variance of a pose that all frames past one marker share: calibration and mount of the camera. Source:
@@ -38,7 +86,7 @@ _PATH_NEAR_M = 8.0  # [m] further from the path it is not driven; source: by han
 _PATH_SPACING_M = 1.0  # [m] between points of a path that is searched; source: by hand
 _PATH_SIGMAS = 3.0  # source: by hand, beyond it the vehicle has left the lane
 _SAME_WAY = 0.87  # cosine of the angle between vehicle and lane; source: by hand, 30 deg
-_MIN_PATH_SIGMA_M = 0.02  # [m] source: app/lanes/driven_line.py
+_MIN_PATH_SIGMA_M = 0.02  # [m] source: app/lanes/initial_line.py
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -282,3 +330,68 @@ def passage_distances(
         off = vectors.T @ (residual[members].mean(axis=0) / np.sqrt(np.diag(own)))
         result[members] = np.maximum(result[members], float((off**2 / np.maximum(values, 1e-3)).sum()))
     return result
+
+
+# === Positions of the vehicle's own receiver beside markers.
+#
+# Markers are surveyed and a receiver is not: positions of a receiver never decide which markers are used. The drive is
+# estimated by its markers first; where that track shows that positions are further off than their stated accuracy, the
+# accuracy is enlarged until they fit. Only then the positions take part, each gated by its distance from the track.
+#
+# A receiver's error changes slowly: all positions of a minute share it, as frames of one marker share that of its
+# survey.
+
+
+_MAX_DOUBLINGS = 60  # of the variance; any position on earth fits then
+_NEAREST_SHARE = 0.5  # of the positions, where the track by markers is best, show how good they are; source: by hand
+
+
+def is_receiver(fixes: tuple[PositionFix, ...]) -> Bools:
+    """Which fixes are positions of a receiver, shape (K,)."""
+    return np.array([fix.marker_id is None for fix in fixes], bool)
+
+
+def with_estimated_accuracy(
+    fixes: tuple[PositionFix, ...], arrays: FixArrays, by_markers: Smoothed
+) -> tuple[FixArrays, Floats]:
+    """Fixes with the covariance of the receivers' positions enlarged to what markers show, and the factors (K,).
+
+    Notes
+    -----
+    For each source, the least power of two by which its covariances R are to be multiplied so that the median of
+    r' (S + f R)^-1 r does not exceed that of the chi-square distribution with two degrees of freedom. r is the distance
+    from the track by markers and S the covariance of that track, of the receiver's clock with it.
+    """
+    factor = np.ones(len(fixes))
+    limit = float(scipy.stats.chi2.ppf(0.5, 2))
+    upper = np.array([[0, 1], [1, 2]])
+    own = arrays.cov_m2[:, upper]
+    off, spread = by_markers.offset_m[:, :2], by_markers.spread[:, :2, :2]
+    sources = np.array([fix.source if fix.marker_id is None else "" for fix in fixes])
+    receiver = is_receiver(fixes)
+    for source in dict.fromkeys(sources[receiver].tolist()):
+        members = np.flatnonzero(receiver & (sources == source))
+        size = np.linalg.det(spread[members])
+        near = members[size <= np.quantile(size, _NEAREST_SHARE)]
+        for doubling in range(_MAX_DOUBLINGS):
+            factor[members] = 2.0**doubling
+            whole = spread[near] + factor[near, None, None] * own[near]
+            if np.median(np.einsum("ki,ki->k", off[near], np.linalg.solve(whole, off[near, :, None])[..., 0])) <= limit:
+                break
+    cov = arrays.cov_m2 * factor[:, None]
+    common = np.where(receiver, (cov[:, 0] + cov[:, 2]) / 2, arrays.common_m2)
+    return replace(arrays, cov_m2=cov, common_m2=common), factor
+
+
+def receiver_results(fixes: tuple[PositionFix, ...], factor: Floats, used: Bools) -> tuple[ReceiverResult, ...]:
+    """What became of the positions of each source."""
+    found = []
+    for source in dict.fromkeys(fix.source for fix in fixes if fix.marker_id is None):
+        members = [k for k, fix in enumerate(fixes) if fix.marker_id is None and fix.source == source]
+        stated = float(np.median([math.sqrt(fixes[k].covariance_m2[0] + fixes[k].covariance_m2[2]) for k in members]))
+        count = int(used[members].sum())
+        widened = math.sqrt(float(factor[members[0]]))
+        found.append(
+            ReceiverResult(source, fixes[members[0]].clock, count, len(members) - count, stated, stated * widened)
+        )
+    return tuple(found)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.tracks.left_out import times_lost
+from app.tracks.measure import times_lost
 from app.tracks.time_base import TimeBase
 from app.tracks.types import (
     BIAS,

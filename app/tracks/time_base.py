@@ -3,13 +3,165 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from app.errors import InvalidParameter
-from app.tracks.types import CLOCKS, Clock, Floats, TrackInput
+from app.tracks.types import CLOCKS, MAX_CLOCK_SIGMA_S, Clock, Floats, Ints, PositionFix, Samples, TrackInput
+
+if TYPE_CHECKING:
+    from app.tracks.estimate import Segment
+
+
+# === Clocks that were set while a sensor recorded.
+
+
+_MIN_STEP_S = 0.1  # [s] smaller steps are the drift of a clock; source: by hand
+_MIN_FIXES = 3  # on both sides; source: by hand, two could be outliers
+_SIGMAS = 5.0  # of a step over its standard error; source: by hand
+_BACK_S = 0.5  # [s] a step back in the order of the frames that is no late frame; source: by hand
+_MAX_BACK = 3  # steps back of a clock; more of them are no steps of a clock; source: by hand
+_BACK_SIGMA_S = 5.0  # [s] error of a clock after a step back, at least; source: by hand
+_MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Jump:
+    """A step of a sensor's clock: time of the first fix after it, on that clock, and offsets on both sides. [s]"""
+
+    first_s: float
+    before_s: float
+    after_s: float
+
+
+def split_where_time_falls(
+    fixes: tuple[PositionFix, ...], segment_of: Ints, segments: list[Segment]
+) -> tuple[Ints, int]:
+    """Give each part of a source whose times run backwards an offset of its own.
+
+    Parameters
+    ----------
+    fixes : tuple of PositionFix
+    segment_of : ndarray of int, shape (K,)
+    segments : list of Segment
+        Those of new parts are appended.
+
+    Returns
+    -------
+    segment_of : ndarray of int, shape (K,)
+    count : int
+        Steps back that were found.
+    """
+    found, segment_of = 0, segment_of.copy()
+    by_source: dict[tuple[str, str], list[int]] = {}
+    for k, fix in enumerate(fixes):
+        by_source.setdefault((fix.clock, fix.source), []).append(k)
+    for members in by_source.values():
+        rows = np.array(sorted(members, key=lambda k: (fixes[k].place, fixes[k].time_s)))
+        place = np.array([fixes[k].place for k in rows])
+        fallen = np.diff([fixes[k].time_s for k in rows]) < -_BACK_S
+        starts = np.flatnonzero(fallen & (np.diff(place) > 0)) + 1
+        if starts.size > _MAX_BACK or (np.diff(np.r_[0, starts, rows.size]) < _MIN_FIXES).any():
+            continue  # the pictures are in another order than that of their times
+        for start in starts:
+            old = segments[segment_of[rows[start]]]
+            clock = replace(old.clock, sigma_s=max(old.clock.sigma_s, _BACK_SIGMA_S))
+            segments.append(replace(old, jumped=True, is_reference=False, clock=clock))
+            segment_of[rows[start:]] = len(segments) - 1
+            found += 1
+    return segment_of, found
+
+
+def find_jump(time_s: Floats, offset_s: Floats) -> Jump | None:
+    """The step of a clock whose offset was estimated at each fix.
+
+    A clock that was set divides the offsets into two groups; a wrong marker stands alone.
+
+    Parameters
+    ----------
+    time_s, offset_s : ndarray, shape (K,)
+        Times of a clock's fixes, rising, and its offset at each, by a smoother that lets it change. [s]
+    """
+    if time_s.size < 2 * _MIN_FIXES:
+        return None
+    splits = range(_MIN_FIXES, time_s.size - _MIN_FIXES + 1)
+    i = min(splits, key=lambda i: _spread(offset_s[:i]) + _spread(offset_s[i:]))
+    left, right = offset_s[:i], offset_s[i:]
+    before, after = float(np.median(left)), float(np.median(right))
+    noise = _MAD_TO_SIGMA * float(np.median(np.abs(np.r_[left - before, right - after])))
+    if abs(after - before) < max(_MIN_STEP_S, _SIGMAS * noise / np.sqrt(min(i, time_s.size - i))):
+        return None
+    return Jump(float(time_s[i]), before, after)
+
+
+def _spread(values: Floats) -> float:
+    return float(np.abs(values - np.median(values)).sum())
+
+
+# === Clocks of sensors that both know the speed: the offset at which their speeds agree.
+
+
+_STEP_S = 0.1  # [s] source: by hand, the smoother finds the rest
+_MIN_OVERLAP_S = 20.0  # [s] source: by hand, one junction
+_MIN_CHANGE_M_S = 0.5  # [m/s] standard deviation of a speed that has a shape; source: by hand
+_MIN_CORRELATION = 0.9  # source: by hand, the same car
+_MIN_LEAD = 0.02  # over offsets that are more than `_APART_S` away; source: by hand
+_APART_S = 2.0  # [s]
+_SEARCH_SIGMAS, _MIN_SEARCH_S = 4.0, 2.0  # source: by hand
+_FOUND_SIGMA_S = 0.3  # [s] of an offset that was found so; source: by hand, three steps
+
+
+def align_clocks(given: TrackInput, clocks: dict[str, Clock]) -> TrackInput:
+    """Set the offsets of clocks by the speeds, compared with those of the clock that has most of them."""
+    longest: dict[str, Samples] = {}
+    for series in given.speeds:
+        if series.clock not in longest or series.time_s.size > longest[series.clock].time_s.size:
+            longest[series.clock] = series
+    if len(longest) < 2:
+        return given
+    reference = min(longest, key=lambda name: (-longest[name].time_s.size, name))
+    found = dict(clocks)
+    for name, series in longest.items():
+        clock = clocks[name]
+        if name == reference or clock.sigma_s == 0:
+            continue
+        lag = _best_lag(longest[reference], clocks[reference], series, clock)
+        if lag is not None:
+            sigma = min(max(clock.sigma_s, 1e-3), _FOUND_SIGMA_S, MAX_CLOCK_SIGMA_S)
+            found[name] = replace(clock, offset_s=clock.offset_s + lag, sigma_s=sigma)
+    return replace(given, clocks=tuple(found.values()))
+
+
+def _best_lag(reference: Samples, reference_clock: Clock, series: Samples, clock: Clock) -> float | None:
+    """What is to be added to the offset; None where no offset stands out."""
+    reach = max(_SEARCH_SIGMAS * clock.sigma_s, _MIN_SEARCH_S)
+    t, own = reference.time_s + reference_clock.offset_s, series.time_s + clock.offset_s
+    start, end = max(t[0], own[0]) + reach, min(t[-1], own[-1]) - reach
+    if end - start < _MIN_OVERLAP_S:
+        return None
+    at = np.arange(start, end, _STEP_S)
+    first = np.interp(at, t, reference.value)
+    if first.std() < _MIN_CHANGE_M_S:
+        return None
+    lags = np.arange(-reach, reach + _STEP_S / 2, _STEP_S)
+    score = np.array([_correlation(first, np.interp(at - lag, own, series.value)) for lag in lags])
+    best = int(np.argmax(score))
+    others = score[np.abs(lags - lags[best]) > _APART_S]
+    if score[best] < _MIN_CORRELATION or (others.size and score[best] < others.max() + _MIN_LEAD):
+        return None
+    return float(lags[best])
+
+
+def _correlation(a: Floats, b: Floats) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-9)
+
+
+# === The times of a drive.
+
 
 STEP_S = 0.1
 """Time between nodes. [s] Source: by hand; a car turns by less than 3 deg and brakes by less than 1 m/s in it."""
@@ -19,7 +171,7 @@ below the memory and the time of a decoder process: 89 s and 1.2 GB, the simulat
 MAX_PAUSE_S = 600.0
 """Longest time without any data that a track leads across. [s] Source: by hand; a constant speed is no forecast for
 ten minutes, but a wait at a ferry is one drive."""
-_NEAR_S = 1.0  # [s] a node has a speed or a heading if a sample is so near; source: app/formats/traces/series.py
+_NEAR_S = 1.0  # [s] a node has a speed or a heading if a sample is so near; source: app/formats/traces/parts.py
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 EAST, NORTH, HEADING, SPEED, YAW_RATE, SCALE, BIAS, WANDER, CLOCKS = range(9)
-"""Places in the state (`app.tracks.motion`); the offsets of the clocks follow from `CLOCKS` on."""
+"""Places in the state (`app.tracks.kernel`); the offsets of the clocks follow from `CLOCKS` on."""
 
 
 class LeftOutReason(StrEnum):

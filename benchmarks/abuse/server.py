@@ -17,7 +17,7 @@ from pathlib import Path
 
 import httpx
 
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _POLL_S = 0.02

@@ -11,20 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from app.decoders.cerpm.freshness import SequenceSpan
 from app.decoders.cerpm.merge import merge_markers
-from app.decoders.cerpm.verify import Verdict, verify_packets
+from app.decoders.cerpm.verify import SequenceSpan, Verdict, verify_packets
 from app.lanes.control import Controller
 from app.lanes.estimate import fit_lane
-from app.sensors.receiver import ReceivedPacket
+from app.sensors.pose_track import ReceivedPacket
 from app.simulation.radio.attacks import forge_packets, number_entries, replay_packets
 from app.simulation.radio.drive import SimulatedDrive, drive_past, marker_message
-from app.simulation.radio.lanes import make_lane
+from app.simulation.radio.lanes import InstalledMarkers, RoadShape, lane_of_shape, make_lane
 from app.simulation.radio.link import Radio, mean_rssi_dbm, receive_transmissions, send_beacons
-from app.simulation.radio.markers import InstalledMarkers
-from app.simulation.radio.road_shapes import RoadShape, lane_of_shape
-from app.simulation.steering import check_steering
-from app.simulation.vehicle import PoseNoise
+from app.simulation.steering import PoseNoise, check_steering
 from benchmarks.cerpm import scenes
 from benchmarks.cerpm.paths import Result, met, runs_of
 

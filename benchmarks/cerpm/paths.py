@@ -11,8 +11,7 @@ import numpy as np
 from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.verify import verify_packets
 from app.lanes.estimate import Lane, LaneMarkers, fit_lane
-from app.sensors.pose_track import PoseTrack
-from app.sensors.receiver import ReceivedPacket
+from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from app.simulation.radio.attacks import (
     corrupt_packets,
     forge_packets,
@@ -22,10 +21,8 @@ from app.simulation.radio.attacks import (
     shift_clock,
     shuffle_packets,
 )
-from app.simulation.radio.drive import drive_past
-from app.simulation.radio.driving import SatelliteReceiver
-from app.simulation.radio.lanes import TrueLane
-from app.simulation.radio.markers import InstalledMarkers, lose_row, lose_share
+from app.simulation.radio.drive import SatelliteReceiver, drive_past
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane, lose_row, lose_share
 from benchmarks.cerpm import scenes
 from benchmarks.cerpm.path_errors import Tally, path_errors, track_errors
 

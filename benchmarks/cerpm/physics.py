@@ -14,12 +14,10 @@ import numpy.typing as npt
 from app.decoders.cerpm.merge import merge_markers
 from app.decoders.cerpm.verify import verify_packets
 from app.lanes.estimate import fit_lane
-from app.radio.path_loss import fit_path_loss
-from app.simulation.radio.drive import drive_past
-from app.simulation.radio.driving import Multipath, SatelliteReceiver
+from app.radio.link import fit_path_loss
+from app.simulation.radio.drive import Multipath, SatelliteReceiver, drive_past
 from app.simulation.radio.lanes import TrueLane
-from app.simulation.radio.link import Radio, mean_rssi_dbm
-from app.simulation.radio.propagation import ANTENNA_M, AntennaPattern, TwoRay
+from app.simulation.radio.link import ANTENNA_M, AntennaPattern, Radio, TwoRay, mean_rssi_dbm
 from benchmarks.cerpm import scenes
 from benchmarks.cerpm.path_errors import Tally, path_errors, track_errors
 from benchmarks.cerpm.paths import Result, list_scenes, span_of

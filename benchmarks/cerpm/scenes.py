@@ -11,17 +11,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.merged_markers import MergedMarkers
-from app.encoders.cerpm.payload import encode_message
+from app.decoders.cerpm.merge import MergedMarkers
+from app.encoders.cerpm import encode_message
 from app.lanes.estimate import LaneMarkers
-from app.markers.cerpm import CerpmMessage, SpeedLimit, SpeedUnit
-from app.markers.cerpm_keys import derive_marker_key
+from app.markers.cerpm import CerpmMessage, SpeedLimit, SpeedUnit, derive_marker_key
 from app.planning.cerpm_placement import place_markers
-from app.sensors.pose_track import PoseTrack
-from app.sensors.receiver import ReceivedPacket
-from app.simulation.radio.driving import Driver, SatelliteReceiver, drive_lane, observe_track
-from app.simulation.radio.lanes import TrueLane, lane_from_wgs84, make_lane
-from app.simulation.radio.markers import InstalledMarkers, install_markers
+from app.sensors.pose_track import PoseTrack, ReceivedPacket
+from app.simulation.radio.drive import Driver, SatelliteReceiver, drive_lane, observe_track
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_from_wgs84, make_lane
 
 Floats = npt.NDArray[np.float64]
 

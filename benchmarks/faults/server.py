@@ -13,7 +13,7 @@ from pathlib import Path
 import httpx
 import psutil
 
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 
 ADMIN_KEY = "an-admin-key-for-the-faults"
 HEADERS = {"X-API-Key": ADMIN_KEY}

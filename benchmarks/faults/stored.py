@@ -10,12 +10,12 @@ import sqlalchemy as sa
 
 from app.registry.blob_references import blob_references
 from app.registry.database import Database
+from app.registry.engines import across_agencies
 from app.registry.jobs import UNFINISHED
 from app.registry.tables import decodes, jobs, markers, plan_markers, planned_markers
-from app.registry.tenancy import across_agencies
 from app.services.access.audit import AuditLog
+from app.services.blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.services.ports import utc_now
-from app.services.unused_blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.storage.blobs import Blobs
 from benchmarks.faults.writers import IMPORT_ROAD, IMPORT_ROWS, Acknowledged
 

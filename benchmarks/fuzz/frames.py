@@ -12,9 +12,9 @@ from app.decoders.plate.reader import decode_plates
 from app.errors import WaymarkError
 from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.jobs.pool import DecodePool
-from app.services.decodes.frame_task import FramePicture, FrameSearch, FrameTask
+from app.services.decodes.tasks import FramePicture, FrameSearch, FrameTask
 from benchmarks.fuzz.parsers import Outcome
 from benchmarks.fuzz.pictures import list_pictures
 

@@ -16,22 +16,21 @@ from pathlib import Path
 from hypothesis import HealthCheck, Phase, given, settings
 
 from app.api.ogc.cql2 import Reader
-from app.decoders.cerpm.payload import decode_message
-from app.encoders.cerpm.payload import encode_message
+from app.decoders.cerpm.verify import decode_message
+from app.encoders.cerpm import encode_message
 from app.errors import WaymarkError
 from app.formats.alignments.read import read_alignment
-from app.formats.archives import read_members
-from app.formats.image_headers import ImageLimits, scan_image
+from app.formats.format import SpooledFile, read_members
+from app.formats.images import ImageLimits, scan_image
 from app.formats.json_text import parse_json
 from app.formats.kinds import detect_drive_file, guess_kind
 from app.formats.packets.read import read_packets
-from app.formats.poses.read import read_poses
-from app.formats.spooled_file import SpooledFile
+from app.formats.poses import read_poses
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.formats.traces.read import read_trace
 from app.markers.cerpm import KEY_BYTES, CerpmMessage
-from app.planning.read_rules import read_rules
+from app.planning.rules import read_rules
 from benchmarks.fuzz.mutations import damaged
 from benchmarks.fuzz.pictures import list_pictures
 

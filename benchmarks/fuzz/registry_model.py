@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from app.errors import CodeTaken, StaleVersion
-from app.families.inputs import PositionIn
-from app.families.plate.registration import NewPlate
+from app.families.documents import PositionIn
+from app.families.plate.inputs import NewPlate
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter
 from app.services.access.access import Access, Scope

@@ -17,12 +17,17 @@ from app.markers.cerpm import LaneSide
 from app.planning.cerpm_placement import place_markers
 from app.plots.lane import picture_of_lane, plot_lane
 from app.sensors.pose_track import PoseTrack
-from app.simulation.radio.drive import drive_past
-from app.simulation.radio.driving import Driver, SatelliteReceiver, drive_lane, observe_track
-from app.simulation.radio.lanes import TrueLane
+from app.simulation.radio.drive import Driver, SatelliteReceiver, drive_lane, drive_past, observe_track
+from app.simulation.radio.lanes import (
+    InstalledMarkers,
+    RoadShape,
+    TrueLane,
+    install_markers,
+    lane_of_shape,
+    lose_row,
+    lose_share,
+)
 from app.simulation.radio.link import Radio
-from app.simulation.radio.markers import InstalledMarkers, install_markers, lose_row, lose_share
-from app.simulation.radio.road_shapes import RoadShape, lane_of_shape
 from benchmarks.cerpm.path_errors import TOLERANCE_M, PlaceErrors, place_errors
 from benchmarks.cerpm.scenes import LIMIT, ROUTE_NAMES, keys_for, markers_from_merged, route, sign
 from benchmarks.hunt.scenes import Bound, Kind, Outcome, Parameters, switch

@@ -15,10 +15,9 @@ from app.markers.magnet import MOMENT_AM2, Orientation, Polarity
 from app.sensors.magnetometer_bar import MagnetometerBar
 from app.simulation.magnetic.clutter import Clutter, ferrous_clutter, town_clutter
 from app.simulation.magnetic.dipoles import dipole_field_ut
-from app.simulation.magnetic.drive import Scene, SimulatedDrive, TrueMagnet, simulate_drive
-from app.simulation.magnetic.readout import Chip
+from app.simulation.magnetic.drive import Course, Scene, SimulatedDrive, TrueMagnet, Vehicle, Wheel, simulate_drive
+from app.simulation.magnetic.recorder import Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, line_magnets
-from app.simulation.magnetic.vehicle import Course, Vehicle, Wheel
 from benchmarks.hunt.scenes import Bound, Kind, Outcome, Parameters, draw_parameters, switch
 from benchmarks.magnets.drawn_scenes import FORMAT
 from benchmarks.magnets.scenes import LEAD_M, random_magnets, random_tag

@@ -15,8 +15,8 @@ import numpy as np
 from pyproj import CRS
 
 from app.errors import WaymarkError
-from app.families.rules import MarkerRules
-from app.formats.spooled_file import SpooledFile
+from app.families.surveys import MarkerRules
+from app.formats.format import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.jobs.tasks import SameProcess

@@ -145,8 +145,8 @@ def _measured(what: str, command: list[str]) -> Figure | None:
 
 def main() -> None:
     """One step in this process; its figures as JSON."""
-    from app.families.rules import MarkerRules
-    from app.formats.spooled_file import SpooledFile
+    from app.families.surveys import MarkerRules
+    from app.formats.format import SpooledFile
     from app.formats.surveys.declaration import ImportDeclaration
     from app.jobs.tasks import SameProcess
     from app.registry.database import Database
@@ -185,7 +185,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from app.registry.tenancy import across_agencies
+    from app.registry.engines import across_agencies
 
     with across_agencies():
         main()

@@ -22,8 +22,7 @@ from app.decoders.magnet.metro import MetroSettings, decode_trace_metro
 from app.decoders.magnet.readings import Finding
 from app.markers.magnet import Orientation
 from app.sensors.magnetometer_bar import MagnetTrace
-from app.simulation.magnetic.drive import SimulatedDrive
-from app.simulation.magnetic.vehicle import Course, Vehicle
+from app.simulation.magnetic.drive import Course, SimulatedDrive, Vehicle
 from benchmarks.magnets import drawn_scenes, scenes
 from benchmarks.magnets.physics import run_physics
 from benchmarks.magnets.score import TagTally, Tally, score_magnets, score_tags

@@ -9,9 +9,8 @@ import numpy as np
 from app.decoders.magnet.identify import TagFormat
 from app.markers.magnet import Polarity
 from app.simulation.magnetic.clutter import ferrous_clutter, town_clutter
-from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
+from app.simulation.magnetic.drive import MPH, Course, Scene, SimulatedDrive, Vehicle, Wheel, simulate_drive
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
-from app.simulation.magnetic.vehicle import MPH, Course, Vehicle, Wheel
 from benchmarks.magnets.scenes import LEAD_M, random_magnets, random_tag
 
 WHEEL_MOMENTS_AM2 = (0.01, 1.0)

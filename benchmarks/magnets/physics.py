@@ -14,11 +14,10 @@ import numpy as np
 from app.decoders.magnet.decoder import decode_trace
 from app.decoders.magnet.identify import TagCandidates, TagFormat
 from app.simulation.magnetic.clutter import ferrous_clutter
-from app.simulation.magnetic.cylinders import METRO_CYLINDER, Cylinder
-from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
-from app.simulation.magnetic.readout import Chip
+from app.simulation.magnetic.dipoles import METRO_CYLINDER, Cylinder
+from app.simulation.magnetic.drive import MPH, Course, Scene, SimulatedDrive, Vehicle, simulate_drive
+from app.simulation.magnetic.recorder import Chip
 from app.simulation.magnetic.road import PlacedTag, Road
-from app.simulation.magnetic.vehicle import MPH, Course, Vehicle
 from benchmarks.magnets.scenes import LEAD_M, random_magnets, random_tag
 from benchmarks.magnets.score import TagTally, Tally, score_magnets, score_tags
 

@@ -10,9 +10,8 @@ import numpy as np
 from app.decoders.magnet.identify import TagFormat
 from app.markers.magnet import InformationTag, Orientation, Polarity
 from app.simulation.magnetic.clutter import Clutter, ferrous_clutter, town_clutter
-from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
+from app.simulation.magnetic.drive import MPH, Course, Scene, SimulatedDrive, Vehicle, simulate_drive
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, line_magnets
-from app.simulation.magnetic.vehicle import MPH, Course, Vehicle
 
 LEAD_M = 60.0
 """Without a magnet: the paper's thresholds are set there."""

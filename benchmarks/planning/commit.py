@@ -10,12 +10,12 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from app.families.rules import MarkerRules
-from app.formats.spooled_file import SpooledFile
+from app.families.surveys import MarkerRules
+from app.formats.format import SpooledFile
 from app.jobs.tasks import SameProcess
-from app.planning.alignment_declaration import AlignmentDeclaration
+from app.planning.alignment import AlignmentDeclaration
 from app.registry.database import Database
-from app.registry.tenancy import across_agencies
+from app.registry.engines import across_agencies
 from app.services.access.access import Access, Scope
 from app.services.plans.alignments import Alignments
 from app.services.plans.plans import Plans

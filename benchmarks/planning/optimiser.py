@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from app.planning.alignment import Alignment
 from app.planning.optimise.cover import cheapest_cover, least_gain
-from app.planning.optimise.models import optimise_by_prediction
+from app.planning.optimise.plan import optimise_by_prediction
 from app.planning.rules import PlanRules
 from benchmarks.planning.roads import LANES, generated_road, real_lane
 from benchmarks.planning.tables import Section, table

@@ -16,7 +16,7 @@ from app.planning.plan_checks import check_plan
 from app.planning.proof import ProofTerms
 from app.planning.proof.plates import FramesRead, read_frames
 from app.planning.proof.prove import Prover
-from app.planning.proof.terms import drive_terms
+from app.planning.proof.report import drive_terms
 from app.planning.rules import PlanRules
 from app.radio.link import LinkModel
 from benchmarks.planning.roads import generated_road

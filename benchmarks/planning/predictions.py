@@ -15,14 +15,13 @@ import numpy as np
 from app.planning.alignment import Alignment
 from app.planning.placement import place_plan
 from app.planning.plan import Plan, PlannedLineMagnet, PlannedPlate, PlannedTag
-from app.planning.plan_checks.predictions import check_predictions
+from app.planning.plan_checks.check import check_predictions
 from app.planning.predict.rates import path_errors_m
 from app.planning.proof import ProofTerms, UnitKind, wilson
-from app.planning.proof.cerpms import drive_cerpms
-from app.planning.proof.magnets import drive_line, read_tag
+from app.planning.proof.drives import drive_cerpms, drive_line, read_tag
 from app.planning.proof.plates import read_frames
 from app.planning.proof.prove import Prover
-from app.planning.proof.terms import DriveTerms, drive_terms
+from app.planning.proof.report import DriveTerms, drive_terms
 from app.planning.rules import PlanRules
 from benchmarks.planning.roads import LANES, generated_road, real_lane
 from benchmarks.planning.tables import Section, table

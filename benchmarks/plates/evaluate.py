@@ -11,9 +11,8 @@ import numpy as np
 
 from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.fit import FINE_CORNER_SCATTER
-from app.decoders.plate.pose import camera_position_m
+from app.decoders.plate.pose import camera_position_m, locate_moving_plate
 from app.decoders.plate.reader import decode_plates
-from app.decoders.plate.rolling_shutter import locate_moving_plate
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.plate_scene import FaceTruth

@@ -14,9 +14,8 @@ import numpy as np
 
 from app.decoders.plate.confirm import confirm_frames
 from app.decoders.plate.reader import decode_plates
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, recommended_geometry
 from app.markers.reading import PlateReading
-from app.markers.recommended_plate import recommended_geometry
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import draw_stress
 from app.simulation.plate_face import Face, plate_face

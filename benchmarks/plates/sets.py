@@ -19,6 +19,7 @@ from app.sensors.camera import Camera
 from app.simulation.camera import RenderedFrame, render_plate_scene
 from app.simulation.conditions import (
     Conditions,
+    Drive,
     draw_daylight,
     draw_occluder,
     draw_place,
@@ -26,12 +27,11 @@ from app.simulation.conditions import (
     draw_stress,
     draw_thermal,
     draw_wear,
+    drive_over_plate,
     scene_under,
 )
-from app.simulation.distractors import draw_distractor_faces, paint_distractors
-from app.simulation.drive import Drive, drive_over_plate
 from app.simulation.plate_face import Face, plate_face, warm_face
-from app.simulation.plate_scene import Air, PlateScene, face_truth
+from app.simulation.plate_scene import Air, PlateScene, draw_distractor_faces, face_truth, paint_distractors
 from app.simulation.thermal import render_thermal_scene
 from benchmarks.plates.views import draw_background, draw_camera
 from benchmarks.plates.without_plate import DRAW_WITHOUT_PLATE

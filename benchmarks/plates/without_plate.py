@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.simulation.conditions import Conditions, draw_daylight, draw_stress, scene_under
-from app.simulation.distractors import draw_distractor_faces, paint_distractors
-from app.simulation.plate_scene import PlacedFace, PlateScene
+from app.simulation.plate_scene import PlacedFace, PlateScene, draw_distractor_faces, paint_distractors
 from benchmarks.plates.lookalikes import draw_flat, paint_upright
 from benchmarks.plates.views import draw_background, draw_camera, draw_crop
 

@@ -16,16 +16,15 @@ import numpy.typing as npt
 import sqlalchemy as sa
 from scipy.spatial import cKDTree
 
-from app.families.cerpm.registration import NewCerpm
-from app.families.inputs import PositionIn
-from app.families.plate.registration import CodeInput, NewPlate
+from app.families.cerpm import NewCerpm
+from app.families.documents import PositionIn
+from app.families.plate.inputs import CodeInput, NewPlate
 from app.markers.plate import PlateCode, PlateScheme
 from app.registry.bulk_load import large_load, load_rows
+from app.registry.column_types import new_id, row_of
 from app.registry.database import Database
-from app.registry.feature_text import feature_text
-from app.registry.ids import new_id
+from app.registry.features import feature_text
 from app.registry.marker_rows import MarkerRow
-from app.registry.rows import row_of
 from app.registry.tables import markers
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers

@@ -1,6 +1,6 @@
 """``python -m benchmarks.registry.rtree [--rows N] [--imports]``: three ways to fill the R*Tree of an SQLite file.
 
-Packed nodes (`app.registry.rtree_pack`), one INSERT in the order of the rows, one INSERT in the order of packing. With
+Packed nodes (`app.registry.spatial`), one INSERT in the order of the rows, one INSERT in the order of packing. With
 ``--imports`` whole imports of as many rows are measured too, each in a process of its own.
 """
 
@@ -21,7 +21,7 @@ import numpy.typing as npt
 import sqlalchemy as sa
 
 from app.registry import bulk_load
-from app.registry.rtree_pack import fill_rtree
+from app.registry.spatial import fill_rtree
 
 Floats = npt.NDArray[np.float64]
 
@@ -136,12 +136,12 @@ def _query_us(connection: sa.Connection, points: Floats) -> float:
 
 def _import(way: str, rows: int) -> None:
     """One import in this process, with the R*Tree filled in one of the ways."""
-    from app.families.rules import MarkerRules
-    from app.formats.spooled_file import SpooledFile
+    from app.families.surveys import MarkerRules
+    from app.formats.format import SpooledFile
     from app.formats.surveys.declaration import ImportDeclaration
     from app.jobs.tasks import SameProcess
     from app.registry.database import Database
-    from app.registry.tenancy import across_agencies
+    from app.registry.engines import across_agencies
     from app.services.access.access import Access, Scope
     from app.services.surveys.import_report import ImportInput
     from app.services.surveys.imports import Imports

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 import sqlalchemy as sa
 
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 
 PEER = ("tipg==1.6.1", "uvicorn==0.54.0", "uvloop==0.23.0", "httptools==0.9.0")
 _LOCAL = "postgresql+psycopg://postgres@127.0.0.1:5432/postgres"

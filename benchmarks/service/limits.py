@@ -22,16 +22,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from app.formats.spooled_file import SpooledFile
-from app.jobs.trace_tasks import decode_recording
-from app.registry import agencies, job_leases, jobs
+from app.formats.format import SpooledFile
+from app.jobs.drive_tasks import decode_recording
+from app.registry import agencies, jobs
 from app.registry import decodes as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.decodes import DecodeRow
-from app.registry.ids import new_id
+from app.registry.engines import acting_for
 from app.registry.jobs import JobKind, new_job
-from app.registry.tenancy import acting_for
-from app.services.decodes.trace_task import TraceTask
+from app.services.decodes.tasks import TraceTask
 from benchmarks.service.throughput import PROCESSES, make_frames, measure_bare
 
 VEHICLES = 10_000
@@ -115,7 +115,7 @@ def _store_decodes(url: str, agency_id: str, seconds: float, barrier: Any, count
                 store.add_decode(connection, agency_id, None, row)
                 jobs.add_job(connection, new_job(JobKind.DECODE, decode_id, agency_id, "", now))
             with database.write() as connection:
-                job_leases.start_job(connection, decode_id, now)
+                jobs.start_job(connection, decode_id, now)
             with database.write() as connection:
                 jobs.finish_job(connection, decode_id, "done", now)
                 store.store_result(connection, agency_id, decode_id, result=_RESULT, picture_key=None, now=now)

@@ -20,7 +20,7 @@ import psutil
 import sqlalchemy as sa
 from kombu import Connection
 
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 
 _WITHIN_S = 120.0
 _RABBITMQ = "/usr/lib/rabbitmq/lib/rabbitmq_server-*/sbin/rabbitmq-server"

@@ -30,14 +30,13 @@ import httpx
 import numpy as np
 
 from app.decoders.plate.reader import decode_plates
+from app.formats.format import SpooledFile
 from app.formats.images import load_image
-from app.formats.spooled_file import SpooledFile
 from app.jobs.decoder_process import ONE_THREAD, keep_memory
-from app.jobs.trace_tasks import decode_recording
-from app.markers.plate import PlateCode
-from app.markers.recommended_plate import EXPECTED_GEOMETRIES
+from app.jobs.drive_tasks import decode_recording
+from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode
 from app.sensors.camera import Camera
-from app.services.decodes.trace_task import TraceTask
+from app.services.decodes.tasks import TraceTask
 from benchmarks.faults.server import FaultServer
 from benchmarks.http_overhead import CAMERA, LAT_DEG, LON_DEG, STEP_DEG, frame_1080p
 from benchmarks.service.processor_time import ProcessorTime, counted

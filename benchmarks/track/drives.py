@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy import signal
 from scipy.ndimage import gaussian_filter1d
 
-from app.geodesy.ellipsoid import metres_per_radian
+from app.geodesy.frames import metres_per_radian
 from app.tracks import Clock, LanePath, PositionFix, Samples, TrackInput
 
 Floats = npt.NDArray[np.float64]

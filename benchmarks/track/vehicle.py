@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.demo.cerpms import write_packets, write_poses
-from app.encoders.cerpm.payload import encode_message
+from app.encoders.cerpm import encode_message
 from app.geodesy import enu_from_wgs84, wgs84_from_enu
 from app.markers.cerpm import LaneSide
 from app.markers.magnet import InformationTag, parse_tag
@@ -30,18 +30,15 @@ from app.planning.cerpm_placement import place_markers
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import draw_daylight
-from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.drive import Course, Scene, Vehicle, drive_course, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road
-from app.simulation.magnetic.vehicle import Course, Vehicle, drive_course
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene
-from app.simulation.radio.drive import drive_past
-from app.simulation.radio.driving import Drive, SatelliteReceiver, observe_track
-from app.simulation.radio.lanes import TrueLane, lane_between
+from app.simulation.radio.drive import Drive, SatelliteReceiver, drive_past, observe_track
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_between
 from app.simulation.radio.link import Radio
-from app.simulation.radio.markers import InstalledMarkers, install_markers
-from app.simulation.road import road_background, road_photos
+from app.simulation.thermal import road_background, road_photos
 
 Floats = npt.NDArray[np.float64]
 

@@ -16,10 +16,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.colour import half_planes
+from app.decoders.plate.detect_blobs import half_planes
 from app.decoders.plate.detect_quads import MarkerQuad, detect_marker_quads
-from app.decoders.plate.filter_candidates import FEATURES, candidate_features
-from app.decoders.plate.find_candidates import SIGNALS, possible_geometries
+from app.decoders.plate.find_candidates import FEATURES, SIGNALS, candidate_features, possible_geometries
 from app.decoders.plate.fit import fit_plate
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES
 from app.errors import InvalidParameter
@@ -29,7 +28,7 @@ from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Conditions, draw_daylight, draw_place, draw_shadow, draw_stress, scene_under
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import FaceTruth
-from app.simulation.road import road_background
+from app.simulation.thermal import road_background
 from benchmarks.plates.sets import Job, Shot, shoot
 from benchmarks.plates.tables import table
 from benchmarks.plates.views import read_photos

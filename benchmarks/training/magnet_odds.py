@@ -20,12 +20,17 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from app.decoders.magnet.classify import Classification, is_strong
+from app.decoders.magnet.classify import (
+    FEATURES,
+    Classification,
+    MagnetState,
+    is_strong,
+    kind_probability,
+    magnet_features,
+)
 from app.decoders.magnet.decoder import MagnetDecoder, estimate_state, learn_wheels
 from app.decoders.magnet.dipole_fit import UPRIGHT
 from app.decoders.magnet.fit_window import Dipole
-from app.decoders.magnet.magnet_odds import FEATURES, kind_probability, magnet_features
-from app.decoders.magnet.magnet_state import MagnetState
 from app.decoders.magnet.readings import MagnetReading, NoiseFinding
 from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
 from app.markers.magnet import Orientation, Polarity

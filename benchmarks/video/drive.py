@@ -22,7 +22,7 @@ from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Conditions, draw_daylight, draw_stress
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene, face_truth
-from app.simulation.road import moving_backgrounds, road_photos
+from app.simulation.thermal import moving_backgrounds, road_photos
 
 LOOP_FRAMES = 16
 """[frames] of moving road before it begins again. Source: chosen by hand, for memory."""

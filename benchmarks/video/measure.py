@@ -15,13 +15,12 @@ from app.decoders.plate.unit_likelihoods import LARGE_UNIT_PX, code_units
 from app.decoders.plate.video_search import FoundPlate
 from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
-from app.formats.spooled_file import SpooledFile
-from app.formats.video.container import VideoFile, VideoKind
+from app.formats.format import SpooledFile
+from app.formats.video import VideoFile, VideoKind
 from app.jobs.video_tasks import decode_segment, index_frames
-from app.markers.plate import PlateCode
-from app.markers.recommended_plate import EXPECTED_GEOMETRIES
+from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode
 from app.sensors.camera import Camera
-from app.services.decodes.video_task import IndexVideoTask, SegmentTask
+from app.services.decodes.tasks import IndexVideoTask, SegmentTask
 from benchmarks.video.drive import PassedPlate
 
 

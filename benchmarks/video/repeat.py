@@ -17,12 +17,12 @@ import psutil  # type: ignore[import-untyped]
 from app.decoders.plate.reader import decode_plates
 from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
-from app.formats.spooled_file import SpooledFile
-from app.formats.video.container import VideoFile, VideoKind
+from app.formats.format import SpooledFile
+from app.formats.video import VideoFile, VideoKind
 from app.jobs.decoder_process import ProcessIdTask
 from app.jobs.pool import DecodePool
-from app.markers.recommended_plate import EXPECTED_GEOMETRIES
-from app.services.decodes.video_task import IndexVideoTask, SegmentTask
+from app.markers.plate import EXPECTED_GEOMETRIES
+from app.services.decodes.tasks import IndexVideoTask, SegmentTask
 from benchmarks.video.drive import CAMERA, DriveShape, write_drive
 
 SPEED_M_S, SPACING_M, RATE_HZ = 25.0, 5.0, 30.0

@@ -1,4 +1,4 @@
-"""Row level security on PostgreSQL: a transaction sees the rows of its agency (registry/tenancy.py).
+"""Row level security on PostgreSQL: a transaction sees the rows of its agency (registry/engines.py).
 
 The policies are forced and therefore apply to the owner of the tables too, but never to superusers. A later migration
 that adds a table also adds its policy; a test checks this.

@@ -15,7 +15,7 @@ from alembic import op
 
 from app.geodesy import grade_accuracy
 from app.geodesy.place import stored_frame
-from app.registry.grade_columns import regraded
+from app.registry.conditions import regraded
 
 revision = "0016"
 down_revision = "0015"

@@ -1,4 +1,4 @@
-"""Events that are sent to those who subscribe to them: app/registry/events.py."""
+"""Events that are sent to those who subscribe to them: app/registry/webhooks.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Leases on running jobs, whose turn it is, and jobs that stopped their processes: app/registry/job_leases.py."""
+"""Leases on running jobs, whose turn it is, and jobs that stopped their processes: app/registry/jobs.py."""
 
 from __future__ import annotations
 

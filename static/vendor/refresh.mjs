@@ -2,7 +2,7 @@
 // the versions into the HTML files: addresses of vendored files, and the import map of index.html.
 //
 // - Source maps are left out, and pictures inside of files are taken out: the content security policy allows no data: addresses.
-// - Folders carry the version, so the server can let browsers keep the files for ever (app/api/http/static_files.py).
+// - Folders carry the version, so the server can let browsers keep the files for ever (app/api/http/ui.py).
 
 import { createHash } from "node:crypto";
 import fs from "node:fs";

@@ -16,7 +16,8 @@ CORE = (
     "planning", "surveys", "simulation", "encoders", "decoders", "lanes", "formats", "radio", "calibration", "markers",
     "sensors", "roads", "geodesy", "errors", "tracks", "health",
 )  # fmt: skip
-MAX_LINES = 450
+MAX_LINES = 850
+MAX_FILES = 520
 
 
 def _modules(prefix: str = "app") -> list[str]:
@@ -101,7 +102,7 @@ def test_locked_dependencies_have_hashes_and_no_addresses(name: str) -> None:
     assert "index-url" not in text.replace("--no-emit-index-url", "")
 
 
-def test_a_file_tells_one_story() -> None:
+def test_a_module_is_a_topic() -> None:
     lengths = {path: len(path.read_text("utf-8").splitlines()) for path in (ROOT / "app").rglob("*.py")}
-    assert len(lengths) > 400
+    assert 400 < len(lengths) <= MAX_FILES
     assert {str(path.relative_to(ROOT)): n for path, n in lengths.items() if n > MAX_LINES} == {}

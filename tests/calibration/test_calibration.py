@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from app.calibration.board_view import ViewFault, find_board
+from app.calibration.board_view import CalibrationRules, CameraCalibration, Photo, ViewFault, find_board
 from app.calibration.calibrate import calibrate_camera, is_invertible
-from app.calibration.results import CalibrationRules, CameraCalibration, Photo
 from app.errors import CalibrationRefused, InvalidParameter
-from app.sensors.calibration_board import CalibrationBoard
+from app.sensors.camera import CalibrationBoard
 from tests.api.fleet.board_photos import BOARD, Pose, TrueCamera, good_photos, photo, poses, true_corners_px
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,7 @@ import orjson
 import pytest
 
 from app import cli
-from app.control.sockets import short_address, socket_path
+from app.control.client import short_address, socket_path
 from app.main import create_app
 from app.settings import Settings
 from tests.conftest import ADMIN_KEY, LiveServer

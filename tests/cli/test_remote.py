@@ -16,11 +16,12 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
-from app.cli.progress import BYTES, Progress, amount, speed
+from app.cli.terminal import BYTES, Progress, amount, speed
 from app.errors import WaymarkError
 from app.main import create_app
 from app.services.access.access import Scope
-from app.services.decodes import archive_handler, frame_runs
+from app.services.decodes import frames as archive_handler
+from app.services.decodes import frames as frame_runs
 from app.settings import Settings
 from tests.api.decodes.conftest import near
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
@@ -205,7 +206,7 @@ class Broken(httpx.SyncByteStream):
 def cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int], Cut]:
     """Have the command's next connections break, and its uploads take the way of large files."""
     monkeypatch.setattr("app.cli.remote._SMALL_BYTES", 0)
-    monkeypatch.setattr("app.cli.resumable._PAUSES_S", (0.1,) * 600)
+    monkeypatch.setattr("app.cli.remote._PAUSES_S", (0.1,) * 600)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     make = httpx.Client
 
@@ -239,7 +240,7 @@ def test_an_upload_goes_on_in_the_next_run_of_the_command(
     run: Callable[..., Result], cut: Callable[[int], Cut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = long_archive(tmp_path / "drive.zip")
-    monkeypatch.setattr("app.cli.resumable._PAUSES_S", ())
+    monkeypatch.setattr("app.cli.remote._PAUSES_S", ())
     cut(1)
     broken = run("upload", str(path))
     assert broken.exit_code == 1

@@ -11,7 +11,7 @@ import orjson
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from app.decoders.newest_snapshot import UnreadableMemory, open_newest_snapshot
+from app.decoders.snapshot import UnreadableMemory, open_newest_snapshot
 from app.encoders.snapshot import write_snapshot
 from app.markers.snapshot import ForgedSnapshot, RolledBackSnapshot, Trust
 

@@ -18,8 +18,7 @@ from app.encoders.snapshot import kind_text, write_snapshot
 from app.errors import InvalidParameter
 from app.markers import snapshot as layout
 from app.markers.magnet import parse_tag
-from app.markers.magnet_codebook import Codebook, Meaning, MeaningKind
-from app.markers.magnet_design import TagDesign
+from app.markers.magnet_design import Codebook, Meaning, MeaningKind, TagDesign
 from app.markers.plate import PlateCode, PlateScheme
 
 NOW = datetime(2026, 5, 4, 8, 0, 0, tzinfo=UTC)

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from app.cli.database import read_settings
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 from app.main import create_app
 from app.settings import Settings
 from tests.api.http.test_permissions import list_routes

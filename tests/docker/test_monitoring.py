@@ -15,13 +15,13 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from app.control.metrics import MetricsServer, ProcessMetrics
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 from app.errors import Unavailable, UnreadableUpload
 from app.main import create_app
 from app.registry import jobs as store
+from app.registry.engines import across_agencies
 from app.registry.jobs import JobKind
-from app.registry.tenancy import across_agencies
-from app.services.decodes.measures import DECODE_METRICS, measured
+from app.services.decodes.upload_path import DECODE_METRICS, measured
 from app.services.ports import utc_now
 from app.settings import Settings
 from tests.conftest import LiveServer

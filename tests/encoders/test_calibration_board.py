@@ -16,7 +16,7 @@ import pytest
 from app.encoders.calibration_board import encode_board
 from app.encoders.plate import ArtworkFormat, write_artwork
 from app.errors import InvalidParameter
-from app.sensors.calibration_board import CalibrationBoard
+from app.sensors.camera import CalibrationBoard
 from tests.http import WITHIN_S
 from tests.machine import require_module, require_tool
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 from app.families.magnet.layouts import MAX_MAGNETS
-from app.families.magnet.planned import PlannedMagnets
-from app.families.planned import Commitment
-from app.families.rules import MarkerRules
+from app.families.magnet.magnets import PlannedMagnets
+from app.families.surveys import Commitment, MarkerRules
 from app.planning.placement import place_plan
 from app.planning.rules import PlanRules
 from tests.planning.roads import road, straight

@@ -8,7 +8,7 @@ import zipfile
 import pytest
 
 from app.errors import WaymarkError
-from app.formats.archives import count_members, read_members
+from app.formats.format import count_members, read_members
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
 from app.formats.traces.declaration import TraceLimits

@@ -13,12 +13,10 @@ import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.bags import messages as bag_messages
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.formats.traces.declaration import AxisConvention, TraceDeclaration
 from app.formats.traces.read import read_trace
-from app.formats.video.container import VideoFile, VideoKind, detect_video
-from app.formats.video.frames import ReadReport, read_frames
-from app.formats.video.index import VideoIndex, index_video
+from app.formats.video import ReadReport, VideoFile, VideoIndex, VideoKind, detect_video, index_video, read_frames
 from tests.formats.pictures import jpeg
 from tests.machine import require_module
 

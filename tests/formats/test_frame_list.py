@@ -9,10 +9,10 @@ import struct
 import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge, WaymarkError
-from app.formats.exif import read_exif
 from app.formats.frame_list import MAX_LIST_BYTES, is_beside_frames, read_frame_list
-from app.formats.log_times import LogClock
-from app.formats.poses.declaration import PoseDeclaration
+from app.formats.images import read_exif
+from app.formats.logs import LogClock
+from app.formats.poses import PoseDeclaration
 
 ROWS = "file;time;lon;lat;heading;accuracy\nab/1.jpg;2026-05-04T08:30:00Z;114,2;22,3;361;0,5\n2.jpg;;;;;\n"
 

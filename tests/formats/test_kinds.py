@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from app.errors import WaymarkError
-from app.formats.format import Use
+from app.formats.format import SpooledFile, Use
 from app.formats.kinds import FORMATS, UploadKind, detect_drive_file, guess_kind
-from app.formats.spooled_file import SpooledFile
 
 JPEG, PNG = b"\xff\xd8\xff\xe0" + bytes(40), b"\x89PNG\r\n\x1a\n" + bytes(40)
 RAW_DATA = b"Time Stamp,Sensor 1 X,Sensor 1 Y\n0.1,2,3\n"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from app.formats.spreadsheet import TableWriter, plain_text
+from app.formats.text import TableWriter, plain_text
 
 APP = Path(__file__).resolve().parents[2] / "app"
 
@@ -51,4 +51,4 @@ def test_all_tables_are_written_by_it() -> None:
         for file in APP.rglob("*.py")
         if re.search(r"csv\.(Dict)?[wW]riter\(", file.read_text())
     }
-    assert writers == {"formats/spreadsheet.py", "demo/cerpms.py", "demo/run.py"}
+    assert writers == {"formats/text.py", "demo/cerpms.py", "demo/run.py"}

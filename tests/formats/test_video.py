@@ -17,12 +17,20 @@ import psutil
 import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
-from app.formats.archives import ArchiveLimits
-from app.formats.spooled_file import SpooledFile
-from app.formats.video.archive import holds_video, open_packed_video
-from app.formats.video.container import VideoFile, VideoKind, detect_video
-from app.formats.video.frames import ReadReport, read_frames
-from app.formats.video.index import VideoIndex, VideoLimits, VideoSegment, index_video
+from app.formats.format import ArchiveLimits, SpooledFile
+from app.formats.video import (
+    ReadReport,
+    VideoFile,
+    VideoIndex,
+    VideoKind,
+    VideoLimits,
+    VideoSegment,
+    detect_video,
+    holds_video,
+    index_video,
+    open_packed_video,
+    read_frames,
+)
 
 WIDTH, HEIGHT = 160, 120
 

@@ -10,9 +10,8 @@ from pyproj import Geod, Transformer
 
 from app.errors import ReferenceSystemError
 from app.geodesy import LocalizationGrade, grade_accuracy, place_position, reference_system, total_accuracy_m
-from app.geodesy.from_wgs84 import Origin, positions_in_system
-from app.geodesy.realizations import accuracy_of_global
-from app.geodesy.vertical import normalize_vertical_datum
+from app.geodesy.place import Origin, positions_in_system
+from app.geodesy.systems import accuracy_of_global, normalize_vertical_datum
 
 KARLSRUHE = (8.4, 49.0)
 CM, DM, M, UNFIT = LocalizationGrade

@@ -20,8 +20,7 @@ from app.health import (
     update_marker,
     update_unregistered,
 )
-from app.health.likelihoods import missing_gain, moved_ratios
-from app.health.priority import item_priority
+from app.health.marker_tests import item_priority, missing_gain, moved_ratios
 
 DAY_S = 86_400.0
 

@@ -21,10 +21,10 @@ import pytest
 from paho.mqtt.enums import CallbackAPIVersion
 
 from app.demo.cerpms import BuiltLane, build_lane
-from app.demo.free_ports import free_ports
-from app.encoders.cerpm.payload import encode_message
+from app.demo.server import free_ports
+from app.encoders.cerpm import encode_message
 from app.errors import InvalidParameter, NotAllowed, Unavailable
-from app.ingest.mqtt import MqttIngest, MqttSource, Sink
+from app.ingest import MqttIngest, MqttSource, Sink
 from app.main import create_app
 from app.services.access.access import Scope
 from app.settings import Settings

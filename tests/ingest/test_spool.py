@@ -6,7 +6,7 @@ from pathlib import Path
 
 import orjson
 
-from app.ingest.spool import Spool
+from app.ingest import Spool
 
 
 def lines(path: Path) -> list[object]:

@@ -8,10 +8,10 @@ import pytest
 
 from app.calibration.board_view import BoardView, find_board
 from app.errors import CalibrationRefused, UploadTooLarge
-from app.formats.spooled_file import SpooledFile
-from app.jobs import calibration_tasks
-from app.jobs.calibration_tasks import WITHOUT_BOARD, calibrate_photos
-from app.sensors.calibration_board import CalibrationBoard
+from app.formats.format import SpooledFile
+from app.jobs import picture_tasks
+from app.jobs.picture_tasks import WITHOUT_BOARD, calibrate_photos
+from app.sensors.camera import CalibrationBoard
 from app.services.fleet.calibrations import MAX_PHOTOS, CalibrationTask
 
 
@@ -31,14 +31,14 @@ def test_sixty_photos_of_noise_are_refused_after_eight(monkeypatch: pytest.Monke
         searched.append(len(searched))
         return find_board(grey, board)
 
-    monkeypatch.setattr(calibration_tasks, "find_board", count)
+    monkeypatch.setattr(picture_tasks, "find_board", count)
     with pytest.raises(CalibrationRefused) as caught:
         calibrate_photos(_noise(), None)
     assert len(searched) == len(caught.value.parts) == WITHOUT_BOARD
 
 
 def test_photos_that_take_all_of_the_time_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calibration_tasks, "PROCESSOR_S", -1.0)
+    monkeypatch.setattr(picture_tasks, "PROCESSOR_S", -1.0)
     with pytest.raises(UploadTooLarge, match="first 0 photos") as caught:
         calibrate_photos(_noise(), None)
     assert caught.value.limit == "-1 s of a processor"

@@ -16,24 +16,23 @@ from kombu import Connection
 
 from app import worker
 from app.errors import InvalidParameter, ProcessStopped, Unavailable
-from app.jobs.celery_app import (
+from app.jobs.celery_queue import (
     DELIVERY_LIMIT,
+    CeleryQueue,
     dead_letter_name,
     declare_queues,
     job_queue,
     make_celery,
     queue_name,
 )
-from app.jobs.celery_queue import CeleryQueue
 from app.jobs.celery_worker import CeleryWorker
-from app.registry import agencies, job_leases
+from app.registry import agencies, jobs
 from app.registry import jobs as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.jobs import JobKind, new_job
 from app.registry.tables import jobs as table
-from app.services.job_queues import QueueName
-from app.services.jobs import Jobs, RunningJob
+from app.services.jobs import Jobs, QueueName, RunningJob
 from app.settings import Settings
 from tests.brokers import find_broker, own_queues
 from tests.databases import PostgresServer
@@ -204,9 +203,9 @@ def test_lost_messages_are_replaced_and_no_more(fleet: Fleet) -> None:
 def test_the_job_of_a_dead_worker_runs_again_when_its_lease_has_ended(fleet: Fleet) -> None:
     job = fleet.add("orphan", submit=False)
     with fleet.database.write() as connection:
-        assert job_leases.start_job(connection, job, now(), "a dead worker") is not None
-        assert job_leases.start_job(connection, job, now(), "another") is None
-        assert job_leases.count_startable(connection, now()) == {}
+        assert jobs.start_job(connection, job, now(), "a dead worker") is not None
+        assert jobs.start_job(connection, job, now(), "another") is None
+        assert jobs.count_startable(connection, now()) == {}
         past = now() - timedelta(seconds=1)
         connection.execute(sa.update(table).where(table.c.id == job).values(lease_until=past))
     fleet.queue.resubmit(fleet.jobs)
@@ -216,7 +215,7 @@ def test_the_job_of_a_dead_worker_runs_again_when_its_lease_has_ended(fleet: Fle
 
 
 def test_a_running_job_keeps_its_lease(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.services.job_leases.RENEW_S", 0.01)
+    monkeypatch.setattr("app.services.jobs.RENEW_S", 0.01)
     fleet.handler.held.clear()
     fleet.worker.open(fleet.jobs)
     job = fleet.add("long")

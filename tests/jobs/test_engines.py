@@ -15,10 +15,10 @@ import pytest
 import sqlalchemy as sa
 from rosbags.typesys import Stores, get_typestore
 
+from app.registry.engines import across_agencies
 from app.registry.tables import marker_versions
-from app.registry.tenancy import across_agencies
 from app.services.access.access import Scope
-from app.services.markers.artwork_jobs import IMMEDIATE_PLATES
+from app.services.markers.artwork import IMMEDIATE_PLATES
 from app.settings import Settings
 from tests.api.decodes.conftest import post_frame
 from tests.api.decodes.test_archives import pack

@@ -10,12 +10,11 @@ from queue import Empty
 import pytest
 
 from app.errors import Unavailable
-from app.jobs.fair_queue import FairQueue
-from app.jobs.local_queue import LocalQueue
-from app.jobs.places import Places
+from app.jobs.pool import Places
+from app.jobs.queues import FairQueue, LocalQueue
+from app.registry.engines import EVERY_AGENCY
 from app.registry.jobs import JobKind, UnfinishedJob
-from app.registry.tenancy import EVERY_AGENCY
-from app.services.job_queues import QUEUES
+from app.services.jobs import QUEUES
 from app.services.request_work import add_processor_time
 from tests.http import WITHIN_S, wait_until
 

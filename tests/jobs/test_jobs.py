@@ -12,8 +12,8 @@ import pytest
 from app.errors import StorageFull, Unavailable
 from app.registry import agencies
 from app.registry import jobs as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.jobs import JobKind, new_job
 from app.services.jobs import MAX_ATTEMPTS, Jobs, RunningJob
 

@@ -18,15 +18,15 @@ import pytest
 
 from app.errors import InvalidParameter, ProcessStopped, Unavailable, UnreadableUpload
 from app.families.plate.frames import PlateSearch
-from app.formats.spooled_file import SpooledFile
-from app.jobs import decoder_process, supervisor
-from app.jobs.pool import DecodePool
-from app.jobs.process_limits import ProcessLimits
-from app.jobs.supervisor import Pending, WorkerSupervisor
+from app.formats.format import SpooledFile
+from app.jobs import decoder_process
+from app.jobs import pool as supervisor
+from app.jobs.decoder_process import ProcessLimits
+from app.jobs.pool import DecodePool, Pending, WorkerSupervisor
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome
-from app.registry.tenancy import acting_for
-from app.services.decodes.frame_task import AnnotationTask, FramePicture, FrameResult, FrameSearch, FrameTask, Outline
+from app.registry.engines import acting_for
+from app.services.decodes.tasks import AnnotationTask, FramePicture, FrameResult, FrameSearch, FrameTask, Outline
 from tests.formats.pictures import huge_png, jpeg, lying_png, png
 from tests.http import wait_until
 from tests.jobs import standin
@@ -194,7 +194,7 @@ def test_decoders_and_their_kernels_are_loaded_before_a_process_is_forked() -> N
     """Else each decoder process has its own 90 MB of them; the collector would copy them, page by page."""
     program = (
         "import gc, os\nfrom app.jobs.forkserver_preload import load_decoders\nload_decoders()\n"
-        "from app.decoders.plate.gauss_newton import minimize\n"
+        "from app.decoders.plate.fit import minimize\n"
         "print(len(minimize.signatures) > 0, gc.get_freeze_count() > 100_000, gc.isenabled(),"
         " len(os.listdir('/proc/self/task')))"
     )

@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 
 from app.families.plate.frames import PlateSearch
-from app.formats.spooled_file import SpooledFile
-from app.jobs import process_limits
+from app.formats.format import SpooledFile
+from app.jobs import decoder_process
+from app.jobs.decoder_process import ProcessLimits
 from app.jobs.pool import DecodePool
-from app.jobs.process_limits import ProcessLimits
 from app.markers.reading import PlateOutcome, PlateReading
-from app.services.decodes.frame_task import FramePicture, FrameSearch, FrameTask
+from app.services.decodes.tasks import FramePicture, FrameSearch, FrameTask
 from tests.formats.pictures import png
 from tests.jobs import standin
 
@@ -107,14 +107,14 @@ def test_every_limit_holds_and_the_next_task_finds_an_empty_folder(pool: DecodeP
         assert report["dump"] == 0
         assert report["before"] == []
         assert report["temporary"] == report["folder"] != os.getcwd()
-    assert Path(first["folder"]).name.startswith(process_limits.FOLDER_PREFIX)
+    assert Path(first["folder"]).name.startswith(decoder_process.FOLDER_PREFIX)
     pool.close()
     assert not Path(first["folder"]).exists()
 
 
 def test_processor_time_ends_a_process_that_nobody_watches() -> None:
     program = (
-        "from app.jobs import process_limits as limits\n"
+        "from app.jobs import decoder_process as limits\n"
         "limits._MORE_S = 0.0\n"
         "limits.allow_processor_time(limits.ProcessLimits(timeout_s=1.0, trace_timeout_s=1.0))\n"
         "while True: pass"
@@ -126,9 +126,9 @@ def test_folders_of_dead_processes_are_deleted(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
-    left = tmp_path / f"{process_limits.FOLDER_PREFIX}{ended.pid}-x"
+    left = tmp_path / f"{decoder_process.FOLDER_PREFIX}{ended.pid}-x"
     left.mkdir()
     (left / "file").touch()
-    own = process_limits.new_folder()
-    process_limits.delete_folders_of_the_dead()
+    own = decoder_process.new_folder()
+    decoder_process.delete_folders_of_the_dead()
     assert (left.exists(), own.exists()) == (False, True)

@@ -11,9 +11,9 @@ _COUNTED = """
 import gc
 from pathlib import Path
 from numba.core.registry import CPUDispatcher
-from app.formats.spooled_file import SpooledFile
-from app.jobs.trace_tasks import compile_traces, decode_recording
-from app.services.decodes.trace_task import CompileTracesTask, TraceTask
+from app.formats.format import SpooledFile
+from app.jobs.drive_tasks import compile_traces, decode_recording
+from app.services.decodes.tasks import CompileTracesTask, TraceTask
 
 def compiled():
     kernels = [found for found in gc.get_objects() if isinstance(found, CPUDispatcher)]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from app.lanes.estimate import fit_lane
-from app.lanes.even_spacing import find_known_lengths
-from app.lanes.marker_pairs import find_pairs
+from app.lanes.observations import find_known_lengths, find_pairs
 from app.lanes.smooth_line import SmoothLine
 from app.lanes.types import LEFT, RIGHT
 from tests.lanes.lanes import Road, bendy, markers_at, place

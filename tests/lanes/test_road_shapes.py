@@ -7,8 +7,8 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.lanes.estimate import fit_lane
-from app.simulation.radio.driving import SatelliteReceiver
-from app.simulation.radio.road_shapes import RoadShape, lane_of_shape
+from app.simulation.radio.drive import SatelliteReceiver
+from app.simulation.radio.lanes import RoadShape, lane_of_shape
 from benchmarks.cerpm import scenes
 from benchmarks.cerpm.path_errors import path_errors
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.lanes.banded_matrix import factor, inverse_band, variances
-from app.lanes.least_squares import Hyperparameters, LaneProblem, Measurements
+from app.lanes.least_squares import Hyperparameters, LaneProblem, Measurements, factor, inverse_band, variances
 from app.lanes.smooth_line import SmoothLine
 
 

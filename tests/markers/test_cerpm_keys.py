@@ -10,16 +10,16 @@ from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
 from app.errors import InvalidParameter
-from app.markers.cerpm import MESSAGE_BYTES
-from app.markers.cerpm_keys import (
+from app.markers.cerpm import (
     MAX_INVALID_TAGS_PER_DAY,
     MAX_INVALID_TAGS_PER_LOG,
+    MESSAGE_BYTES,
     aes_cmac,
     derive_marker_key,
     forgery_probability,
     message_tag,
 )
-from app.radio.airtime import time_on_air_s
+from app.radio.settings import time_on_air_s
 
 RFC4493_KEY = bytes.fromhex("2b7e151628aed2a6abf7158809cf4f3c")
 RFC4493_MESSAGE = bytes.fromhex(

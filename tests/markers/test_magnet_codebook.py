@@ -10,8 +10,7 @@ import pytest
 
 from app.errors import Conflict, InvalidParameter
 from app.markers.magnet import InformationTag, parse_tag
-from app.markers.magnet_codebook import Codebook, Meaning, MeaningKind
-from app.markers.magnet_design import TagDesign
+from app.markers.magnet_design import Codebook, Meaning, MeaningKind, TagDesign
 
 DESIGN = TagDesign(3, 2.0, 1.0)
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from app.errors import InvalidParameter
-from app.markers.magnet_design import TagDesign
-from app.markers.magnet_error import (
+from app.markers.magnet_design import (
     METRO_ERROR,
     MagnetErrorModel,
     OdometerError,
     ReadingConditions,
+    TagDesign,
     covariance_of,
     distinguishable,
     placements_of,

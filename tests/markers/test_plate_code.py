@@ -17,14 +17,15 @@ from app.markers.plate import (
     PlateGeometry,
     PlateScheme,
     code_cells,
+    decimal_codes,
     encode_number,
     is_codeword,
     plate_capacity,
     position_decimals,
+    resolve_position,
     unit_index,
     units_from_symbols,
 )
-from app.markers.plate_position import decimal_codes, resolve_position
 
 # --- layout -----------------------------------------------------------------------------------------------------------
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.markers.plate import PlateCode, PlateScheme
-from app.markers.plate_digits import id_digits, position_digits, registry_number_bits
+from app.markers.plate import PlateCode, PlateScheme, id_digits, position_digits, registry_number_bits
 
 TIES = [0.0000005, 1.2345675, 8.0, 179.9999995, 179.99999951, 12.3456785, 0.1 + 0.2, -0.0000015, 99.9999995]
 

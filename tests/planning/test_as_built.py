@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from app.markers.checks import Verdict
-from app.planning.as_built import SurveyedPlace, plan_as_built, residual_of
-from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
+from app.markers.reading import Verdict
+from app.planning.plan import (
+    Plan,
+    PlannedCerpm,
+    PlannedLineMagnet,
+    PlannedMarker,
+    PlannedPlate,
+    PlannedTag,
+    SurveyedPlace,
+    plan_as_built,
+    residual_of,
+)
 from app.planning.plan_checks import check_plan
 from tests.planning.outputs.made import plan_of
 from tests.planning.roads import GEOD, bend, road

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from app.planning.read_rules import check_rules
+from app.planning.rules import check_rules
 from benchmarks.planning.optimiser import brute_force
 from benchmarks.planning.papers import measure_papers
 from benchmarks.planning.roads import LANES, generated_road, real_lane

@@ -9,10 +9,16 @@ from pyproj import Geod
 
 from app.encoders.magnet import place_line, place_tag
 from app.errors import InvalidParameter
-from app.markers.checks import Check
 from app.markers.magnet import InformationTag, LineStyle, Orientation
-from app.planning.costs import bill_of_materials
-from app.planning.magnet_checks import Neighbour, Site, check_layout, reaction_distance_m, vehicle_clearances
+from app.markers.reading import Check
+from app.planning.magnet_checks import (
+    Neighbour,
+    Site,
+    bill_of_materials,
+    check_layout,
+    reaction_distance_m,
+    vehicle_clearances,
+)
 from app.roads.lane_line import LaneLine
 
 STRAIGHT = LaneLine.from_lon_lat([(8.0, 49.0), (8.0, 49.003)])

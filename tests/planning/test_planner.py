@@ -10,16 +10,16 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.formats.alignments.geometry import EventKind
-from app.markers.checks import Verdict
+from app.markers.reading import Verdict
 from app.planning.alignment import Alignment, RoadEvent
 from app.planning.outputs.bill import plan_bill
-from app.planning.outputs.files import OutputOptions, plan_files
+from app.planning.outputs.package import OutputOptions, plan_files
 from app.planning.outputs.plan_document import read_plan, write_plan
 from app.planning.placement import place_plan
 from app.planning.plan import Plan
 from app.planning.planner import make_plan
-from app.planning.read_rules import check_rules
-from app.plots.trade_off import draw_trade_off
+from app.planning.rules import check_rules
+from app.plots.track import draw_trade_off
 from tests.planning.optimise.test_path import winding
 from tests.planning.roads import road, straight
 

@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 
 from app.errors import InvalidParameter
-from app.markers.checks import RadioFinding, Verdict
-from app.planning import radio_recommendation
-from app.planning.radio_checks import PreviewRule, RadioCheck, RadioPlan, check_radio
-from app.planning.radio_recommendation import recommend_settings
-from app.radio.battery import Battery, battery_life_days, mean_current_ma, transmit_current_ma
-from app.radio.collisions import Receiver
+from app.markers.reading import RadioFinding, Verdict
+from app.planning import radio_checks
+from app.planning.radio_checks import PreviewRule, RadioCheck, RadioPlan, check_radio, recommend_settings
 from app.radio.link import LinkModel
-from app.radio.lorawan import Region
-from app.radio.reception import Air, Approach, RoadMarkers, approach
+from app.radio.reception import Air, Approach, Receiver, RoadMarkers, approach
 from app.radio.regulation import is_permitted
-from app.radio.settings import RadioSettings
+from app.radio.settings import Battery, RadioSettings, Region, battery_life_days, mean_current_ma, transmit_current_ma
 
 TEN_A_SIDE = RoadMarkers(np.repeat(np.arange(10) * 12.192, 2), np.tile([1.8, -1.8], 10))
 PAPERS_RADIO = RadioSettings(bandwidth_hz=125_000, interval_s=2.0)
@@ -237,7 +233,7 @@ def test_an_approach_is_computed_once_for_all_channels(monkeypatch: pytest.Monke
         approached.append((air.threshold_dbm, air.settings.power_dbm))
         return approach(markers, index, nearest_m, air)
 
-    monkeypatch.setattr(radio_recommendation, "approach", count)
+    monkeypatch.setattr(radio_checks, "approach", count)
     crowded = RoadMarkers(np.linspace(0.0, 500.0, 500), np.tile([1.8, -1.8], 250))
     found = recommend_settings(RadioPlan(RadioSettings(), markers=crowded))
     assert not found.reaches

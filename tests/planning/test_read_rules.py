@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload, WaymarkError
-from app.planning.read_rules import MAX_RULES_BYTES, read_rules, rules_schema
+from app.planning.rules import MAX_RULES_BYTES, read_rules, rules_schema
 
 DOCS = Path(__file__).resolve().parents[2] / "docs/plans"
 EXAMPLES = sorted(DOCS.glob("rules-*.yaml"))

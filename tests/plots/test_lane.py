@@ -12,8 +12,7 @@ import pytest
 
 from app.lanes.estimate import fit_lane
 from app.lanes.types import LaneMarkers
-from app.plots.lane import LanePicture, picture_of_lane, plot_lane
-from app.plots.signal import SignalPicture
+from app.plots.lane import LanePicture, SignalPicture, picture_of_lane, plot_lane
 from app.sensors.pose_track import PoseTrack
 
 SVG = "{http://www.w3.org/2000/svg}"

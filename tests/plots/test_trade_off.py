@@ -8,7 +8,7 @@ import numpy as np
 
 from app.planning.optimise import TradeOffPoint
 from app.plots.axes import BLUE, INK, ORANGE
-from app.plots.trade_off import draw_trade_off
+from app.plots.track import draw_trade_off
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from app.errors import InvalidParameter
-from app.radio.airtime import time_on_air_s
+from app.radio.settings import time_on_air_s
 
 PUBLISHED_MS = [
     (20, 7, 125_000, 56.576),

@@ -12,11 +12,21 @@ from scipy.special import ndtr
 from scipy.stats import truncnorm
 
 from app.errors import InvalidParameter
-from app.radio.airtime import time_on_air_s
-from app.radio.collisions import Receiver, aloha_success, harmful_others, harmful_to_each, packet_success
 from app.radio.link import LinkModel, sensitivity_dbm
-from app.radio.reception import Air, RoadMarkers, approach, read_probability, reception_at, road_reception
-from app.radio.settings import RadioSettings
+from app.radio.reception import (
+    Air,
+    Receiver,
+    RoadMarkers,
+    aloha_success,
+    approach,
+    harmful_others,
+    harmful_to_each,
+    packet_success,
+    read_probability,
+    reception_at,
+    road_reception,
+)
+from app.radio.settings import RadioSettings, time_on_air_s
 
 STEADY = LinkModel(fading_db=0.0)
 DEAF_TO_CAPTURE = Receiver(capture_db=None)

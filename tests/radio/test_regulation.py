@@ -7,10 +7,9 @@ from dataclasses import replace
 import pytest
 
 from app.errors import InvalidParameter
-from app.markers.checks import RadioFinding, Verdict
-from app.radio.lorawan import Region
+from app.markers.reading import RadioFinding, Verdict
 from app.radio.regulation import FIELD_EIRP_DBM, check_legal, check_transmitter, is_permitted, region_at
-from app.radio.settings import RadioSettings
+from app.radio.settings import RadioSettings, Region
 
 HOPPING = RadioSettings(
     frequency_hz=902_300_000, bandwidth_hz=125_000, spreading_factor=10, interval_s=2.0, power_dbm=17.0, channels=64,

@@ -12,9 +12,9 @@ import pytest
 import sqlalchemy as sa
 
 from app.errors import InvalidParameter, NotFound
-from app.families.inputs import PositionIn
-from app.families.plate.registration import NewPlate
-from app.registry import agencies, audit_check
+from app.families.documents import PositionIn
+from app.families.plate.inputs import NewPlate
+from app.registry import agencies, audit
 from app.registry.audit import Author, find_head, list_entries, record, recording, version_sha256
 from app.registry.database import Database
 from app.services.access.access import Caller, Scope
@@ -93,7 +93,7 @@ def test_versions_are_parsed_only_where_their_texts_differ(registry: Registry, m
         parsed.append(marker_id)
         return version_sha256(agency_id, marker_id, *rest)
 
-    monkeypatch.setattr(audit_check, "version_sha256", count)
+    monkeypatch.setattr(audit, "version_sha256", count)
     assert registry.faults() == []
     assert parsed == []
     with registry.database.write() as connection:

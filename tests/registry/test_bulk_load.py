@@ -11,13 +11,11 @@ import pytest
 import sqlalchemy as sa
 
 from app.registry import agencies, bulk_load
-from app.registry.bulk_load import large_load, load_columns, load_rows
-from app.registry.columns import Columns, JsonTexts
+from app.registry.bulk_load import Columns, JsonTexts, large_load, load_columns, load_rows
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, list_markers
-from app.registry.rtree_pack import fill_rtree
-from app.registry.spatial import box_around
+from app.registry.spatial import box_around, fill_rtree
 from app.registry.tables import marker_versions, markers
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)

@@ -9,11 +9,10 @@ import orjson
 import pytest
 
 from app.registry.audit import AuditEntry, version_sha256
-from app.registry.columns import Columns, JsonTexts, json_objects
-from app.registry.feature_text import feature_text, feature_texts
-from app.registry.ids import new_ids
+from app.registry.bulk_load import Columns, JsonTexts, json_objects
+from app.registry.column_types import new_ids, row_of
+from app.registry.features import feature_text, feature_texts
 from app.registry.marker_rows import MarkerRow
-from app.registry.rows import row_of
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)
 AWKWARD = ("", "plain", "a, b", '"%s" 100 %', "back\\slash\n", "Straße 日本", "null", "\x7f\u2028")

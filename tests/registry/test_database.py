@@ -14,13 +14,13 @@ from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
 from app.errors import ClientLeft, CodeTaken, Unavailable
-from app.families.inputs import PositionIn
-from app.families.plate.registration import CodeInput, NewPlate
+from app.families.documents import PositionIn
+from app.families.plate.inputs import CodeInput, NewPlate
 from app.markers.plate import PlateScheme
 from app.registry import agencies
 from app.registry.database import Database, head_revision
+from app.registry.engines import across_agencies
 from app.registry.tables import metadata
-from app.registry.tenancy import across_agencies
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
 from app.services.request_work import working

@@ -6,9 +6,9 @@ from datetime import UTC, datetime
 
 import pytest
 
-from app.registry import agencies, events
+from app.registry import agencies, webhooks
 from app.registry.database import Database
-from app.registry.tenancy import acting_for
+from app.registry.engines import acting_for
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 
@@ -19,13 +19,13 @@ def test_each_agency_reads_its_own_events_in_order(database: Database) -> None:
     for agency_id in (own, other):
         with acting_for(agency_id), database.write() as connection:
             for number in range(3):
-                events.add_event(
+                webhooks.add_event(
                     connection, agency_id, "maintenance.suspect", subject_id=f"s{number}", at=NOW, detail={"n": number}
                 )
     with acting_for(own), database.read() as connection:
-        found = events.list_events(connection, own)
-        newer = events.list_events(connection, own, after=found[0].id)
-        assert events.newest_event(connection, own) == found[-1].id
+        found = webhooks.list_events(connection, own)
+        newer = webhooks.list_events(connection, own, after=found[0].id)
+        assert webhooks.newest_event(connection, own) == found[-1].id
     assert [row.subject_id for row in found] == ["s0", "s1", "s2"]
     assert [row.detail for row in newer] == [{"n": 1}, {"n": 2}]
     assert [row.id for row in found] == sorted(row.id for row in found)
@@ -37,10 +37,10 @@ def test_events_of_jobs_are_those_of_the_kinds_that_are_named(database: Database
     of = {"job.done": {"job_kind": "decode"}, "job.failed": {"job_kind": "audit"}, "maintenance.suspect": {}}
     with acting_for(own), database.write() as connection:
         for kind, detail in of.items():
-            events.add_event(connection, own, kind, subject_id="s", at=NOW, detail=detail)
+            webhooks.add_event(connection, own, kind, subject_id="s", at=NOW, detail=detail)
     with acting_for(own), database.read() as connection:
         seen = {
-            kinds: [row.kind for row in events.list_events(connection, own, job_kinds=kinds)]
+            kinds: [row.kind for row in webhooks.list_events(connection, own, job_kinds=kinds)]
             for kinds in (None, (), ("decode",))
         }
     assert seen == {None: [*of], (): ["maintenance.suspect"], ("decode",): ["job.done", "maintenance.suspect"]}
@@ -52,11 +52,11 @@ def test_nothing_that_was_rolled_back_is_an_event(database: Database) -> None:
     with pytest.raises(RuntimeError):
         _roll_back_an_event(database, own)
     with acting_for(own), database.read() as connection:
-        assert events.list_events(connection, own) == []
-        assert events.newest_event(connection, own) == 0
+        assert webhooks.list_events(connection, own) == []
+        assert webhooks.newest_event(connection, own) == 0
 
 
 def _roll_back_an_event(database: Database, agency_id: str) -> None:
     with acting_for(agency_id), database.write() as connection:
-        events.add_event(connection, agency_id, "maintenance.suspect", subject_id=None, at=NOW)
+        webhooks.add_event(connection, agency_id, "maintenance.suspect", subject_id=None, at=NOW)
         raise RuntimeError

@@ -12,9 +12,8 @@ import sqlalchemy as sa
 
 from app.registry.database import Database
 from app.registry.decodes import DecodeFilter, get_decode, list_decodes
-from app.registry.job_leases import list_startable, start_job
-from app.registry.jobs import JobKind, list_jobs
-from app.registry.tenancy import acting_for
+from app.registry.engines import acting_for
+from app.registry.jobs import JobKind, list_jobs, list_startable, start_job
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, 890123, tzinfo=UTC)
 LATER = datetime(2026, 3, 4, 5, 6, 9, tzinfo=UTC)

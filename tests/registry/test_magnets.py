@@ -10,15 +10,13 @@ import sqlalchemy as sa
 
 from app.encoders.magnet import CodebookRules
 from app.errors import StaleVersion
-from app.families.inputs import PositionIn
-from app.families.magnet.layouts import LaneInput, PlacedTag
-from app.families.magnet.registration import NewMagnets, TagInput
-from app.families.plate.registration import NewPlate
+from app.families.documents import PositionIn
+from app.families.magnet.layouts import LaneInput, NewMagnets, PlacedTag, TagInput
+from app.families.plate.inputs import NewPlate
 from app.markers.magnet_design import TagDesign
-from app.registry import agencies, codebooks
+from app.registry import agencies, markers
 from app.registry.database import Database
-from app.registry.magnets import list_magnets_in
-from app.registry.markers import MarkerFilter, list_markers
+from app.registry.markers import MarkerFilter, list_magnets_in, list_markers
 from app.registry.spatial import Box, box_around
 from app.services.access.access import Caller, Scope
 from app.services.markers.codebooks import Codebooks
@@ -96,9 +94,9 @@ def test_a_codebook_is_replaced_at_its_version_only(database: Database, caller: 
     with database.write() as connection:
         change = {"version": 1, "now": NOW}
         assert (
-            codebooks.CODEBOOKS.update(connection, caller.agency_id, made["id"], {"entries": []}, **change).version == 2
+            markers.CODEBOOKS.update(connection, caller.agency_id, made["id"], {"entries": []}, **change).version == 2
         )
         with pytest.raises(StaleVersion):
-            codebooks.CODEBOOKS.update(connection, caller.agency_id, made["id"], {"entries": []}, **change)
+            markers.CODEBOOKS.update(connection, caller.agency_id, made["id"], {"entries": []}, **change)
         with pytest.raises(StaleVersion):
-            codebooks.CODEBOOKS.update(connection, "another agency", made["id"], {"entries": []}, version=2, now=NOW)
+            markers.CODEBOOKS.update(connection, "another agency", made["id"], {"entries": []}, version=2, now=NOW)

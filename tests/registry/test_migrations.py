@@ -13,17 +13,15 @@ import orjson
 import pytest
 import sqlalchemy as sa
 
-from app.registry.audit import find_head, version_sha256
-from app.registry.audit_check import ChainReport, check_history
+from app.registry.audit import ChainReport, check_history, find_head, version_sha256
 from app.registry.bulk_load import load_rows
+from app.registry.column_types import row_of
+from app.registry.conditions import regraded
 from app.registry.database import Database
-from app.registry.feature_text import feature_text
-from app.registry.grade_columns import regraded
+from app.registry.features import feature_text
 from app.registry.history import list_versions
-from app.registry.magnets import list_magnets_in
 from app.registry.marker_rows import MarkerRow
-from app.registry.markers import MarkerFilter, list_markers
-from app.registry.rows import row_of
+from app.registry.markers import MarkerFilter, list_magnets_in, list_markers
 from app.registry.spatial import Box
 from app.registry.tables import markers, metadata
 from app.services.access.audit import AuditLog

@@ -16,12 +16,12 @@ from pyproj import Geod
 from sqlalchemy import event
 
 from app.registry import agencies, nearest
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, list_markers
 from app.registry.nearest import find_nearest_at_once, list_nearest
 from app.registry.tables import markers
-from app.services.markers.search_areas import area_of
+from app.services.markers.searches import area_of
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)
 GEOD = Geod(ellps="WGS84")

@@ -11,11 +11,10 @@ import sqlalchemy as sa
 
 from app.registry import agencies
 from app.registry.database import Database
-from app.registry.magnets import list_magnets_in
-from app.registry.markers import MarkerFilter, find_code_near, list_markers, list_near
+from app.registry.markers import MarkerFilter, find_code_near, list_magnets_in, list_markers, list_near
 from app.registry.nearest import find_nearest_at_once
 from app.registry.spatial import Box, box_around
-from app.services.markers.search_areas import area_of
+from app.services.markers.searches import area_of
 from tests.databases import query_plan
 
 NOW = datetime(2026, 3, 4, tzinfo=UTC)

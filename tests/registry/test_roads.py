@@ -9,13 +9,13 @@ import pytest
 import sqlalchemy as sa
 from pyproj import Geod
 
-from app.families.cerpm.registration import NewCerpm
-from app.families.inputs import PositionIn
+from app.families.cerpm import NewCerpm
+from app.families.documents import PositionIn
 from app.registry.database import Database
 from app.registry.tables import audit_log, marker_versions, markers
 from app.services.access.access import Access, Caller, Scope
 from app.services.markers.markers import Markers
-from app.services.roads.input import CalibrationInput, LinesInput
+from app.services.roads.documents import CalibrationInput, LinesInput
 from app.services.roads.roads import NewRoad, RoadChange, Roads
 
 GEOD = Geod(ellps="WGS84")

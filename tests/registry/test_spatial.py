@@ -12,8 +12,8 @@ import sqlalchemy as sa
 from pyproj import Geod
 
 from app.registry import agencies
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.markers import MarkerFilter, list_markers
 from app.registry.spatial import Box, box_around
 from app.registry.tables import markers

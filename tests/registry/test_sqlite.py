@@ -12,13 +12,13 @@ import pytest
 import sqlalchemy as sa
 
 from app.errors import CommitUnknown, StorageFull, Unavailable
-from app.families.inputs import PositionIn
-from app.families.plate.registration import NewPlate
+from app.families.documents import PositionIn
+from app.families.plate.inputs import NewPlate
 from app.registry import agencies
 from app.registry.database import Database
 from app.services.access.access import Access, Caller, Scope
+from app.services.blobs import staged
 from app.services.markers.markers import Markers
-from app.services.staged_blobs import staged
 from app.storage.blobs import Blobs
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)

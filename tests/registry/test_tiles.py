@@ -17,10 +17,8 @@ from app.registry import agencies, audit
 from app.registry.audit import Author
 from app.registry.database import Database
 from app.registry.features import ON_ROAD, RETIRED, TILE_FIELDS
-from app.registry.mvt import EXTENT, write_layer
 from app.registry.tables import markers
-from app.registry.tile_groups import MAX_SINGLE, FeatureGrid, read_grid
-from app.registry.tiles import MAX_FEATURES, Tile, feature_tile
+from app.registry.tiles import EXTENT, MAX_FEATURES, MAX_SINGLE, FeatureGrid, Tile, feature_tile, read_grid, write_layer
 from app.services.access.access import Caller, Scope
 from app.services.markers.features import MARKERS, Features
 from tests.databases import PostgresServer

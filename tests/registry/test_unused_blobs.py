@@ -12,13 +12,12 @@ import sqlalchemy as sa
 
 from app.registry import agencies, jobs
 from app.registry.blob_references import COLUMNS
+from app.registry.column_types import metadata, new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.jobs import JobKind, new_job
-from app.registry.metadata import metadata
-from app.registry.plan_tables import alignments, plans
 from app.registry.tables import damage_reports, decodes, markers
-from app.services.unused_blobs import MIN_AGE, OWNERS, UnusedBlobs
+from app.registry.work_tables import alignments, plans
+from app.services.blobs import MIN_AGE, OWNERS, UnusedBlobs
 from app.storage.blobs import Blobs, new_blob_key
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from app.errors import InvalidParameter
-from app.roads.measures import CalibrationPoint, calibrate
+from app.roads.lane_line import CalibrationPoint, calibrate
 
 ONE = [(0.0, 1000.0)]
 

@@ -10,8 +10,7 @@ import pytest
 
 from app.decoders.plate.reader import decode_plates
 from app.encoders.plate import PlateOrder, encode_plate, write_png
-from app.markers.plate import PlateCode, PlateGeometry
-from app.markers.plate_position import resolve_position
+from app.markers.plate import PlateCode, PlateGeometry, resolve_position
 from app.markers.reading import PlateOutcome
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene

@@ -12,13 +12,25 @@ from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
-from app.simulation.conditions import draw_daylight, draw_place, draw_stress, draw_thermal, scene_under
-from app.simulation.distractors import decoy_plate, draw_distractor_faces, paint_distractors
-from app.simulation.drive import Drive, drive_over_plate
+from app.simulation.conditions import (
+    Drive,
+    draw_daylight,
+    draw_place,
+    draw_stress,
+    draw_thermal,
+    drive_over_plate,
+    scene_under,
+)
 from app.simulation.plate_face import Face, PlateWarmth, PlateWear, plate_face, warm_face
-from app.simulation.plate_scene import PlacedFace, PlateScene, face_truth
-from app.simulation.road import road_background
-from app.simulation.thermal import ThermalSensor, render_thermal_scene
+from app.simulation.plate_scene import (
+    PlacedFace,
+    PlateScene,
+    decoy_plate,
+    draw_distractor_faces,
+    face_truth,
+    paint_distractors,
+)
+from app.simulation.thermal import ThermalSensor, render_thermal_scene, road_background
 
 CAMERA = Camera.from_field_of_view(1920, 1080, 70.0)
 CODE = PlateCode("023792168411")

@@ -10,10 +10,9 @@ import pytest
 from app.markers.magnet import InformationTag, Orientation, Polarity
 from app.sensors.magnetometer_bar import MagnetometerBar
 from app.simulation.magnetic.dipoles import dipole_field_ut
-from app.simulation.magnetic.drive import Scene, simulate_drive
-from app.simulation.magnetic.readout import CanBus, Chip
+from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
+from app.simulation.magnetic.recorder import CanBus, Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, Spread
-from app.simulation.magnetic.vehicle import Course, Vehicle
 
 QUIET = Chip(
     noise_ut=(0, 0, 0), count_ut=(0, 0, 0), offset_ut=0, gain=0, misalignment_deg=0, soft_iron=0, jitter=0, stale=0,

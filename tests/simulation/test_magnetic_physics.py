@@ -12,14 +12,18 @@ import pytest
 from app.errors import InvalidParameter
 from app.markers.magnet import MOMENT_AM2, Orientation, Polarity
 from app.simulation.magnetic.clutter import KINDS, Clutter
-from app.simulation.magnetic.cylinders import METRO_CYLINDER, Cylinder, cylinder_dipoles
-from app.simulation.magnetic.dipoles import dipole_field_ut
-from app.simulation.magnetic.drive import EARTH_UT, Scene, simulate_drive
-from app.simulation.magnetic.readout import Chip
+from app.simulation.magnetic.dipoles import METRO_CYLINDER, Cylinder, cylinder_dipoles, dipole_field_ut
+from app.simulation.magnetic.drive import EARTH_UT, Scene, Vehicle, simulate_drive
+from app.simulation.magnetic.recorder import Chip
 from app.simulation.magnetic.road import Road, RoadMagnet
-from app.simulation.magnetic.spheroid_clutter import SHAPES, spheroid_clutter
-from app.simulation.magnetic.spheroids import Spheroid, demagnetising_factors, spheroid_dipoles, spheroid_moment_am2
-from app.simulation.magnetic.vehicle import Vehicle
+from app.simulation.magnetic.spheroids import (
+    SHAPES,
+    Spheroid,
+    demagnetising_factors,
+    spheroid_clutter,
+    spheroid_dipoles,
+    spheroid_moment_am2,
+)
 
 Floats = npt.NDArray[np.float64]
 

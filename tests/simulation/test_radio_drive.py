@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.encoders.cerpm.payload import encode_message
+from app.encoders.cerpm import encode_message
 from app.errors import InvalidParameter
-from app.markers.cerpm import BODY_BYTES, CerpmMessage, SpeedLimit, SpeedUnit
-from app.markers.cerpm_keys import message_tag
+from app.markers.cerpm import BODY_BYTES, CerpmMessage, SpeedLimit, SpeedUnit, message_tag
 from app.planning.cerpm_placement import place_markers
 from app.simulation.radio.attacks import (
     corrupt_packets,
@@ -21,9 +20,8 @@ from app.simulation.radio.attacks import (
     shuffle_packets,
 )
 from app.simulation.radio.drive import SimulatedDrive, drive_past
-from app.simulation.radio.lanes import TrueLane, make_lane
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, make_lane
 from app.simulation.radio.link import Radio
-from app.simulation.radio.markers import InstalledMarkers, install_markers
 
 LIMIT = SpeedLimit(25, SpeedUnit.MPH)
 

@@ -8,7 +8,7 @@ import pytest
 from app.errors import InvalidParameter
 from app.markers.cerpm import LaneSide
 from app.planning.cerpm_placement import place_markers
-from app.simulation.radio.driving import (
+from app.simulation.radio.drive import (
     Driver,
     SatelliteReceiver,
     drive_lane,
@@ -16,8 +16,7 @@ from app.simulation.radio.driving import (
     observe_track,
     ornstein_noise,
 )
-from app.simulation.radio.lanes import TrueLane, lane_between, make_lane
-from app.simulation.radio.markers import install_markers, lose_row, lose_share
+from app.simulation.radio.lanes import TrueLane, install_markers, lane_between, lose_row, lose_share, make_lane
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,16 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.planning.cerpm_placement import place_markers
-from app.simulation.radio.drive import SimulatedDrive, drive_past
-from app.simulation.radio.driving import Driver, Multipath, SatelliteReceiver, draw_multipath_m
-from app.simulation.radio.lanes import TrueLane, make_lane
-from app.simulation.radio.link import Radio, mean_rssi_dbm
-from app.simulation.radio.markers import InstalledMarkers, install_markers
-from app.simulation.radio.propagation import AntennaPattern, Notch, TwoRay
+from app.simulation.radio.drive import (
+    Driver,
+    Multipath,
+    SatelliteReceiver,
+    SimulatedDrive,
+    draw_multipath_m,
+    drive_past,
+)
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, make_lane
+from app.simulation.radio.link import AntennaPattern, Notch, Radio, TwoRay, mean_rssi_dbm
 from benchmarks.cerpm.physics import ROWS, Row, add_drive
 
 LOSSLESS = TwoRay(permittivity=5.0, conductivity_s_m=0.0)

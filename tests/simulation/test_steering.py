@@ -9,8 +9,7 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.lanes.control import Controller, SteeringSettings
-from app.simulation.steering import check_steering
-from app.simulation.vehicle import PoseNoise, Vehicle, draw_pose_errors
+from app.simulation.steering import PoseNoise, Vehicle, check_steering, draw_pose_errors
 
 pytestmark = pytest.mark.slow
 

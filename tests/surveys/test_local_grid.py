@@ -11,7 +11,7 @@ from app.errors import InvalidParameter
 from app.formats.surveys.declaration import ControlPoint, ImportDeclaration, LocalGrid
 from app.formats.surveys.read import read_survey
 from app.formats.surveys.table import SurveyTable
-from app.surveys.local_grid import LocalGridDocument, apply_local_grid, fit_similarity
+from app.surveys.georeference import LocalGridDocument, apply_local_grid, fit_similarity
 
 # A triangle of 300, 400 and 500 m, turned by the angle whose cosine is 0.8 and sine 0.6, and shifted: by hand
 CONTROL = (("C1", 457000.0, 5428000.0), ("C2", 457240.0, 5428180.0), ("C3", 456760.0, 5428320.0))

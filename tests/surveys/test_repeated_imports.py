@@ -11,16 +11,15 @@ from pyproj import Transformer
 
 from app.api.surveys.schemas import DeclarationIn
 from app.errors import InvalidParameter
-from app.families.rules import MarkerRules
-from app.formats.spooled_file import SpooledFile
+from app.families.surveys import MarkerRules
+from app.formats.format import SpooledFile
 from app.jobs.tasks import SameProcess
 from app.registry.database import Database
+from app.registry.engines import seeing_every_agency
 from app.registry.tables import markers
-from app.registry.tenancy import seeing_every_agency
 from app.services.access.access import Access, Scope
 from app.services.ports import utc_now
-from app.services.surveys.declarations import import_input
-from app.services.surveys.documents import ImportReport
+from app.services.surveys.import_report import ImportReport, import_input
 from app.services.surveys.imports import SETTLED, Imports
 
 DECLARED = {"crs": "EPSG:25832", "family": "cerpm", "area_deg": [8.3, 48.9, 8.6, 49.1], "ignore_heights": True}

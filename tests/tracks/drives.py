@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal
 
-from app.geodesy.ellipsoid import metres_per_radian
+from app.geodesy.frames import metres_per_radian
 from app.tracks import Clock, PositionFix, Samples, Track, TrackInput
 
 Floats = npt.NDArray[np.float64]

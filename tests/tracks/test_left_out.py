@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.tracks.estimate import estimate_track
-from app.tracks.left_out import count_passages, stretches_left_out, times_lost
+from app.tracks.measure import count_passages, stretches_left_out, times_lost
 from benchmarks.track.drives import simulate
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.geodesy.ellipsoid import metres_per_radian
+from app.geodesy.frames import metres_per_radian
 from app.tracks import Clock, PositionFix, Track, TrackInput
 from app.tracks.estimate import estimate_track
 from tests.tracks.drives import T0_S, Truth, drive, recording

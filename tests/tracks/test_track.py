@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.errors import InvalidParameter
-from app.geodesy.ellipsoid import metres_per_radian
+from app.geodesy.frames import metres_per_radian
 from app.tracks import Clock, ClockState, LanePath, LeftOutReason, Samples, TrackInput, TrackRules
 from app.tracks.estimate import estimate_track
 from tests.tracks.drives import T0_S, drive, recording

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import Route, expect
 
-from app.registry.mvt import write_layer
+from app.registry.tiles import write_layer
 from tests.conftest import LiveServer
 from tests.web.browsing import PHONE, Watched, shows, until
 from tests.web.conftest import OpenPage

@@ -13,14 +13,23 @@ from pydantic import TypeAdapter
 from starlette.datastructures import UploadFile
 
 from app.api.decodes.schemas import ContextIn
-from app.api.http.bodies import SpooledPart, received_body, received_form
+from app.api.http.bodies import (
+    FORM,
+    SpooledPart,
+    check_parts,
+    idempotency_of,
+    media_type_of,
+    read_declaration,
+    read_text,
+    received_body,
+    received_form,
+)
 from app.api.http.dependencies import caller_of
-from app.api.http.forms import FORM, check_parts, idempotency_of, media_type_of, read_declaration, read_text
 from app.api.http.problems import BodyRefused
 from app.api.http.responses import IdempotencyKeyHeader
 from app.api.http.strict_json import validated
 from app.errors import MalformedRequest, QuotaExceeded, UnreadableUpload, UnsupportedUpload
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.services.decodes.context import ContextInput
 from app.services.idempotency import IdempotencyKey
 from app.services.uploads.quotas import Quotas

@@ -1,6 +1,6 @@
 """Responses compressed with gzip for clients that accept it (RFC 9110 section 8.4): texts, JSON, CSV, SVG.
 
-Tiles, archives, PDF and pictures are compressed already. The files of `static/` have their own way (static_files.py).
+Tiles, archives, PDF and pictures are compressed already. The files of `static/` have their own way (ui.py).
 """
 
 from __future__ import annotations

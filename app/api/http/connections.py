@@ -26,7 +26,7 @@ from uvicorn.protocols.http.flow_control import HIGH_WATER_LIMIT, FlowControl
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from app.api.http.event_stream import STOP
-from app.api.http.rate_limits import address_of
+from app.api.http.limits import address_of
 
 MAX_HEADER_BYTES = 64 * 1024
 """Longest request line and headers. [byte] Source: twice what nginx takes by default (large_client_header_buffers)."""

@@ -19,14 +19,12 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import tracing
-from app.api.http.costs import Budget, Slots, admitted
-from app.api.http.credentials import key_in
-from app.api.http.permissions import Permissions
+from app.api.http.limits import Budget, RateLimit, Slots, address_of, admitted
+from app.api.http.permissions import Permissions, key_in
 from app.api.http.problems import BodyRefused, problem_from, unexpected
-from app.api.http.rate_limits import RateLimit, address_of
-from app.api.public_pages.negotiation import accepts_html
+from app.api.public_pages.texts import accepts_html
 from app.errors import ClientLeft, MalformedRequest, NotAuthenticated, UploadTooLarge, WaymarkError
-from app.registry.tenancy import acting_for
+from app.registry.engines import acting_for
 from app.services.access.access import Caller
 
 PROTECTED = ("/v1", "/ogc")

@@ -14,9 +14,9 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 
-from app.api.http.components import component_schemas
-from app.api.http.credentials import SECURITY, SECURITY_SCHEMES
 from app.api.http.middleware import is_protected
+from app.api.http.permissions import SECURITY, SECURITY_SCHEMES
+from app.api.http.problems import component_schemas
 
 STORED = Path(__file__).with_name("data") / "openapi.json"
 DESCRIPTION = """The registry of machine-readable roads: coded plates, magnet tags, radio markers (CERPMs) and fiducial

@@ -1,24 +1,57 @@
-"""Every error that a client can cause, as an RFC 9457 problem document from one table."""
+"""Every error that a client can cause, as an RFC 9457 problem document from one table, with its OpenAPI schema."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Any, NamedTuple, NotRequired
+from typing import Any, Literal, NamedTuple, NotRequired
 
 import orjson
 import structlog
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from pydantic import ConfigDict, with_config
+from pydantic import ConfigDict, TypeAdapter, with_config
 from starlette.exceptions import HTTPException
 
 from app import errors
-from app.api.http.components import reference
-from app.api.http.credentials import CHALLENGES
-from app.api.public_pages.responses import as_page
+from app.api.http.permissions import CHALLENGES
+from app.api.public_pages.html import as_page
 from app.encoders.magnet import CodebookFull
-from app.services.error_documents import ErrorCause, cut_text, error_cause
+from app.services.documents import ErrorCause, cut_text, error_cause
+
+# === Schemas of the OpenAPI document that FastAPI does not find by itself: parts of forms, and problem documents.
+
+
+Mode = Literal["validation", "serialization"]
+_TEMPLATE = "#/components/schemas/{model}"
+_MODELS: dict[str, tuple[Any, Mode]] = {}
+
+
+def reference(model: Any, mode: Mode = "validation") -> dict[str, str]:
+    """A reference to the schema of a model, which becomes part of the document."""
+    _MODELS[model.__name__] = model, mode
+    return {"$ref": _TEMPLATE.format(model=model.__name__)}
+
+
+def with_reference(response: dict[str, Any]) -> dict[str, Any]:
+    """A response of a route whose `model`, if it is a class, is a reference: FastAPI would make its schema at once."""
+    if not isinstance(response.get("model"), type):
+        return response
+    described = {name: value for name, value in response.items() if name != "model"}
+    schema = reference(response["model"], "serialization")
+    return {**described, "content": {**described.get("content", {}), "application/json": {"schema": schema}}}
+
+
+def component_schemas() -> dict[str, Any]:
+    """The schemas of all models that are referred to, and of the models within them, by name."""
+    adapters = [(name, mode, TypeAdapter(model)) for name, (model, mode) in _MODELS.items()]
+    _, schemas = TypeAdapter.json_schemas(adapters, ref_template=_TEMPLATE)
+    found: dict[str, Any] = schemas["$defs"]
+    return found
+
+
+# === Every error that a client can cause, as an RFC 9457 problem document from one table.
+
 
 Described = dict[int | str, dict[str, Any]]
 """What FastAPI's argument `responses` takes: status to description."""

@@ -1,15 +1,20 @@
-"""What many routes return, and its OpenAPI description: documents, pages, files, 304 Not Modified."""
+"""What many routes return, and its OpenAPI description: documents, pages, cursors, files, times, 304."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
 from types import MappingProxyType
 from typing import Annotated, Any
 
 import orjson
 from fastapi import Header, Request, Response
+from pydantic import AfterValidator, AwareDatetime
 
 from app.api.http.problems import Described, problem_responses
+from app.errors import InvalidParameter
 
 BINARY: dict[str, str] = {"type": "string", "format": "binary"}
 GEOJSON: dict[str, Any] = {
@@ -118,3 +123,95 @@ def created_response(
 def etag_of(document: Mapping[str, object]) -> str:
     """The ETag of a document with versions."""
     return f'"{document["version"]}"'
+
+
+# === Where a page ended, as the link to the next page has it.
+
+
+_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+_PLACE = re.compile(r"(-?[0-9]{1,9}(?:\.[0-9]{1,20})?(?:e-[0-9]{1,3})?),([0-9a-f-]{36})")
+
+
+def checked_id(after: str | None) -> str | None:
+    """The last id of a page in the order of ids.
+
+    Raises
+    ------
+    InvalidParameter
+        It is no id.
+    """
+    if after is not None and not _ID.fullmatch(after):
+        raise _no_cursor()
+    return after
+
+
+def cursor_of(after: str | None) -> tuple[float, str] | None:
+    """The last distance or measure [m], and its id, of a page in the order of these.
+
+    Raises
+    ------
+    InvalidParameter
+        It is not where a page ended.
+    """
+    if after is None:
+        return None
+    found = _PLACE.fullmatch(after)
+    if found is None or not math.isfinite(float(found[1])):
+        raise _no_cursor()
+    return float(found[1]), found[2]
+
+
+def _no_cursor() -> InvalidParameter:
+    return InvalidParameter(
+        "this is not where a page of this list ended",
+        field="after",
+        limit="as the link to the next page has it",
+        cure="start without after, and follow the links",
+    )
+
+
+# === Times in addresses, queries and bodies.
+
+
+MIN_YEAR, MAX_YEAR = 1900, 2200
+"""Years of times in requests. Source: by hand, so that no offset and no length of a recording leads out of the calendar
+of Python and PostgreSQL."""
+
+_RFC3339 = re.compile(
+    r"[0-9]{4}-[0-9]{2}-[0-9]{2}[Tt ][0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,6})?([Zz]|[+-][0-9]{2}:[0-9]{2})"
+)
+
+
+def parse_time(text: str, field: str) -> datetime:
+    """A time with its zone (RFC 3339).
+
+    Raises
+    ------
+    InvalidParameter
+        It is none.
+    """
+    try:
+        if _RFC3339.fullmatch(text):
+            return datetime.fromisoformat(text.upper()).astimezone(UTC)
+    except (ValueError, OverflowError):
+        pass
+    raise InvalidParameter(
+        f"{text[:40]!r} is no time",
+        field=field,
+        limit="RFC 3339 with a zone and at most six decimals, years 1 to 9999",
+        cure="write 2026-03-04T05:06:07Z; a + in an address is written %2B",
+    )
+
+
+def _check_year(time: datetime) -> datetime:
+    if not MIN_YEAR <= time.year < MAX_YEAR:
+        raise InvalidParameter(
+            "the time is too far away",
+            limit=f"years {MIN_YEAR} to {MAX_YEAR - 1}",
+            cure="send an RFC 3339 time with its offset, e.g. 2026-03-04T05:06:07Z",
+        )
+    return time
+
+
+Time = Annotated[AwareDatetime, AfterValidator(_check_year)]
+"""A time with its zone in a query or a body."""

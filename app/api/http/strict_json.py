@@ -9,20 +9,20 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import cache, partial
 from threading import RLock
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import Depends, Request, Response
 from fastapi.datastructures import DefaultPlaceholder
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 from starlette.routing import compile_path, get_name
 
-from app.api.http.components import with_reference
-from app.api.http.costs import EXPENSIVE, bounded
-from app.api.http.dependencies import refuse_unknown_parameters
+from app.api.http.dependencies import Number, refuse_unknown_parameters
+from app.api.http.limits import EXPENSIVE, bounded
 from app.api.http.openapi import operation_id
+from app.api.http.problems import with_reference
 from app.errors import UnsupportedUpload
 from app.formats.json_text import parse_json
 from app.services.request_work import counted
@@ -162,3 +162,50 @@ def _names_in(adapter: TypeAdapter[Any]) -> tuple[str, ...]:
     return tuple(
         sorted({name for model in (schema, *schema.get("$defs", {}).values()) for name in model.get("properties", ())})
     )
+
+
+# === Schemas of the GeoJSON geometries that requests carry (RFC 7946).
+
+
+# Long lists stop at their first error: a body of 1 MiB has room for 200,000 of them.
+Position = Annotated[list[Number], Field(min_length=2, max_length=4), FailFast()]
+Line = Annotated[list[Position], Field(min_length=2), FailFast()]
+Ring = Annotated[list[Position], Field(min_length=4), FailFast()]
+
+
+class _Geometry(BaseModel):
+    model_config = ConfigDict(extra="ignore")  # RFC 7946, section 6.1: foreign members
+
+
+class GeoLineIn(_Geometry):
+    """A line."""
+
+    type: Literal["LineString"]
+    coordinates: Line
+
+
+class MultiLineStringIn(_Geometry):
+    """Several lines."""
+
+    type: Literal["MultiLineString"]
+    coordinates: Annotated[list[Line], Field(min_length=1), FailFast()]
+
+
+class PolygonIn(_Geometry):
+    """A polygon: its outer ring, then its holes."""
+
+    type: Literal["Polygon"]
+    coordinates: Annotated[list[Ring], Field(min_length=1), FailFast()]
+
+
+class MultiPolygonIn(_Geometry):
+    """Several polygons."""
+
+    type: Literal["MultiPolygon"]
+    coordinates: Annotated[
+        list[Annotated[list[Ring], Field(min_length=1), FailFast()]], Field(min_length=1), FailFast()
+    ]
+
+
+AnyLine = Annotated[GeoLineIn | MultiLineStringIn, Field(discriminator="type")]
+AnyPolygon = Annotated[PolygonIn | MultiPolygonIn, Field(discriminator="type")]

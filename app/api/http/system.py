@@ -1,23 +1,25 @@
-"""/healthz, /readyz and /metrics for operators, without a key."""
+"""/healthz, /readyz and /metrics for operators, without a key; the settings that pages and admins see."""
 
 from __future__ import annotations
 
 import asyncio
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Annotated, Literal
 
 import anyio
 import structlog
 from anyio import to_thread
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
+from pydantic import Field
 from typing_extensions import TypedDict
 
-from app.api.http.responses import json_response, text_response
+from app.api.http.dependencies import Caller
+from app.api.http.responses import document_response, json_response, text_response
 from app.api.http.strict_json import StrictRoute
 from app.errors import WaymarkError
-from app.services.decodes.measures import written_metrics
+from app.services.decodes.upload_path import written_metrics
 
 router = APIRouter(tags=["system"], route_class=StrictRoute)
 _LOG = structlog.get_logger("waymark")
@@ -115,3 +117,81 @@ async def get_readiness(request: Request) -> Response:
 def get_metrics(request: Request) -> Response:
     """Prometheus metrics."""
     return Response(written_metrics(request.app.state.metrics), media_type=CONTENT_TYPE_LATEST)
+
+
+# === GET /v1/page-settings: what the web pages need to know before anybody has signed in.
+
+
+page_settings_router = APIRouter(prefix="/v1/page-settings", tags=["system"], route_class=StrictRoute)
+
+
+class SignInOptions(TypedDict):
+    """How a page signs somebody in at the identity provider: OAuth 2.0, authorization code with PKCE (RFC 7636)."""
+
+    issuer: str
+    client_id: str
+    authorize_url: Annotated[str, Field(description="The provider's authorization endpoint.")]
+    token_url: Annotated[str, Field(description="The provider's token endpoint.")]
+    scopes: Annotated[str, Field(description="Scopes to request, separated by spaces.")]
+
+
+class BaseMap(TypedDict):
+    """The map under the markers."""
+
+    kind: Literal["pmtiles", "raster"]
+    url: Annotated[str, Field(description="Of a PMTiles file, or of raster tiles with {z}, {x} and {y}.")]
+    attribution: str
+
+
+class PageSettings(TypedDict):
+    """Settings of the web pages."""
+
+    version: Annotated[str, Field(description="Of the server.")]
+    sign_in: Annotated[SignInOptions | None, Field(description="null: sign in with a key.")]
+    base_map: Annotated[BaseMap | None, Field(description="null: the pages draw a grid.")]
+    guide: Annotated[bool, Field(description="The documents are at /guide: false where they were not built.")]
+
+
+@page_settings_router.get("", responses=document_response(PageSettings))
+async def get_page_settings(request: Request) -> Response:
+    """Sign-in, base map and guide of the web pages. Needs no key."""
+    return json_response(request.app.state.page_settings)
+
+
+# === GET /v1/server-settings: what the server runs with, for admins: no secret, no path, no address of a store.
+
+
+server_settings_router = APIRouter(prefix="/v1/server-settings", tags=["system"], route_class=StrictRoute)
+
+
+class NumberSetting(TypedDict):
+    """A setting that is a number or a switch."""
+
+    name: Annotated[str, Field(description="Of the environment variable.")]
+    value: float | bool
+    default: float | bool
+    description: str
+
+
+class ServerSettings(TypedDict):
+    """Settings in use."""
+
+    version: Annotated[str, Field(description="Of the server.")]
+    engine: Annotated[Literal["embedded", "celery"], Field(description="Who runs the jobs: the server, or workers.")]
+    database: Literal["sqlite", "postgresql"]
+    storage: Annotated[Literal["folder", "s3"], Field(description="Where uploads are stored.")]
+    broker: Annotated[Literal["amqp"] | None, Field(description="null: the server needs none.")]
+    public_url: Annotated[str | None, Field(description="Address of the server in QR codes and links.")]
+    issuer: Annotated[str | None, Field(description="OpenID Connect issuer whose tokens are accepted.")]
+    base_map: Annotated[Literal["pmtiles", "raster"] | None, Field(description="null: the pages draw a grid.")]
+    grids: Annotated[bool, Field(description="PROJ grids for coordinate transformations are installed.")]
+    tracing: Annotated[bool, Field(description="Traces are sent to a collector.")]
+    log_format: Literal["console", "json"]
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"]
+    numbers: Annotated[list[NumberSetting], Field(description="Limits and switches, see docs/settings.md.")]
+
+
+@server_settings_router.get("", responses=document_response(ServerSettings))
+async def get_server_settings(request: Request, caller: Caller) -> Response:
+    """The settings that the server runs with."""
+    return json_response(request.app.state.server_settings)

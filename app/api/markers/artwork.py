@@ -1,8 +1,9 @@
-"""Artwork: of one marker, or of a selection of plates as a ZIP."""
+"""Artwork of markers, drilling sheets of magnets, and programs of CERPMs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from enum import StrEnum
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
@@ -11,15 +12,27 @@ from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.dependencies import Caller, Idempotency, MarkerId, Number, use_cases
 from app.api.http.problems import problem_responses
-from app.api.http.responses import NOT_MODIFIED, IfNoneMatch, Prefer, file_response, wants_job
+from app.api.http.responses import (
+    BINARY,
+    NOT_MODIFIED,
+    IfNoneMatch,
+    Prefer,
+    file_response,
+    json_response,
+    text_response,
+    wants_job,
+)
 from app.api.http.strict_json import StrictRoute
-from app.api.jobs.files import queued_job
-from app.api.markers.schemas_selection import SelectionIn
+from app.api.jobs import queued_job
+from app.api.markers.searches import SelectionIn
+from app.encoders.cerpm import hex_dump
+from app.encoders.magnet import SheetFormat
 from app.encoders.plate import ArtworkFormat, ArtworkOptions
-from app.families.inputs import Flag, StrictModel
-from app.services.markers.artwork import Artworks, Bundle
-from app.services.markers.artwork_jobs import ArtworkJobs, bundle_options
-from app.services.progress.documents import JobDocument
+from app.families.documents import Flag, StrictModel
+from app.markers.cerpm import MAX_SEQUENCE
+from app.services.markers.artwork import ArtworkJobs, Artworks, Bundle, bundle_options
+from app.services.markers.programs import CerpmPrograms, Layouts, PayloadDocument, payload_document
+from app.services.progress import JobDocument
 
 router = APIRouter(prefix="/v1", tags=["artwork"], route_class=StrictRoute)
 
@@ -140,3 +153,104 @@ def _chunks(bundle: Bundle) -> Iterator[bytes]:
     with bundle.file as file:
         while chunk := file.read(_CHUNK):
             yield chunk
+
+
+# === Layouts of magnet markers as drilling sheets.
+
+
+layout_router = APIRouter(prefix="/v1/markers", tags=["layouts"], route_class=StrictRoute)
+
+
+@layout_router.get(
+    "/{marker_id}/layout.{form}",
+    responses={
+        **file_response(form.media_type.partition(";")[0] for form in SheetFormat),
+        **NOT_MODIFIED,
+        **problem_responses(404),
+    },
+)
+def get_layout(
+    marker_id: MarkerId,
+    form: SheetFormat,
+    caller: Caller,
+    layouts: Annotated[Layouts, use_cases("layouts")],
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """Drilling sheet of a magnet marker: holes with polarity and orientation, checks, materials and costs."""
+    headers = {"ETag": f'"{layouts.tag(caller, marker_id, form)}"', "Cache-Control": "private, no-cache"}
+    if if_none_match == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    sheet = layouts.sheet(caller, marker_id, form)
+    headers["Content-Disposition"] = f'inline; filename="{sheet.file_name}"'
+    return Response(sheet.content, headers=headers, media_type=sheet.media_type)
+
+
+# === What CERPMs send and are programmed with.
+
+
+program_router = APIRouter(prefix="/v1", tags=["cerpms"], route_class=StrictRoute)
+
+
+class PayloadFormat(StrEnum):
+    """How a payload is written."""
+
+    BIN = "bin"
+    HEX = "hex"
+    JSON = "json"
+
+    @property
+    def media_type(self) -> str:
+        """Of the file."""
+        return {"bin": "application/octet-stream", "hex": "text/plain", "json": "application/json"}[self.value]
+
+
+class ProgramsIn(SelectionIn):
+    """Markers to program, by id or by filter."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"status": "surveyed"}, {"bbox": [-86, 42, -85, 43]}]})
+
+    with_keys: Flag = Field(False, description="With the markers' own keys; takes an admin's key.")
+
+
+Programs = Annotated[CerpmPrograms, use_cases("programs")]
+
+
+@program_router.get(
+    "/markers/{marker_id}/payload.{form}",
+    responses={
+        200: {
+            "model": PayloadDocument,
+            "content": {"application/octet-stream": {"schema": BINARY}, "text/plain": {"schema": {"type": "string"}}},
+        },
+        **problem_responses(404),
+    },
+)
+def get_payload(
+    marker_id: MarkerId,
+    form: PayloadFormat,
+    caller: Caller,
+    programs: Programs,
+    sequence: Annotated[
+        int | None, Query(ge=0, le=MAX_SEQUENCE, description="Which transmission; the next one if left out.")
+    ] = None,
+) -> Response:
+    """What a CERPM sends: the 24 bytes, a dump that explains them, or both as JSON. Takes a key that may write."""
+    payload = programs.payload(caller, marker_id, sequence)
+    headers = {
+        "Cache-Control": "private, no-store",
+        "Content-Disposition": f'inline; filename="cerpm-{payload.number}.{form}"',
+    }
+    if payload.note is not None:
+        headers["Waymark-Note"] = payload.note.encode("ascii", "replace").decode()
+    if form is PayloadFormat.JSON:
+        return json_response(payload_document(payload), headers=headers)
+    content = payload.payload if form is PayloadFormat.BIN else hex_dump(payload.payload, payload.key).encode()
+    return Response(content, headers=headers, media_type=form.media_type)
+
+
+@program_router.post("/programs", responses={**text_response("text/csv"), **problem_responses(404)})
+def post_programs(wanted: ProgramsIn, caller: Caller, programs: Programs) -> Response:
+    """Table for programming a selection of CERPMs, CSV: one row a marker, with its key only if that is asked for."""
+    table = programs.programs_csv(caller, wanted.selection(), with_keys=wanted.with_keys)
+    headers = {"Content-Disposition": 'attachment; filename="cerpm-programs.csv"', "Cache-Control": "private, no-store"}
+    return Response(table, headers=headers, media_type="text/csv")

@@ -6,23 +6,186 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
+from pydantic import ConfigDict, Field, model_validator
 
-from app.api.http.cursors import checked_id, cursor_of
-from app.api.http.dependencies import AfterLink, Caller, LastId, PageSize, Text, use_cases
-from app.api.http.responses import document_response, json_response, page_response
-from app.api.http.strict_json import StrictRoute
-from app.api.http.times import parse_time
-from app.api.markers.filters import Filtered, check_measures
-from app.api.markers.schemas_searches import MAX_PAGE, MAX_RADIUS_M, AlongIn, SearchIn
+from app.api.http.dependencies import AfterLink, Caller, Identifier, LastId, Number, PageSize, Text, use_cases
+from app.api.http.responses import checked_id, cursor_of, document_response, json_response, page_response, parse_time
+from app.api.http.strict_json import AnyPolygon, GeoLineIn, StrictRoute
 from app.errors import InvalidParameter
+from app.families import FamilyName
+from app.families.documents import Metres, StrictModel
 from app.geodesy import check_lon_lat
+from app.markers.reading import Status
 from app.registry.markers import MarkerFilter
-from app.services.markers.documents import FoundMarker, MarkerPage
-from app.services.markers.search_areas import area_of
-from app.services.markers.search_boxes import checked_box, parse_numbers
+from app.services.markers.markers import FoundMarker, MarkerPage
 from app.services.markers.searches import Searches as SearchesService
-from app.services.markers.searches import circle
+from app.services.markers.searches import (
+    Selection,
+    area_of,
+    area_of_text,
+    checked_box,
+    circle,
+    parse_box,
+    parse_numbers,
+)
+
+# === Which markers are meant: the query parameters that the list of markers and its exports share.
+
+
+_MAX_POLYGON_TEXT = 8_000
+_MetresQuery = Annotated[float | None, Query(ge=-1e8, le=1e8, allow_inf_nan=False)]
+
+
+async def get_marker_filter(
+    bbox: Annotated[Text | None, Query(max_length=200, examples=["114.1,22.2,114.3,22.4"])] = None,
+    polygon: Annotated[
+        Text | None, Query(max_length=_MAX_POLYGON_TEXT, description="WKT of a POLYGON or MULTIPOLYGON.")
+    ] = None,
+    road: Annotated[Text | None, Query(min_length=1, max_length=200)] = None,
+    from_m: _MetresQuery = None,
+    to_m: _MetresQuery = None,
+    code: Annotated[
+        Text | None,
+        Query(
+            min_length=1,
+            max_length=64,
+            description="All digits of a plate, the text of a tag, or the number of a CERPM.",
+        ),
+    ] = None,
+    status: Status | None = None,
+    family: FamilyName | None = None,
+) -> MarkerFilter:
+    """The filter in a query.
+
+    Raises
+    ------
+    InvalidParameter
+        A part cannot be read or is out of range, or measures come without their road.
+    """
+    filtered = MarkerFilter(
+        box=parse_box(bbox) if bbox is not None else None,
+        area=area_of_text(polygon) if polygon is not None else None,
+        road=road,
+        from_m=from_m,
+        to_m=to_m,
+        digits=code,
+        status=status,
+        family=family,
+    )
+    check_measures(filtered)
+    return filtered
+
+
+Filtered = Annotated[MarkerFilter, Depends(get_marker_filter)]
+
+
+def check_measures(filtered: MarkerFilter) -> None:
+    """Refuse measures without their road, as InvalidParameter."""
+    if filtered.road is None and (filtered.from_m is not None or filtered.to_m is not None):
+        raise InvalidParameter(
+            "measures belong to a road", field="road", limit="a road with from_m, to_m", cure="name the road"
+        )
+
+
+# === Schema of a selection of markers.
+
+
+class SelectionIn(StrictModel):
+    """Markers by id or by filter."""
+
+    marker_ids: list[Identifier] | None = Field(None, min_length=1, description="Ids, up to 5 000.")
+    bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
+        None, description="west, south, east, north. [deg]"
+    )
+    status: Status | None = Field(None, description="Only markers with this status.")
+
+    @model_validator(mode="after")
+    def _by_id_or_by_filter(self) -> SelectionIn:
+        if (self.marker_ids is None) == (self.bbox is None and self.status is None):
+            raise InvalidParameter(
+                "markers are selected by id, or by a filter",
+                field="marker_ids",
+                limit="marker_ids; or bbox, status or both",
+                cure="send one of the two",
+            )
+        return self
+
+    def selection(self) -> Selection:
+        """The selection as the use cases know it."""
+        box = checked_box(*self.bbox) if self.bbox is not None else None
+        return Selection(tuple(self.marker_ids or ()), MarkerFilter(box=box, status=self.status))
+
+
+# === Schemas of searches for markers.
+
+
+MAX_PAGE = 1000
+MAX_RADIUS_M = 100_000.0
+MAX_CORRIDOR_M = 2_000.0
+
+Nearest = Annotated[int, Field(strict=True, ge=1, le=MAX_PAGE)]
+Radius = Annotated[float, Field(allow_inf_nan=False, ge=0, le=MAX_RADIUS_M)]
+
+
+class PlaceIn(StrictModel):
+    """A place to search from."""
+
+    lon_deg: Number = Field(description="Longitude. [deg]")
+    lat_deg: Number = Field(description="Latitude. [deg]")
+
+
+class AlongIn(StrictModel):
+    """A corridor along a line."""
+
+    geometry: GeoLineIn = Field(description="In the direction of travel, in longitude and latitude.")
+    corridor_m: Annotated[float, Field(allow_inf_nan=False, gt=0, le=MAX_CORRIDOR_M)] = Field(
+        description="Width: half of it to each side. [m]"
+    )
+
+
+class SearchIn(StrictModel):
+    """What to search for; each member narrows further."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "polygon": {
+                        "type": "Polygon",
+                        "coordinates": [[[8.40, 49.00], [8.44, 49.00], [8.42, 49.02], [8.40, 49.00]]],
+                    },
+                    "family": "plate",
+                },
+                {"near": {"lon_deg": 114.1792, "lat_deg": 22.3041}, "nearest": 10, "status": "active"},
+                {
+                    "along": {
+                        "geometry": {"type": "LineString", "coordinates": [[8.40, 49.00], [8.44, 49.01]]},
+                        "corridor_m": 20,
+                    }
+                },
+            ]
+        },
+    )
+
+    bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
+        None, description="west, south, east, north; a west above the east spans the antimeridian. [deg]"
+    )
+    polygon: AnyPolygon | None = Field(None, description="Markers inside or on the edge; up to 10 000 vertices.")
+    near: PlaceIn | None = Field(None, description="With `radius_m`, `nearest` or both.")
+    radius_m: Radius | None = Field(None, description="Geodesic distance from `near`. [m]")
+    nearest: Nearest | None = Field(None, description="How many of the nearest to `near`, nearest first.")
+    along: AlongIn | None = Field(None, description="Markers in the order of a line.")
+    road: Text | None = Field(None, min_length=1, max_length=200)
+    from_m: Metres | None = Field(None, description="Least measure on the road. [m]")
+    to_m: Metres | None = Field(None, description="Greatest measure on the road. [m]")
+    code: Text | None = Field(None, min_length=1, max_length=64)
+    status: Status | None = None
+    family: FamilyName | None = None
+
+
+# === Finding markers.
+
 
 router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
 

@@ -1,31 +1,221 @@
-"""The documents that lead to features: landing page, conformance, collections and their schemas."""
+"""The documents that lead to features: landing page, conformance, collections, their schemas, and OpenAPI."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import re
+from typing import Annotated, Any
 
 from fastapi import Depends
 from starlette.responses import Response
 
+from app import __version__
 from app.api.http.dependencies import Caller
+from app.api.http.permissions import SECURITY, SECURITY_SCHEMES
 from app.api.ogc import pages
-from app.api.ogc.dependencies import BaseUrl, CollectionOf, FeaturesService, Offers
-from app.api.ogc.openapi import api_document
+from app.api.ogc.edits import READ_ONLY
 from app.api.ogc.pages import html_response
-from app.api.ogc.responses import GEOJSON, HTML, JSON, OPENAPI, SCHEMA, answer, link
-from app.api.ogc.schemas import (
-    QUERYABLES_REL,
-    SCHEMA_CONFORMANCE,
-    SCHEMA_REL,
-    geojson_schema,
-    property_schema,
-    queryables,
+from app.api.ogc.query import OF_ITEM, ONLY_FORMAT, PARAMETERS, list_parameters
+from app.api.ogc.query import described as parameters_described
+from app.api.ogc.responses import (
+    GEOJSON,
+    HTML,
+    JSON,
+    OPENAPI,
+    SCHEMA,
+    BaseUrl,
+    CollectionDocument,
+    CollectionOf,
+    Collections,
+    Conformance,
+    ExtentDocument,
+    FeaturesService,
+    LandingPage,
+    Offers,
+    answer,
+    link,
 )
-from app.api.ogc.shapes import CollectionDocument, Collections, Conformance, ExtentDocument, LandingPage
 from app.api.ogc.tiles import TILES_REL
-from app.registry.features import Extent
-from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
-from app.services.markers.features import COLLECTIONS, Collection
+from app.registry.features import Extent, Field
+from app.services.markers.features import COLLECTIONS, STORAGE_CRS, Collection, FeatureCrs
+
+# === JSON Schemas of a collection's features: as OGC API Common part 3 (OGC 23-058r2, formerly Features part 5)
+# describes
+#
+# properties, as GeoJSON, and of what filters can ask.
+
+
+SCHEMA_REL = "http://www.opengis.net/def/rel/ogc/1.0/schema"
+QUERYABLES_REL = "http://www.opengis.net/def/rel/ogc/1.0/queryables"
+_DRAFT = "https://json-schema.org/draft/2020-12/schema"
+_COMMON = "http://www.opengis.net/spec/ogcapi-common-3/1.0/conf"
+_DRAFT_5 = "http://www.opengis.net/spec/ogcapi-features-5/1.0/conf"
+SCHEMA_CONFORMANCE = (
+    f"{_COMMON}/schemas",
+    f"{_COMMON}/advanced-property-roles",
+    f"{_COMMON}/returnables-and-receivables",
+    f"{_COMMON}/queryables",
+    f"{_DRAFT_5}/schemas",
+    f"{_DRAFT_5}/core-roles-features",
+    f"{_DRAFT_5}/returnables-and-receivables",
+)
+"""The classes of the standard, and those of its last draft, which QGIS up to 4.0 looks for."""
+_UNITS = {"deg": "deg", "m": "m", "km/h": "km/h", "1/m": "/m", "decimal year": "a"}
+"""UCUM codes of units as the texts of properties name them."""
+_ROLES = {"family": "type", "updated_at": "primary-instant"}
+_UNIT = re.compile(r" \[([^\]]+)\]$")
+
+
+def property_schema(collection: Collection, url: str) -> dict[str, Any]:
+    """The properties of a collection's features, independent of their format; the geometry is one of them."""
+    properties: dict[str, Any] = {
+        "id": {"title": "Id of the feature", "type": "string", "readOnly": True, "x-ogc-role": "id"},
+        "geometry": {
+            "title": "Position" if collection.geometry == "Point" else "Course",
+            "format": f"geometry-{collection.geometry.lower()}",
+            "x-ogc-role": "primary-geometry",
+            **({} if collection.editable else {"readOnly": True}),
+        },
+    }
+    for field in collection.fields:
+        properties[field.name] = _returnable(field, collection.editable and field.name not in READ_ONLY)
+    for place, described in enumerate(properties.values(), start=1):
+        described["x-ogc-propertySeq"] = place
+    return {
+        "$schema": _DRAFT,
+        "$id": url,
+        "title": collection.title,
+        "description": collection.text,
+        "type": "object",
+        "properties": properties,
+        "additionalProperties": False,
+    }
+
+
+def geojson_schema(collection: Collection, url: str) -> dict[str, Any]:
+    """A feature as GeoJSON: GDAL takes the types of fields from it; without it, it guesses from the first page."""
+    return {
+        "$schema": _DRAFT,
+        "$id": url,
+        "title": collection.title,
+        "type": "object",
+        "required": ["type", "geometry", "properties"],
+        "properties": {
+            "type": {"type": "string", "enum": ["Feature"]},
+            "id": {"type": "string"},
+            "geometry": {"$ref": f"https://geojson.org/schema/{collection.geometry}.json"},
+            "properties": {"type": "object", "properties": _plain(collection)},
+        },
+    }
+
+
+def queryables(collection: Collection, url: str) -> dict[str, Any]:
+    """What filters can ask of a collection's features."""
+    return {
+        "$schema": _DRAFT,
+        "$id": url,
+        "title": collection.title,
+        "type": "object",
+        "properties": _plain(collection),
+        "additionalProperties": False,
+    }
+
+
+def schema_type(kind: str) -> dict[str, str]:
+    """JSON Schema of a kind of property."""
+    return {"type": "string", "format": "date-time"} if kind == "date-time" else {"type": kind}
+
+
+def _plain(collection: Collection) -> dict[str, dict[str, str]]:
+    return {field.name: schema_type(field.kind) | {"title": field.text} for field in collection.fields}
+
+
+def _returnable(field: Field, is_receivable: bool) -> dict[str, Any]:
+    described: dict[str, Any] = {**schema_type(field.kind), "title": field.text}
+    unit = _UNIT.search(field.text)
+    if unit is not None and unit[1] in _UNITS:
+        described |= {"x-ogc-unit": _UNITS[unit[1]]}
+    if field.name in _ROLES:
+        described["x-ogc-role"] = _ROLES[field.name]
+    return described if is_receivable else described | {"readOnly": True}
+
+
+# === /ogc/api by hand: the clients want OpenAPI 3.0, a literal path for each collection, and parameters named like
+# fields.
+#
+# GDAL pushes `code = '7'` down to the server only if the path's parameters list `code`; QGIS takes its page size from
+# `components.parameters.limit`.
+
+
+_PROBLEM = {
+    "description": "A problem document (RFC 9457)",
+    "content": {"application/problem+json": {"schema": {"type": "object"}}},
+}
+
+
+def api_document(base: str) -> dict[str, Any]:
+    """The OpenAPI document of /ogc for a server that is reached at `base`."""
+    paths: dict[str, Any] = {
+        "/": _read("Landing page"),
+        "/conformance": _read("Conformance classes"),
+        "/api": _read("This document"),
+        "/collections": _read("Collections"),
+    }
+    for collection in COLLECTIONS.values():
+        paths |= _paths(collection)
+    return {
+        "openapi": "3.0.3",
+        "info": {
+            "title": "Waymark",
+            "version": __version__,
+            "description": "Road markers as OGC API Features. Send your key as `Authorization: Bearer KEY`, as "
+            "`X-API-Key: KEY`, or as the password of HTTP Basic with any user name.",
+        },
+        "servers": [{"url": base}],
+        "security": SECURITY,
+        "paths": paths,
+        "components": {
+            "parameters": _parameters(),
+            "responses": {"Problem": _PROBLEM},
+            "securitySchemes": SECURITY_SCHEMES,
+        },
+    }
+
+
+def _paths(collection: Collection) -> dict[str, Any]:
+    url, name = f"/collections/{collection.id}", collection.title
+    items = _read(f"{name}: a page", GEOJSON, list_parameters(collection))
+    item = _read(f"{name}: one", GEOJSON, OF_ITEM)
+    item["parameters"] = [{"$ref": "#/components/parameters/featureId"}]
+    return {
+        url: _read(name),
+        f"{url}/schema": _read(f"{name}: schema", SCHEMA),
+        f"{url}/geojson-schema": _read(f"{name}: schema in GeoJSON", SCHEMA),
+        f"{url}/queryables": _read(f"{name}: what can be asked of the properties", SCHEMA),
+        f"{url}/items": items,
+        f"{url}/items/{{featureId}}": item,
+    }
+
+
+def _read(summary: str, kind: str = JSON, parameters: tuple[str, ...] = ONLY_FORMAT) -> dict[str, Any]:
+    return {
+        "get": {
+            "summary": summary,
+            "parameters": [{"$ref": f"#/components/parameters/{name}"} for name in parameters],
+            "responses": {
+                "200": {"description": summary, "content": {kind: {"schema": {"type": "object"}}}},
+                "4XX": {"$ref": "#/components/responses/Problem"},
+            },
+        }
+    }
+
+
+def _parameters() -> dict[str, Any]:
+    feature = {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}}
+    return {name: parameters_described(name) for name in PARAMETERS} | {"featureId": feature}
+
+
+# === The documents that lead to features.
+
 
 _SCHEMES_REL = "http://www.opengis.net/def/rel/ogc/1.0/tiling-schemes"
 _FEATURES = "http://www.opengis.net/spec/ogcapi-features"

@@ -15,13 +15,14 @@ from fastapi import Depends, Header, Request
 from pydantic import TypeAdapter
 from starlette.responses import Response
 
+from app.api.http.bodies import media_type_of
 from app.api.http.dependencies import Caller, Markers, SentVersion
-from app.api.http.forms import media_type_of
 from app.api.http.permissions import PERMISSIONS
 from app.api.http.strict_json import in_thread_if_large, validated
-from app.api.markers.markers import WARNINGS_TEXT, NewMarkerIn, patch_marker, post_marker
-from app.api.markers.schemas_patch import MarkerPatch
-from app.api.ogc.dependencies import (
+from app.api.markers.markers import WARNINGS_TEXT, MarkerPatch, NewMarkerIn, patch_marker, post_marker
+from app.api.ogc.responses import (
+    GEOJSON,
+    JSON,
     BaseUrl,
     CollectionOf,
     EditableCollection,
@@ -29,15 +30,13 @@ from app.api.ogc.dependencies import (
     FeaturesService,
     refuse_parameters,
 )
-from app.api.ogc.responses import GEOJSON, JSON
 from app.errors import InvalidParameter, StaleVersion, UnsupportedUpload
 from app.families import FAMILIES, FAMILY_NAMES, get_family
 from app.families.family import Family
 from app.formats.json_text import parse_json
-from app.geodesy.vertical import is_ellipsoidal
+from app.geodesy.systems import is_ellipsoidal
 from app.services.access.access import Caller as CallerValue
-from app.services.markers.feature_crs import STORAGE_CRS, FeatureCrs
-from app.services.markers.features import Collection
+from app.services.markers.features import STORAGE_CRS, Collection, FeatureCrs
 from app.services.markers.features import Features as FeaturesUseCases
 from app.services.markers.markers import Markers as MarkersUseCases
 from app.services.markers.plausibility import WarningMode

@@ -3,16 +3,206 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Annotated, Literal, NotRequired
 from urllib.parse import urlencode
 
 import orjson
+from fastapi import Depends, Path
+from fastapi import Request as FastapiRequest
+from pydantic import ConfigDict, JsonValue, with_config
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
+from typing_extensions import TypedDict
 
-from app.api.ogc.query import refuse
-from app.api.ogc.shapes import Link
-from app.services.markers.feature_crs import FeatureCrs
+from app.api.http.dependencies import use_cases
+from app.api.ogc.query import (
+    OF_ITEM,
+    ONLY_FORMAT,
+    ItemsQuery,
+    crs_parameter,
+    items_query,
+    known_parameters,
+    query_pairs,
+    refuse,
+)
+from app.errors import InvalidParameter
+from app.services.markers.features import Collection, FeatureCrs, Features, get_collection, no_feature
+
+# === What the API returns under /ogc, typed (OGC 17-069r4, 18-058r1, 20-057; GeoJSON: RFC 7946).
+
+
+JsonObject = dict[str, JsonValue]
+
+
+class Link(TypedDict):
+    """A link."""
+
+    href: str
+    rel: str
+    type: str
+    title: NotRequired[str]
+    templated: NotRequired[bool]
+
+
+class LandingPage(TypedDict):
+    """Where everything is."""
+
+    title: str
+    description: str
+    links: list[Link]
+
+
+class Conformance(TypedDict):
+    """The conformance classes."""
+
+    conformsTo: list[str]
+
+
+class SpatialExtent(TypedDict):
+    """A box: west, south, east, north. [deg]"""
+
+    bbox: list[list[float]]
+    crs: str
+
+
+class TemporalExtent(TypedDict):
+    """The first and the last change."""
+
+    interval: list[list[datetime | None]]
+
+
+class ExtentDocument(TypedDict):
+    """What the features of a collection cover."""
+
+    spatial: SpatialExtent
+    temporal: TemporalExtent
+
+
+class CollectionDocument(TypedDict):
+    """A collection of features."""
+
+    id: str
+    title: str
+    description: str
+    itemType: Literal["feature"]
+    crs: list[str]
+    storageCrs: str
+    links: list[Link]
+    extent: NotRequired[ExtentDocument]
+    storageCrsCoordinateEpoch: NotRequired[float]
+
+
+class Collections(TypedDict):
+    """All collections."""
+
+    links: list[Link]
+    crs: list[str]
+    collections: list[CollectionDocument]
+
+
+class Geometry(TypedDict):
+    """A point or a line."""
+
+    type: Literal["Point", "LineString"]
+    coordinates: list[float] | list[list[float]]
+
+
+class Feature(TypedDict):
+    """A feature; the schema of its collection describes its properties."""
+
+    type: Literal["Feature"]
+    id: str
+    geometry: Geometry
+    properties: JsonObject
+    links: NotRequired[list[Link]]
+
+
+class FeaturePage(TypedDict):
+    """A page of features."""
+
+    type: Literal["FeatureCollection"]
+    timeStamp: datetime
+    numberReturned: int
+    numberMatched: NotRequired[int]
+    links: list[Link]
+    features: list[Feature]
+
+
+_EXAMPLE: JsonObject = {
+    "type": "Feature",
+    "geometry": {"type": "Point", "coordinates": [114.1792, 22.3041]},
+    "properties": {"family": "plate", "status": "planned", "heading_deg": 90.0},
+}
+
+
+@with_config(ConfigDict(json_schema_extra={"examples": [_EXAMPLE]}))
+class NewFeature(TypedDict):
+    """A feature that is sent: a point and flat properties."""
+
+    type: NotRequired[Literal["Feature"]]
+    id: NotRequired[str | int | None]
+    geometry: NotRequired[JsonObject | None]
+    properties: NotRequired[JsonObject | None]
+
+
+class TileSet(TypedDict):
+    """A set of vector tiles."""
+
+    title: str
+    dataType: Literal["vector"]
+    crs: str
+    tileMatrixSetURI: str
+    links: list[Link]
+
+
+class TileSets(TypedDict):
+    """The tile sets of a collection."""
+
+    tilesets: list[TileSet]
+
+
+class TileMatrix(TypedDict):
+    """One zoom level of a tile matrix set."""
+
+    id: str
+    scaleDenominator: float
+    cellSize: float
+    pointOfOrigin: list[float]
+    tileWidth: int
+    tileHeight: int
+    matrixWidth: int
+    matrixHeight: int
+
+
+class TileMatrixSet(TypedDict):
+    """A tile matrix set."""
+
+    id: str
+    uri: str
+    crs: str
+    orderedAxes: list[str]
+    tileMatrices: list[TileMatrix]
+
+
+class TileMatrixSetItem(TypedDict):
+    """A tile matrix set in a list."""
+
+    id: str
+    uri: str
+    links: list[Link]
+
+
+class TileMatrixSets(TypedDict):
+    """The tile matrix sets."""
+
+    tileMatrixSets: list[TileMatrixSetItem]
+
+
+# === What every answer under /ogc has in common.
+
 
 JSON = "application/json"
 GEOJSON = "application/geo+json"
@@ -124,3 +314,108 @@ def answer(
     if crs is not None:
         sent["Content-Crs"] = f"<{crs}>"
     return Response(orjson.dumps(content, option=_OPTIONS), status, sent, media_type=kind)
+
+
+# === What the routes of /ogc ask for, as FastAPI dependencies: the collection, the feature, the query, the base URL.
+
+
+_GEOJSON_NAMES = ("json", "geojson")
+_FEATURE_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}(\.[0-9]{5,7})?", re.ASCII)
+
+
+async def get_named_collection(
+    collection: Annotated[str, Path(description="Id of the collection.")],
+) -> Collection:
+    """The collection that the path names."""
+    return get_collection(collection)
+
+
+CollectionOf = Annotated[Collection, Depends(get_named_collection)]
+
+
+async def get_editable_collection(collection: CollectionOf) -> Collection:
+    """The collection that the path names, if clients may edit it.
+
+    Raises
+    ------
+    InvalidParameter
+        It is read only.
+    """
+    if not collection.editable:
+        raise InvalidParameter("this collection is read only", field="collectionId", limit="markers can be edited")
+    return collection
+
+
+async def get_feature_id(
+    collection: CollectionOf, feature: Annotated[str, Path(description="Id of the feature.")]
+) -> str:
+    """The feature's id in the path.
+
+    Raises
+    ------
+    NotFound
+        No feature has such an id.
+    """
+    if not _FEATURE_ID.fullmatch(feature):
+        raise no_feature(collection)
+    return feature
+
+
+async def get_items_query(request: FastapiRequest, collection: CollectionOf) -> ItemsQuery:
+    """The query of a request for items, whose client takes GeoJSON or HTML."""
+    pairs = query_pairs(request)
+    form = next((value for name, value in pairs if name == "f"), None)
+    is_page = negotiate(request, form, GEOJSON, JSON, names=_GEOJSON_NAMES, html=True)
+    return items_query(pairs, collection, is_page=is_page)
+
+
+@dataclass(frozen=True, slots=True)
+class ItemQuery:
+    """What a request for one item asks for: parameters as they were sent, the CRS, and whether it wants HTML."""
+
+    pairs: list[tuple[str, str]]
+    crs: FeatureCrs
+    is_page: bool
+
+
+async def get_item_query(request: FastapiRequest, _collection: CollectionOf) -> ItemQuery:
+    """The query of a request for one item, whose client takes GeoJSON or HTML."""
+    found = known_parameters(request, OF_ITEM)
+    crs = crs_parameter(found, "crs")
+    is_page = negotiate(request, found.get("f"), GEOJSON, JSON, names=_GEOJSON_NAMES, html=True)
+    return ItemQuery(list(found.items()), crs, is_page)
+
+
+async def refuse_parameters(request: FastapiRequest) -> None:
+    """Refuse every query parameter."""
+    known_parameters(request, ())
+
+
+class Offers:
+    """A dependency: whether a client gets HTML.
+
+    It refuses clients that take none of the offered media types, and parameters other than `f`.
+    """
+
+    def __init__(self, *kinds: str, names: tuple[str, ...] = ("json",), html: bool = False) -> None:
+        self._kinds = kinds
+        self._names = names
+        self._html = html
+
+    async def __call__(self, request: FastapiRequest) -> bool:
+        """Check one request."""
+        form = known_parameters(request, ONLY_FORMAT).get("f")
+        return negotiate(request, form, *self._kinds, names=self._names, html=self._html)
+
+
+async def get_base_url(request: FastapiRequest) -> str:
+    """The URL at which the client reaches /ogc."""
+    return base_url(request)
+
+
+EditableCollection = Annotated[Collection, Depends(get_editable_collection)]
+FeatureId = Annotated[str, Depends(get_feature_id)]
+FeaturesService = Annotated[Features, use_cases("features")]
+ItemsQueryOf = Annotated[ItemsQuery, Depends(get_items_query)]
+ItemQueryOf = Annotated[ItemQuery, Depends(get_item_query)]
+BaseUrl = Annotated[str, Depends(get_base_url)]

@@ -1,4 +1,4 @@
-"""The routes of /ogc. Queries are read by typed dependencies; pages and tiles have threads of their own."""
+"""The routes of /ogc and pages of items. Queries are read by typed dependencies; pages and tiles have own threads."""
 
 from __future__ import annotations
 
@@ -7,36 +7,149 @@ import os
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
+from datetime import UTC, datetime
 from functools import partial, wraps
 from inspect import Parameter, signature
-from typing import Any
+from typing import Any, cast
 
-from fastapi import APIRouter, FastAPI, Request, Response
+import orjson
+from fastapi import APIRouter, FastAPI, Request
+from fastapi import Response as FastapiResponse
 from fastapi.routing import APIRoute
+from starlette.responses import Response
 
-from app.api.http.components import reference
-from app.api.http.costs import watch_client
-from app.api.http.problems import Described, problem_responses
+from app.api.http.dependencies import Caller
+from app.api.http.limits import watch_client
+from app.api.http.problems import Described, problem_responses, reference
 from app.api.http.responses import file_response
 from app.api.http.strict_json import StrictRoute
-from app.api.ogc import documents, edits, items, tiles
-from app.api.ogc.parameters import OF_ITEM, OF_ITEMS, OF_TILE, ONLY_FORMAT, PARAMETERS, described
-from app.api.ogc.responses import GEOJSON, HTML, JSON, MAP_STYLE, MVT, OPENAPI, SCHEMA
-from app.api.ogc.shapes import (
+from app.api.ogc import documents, edits, tiles
+from app.api.ogc.pages import html_response, item_page, items_page
+from app.api.ogc.query import OF_ITEM, OF_ITEMS, OF_TILE, ONLY_FORMAT, PARAMETERS, ItemsQuery, described
+from app.api.ogc.responses import (
+    GEOJSON,
+    HTML,
+    JSON,
+    MAP_STYLE,
+    MVT,
+    OPENAPI,
+    SCHEMA,
+    BaseUrl,
     CollectionDocument,
+    CollectionOf,
     Collections,
     Conformance,
     Feature,
+    FeatureId,
     FeaturePage,
+    FeaturesService,
+    ItemQueryOf,
+    ItemsQueryOf,
     JsonObject,
     LandingPage,
+    Link,
     NewFeature,
     TileMatrixSet,
     TileMatrixSets,
     TileSet,
     TileSets,
+    answer,
+    link,
+    with_query,
 )
 from app.services.request_work import counted
+
+# === Features: pages of them, and single ones.
+
+
+def list_items(
+    collection: CollectionOf, query: ItemsQueryOf, base: BaseUrl, caller: Caller, features: FeaturesService
+) -> Response:
+    """A page of features, or how many there are."""
+    count, read = features.count, features.page
+    if collection.lines is not None:
+        count = partial(features.count_lines, lines=collection.lines)
+        read = partial(features.lines, lines=collection.lines)
+    if query.hits:
+        hits = _hits(count(caller, filtered=query.filtered))
+        if query.is_page:
+            return html_response(items_page(base, collection, query, hits, None))
+        return answer(hits, GEOJSON)
+    page = read(
+        caller, filtered=query.filtered, after=query.after, limit=query.limit, crs=query.crs, counted=query.counted
+    )
+    document: FeaturePage = {
+        "type": "FeatureCollection",
+        "timeStamp": datetime.now(UTC),
+        "numberReturned": page.returned,
+        "links": _links(query, f"{base}/collections/{collection.id}", page.after),
+        "features": cast("list[Feature]", page.features),  # JSON already, as it is stored
+    }
+    if page.matched is not None:
+        document["numberMatched"] = page.matched
+    if query.is_page:
+        document["features"] = orjson.loads(orjson.dumps(page.features))
+        return html_response(items_page(base, collection, query, document, page.after))
+    return answer(document, GEOJSON, crs=query.crs)
+
+
+def get_item(
+    collection: CollectionOf,
+    query: ItemQueryOf,
+    feature_id: FeatureId,
+    base: BaseUrl,
+    caller: Caller,
+    features: FeaturesService,
+) -> Response:
+    """One feature."""
+    if collection.lines is not None:
+        feature = features.get_line(caller, collection, collection.lines, feature_id, query.crs)
+    else:
+        feature = features.get(caller, collection, feature_id, query.crs)
+    url = f"{base}/collections/{collection.id}"
+    document: Feature = {
+        "type": "Feature",
+        "id": feature["id"],
+        "geometry": feature["geometry"],
+        "properties": feature["properties"],
+        "links": [
+            link(f"{url}/items/{feature['id']}", "self", GEOJSON),
+            link(f"{url}/items/{feature['id']}?f=html", "alternate", HTML, "As HTML"),
+            link(url, "collection", JSON),
+        ],
+    }
+    if query.is_page:
+        return html_response(item_page(base, collection, query.crs, query.pairs, feature))
+    version = feature["properties"].get("version")
+    return answer(document, GEOJSON, crs=query.crs, headers={"ETag": f'"{version}"'} if version is not None else None)
+
+
+def _hits(matched: int) -> FeaturePage:
+    return {
+        "type": "FeatureCollection",
+        "timeStamp": datetime.now(UTC),
+        "numberReturned": 0,
+        "numberMatched": matched,
+        "links": [],
+        "features": [],
+    }
+
+
+def _links(query: ItemsQuery, url: str, after: str | None) -> list[Link]:
+    rest = [(name, value) for name, value in query.pairs if name not in ("f", "earlier")]
+    links = [
+        link(with_query(f"{url}/items", query.pairs), "self", GEOJSON),
+        link(with_query(f"{url}/items", [*rest, ("f", "html")]), "alternate", HTML, "As HTML"),
+        link(url, "collection", JSON),
+    ]
+    if after is not None:
+        onward = [*((name, value) for name, value in query.pairs if name not in ("after", "earlier")), ("after", after)]
+        links.append(link(with_query(f"{url}/items", onward), "next", GEOJSON))
+    return links
+
+
+# === The routes of /ogc. Queries are read by typed dependencies; pages and tiles have threads of their own.
+
 
 _ITEMS = "/ogc/collections/{collection}/items"
 _ITEM = f"{_ITEMS}/{{feature}}"
@@ -46,11 +159,11 @@ _ANY_OBJECT = {"type": "object", "additionalProperties": True}
 Endpoint = Callable[..., Any]
 
 
-def _in_own_threads(answer: Callable[..., Response]) -> Callable[..., Awaitable[Response]]:
+def _in_own_threads(answer: Callable[..., FastapiResponse]) -> Callable[..., Awaitable[FastapiResponse]]:
     """An endpoint that a few threads run: more would only wait for each other, and each for a connection."""
 
     @wraps(answer)
-    async def endpoint(request: Request, **values: Any) -> Response:
+    async def endpoint(request: Request, **values: Any) -> FastapiResponse:
         watch_client()
         threads: ThreadPoolExecutor = request.app.state.ogc_threads
         run = partial(copy_context().run, partial(counted, answer, **values))
@@ -112,7 +225,7 @@ def _add_heads(router: APIRouter) -> None:
 def _router() -> APIRouter:
     router = APIRouter(route_class=StrictRoute, tags=["ogc"])
     read, edit = partial(_add_read, router), partial(_add_edit, router)
-    read(_ITEMS, _in_own_threads(items.list_items), _json(FeaturePage, GEOJSON), (*OF_ITEMS, *_filters()))
+    read(_ITEMS, _in_own_threads(list_items), _json(FeaturePage, GEOJSON), (*OF_ITEMS, *_filters()))
     read(
         f"{_TILES}/{{matrix_set}}/{{zoom}}/{{row}}/{{column}}",
         _in_own_threads(tiles.get_tile),
@@ -133,7 +246,7 @@ def _router() -> APIRouter:
         _json(JsonObject, SCHEMA, html=False),
     )
     read("/ogc/collections/{collection}/queryables", documents.get_queryables, _json(JsonObject, SCHEMA))
-    read(_ITEM, items.get_item, _json(Feature, GEOJSON), OF_ITEM)
+    read(_ITEM, get_item, _json(Feature, GEOJSON), OF_ITEM)
     read("/ogc/tileMatrixSets", tiles.list_matrix_sets, _json(TileMatrixSets, JSON, html=False))
     read("/ogc/tileMatrixSets/{matrix_set}", tiles.get_matrix_set, _json(TileMatrixSet, JSON, html=False))
     read(_TILES, tiles.list_tilesets, _json(TileSets, JSON, html=False))

@@ -8,11 +8,19 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
-from app.api.http.bodies import SpooledPart, received_form
-from app.api.http.components import reference
+from app.api.http.bodies import (
+    FORM,
+    SpooledPart,
+    check_parts,
+    form_body,
+    idempotency_of,
+    media_type_of,
+    read_declaration,
+    read_text,
+    received_form,
+)
 from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
-from app.api.http.forms import FORM, check_parts, form_body, idempotency_of, media_type_of, read_declaration, read_text
-from app.api.http.problems import problem_responses
+from app.api.http.problems import problem_responses, reference
 from app.api.http.responses import (
     BINARY,
     NOT_MODIFIED,
@@ -26,15 +34,14 @@ from app.api.http.responses import (
     versioned_response,
 )
 from app.api.http.strict_json import StrictRoute
-from app.api.markers.filters import Filtered
+from app.api.markers.searches import Filtered
 from app.api.plans.schemas import AlignmentIn, RoadAlignmentIn
 from app.errors import MalformedRequest, UnreadableUpload, UnsupportedUpload
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.services.idempotency import IdempotencyKey
 from app.services.plans.alignments import Alignments
 from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile
-from app.services.plans.profiles import MAX_SAMPLES
-from app.services.plans.tasks import MapForm
+from app.services.plans.tasks import MAX_SAMPLES, MapForm
 
 router = APIRouter(prefix="/v1/alignments", tags=["plans"], route_class=StrictRoute)
 

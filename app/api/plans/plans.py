@@ -1,10 +1,13 @@
-"""/v1/plans: markers placed on a road by rules, checked, approved, committed, and compared with what was built."""
+"""/v1/plans: markers placed on a road by rules, checked, approved and committed; their rules, packages and proofs."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, cast
+from functools import cache
+from typing import Annotated, Any, Literal, cast
 
+import orjson
 from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import StreamingResponse
 
 from app.api.http.dependencies import (
     AfterVersion,
@@ -31,21 +34,120 @@ from app.api.http.responses import (
     wants_job,
 )
 from app.api.http.strict_json import StrictRoute
-from app.api.plans.plan_jobs import queued_response
-from app.api.plans.schemas import PlanIn, PlanPatch
-from app.planning.outputs.files import MEDIA_TYPES
+from app.api.plans.schemas import PackageIn, PlanIn, PlanPatch, PlanPreviewIn, ProofIn, RulesTextIn
+from app.planning.outputs.package import MEDIA_TYPES
+from app.planning.rules import read_rules, rules_schema
+from app.registry.jobs import JobState
 from app.services.plans.documents import (
     AsBuiltDocument,
     CommittedPlan,
     PlanDocument,
     PlanPage,
+    PlanPreview,
     PlanStatus,
     PlanVersionPage,
+    ProofDocument,
+    ReadRules,
 )
-from app.services.plans.making import PlanMaking
-from app.services.plans.plan_jobs import PlanJobDocument
+from app.services.plans.making import MAX_MARKERS, PlanMaking, PlanPreviews
+from app.services.plans.packages import Packages
 from app.services.plans.plans import Plans
-from app.services.plans.proofs import PROOF_FILES, Proofs
+from app.services.plans.proofs import PROOF_FILES, REPORT_FILE, PlanJobDocument, PlanJobPage, PlanJobs, Proofs
+
+# === /v1/plan-rules and /v1/plan-previews: rules of plans, and what they would place.
+
+
+rule_router = APIRouter(prefix="/v1", tags=["plans"], route_class=StrictRoute)
+
+SCHEMA_TYPE = "application/schema+json"
+_SCHEMA: dict[int | str, dict[str, Any]] = {
+    200: {"description": "JSON Schema, draft 2020-12", "content": {SCHEMA_TYPE: {"schema": {"type": "object"}}}}
+}
+
+
+@rule_router.get("/plan-rules/schema", responses={**_SCHEMA, **problem_responses()})
+def get_rules_schema(caller: Caller) -> Response:
+    """The JSON Schema of rules, for editors and forms."""
+    return Response(_schema(), media_type=SCHEMA_TYPE)
+
+
+@rule_router.post("/plan-rules", responses=document_response(ReadRules))
+def post_rules_text(wanted: RulesTextIn, caller: Caller) -> Response:
+    """Read and check rules of a file, YAML or JSON, and store nothing: for forms."""
+    rules = read_rules(wanted.text.encode())
+    return json_response(ReadRules(rules=rules.model_dump(mode="json", exclude_unset=True, by_alias=True)))
+
+
+@rule_router.post("/plan-previews", responses=document_response(PlanPreview, 404))
+def post_plan_preview(
+    request: Request,
+    wanted: PlanPreviewIn,
+    caller: Caller,
+    previews: Annotated[PlanPreviews, use_cases("plan_previews")],
+    after: Annotated[int, Query(ge=0, le=10**7, description="Markers of the pages before.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=MAX_MARKERS)] = 1000,
+) -> Response:
+    """Place and check what rules ask for on an alignment, and store nothing: to compare rules before a plan is made.
+
+    On at most 20 km of lanes. Markers have no codes. The counts are those of all markers; `markers` is a page of them,
+    and a Link header names the next one, which is requested with the same body.
+    """
+    page, onward = previews.preview(caller, wanted.alignment_id, wanted.rules, after=after, limit=limit)
+    return page_response(request, page, after=onward)
+
+
+@cache
+def _schema() -> bytes:
+    return orjson.dumps(rules_schema())
+
+
+# === /v1/plan-jobs: progress, results and cancelling of jobs about plans.
+
+
+job_router = APIRouter(prefix="/v1/plan-jobs", tags=["plans"], route_class=StrictRoute)
+
+JobId = Annotated[Identifier, Path(description="Id of the job.")]
+JobService = Annotated[PlanJobs, use_cases("plan_jobs")]
+
+
+def queued_response(job: PlanJobDocument, replayed: bool) -> Response:
+    """202 Accepted for a job that was queued."""
+    response = created_response(job, replayed, path="/v1/plan-jobs", status=202)
+    response.headers["Retry-After"] = "1"
+    return response
+
+
+@job_router.get("", responses=document_response(PlanJobPage))
+def list_plan_jobs(
+    request: Request,
+    caller: Caller,
+    jobs: JobService,
+    plan_id: Annotated[Identifier | None, Query(description="Jobs about this plan.")] = None,
+    state: JobState | None = None,
+    limit: PageSize = 100,
+    before: LastId = None,
+) -> Response:
+    """Jobs about plans without their results, newest first."""
+    page, last = jobs.page(caller, plan_id=plan_id, state=state, before=before, limit=limit)
+    return page_response(request, page, before=last)
+
+
+@job_router.get("/{job_id}", responses=document_response(PlanJobDocument, 404))
+def get_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
+    """A job with its progress, or its result."""
+    document = jobs.get(caller, job_id)
+    waiting = document["state"] in ("queued", "running")
+    return json_response(document, headers={"Retry-After": "1"} if waiting else None)
+
+
+@job_router.post("/{job_id}/cancel", responses=document_response(PlanJobDocument, 404))
+def cancel_plan_job(job_id: JobId, caller: Caller, jobs: JobService) -> Response:
+    """Ask a queued or running job to stop; a finished one stays as it is."""
+    return json_response(jobs.cancel(caller, job_id))
+
+
+# === /v1/plans.
+
 
 router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
 
@@ -174,3 +276,85 @@ def commit_plan(
 def get_as_built(plan_id: PlanId, caller: Caller, plans: Service) -> Response:
     """A plan beside what was built and surveyed: residuals, tolerances, and what that does to the checks."""
     return json_response(plans.as_built(caller, plan_id))
+
+
+# === /v1/plans/{plan_id}/package: all files of a plan in one ZIP.
+
+
+package_router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
+
+PackageService = Annotated[Packages, use_cases("packages")]
+
+
+@package_router.post(
+    "/{plan_id}/package",
+    status_code=202,
+    responses=document_response(
+        PlanJobDocument, 404, 409, status=202, description="Queued; Location leads to its progress"
+    ),
+)
+def post_package(
+    plan_id: PlanId, wanted: PackageIn, caller: Caller, packages: PackageService, idempotency: Idempotency
+) -> Response:
+    """Pack all files of a plan: drawings, stakeout, bill, maps, drilling sheets, artwork and a manifest with SHA-256.
+
+    Every plate is read back from its drawing first. The package replaces the plan's earlier one.
+    """
+    return queued_response(*packages.request(caller, plan_id, wanted.options(), idempotency))
+
+
+@package_router.get(
+    "/{plan_id}/package",
+    response_class=StreamingResponse,
+    responses={**file_response(["application/zip"], "The package"), **NOT_MODIFIED, **problem_responses(404)},
+)
+def get_package(
+    plan_id: PlanId, caller: Caller, packages: PackageService, if_none_match: IfNoneMatch = None
+) -> Response:
+    """The package of a plan, as it was packed last; 404 if its markers were placed anew since."""
+    package = packages.open(caller, plan_id)
+    headers = {"ETag": f'"{package.sha256}"'}
+    if if_none_match == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    headers |= {
+        "Content-Length": str(package.size_bytes),
+        "Content-Disposition": f'attachment; filename="plan-{plan_id}.zip"',
+    }
+    return StreamingResponse(package.chunks, headers=headers, media_type="application/zip")
+
+
+# === /v1/plans/{plan_id}/proof: what simulated vehicles read of a plan.
+
+
+proof_router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
+
+ProofService = Annotated[Proofs, use_cases("proofs")]
+
+
+@proof_router.post(
+    "/{plan_id}/proof",
+    status_code=202,
+    responses=document_response(
+        PlanJobDocument, 404, 409, 412, 428, status=202, description="Queued; Location leads to its progress"
+    ),
+)
+def post_proof(
+    plan_id: PlanId, terms: ProofIn, caller: Caller, proofs: ProofService, version: Version, idempotency: Idempotency
+) -> Response:
+    """Prove a plan: simulated vehicles drive over it, and the real decoders read what they record.
+
+    The same plan, terms and seed give the same report. A checked plan is `proved` if no reading was wrong; weak markers
+    are listed and change nothing. The proof belongs to the markers as they are placed now: if other rules place them
+    anew in the meantime, the plan is not proved.
+    """
+    return queued_response(*proofs.request(caller, plan_id, terms, version, idempotency))
+
+
+@proof_router.get("/{plan_id}/proof", responses={**document_response(ProofDocument, 404), **problem_responses(404)})
+def get_proof(plan_id: PlanId, caller: Caller, proofs: ProofService) -> Response:
+    """The report of the latest proof: read rates, fixes, gaps, wrong readings, weak markers and their causes.
+
+    The table of its markers is the plan's file `proof.csv`.
+    """
+    data, row = proofs.file(caller, plan_id, REPORT_FILE)
+    return Response(data, media_type="application/json", headers={"ETag": f'"{row.version}-{REPORT_FILE}"'})

@@ -9,15 +9,12 @@ from app.api.http.dependencies import Caller, Number, Whole
 from app.api.http.responses import document_response, json_response
 from app.api.http.strict_json import StrictRoute
 from app.errors import naming
-from app.families.cerpm.inputs import RadioIn
-from app.families.inputs import Flag, StrictModel
+from app.families.cerpm import RadioIn
+from app.families.documents import Flag, StrictModel
 from app.planning.radio_checks import PreviewRule, RadioPlan
-from app.radio.battery import Battery
-from app.radio.collisions import Receiver
-from app.radio.lorawan import Region
-from app.radio.reception import MAX_MARKERS, RoadMarkers
-from app.services.plans.radio_check_documents import RadioCheckDocument
-from app.services.plans.radio_checks import check_plan
+from app.radio.reception import MAX_MARKERS, Receiver, RoadMarkers
+from app.radio.settings import Battery, Region
+from app.services.plans.documents import RadioCheckDocument, check_plan
 
 router = APIRouter(prefix="/v1/radio-checks", tags=["cerpms"], route_class=StrictRoute)
 

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.encoders.plate import ArtworkFormat
-from app.families.inputs import Flag, Identifier, Number, Text, VerticalDatum
-from app.formats.alignments.registered_road import RoadLanes
-from app.planning.alignment_declaration import AlignmentDeclaration
+from app.families.documents import Flag, Identifier, Number, Text, VerticalDatum
+from app.formats.alignments.read import RoadLanes
+from app.planning.alignment import AlignmentDeclaration
 from app.planning.proof import ProofTerms
 from app.services.plans.plans import PlanChange
 

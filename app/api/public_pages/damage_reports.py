@@ -1,4 +1,4 @@
-"""/v1/damage-reports: what people reported on public pages, and the agency's decisions."""
+"""/v1/damage-reports and /v1/public-page: what people reported, the agency's decisions, and what it releases."""
 
 from __future__ import annotations
 
@@ -7,12 +7,28 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict, Field
 
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_cases
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, Version, use_cases
 from app.api.http.problems import problem_responses
-from app.api.http.responses import document_response, file_response, json_response, page_response
+from app.api.http.responses import (
+    NOT_MODIFIED,
+    IfNoneMatch,
+    document_response,
+    file_response,
+    json_response,
+    page_response,
+    versioned_response,
+)
 from app.api.http.strict_json import StrictRoute
-from app.families.inputs import StrictModel
-from app.services.public_pages.documents import DamageReport, DamageReportPage, ReportContact, ReportStatus
+from app.families.documents import Flag, StrictModel
+from app.services.public_pages.pages import (
+    DamageReport,
+    DamageReportPage,
+    PublicField,
+    PublicPageDocument,
+    PublicPages,
+    ReportContact,
+    ReportStatus,
+)
 from app.services.public_pages.reports import DamageReports
 
 router = APIRouter(prefix="/v1/damage-reports", tags=["public pages"], route_class=StrictRoute)
@@ -98,3 +114,41 @@ def accept_damage_report(acceptance: AcceptanceIn, report_id: ReportId, caller: 
 def reject_damage_report(rejection: RejectionIn, report_id: ReportId, caller: Caller, reports: Service) -> Response:
     """Reject a report with a reason."""
     return json_response(reports.reject(caller, report_id, rejection.reason))
+
+
+# === /v1/public-page: what an agency releases on the public pages of its markers.
+
+
+settings_router = APIRouter(prefix="/v1/public-page", tags=["public pages"], route_class=StrictRoute)
+
+Pages = Annotated[PublicPages, use_cases("public_pages")]
+
+
+class PublicPageIn(StrictModel):
+    """What is released."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {"fields": ["code", "agency", "status", "revision", "road", "measure"], "damage_reports": True},
+                {"fields": [], "damage_reports": False},
+            ]
+        }
+    )
+
+    fields: list[PublicField] = Field(
+        max_length=6, description="Fields of markers that everybody may see; none: the markers have no public pages."
+    )
+    damage_reports: Flag = Field(description="Whether the pages have a form for damage reports.")
+
+
+@settings_router.get("", responses={**NOT_MODIFIED, **document_response(PublicPageDocument)})
+def get_public_page_settings(caller: Caller, pages: Pages, if_none_match: IfNoneMatch = None) -> Response:
+    """What the agency releases of its markers on their public pages."""
+    return versioned_response(pages.settings(caller), if_none_match)
+
+
+@settings_router.put("", responses=document_response(PublicPageDocument, 412, 428))
+def put_public_page_settings(settings: PublicPageIn, caller: Caller, pages: Pages, version: Version) -> Response:
+    """Release other fields, or none. It holds at once, for the pages of all markers of the agency."""
+    return versioned_response(pages.change(caller, settings.fields, settings.damage_reports, version))

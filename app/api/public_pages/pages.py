@@ -8,9 +8,8 @@ from typing import Annotated, Any, cast
 from anyio import to_thread
 from fastapi import APIRouter, Path, Query, Request, Response
 
-from app.api.http.bodies import received_form
+from app.api.http.bodies import FORM, received_form
 from app.api.http.dependencies import use_cases
-from app.api.http.forms import FORM
 from app.api.http.problems import problem_responses
 from app.api.http.responses import BINARY, json_response
 from app.api.http.strict_json import StrictRoute
@@ -21,22 +20,27 @@ from app.api.public_pages.forms import (
     MEGABYTE,
     Fault,
     FormRefused,
+    PublicLimits,
     ReportForm,
     check_form,
     photo_fault,
     read_form,
 )
-from app.api.public_pages.html import MAX_EMAIL, MAX_TEXT, FormState, marker_page, thanks_page
-from app.api.public_pages.limits import PublicLimits
-from app.api.public_pages.negotiation import texts_for, wants_json
-from app.api.public_pages.responses import page_response
-from app.api.public_pages.texts import Texts
-from app.api.public_pages.texts_en import ENGLISH
+from app.api.public_pages.html import MAX_EMAIL, MAX_TEXT, FormState, marker_page, page_response, thanks_page
+from app.api.public_pages.texts import ENGLISH, Texts, texts_for, wants_json
 from app.errors import InvalidParameter, NotFound, ProcessStopped, UnreadableUpload
-from app.services.public_pages.documents import PublicMarkerDocument, ReceivedReport
-from app.services.public_pages.documents import ReportForm as ReportFormDocument
-from app.services.public_pages.form_tokens import MAX_AGE_S, MIN_AGE_S, FormTokens, TokenRefused, TokenTooYoung
-from app.services.public_pages.pages import PublicMarker, PublicPages
+from app.services.public_pages.pages import (
+    MAX_AGE_S,
+    MIN_AGE_S,
+    FormTokens,
+    PublicMarker,
+    PublicMarkerDocument,
+    PublicPages,
+    ReceivedReport,
+    TokenRefused,
+    TokenTooYoung,
+)
+from app.services.public_pages.pages import ReportForm as ReportFormDocument
 from app.services.public_pages.reports import DamageReports
 
 router = APIRouter(prefix="/m", tags=["public pages"], route_class=StrictRoute)

@@ -8,8 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from app.api.http.dependencies import Number, Text
 from app.families import FAMILIES, FamilyName
-from app.families.inputs import Accuracy, StrictModel, VerticalDatum
-from app.markers.status import Status
+from app.families.documents import Accuracy, StrictModel, VerticalDatum
+from app.markers.reading import Status
 from app.services.surveys.import_report import MAX_ROWS_LISTED
 
 Unit = Literal["m", "ft-us", "ft-intl"]
@@ -136,5 +136,5 @@ class DeclarationIn(_FamilyMembers):
     reason: Annotated[Text, Field(min_length=1, max_length=500)] | None = None
 
     def declared(self) -> dict[str, Any]:
-        """JSON with every member, as `app.services.surveys.declarations.import_input` takes it."""
+        """JSON with every member, as `app.services.surveys.import_report.import_input` takes it."""
         return self.model_dump(mode="json")

@@ -4,27 +4,223 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.merged_markers import (
-    USED_ANYWAY,
-    Disagreement,
-    Finding,
-    MergedMarkers,
-    MergeRules,
-    RegisteredMarker,
+from app.decoders.cerpm.verify import (
+    FreshnessRules,
+    SequenceSpan,
+    Verdict,
+    Verification,
+    VerifiedPacket,
+    decode_message,
+    verify_packets,
 )
-from app.decoders.cerpm.vehicle_positions import distances_m, offsets_m, vehicle_positions
-from app.decoders.cerpm.verify import Verdict, VerifiedPacket
-from app.markers.cerpm import CerpmMessage, LaneSide
-from app.sensors.pose_track import PoseTrack
-from app.sensors.receiver import PlainClaim
+from app.errors import InvalidParameter, WaymarkError
+from app.geodesy import LocalizationGrade, grade_accuracy
+from app.geodesy.frames import metres_per_radian
+from app.markers.cerpm import MAX_INVALID_TAGS_PER_LOG, MESSAGE_BYTES, CerpmMessage, LaneSide
+from app.sensors.pose_track import PlainClaim, PoseTrack, ReceivedPacket
+
+# === Positions of the vehicle at given times, and distances from them.
+
 
 Floats = npt.NDArray[np.float64]
+
+MAX_GAP_S = 5.0  # [s] between poses further apart the position is unknown; source: by hand, 100 m at 72 km/h
+
+
+def vehicle_positions(track: PoseTrack, time_s: npt.ArrayLike, max_gap_s: float = MAX_GAP_S) -> Floats:
+    """Longitude and latitude of the vehicle at given times.
+
+    Parameters
+    ----------
+    track : PoseTrack
+    time_s : array_like, shape (N,)
+        NaN where it is not known. [s]
+    max_gap_s : float
+        [s]
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Longitude, latitude; NaN before, after and in gaps of the track. [deg]
+    """
+    at = np.asarray(time_s, float)
+    positions = np.full((len(at), 2), np.nan)
+    if not len(track.time_s):
+        return positions
+    after = np.searchsorted(track.time_s, at, side="left").clip(0, len(track.time_s) - 1)
+    before = np.maximum(np.where(track.time_s[after] == at, after, after - 1), 0)
+    with np.errstate(invalid="ignore"):
+        known = (at >= track.time_s[0]) & (at <= track.time_s[-1])
+        known &= track.time_s[after] - track.time_s[before] <= max_gap_s
+    lon = np.interp(at[known], track.time_s, np.unwrap(track.lon_deg, period=360.0))
+    positions[known, 0] = (lon + 180.0) % 360.0 - 180.0
+    positions[known, 1] = np.interp(at[known], track.time_s, track.lat_deg)
+    return positions
+
+
+def offsets_m(from_deg: npt.ArrayLike, to_deg: npt.ArrayLike) -> Floats:
+    """East and north from places to others near them, on the ellipsoid; NaN where either is unknown.
+
+    Parameters
+    ----------
+    from_deg, to_deg : array_like, shape (N, 2)
+        Longitude, latitude. [deg]
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Accurate to 1e-5 over kilometres; of places far apart only the order of magnitude is correct. [m]
+    """
+    start, end = np.atleast_2d(np.asarray(from_deg, float)), np.atleast_2d(np.asarray(to_deg, float))
+    lon = np.radians((end[:, 0] - start[:, 0] + 180.0) % 360.0 - 180.0)
+    lat = np.radians(end[:, 1] - start[:, 1])
+    middle = np.radians((end[:, 1] + start[:, 1]) / 2)
+    east_per_rad, north_per_rad = metres_per_radian(middle)
+    return np.stack([lon * east_per_rad, lat * north_per_rad], axis=1)
+
+
+def distances_m(from_deg: npt.ArrayLike, to_deg: npt.ArrayLike) -> Floats:
+    """Distances of `offsets_m`, shape (N,). [m]"""
+    return np.asarray(np.hypot(*offsets_m(from_deg, to_deg).T))
+
+
+# === Input and result of merging verified packets: registered markers, one position a marker, and disagreements.
+
+
+class Disagreement(StrEnum):
+    """How the messages of a marker disagree with each other, the registry or the track."""
+
+    MOVED = "moved"
+    TWO_PLACES = "two-places"
+    REPROGRAMMED = "reprogrammed"
+    OUT_OF_REACH = "out-of-reach"
+    SWAPPED = "swapped"
+    DATUM_SHIFT = "datum-shift"
+    OTHER_SIDE = "other-side"
+
+
+USED_ANYWAY = frozenset((Disagreement.REPROGRAMMED, Disagreement.OTHER_SIDE))
+"""These are reported, and the marker is used."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegisteredMarker:
+    """A marker as it is registered.
+
+    Attributes
+    ----------
+    lon_deg, lat_deg : float
+        WGS 84 / ITRF. [deg]
+    height_m : float or None
+        Above the ellipsoid. [m]
+    side : LaneSide
+    speed_limit_km_h : float
+        NaN where none is posted. [km/h]
+    sigma_m : float
+        Standard deviation of its survey on each axis; NaN if unknown. [m]
+    """
+
+    lon_deg: float
+    lat_deg: float
+    height_m: float | None = None
+    side: LaneSide = LaneSide.UNKNOWN
+    speed_limit_km_h: float = math.nan
+    sigma_m: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A disagreement about one marker.
+
+    Attributes
+    ----------
+    number : int
+    kind : Disagreement
+    reason : str
+    distance_m : float
+        Between the positions that disagree; NaN where there are none. [m]
+    """
+
+    number: int
+    kind: Disagreement
+    reason: str
+    distance_m: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class MergeRules:
+    """Limits of a disagreement.
+
+    Attributes
+    ----------
+    apart_m : float
+        Positions closer than this to the registered one, or to each other, agree. [m]
+    sigmas : float
+        They also agree within this many standard deviations of the survey.
+    reach_m : float
+        No marker is received from further away. [m]
+    accept_clear : bool
+        Use packets in clear of markers without an authentic packet.
+    """
+
+    apart_m: float = 0.5  # [m] source: by hand; a marker that is moved by less still marks the boundary
+    sigmas: float = 3.0  # source: three sigma, one false alarm in 370
+    reach_m: float = 2000.0  # [m] source: by hand; six times the 340 m of the CERPM paper, section 4.1
+    accept_clear: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("apart_m", "sigmas", "reach_m"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InvalidParameter(f"{name} is {getattr(self, name)}", field=name, limit="above 0, finite")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedMarkers:
+    """One row for each marker that may be used, and the findings on all.
+
+    Attributes
+    ----------
+    number : ndarray of int, shape (K,)
+    lon_deg, lat_deg : ndarray, shape (K,)
+        Registered position, or that of the newest authentic message. [deg]
+    side : ndarray of int, shape (K,)
+        `LaneSide` values.
+    sigma_m, speed_limit_km_h : ndarray, shape (K,)
+        [m, km/h]
+    packets : ndarray of int, shape (K,)
+        Accepted ones.
+    registered : ndarray of bool, shape (K,)
+    left_out : dict of int to str
+        Markers without a row, with the reason.
+    findings : list of Finding
+    shift_m : (float, float) or None
+        Common shift of sent against registered positions, east and north, from another datum. [m]
+    warnings : list of str
+    """
+
+    number: npt.NDArray[np.int64]
+    lon_deg: Floats
+    lat_deg: Floats
+    side: npt.NDArray[np.int64]
+    sigma_m: Floats
+    speed_limit_km_h: Floats
+    packets: npt.NDArray[np.int64]
+    registered: npt.NDArray[np.bool_]
+    left_out: dict[int, str]
+    findings: list[Finding]
+    shift_m: tuple[float, float] | None
+    warnings: list[str]
+
+
+# === Verified packets to one position a marker, compared with the registry, the other markers and the vehicle's track.
+
 
 SURVEY_SIGMA_M = 0.02  # [m] of a survey of unknown accuracy; source: CERPM paper, section 2.2
 _MIN_SHIFTED = 3  # markers with a common shift; source: by hand, a median of three ignores one outlier
@@ -321,3 +517,118 @@ def _speed_limit_km_h(candidate: _Candidate) -> float:
         return candidate.known.speed_limit_km_h
     limit = candidate.newest.speed_limit
     return math.nan if limit is None else limit.km_h
+
+
+# === Received packets matched with known markers: which packets are authentic, where the markers are, and how
+# accurately.
+#
+# Used on the server with the registry, and on board with a snapshot.
+
+
+RETIRED_REASON = "it is retired: its messages are not used any more"
+
+
+@dataclass(frozen=True, slots=True)
+class KnownCerpms:
+    """What is known of markers, by their numbers.
+
+    Attributes
+    ----------
+    registered : dict of int to RegisteredMarker
+    earlier_spans : dict of int to list of SequenceSpan
+        Of earlier drives.
+    min_interval_s : dict of int to float
+        Shortest programmed time between two transmissions of a marker. [s]
+    localization_warnings : dict of int to tuple of str
+        Why a registered position is unfit for localization.
+    retired : frozenset of int
+        Their messages are not used.
+    """
+
+    registered: dict[int, RegisteredMarker] = field(default_factory=dict)
+    earlier_spans: dict[int, list[SequenceSpan]] = field(default_factory=dict)
+    min_interval_s: dict[int, float] = field(default_factory=dict)
+    localization_warnings: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    retired: frozenset[int] = frozenset()
+
+
+def list_numbers(packets: Iterable[ReceivedPacket]) -> list[int]:
+    """Marker numbers in packets, each once, sorted."""
+    received = list(packets)
+    found = {packet.claim.number for packet in received if packet.claim is not None}
+    for payload in {packet.payload for packet in received}:
+        if payload is not None and len(payload) == MESSAGE_BYTES:
+            try:
+                found.add(decode_message(payload)[0].number)
+            except WaymarkError:
+                continue  # verification reports what is wrong with it
+    return sorted(found)
+
+
+def match_known_markers(
+    packets: Sequence[ReceivedPacket],
+    keys: Callable[[int], bytes | None] | Mapping[int, bytes],
+    known: KnownCerpms,
+    track: PoseTrack | None = None,
+    freshness: FreshnessRules | None = None,
+    rules: MergeRules | None = None,
+    *,
+    max_invalid_tags: int = MAX_INVALID_TAGS_PER_LOG,
+) -> tuple[Verification, MergedMarkers]:
+    """Verify packets, and merge them to one position a marker.
+
+    Parameters
+    ----------
+    packets : sequence of ReceivedPacket
+    keys : callable or mapping
+        As of `verify_packets`.
+    known : KnownCerpms
+    track : PoseTrack, optional
+    freshness : FreshnessRules, optional
+        Its `min_interval_s` is replaced by half of the shortest programmed interval of these markers, if known: their
+        clocks may be inaccurate.
+    rules : MergeRules, optional
+    max_invalid_tags : int
+        As of `verify_packets`.
+    """
+    numbers = list_numbers(packets)
+    intervals_s = [known.min_interval_s[n] / 2 for n in numbers if n in known.min_interval_s]
+    freshness = replace(freshness or FreshnessRules(), min_interval_s=min(intervals_s, default=None))
+    verification = verify_packets(packets, keys, known.earlier_spans, freshness, max_invalid_tags=max_invalid_tags)
+    merged = merge_markers(verification.packets, known.registered, track, rules)
+    return verification, _without_retired(merged, known.retired)
+
+
+def grade_markers(
+    merged: MergedMarkers, verification: Verification, known: KnownCerpms
+) -> tuple[LocalizationGrade, tuple[str, ...]]:
+    """Grade of the least accurate of these markers, and the reasons why their path may not localize a vehicle."""
+    localization_warnings: dict[str, int] = {}
+    authentic = {packet.number for packet in verification.packets if packet.accepted}
+    for number in merged.number.tolist():
+        warnings = list(known.localization_warnings.get(number, ()))
+        if number not in known.registered:
+            warnings.append("the marker is not registered")
+        if number not in authentic:
+            warnings.append("the marker was only received in clear: anyone can have sent it")
+        for warning in warnings:
+            localization_warnings[warning] = localization_warnings.get(warning, 0) + 1
+    if merged.shift_m is not None:
+        localization_warnings["the markers send positions in another datum"] = len(merged.left_out)
+    texts = tuple(f"{warning} ({count} of {len(merged.number)})" for warning, count in localization_warnings.items())
+    if texts or not len(merged.number):
+        return LocalizationGrade.UNFIT, texts
+    return grade_accuracy(float(merged.sigma_m.max()) * math.sqrt(2)), texts  # horizontal RMSE is of both axes
+
+
+def _without_retired(merged: MergedMarkers, retired: frozenset[int]) -> MergedMarkers:
+    named = [number for number in merged.number.tolist() if number in retired]
+    if not named:
+        return merged
+    kept = ~np.isin(merged.number, named)
+    arrays = ("number", "lon_deg", "lat_deg", "side", "sigma_m", "speed_limit_km_h", "packets", "registered")
+    return replace(
+        merged,
+        **{name: getattr(merged, name)[kept] for name in arrays},
+        left_out={**merged.left_out, **dict.fromkeys(named, RETIRED_REASON)},
+    )

@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.vehicle_positions import distances_m, vehicle_positions
+from app.decoders.cerpm.merge import distances_m, vehicle_positions
 from app.decoders.cerpm.verify import VerifiedPacket
 from app.errors import InvalidParameter
-from app.radio.link import EXPONENT, NEAR_DBM
-from app.radio.path_loss import (
+from app.radio.link import (
+    EXPONENT,
+    NEAR_DBM,
     Estimate,
     PathLoss,
     audible_share,
@@ -33,7 +34,7 @@ MIN_FLEET = 5  # markers with a profile to compare a marker with; source: by han
 MIN_LEVELS = 8  # packets with strength and distance, for a level; source: by hand, no measurement kept
 MIN_EXPECTED = 10  # transmissions, for a delivery ratio; source: by hand, no measurement kept
 _MIN_AUDIBLE = 4.0  # expected receptions of a healthy marker for silence to be evidence; source: exp(-4), 2 % by chance
-_REACH_M = 2000.0  # [m] source: `merged_markers.MergeRules.reach_m`
+_REACH_M = 2000.0  # [m] source: `merge.MergeRules.reach_m`
 _MAX_TRANSMISSIONS = 100_000  # of a marker in a drive, more are not reconstructed; source: by hand, a bound on memory
 _PAUSE_S, _PAUSE_INTERVALS = 60.0, 20.0  # [s, intervals] longer silence is out of range; source: by hand
 _SIGMAS = 1.96  # source: 95 % of a normal distribution
@@ -45,7 +46,7 @@ _DEFAULT_SPREAD_DB = 4.5  # [dB] source: shadows of 4 dB and fading of 2 dB, `si
 _DEFAULT_SENSITIVITY_DBM = (
     -150.0
 )  # [dBm] no packet is too weak; source: below every receiver's, SX1276 data sheet: -148 dBm
-_DEFAULT_CORRELATION = 0.5  # of consecutive packets; source: by hand, as `radio.path_loss.residual_correlation`
+_DEFAULT_CORRELATION = 0.5  # of consecutive packets; source: by hand, as `radio.link.residual_correlation`
 
 
 class SignalHealth(StrEnum):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hmac
 import math
+import struct
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,22 +14,319 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.cerpm.freshness import (
-    FASTEST_INTERVAL_S,
-    FreshnessRules,
-    LearnedIntervals,
-    SequenceOrder,
-    SequenceSpan,
-    order_of_spans,
-    within_spans,
-)
-from app.decoders.cerpm.payload import UndecodablePayload, decode_message, has_valid_tag
 from app.errors import InvalidParameter
-from app.markers.cerpm import CerpmMessage
-from app.markers.cerpm_keys import MAX_INVALID_TAGS_PER_LOG
-from app.sensors.receiver import ReceivedPacket
+from app.markers.cerpm import (
+    BODY_BYTES,
+    KEY_BYTES,
+    MAX_INVALID_TAGS_PER_LOG,
+    MAX_NUMBER,
+    MESSAGE_BYTES,
+    NO_HEIGHT,
+    VERSION,
+    CerpmMessage,
+    LaneSide,
+    SpeedLimit,
+    SpeedUnit,
+    message_tag,
+)
+from app.sensors.pose_track import ReceivedPacket
+
+# === The 24 bytes of a CERPM to its message, and the check of its tag.
+
+
+_BODY = struct.Struct(">BIiiHBI")  # source: the table of `app.markers.cerpm`
+_LON_STEPS, _LAT_STEPS = 1_800_000_000, 900_000_000  # source: 180 and 90 degrees in 1e-7 (docs/cerpm-message.md)
+_FIELD = "payload"
+_CURE_DAMAGED = "ignore this packet; if all packets of a marker are like this, program it again"
+
+
+class UndecodablePayload(InvalidParameter):
+    """Bytes that are not a message of this version at all: another length, or another version."""
+
+
+def decode_message(payload: bytes) -> tuple[CerpmMessage, bytes]:
+    """Message and tag of a payload. The tag is not checked yet.
+
+    Parameters
+    ----------
+    payload : bytes
+        24 of them, in the layout of `app.markers.cerpm`.
+
+    Returns
+    -------
+    CerpmMessage
+    bytes
+        The tag, 4 bytes.
+
+    Raises
+    ------
+    UndecodablePayload
+        Another length or an unknown version.
+    InvalidParameter
+        An invalid value: the reserved bit, a side, the number 0, or a position off the globe.
+    """
+    _check_form(payload)
+    head, number, lon_steps, lat_steps, height_steps, speed, sequence = _BODY.unpack_from(payload)
+    side = head >> 2 & 3
+    if head & 1:
+        raise _damaged("the reserved bit of byte 0 is set", "payload.head", "bit 0 is zero")
+    if side > LaneSide.RIGHT:
+        raise _damaged("the side of the lane is 3", "payload.side", "0 unknown, 1 left, 2 right")
+    if not 1 <= number <= MAX_NUMBER:
+        raise _damaged("the number of the marker is 0", "payload.number", f"1 to {MAX_NUMBER}")
+    if abs(lon_steps) > _LON_STEPS:
+        raise _damaged(f"the longitude is {lon_steps / 1e7} degrees", "payload.lon_deg", "-180 to 180 deg")
+    if abs(lat_steps) > _LAT_STEPS:
+        raise _damaged(f"the latitude is {lat_steps / 1e7} degrees", "payload.lat_deg", "-90 to 90 deg")
+    message = CerpmMessage(
+        number=number,
+        lon_deg=lon_steps / 1e7,
+        lat_deg=lat_steps / 1e7,
+        height_m=None if height_steps == NO_HEIGHT else (height_steps - 10_000) / 10,
+        side=LaneSide(side),
+        speed_limit=SpeedLimit(speed, SpeedUnit.MPH if head & 2 else SpeedUnit.KM_H) if speed else None,
+        sequence=sequence,
+    )
+    return message, payload[BODY_BYTES:]
+
+
+def has_valid_tag(payload: bytes, key: bytes) -> bool:
+    """Whether a payload carries the tag of this key.
+
+    Parameters
+    ----------
+    payload : bytes
+        24 of them.
+    key : bytes
+        The marker's own, 16 bytes.
+
+    Raises
+    ------
+    InvalidParameter
+        The payload or the key has another length.
+
+    Notes
+    -----
+    Four bytes of AES-CMAC (RFC 4493): a guess is right once in 2^32.
+    """
+    if len(key) != KEY_BYTES:
+        raise InvalidParameter(f"a marker's key has {len(key)} bytes", field="key", limit=f"{KEY_BYTES} bytes")
+    if len(payload) != MESSAGE_BYTES:
+        raise _wrong_length(payload)
+    return hmac.compare_digest(message_tag(key, payload[:BODY_BYTES]), payload[BODY_BYTES:])
+
+
+def _check_form(payload: bytes) -> None:
+    if len(payload) != MESSAGE_BYTES:
+        raise _wrong_length(payload)
+    if payload[0] >> 4 != VERSION:
+        raise UndecodablePayload(
+            f"the payload is of version {payload[0] >> 4} (first byte 0x{payload[0]:02x})",
+            field=_FIELD,
+            limit=f"version {VERSION}: a first byte from 0x{VERSION << 4:02x} to 0x{(VERSION << 4) | 15:02x}",
+            cure="send packets of CERPMs only; a newer version of the message needs a newer decoder",
+        )
+
+
+def _wrong_length(payload: bytes) -> UndecodablePayload:
+    return UndecodablePayload(
+        f"the payload has {len(payload)} bytes",
+        field=_FIELD,
+        limit=f"{MESSAGE_BYTES} bytes",
+        cure="send the application payload alone, without LoRaWAN's frame, and not cut",
+    )
+
+
+def _damaged(message: str, field: str, limit: str) -> InvalidParameter:
+    return InvalidParameter(message, field=field, limit=limit, cure=_CURE_DAMAGED)
+
+
+# === Freshness of transmissions from their sequences and times of reception.
+#
+# A marker counts its transmissions, so a message of sequence s was made before every message of a higher sequence, by
+# at least the shortest interval for each step between them. If the higher one was received at t, the lower one was made
+# before t; received later than that, it was recorded and sent again. This holds whoever sent it.
+
 
 Floats = npt.NDArray[np.float64]
+
+
+FASTEST_INTERVAL_S = 0.014  # [s] source: below the 15.4 ms on air of 24 bytes at SF7, 500 kHz (`radio.settings`)
+_MAX_STEPS = 50  # of sequence between two packets whose interval is used; source: by hand, no measurement kept
+_MIN_PAIRS = 20  # of packets for the interval of all markers; source: by hand, no measurement kept
+_MIN_OWN_PAIRS = 6  # of packets for the interval of one marker; source: by hand, no measurement kept
+_SIMILAR = 1.25  # ratio to the middle of similar intervals; source: jitter of 0.1 early and late is 1.2
+_SIMILAR_SHARE = 0.5  # of all intervals that must be similar; source: a majority, so a flooded log gives none
+_SAFETY = 0.5  # of the interval found, taken as the shortest; source: by hand, no measurement kept
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceSpan:
+    """Sequences of one marker that were received in one drive.
+
+    Attributes
+    ----------
+    first_sequence, last_sequence : int
+        Lowest and highest.
+    first_heard_s, last_heard_s : float
+        Times of reception, seconds since 1970-01-01 UTC; NaN if the log had no times: then no message up to the
+        highest sequence is fresh any more. [s]
+    """
+
+    first_sequence: int
+    last_sequence: int
+    first_heard_s: float
+    last_heard_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class FreshnessRules:
+    """Tolerances when times and sequences are compared.
+
+    Attributes
+    ----------
+    clock_tolerance_s : float
+        Maximum difference between the clocks of two drives. [s]
+    log_tolerance_s : float
+        Maximum by which times within one log are out of order. [s]
+    echo_s : float
+        The same sequence again within this time is an echo (another gateway, a repeated delivery), later a replay. [s]
+    min_interval_s : float or None
+        Shortest time from one transmission of a marker to the next, if known. Without it, half of the interval found
+        in the log is used within the log, and the time on air at the fastest setting between logs. [s]
+    uploaded_at_s : float or None
+        When the log was uploaded: no packet can have been received later. [s]
+
+    Raises
+    ------
+    InvalidParameter
+        A value is negative or not finite.
+    """
+
+    clock_tolerance_s: float = 60.0  # [s] source: by hand, no measurement kept
+    log_tolerance_s: float = 3.0  # [s] source: by hand, no measurement kept
+    echo_s: float = 3.0  # [s] source: `log_tolerance_s`
+    min_interval_s: float | None = None
+    uploaded_at_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value >= 0):
+                raise InvalidParameter(f"{name} is {value}", field=f"freshness.{name}", limit="0 or more, finite [s]")
+
+
+class SequenceOrder:
+    """Sequences of one marker in order, with their times of reception.
+
+    Parameters
+    ----------
+    sequences : array_like, shape (N,)
+    received_s : array_like, shape (N,)
+        NaN counts as received before any other time. [s]
+    min_interval_s : float
+        [s]
+    """
+
+    def __init__(self, sequences: npt.ArrayLike, received_s: npt.ArrayLike, min_interval_s: float) -> None:
+        known = np.asarray(sequences, float)
+        order = np.argsort(known, kind="stable")
+        times = np.asarray(received_s, float)[order]
+        times[np.isnan(times)] = -np.inf
+        self._interval_s = min_interval_s
+        self._sequences = known[order]
+        made = times - self._sequences * min_interval_s
+        self._made_before_s = np.append(np.minimum.accumulate(made[::-1])[::-1], np.inf)
+        self._received_by_s = np.append(-np.inf, np.maximum.accumulate(times))
+
+    def late_s(self, sequences: npt.ArrayLike, received_s: npt.ArrayLike) -> Floats:
+        """Delay of each reception after the last time it can have been made; -inf where there is no such time. [s]"""
+        asked = np.asarray(sequences, float)
+        at = np.searchsorted(self._sequences, asked, side="left")
+        with np.errstate(invalid="ignore"):
+            return np.asarray(received_s, float) - (self._made_before_s[at] + asked * self._interval_s)
+
+    def early_s(self, sequences: npt.ArrayLike, received_s: npt.ArrayLike) -> Floats:
+        """Time of each reception before that of a lower or equal sequence; -inf where there is none. [s]"""
+        at = np.searchsorted(self._sequences, np.asarray(sequences, float), side="right")
+        return np.asarray(self._received_by_s[at] - np.asarray(received_s, float))
+
+
+def order_of_spans(spans: Sequence[SequenceSpan], min_interval_s: float) -> SequenceOrder:
+    """The order of the first and the last transmission of each span."""
+    return SequenceOrder(
+        [s for span in spans for s in (span.first_sequence, span.last_sequence)],
+        [t for span in spans for t in (span.first_heard_s, span.last_heard_s)],
+        min_interval_s,
+    )
+
+
+def within_spans(spans: Sequence[SequenceSpan], sequences: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Whether each sequence lies in one of the spans."""
+    asked = np.asarray(sequences, float)
+    if not spans:
+        return np.zeros(len(asked), bool)
+    order = sorted(spans, key=lambda span: span.first_sequence)
+    first = np.array([span.first_sequence for span in order], float)
+    last = np.maximum.accumulate(np.array([span.last_sequence for span in order], float))
+    at = np.searchsorted(first, asked, side="right") - 1
+    return (at >= 0) & (last[np.maximum(at, 0)] >= asked)
+
+
+class LearnedIntervals:
+    """Intervals between transmissions, estimated from a log.
+
+    Parameters
+    ----------
+    received : mapping of int to (array, array)
+        Sequences and times of the packets of each marker with a valid tag. [s]
+
+    Notes
+    -----
+    Times from one packet to the next, divided by their steps in sequence, are close to the interval for genuine packets
+    and arbitrary for packets that were recorded and sent again. So the shortest range that holds half of all values is
+    used, if they are similar: flooding a log prevents an estimate, but does not shift it.
+    """
+
+    def __init__(self, received: Mapping[int, tuple[Floats, Floats]]) -> None:
+        self._own = {number: _intervals_s(*values) for number, values in received.items()}
+        pooled = np.concatenate(list(self._own.values())) if self._own else np.empty(0)
+        self._all_s = _densest(pooled, _MIN_PAIRS)
+
+    def min_s(self, number: int) -> float:
+        """Half of the marker's own interval or of the interval of all markers, whichever is known and shorter. [s]"""
+        own = self._own.get(number, np.empty(0))
+        found = [interval for interval in (self._all_s, _densest(own, _MIN_OWN_PAIRS)) if interval is not None]
+        if self._all_s is not None and len(own):  # a marker that is clearly faster than the others
+            found.append(float(own.max()))
+        return max(_SAFETY * min(found), FASTEST_INTERVAL_S) if found else FASTEST_INTERVAL_S
+
+
+def _intervals_s(sequences: Floats, received_s: Floats) -> Floats:
+    """Time between packets that follow each other, over their step in sequence. [s]"""
+    order = np.lexsort((received_s, sequences))
+    order = order[np.diff(sequences[order], prepend=-1) > 0]  # the first reception of each sequence
+    steps, apart_s = np.diff(sequences[order]), np.diff(received_s[order])
+    kept = (steps >= 1) & (steps <= _MAX_STEPS) & (apart_s > 0)
+    return np.asarray(apart_s[kept] / steps[kept])
+
+
+def _densest(intervals_s: Floats, min_count: int) -> float | None:
+    """The median of the shortest range that holds half of the values, if they are similar. [s]"""
+    if len(intervals_s) < min_count:
+        return None
+    values = np.sort(np.log(intervals_s))
+    half = math.ceil(_SIMILAR_SHARE * len(values))
+    widths = values[half - 1 :] - values[: len(values) - half + 1]
+    first = int(widths.argmin())
+    if widths[first] > 2 * math.log(_SIMILAR):
+        return None
+    return float(np.exp(np.median(values[first : first + half])))
+
+
+# === Received packets to a verdict on each.
+
+
 Keys = Callable[[int], bytes | None] | Mapping[int, bytes]
 
 _FIXED_BYTES = (

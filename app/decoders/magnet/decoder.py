@@ -1,8 +1,7 @@
 """The default decoder (``method="matched"``): matched filters over all sensors and axes, then a fit of dipoles.
 
-The stages in order: `preprocess`, `wheel_noise`, `resample`, `matched_filter` (candidates), `detect_dipoles` (with
-`reconsider`, `fit_window`, `dipole_fit`, `dipole_model`), `classify` (with `ferrous`), `vehicle_path`, `assemble`
-(with `identify`).
+The stages in order: `preprocess`, `wheel_noise`, `matched_filter` (candidates), `detect_dipoles` (with `fit_window` and
+`dipole_fit`), `classify` (also the assembly of tags and lines, with `identify`). `readings` has the results.
 """
 
 from __future__ import annotations
@@ -13,21 +12,21 @@ from copy import deepcopy
 
 import numpy as np
 
-from app.decoders.magnet.assemble import TagAssembler
 from app.decoders.magnet.classify import (
+    FORGET_M,
     Accepted,
     Classification,
+    MagnetState,
     Rejected,
+    TagAssembler,
     classify_dipoles,
     is_strong,
     shows_clearance,
     with_log_odds,
 )
 from app.decoders.magnet.detect_dipoles import DipoleDetector, are_same
-from app.decoders.magnet.ferrous import FORGET_M
 from app.decoders.magnet.fit_window import WINDOW_M, Dipole, Region, SensorArray
 from app.decoders.magnet.identify import TagCandidates
-from app.decoders.magnet.magnet_state import MagnetState
 from app.decoders.magnet.matched_filter import (
     BIN_M,
     HALF_BINS,
@@ -40,7 +39,7 @@ from app.decoders.magnet.matched_filter import (
     make_filter_bank,
     scan_bins,
 )
-from app.decoders.magnet.preprocess import Blocks, Preprocessor
+from app.decoders.magnet.preprocess import Blocks, FieldBins, Preprocessor
 from app.decoders.magnet.readings import (
     Finding,
     LineCrossing,
@@ -49,9 +48,8 @@ from app.decoders.magnet.readings import (
     NoiseKind,
     PlacedMagnet,
     TagReading,
+    VehiclePath,
 )
-from app.decoders.magnet.resample import FieldBins
-from app.decoders.magnet.vehicle_path import VehiclePath
 from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
 from app.markers.magnet import MOMENT_AM2
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace

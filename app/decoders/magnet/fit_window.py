@@ -7,12 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.magnet.dipole_fit import FORWARD, UPRIGHT, MagnetPrior, fit_dipoles, residual_cost
-from app.decoders.magnet.dipole_model import (
+from app.decoders.magnet.dipole_fit import (
+    FORWARD,
     PARAMETERS,
+    UPRIGHT,
     FitData,
+    MagnetPrior,
     Samples,
     add_dipole_field,
+    fit_dipoles,
+    residual_cost,
     whiten,
 )
 from app.decoders.magnet.matched_filter import DISTANCES_M, BinScores
@@ -71,7 +75,7 @@ class Dipole:
     margin : float
         By how much its kind costs less than the other.
     log_odds : float
-        Of a magnet against iron, by its depth and moment alone (`app.decoders.magnet.magnet_odds`).
+        Of a magnet against iron, by its depth and moment alone (`app.decoders.magnet.classify`).
     """
 
     params: Floats

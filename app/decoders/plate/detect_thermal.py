@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.fit import PlateFit, fit_plate
-from app.decoders.plate.layout import marker_centroids
+from app.decoders.plate.pose import marker_centroids
 from app.markers.plate import PlateGeometry
 
 Frame = npt.NDArray[Any]

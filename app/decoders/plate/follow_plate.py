@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from app.decoders.plate.evidence import PlateEvidence
-from app.decoders.plate.fit import fit_plate
-from app.decoders.plate.homography import project
-from app.decoders.plate.layout import marker_centroids
+from app.decoders.plate.fit import fit_plate, project
+from app.decoders.plate.pose import marker_centroids
 from app.decoders.plate.unit_likelihoods import unit_log_likelihoods
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlatePose

@@ -11,13 +11,172 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from app.compiled import kernel, routine, step
-from app.decoders.plate.linear import subtract_rows
-from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
+from app.decoders.plate.normal_equations import subtract_rows
 from app.decoders.plate.profiles import Floats, Ints
+from app.decoders.plate.synthesis import Light, PlatePatch
+
+# === The image around a plate, in linear light and averaged to about two or three pixels a unit.
+
+
+Frame = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.float64]
+
+GAMMA = 2.2
+"""[1] exponent from encoded values to linear light. Source: close to sRGB, IEC 61966-2-1, without its linear toe."""
+MIN_STEP_PX = 1.25
+"""[px] below which pixels are not averaged. Source: chosen by hand: resampling by so little costs more than it
+saves."""
+PATCH_PAD = 0.15
+"""[extent of the plate's image] cut out around it, so that the corners may move. Source: chosen by hand."""
+MIN_PATCH_EXTENT_PX = 3.0
+"""[px] least width and height of a plate's image. Source: chosen by hand."""
+MAX_TURNED = 1.5
+"""[1] factor by which a turned plate's bounding box is cut finer: root of its area over the plate's. Source: chosen by
+hand."""
+MIN_PATCH_PX = 4
+"""[px] least side of an averaged patch. Source: chosen by hand."""
+MIN_WEIGHT_LEVEL = 0.18
+"""[encoded level] below which noise in the dark, not the gamma, sets a pixel's weight. Source: chosen by hand."""
+_LEVELS = np.linspace(0.0, 1.0, 256)
+_LIGHT = (_LEVELS**GAMMA).astype(np.float32)
+_LINEAR = _LEVELS.astype(np.float32)
+# weight of a pixel's squared error by its light: noise is even in grey levels, so light errs by the slope of the gamma
+_WEIGHTS = ((GAMMA * np.maximum(_LEVELS ** (1 / GAMMA), MIN_WEIGHT_LEVEL) ** (GAMMA - 1)) ** -2.0).astype(np.float32)
+
+
+def cut_patch(image: Frame, corners_px: Array, wanted_px: float, linear: bool) -> PlatePatch | None:
+    """The image around a plate, averaged down to about this many pixels along its sides; None outside the image."""
+    low, high = corners_px.min(axis=0), corners_px.max(axis=0)
+    extent = high - low
+    if not (extent > MIN_PATCH_EXTENT_PX).all() or not (extent < 2 * max(image.shape)).all():
+        return None
+    turned = math.sqrt(float(extent.prod()) / max(cv2.contourArea(corners_px.astype(np.float32)), 1.0))
+    step = extent / (wanted_px * min(turned, MAX_TURNED))
+    pad = PATCH_PAD * extent + 2 * step
+    x0, y0 = (int(v) for v in np.maximum(low - pad, 0))
+    x1, y1 = (int(v) for v in np.minimum(high + pad + 1, [image.shape[1], image.shape[0]]))
+    wide, tall = ((far - near if s < MIN_STEP_PX else round((far - near) / s))
+                  for near, far, s in ((x0, x1, step[0]), (y0, y1, step[1])))  # fmt: skip
+    if min(wide, tall) < MIN_PATCH_PX:
+        return None
+    step = np.array([(x1 - x0) / wide, (y1 - y0) / tall])
+    patch = image[y0:y1, x0:x1]
+    luma = cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY) if patch.ndim == 3 else np.ascontiguousarray(patch)
+    light: Light = np.asarray(cv2.LUT(luma, _LINEAR if linear else _LIGHT), np.float32)
+    if (tall, wide) != light.shape:
+        light = np.asarray(cv2.resize(light, (wide, tall), interpolation=cv2.INTER_AREA), np.float32)
+    weights: Light = np.ones_like(light) if linear else _WEIGHTS[(light * 255 + 0.5).astype(np.uint8)]
+    grid = np.array([x0 + (step[0] - 1) / 2, y0 + (step[1] - 1) / 2, step[0], step[1]])
+    return PlatePatch(light, weights, grid)
+
+
+# === What the hypotheses about a plate's units are compared on: pixels, pattern, light and spots of paint.
+
+
+class PlatePixels(NamedTuple):
+    """The pixels on a plate.
+
+    Attributes
+    ----------
+    light : ndarray, shape (P,)
+        Without the haze. [linear, 1 = saturation]
+    weight : ndarray, shape (P,)
+        Of the squared error, 1 on average.
+    units : ndarray, shape (P, units)
+        Share of each unit in each pixel, in the order of the symbols' units.
+    rest : ndarray, shape (P, 6)
+        Shares of the gaps, the triangle, the other half of its cell and the three squares.
+    places_mm : ndarray, shape (P, 2)
+    level : float
+        Light of the lightest units without the haze.
+    blur_mm : float
+        Standard deviation of the blur on the plate. [mm]
+    """
+
+    light: Floats
+    weight: Floats
+    units: Floats
+    rest: Floats
+    places_mm: Floats
+    level: float
+    blur_mm: float
+
+
+class PlatePattern(NamedTuple):
+    """The pattern that is verified, and its units.
+
+    Attributes
+    ----------
+    dark : ndarray, shape (units,)
+        1 for the dark units of the pattern, 0 for the light ones.
+    seen : ndarray, shape (P,)
+        Reflectance that each pixel sees of the pattern; white is 1.
+    dark_albedo : float
+        Reflectance of dark units.
+    white_spread, dark_spread : float
+        Standard deviations of the reflectances of light and of dark units, each unit's own. [white]
+    centres_mm : ndarray, shape (units, 2)
+    reach_mm, inner_mm : float
+        Around a unit's centre, within which pixels are compared, and within which lies what pixels see of it.
+    """
+
+    dark: Floats
+    seen: Floats
+    dark_albedo: float
+    white_spread: float
+    dark_spread: float
+    centres_mm: Floats
+    reach_mm: float
+    inner_mm: float
+
+
+class LightPrior(NamedTuple):
+    """Light on the plate before the pixels around a unit are compared.
+
+    Attributes
+    ----------
+    field, noise : ndarray, shape (P,)
+        Light on each pixel, and variance of its error.
+    spread : float
+        Standard deviation of the light, relative.
+    length_mm, level_variance : float
+        Distance over which the correlation of the light falls to 1/e, and the variance of its mean, relative.
+    veil_variance, veil_length_mm : float
+        Variance of the error of light that the plate does not send, and length over which that changes.
+    """
+
+    field: Floats
+    noise: Floats
+    spread: float
+    length_mm: float
+    level_variance: float
+    veil_variance: float = 0.0
+    veil_length_mm: float = 1.0
+
+
+class Spots(NamedTuple):
+    """Spots of paint that may hide a unit.
+
+    Attributes
+    ----------
+    shapes : ndarray, shape (6, spots)
+        Centre around the unit's, inverse shape xx, xy, yy, mean radius. [mm]
+    paints, opacities : ndarray
+        Reflectances [white] and shares of the light that the paint hides.
+    """
+
+    shapes: Floats
+    paints: Floats
+    opacities: Floats
+
+
+# === Log likelihoods of the pixels around each unit, under each hypothesis about it.
+
 
 STAIN_LENGTH_MM, STAIN_REACH_MM, STAIN_SPREAD = 12.0, 27.0, 0.45
 """[mm, mm, 1] length over which a smooth stain changes, how far around the unit's centre it reaches, and its standard

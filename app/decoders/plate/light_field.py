@@ -8,16 +8,24 @@ tb01729.x), so that its inverse covariance is banded and a solution takes a tent
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.compiled import kernel, loop, step
-from app.decoders.plate.linear import factorize, solve_factorized, substitute
-from app.decoders.plate.plate_pixels import PlatePixels
-from app.decoders.plate.profiles import Floats, Ints
+from app.compiled import ieee_kernel, kernel, loop, step
+from app.decoders.plate.detect_blobs import MarkerSignal
+from app.decoders.plate.fit import project
+from app.decoders.plate.hypotheses import PlatePixels
+from app.decoders.plate.normal_equations import factorize, invert, solve_factorized, substitute
+from app.decoders.plate.pose import unit_edges
+from app.decoders.plate.profiles import Floats as ProfilesFloats
+from app.decoders.plate.profiles import Ints
+from app.decoders.plate.unit_patterns import minimize_pattern
+from app.markers.plate import PlateGeometry, unit_index
 
 Array = npt.NDArray[Any]
 
@@ -90,16 +98,16 @@ class Knots(NamedTuple):
 
     along: int
     side_mm: float
-    precision: Floats
+    precision: ProfilesFloats
 
 
 class _Field(NamedTuple):
     """What is fitted, changed in place: light and noise of each pixel, reflectance that it sees; those of the parts."""
 
-    light: Floats
-    noise: Floats
-    seen: Floats
-    albedo: Floats
+    light: ProfilesFloats
+    noise: ProfilesFloats
+    seen: ProfilesFloats
+    albedo: ProfilesFloats
 
 
 def fit_light(pixels: PlatePixels, white: Array, parts: Array, albedo: Array, side_mm: float) -> LightField:
@@ -148,7 +156,7 @@ def _knots(side_mm: float) -> Knots:
 
 
 @step
-def _set_seen(white: Floats, parts: Floats, field: _Field) -> None:
+def _set_seen(white: ProfilesFloats, parts: ProfilesFloats, field: _Field) -> None:
     """Set the reflectance that each pixel sees."""
     for p in range(white.size):
         total = white[p]
@@ -166,11 +174,11 @@ def _set_noise(pixels: PlatePixels, sigma: float, field: _Field) -> None:
 
 
 @loop
-def _factorize_band(matrix: Floats, band: int) -> None:
+def _factorize_band(matrix: ProfilesFloats, band: int) -> None:
     """Replace the band of a symmetric matrix, stored as `Knots.precision`, by that of its transposed Cholesky factor.
 
-    Rows are subtracted four at a time (`linear.factorize`): the columns beyond the band are zeros, so that the four may
-    reach to where the last one ends.
+    Rows are subtracted four at a time (`normal_equations.factorize`): the columns beyond the band are
+    zeros, so that the four may reach to where the last one ends.
     """
     size, width = matrix.shape
     flat = matrix.reshape(-1)
@@ -198,7 +206,7 @@ def _factorize_band(matrix: Floats, band: int) -> None:
 
 
 @loop
-def _solve_band(factor: Floats, band: int, values: Floats) -> None:
+def _solve_band(factor: ProfilesFloats, band: int, values: ProfilesFloats) -> None:
     """Replace the right side of a system by its solution."""
     size = factor.shape[0]
     for i in range(size):
@@ -255,7 +263,7 @@ def _fit_knots(pixels: PlatePixels, knots: Knots, spread: float, field: _Field) 
 
 
 @loop
-def _set_knots(places_mm: Floats, p: int, knots: Knots, near: Ints, weights: Floats) -> None:
+def _set_knots(places_mm: ProfilesFloats, p: int, knots: Knots, near: Ints, weights: ProfilesFloats) -> None:
     """Set the four knots around a pixel, in ascending order, and their weights."""
     count = knots.along
     x = min(max(places_mm[p, 0] / knots.side_mm, 0.0), 1.0) * (count - 1)
@@ -271,7 +279,7 @@ def _set_knots(places_mm: Floats, p: int, knots: Knots, near: Ints, weights: Flo
 
 
 @step
-def _fit_albedo(pixels: PlatePixels, white: Floats, parts: Floats, field: _Field) -> None:
+def _fit_albedo(pixels: PlatePixels, white: ProfilesFloats, parts: ProfilesFloats, field: _Field) -> None:
     """Set the reflectances of the parts for the present light."""
     count = parts.shape[1]
     ridge = ALBEDO_WEIGHT * np.median(1.0 / field.noise) * pixels.level * pixels.level
@@ -297,7 +305,7 @@ def _fit_albedo(pixels: PlatePixels, white: Floats, parts: Floats, field: _Field
 
 
 @kernel
-def _fit_field(pixels: PlatePixels, white: Floats, parts: Floats, knots: Knots, field: _Field) -> float:
+def _fit_field(pixels: PlatePixels, white: ProfilesFloats, parts: ProfilesFloats, knots: Knots, field: _Field) -> float:
     """Fit light and reflectances in turns; returns the standard deviation of the light, relative."""
     spread = LIGHT_SPREAD[1]
     sigma = FIRST_NOISE * pixels.level
@@ -314,3 +322,328 @@ def _fit_field(pixels: PlatePixels, white: Floats, parts: Floats, knots: Knots, 
         spread = min(max(SPREAD_FACTOR * field.light.std() / field.light.mean(), LIGHT_SPREAD[0]), LIGHT_SPREAD[1])
     _set_noise(pixels, sigma, field)
     return spread
+
+
+# === Light in the image of a plate that the plate does not send: haze over all of it, a veil of glare over a part.
+#
+# Shade divides the light of the units, glare adds to it. Both are Gaussian processes over the units, and so are the two
+# explanations of a plate's units: uneven light and even haze, or a veil besides. Their marginal likelihoods say which
+# holds. A veil is smooth over several units, so it is no explanation of a spot of paint.
+
+
+DARK_SHARE = 0.12
+"""[light level] light of dark units without haze: what they have beyond it is taken for haze. Source: chosen by hand;
+the simulated plates (`simulation.plate_face.draw_look`) have 0.02 to 0.2."""
+VEIL_LENGTH = 2.0
+"""[units of 8] length over which a veil changes: 80 mm, several units, where spots of paint have 8 to 30 mm. Source:
+the standard deviation of the simulated glare is 50 to 500 mm (`simulation.conditions`)."""
+VEIL_SPREADS = (0.1, 0.3)
+"""[light level] standard deviations of a veil, each as likely. Source: the simulated glare adds 0.05 to 0.35."""
+LIGHT_SPREADS, LIGHT_LENGTH = (0.1, 0.25, 0.5), 4.0
+"""[1, units of 8] standard deviations of uneven light, relative, each as likely, and distance over which its
+correlation falls to 1/e. Source: fair light, shade and deep shade, chosen by hand."""
+LEVEL_SPREAD, HAZE_SPREAD = 0.5, 0.3
+"""[1, light level] standard deviations of the light and of the haze over the whole plate, which leave both open.
+Source: chosen by hand."""
+LIGHT_WEAR, DARK_WEAR = 0.09, 0.05
+"""[light level] standard deviations of what light and dark units differ by themselves. Source: as
+`unit_likelihoods.WHITE_SPREAD`."""
+VEIL_PRIOR = 0.05
+"""[probability] of a veil. Source: chosen by hand."""
+SEARCH_SPREAD, SEARCH_WEAR = 0.3, 0.12
+"""[span] standard deviations of the veil and of what units differ by themselves, while the pattern under a veil is
+searched. Source: chosen by hand."""
+CONTRAST, CONTRAST_SPREAD = 0.85, 0.25
+"""[span] expected difference of light and dark units, and its standard deviation: glare adds to the light of the
+lightest. Source: chosen by hand."""
+
+
+class Veil(NamedTuple):
+    """Light that the plate does not send.
+
+    Attributes
+    ----------
+    light : ndarray, shape (n, n)
+        On each unit and marker. [linear, 1 = saturation]
+    level : float
+        Light of light units without it. [linear, 1 = saturation]
+    """
+
+    light: Array
+    level: float
+
+    @property
+    def is_even(self) -> bool:
+        """Whether it is the same everywhere: haze, not glare."""
+        return bool(np.ptp(self.light) == 0)
+
+
+def uniform_haze(dark: float, light: float, n: int) -> Veil:
+    """The veil that is the same everywhere, from the light of the darkest and the lightest units."""
+    haze = max(0.0, (dark - DARK_SHARE * light) / (1 - DARK_SHARE))
+    return Veil(np.full((n, n), haze), light - haze)
+
+
+def estimate_veil(values: Array, covariance: Array, span: float, n: int) -> tuple[Veil, npt.NDArray[np.bool_]]:
+    """The veil that changes over the plate, and the pattern of dark units under it.
+
+    Parameters
+    ----------
+    values : ndarray, shape (units,)
+        Light of the units in the order of the symbols' units.
+    covariance : ndarray, shape (units, units)
+        Of their errors.
+    span : float
+        Light of the lightest units above the darkest ones.
+    n : int
+        Units along a side.
+    """
+    order = unit_index(n).reshape(-1)
+    by_grid = span**2 * (SEARCH_SPREAD**2 * _correlations(n).veil + 4.0)
+    total = by_grid[order] + covariance
+    total[np.diag_indices_from(total)] += (SEARCH_WEAR * span) ** 2
+    mean = float(values.mean())
+    # a unit is dark to begin with where it is darker than the units around it are on average
+    around = total.copy()
+    around[np.diag_indices_from(around)] += (CONTRAST * span / 2) ** 2
+    dark = (values - mean < by_grid[order] @ np.linalg.solve(around, values - mean)).astype(float)
+    weight = invert(total)
+    residual, contrast = minimize_pattern(weight, values - mean, dark, CONTRAST * span, CONTRAST_SPREAD * span)
+    level = contrast / (1 - DARK_SHARE)
+    lightest = mean + by_grid @ (weight @ residual)
+    return Veil(np.maximum(lightest - level, 0.0).reshape(n, n), level), dark > 0.5
+
+
+def veil_log_odds(values: Array, covariance: Array, haze: Veil, patterns: list[Array], n: int) -> float:
+    """Logarithm of the odds that there is a veil, by the marginal likelihoods of the units' light.
+
+    Parameters
+    ----------
+    values, covariance : ndarray
+        As in `estimate_veil`.
+    haze : Veil
+        The even one.
+    patterns : list of ndarray of bool, shape (units,)
+        Patterns of dark units that are likely under either explanation.
+    n : int
+        Units along a side.
+    """
+    order = unit_index(n).reshape(-1)
+    even = [_log_likelihood(values, covariance, haze, dark, s, None, n) for dark in patterns for s in LIGHT_SPREADS]
+    veil = _correlations(n).veil[order]
+    veiled = [
+        _log_likelihood(values, covariance, haze, dark, s, v**2 * veil, n)
+        for dark in patterns
+        for s in LIGHT_SPREADS[:1]
+        for v in VEIL_SPREADS
+    ]
+    even_mean = np.logaddexp.reduce(even) - math.log(len(LIGHT_SPREADS))
+    veiled_mean = np.logaddexp.reduce(veiled) - math.log(len(VEIL_SPREADS))
+    return float(veiled_mean - even_mean) + math.log(VEIL_PRIOR / (1 - VEIL_PRIOR))
+
+
+def _log_likelihood(
+    values: Array, covariance: Array, haze: Veil, dark: Array, light_spread: float, veil: Array | None, n: int
+) -> float:
+    """Of the units' light under a pattern, without the constant."""
+    seen, scale = np.where(dark, DARK_SHARE, 1.0), haze.level
+    light = light_spread**2 * _correlations(n).light + LEVEL_SPREAD**2
+    total = light * np.outer(seen, seen) + HAZE_SPREAD**2 + np.diag(np.where(dark, DARK_WEAR, LIGHT_WEAR) ** 2)
+    if veil is not None:
+        total = total + veil
+    total = scale**2 * total + covariance
+    residual = values - float(haze.light[0, 0]) - scale * seen
+    factor = np.linalg.cholesky(total)
+    half = np.linalg.solve(factor, residual)
+    return float(-0.5 * half @ half - np.log(np.diag(factor)).sum())
+
+
+class _Correlations(NamedTuple):
+    """Of the veil between all units and markers and the symbols' units, and of the light between the latter."""
+
+    veil: Array
+    light: Array
+
+
+@lru_cache
+def _correlations(n: int) -> _Correlations:
+    grid = np.stack(np.divmod(np.arange(n * n), n), axis=1).astype(float) * (8 / n)
+    units = grid[unit_index(n).reshape(-1)]
+    apart = np.linalg.norm(grid[:, None] - units[None], axis=2)
+    between = np.linalg.norm(units[:, None] - units[None], axis=2)
+    return _Correlations(np.exp(-0.5 * (apart / VEIL_LENGTH) ** 2), np.exp(-between / LIGHT_LENGTH))
+
+
+# === How red the triangle of a fitted plate is, and how green its squares are.
+
+
+Floats = npt.NDArray[np.float64]
+Grey = npt.NDArray[np.uint8]
+
+LEVEL_QUANTILES = (0.15, 0.85)
+"""Shares of the units below the level of dark ones and of light ones. Source: by hand."""
+MIN_LEVEL_CONTRAST = 0.2
+"""[light units] between both levels, to call a triangle black. Source: by hand."""
+SPOT_PITCH = 0.03
+"""[plate sides] between the 3 x 3 points that are sampled on a marker. Source: chosen by hand; half a marker is 0.115
+on 8 x 8, 0.077 on 12 x 12."""
+_SPOTS = np.array([(x, y) for x in (-SPOT_PITCH, 0.0, SPOT_PITCH) for y in (-SPOT_PITCH, 0.0, SPOT_PITCH)])
+
+TRIANGLE_SPOT, REST_SPOT, BESIDE_SPOTS, SPOT_REACH = (
+    (0.28, 0.28),
+    (0.75, 0.75),
+    ((-0.45, 0.3), (0.3, -0.45), (-0.45, -0.45)),
+    0.09,
+)
+"""[sides of the triangle's cell] from its outer corner: a spot in the triangle, one in the other half, three beside the
+plate, and half the side of all. Source: chosen by hand: as far from the edges as the cell allows."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerColours:
+    """How red the triangle of a fitted plate is, and how green its squares are.
+
+    Attributes
+    ----------
+    margins : ndarray, shape (4,)
+        How far the signal of the triangle and the squares stands out of the units', in their spreads.
+    tints : ndarray, shape (4,)
+        Red of the triangle, green of the squares above their other colours, as shares of the median square's; grey
+        being the units' colour. A black square in the dark has none, whatever the ratio of its few grey levels.
+    cast : ndarray, shape (2,)
+        Blue and red of the units as shares of their green.
+    rest : float
+        Red of the other half of the triangle's cell over the triangle's own: near 1 where the marker is a square.
+    beside : float
+        The same of the reddest spot beside the plate: above 1 where red spreads from there into a dark corner.
+    paleness : float
+        The lower of blue and red of the palest square, from 0 as of dark units to 1 as of light ones: near 1 where the
+        square is white.
+    triangle_red : float
+        Red of the triangle on the same scale: below 0 where it is black.
+    """
+
+    margins: Floats
+    tints: Floats
+    cast: Floats
+    rest: float = 0.0
+    beside: float = 0.0
+    paleness: float = 0.0
+    triangle_red: float = 1.0
+
+
+def red_around_triangle(
+    image: npt.NDArray[np.uint8], plate_from_image: Floats, geometry: PlateGeometry, cast: Floats
+) -> tuple[float, float]:
+    """Red of the other half of the triangle's cell and beside the plate, over the triangle's own.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (H, W, 3)
+    plate_from_image : ndarray, shape (3, 3)
+    geometry : PlateGeometry
+    cast : ndarray, shape (2,)
+        Blue and red of the units as shares of their green.
+
+    Returns
+    -------
+    rest, beside : float
+        As of `MarkerColours`.
+    """
+    edges = unit_edges(geometry)
+    low, side = float(edges[0, 0]), float(edges[1, 1] - edges[0, 0])
+    spots = np.array([TRIANGLE_SPOT, REST_SPOT, *BESIDE_SPOTS])
+    reach = SPOT_REACH * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    points: Floats = low + side * (spots[:, None] + reach).reshape(-1, 2)
+    at_px = project(np.asarray(np.linalg.inv(plate_from_image), float), points).astype(np.float32)
+    seen: npt.NDArray[Any] = cv2.remap(
+        image, at_px[None, :, 0], at_px[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )[0]
+    blue, green, red = seen.astype(float).reshape(len(spots), len(reach), 3).mean(axis=1).T
+    tints = red / cast[1] - np.maximum(green, blue / cast[0])
+    shares = tints[1:] / max(float(tints[0]), 1.0)
+    return float(shares[0]), float(shares[1:].max())
+
+
+def marker_colours(signal: MarkerSignal, plate_from_image: Floats, centroids: Floats, units: Floats) -> MarkerColours:
+    """Colours of a fitted plate's markers.
+
+    Parameters
+    ----------
+    signal : MarkerSignal
+    plate_from_image : ndarray, shape (3, 3)
+        Full-resolution pixels to plate coordinates.
+    centroids : ndarray, shape (4, 2)
+        Of the markers, in plate coordinates.
+    units : ndarray, shape (U, 2)
+        Centres of the units, in plate coordinates.
+    """
+    points = np.concatenate([(centroids[:, None] + _SPOTS[None]).reshape(-1, 2), units])
+    planes = signal.planes
+    seen = np.empty((4, len(points)))
+    sampled = _Signal(signal.opponent, planes.blue, planes.green, planes.red, signal.scale)
+    _look_up(np.asarray(np.linalg.inv(plate_from_image), float), points, sampled, seen)
+    strength, blue, green, red = seen
+    spots = 4 * len(_SPOTS)
+    cast = np.array([plane[spots:].sum() for plane in (blue, green, red)])
+    cast = np.maximum(cast, 1.0) / max(cast[1], 1.0)
+    sign = np.array([1, -1, -1, -1])
+    inside = strength[:spots].reshape(4, -1).mean(axis=1)
+    between = strength[spots:]
+    paleness, triangle_red = _between_levels(blue, red, spots)
+    # as grey units would look in the same light
+    blue, green, red = (
+        plane[:spots].reshape(4, -1).mean(axis=1) / c for plane, c in zip((blue, green, red), cast, strict=True)
+    )
+    tints = np.where(sign > 0, red - np.maximum(green, blue), green - np.maximum(red, blue))
+    return MarkerColours(sign * (inside - between.mean()) / (between.std() + 1.0),
+                         tints / max(float(np.sort(tints[1:])[1]), 1.0), cast[[0, 2]],
+                         paleness=paleness, triangle_red=triangle_red)  # fmt: skip
+
+
+def _between_levels(blue: Floats, red: Floats, spots: int) -> tuple[float, float]:
+    """`MarkerColours.paleness` and `triangle_red`; the latter is 0.5 where the units have no two levels.
+
+    Parameters
+    ----------
+    blue, red : ndarray, shape (points,)
+        At the spots of the markers, then at the units.
+    spots : int
+        Of all markers.
+    """
+    planes = np.stack([blue, red])
+    units = np.sort(planes[:, spots:], axis=1)
+    low, high = (units[:, int(share * (units.shape[1] - 1))] for share in LEVEL_QUANTILES)
+    markers = (planes[:, :spots].reshape(2, 4, -1).mean(axis=2).T - low) / np.maximum(high - low, 1.0)
+    has_levels = high[1] - low[1] > MIN_LEVEL_CONTRAST * high[1]  # an all-light plate has none
+    return float(markers[1:].min(axis=1).max()), float(markers[0, 1]) if has_levels else 0.5
+
+
+class _Signal(NamedTuple):
+    """What is sampled: attributes of `MarkerSignal` and its planes, shape (H // scale, W // scale)."""
+
+    opponent: npt.NDArray[np.int16]
+    blue: Grey
+    green: Grey
+    red: Grey
+    scale: int
+
+
+@ieee_kernel
+def _look_up(image_from_plate: Floats, points: Floats, signal: _Signal, seen: Floats) -> None:
+    """Set the signal, blue, green and red at points of the plate, shape (4, points): those of the nearest pixels."""
+    height, width = signal.opponent.shape
+    scale = signal.scale
+    m = image_from_plate
+    for k in range(points.shape[0]):
+        u = points[k, 0]
+        v = points[k, 1]
+        w = m[2, 0] * u + m[2, 1] * v + m[2, 2]
+        x = ((m[0, 0] * u + m[0, 1] * v + m[0, 2]) / w - (scale - 1) / 2) / scale
+        y = ((m[1, 0] * u + m[1, 1] * v + m[1, 2]) / w - (scale - 1) / 2) / scale
+        column = int(np.rint(min(max(x, 0.0), width - 1.0)))
+        row = int(np.rint(min(max(y, 0.0), height - 1.0)))
+        seen[0, k] = signal.opponent[row, column]
+        seen[1, k] = signal.blue[row, column]
+        seen[2, k] = signal.green[row, column]
+        seen[3, k] = signal.red[row, column]

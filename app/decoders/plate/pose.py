@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -19,6 +20,50 @@ from app.geodesy import enu_from_heading, wgs84_from_enu
 from app.markers.plate import PlateGeometry
 from app.markers.reading import PlatePose, PlateReading
 from app.sensors.camera import Camera
+
+# === Where the shapes of a plate lie, in plate sides: (0, 0) is the triangle's corner, (1, 1) the opposite one.
+
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@lru_cache
+def unit_edges(geometry: PlateGeometry) -> FloatArray:
+    """Low and high edge of every unit along a side, in plate sides, shape (n, 2)."""
+    low = (geometry.gap_mm + np.arange(geometry.n) * geometry.pitch_mm) / geometry.side_mm
+    return np.stack([low, low + geometry.unit_mm / geometry.side_mm], axis=1)
+
+
+@lru_cache
+def marker_centroids(geometry: PlateGeometry) -> FloatArray:
+    """Centroids of the triangle and the three squares, clockwise, in plate sides, shape (4, 2)."""
+    edges = unit_edges(geometry)
+    low, side = edges[0, 0], edges[1, 1] - edges[0, 0]
+    near, far = low + side / 2, 1 - low - side / 2
+    tip = low + side / 3
+    return np.array([(tip, tip), (far, near), (far, far), (near, far)])
+
+
+@lru_cache
+def unit_centres(geometry: PlateGeometry) -> FloatArray:
+    """Centres of the units that carry the code, in plate sides, shape (units, 2)."""
+    middle = unit_edges(geometry).mean(axis=1)
+    rows, columns = np.nonzero(unit_shapes(geometry.n) >= 0)
+    return np.stack([middle[columns], middle[rows]], axis=1)
+
+
+@lru_cache
+def unit_shapes(n: int) -> npt.NDArray[np.int64]:
+    """Number of every unit's shape, row by row; -1 in the corner cells, shape (n, n)."""
+    corner = np.zeros((n, n), dtype=bool)
+    corner[np.ix_([0, 1, n - 2, n - 1], [0, 1, n - 2, n - 1])] = True
+    shapes = np.full((n, n), -1, dtype=np.int64)
+    shapes[~corner] = np.arange(n * n - 16)
+    return shapes
+
+
+# === Corners and camera to the pose of the plate, and that to position and heading of the vehicle.
+
 
 Array = npt.NDArray[Any]
 
@@ -224,3 +269,66 @@ def fix_vehicle(
     covariance += math.radians(heading_rmse_deg) ** 2 * np.outer(by_heading, by_heading)
     lon, lat, height = wgs84_from_enu(state[:3], (lon_deg, lat_deg, height_m))
     return VehicleFix(lon, lat, height, (heading_deg + math.degrees(state[3])) % 360.0 % 360.0, covariance)
+
+
+# === Poses of plates seen through a rolling shutter by a moving vehicle.
+#
+# Each row of the image is exposed at its own time, so that the vehicle has moved between the corners of a plate, and
+# between a corner and the middle row, whose time is the frame's.
+
+
+MAX_SHUTTER_STEPS = 4
+"""[steps] of alternating between pose and corners. Source: chosen by hand; the third changes less than 0.01 px."""
+REST_PX = 0.005
+"""[px] change of a corner below which the steps end. Source: chosen by hand."""
+
+
+def row_time_s(rows_px: Array, camera: Camera) -> Array:
+    """When rows are exposed, after the middle row of the frame. [s]"""
+    share = (np.asarray(rows_px, float) - (camera.height_px - 1) / 2) / max(camera.height_px - 1, 1)
+    return np.asarray(share * camera.readout_s)
+
+
+def locate_moving_plate(
+    corners_px: Array, covariance_px2: Array, geometry: PlateGeometry, camera: Camera, speed_m_s: float
+) -> PlatePose | None:
+    """Pose of a plate at the time of the frame's middle row, seen by a camera that drives straight ahead.
+
+    Parameters
+    ----------
+    corners_px, covariance_px2, geometry, camera
+        As in `locate_plate`; the camera has `readout_s`.
+    speed_m_s : float
+        Of the vehicle, forward. [m/s]
+
+    Returns
+    -------
+    PlatePose or None
+        None when no pose in front of the camera projects to the corners.
+    """
+    pose = locate_plate(corners_px, covariance_px2, geometry, camera)
+    moved_m = speed_m_s * row_time_s(corners_px[:, 1], camera)
+    if pose is None or not np.abs(moved_m).max() > 0:
+        return pose
+    object_m = np.column_stack([geometry.corners_mm / 1000, np.zeros(4)])
+    forward = camera.camera_from_vehicle[:, 0]
+    distortion = np.array(camera.distortion or (0.0,) * 4)
+    shift = np.zeros((4, 2))
+    for _step in range(MAX_SHUTTER_STEPS):
+        in_camera = object_m @ pose.rotation.T + pose.translation_m
+        # where the vehicle was when the row of a corner was exposed, and so where that corner was seen
+        then = in_camera - moved_m[:, None] * forward
+        now, seen = _project(in_camera, camera, distortion), _project(then, camera, distortion)
+        last, shift = shift, now - seen
+        if np.abs(shift - last).max() < REST_PX:
+            break
+        moved = locate_plate(corners_px + shift, covariance_px2, geometry, camera)
+        if moved is None:
+            return None
+        pose = moved
+    return pose
+
+
+def _project(points_m: Array, camera: Camera, distortion: Array) -> Array:
+    zero = np.zeros(3)
+    return np.asarray(cv2.projectPoints(points_m, zero, zero, camera.matrix, distortion)[0].reshape(-1, 2))

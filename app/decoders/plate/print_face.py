@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.decoders.plate.layout import unit_shapes
+from app.decoders.plate.pose import unit_shapes
 from app.markers.plate import PlateGeometry
 
 PX_PER_MM = 2.0

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from app.compiled import loop
+from app.compiled import loop, routine, step
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -135,3 +135,143 @@ def set_profiles(x: float, blur: AxisBlur, edges: Floats, table: Floats, out: Ax
     else:  # the plate's edges are out of reach
         out.values[n + 2, 0] = 1.0
         out.values[n + 2, 1:] = 0.0
+
+
+# === Quadrature for a blur that lies on neither axis of the plate.
+#
+# A round blur in the image is an ellipse on the plate, long along the line of sight; so is the motion's. An upright
+# plate has that line nearly along its columns, where the profiles of the shapes are exact. What is left there, the
+# covariance of the blur along the rows and along the columns, moves the corners of small plates by a tenth of a pixel,
+# which matters to a pose and not to the units.
+
+
+UPRIGHT_SINE = 0.35
+"""[1] sine of the angle between the blur's long axis and the plate's columns up to which the blur counts as lying along
+them. Source: 20 degrees, chosen by hand."""
+ROUND_BLUR = 1.69
+"""[1] ratio of the blur's variances up to which it counts as round. Source: 1.3 squared, chosen by hand."""
+NODES_PER_RATIO = 1.2
+"""[1] quadrature nodes on each side of the middle per ratio of the blur's axes. Source: chosen by hand."""
+NODE_REACH = 2.2
+"""[standard deviations] of the outermost node. Source: chosen by hand."""
+MIN_SKEW = 0.02
+"""[1] correlation of an upright plate's blur along its rows and columns that is left out. Source: chosen by hand; 0.6
+degrees on a blur five times as long as wide."""
+MIN_MOTION2 = 0.0004
+"""[plate sides^2] square of the motion that the quadrature allows for at least, so that its derivative is not zero.
+Source: chosen by hand."""
+
+
+class Quadrature(NamedTuple):
+    """Nodes along the part of the blur that lies on neither axis of the plate; one node where there is none.
+
+    Attributes
+    ----------
+    nodes, weights : ndarray, shape (K,)
+        Places along `direction` [plate sides], and weights that sum to 1.
+    direction : ndarray, shape (2,)
+        Unit vector on the plate.
+    by_spread : ndarray, shape (2,)
+        Relative change of the nodes with the logarithm of the lens blur and with the motion's square.
+    is_turned : bool
+        The profiles along both axes have the blur of the ellipse's short axis, and the nodes have the motion too.
+    share : float
+        Share of the blur's variance along u and v that is left to the profiles of a plate that is not turned.
+    """
+
+    nodes: Floats
+    weights: Floats
+    direction: Floats
+    by_spread: Floats
+    is_turned: bool
+    share: float
+
+
+class _Ellipse(NamedTuple):
+    """Blur on the plate: covariance, variances along the long and the short axis [plate sides^2], angle [rad]."""
+
+    uu: float
+    uv: float
+    vv: float
+    long2: float
+    short2: float
+    angle: float
+
+
+@step
+def _blur_ellipse(pose: Floats, wide: float, tall: float) -> _Ellipse:
+    """Blur at the frame's origin from its standard deviations in the image, in normalised coordinates.
+
+    The covariance is J diag(wide^2, tall^2) J^T with the homography's derivative J; its eigenvalues are the variances.
+    """
+    ux = (pose[0] - pose[2] * pose[6]) * wide
+    uy = (pose[1] - pose[2] * pose[7]) * tall
+    vx = (pose[3] - pose[5] * pose[6]) * wide
+    vy = (pose[4] - pose[5] * pose[7]) * tall
+    a = ux * ux + uy * uy
+    b = ux * vx + uy * vy
+    d = vx * vx + vy * vy
+    root = math.sqrt(0.25 * (a - d) * (a - d) + b * b)
+    return _Ellipse(a, b, d, 0.5 * (a + d) + root, max(0.5 * (a + d) - root, 1e-18), 0.5 * math.atan2(2.0 * b, a - d))
+
+
+@step
+def _set_nodes(ratio: float, spread2: float, max_nodes: int) -> tuple[Floats, Floats]:
+    """Evenly spaced samples of a Gaussian, and their weights; the spacing gives exactly its variance."""
+    half = min(max(math.ceil(NODES_PER_RATIO * ratio), 1), max_nodes)
+    nodes = np.empty(2 * half + 1)
+    weights = np.empty(2 * half + 1)
+    total = 0.0
+    second = 0.0
+    for k in range(2 * half + 1):
+        nodes[k] = NODE_REACH * (k - half) / half
+        weights[k] = math.exp(-0.5 * nodes[k] * nodes[k])
+        total += weights[k]
+        second += weights[k] * nodes[k] * nodes[k]
+    scale = math.sqrt(spread2 * total / second)
+    for k in range(2 * half + 1):
+        nodes[k] *= scale
+        weights[k] /= total
+    return nodes, weights
+
+
+@step
+def _upright_quadrature(blur: _Ellipse, lens_share: float, max_nodes: int) -> Quadrature:
+    """Quadrature of the covariance of an upright plate's blur along its rows and columns.
+
+    With the correlation r, the covariance matrix is (1 - |r|) diag(uu, vv) + w w^T, w = sqrt|r| (sqrt uu, +-sqrt vv):
+    of all ways to take off one line, this one leaves most to both profiles.
+    """
+    skew = abs(blur.uv) / math.sqrt(blur.uu * blur.vv)
+    along_u = math.sqrt(skew * blur.uu)
+    along_v = math.copysign(math.sqrt(skew * blur.vv), blur.uv)
+    length2 = along_u * along_u + along_v * along_v
+    if skew < MIN_SKEW:
+        return Quadrature(np.zeros(1), np.ones(1), np.array([0.0, 1.0]), np.zeros(2), False, 1.0)
+    nodes, weights = _set_nodes(math.sqrt(skew / (1.0 - skew)), length2, max_nodes)
+    direction = np.array([along_u, along_v]) / math.sqrt(length2)
+    return Quadrature(nodes, weights, direction, np.array([lens_share, 0.0]), False, 1.0 - skew)
+
+
+@routine
+def blur_quadrature(pose: Floats, frame: Floats, grid: Floats, max_nodes: int, is_skewed: bool) -> Quadrature:
+    """Quadrature of the blur for a pose, with at most `max_nodes` nodes on each side of the middle.
+
+    The nodes of a turned plate have what the ellipse's long axis has beyond the short one, with the motion. An upright
+    plate has nodes only if `is_skewed`.
+    """
+    lens2 = math.exp(2.0 * pose[8])
+    wide = math.sqrt(lens2 + (grid[2] * grid[2] - 1.0) / 12.0) / frame[2]
+    tall = math.sqrt(lens2 + (grid[3] * grid[3] - 1.0) / 12.0) / frame[2]
+    blur = _blur_ellipse(pose, wide, tall)
+    direction = np.array([math.cos(blur.angle), math.sin(blur.angle)])
+    lens_share = 2.0 * lens2 / (frame[2] * frame[2] * (wide * wide + tall * tall))
+    if blur.long2 < ROUND_BLUR * blur.short2 or abs(direction[0]) < UPRIGHT_SINE:
+        if is_skewed:
+            return _upright_quadrature(blur, lens_share, max_nodes)
+        return Quadrature(np.zeros(1), np.ones(1), direction, np.zeros(2), False, 1.0)
+    motion2 = max(pose[9], MIN_MOTION2)
+    spread2 = blur.long2 - blur.short2 + motion2 / 12.0
+    nodes, weights = _set_nodes(math.sqrt(spread2 / blur.short2), spread2, max_nodes)
+    by_spread = np.array([lens_share * (1.0 - motion2 / (12.0 * spread2)), 1.0 / (24.0 * spread2)])
+    return Quadrature(nodes, weights, direction, by_spread, True, 1.0)

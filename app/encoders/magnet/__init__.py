@@ -8,9 +8,8 @@ from app.encoders.magnet.codebook import (
     fitting_codes,
     list_conflicts,
 )
-from app.encoders.magnet.formats import write_sheet
-from app.encoders.magnet.layout import Hole, MagnetLayout, place_line, place_tag
-from app.encoders.magnet.sheet import DrillingSheet, SheetFormat
+from app.encoders.magnet.layout import DrillingSheet, Hole, MagnetLayout, SheetFormat, place_line, place_tag
+from app.encoders.magnet.sheets import write_sheet
 
 __all__ = [
     "CodebookFull",

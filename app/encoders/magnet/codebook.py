@@ -12,11 +12,12 @@ import numpy.typing as npt
 
 from app.errors import Conflict, InvalidParameter
 from app.markers.magnet import InformationTag, Polarity
-from app.markers.magnet_codebook import Codebook, Meaning
-from app.markers.magnet_design import TagDesign
-from app.markers.magnet_error import (
+from app.markers.magnet_design import (
     MAX_PLACEMENTS,
+    Codebook,
+    Meaning,
     ReadingConditions,
+    TagDesign,
     covariance_of,
     placements_of,
     separation_for,

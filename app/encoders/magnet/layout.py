@@ -10,21 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 import scipy
 
 from app.errors import InvalidParameter
-from app.markers.magnet import (
-    MAX_LINE_SPACING_M,
-    InformationTag,
-    LineStyle,
-    LineTag,
-    Orientation,
-    Polarity,
-    Tag,
-)
-from app.markers.magnet_codebook import Meaning, check_name
+from app.markers.magnet import MAX_LINE_SPACING_M, InformationTag, LineStyle, LineTag, Orientation, Polarity, Tag
+from app.markers.magnet_design import Meaning, check_name
+from app.markers.reading import Check
 from app.roads.lane_line import FloatArray, LaneLine, bearing_deg, left_of
 
 MAX_HOLES = 10_000
@@ -278,3 +272,95 @@ def _holes(
             zip(rows, polarities, strict=True), start=1
         )
     )
+
+
+# === Bill of materials of a layout: quantities, unit costs and totals.
+
+
+PAINT = "paint or thermoplastic marking"
+
+
+@dataclass(frozen=True, slots=True)
+class UnitCost:
+    """What one of something costs, from the cheapest to the dearest. [USD]"""
+
+    item: str
+    unit: str
+    low_usd: float
+    high_usd: float
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class CostRow:
+    """A quantity of something and what it costs. [USD]"""
+
+    cost: UnitCost
+    quantity: float
+
+    @property
+    def low_usd(self) -> float:
+        """At the lowest price. [USD]"""
+        return round(self.quantity * self.cost.low_usd, 2)
+
+    @property
+    def high_usd(self) -> float:
+        """At the highest price. [USD]"""
+        return round(self.quantity * self.cost.high_usd, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Bill:
+    """Materials of a layout and their alternatives.
+
+    Attributes
+    ----------
+    materials : tuple of CostRow
+        What is bought: the magnets in their shells.
+    alternatives : tuple of CostRow
+        Paint along the same length; for an information tag also one rugged RFID tag.
+    """
+
+    materials: tuple[CostRow, ...]
+    alternatives: tuple[CostRow, ...]
+
+    @property
+    def total_usd(self) -> float:
+        """Materials, at the highest price. [USD]"""
+        return round(sum(row.high_usd for row in self.materials), 2)
+
+    @property
+    def paint(self) -> CostRow:
+        """Paint or thermoplastic over the same length."""
+        return next(row for row in self.alternatives if row.cost.item == PAINT)
+
+
+# === The drilling sheet: a layout with its checks and its costs, for the writers.
+
+
+class SheetFormat(StrEnum):
+    """What a drilling sheet can be written as; the value is the file's extension."""
+
+    PDF = "pdf"
+    CSV = "csv"
+    GEOJSON = "geojson"
+
+    @property
+    def media_type(self) -> str:
+        """For HTTP's Content-Type."""
+        return {"pdf": "application/pdf", "csv": "text/csv; charset=utf-8", "geojson": "application/geo+json"}[self]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrillingSheet:
+    """What the crew, the planner and the buyer need of one layout; `holes` is what the agency states of the holes."""
+
+    layout: MagnetLayout
+    checks: tuple[Check, ...]
+    bill: Bill
+    holes: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed."""
+        return all(check.passed for check in self.checks)

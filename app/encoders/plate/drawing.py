@@ -9,10 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Literal
+from functools import lru_cache
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from fontTools.pens.basePen import BasePen
+from fontTools.pens.transformPen import TransformPen
+
+from app.encoders.pdf import load_typeface
 
 FloatArray = npt.NDArray[np.float64]
 Anchor = Literal["start", "middle", "end"]
@@ -169,3 +174,219 @@ def moved(parts: Iterable[Part], x_mm: float, y_mm: float) -> tuple[Part, ...]:
 def box_points(left: float, bottom: float, right: float, top: float) -> FloatArray:
     """Corners of a rectangle, clockwise from the upper left, shape (4, 2)."""
     return np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+
+
+# === Colours of a plate as data: what the fabricator buys, the inspector measures and the files show.
+#
+# Sources: ASTM D4956 (retroreflective sheeting) and its daytime chromaticity limits as printed in 23 CFR 655, subpart
+# F, appendix, table 1; ASTM D6628 (colour of retroreflective pavement marking); RAL Classic "traffic" colours.
+
+
+Chromaticity = tuple[tuple[float, float], ...]
+
+_WHITE: Chromaticity = ((0.303, 0.300), (0.368, 0.366), (0.340, 0.393), (0.274, 0.329))
+_RED: Chromaticity = ((0.648, 0.351), (0.735, 0.265), (0.629, 0.281), (0.565, 0.346))
+_GREEN: Chromaticity = ((0.026, 0.399), (0.166, 0.364), (0.286, 0.446), (0.207, 0.771))
+
+
+@dataclass(frozen=True, slots=True)
+class ColourSpec:
+    """What one area of the plate must look like.
+
+    Attributes
+    ----------
+    layer : Layer
+    area : str
+        Part of the plate, in words.
+    ral : str
+        Nearest RAL Classic colour.
+    sheeting : str
+        ASTM D4956 colour, or why there is none.
+    marking : str
+        ASTM D6628 colour, or why there is none.
+    chromaticity_xy : tuple of (x, y)
+        Corners of the permitted daytime region, CIE 1931, illuminant D65, 45/0; empty where none is specified.
+    """
+
+    layer: Layer
+    area: str
+    ral: str
+    sheeting: str
+    marking: str
+    chromaticity_xy: Chromaticity = ()
+
+
+COLOURS = (
+    ColourSpec(Layer.BASE, "base and gaps", "RAL 7035 light grey", "none: matt, not retroreflective", "none"),
+    ColourSpec(Layer.CODE_LIGHT, "light units", "RAL 9016 traffic white", "D4956 white", "D6628 white", _WHITE),
+    ColourSpec(Layer.CODE_DARK, "dark units", "RAL 9017 traffic black", "none: matt, not retroreflective", "none"),
+    ColourSpec(Layer.MARK_RED, "triangle", "RAL 3020 traffic red", "D4956 red", "none: a sheeting colour", _RED),
+    ColourSpec(Layer.MARK_GREEN, "squares", "RAL 6024 traffic green", "D4956 green", "none: a sheeting colour", _GREEN),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Ink:
+    """How the files show a layer: sRGB on screens, CMYK as the alternate of the spot ink, an AutoCAD colour index."""
+
+    rgb: tuple[int, int, int]
+    cmyk: tuple[float, float, float, float]
+    aci: int
+
+    @property
+    def hex(self) -> str:
+        """sRGB as #rrggbb."""
+        return "#{:02x}{:02x}{:02x}".format(*self.rgb)
+
+
+_BASE = Ink((203, 208, 204), (0.03, 0.0, 0.02, 0.18), 9)
+INKS: dict[Layer, Ink] = {
+    Layer.BLEED: _BASE,
+    Layer.BASE: _BASE,
+    Layer.CODE_LIGHT: Ink((241, 240, 234), (0.0, 0.0, 0.02, 0.04), 254),
+    Layer.CODE_DARK: Ink((30, 30, 32), (0.1, 0.05, 0.0, 0.95), 250),
+    Layer.MARK_RED: Ink((187, 30, 16), (0.0, 0.95, 0.95, 0.15), 1),
+    Layer.MARK_GREEN: Ink((0, 125, 75), (0.95, 0.0, 0.75, 0.35), 3),
+    Layer.HEATER: Ink((214, 110, 0), (0.0, 0.55, 1.0, 0.1), 30),
+    Layer.LED: Ink((0, 130, 200), (0.9, 0.3, 0.0, 0.0), 5),
+    Layer.ENGRAVE: Ink((70, 40, 120), (0.7, 0.9, 0.0, 0.2), 6),
+    Layer.NOTE: Ink((60, 60, 60), (0.0, 0.0, 0.0, 0.8), 8),
+    Layer.CROP: Ink((0, 0, 0), (1.0, 1.0, 1.0, 1.0), 7),
+    Layer.CUT: Ink((230, 0, 126), (0.0, 1.0, 0.0, 0.0), 2),
+}
+
+
+# === Text as outlines: no file needs a font where it is opened.
+#
+# Glyph coordinates are font units, y up; a run of text is a path per character, cached both per character and per text.
+
+
+_SHRINK = 1 / 8  # 256 units to the em: 0.02 mm on a 2.4 mm capital, and files a third smaller
+CAPITAL_UNITS = 1493.0 * _SHRINK
+_CURVE_STEPS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class _Glyph:
+    """One character: `svg` relative to the current point, `pdf` from the origin, `contours` flattened."""
+
+    advance: int
+    svg: str
+    pdf: str
+    contours: tuple[FloatArray, ...]
+
+
+class _OutlinePen(BasePen):  # type: ignore[misc]
+    """Collects a glyph's outline in the three forms that writers use."""
+
+    def __init__(self, glyphs: Any) -> None:
+        super().__init__(glyphs)
+        self.svg: list[str] = []
+        self.pdf: list[str] = []
+        self.contours: list[list[tuple[float, float]]] = []
+        self._at = (0, 0)
+
+    def _relative(self, *points: tuple[float, float]) -> str:
+        x, y = self._at
+        text = " ".join(f"{round(px) - x} {round(py) - y}" for px, py in points)
+        self._at = (round(points[-1][0]), round(points[-1][1]))
+        return text
+
+    def _moveTo(self, pt: tuple[float, float]) -> None:
+        self.pdf.append(f"{pt[0]:.0f} {pt[1]:.0f} m")
+        self.svg.append(f"m{self._relative(pt)}")
+        self.contours.append([pt])
+
+    def _lineTo(self, pt: tuple[float, float]) -> None:
+        self.pdf.append(f"{pt[0]:.0f} {pt[1]:.0f} l")
+        self.svg.append(f"l{self._relative(pt)}")
+        self.contours[-1].append(pt)
+
+    def _qCurveToOne(self, pt1: tuple[float, float], pt2: tuple[float, float]) -> None:
+        start, control, end = (np.array(point) for point in (self.contours[-1][-1], pt1, pt2))
+        for t in np.arange(1, _CURVE_STEPS + 1) / _CURVE_STEPS:
+            point = (1 - t) ** 2 * start + 2 * (1 - t) * t * control + t**2 * end
+            self.contours[-1].append((float(point[0]), float(point[1])))
+        cubic = (start + 2 * (control - start) / 3, end + 2 * (control - end) / 3, end)  # PDF has no quadratic curves
+        self.pdf.append(" ".join(f"{x:.0f} {y:.0f}" for x, y in cubic) + " c")
+        self.svg.append(f"q{self._relative(pt1, pt2)}")
+
+    def _closePath(self) -> None:
+        self.pdf.append("h")
+        self.svg.append("z")
+        self._at = (round(self.contours[-1][0][0]), round(self.contours[-1][0][1]))
+
+
+@lru_cache(maxsize=1024)
+def _glyph(character: str) -> _Glyph:
+    face = load_typeface()
+    glyphs, name = face.glyphs, face.glyph_name(character, ".notdef")
+    pen = _OutlinePen(glyphs)
+    glyphs[name].draw(TransformPen(pen, (_SHRINK, 0, 0, _SHRINK, 0, 0)))
+    contours = tuple(np.array(contour) for contour in pen.contours)
+    return _Glyph(round(glyphs[name].width * _SHRINK), "".join(pen.svg), " ".join(pen.pdf), contours)
+
+
+@lru_cache(maxsize=4096)
+def run_units(text: str) -> int:
+    """Width of a text in font units."""
+    return sum(_glyph(c).advance for c in text)
+
+
+@lru_cache(maxsize=4096)
+def svg_run(text: str) -> str:
+    """SVG path data of a text in font units, y up."""
+    pen, pieces = 0, []
+    for glyph in map(_glyph, text):
+        if glyph.svg:
+            pieces.append(f"M{pen} 0{glyph.svg}")
+        pen += glyph.advance
+    return "".join(pieces)
+
+
+@lru_cache(maxsize=4096)
+def pdf_run(text: str) -> str:
+    """PDF operators that fill a text in font units, y up; moves the origin along."""
+    pen, pieces = 0, []
+    for glyph in map(_glyph, text):
+        if glyph.pdf:
+            pieces.append(f"1 0 0 1 {pen} 0 cm {glyph.pdf} f")
+            pen = 0
+        pen += glyph.advance
+    return "\n".join(pieces)
+
+
+@lru_cache(maxsize=1024)
+def _run_contours(text: str) -> tuple[FloatArray, ...]:
+    pen, contours = 0, []
+    for glyph in map(_glyph, text):
+        contours += [contour + np.array([pen, 0.0]) for contour in glyph.contours]
+        pen += glyph.advance
+    return tuple(contours)
+
+
+def scale_mm(text: Text) -> float:
+    """Millimetres per font unit."""
+    return text.height_mm / CAPITAL_UNITS
+
+
+def origin_mm(text: Text) -> tuple[float, float]:
+    """Where the first character stands, after the anchor. [mm]"""
+    share = {"start": 0.0, "middle": 0.5, "end": 1.0}[text.anchor]
+    return text.x_mm - share * run_units(text.text) * scale_mm(text), text.y_mm
+
+
+def contours_mm(text: Text) -> list[FloatArray]:
+    """Flattened outlines of a text on its sheet; holes are contours of their own. [mm]"""
+    return [contour * scale_mm(text) + np.array(origin_mm(text)) for contour in _run_contours(text.text)]
+
+
+def fitted_height_mm(text: str, height_mm: float, width_mm: float) -> float:
+    """Height at which a text is no wider than `width_mm`, at most `height_mm`. [mm]"""
+    units = run_units(text)
+    return height_mm if units == 0 else min(height_mm, width_mm * CAPITAL_UNITS / units)
+
+
+def text_width_mm(text: str, height_mm: float) -> float:
+    """Width of a text. [mm]"""
+    return run_units(text) * height_mm / CAPITAL_UNITS

@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.encoders.plate.colours import INKS
-from app.encoders.plate.drawing import FACE_LAYERS, Boxes, Drawing, FloatArray, Shape, box_points
-from app.encoders.plate.raster import Image
+from app.encoders.plate.drawing import FACE_LAYERS, INKS, Boxes, Drawing, FloatArray, Shape, box_points
+from app.encoders.plate.writers import Image
 from app.errors import ProofFailed
 from app.markers.plate import PlateCode, PlateGeometry
 from app.markers.reading import PlateOutcome, PlateReading

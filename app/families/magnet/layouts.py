@@ -4,23 +4,101 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Final
+from itertools import pairwise
+from typing import Any, ClassVar, Final, Literal
 
 import orjson
+from pyproj import Geod
+from typing_extensions import TypedDict
 
 from app.encoders.magnet import DrillingSheet, MagnetLayout, place_line, place_tag
 from app.errors import InvalidParameter, naming
-from app.families.inputs import PositionIn
-from app.families.magnet.spec import MagnetSpec, StoredLane, meaning_of
+from app.families.documents import PositionIn
+from app.families.surveys import NewMarker
 from app.geodesy import PlacedPosition, place_position
-from app.markers.checks import Check
-from app.markers.magnet import InformationTag, LineTag, Orientation, parse_tag
-from app.planning.drilling_sheet import drilling_sheet
-from app.planning.magnet_checks import Neighbour, Site
+from app.markers.magnet import InformationTag, LineStyle, LineTag, Orientation, parse_tag
+from app.markers.magnet_design import Meaning, MeaningKind
+from app.markers.reading import Check
+from app.planning.magnet_checks import Neighbour, Site, drilling_sheet
 from app.registry.marker_rows import MarkerRow
 from app.roads.lane_line import LaneLine
+
+# === What the row of a magnet marker has in its column `spec`.
+
+
+class StoredMeaning(TypedDict):
+    """The kind of a meaning and its value."""
+
+    kind: str
+    value: float | str
+
+
+class TagPlaceDocument(TypedDict):
+    """Where an information tag lies on its lane."""
+
+    chainage_m: float
+    offset_m: float
+
+
+class LinePlaceDocument(TypedDict):
+    """Which part of a line carries magnets."""
+
+    from_m: float
+    to_m: float | None
+    spacing_m: float
+
+
+class StoredLane(TypedDict):
+    """Vertices in WGS 84, and in `given` the coordinates that were sent where they were of another system."""
+
+    points_deg: list[list[float]]
+    height_m: float | None
+    given: list[list[float]] | None
+
+
+class SiteDocument(TypedDict):
+    """What the checks know of the road and its traffic."""
+
+    design_speed_mps: float | None
+    stop_line_chainage_m: float | None
+    vehicles: list[str]
+    readable_clearance_m: float
+    reaction_s: float
+    deceleration_mps2: float
+
+
+class StoredNeighbour(TypedDict):
+    """The nearest magnet of another marker with an orientation."""
+
+    name: str
+    lon_deg: float
+    lat_deg: float
+    phi_deg: int
+
+
+class MagnetSpec(TypedDict):
+    """What the layout of a magnet marker follows from."""
+
+    kind: Literal["information-tag", "line-tag"]
+    tag: str
+    codebook_id: str | None
+    meaning: StoredMeaning | None
+    lane: StoredLane
+    place: TagPlaceDocument | LinePlaceDocument
+    site: SiteDocument
+    neighbours: list[StoredNeighbour]
+
+
+def meaning_of(spec: MagnetSpec) -> Meaning | None:
+    """What the tag means, if it is in a codebook."""
+    stored = spec["meaning"]
+    return None if stored is None else Meaning(MeaningKind(stored["kind"]), stored["value"])
+
+
+# === A magnet marker's layout.
+
 
 INFORMATION_TAG: Final = "information-tag"
 LINE_TAG: Final = "line-tag"
@@ -228,3 +306,54 @@ def resurveyed(row: MarkerRow, lon_deg: float, lat_deg: float) -> MagnetSpec:
         spec = {**spec, "place": {"chainage_m": place.chainage_m, "offset_m": place.offset_m}}
         layout = layout_of(row.id, spec)
     return spec
+
+
+# === Magnets that are to be registered, as their use case knows them.
+
+
+MAX_TAG_MAGNETS = 7  # source: `TagDesign`, seven magnets
+_GEOD = Geod(ellps="WGS84")
+
+
+@dataclass(frozen=True, slots=True)
+class TagInput:
+    """An information tag to place, named by its text or by its meaning in a codebook."""
+
+    place: PlacedTag
+    code: str | None = None
+    codebook_id: str | None = None
+    meaning: tuple[str, float | str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LineInput:
+    """A line of line tags to place."""
+
+    place: PlacedLine
+    style: LineStyle
+
+
+@dataclass(frozen=True, slots=True)
+class NewMagnets(NewMarker):
+    """A tag or a line of magnets to register."""
+
+    family: ClassVar[str] = "magnet"
+    lane: LaneInput
+    what: TagInput | LineInput
+    site: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def part_count(self) -> int:
+        """Magnets of a line, from its length; up to those that one marker may have."""
+        if isinstance(self.what, TagInput):
+            return MAX_TAG_MAGNETS
+        first, second = zip(*self.lane.coordinates, strict=True)
+        length_m = _GEOD.line_length(first, second) if not self.lane.projected else _plane_length(first, second)
+        place = self.what.place
+        to_m = length_m if place.to_m is None else min(place.to_m, length_m)
+        count = (to_m - place.from_m) / place.spacing_m if place.spacing_m > 0 else math.inf
+        return 1 + math.ceil(min(max(count, 0.0), MAX_MAGNETS))
+
+
+def _plane_length(east: tuple[float, ...], north: tuple[float, ...]) -> float:
+    return sum(math.dist(one, other) for one, other in pairwise(zip(east, north, strict=True)))

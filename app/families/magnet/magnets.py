@@ -2,37 +2,280 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from datetime import datetime
+from typing import Any, cast
 
+import numpy as np
+import scipy
 import sqlalchemy as sa
 
-from app.encoders.magnet import write_sheet
-from app.errors import CodeMismatch, InvalidParameter, naming
-from app.families.family import Family, Registration
-from app.families.files import MarkerSheet
-from app.families.magnet.columns import magnet_columns
-from app.families.magnet.documents import MagnetDetailDocument, MagnetDocument, magnet_detail, magnet_document
-from app.families.magnet.inputs import MAGNET_EXAMPLES, MagnetIn
+from app.encoders.magnet import MagnetLayout, write_sheet
+from app.errors import CodeMismatch, Conflict, InvalidParameter, naming
+from app.families.documents import PositionIn, position_columns
+from app.families.family import Family, MarkerSheet, Registration, SnapshotRecord
+from app.families.magnet.documents import (
+    MAGNET_EXAMPLES,
+    MagnetDetailDocument,
+    MagnetDocument,
+    MagnetIn,
+    magnet_detail,
+    magnet_document,
+)
 from app.families.magnet.layouts import (
+    INFORMATION_TAG,
+    LINE_TAG,
+    MAX_MAGNETS,
+    LaneInput,
+    LineInput,
+    LinePlaceDocument,
+    MagnetSpec,
+    NewMagnets,
+    PlacedLine,
+    PlacedTag,
+    SiteDocument,
+    TagInput,
+    TagPlaceDocument,
+    check_never_broken,
+    lane_spec,
     layout_of,
+    place_lane,
     resurveyed,
     sheet_of,
+    worst_grade,
 )
-from app.families.magnet.map_markers import magnets_of_map
-from app.families.magnet.neighbours import find_neighbours
-from app.families.magnet.planned import PlannedMagnets
-from app.families.magnet.registration import LineInput, NewMagnets, TagInput
-from app.families.magnet.snapshot import MagnetSnapshot
-from app.families.magnet.spec import MagnetSpec
-from app.families.rules import is_placed_anew
-from app.markers.magnet import InformationTag, LineTag, Tag, parse_tag
-from app.markers.magnet_codebook import Meaning
+from app.families.surveys import PLAN_METHOD, Commitment, MarkerRules, PlannedMarkers, PlannedRow, is_placed_anew
+from app.markers.magnet import MIN_GAP_M, InformationTag, LineStyle, LineTag, Orientation, Tag, parse_tag
+from app.markers.magnet_design import Meaning
+from app.planning.magnet_checks import HALF_BAR_M, Neighbour, Site
+from app.planning.magnet_stretches import even_stretches, lane_around, spacing_of
 from app.planning.outputs.hd_map import MapMarker
-from app.registry.codebooks import CODEBOOKS, book_of
-from app.registry.magnet_lines import MagnetLines
-from app.registry.magnets import replace_magnets
+from app.planning.plan import PlannedLineMagnet, PlannedMarker, PlannedTag
+from app.registry.column_types import new_id
+from app.registry.lines import MagnetLines
 from app.registry.marker_rows import MarkerRow
+from app.registry.markers import CODEBOOKS, MagnetRow, book_of, list_magnets_in, replace_magnets
+from app.registry.spatial import Box, box_around
+from app.registry.tables import markers
+from app.roads.lane_line import LaneLine, bearing_deg
+
+# === Magnets of other markers near a layout: too near is a conflict, near is a check's warning.
+
+
+NEAR_M = HALF_BAR_M + MIN_GAP_M
+"""Beyond it no check of a layout asks. [m]"""
+_TOLERANCE_M = 0.0005
+_HOLES_IN_A_BOX = 20
+_STRANGER = "a marker of another agency"
+
+
+def find_neighbours(
+    connection: sa.Connection, agency_id: str, layout: MagnetLayout, *, ignoring: str
+) -> tuple[Neighbour, ...]:
+    """The nearest magnet near by of each orientation; names of other agencies' markers are kept back.
+
+    Raises
+    ------
+    Conflict
+        It is so near that the fields of both would be read as one.
+    """
+    rows = _list_near(connection, layout, ignoring)
+    if not rows:
+        return ()
+    holes = scipy.spatial.cKDTree([hole.point_enu_m[:2] for hole in layout.holes])
+    points = [layout.lane.from_position(row.lon_deg, row.lat_deg)[:2] for row in rows]
+    distances_m = np.asarray(holes.query(np.array(points))[0], dtype=np.float64)
+    nearest: dict[int, tuple[float, MagnetRow]] = {}
+    for distance_m, row in zip(distances_m.tolist(), rows, strict=True):
+        if distance_m < nearest.get(row.phi_deg, (NEAR_M, row))[0]:
+            nearest[row.phi_deg] = (distance_m, row)
+    for distance_m, row in nearest.values():
+        if distance_m < MIN_GAP_M - _TOLERANCE_M:
+            raise Conflict(
+                f"a magnet would lie {distance_m:.3f} m from one of {_name(row, agency_id)}",
+                field="lane",
+                limit=f"{MIN_GAP_M:g} m between magnets: METRO figure 17a",
+                cure="choose another chainage or offset, or retire the other marker",
+            )
+    return tuple(
+        Neighbour(_name(row, agency_id), row.lon_deg, row.lat_deg, Orientation(row.phi_deg))
+        for _, (_, row) in sorted(nearest.items())
+    )
+
+
+def _name(row: MagnetRow, agency_id: str) -> str:
+    return f"marker {row.marker_id}" if row.agency_id == agency_id else _STRANGER
+
+
+def _list_near(connection: sa.Connection, layout: MagnetLayout, ignoring: str) -> list[MagnetRow]:
+    """Magnets in boxes around a few holes each: one box around a long line would hold a town."""
+    found: dict[int, MagnetRow] = {}
+    for start in range(0, len(layout.holes), _HOLES_IN_A_BOX):
+        holes = layout.holes[start : start + _HOLES_IN_A_BOX]
+        for row in list_magnets_in(
+            connection, _box(holes[0].lon_deg, [(h.lon_deg, h.lat_deg) for h in holes]), ignoring=ignoring
+        ):
+            found[row.row] = row
+    return list(found.values())
+
+
+def _box(around_deg: float, places: list[tuple[float, float]]) -> Box:
+    """Box around a few places near each other, over the antimeridian too."""
+    boxes = [box_around(lon, lat, NEAR_M) for lon, lat in places]
+    south, north = min(box.south_deg for box in boxes), max(box.north_deg for box in boxes)
+    if any(box.east_deg - box.west_deg == 360.0 for box in boxes):  # at a pole
+        return Box(-180.0, south, 180.0, north)
+
+    def turned(lon_deg: float) -> float:
+        return (lon_deg - around_deg + 180.0) % 360.0 - 180.0
+
+    west = min(turned(box.west_deg) for box in boxes) + around_deg
+    east = max(turned(box.east_deg) for box in boxes) + around_deg
+    wrapped = [(lon + 180.0) % 360.0 - 180.0 for lon in (west, east)]
+    return Box(wrapped[0], south, wrapped[1], north)
+
+
+# === Magnets in HD maps: each magnet of a tag or of a line is one point.
+
+
+def magnets_of_map(row: MarkerRow) -> list[MapMarker]:
+    """The magnets of a marker; the height that was surveyed is that of the first one, and holds for a tag only."""
+    layout = layout_of(row.id, row.spec)
+    is_line = isinstance(layout.tag, LineTag)
+    return [
+        MapMarker(
+            f"{row.id}.{hole.number}", row.family, row.digits, hole.lon_deg, hole.lat_deg,
+            None if is_line else row.height_m,
+            bearing_deg(layout.lane.direction_at(hole.chainage_m)) if is_line else layout.bearing_deg % 360.0,
+            "line" if is_line else "information", vertical_datum=row.vertical_datum,
+        )
+        for hole in layout.holes
+    ]  # fmt: skip
+
+
+# === Magnet markers in the snapshot of an area.
+
+
+class MagnetSnapshot(SnapshotRecord):
+    """Tag, meaning and the beginning of the lane of magnet markers."""
+
+    def columns(self) -> tuple[sa.ColumnElement[Any], ...]:
+        """Where the lane begins, and the meaning."""
+        spec = markers.c.spec
+        lane_start = spec["lane"]["points_deg"][0]
+        return (
+            lane_start[0].as_float().label("lane_lon_deg"),
+            lane_start[1].as_float().label("lane_lat_deg"),
+            spec["meaning"].label("meaning"),
+        )
+
+    def kind(self, row: MarkerRow) -> dict[str, Any]:
+        """Scheme and meaning."""
+        return {"scheme": row.scheme, "meaning": row.spec["meaning"]}
+
+
+# === Columns of a marker that is a tag or a line of magnets.
+
+
+def magnet_columns(
+    new: NewMagnets, tag: Tag, meaning: Meaning | None, rules: MarkerRules, now: datetime
+) -> dict[str, Any]:
+    """Columns of a tag or a line of magnets that breaks no limit by itself.
+
+    Raises
+    ------
+    InvalidParameter, ReferenceSystemError
+        The lane or the site cannot be, or magnets would stand too near or too far apart.
+    """
+    placed = place_lane(new.lane, rules.crs_accuracy_m)
+    with naming("site"):
+        site = asdict(Site(**new.site))
+    del site["neighbours"]
+    marker_id = new_id(now)
+    spec: MagnetSpec = {
+        "kind": LINE_TAG if isinstance(tag, LineTag) else INFORMATION_TAG,
+        "tag": tag.text,
+        "codebook_id": new.what.codebook_id if isinstance(new.what, TagInput) else None,
+        "meaning": None if meaning is None else {"kind": meaning.kind.value, "value": meaning.value},
+        "lane": lane_spec(new.lane, placed),
+        "place": cast(TagPlaceDocument | LinePlaceDocument, asdict(new.what.place)),
+        "site": cast(SiteDocument, site),
+        "neighbours": [],
+    }
+    layout, sheet = layout_of(marker_id, spec), sheet_of(marker_id, spec)
+    check_never_broken(layout, sheet.checks)
+    first = layout.holes[0]
+    columns = position_columns(new.lane.provenance, worst_grade(placed))
+    placed_at = {name: value for name, value in spec["place"].items() if value is not None}
+    return {
+        "id": marker_id,
+        "spec": spec,
+        "family": "magnet",
+        "scheme": spec["kind"],
+        "digits": tag.text,
+        **columns,
+        "lon_deg": first.lon_deg,
+        "lat_deg": first.lat_deg,
+        "heading_deg": layout.bearing_deg % 360.0,
+        "original": {**columns["original"], **placed_at},
+    }
+
+
+# === Planned magnets as rows of the registry: a tag is a marker, and so is a line of magnets at even distances.
+
+
+class PlannedMagnets(PlannedMarkers):
+    """Tags and lines of magnets."""
+
+    needs_index = True
+
+    def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
+        """One row for each tag, and one for each stretch of a line."""
+        for marker in markers:
+            if isinstance(marker.detail, PlannedTag):
+                yield self._tag(commitment, marker, marker.detail)
+        for stretch in even_stretches(markers, MAX_MAGNETS):
+            yield self._line(commitment, stretch)
+
+    def _tag(self, commitment: Commitment, marker: PlannedMarker, detail: PlannedTag) -> PlannedRow:
+        lon, lat, along_m = lane_around(commitment.alignment.lane(marker.lane), marker)
+        lane_input = _lane_input(commitment, lon.tolist(), lat.tolist(), marker.height_m)
+        place = PlacedTag(along_m, marker.offset_m)
+        what = TagInput(place, code=detail.tag.text, codebook_id=commitment.codebook_id)
+        columns = magnet_columns(
+            NewMagnets(lane=lane_input, what=what), detail.tag, detail.meaning, commitment.rules, commitment.now
+        )
+        return PlannedRow(marker.number, columns | {"original": commitment.original(marker)})
+
+    def _line(self, commitment: Commitment, stretch: Sequence[PlannedMarker]) -> PlannedRow:
+        lon, lat = [marker.lon_deg for marker in stretch], [marker.lat_deg for marker in stretch]
+        lane_input = _lane_input(commitment, lon, lat, stretch[0].height_m)
+        detail = stretch[0].detail
+        assert isinstance(detail, PlannedLineMagnet)
+        line = LaneLine.from_lon_lat(list(zip(lon, lat, strict=True)), stretch[0].height_m or 0.0)
+        spacing_m = spacing_of(line)
+        style = LineStyle.SOLID if detail.tag.style is LineStyle.SOLID else LineStyle.DASHED
+        what = LineInput(PlacedLine(spacing_m=spacing_m), style)
+        columns = magnet_columns(
+            NewMagnets(lane=lane_input, what=what), detail.tag, None, commitment.rules, commitment.now
+        )
+        return PlannedRow(stretch[0].number, columns | {"original": commitment.original(stretch[0])}, len(stretch))
+
+
+def _lane_input(commitment: Commitment, lon: list[float], lat: list[float], height_m: float | None) -> LaneInput:
+    road = commitment.alignment
+    provenance = PositionIn(
+        height_m=height_m,
+        realization=road.realization,
+        epoch=road.epoch,
+        vertical_datum=road.vertical_datum if height_m is not None else None,
+        survey_method=PLAN_METHOD,
+    )
+    return LaneInput(tuple(zip(lon, lat, strict=True)), False, "points_deg", provenance)
+
+
+# === The family of magnet markers.
 
 
 class Magnets(Family[NewMagnets, dict[str, Any]]):

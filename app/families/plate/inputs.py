@@ -1,16 +1,58 @@
-"""Schemas of requests that register plates."""
+"""Plates as clients register them: schemas of requests, and the rows that they become."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.errors import naming
-from app.families.inputs import POSITION_EXAMPLE, Headed, MarkerIn, Number, PositionIn, StrictModel, Text, Whole
-from app.families.plate.registration import CodeInput, NewPlate
-from app.markers.plate import PlateGeometry, PlateScheme
-from app.markers.recommended_plate import RECOMMENDED_SCHEME, recommended_geometry
+from app.families.documents import POSITION_EXAMPLE, Headed, MarkerIn, Number, PositionIn, StrictModel, Text, Whole
+from app.families.surveys import NewMarker
+from app.markers.plate import RECOMMENDED_SCHEME, PlateCode, PlateGeometry, PlateScheme, recommended_geometry
+from app.registry.marker_rows import MarkerRow
+
+# === The row of a plate as values of the core.
+
+
+def plate_code(row: MarkerRow) -> PlateCode:
+    """Code of a plate's row."""
+    return PlateCode(row.digits, PlateScheme(row.scheme), row.n, row.check_digits or 1)
+
+
+def plate_geometry(row: MarkerRow) -> PlateGeometry:
+    """Geometry of a plate's row."""
+    return PlateGeometry(row.n, row.unit_mm, row.gap_mm, row.thickness_mm)
+
+
+# === A plate that is to be registered, as its use case knows it.
+
+
+@dataclass(frozen=True, slots=True)
+class CodeInput:
+    """The code that a plate is to have."""
+
+    scheme: PlateScheme = RECOMMENDED_SCHEME
+    digits: str | None = None
+    check_digits: int | None = None
+    registry_number: int | None = None
+    allow_mismatched_digits: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class NewPlate(NewMarker):
+    """A plate to register."""
+
+    family: ClassVar[str] = "plate"
+    position: PositionIn
+    code: CodeInput = field(default_factory=CodeInput)
+    geometry: PlateGeometry = field(default_factory=PlateGeometry)
+    heading_deg: float | None = None
+
+
+# === Schemas of requests that register plates.
+
 
 SchemeName = Literal["id", "position-robust", "position-check", "position"]
 RECOMMENDED_SCHEME_NAME: SchemeName = RECOMMENDED_SCHEME.value

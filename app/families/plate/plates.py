@@ -2,30 +2,245 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
+from typing_extensions import TypedDict
 
-from app.errors import CodeTaken
-from app.families.family import Family, Registration, map_point
-from app.families.plate.artwork import PlateArtwork
-from app.families.plate.coding import CodedPlate, coded_plate, position_code
-from app.families.plate.documents import PlateDocument, plate_document
-from app.families.plate.frames import PlateFrames
-from app.families.plate.inputs import PLATE_EXAMPLES, PlateIn
-from app.families.plate.planned import PlannedPlates
-from app.families.plate.registration import NewPlate
-from app.families.plate.rows import plate_code, plate_geometry
-from app.families.plate.snapshot import PlateSnapshot
+from app.errors import CodeMismatch, CodeTaken, InvalidParameter, naming
+from app.families.documents import MarkerDocument, marker_head, marker_place, place_input, position_columns
+from app.families.family import Family, Registration, SnapshotRecord, map_point
+from app.families.plate.frames import PlateArtwork, PlateFrames
+from app.families.plate.inputs import PLATE_EXAMPLES, CodeInput, NewPlate, PlateIn, plate_code, plate_geometry
 from app.families.plate.survey import PlateSurvey
-from app.families.positions import place_input, position_columns
-from app.families.rules import PLANNED, is_placed_anew
+from app.families.surveys import PLANNED, Commitment, PlannedMarkers, PlannedRow, is_placed_anew
 from app.geodesy import PlacedPosition
 from app.markers.plate import PlateCode, PlateScheme, plate_capacity
 from app.planning.outputs.hd_map import MapMarker
+from app.planning.plan import PlannedMarker, PlannedPlate
 from app.registry import markers as store
-from app.registry.marker_rows import MarkerRow
+from app.registry.marker_rows import CodeRow, MarkerRow
+
+# === Plates as clients see them.
+
+
+class PlateCodeDocument(TypedDict):
+    """A plate's code."""
+
+    scheme: str
+    digits: str
+    check_digits: int | None
+    registry_number: int | None
+    digits_match_position: bool | None
+
+
+class PlateGeometryDocument(TypedDict):
+    """Dimensions of a plate."""
+
+    n: int
+    unit_mm: float
+    gap_mm: float
+    thickness_mm: float
+    side_mm: float
+
+
+class PlateDocument(MarkerDocument):
+    """A plate."""
+
+    code: PlateCodeDocument
+    geometry: PlateGeometryDocument
+
+
+def plate_document(row: MarkerRow) -> PlateDocument:
+    """A plate's row as clients see it."""
+    n, unit_mm, gap_mm = row.n, row.unit_mm, row.gap_mm
+    return {
+        **marker_head(row),
+        "code": {
+            "scheme": row.scheme,
+            "digits": row.digits,
+            "check_digits": row.check_digits,
+            "registry_number": _registry_number(row.digits, n) if row.scheme == "id" else None,
+            "digits_match_position": row.digits_match_position,
+        },
+        "geometry": {
+            "n": n,
+            "unit_mm": unit_mm,
+            "gap_mm": gap_mm,
+            "thickness_mm": row.thickness_mm,
+            "side_mm": n * unit_mm + (n + 1) * gap_mm,
+        },
+        **marker_place(row),
+    }
+
+
+@lru_cache(maxsize=2**16)
+def _registry_number(digits: str, n: int) -> int:
+    return PlateCode(digits, PlateScheme.ID, n).registry_number
+
+
+# === The code requested for a plate: explicit, or derived from its position or its registry number.
+
+
+@dataclass(frozen=True, slots=True)
+class CodedPlate:
+    """A code with its relation to the position.
+
+    Attributes
+    ----------
+    code : PlateCode
+    digits_match_position : bool or None
+        None for registry numbers, and where no position is known.
+    is_explicit : bool
+        The request has the code, and it does not follow from the position.
+    """
+
+    code: PlateCode
+    digits_match_position: bool | None
+    is_explicit: bool
+
+
+def coded_plate(
+    wanted: CodeInput, n: int, place_deg: tuple[float, float] | None, allocate: Callable[[], PlateCode]
+) -> CodedPlate:
+    """The code that was asked for, or the one that follows from the position or from an allocated registry number.
+
+    Parameters
+    ----------
+    wanted : CodeInput
+    n : int
+        Units along a side.
+    place_deg : (float, float) or None
+        Longitude and latitude; None where the plate has no position yet. [deg]
+    allocate : callable
+        Allocates a registry number if the request has none.
+
+    Raises
+    ------
+    InvalidParameter, CodeMismatch
+        The code contradicts itself or the position, or it follows from a position that is not known.
+    """
+    if wanted.scheme is not PlateScheme.ID and wanted.digits is None and place_deg is None:
+        raise InvalidParameter(
+            f"the digits of the scheme {wanted.scheme} follow from the position, and there is none",
+            field="position",
+            limit="a position, or the digits",
+            cure="send the position of the plate's centre",
+        )
+    with naming("code"):
+        _check_code_request(wanted)
+        if wanted.scheme is PlateScheme.ID:
+            return _numbered(wanted, n, allocate)
+        if place_deg is None:
+            return CodedPlate(PlateCode(wanted.digits or "", wanted.scheme, n, wanted.check_digits or 1), None, True)
+        return _at_position(wanted, n, place_deg)
+
+
+def _numbered(wanted: CodeInput, n: int, allocate: Callable[[], PlateCode]) -> CodedPlate:
+    if wanted.digits is not None:
+        return CodedPlate(PlateCode(wanted.digits, PlateScheme.ID, n), None, True)
+    if wanted.registry_number is not None:
+        return CodedPlate(PlateCode.from_registry_number(wanted.registry_number, n=n), None, True)
+    return CodedPlate(allocate(), None, False)
+
+
+def _at_position(wanted: CodeInput, n: int, place_deg: tuple[float, float]) -> CodedPlate:
+    expected = position_code(*place_deg, n, wanted.scheme, wanted.check_digits)
+    if wanted.digits is None:
+        return CodedPlate(expected, True, False)
+    code = PlateCode(wanted.digits, wanted.scheme, n, wanted.check_digits or 1)
+    matches = code == expected
+    if not matches and not wanted.allow_mismatched_digits:
+        lon_deg, lat_deg = place_deg
+        raise CodeMismatch(
+            f"the digits {code.digits} do not fit the position {lon_deg:.6f}, {lat_deg:.6f}, "
+            f"whose digits are {expected.digits}",
+            field="code.digits",
+            limit=f"{expected.digits} at {lon_deg:.6f}, {lat_deg:.6f} deg",
+            cure="leave the digits out, correct the position, or set code.allow_mismatched_digits for a test plate",
+        )
+    return CodedPlate(code, matches, not matches)
+
+
+def position_code(lon_deg: float, lat_deg: float, n: int, scheme: PlateScheme, check_digits: int | None) -> PlateCode:
+    """The code of a plate at a position."""
+    return PlateCode.from_position(lon_deg, lat_deg, n=n, scheme=scheme, check_digits=check_digits or 0)
+
+
+def _check_code_request(wanted: CodeInput) -> None:
+    is_id = wanted.scheme is PlateScheme.ID
+    for name, misplaced in (
+        ("registry_number", not is_id and wanted.registry_number is not None),
+        ("check_digits", wanted.scheme is not PlateScheme.POSITION_CHECK and wanted.check_digits is not None),
+        ("allow_mismatched_digits", is_id and wanted.allow_mismatched_digits),
+    ):
+        if misplaced:
+            raise InvalidParameter(
+                f"{name} means nothing in the scheme {wanted.scheme}",
+                field=f"code.{name}",
+                limit="registry_number: id; check_digits: position-check; allow_mismatched_digits: position schemes",
+                cure=f"leave {name} out or choose the scheme it belongs to",
+            )
+    if wanted.digits is not None and wanted.registry_number is not None:
+        raise InvalidParameter(
+            "give the digits or the registry number, not both",
+            field="code.registry_number",
+            limit="one of digits, registry_number",
+            cure="leave one of the two out",
+        )
+
+
+# === Planned plates as rows of the registry.
+
+
+class PlannedPlates(PlannedMarkers):
+    """Scheme, digits and dimensions."""
+
+    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
+        """A registry number names one plate of the whole server."""
+        ids = [row for row in known if row.scheme == PlateScheme.ID]
+        return {PlateCode(row.digits, PlateScheme.ID, row.n).registry_number for row in ids}
+
+    def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
+        """One row for each plate."""
+        for marker in markers:
+            detail = marker.detail
+            assert isinstance(detail, PlannedPlate)
+            code, geometry = detail.code, detail.geometry
+            checks = code.check_digits if code.scheme is PlateScheme.POSITION_CHECK else None
+            columns = {
+                **commitment.position(marker),
+                "scheme": str(code.scheme),
+                "digits": code.digits,
+                "check_digits": checks,
+                "digits_match_position": None if code.scheme is PlateScheme.ID else True,
+                "n": geometry.n,
+                "unit_mm": geometry.unit_mm,
+                "gap_mm": geometry.gap_mm,
+                "thickness_mm": geometry.thickness_mm,
+            }
+            yield PlannedRow(marker.number, columns)
+
+
+# === Plates in the snapshot of an area.
+
+
+_KIND = ("scheme", "check_digits", "n", "unit_mm", "gap_mm", "thickness_mm")
+
+
+class PlateSnapshot(SnapshotRecord):
+    """Code scheme and dimensions of plates."""
+
+    def kind(self, row: MarkerRow) -> dict[str, Any]:
+        """Scheme and dimensions."""
+        return {name: getattr(row, name) for name in _KIND}
+
+
+# === The family of plates.
+
 
 _LETTERS = frozenset("ABCDEF")
 _MIN_LETTERS = 3

@@ -12,14 +12,21 @@ from pydantic import BaseModel, Field
 
 from app.errors import InvalidParameter, WaymarkError, naming
 from app.families.plate.inputs import RECOMMENDED_SCHEME_NAME, SCHEME_DESCRIPTION, GeometryIn, SchemeName
-from app.families.rules import RETIRED, MarkerRules
-from app.families.surveys import Flags, RowCodes, Rows, SurveyImport, listed_codes
+from app.families.surveys import RETIRED, Flags, MarkerRules, RowCodes, Rows, SurveyImport, listed_codes
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, code_cells
-from app.markers.plate_digits import id_digits, position_digits, registry_number_bits
-from app.markers.recommended_plate import RECOMMENDED_SCHEME, recommended_geometry
-from app.registry.columns import Columns
+from app.markers.plate import (
+    RECOMMENDED_SCHEME,
+    PlateCode,
+    PlateGeometry,
+    PlateScheme,
+    code_cells,
+    id_digits,
+    position_digits,
+    recommended_geometry,
+    registry_number_bits,
+)
+from app.registry.bulk_load import Columns
 from app.registry.marker_rows import CodeRow
 from app.registry.spatial import distance_m
 from app.surveys.georeference import GeoreferencedSurvey

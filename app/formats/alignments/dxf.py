@@ -17,17 +17,19 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import UnreadableUpload
-from app.formats.alignments.assemble import assemble_road
-from app.formats.alignments.chains import Link, chain_parts, turned_part
 from app.formats.alignments.features import (
     AREA_KINDS,
     EVENT_KINDS,
+    Link,
     RoadFeature,
     Shape,
     area_kind,
+    assemble_road,
+    chain_parts,
     check_counts,
     check_vertices,
     normalize_kind,
+    turned_part,
 )
 from app.formats.alignments.geometry import CHORD_ERROR_M, MAX_VERTICES, AlignmentFile
 from app.formats.surveys.declaration import FEET, METRES

@@ -5,11 +5,15 @@ Every reader returns an `AlignmentFile`. `app.planning.build_alignment` turns it
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError, ProjError
 
 Floats = npt.NDArray[np.float64]
 
@@ -20,7 +24,7 @@ CHORD_ERROR_M = 0.001
 hand, a tenth of the best survey's accuracy."""
 
 MAX_COORDINATE = 1e12
-"""Largest coordinate or height. Source: app/formats/surveys/json_reader.py, far beyond every projection."""
+"""Largest coordinate or height. Source: app/formats/surveys/read.py, far beyond every projection."""
 
 
 class BoundaryStyle(StrEnum):
@@ -98,7 +102,7 @@ class EventGeometry:
     lane : str or None
         Name of the lane; None: the nearest one.
     value : float, str or None
-        Speed limit [km/h], direction of an arrow (`app.markers.magnet_codebook.Arrow`); None for the others.
+        Speed limit [km/h], direction of an arrow (`app.markers.magnet_design.Arrow`); None for the others.
     """
 
     kind: EventKind
@@ -165,7 +169,7 @@ class AlignmentFile:
     Attributes
     ----------
     format : str
-        Name of the format, as in `app.formats.alignments.formats`.
+        Name of the format, as in `app.formats.alignments.read`.
     lanes : tuple of LaneGeometry
     crs : str or None
         As the file states it: ``EPSG:code``, WKT or a PROJ string; None if it states none that places it on Earth.
@@ -194,3 +198,110 @@ class AlignmentFile:
     start_station_m: float = 0.0
     warnings: tuple[str, ...] = ()
     earlier: EarlierTransformation | None = None
+
+
+# === Whether what a file states as its reference system places its coordinates on Earth.
+
+
+CURE = "give the origin of its local coordinates (--origin LON,LAT), or state a complete reference system"
+_MAX_TEXT = 8192
+"""Characters. Source: chosen by hand; a WKT of a compound system has 4,000."""
+_FILES = re.compile(r"\+(?P<key>geoidgrids|nadgrids|grids)\s*=\s*(?P<name>[^\s+]+)|\+init\s*=|proj\s*=\s*pipeline")
+_LAT_LON = re.compile(r"\+(?P<key>lat_0|lon_0)\s*=\s*(?P<value>[-+.\deE]+)")
+_FALSE_EASTING_M = 100_000.0
+"""A system with a false easting above this has its origin far from where it is used. [m] Source: UTM has 500 km."""
+_NEAR_ORIGIN_M = 20_000.0
+"""Coordinates this near to 0, 0 of such a system are local ones. [m] Source: chosen by hand; the strip of a UTM zone
+begins 166 km from its false origin at the equator."""
+_NULL_DEG = 0.2
+"""Nearer to 0 E, 0 N there is no road, but the origin of projections without lat_0 and lon_0. [deg] Source: by hand."""
+_AREA_MARGIN_DEG = 1.0
+"""About an area of use. [deg] Source: as for positions in `app.geodesy`."""
+
+
+def usable_crs(text: str | None, x: float, y: float) -> tuple[str | None, str | None]:
+    """The reference system of a file in metres, if it places the file on Earth.
+
+    Parameters
+    ----------
+    text : str or None
+        EPSG code, WKT or PROJ string as the file states it.
+    x, y : float
+        A place of the file in that system. [m]
+
+    Returns
+    -------
+    crs : str or None
+        ``EPSG:code`` where the registry has the system, otherwise its WKT.
+    problem : str or None
+        Why it cannot be used, with the cure; None with a `crs`.
+    """
+    if text is None:
+        return None, f"The file states no reference system (geoReference); {CURE}."
+    text = text.strip()
+    if not text:
+        return None, f"The geoReference is empty; {CURE}."
+    if len(text) > _MAX_TEXT:
+        return None, f"The geoReference has {len(text)} characters, more than {_MAX_TEXT}; {CURE}."
+    if found := _FILES.search(text):
+        part = f"+{found['key']}={found['name'][:60]}" if found["key"] else found[0]
+        return None, (
+            f"The geoReference refers to a file that is not at hand ({part}); leave this part out of geoReference "
+            f"if it concerns heights alone, or {CURE}."
+        )
+    try:
+        system = CRS.from_user_input(text)
+    except CRSError:
+        given = {match["key"]: match["value"] for match in _LAT_LON.finditer(text)}
+        if "+proj" not in text and len(given) == 2:
+            return None, (
+                "The geoReference has lat_0 and lon_0 without a projection; give them as the origin of its local "
+                f"coordinates (--origin {given['lon_0'][:20]},{given['lat_0'][:20]})."
+            )
+        return None, f"The geoReference {text[:80]!r} is not a reference system; {CURE}."
+    return _placed(system, x, y)
+
+
+def _placed(system: CRS, x: float, y: float) -> tuple[str | None, str | None]:
+    if system.is_compound and system.sub_crs_list:
+        system = system.sub_crs_list[0]
+    if system.is_bound and system.source_crs is not None:
+        system = system.source_crs
+    system = system.to_2d()
+    if not system.is_projected or system.geodetic_crs is None or system.coordinate_operation is None:
+        return None, f"The geoReference is a {system.type_name}, and the coordinates are metres on a plane; {CURE}."
+    if any(axis.unit_conversion_factor != 1.0 for axis in system.axis_info[:2]):
+        return None, f"The geoReference is not in metres, and OpenDRIVE's coordinates are; {CURE}."
+    shift = max(
+        (
+            abs(float(p.value)) * p.unit_conversion_factor
+            for p in system.coordinate_operation.params
+            if "easting" in p.name
+        ),
+        default=0.0,
+    )
+    if shift > _FALSE_EASTING_M and math.hypot(x, y) < _NEAR_ORIGIN_M:
+        return None, _lands_outside(system, x, y)
+    try:
+        lon, lat = Transformer.from_crs(system, system.geodetic_crs, always_xy=True).transform(x, y)
+    except ProjError:
+        lon = lat = math.inf
+    area = system.area_of_use
+    inside = math.isfinite(lon) and math.isfinite(lat)
+    if inside and area is not None:
+        across = (lon - area.west + _AREA_MARGIN_DEG) % 360.0
+        inside = across <= ((area.east - area.west) % 360.0 or 360.0) + 2 * _AREA_MARGIN_DEG
+        inside &= area.south - _AREA_MARGIN_DEG <= lat <= area.north + _AREA_MARGIN_DEG
+    if not inside or max(abs(lon), abs(lat)) < _NULL_DEG:
+        return None, _lands_outside(system, x, y)
+    datum = system.geodetic_crs.datum
+    known = datum is not None and not datum.name.startswith("Unknown")  # PROJ takes any datum on its ellipsoid
+    code = system.to_epsg() if known else None
+    return (f"EPSG:{code}" if code else system.to_wkt()), None
+
+
+def _lands_outside(system: CRS, x: float, y: float) -> str:
+    return (
+        f"The coordinates (near {x:.9g}, {y:.9g}) are local ones: in the stated geoReference ({system.name[:60]}) they "
+        f"lie outside its area; {CURE}."
+    )

@@ -12,9 +12,19 @@ import numpy as np
 
 from app.errors import ReferenceSystemError, UnreadableUpload
 from app.formats.alignments.curves import GAP_WARNING_M as GAP_M
-from app.formats.alignments.curves import Curve, Ints, Piece, build_curve, clothoid, report_gap, sample
+from app.formats.alignments.curves import (
+    Curve,
+    Ints,
+    Piece,
+    Profile,
+    VerticalPoint,
+    build_curve,
+    build_profile,
+    clothoid,
+    report_gap,
+    sample,
+)
 from app.formats.alignments.geometry import MAX_VERTICES, AlignmentFile, Floats, LaneGeometry, StationEquation
-from app.formats.alignments.vertical import Profile, VerticalPoint, build_profile
 from app.formats.xml_tree import attribute, finite_number, parse_xml
 from app.geodesy import reference_system
 

@@ -2,10 +2,383 @@
 
 from __future__ import annotations
 
-from app.errors import InvalidParameter, UnsupportedUpload
-from app.formats.alignments.formats import ALIGNMENT_FORMATS
-from app.formats.alignments.geometry import AlignmentFile
-from app.formats.format import Sample, detect_format, list_accepted
+import re
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+import orjson
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pyproj import Geod
+
+from app.errors import InvalidParameter, ReferenceSystemError, UnreadableUpload, UnsupportedUpload
+from app.formats.alignments.features import SPEEDS_KMH, RoadFeature, Shape, assemble_road, read_ring, read_vertices
+from app.formats.alignments.geometry import (
+    MAX_VERTICES,
+    AlignmentFile,
+    BoundaryStyle,
+    EarlierTransformation,
+    Floats,
+    LaneGeometry,
+    StationEquation,
+)
+from app.formats.format import Confidence, Format, Sample, Use, detect_format, detect_signature, list_accepted
+from app.roads.axis import Axis
+from app.roads.lane_line import CalibrationPoint, Measures, calibrate, cut_edges, parallel_line
+
+# === Roads as GeoJSON (RFC 7946): lines are lanes or their boundaries, points are events, polygons are areas to avoid.
+
+
+_CURE = "send a FeatureCollection with the lanes as lines"
+_MAX_NESTED = 10  # levels of GeometryCollections; source: chosen by hand
+
+
+def read_geojson(data: bytes) -> AlignmentFile:
+    """A road of a FeatureCollection, a Feature or a geometry.
+
+    Raises
+    ------
+    UnreadableUpload
+        It is no GeoJSON, has no line or too many vertices.
+    InvalidParameter, ReferenceSystemError
+        A feature cannot be used, or features have different CRSs; the message names the feature.
+    """
+    try:
+        document = orjson.loads(data)
+    except (orjson.JSONDecodeError, RecursionError) as error:
+        raise _unreadable(f"it is not JSON: {error}") from error
+    if not isinstance(document, dict):
+        raise _unreadable("it is no object")
+    found = document.get("features", [document])
+    if not isinstance(found, list):
+        raise _unreadable("its features are no list")
+    features: list[RoadFeature] = []
+    for number, feature in enumerate(found, 1):
+        features += _features(feature, f"feature {number}")
+    properties = document.get("properties")
+    defaults = dict(properties) if isinstance(properties, dict) and "features" in document else {}
+    if isinstance(document.get("name"), str):
+        defaults.setdefault("name", document["name"])
+    return assemble_road("geojson", features, defaults=defaults, crs=_crs(document, found, defaults), unit_m=None)
+
+
+def _features(feature: Any, where: str) -> Iterator[RoadFeature]:
+    if not isinstance(feature, dict):
+        raise _unreadable(f"{where} is no object")
+    properties = feature.get("properties")
+    names = {str(k).lower(): v for k, v in properties.items()} if isinstance(properties, dict) else {}
+    geometry = feature["geometry"] if feature.get("type") == "Feature" and "geometry" in feature else feature
+    for shape, parts in _geometries(geometry, where):
+        yield RoadFeature(where, shape, parts, names)
+
+
+def _geometries(geometry: Any, where: str, level: int = 0) -> Iterator[tuple[Shape, tuple[Any, ...]]]:
+    if geometry is None:
+        return
+    kind = geometry.get("type") if isinstance(geometry, dict) else None
+    if kind == "GeometryCollection" and isinstance(geometry.get("geometries"), list) and level < _MAX_NESTED:
+        for one in geometry["geometries"]:
+            yield from _geometries(one, where, level + 1)
+        return
+    coordinates = geometry.get("coordinates") if isinstance(geometry, dict) else None
+    if not isinstance(coordinates, list) or not isinstance(kind, str):
+        raise _unreadable(f"{where} has no geometry")
+    many = coordinates if kind.startswith("Multi") else [coordinates]
+    if not all(isinstance(part, list) for part in many):
+        raise InvalidParameter(f"{where}: the coordinates are not lists", field="file", limit="RFC 7946", cure=_CURE)
+    match kind.removeprefix("Multi"):
+        case "LineString":
+            yield Shape.LINE, tuple(read_vertices(part, where) for part in many)
+        case "Point":
+            yield Shape.POINT, tuple(read_vertices([point], where) for point in many)
+        case "Polygon":
+            yield Shape.AREA, tuple(read_ring(rings[0], where) for rings in many if rings)
+        case _:
+            raise _unreadable(f"{where} has a geometry of type {kind[:40]!r}")
+
+
+def _crs(document: dict[str, Any], features: list[Any], defaults: dict[str, Any]) -> str | None:
+    """The one CRS that the file states, as GeoJSON 2008 did and QGIS does, or as a property of the collection."""
+    stated = {name for one in (document, *features) if (name := _old_crs(one)) is not None}
+    if isinstance(defaults.get("crs"), str):
+        stated.add(defaults["crs"])
+    if len(stated) > 1:
+        raise ReferenceSystemError(
+            f"the file mixes the CRSs {', '.join(sorted(stated))[:200]}",
+            field="crs",
+            limit="one CRS for all features",
+            cure="transform all features to one CRS, best EPSG:4326",
+        )
+    return stated.pop() if stated else None
+
+
+def _old_crs(one: Any) -> str | None:
+    crs = one.get("crs") if isinstance(one, dict) else None
+    properties = crs.get("properties") if isinstance(crs, dict) else None
+    name = properties.get("name") if isinstance(properties, dict) else None
+    return name if isinstance(name, str) else None
+
+
+def _unreadable(message: str) -> UnreadableUpload:
+    return UnreadableUpload(f"the GeoJSON cannot be used: {message}", field="file", limit="RFC 7946", cure=_CURE)
+
+
+# === Roads of the registry as sources of alignments: an axis with its calibration, and the lanes that are declared for
+# it.
+#
+# The document is written by `write_registered_road`. It is read again for each plan, as files are.
+
+
+ROAD_FORMAT: Final = "waymark-road/1"
+MAX_LANES = 8
+"""Lanes of one direction. Source: chosen by hand, wider than any motorway."""
+_SAME_STATION_M = 5e-4  # [m] jumps of the station that drawings do not show; source: half a millimetre
+_GEOD = Geod(ellps="WGS84")
+
+
+Longitude = Annotated[float, Field(ge=-180.0, le=180.0)]
+Latitude = Annotated[float, Field(ge=-90.0, le=90.0)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class RoadLanes(_Part):
+    """Lanes on both sides of a road's axis, which is the line between the two directions; on a road of one direction it
+    is the middle of the carriageway.
+    """
+
+    forward: Annotated[int, Field(ge=0, le=MAX_LANES, description="Lanes in the direction of the axis.")] = 1
+    backward: Annotated[int, Field(ge=0, le=MAX_LANES, description="Lanes against it.")] = 1
+    width_m: Annotated[float, Field(ge=1.5, le=12.0, description="Of each lane. [m]")] = 3.5
+    speed_limit_kmh: Annotated[float, Field(ge=SPEEDS_KMH[0], le=SPEEDS_KMH[1])]
+    driving_side: Literal["right", "left"] = "right"
+    centre_style: Annotated[BoundaryStyle, Field(description="Paint between the directions.")] = BoundaryStyle.UNKNOWN
+    lane_style: Annotated[BoundaryStyle, Field(description="Paint between lanes one way.")] = BoundaryStyle.UNKNOWN
+    edge_style: Annotated[BoundaryStyle, Field(description="Paint at the edges.")] = BoundaryStyle.UNKNOWN
+
+
+class RoadStation(_Part):
+    """A calibration point; `chainage_m` runs along all parts, `ahead_m` is the measure after a jump. [m]"""
+
+    part: int
+    chainage_m: float
+    measure_m: float
+    ahead_m: float | None = None
+
+
+class RegisteredRoad(_Part):
+    """A road of the registry with its lanes.
+
+    Attributes
+    ----------
+    road_id, version
+        Of the registry.
+    parts : list of lines of (lon, lat)
+        In WGS 84 / ITRF. [deg]
+    exact : bool
+        Whether a transformation with a stated accuracy brought them there; otherwise they are not for localization.
+    accuracy_m : float or None
+        Of the positions' reference frame; None in documents that were written without it. [m]
+    note : str or None
+        How they were transformed before.
+    """
+
+    format: Literal["waymark-road/1"] = ROAD_FORMAT
+    road_id: str
+    version: int
+    name: str
+    exact: bool
+    note: str | None
+    accuracy_m: float | None = None
+    lanes: RoadLanes
+    calibration: list[RoadStation]
+    parts: list[list[tuple[Longitude, Latitude]]]
+
+
+def write_registered_road(road: RegisteredRoad) -> bytes:
+    """The document of a road."""
+    return road.model_dump_json().encode()
+
+
+def read_registered_road(data: bytes) -> AlignmentFile:
+    """The lanes of a document that `write_registered_road` wrote.
+
+    Raises
+    ------
+    UnreadableUpload
+        It is no such document.
+    InvalidParameter
+        It has no lanes, its axis is none that could be registered, or there are too many vertices.
+    """
+    try:
+        road = RegisteredRoad.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise UnreadableUpload(
+            f"this is no document of a registered road: {place}: {first['msg']}",
+            field="file",
+            limit=ROAD_FORMAT,
+            cure="make the alignment from the road again",
+        ) from None
+    ranges_m = Axis(road.parts).part_ranges_m
+    axes = [cut_edges(np.array(part).reshape(-1, 2)) for part in road.parts]
+    lanes = road.lanes
+    count = (lanes.forward + lanes.backward) * sum(map(len, axes))
+    if not 0 < count <= MAX_VERTICES:
+        raise InvalidParameter(
+            f"the lanes of the road have {count} vertices",
+            field="lanes",
+            limit=f"1 to {MAX_VERTICES} vertices of all lanes",
+            cure="declare lanes, or register the sections of the road as roads of their own",
+        )
+    chainages, start_m = [], 0.0
+    for axis in axes:
+        lengths = np.asarray(_GEOD.inv(axis[:-1, 0], axis[:-1, 1], axis[1:, 0], axis[1:, 1])[2])
+        chainages.append(start_m + np.concatenate([[0.0], np.cumsum(lengths)]))
+        start_m = float(chainages[-1][-1])
+    points = [CalibrationPoint(p.part, p.chainage_m, p.measure_m, p.ahead_m) for p in road.calibration]
+    measures = calibrate(ranges_m, points)
+    earlier = EarlierTransformation(road.exact, road.note, road.accuracy_m)
+    return AlignmentFile(
+        "road",
+        tuple(_lanes(road, axes, chainages)),
+        "OGC:CRS84",
+        station_equations=tuple(_equations(measures)),
+        start_station_m=float(measures.sections[0].measures_m[0]),
+        unit_m=None,
+        earlier=earlier,
+    )
+
+
+def _lanes(road: RegisteredRoad, axes: list[Floats], chainages: list[Floats]) -> Iterator[LaneGeometry]:
+    """Lanes of both directions, numbered from the axis outward."""
+    lanes = road.lanes
+    right = -1.0 if lanes.driving_side == "right" else 1.0
+    both = lanes.forward > 0 and lanes.backward > 0
+    # without the other direction the axis is the middle of the carriageway
+    shift = 0.0 if both else -max(lanes.forward, lanes.backward) / 2
+    for part, (axis, chainage) in enumerate(zip(axes, chainages, strict=True), 1):
+        where = f"part {part} " if len(axes) > 1 else ""
+        for name, count, side, step in (("forward", lanes.forward, right, 1), ("backward", lanes.backward, -right, -1)):
+            for k in range(count):
+                line = parallel_line(axis, side * (k + 0.5 + shift) * lanes.width_m)[::step]
+                inner = lanes.lane_style if k > 0 else lanes.centre_style if both else lanes.edge_style
+                outer = lanes.lane_style if k + 1 < count else lanes.edge_style
+                styles = (inner, outer) if lanes.driving_side == "right" else (outer, inner)
+                yield LaneGeometry(
+                    f"{where}{name} {k + 1}",
+                    centre=np.column_stack([line, np.full(len(line), np.nan)]),
+                    width_m=np.full(len(line), lanes.width_m),
+                    speed_limit_mps=np.full(len(line), lanes.speed_limit_kmh / 3.6),
+                    station_m=chainage[::step],
+                    left_style=styles[0],
+                    right_style=styles[1],
+                    road=road.name,
+                )
+
+
+def _equations(measures: Measures) -> Iterator[StationEquation]:
+    """Where the displayed station jumps so that it is the measure again."""
+    shown_m = float(measures.sections[0].measures_m[0]) - float(measures.sections[0].chainages_m[0])
+    for section in measures.sections:
+        for chainage, measure in zip(section.chainages_m[:-1].tolist(), section.measures_m[:-1].tolist(), strict=True):
+            back = shown_m + chainage
+            if abs(measure - back) > _SAME_STATION_M:
+                yield StationEquation(chainage, back, measure)
+                shown_m = measure - chainage
+
+
+# === Formats of roads: how each is detected and read. Libraries of rarer formats are loaded when they are needed.
+
+
+AlignmentReader = Callable[[bytes], AlignmentFile]
+
+_HEAD_BYTES = 4096  # [byte] chosen by hand
+_DXF_STARTS = (b"0\n", b"0\r", b"999\n", b"999\r")
+
+
+def _head(sample: Sample) -> bytes:
+    return sample.data[:_HEAD_BYTES].removeprefix(b"\xef\xbb\xbf").lstrip()
+
+
+def _detect_geojson(sample: Sample) -> Confidence:
+    return Confidence.CERTAIN if _head(sample).startswith(b"{") else Confidence.NONE
+
+
+def _detect_registered_road(sample: Sample) -> Confidence:
+    """By the first member, before GeoJSON."""
+    start = f'{{"format":"{ROAD_FORMAT}"'.encode()
+    return Confidence.CERTAIN if _head(sample).startswith(start) else Confidence.NONE
+
+
+def _detect_dxf(sample: Sample) -> Confidence:
+    head = _head(sample)
+    return Confidence.CERTAIN if head.startswith(_DXF_STARTS) or b"SECTION" in head[:40] else Confidence.NONE
+
+
+def _detect_xml(root: str) -> Callable[[Sample], Confidence]:
+    """Whether the first element has this name, with or without a prefix."""
+    start = re.compile(rb"<(?:\w+:)?%s[\s/>]" % root.encode())
+
+    def detect(sample: Sample) -> Confidence:
+        head = _head(sample)
+        return Confidence.CERTAIN if head.startswith(b"<") and start.search(head) else Confidence.NONE
+
+    return detect
+
+
+def _read_opendrive(data: bytes) -> AlignmentFile:
+    from app.formats.alignments.opendrive import read_opendrive
+
+    return read_opendrive(data)
+
+
+def _read_landxml(data: bytes) -> AlignmentFile:
+    from app.formats.alignments.landxml import read_landxml
+
+    return read_landxml(data)
+
+
+def _read_lanelet2(data: bytes) -> AlignmentFile:
+    from app.formats.alignments.lanelet2 import read_lanelet2
+
+    return read_lanelet2(data)
+
+
+def _read_gpkg(data: bytes) -> AlignmentFile:
+    from app.formats.alignments.vector import read_gpkg
+
+    return read_gpkg(data)
+
+
+def _read_shapefile(data: bytes) -> AlignmentFile:
+    from app.formats.alignments.vector import read_shapefile
+
+    return read_shapefile(data)
+
+
+def _read_dxf(data: bytes) -> AlignmentFile:
+    from app.formats.alignments.dxf import read_dxf
+
+    return read_dxf(data)
+
+
+ALIGNMENT_FORMATS: tuple[Format[AlignmentReader], ...] = (
+    Format("road", Use.ALIGNMENT, "registered road", _detect_registered_road, read_registered_road),
+    Format("geojson", Use.ALIGNMENT, "GeoJSON", _detect_geojson, read_geojson),
+    Format("gpkg", Use.ALIGNMENT, "GeoPackage", detect_signature(b"SQLite format 3\x00"), _read_gpkg),
+    Format("shapefile", Use.ALIGNMENT, "zipped Shapefile", detect_signature(b"PK\x03\x04"), _read_shapefile),
+    Format("opendrive", Use.ALIGNMENT, "OpenDRIVE", _detect_xml("OpenDRIVE"), _read_opendrive),
+    Format("landxml", Use.ALIGNMENT, "LandXML", _detect_xml("LandXML"), _read_landxml),
+    Format("lanelet2", Use.ALIGNMENT, "lanelet2 map", _detect_xml("osm"), _read_lanelet2),
+    Format("dxf", Use.ALIGNMENT, "DXF", _detect_dxf, _read_dxf),
+)
+
+
+# === Files with roads.
 
 
 def read_alignment(data: bytes, name: str = "", *, format: str | None = None) -> AlignmentFile:

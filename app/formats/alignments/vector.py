@@ -10,8 +10,7 @@ import numpy.typing as npt
 import shapely
 
 from app.errors import ReferenceSystemError, UnreadableUpload
-from app.formats.alignments.assemble import assemble_road
-from app.formats.alignments.features import RoadFeature, Shape, check_counts, read_ring, read_vertices
+from app.formats.alignments.features import RoadFeature, Shape, assemble_road, check_counts, read_ring, read_vertices
 from app.formats.alignments.geometry import AlignmentFile
 from app.formats.surveys.gis_reader import list_gpkg_layers, name_crs, plain_values, repack_shapefile
 from app.formats.surveys.table import MAX_COLUMNS

@@ -14,7 +14,7 @@ from enum import StrEnum
 from typing import Any, BinaryIO
 
 from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 
 FIELD = "file"
 MAX_CHUNK_BYTES = 256 * 1024**2

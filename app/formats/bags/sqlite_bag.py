@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from urllib.parse import quote
 
 from app.errors import UnsupportedUpload
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 
 _TABLES = {"topics", "messages"}
 

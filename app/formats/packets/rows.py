@@ -1,4 +1,4 @@
-"""Packets from rows with named values, as CSV and JSON have them."""
+"""Packets from rows with named values, as CSV and JSON have them, and from raw bytes of receivers."""
 
 from __future__ import annotations
 
@@ -6,17 +6,27 @@ import base64
 import binascii
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import islice
 
 from app.errors import InvalidParameter
-from app.formats.delimited import read_number
-from app.formats.log_report import LogReport
-from app.formats.log_times import LogClock
-from app.formats.text import clean_text
+from app.formats.format import Sample
+from app.formats.logs import LogClock, LogReport, has_zone
+from app.formats.text import MAX_LINE, clean_text, numbered_lines, read_number, repeated_names
 from app.geodesy import check_lon_lat
-from app.markers.cerpm import HEIGHT_M, MAX_NUMBER, MAX_SPEED_LIMIT, MESSAGE_BYTES, LaneSide, SpeedLimit, SpeedUnit
-from app.sensors.receiver import PlainClaim, ReceivedPacket
+from app.markers.cerpm import (
+    HEIGHT_M,
+    MAX_NUMBER,
+    MAX_SPEED_LIMIT,
+    MESSAGE_BYTES,
+    VERSION,
+    LaneSide,
+    SpeedLimit,
+    SpeedUnit,
+)
+from app.sensors.pose_track import PlainClaim, ReceivedPacket
 
 MAX_PAYLOAD = 255
 """Largest payload of one LoRa packet. [byte] Source: its length field has 8 bits (Semtech SX1276 datasheet)."""
@@ -238,3 +248,255 @@ def warn_untimed(report: LogReport, packets: int, untimed: int) -> None:
             "detected, and the position of the vehicle is not known; declare the clock's scale or offset if there "
             "are times"
         )
+
+
+# === What is declared of a packet log, and the limits of reading one.
+
+
+FIELD = "file"
+
+
+class PacketFormat(StrEnum):
+    """Formats of packet logs."""
+
+    CSV = "csv"
+    JSON = "json"
+    CHIRPSTACK = "chirpstack-v4"
+    THINGS_STACK = "things-stack-v3"
+    RAW = "raw-payloads"
+    HEX = "hex-lines"
+
+
+@dataclass(frozen=True, slots=True)
+class PacketDeclaration:
+    """What the uploader declares of a log; everything is optional.
+
+    Attributes
+    ----------
+    clock : LogClock
+    columns : mapping of str to str
+        Names of columns in place of the usual ones, by quantity: payload, number, lon, lat, height, rssi, snr, time,
+        side, speed_km_h, speed_mph, device, event, crs.
+    payload_text : PayloadText
+        How the payload column is written; `auto` takes what gives 24 bytes.
+
+    Raises
+    ------
+    InvalidParameter
+        A quantity is not one of these.
+    """
+
+    clock: LogClock = field(default_factory=LogClock)
+    columns: Mapping[str, str] = field(default_factory=dict)
+    payload_text: PayloadText = PayloadText.AUTO
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.columns) - set(ALIASES))
+        if unknown:
+            raise InvalidParameter(
+                f"there is no quantity {unknown[0]!r} in a packet log", field="columns", limit=", ".join(ALIASES)
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class PacketLimits:
+    """Limits of reading a log.
+
+    Attributes
+    ----------
+    file_bytes : int
+        Largest file. [byte]
+    document_bytes : int
+        Largest single JSON document; JSON lines may be longer together. [byte]
+    packets : int
+    """
+
+    file_bytes: int = 64 * 1024**2
+    document_bytes: int = 16 * 1024**2
+    packets: int = 500_000
+
+
+@dataclass(frozen=True, slots=True)
+class PacketSource:
+    """A packet log while it is read.
+
+    Attributes
+    ----------
+    sample : Sample
+        All of the file.
+    declaration : PacketDeclaration
+    limits : PacketLimits
+    report : LogReport
+        Filled while packets are read.
+    """
+
+    sample: Sample
+    declaration: PacketDeclaration
+    limits: PacketLimits
+    report: LogReport
+
+
+# === Packet logs as delimited text with a header.
+
+
+def read_csv(source: PacketSource) -> Iterator[ReceivedPacket]:
+    """Packets of the rows; a row that cannot be read is left out.
+
+    Raises
+    ------
+    InvalidParameter
+        A declared column is missing.
+    """
+    declaration, report, log = source.declaration, source.report, source.sample.log
+    missing = {q: n for q, n in declaration.columns.items() if n not in log.columns}
+    if missing:
+        raise missing_columns(source, missing)
+    for repeated in repeated_names(log.columns):
+        report.warn(f"{source.sample.name} has several columns named {repeated!r}; the first is read")
+    places = log.places(ALIASES, declaration.columns)
+    written = payload_text(log.columns[places["payload"]] if "payload" in places else "", declaration)
+    zoned = True
+    for entry, cells in enumerate(log.rows()):
+        report.entries += 1
+        try:
+            if cells is None:
+                raise BrokenEntry("malformed", log.bad_row())
+            values = {quantity: cells[place] for quantity, place in places.items()}
+            zoned = zoned and _names_zone(values.get("time", ""))
+            yield packet_from_values(entry, values, declaration.clock, written, decimal=log.dialect.decimal)
+        except BrokenEntry as broken:
+            report.leave_out(entry, broken.kind, broken.reason)
+    if not zoned and not declaration.clock.utc_offset_s:
+        report.warn("times without a zone were taken as UTC; declare the zone's offset if they are local")
+
+
+def _names_zone(text: str) -> bool:
+    return ":" not in text or has_zone(text)
+
+
+def payload_text(column: str, declaration: PacketDeclaration) -> PayloadText:
+    """How payloads are written: as declared, or else by the name of their column."""
+    if declaration.payload_text is not PayloadText.AUTO:
+        return declaration.payload_text
+    lower = column.lower()
+    if "hex" in lower:
+        return PayloadText.HEX
+    return PayloadText.BASE64 if re.search(r"b(ase)?_?64", lower) else PayloadText.AUTO
+
+
+def missing_columns(source: PacketSource, wanted: Mapping[str, str]) -> InvalidParameter:
+    """The error for declared columns that a log does not have."""
+    quantity, column = next(iter(wanted.items()))
+    shown = ", ".join(repr(clean_text(c, 40)) for c in source.sample.log.columns[:24])
+    return InvalidParameter(
+        f"{source.sample.name} has no column {column!r} for {quantity}; its columns are {shown}",
+        field=f"columns.{quantity}",
+        limit=f"one of {shown}",
+        cure="declare the names as the first line has them",
+    )
+
+
+# === Payloads without other values: bytes one after the other, or lines of hexadecimal digits.
+
+
+_LONG_HEX = re.compile(r"(?:0[xX])?([0-9a-fA-F]{20,})\Z")
+_BYTE = re.compile(r"[0-9a-fA-F]{2}\Z")
+_DATE = re.compile(r"\d{4}-\d\d-\d\d\Z")
+_CLOCK_TIME = re.compile(r"\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:?\d\d)?\Z", re.ASCII)
+_SEPARATORS = re.compile(r"[,;\s|]+")
+_MIN_BYTES = 8  # separate bytes in a row that are a payload, no date or address; chosen by hand
+
+
+def is_raw_payload(data: bytes) -> bool:
+    """Whether bytes that are no text can be payloads: whole ones, or one of this version in any length."""
+    if len(data) % MESSAGE_BYTES == 0:
+        return True
+    count = max(len(data) // MESSAGE_BYTES, 1)
+    matching = _count_version(data[: count * MESSAGE_BYTES])
+    return 2 * matching > count and (len(data) <= MAX_PAYLOAD or matching > 1)
+
+
+def version_share(data: bytes) -> float:
+    """Share of payloads whose first byte is that of this version, 0 to 1."""
+    count = -(-len(data) // MESSAGE_BYTES)
+    return _count_version(data) / count if count else 0.0
+
+
+def _count_version(data: bytes) -> int:
+    """Number of payloads whose first byte is that of this version."""
+    return sum(1 for first in data[::MESSAGE_BYTES] if first >> 4 == VERSION)
+
+
+def read_raw_payloads(data: bytes, report: LogReport) -> Iterable[ReceivedPacket]:
+    """Packets of 24 bytes each; a single one may have another length, to be refused by name later."""
+    if len(data) < 2 * MESSAGE_BYTES:
+        report.entries = 1
+        yield ReceivedPacket(0, float("nan"), data)
+        return
+    whole = len(data) // MESSAGE_BYTES
+    report.entries = whole
+    for i in range(whole):
+        yield ReceivedPacket(i, float("nan"), data[i * MESSAGE_BYTES : (i + 1) * MESSAGE_BYTES])
+    left = len(data) % MESSAGE_BYTES
+    if left:
+        report.entries += 1
+        report.leave_out(whole, "cut-short", f"the last {left} bytes are no whole payload of {MESSAGE_BYTES}")
+
+
+def looks_like_hex_lines(text: str) -> bool:
+    """Whether the first lines hold long hexadecimal numbers."""
+    lines = [line for _number, line in islice(numbered_lines(text[: 1 << 16]), 20) if not line.startswith("#")]
+    held = [line for line in lines if _hex_of(_tokens(line))]
+    return bool(held) and 2 * len(held) >= len(lines)
+
+
+def read_hex_lines(text: str, clock: LogClock, report: LogReport) -> Iterable[ReceivedPacket]:
+    """A packet a line: its bytes in hexadecimal, and beside them a time and an RSSI if there are any."""
+    for _number, line in numbered_lines(text):
+        if line.startswith("#"):
+            continue
+        entry = report.entries
+        report.entries += 1
+        try:
+            if len(line) > MAX_LINE:
+                raise BrokenEntry("long-line", f"the line has more than {MAX_LINE} characters")
+            yield _read_line(entry, line, clock)
+        except BrokenEntry as broken:
+            report.leave_out(entry, broken.kind, broken.reason)
+
+
+def _read_line(entry: int, line: str, clock: LogClock) -> ReceivedPacket:
+    tokens = _tokens(line)
+    found = _hex_of(tokens)
+    payload = read_payload(found[0], PayloadText.HEX) if found else None
+    if found is None or payload is None:
+        raise BrokenEntry("payload", "there are no bytes in hexadecimal in this line")
+    received_at_s, rssi_dbm = float("nan"), float("nan")
+    others = tokens[: found[1]] + tokens[found[2] :]
+    for i, token in enumerate(others):
+        if _DATE.match(token) and i + 1 < len(others) and _CLOCK_TIME.match(others[i + 1]):
+            received_at_s = clock.read(f"{token}T{others[i + 1]}")
+        elif re.fullmatch(r"-\d{1,3}(\.\d+)?(dBm)?", token, re.ASCII):
+            rssi_dbm = float(token.removesuffix("dBm"))
+        elif received_at_s != received_at_s and not _CLOCK_TIME.match(token):
+            received_at_s = clock.read(token)
+    return ReceivedPacket(entry, received_at_s, payload, rssi_dbm=rssi_dbm)
+
+
+def _tokens(line: str) -> list[str]:
+    return [token.strip("'\"[]") for token in _SEPARATORS.split(line[:4096]) if token]
+
+
+def _hex_of(tokens: list[str]) -> tuple[str, int, int] | None:
+    """The bytes among the words of a line, and where they begin and end."""
+    for i, token in enumerate(tokens):
+        if found := _LONG_HEX.match(token):
+            return found[1], i, i + 1
+    start = 0
+    for i in range(len(tokens) + 1):
+        if i < len(tokens) and _BYTE.match(tokens[i]):
+            continue
+        if i - start >= _MIN_BYTES:
+            return "".join(tokens[start:i]), start, i
+        start = i + 1
+    return None

@@ -15,7 +15,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from app.errors import InvalidParameter, UnreadableUpload
-from app.formats.archives import is_file
+from app.formats.format import is_file
 from app.formats.surveys.coordinates import points_of
 from app.formats.surveys.table import MAX_COLUMNS, MAX_ROWS, Faults, SourceTable, Texts
 

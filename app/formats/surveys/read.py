@@ -2,32 +2,264 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import chain, islice
+from typing import Any
 
+import numpy as np
+import orjson
 from pyproj import CRS
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload
-from app.formats.archives import ZIP_MAGIC
-from app.formats.format import Format, Sample, detect_format, list_accepted
-from app.formats.surveys.cells import read_numbers
-from app.formats.surveys.coordinates import check_second_pair, read_coordinates
+from app.formats.format import (
+    ZIP_MAGIC,
+    Confidence,
+    Format,
+    Sample,
+    Use,
+    detect_format,
+    detect_signature,
+    list_accepted,
+)
+from app.formats.surveys.coordinates import check_second_pair, crs_unit, read_coordinates, unit_factor, without_zone
+from app.formats.surveys.csv_reader import read_csv, read_gsi
 from app.formats.surveys.declaration import FEET, METRES, NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
-from app.formats.surveys.formats import SURVEY_FORMATS, SurveyReader
-from app.formats.surveys.grids import crs_unit, unit_factor, without_zone
 from app.formats.surveys.roles import CodeForm, cell_text, find_roles
 from app.formats.surveys.table import (
+    MAX_COLUMNS,
+    MAX_ROWS,
     MAX_TEXT,
     Change,
     Detected,
     Fault,
+    Faults,
     Floats,
     Severity,
     SourceTable,
     SurveyTable,
     Texts,
+    read_numbers,
     warn,
 )
+from app.formats.text import guess_encoding
 from app.geodesy import normalize_crs, reference_system
+
+# === Surveys as GeoJSON (RFC 7946).
+
+
+_CURE = "send a FeatureCollection of points"
+
+
+def read_geojson(data: bytes) -> SourceTable:
+    """Points of a FeatureCollection, with their properties as columns.
+
+    Raises
+    ------
+    UnreadableUpload
+        It is no JSON, no FeatureCollection, or has too many features or names.
+    """
+    try:
+        document = orjson.loads(data)
+    except (orjson.JSONDecodeError, RecursionError) as error:
+        raise UnreadableUpload(f"not JSON: {error}", field="file", limit="RFC 8259", cure=_CURE) from error
+    features = document.get("features") if isinstance(document, dict) else None
+    if not isinstance(features, list) or document.get("type") != "FeatureCollection":
+        raise UnreadableUpload("no FeatureCollection", field="file", limit="RFC 7946", cure=_CURE)
+    features = list(islice(chain.from_iterable(map(_single_points, features)), MAX_ROWS + 1))
+    if len(features) > MAX_ROWS:
+        raise UnreadableUpload("too many points", field="file", limit=f"{MAX_ROWS} points", cure="cut the file")
+    faults: list[Fault] = []
+    points = np.full((3, len(features)), np.nan)
+    names: dict[str, None] = {}
+    for index, feature in enumerate(features):
+        coordinates = _coordinates(feature)
+        if coordinates is None:
+            faults.append(
+                Fault(index + 1, "geometry", "no_point", "the feature is no point with finite numbers", _CURE)
+            )
+        else:
+            points[: len(coordinates), index] = coordinates
+        names.update(dict.fromkeys(_properties(feature)))
+        if len(names) > MAX_COLUMNS:
+            raise UnreadableUpload("too many names", field="file", limit=f"{MAX_COLUMNS} properties", cure=_CURE)
+    columns = tuple([_plain(_properties(feature).get(name)) for feature in features] for name in names)
+    crs = _old_crs(document)
+    return SourceTable(
+        "geojson", tuple(names), columns, (points[0], points[1], points[2]), crs=crs, faults=Faults(faults)
+    )
+
+
+def _coordinates(feature: Any) -> list[float] | None:
+    geometry = feature.get("geometry") if isinstance(feature, dict) else None
+    if not isinstance(geometry, dict) or geometry.get("type") != "Point":
+        return None
+    found = geometry.get("coordinates")
+    if not isinstance(found, list) or not 2 <= len(found) <= 3:
+        return None
+    if any(isinstance(v, bool) or not isinstance(v, int | float) or abs(v) > 1e12 for v in found):
+        return None
+    return found
+
+
+def _single_points(feature: Any) -> Iterable[Any]:
+    """One feature for each point of a multipoint, with the properties of all."""
+    geometry = feature.get("geometry") if isinstance(feature, dict) else None
+    if not isinstance(geometry, dict) or geometry.get("type") != "MultiPoint":
+        return [feature]
+    places = geometry.get("coordinates")
+    if not isinstance(places, list):
+        return [feature]
+    return ({**feature, "geometry": {"type": "Point", "coordinates": place}} for place in places)
+
+
+def _properties(feature: Any) -> dict[str, Any]:
+    found = feature.get("properties") if isinstance(feature, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _plain(value: Any) -> Any:
+    return value if value is None or isinstance(value, str | int | float) else str(value)[:200]
+
+
+def _old_crs(document: dict[str, Any]) -> str | None:
+    """The CRS of GeoJSON 2008, which QGIS and others still write."""
+    crs = document.get("crs")
+    properties = crs.get("properties") if isinstance(crs, dict) else None
+    name = properties.get("name") if isinstance(properties, dict) else None
+    return name if isinstance(name, str) else None
+
+
+# === Formats of surveys: how each is detected and read. Libraries of rarer formats are loaded when they are needed.
+
+
+SurveyReader = Callable[[bytes, ImportDeclaration], SourceTable]
+
+_HEAD_BYTES = 4096  # [byte] chosen by hand
+_DXF_STARTS = (b"0\n", b"0\r", b"999\n", b"999\r")
+_BELOW_TAB = frozenset(range(9))
+_DIRECTORY_BYTES = 1 << 17  # [byte] at the end of a ZIP, for its directory; 1000 files at 100 bytes. Chosen by hand
+_GSI = re.compile(rb"(?:\*[0-9]{2}[0-9.]{4}[+-]\S{16}|[0-9]{2}[0-9.]{4}[+-]\S{8})(?:\s|$)")  # a first word
+
+
+def _head(sample: Sample) -> bytes:
+    """The beginning of the file, in UTF-8 where it is UTF-16."""
+    head = sample.data[:_HEAD_BYTES]
+    name = guess_encoding(head)
+    if name.startswith("utf-16"):
+        head = head.decode(name, "ignore").encode()
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip()
+
+
+def _detect_root(*roots: bytes) -> Callable[[Sample], Confidence]:
+    """Detection of XML by the name of its root element."""
+
+    def detect(sample: Sample) -> Confidence:
+        head = _head(sample)
+        found = head.startswith(b"<") and any(b"<" + root in head for root in roots)
+        return Confidence.CERTAIN if found else Confidence.NONE
+
+    return detect
+
+
+def _detect_kml(sample: Sample) -> Confidence:
+    return Confidence.LIKELY if _head(sample).startswith(b"<") else Confidence.NONE
+
+
+def _detect_geojson(sample: Sample) -> Confidence:
+    return Confidence.CERTAIN if _head(sample).startswith(b"{") else Confidence.NONE
+
+
+def _detect_dxf(sample: Sample) -> Confidence:
+    head = _head(sample)
+    return Confidence.CERTAIN if head.startswith(_DXF_STARTS) or b"SECTION" in head[:40] else Confidence.NONE
+
+
+def _detect_kmz(sample: Sample) -> Confidence:
+    """A ZIP whose directory, at its end, names a KML."""
+    is_zip = sample.data.startswith(ZIP_MAGIC)
+    return Confidence.CERTAIN if is_zip and b".kml" in sample.data[-_DIRECTORY_BYTES:].lower() else Confidence.NONE
+
+
+def _detect_zip(sample: Sample) -> Confidence:
+    return Confidence.LIKELY if sample.data.startswith(ZIP_MAGIC) else Confidence.NONE
+
+
+def _detect_gsi(sample: Sample) -> Confidence:
+    return Confidence.CERTAIN if _GSI.match(_head(sample)) else Confidence.NONE
+
+
+def _detect_csv(sample: Sample) -> Confidence:
+    head = _head(sample)
+    return Confidence.POSSIBLE if head and _BELOW_TAB.isdisjoint(head) else Confidence.NONE
+
+
+def _read_kml(data: bytes, _declaration: ImportDeclaration) -> SourceTable:
+    from app.formats.surveys.xml_reader import read_kml
+
+    return read_kml(data)
+
+
+def _read_landxml(data: bytes, _declaration: ImportDeclaration) -> SourceTable:
+    from app.formats.surveys.xml_reader import read_landxml
+
+    return read_landxml(data)
+
+
+def _read_dxf(data: bytes, declaration: ImportDeclaration) -> SourceTable:
+    from app.formats.surveys.dxf_reader import read_dxf
+
+    return read_dxf(data, declaration.layer, declaration.unit)
+
+
+def _read_kmz(data: bytes, _declaration: ImportDeclaration) -> SourceTable:
+    from app.formats.surveys.xml_reader import read_kmz
+
+    return read_kmz(data)
+
+
+def _read_gpx(data: bytes, _declaration: ImportDeclaration) -> SourceTable:
+    from app.formats.surveys.xml_reader import read_gpx
+
+    return read_gpx(data)
+
+
+def _read_jobxml(data: bytes, _declaration: ImportDeclaration) -> SourceTable:
+    from app.formats.surveys.xml_reader import read_jobxml
+
+    return read_jobxml(data)
+
+
+def _read_gpkg(data: bytes, declaration: ImportDeclaration) -> SourceTable:
+    from app.formats.surveys.gis_reader import read_gpkg
+
+    return read_gpkg(data, declaration.layer)
+
+
+def _read_shapefile(data: bytes, _declaration: ImportDeclaration) -> SourceTable:
+    from app.formats.surveys.gis_reader import read_shapefile
+
+    return read_shapefile(data)
+
+
+SURVEY_FORMATS: tuple[Format[SurveyReader], ...] = (
+    Format("csv", Use.SURVEY, "csv", _detect_csv, read_csv),
+    Format("geojson", Use.SURVEY, "geojson", _detect_geojson, lambda data, _declaration: read_geojson(data)),
+    Format("gpkg", Use.SURVEY, "gpkg", detect_signature(b"SQLite format 3\x00"), _read_gpkg),
+    Format("shapefile", Use.SURVEY, "shapefile", _detect_zip, _read_shapefile),
+    Format("kml", Use.SURVEY, "kml", _detect_kml, _read_kml),
+    Format("kmz", Use.SURVEY, "kmz", _detect_kmz, _read_kmz),
+    Format("gpx", Use.SURVEY, "gpx", _detect_root(b"gpx"), _read_gpx),
+    Format("landxml", Use.SURVEY, "landxml", _detect_root(b"LandXML"), _read_landxml),
+    Format("jobxml", Use.SURVEY, "jobxml", _detect_root(b"JOBFile"), _read_jobxml),
+    Format("gsi", Use.SURVEY, "gsi", _detect_gsi, read_gsi),
+    Format("dxf", Use.SURVEY, "dxf", _detect_dxf, _read_dxf),
+)
+
+
+# === Survey files.
+
 
 _DOCUMENTS = (
     (ZIP_MAGIC, "an Excel workbook", "save the sheet as CSV UTF-8"),
@@ -38,7 +270,6 @@ _DOCUMENTS = (
     (b"LASF", "a point cloud", "export the points of the markers alone"),
 )
 """First bytes of files that are sent by mistake, their kind, and how a survey is made of it."""
-_DIRECTORY_BYTES = 1 << 17  # [byte] at the end of a ZIP in which its directory is; chosen by hand
 _FEET = ("ft-us", "ft-intl")
 _UNIT_ENDINGS = (("_usft", "ft-us"), ("_ftus", "ft-us"), ("_ft", "ft-intl or ft-us"), ("(ft)", "ft-intl or ft-us"))
 

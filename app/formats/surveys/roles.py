@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from app.errors import InvalidParameter
-from app.formats.columns import normal_name
 from app.formats.surveys.declaration import NUMBER_ROLES, TEXT_ROLES, ImportDeclaration
 from app.formats.surveys.table import Change, Detected, Fault, SourceTable, warn
-from app.markers.status import STATUSES
+from app.formats.text import normal_name
+from app.markers.reading import STATUSES
 
 _NAMES = {
     "lon_deg": ("lon", "longitude", "long", "lng", "laenge", "lange", "longitud"),

@@ -13,12 +13,17 @@ from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload
 from app.formats.bags.messages import SIGNATURES
 from app.formats.format import Confidence, Format, Sample, Use, detect_format, detect_signature, list_accepted
 from app.formats.traces.can_log import CanSeries, read_can_log
-from app.formats.traces.declaration import AngleUnit, FieldUnit, SpeedUnit, TraceDeclaration, TraceFormat, TraceLimits
-from app.formats.traces.parts import Part
-from app.formats.traces.recorder import read_raw_data, read_raw_series
-from app.formats.traces.report import TraceReport
-from app.formats.traces.series import Series
-from app.formats.traces.table import Table, read_csv, read_parquet
+from app.formats.traces.declaration import (
+    AngleUnit,
+    FieldUnit,
+    SpeedUnit,
+    TraceDeclaration,
+    TraceFormat,
+    TraceLimits,
+    TraceReport,
+)
+from app.formats.traces.parts import Part, Series
+from app.formats.traces.tables import Table, read_csv, read_parquet, read_raw_data, read_raw_series
 from app.formats.traces.wire import StreamReader
 
 Floats = npt.NDArray[np.float64]
@@ -140,7 +145,7 @@ def _read_recorder_steering(part: Part, reading: TraceReading) -> None:
 
 
 def _read_bag(part: Part, reading: TraceReading) -> None:
-    from app.formats.bags.fields import read_fields  # only here: the libraries are an extra
+    from app.formats.bags.drive import read_fields  # only here: the libraries are an extra
 
     found = read_fields(part.as_file(), reading.declaration.sensors, reading.limits.rows)
     shift_s = reading.shift_s(part)

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
-from app.formats.traces.declaration import TraceLimits
-from app.formats.traces.report import TraceGap, TraceReport
+from app.formats.traces.declaration import TraceGap, TraceLimits, TraceReport
 from app.sensors.magnetometer_bar import MAX_FIELD_UT
 
 Words = npt.NDArray[np.float32]

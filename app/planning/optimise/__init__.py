@@ -1,8 +1,7 @@
 """Rules and unit costs -> the cheapest plan of a required quality, or the best one within a budget."""
 
-from app.planning.optimise.costs import site_costs
-from app.planning.optimise.plan import ChosenSite, FamilyModel, OptimisedPlan, optimise_plan
-from app.planning.trade_off import TradeOffPoint, pareto_points
+from app.planning.optimise.plan import ChosenSite, FamilyModel, OptimisedPlan, optimise_plan, site_costs
+from app.planning.plan import TradeOffPoint, pareto_points
 
 __all__ = [
     "ChosenSite", "FamilyModel", "OptimisedPlan", "TradeOffPoint", "optimise_plan", "pareto_points", "site_costs",

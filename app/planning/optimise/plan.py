@@ -10,18 +10,68 @@ from dataclasses import dataclass
 import numpy as np
 
 from app.errors import InvalidParameter
+from app.markers.plate import PlateGeometry
 from app.planning.alignment import Alignment, Floats, Lane, format_station
-from app.planning.marking_rules import marking_rules
-from app.planning.optimise.costs import list_prices
-from app.planning.optimise.cover import cheapest_cover, least_gain, uncovered_m
-from app.planning.optimise.path import even_pairs, fewest_pairs
-from app.planning.optimise.spacing import even_places, middles, replace_every
-from app.planning.placement.avoid import AvoidedAreas
-from app.planning.placement.plates import covered_by_tags_m, place_plates
-from app.planning.placement.tags import place_tags
-from app.planning.plan import Purpose
-from app.planning.rules import PlanRules, Quality
-from app.planning.trade_off import TradeOffPoint
+from app.planning.optimise.cover import (
+    cheapest_cover,
+    even_pairs,
+    even_places,
+    fewest_pairs,
+    least_gain,
+    middles,
+    replace_every,
+    uncovered_m,
+)
+from app.planning.outputs.bill import plan_quantities
+from app.planning.placement import place_plan
+from app.planning.placement.sites import AvoidedAreas, covered_by_tags_m, place_plates, place_tags
+from app.planning.plan import PlannedMarker, PlannedPlate, PlannedTag, Purpose, TradeOffPoint
+from app.planning.predict.rates import plate_fix_error_m, plate_rates, tag_fix_error_m, tag_fix_share, tag_rates
+from app.planning.rules import PlanRules, Quality, marking_rules
+
+# === Costs of sites by the agency's unit costs.
+
+
+def site_costs(rules: PlanRules) -> dict[str, float]:
+    """Cost of one site of each family that the rules place, from the agency's unit costs: a tag with its magnets and
+    holes, a pair of CERPMs; days by the rate.
+
+    Raises
+    ------
+    InvalidParameter
+        A family has no unit cost.
+    """
+    price = list_prices(rules)
+    each = price["marker"] + (price["day"] / rules.costs.markers_per_day if rules.costs.markers_per_day else 0.0)
+    costs = {}
+    if rules.plates is not None:
+        costs["plate"] = price["plate"] + each
+    if rules.tags is not None:
+        costs["magnet"] = price["tag"] + rules.tags.magnets * (price["magnet"] + price["hole"]) + each
+    if rules.cerpm is not None:
+        sides = 2 if rules.cerpm.sides == "both" else 1
+        costs["cerpm"] = sides * (price["cerpm"] + each)
+    for family, cost in costs.items():
+        if cost <= 0:
+            raise InvalidParameter(
+                f"there is no unit cost for the family {family}",
+                field="costs.items",
+                limit="a positive cost of each family that the rules place",
+                cure=f"add a price per {'magnet or tag' if family == 'magnet' else family}, or per marker",
+            )
+    return costs
+
+
+def list_prices(rules: PlanRules) -> dict[str, float]:
+    """Sum of the agency's prices by what they are per."""
+    prices: defaultdict[str, float] = defaultdict(float)
+    for item in rules.costs.items:
+        prices[item.per] += item.price
+    return prices
+
+
+# === The cheapest spacing and mix of families that has a required quality, or the best quality within a budget.
+
 
 FixModel = Callable[[Lane, Floats], tuple[Floats, Floats]]
 """Probability that a pass fixes the position at markers at chainages of a lane, and the standard error of the fix [m];
@@ -444,3 +494,89 @@ class _Optimiser:
                 return count
             count += max(1, count // 200)
         return None
+
+
+# === The families of rules as the optimiser takes them: costs of the agency, and fixes as the checks predict them.
+
+
+_BY_NUMBER = ("magnet", "hole", "cerpm", "marker")  # units of the costs of markers whose places are not sought
+
+
+def optimise_by_prediction(alignment: Alignment, rules: PlanRules) -> OptimisedPlan:
+    """The cheapest plates and pairs of CERPMs with which the predicted fixes and path have the quality of the rules.
+
+    Tags ahead of events and plates at decision points stand in any case and count as fixes; line magnets, and CERPMs
+    where no path error is required, stand as the rules have them. All are part of the cost.
+
+    Raises
+    ------
+    InvalidParameter
+        As `optimise_plan`; or no family of the rules fixes positions or serves the path.
+    """
+    assert rules.quality is not None
+    path = rules.cerpm is not None and rules.quality.path_error_m is not None
+    if rules.plates is None and rules.tags is None and not path:
+        raise InvalidParameter(
+            "a quality is required, but no marker of the rules fixes a position",
+            field="quality",
+            limit="plates or tags for fixes; cerpm with quality.path_error_m for the path",
+            cure="add plates to the rules, or leave quality out",
+        )
+    costs = site_costs(rules if path else rules.model_copy(update={"cerpm": None}))
+    models = []
+    if rules.plates is not None:
+        models.append(FamilyModel("plate", costs["plate"], lambda lane, at: plate_fixes(rules, lane, at)))
+    if rules.tags is not None:
+        models.append(
+            FamilyModel("magnet", costs["magnet"], lambda lane, at: tag_fixes(rules, lane, at), selectable=False)
+        )
+    if path:
+        models.append(FamilyModel("cerpm", costs["cerpm"], None))
+    return optimise_plan(alignment, rules, models, other_cost=_other_cost(alignment, rules, path=path))
+
+
+def plate_fixes(rules: PlanRules, lane: Lane, at: Floats) -> tuple[Floats, Floats]:
+    """Probability of a fix by plates at chainages of a lane, for the worst camera and condition, and its error [m]."""
+    assert rules.plates is not None
+    size, terms = rules.plates, rules.predictions
+    geometry = PlateGeometry(size.n, size.unit_mm, size.gap_mm, size.thickness_mm)
+    speeds = lane.value_at(lane.design_speed_mps, at)
+    offsets = np.full(len(at), size.offset_from_centre_m)
+    rates = [
+        plate_rates(offsets, speeds, geometry, camera, condition, terms)
+        for camera in rules.cameras
+        for condition in terms.conditions
+    ]
+    error = max(plate_fix_error_m(condition, terms.survey_rmse_m) for condition in terms.conditions)
+    return (1.0 - terms.lost_share) * np.min(rates, axis=0), np.full(len(at), error)
+
+
+def tag_fixes(rules: PlanRules, lane: Lane, at: Floats) -> tuple[Floats, Floats]:
+    """Probability of a fix by tags at chainages of a lane, and its error [m]."""
+    terms = rules.predictions
+    rate = tag_fix_share() * tag_rates(lane, at, terms.clearance_m)
+    return (1.0 - terms.lost_share) * rate, np.full(len(at), tag_fix_error_m(terms.survey_rmse_m))
+
+
+def marker_fixes(rules: PlanRules, lane: Lane, markers: Sequence[PlannedMarker]) -> tuple[Floats, Floats]:
+    """Probability of a fix by each of a lane's plates and tags, and its error [m]; 0 for other markers."""
+    probability, error = np.zeros(len(markers)), np.full(len(markers), np.inf)
+    at = np.array([marker.chainage_m for marker in markers])
+    for kind, fixes in ((PlannedPlate, plate_fixes), (PlannedTag, tag_fixes)):
+        own = np.array([isinstance(marker.detail, kind) for marker in markers], dtype=bool)
+        if own.any():
+            probability[own], error[own] = fixes(rules, lane, at[own])
+    return probability, error
+
+
+def _other_cost(alignment: Alignment, rules: PlanRules, *, path: bool) -> float:
+    """Cost of the markers whose places are not sought, and of the day that whole days may take more."""
+    price, rate = list_prices(rules), rules.costs.markers_per_day
+    cost = price["day"] if rate else 0.0
+    others = {"plates": None, "decision_points": None, "tags": None, **({"cerpm": None} if path else {})}
+    left = rules.model_copy(update=others)
+    if left.lines is None and left.cerpm is None:
+        return cost
+    count = plan_quantities(place_plan(alignment, left, name="costs"))
+    cost += sum(price[unit] * (count[unit] or 0.0) for unit in _BY_NUMBER)
+    return cost + (price["day"] * (count["marker"] or 0.0) / rate if rate else 0.0)

@@ -1,25 +1,27 @@
-"""Bill of materials and cost of a plan: quantities, and the agency's unit costs; no price is assumed."""
+"""Bill of materials and cost of a plan, its schedule, report and trade-off; no price is assumed."""
 
 from __future__ import annotations
 
 import io
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from app.encoders.magnet.bill import PAINT, CostRow
-from app.encoders.magnet.sheet_csv import fixed
-from app.formats.spreadsheet import TableWriter
+from app.encoders.magnet.layout import PAINT, CostRow
+from app.encoders.magnet.sheets import fixed
+from app.formats.text import TableWriter
 from app.markers.cerpm import LaneSide
-from app.planning.costs import unit_costs
-from app.planning.plan import Plan, PlannedLineMagnet, PlannedPlate, PlannedTag
+from app.markers.reading import Verdict
+from app.planning.alignment import format_station
+from app.planning.magnet_checks import unit_costs
+from app.planning.plan import Optimum, Plan, PlanFinding, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
 from app.planning.rules import CostItem
 
 NO_UNIT_COST = "no unit cost given"
 METRO_LABEL = "published figures for comparison, not the agency's prices"
-COLUMNS = ("section", "family", "item", "quantity", "unit", "unit_cost", "cost", "currency", "pay_item", "note")
+BILL_COLUMNS = ("section", "family", "item", "quantity", "unit", "unit_cost", "cost", "currency", "pay_item", "note")
 _LINE_TAGS, _INFORMATION_TAG, _RFID, _MAGNET = (
     "line tags at 6 m",
     "information tag of 3 magnets",
@@ -224,7 +226,7 @@ def write_bill_csv(bill: PlanBill) -> bytes:
     """The bill as CSV in UTF-8: materials, the agency's unit costs, the total, and published figures."""
     stream = io.StringIO()
     writer = TableWriter(stream)
-    writer.write_row(COLUMNS)
+    writer.write_row(BILL_COLUMNS)
     for material in bill.materials:
         note = "" if material.priced else NO_UNIT_COST
         writer.write_row(["material", material.family, material.item, material.quantity, "each", "", "", "", "", note])
@@ -252,3 +254,247 @@ def _plain(value: float | None) -> str:
 
 def _range(low: float, high: float) -> str:
     return fixed(low, 2) if low == high else f"{fixed(low, 2)} to {fixed(high, 2)}"
+
+
+# === Report of a plan for people: counts, cost, findings, and what was left out, as Markdown.
+
+
+_MAX_LEFT_OUT = 200
+"""Places left out that the report lists. Source: chosen by hand; plan.json has all of them."""
+
+_ZERO = 1e-9  # what is shown as 0; source: chosen by hand, rounding of sums of metres
+_COUNTED = {"plate": "plates", "magnet": "magnets", "tag": "information tags", "cerpm": "CERPMs"}
+
+
+def counts_sentence(plan: Plan) -> str:
+    """What is installed, for people."""
+    found = plan_quantities(plan)
+    parts = [
+        f"{found[unit]:g} {name if found[unit] != 1 else name[:-1]}" for unit, name in _COUNTED.items() if found[unit]
+    ]
+    days = found["day"]
+    work = "" if days is None else f"; {days:g} working day{'s' if days != 1 else ''}"
+    return ", ".join(part for part in parts if not part.startswith("0 ")) + work
+
+
+def verdict_counts(plan: Plan) -> dict[Verdict, int]:
+    """Findings by verdict."""
+    counts = Counter(finding.verdict for finding in plan.findings)
+    return {verdict: counts.get(verdict, 0) for verdict in Verdict}
+
+
+def finding_place(plan: Plan, finding: PlanFinding) -> str:
+    """Where a finding is: lane and displayed station; empty for the whole plan."""
+    if finding.lane is None and finding.station_m is None:
+        return ""
+    station = ""
+    if finding.station_m is not None:
+        station = f" at {format_station(plan.alignment.displayed_station_m(finding.station_m))}"
+    return f"lane {finding.lane}{station}" if finding.lane is not None else station.strip()
+
+
+def finding_figures(finding: PlanFinding) -> tuple[str, str]:
+    """Figure and limit of a finding with their unit, for people."""
+    unit = f" {finding.unit}" if finding.unit else ""
+    figure = 0.0 if abs(finding.figure) < _ZERO else finding.figure
+    return f"{figure:.5g}{unit}", f"{finding.relation} {finding.limit:.5g}{unit}"
+
+
+def write_report(plan: Plan, missing_files: Mapping[str, str] | None = None) -> bytes:
+    """The report as Markdown in UTF-8.
+
+    Parameters
+    ----------
+    plan : Plan
+    missing_files : mapping of str to str, optional
+        Files that cannot be written of this plan, with the reason.
+    """
+    road = plan.alignment
+    lines = [f"# Plan {_cell(plan.name)}", ""]
+    if not road.surveyed:
+        lines += ["**PLANNED - POSITIONS NOT SURVEYED**: the road was placed by an origin.", ""]
+    length_km = road.lane_length_m / 1000
+    lines += [
+        f"Road {_cell(road.name)}: {len(road.lanes)} lanes, {length_km:.3f} km of lane, {len(road.events)} events, "
+        f"{len(road.areas)} areas to avoid. Positions: grade {road.grade}; {road.crs}.",
+        "",
+        *(f"- Warning: {_cell(warning)}" for warning in road.warnings),
+        *([""] if road.warnings else []),
+        "## Markers",
+        "",
+        "| what | quantity |",
+        "|---|---:|",
+    ]
+    lines += [f"| {name.replace('_', ' ')} | {value:g} |" for name, value in plan_quantities(plan).items() if value]
+    bill = plan_bill(plan)
+    lines += ["", "## Cost", "", bill.sentence + ".", "", "## Checks", ""]
+    if plan.findings:
+        lines += ["| check | verdict | figure | limit | where | result | source |", "|---|---|---:|---:|---|---|---|"]
+    for finding in plan.findings:
+        figure, limit = finding_figures(finding)
+        cells = (finding.name, finding.verdict.value, figure, limit, finding_place(plan, finding), finding.sentence,
+                 finding.source)  # fmt: skip
+        lines.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
+    lines += ["", "## Left out and moved", ""]
+    for left in plan.left_out[:_MAX_LEFT_OUT]:
+        what = "left out" if left.moved_m is None else f"moved by {left.moved_m:.2f} m"
+        lines.append(f"- {left.family}, lane {_cell(left.lane)}, {left.chainage_m:.1f} m: {what}: {_cell(left.reason)}")
+    if len(plan.left_out) > _MAX_LEFT_OUT:
+        lines.append(f"- and {len(plan.left_out) - _MAX_LEFT_OUT} more, in plan.json")
+    if not plan.left_out:
+        lines.append("Nothing.")
+    if missing_files:
+        lines += ["", "## Files that are left out", ""]
+        lines += [f"- {name}: {_cell(reason)}" for name, reason in missing_files.items()]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+# === Schedule of work: which stretch of which lane is built when, and what a crew carries there.
+
+
+SECTION_M = 1000.0
+"""Length of a section where no daily rate is given. [m] Source: chosen by hand, from one kilometre post to the next."""
+SCHEDULE_COLUMNS = (
+    "order", "day", "lane", "from_station", "to_station", "from_chainage_m", "to_chainage_m", "first_marker",
+    "last_marker", "markers", "plates", "line_magnets", "information_tags", "holes", "cerpms",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One stretch of a lane that is built without a break, in the direction of travel.
+
+    Attributes
+    ----------
+    order : int
+        From 1, in the order of installation.
+    day : int or None
+        Working day from 1; None without a daily rate.
+    lane : str
+    markers : tuple of PlannedMarker
+        By number.
+    """
+
+    order: int
+    day: int | None
+    lane: str
+    markers: tuple[PlannedMarker, ...]
+
+    def count(self, family: str) -> int:
+        """Markers of a family."""
+        return sum(marker.family == family for marker in self.markers)
+
+    @property
+    def line_magnets(self) -> int:
+        """Magnets of painted lines."""
+        return sum(isinstance(marker.detail, PlannedLineMagnet) for marker in self.markers)
+
+    @property
+    def tags(self) -> tuple[PlannedTag, ...]:
+        """Information tags."""
+        return tuple(marker.detail for marker in self.markers if isinstance(marker.detail, PlannedTag))
+
+    @property
+    def holes(self) -> int:
+        """Holes to drill: one a magnet."""
+        return self.line_magnets + sum(tag.tag.magnet_count for tag in self.tags)
+
+
+def plan_schedule(plan: Plan) -> tuple[Section, ...]:
+    """Sections in the order of installation: lane by lane, in the direction of travel.
+
+    Notes
+    -----
+    With `costs.markers_per_day` a day holds as many markers as the crew installs, and a section ends with the day or
+    with the lane. Without, a section is a kilometre of a lane.
+    """
+    rate = plan.rules.costs.markers_per_day
+    sections: list[Section] = []
+    done = 0
+    for markers in _by_lane(plan.markers):
+        start = 0
+        while start < len(markers):
+            if rate is None:
+                day, end = None, _end_of_kilometre(markers, start)
+            else:
+                day = math.floor(done / rate + 1e-9) + 1
+                end = start + max(math.floor(day * rate + 1e-9) - done, 1)
+            part = tuple(markers[start:end])
+            sections.append(Section(len(sections) + 1, day, part[0].lane, part))
+            start, done = start + len(part), done + len(part)
+    return tuple(sections)
+
+
+def _by_lane(markers: Sequence[PlannedMarker]) -> Iterator[list[PlannedMarker]]:
+    lanes: dict[str, list[PlannedMarker]] = {}
+    for marker in markers:
+        lanes.setdefault(marker.lane, []).append(marker)
+    yield from lanes.values()
+
+
+def _end_of_kilometre(markers: Sequence[PlannedMarker], start: int) -> int:
+    kilometre = markers[start].chainage_m // SECTION_M
+    return next(
+        (k for k in range(start, len(markers)) if markers[k].chainage_m // SECTION_M != kilometre), len(markers)
+    )
+
+
+def write_schedule_csv(plan: Plan) -> bytes:
+    """The schedule as CSV in UTF-8, one row a section; stations are displayed ones."""
+    stream = io.StringIO()
+    writer = TableWriter(stream)
+    writer.write_row(SCHEDULE_COLUMNS)
+    for section in plan_schedule(plan):
+        first, last = section.markers[0], section.markers[-1]
+        stations = [format_station(plan.alignment.displayed_station_m(m.station_m)) for m in (first, last)]
+        writer.write_row(
+            [
+                section.order, section.day or "", section.lane, *stations,
+                fixed(first.chainage_m, 2), fixed(last.chainage_m, 2), first.number, last.number,
+                len(section.markers), section.count("plate"), section.line_magnets, len(section.tags), section.holes,
+                section.count("cerpm"),
+            ]
+        )  # fmt: skip
+    return stream.getvalue().encode()
+
+
+# === The trade-off of an optimised plan as a table and a sentence.
+
+
+TRADE_OFF_COLUMNS = (
+    "fix_every_m", "path_error_m", "cost", "bound", "even_cost", "share_of_even", "currency", "markers", "required",
+)  # fmt: skip
+
+
+def write_trade_off_csv(optimum: Optimum, currency: str) -> bytes:
+    """Requirements with the cheapest cost found, its bound, and the cost of even spacing, as CSV in UTF-8."""
+    stream = io.StringIO()
+    writer = TableWriter(stream)
+    writer.write_row(TRADE_OFF_COLUMNS)
+    required = optimum.quality
+    for point in optimum.table:
+        even = point.even_cost
+        is_required = (point.fix_every_m, point.path_error_m) == (required.fix_every_m, required.path_error_m)
+        writer.write_row(
+            [
+                f"{point.fix_every_m:.10g}", "" if point.path_error_m is None else f"{point.path_error_m:.10g}",
+                f"{point.cost:.2f}", f"{point.bound:.2f}", "" if even is None else f"{even:.2f}",
+                "" if even is None else f"{point.cost / even:.3f}", currency,
+                "; ".join(f"{count} {family}" for family, count in point.counts), "yes" if is_required else "no",
+            ]
+        )  # fmt: skip
+    return stream.getvalue().encode()
+
+
+def optimum_sentence(optimum: Optimum, currency: str) -> str:
+    """The optimum for people."""
+    asked = f"a fix every {optimum.quality.fix_every_m:g} m"
+    if optimum.quality.path_error_m is not None:
+        asked += f", path error {optimum.quality.path_error_m:g} m"
+    sentence = f"cheapest plan found for {asked}: {optimum.cost:,.2f} {currency}, bound {optimum.bound:,.2f}"
+    even = optimum.table[0].even_cost if optimum.table else None
+    return sentence + ("" if even is None else f"; even spacing of equal quality: {even:,.2f}")

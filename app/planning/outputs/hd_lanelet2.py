@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy
 
 from app.formats.alignments.geometry import BoundaryStyle, EventKind
-from app.geodesy.ellipsoid import metres_per_radian
+from app.geodesy.frames import metres_per_radian
 from app.planning.alignment import Floats, Lane
 from app.planning.outputs.hd_map import (
     HdMap,

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from app.geodesy.ellipsoid import ecef_from_wgs84
+from app.geodesy.frames import ecef_from_wgs84
 from app.markers.cerpm import LaneSide
 from app.planning.alignment import Alignment, Floats, Lane, RoadEvent
 from app.planning.plan import Plan, PlannedCerpm, PlannedMarker, PlannedPlate, PlannedTag

@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import orjson
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
+from shapely import LineString, get_coordinates, simplify
 
+from app.encoders.cerpm import MAX_PROGRAMS, MarkerProgram, write_programs_csv
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import BoundaryStyle, StationEquation
-from app.markers.magnet_codebook import Codebook
-from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent
-from app.planning.plan import LeftOut, Plan, PlanFinding, PlannedMarker
+from app.markers.cerpm import HEIGHT_M, KEY_BYTES, CerpmMessage, LaneSide
+from app.markers.magnet_design import Codebook
+from app.planning.alignment import Alignment, AvoidedArea, Floats, Lane, RoadEvent, format_station
+from app.planning.plan import (
+    Detail,
+    LeftOut,
+    Optimum,
+    Plan,
+    PlanFinding,
+    PlannedCerpm,
+    PlannedLineMagnet,
+    PlannedMarker,
+    PlannedPlate,
+    PlannedTag,
+)
+from app.planning.plan_checks.families import radio_settings
 from app.planning.rules import PlanRules
-from app.planning.trade_off import Optimum
 from app.radio.settings import RadioSettings
 
 PLAN_FORMAT = "waymark-plan/1"
@@ -205,3 +221,155 @@ def read_plan(data: bytes) -> Plan:
 
 def _unreadable(message: str, field: str, limit: str) -> UnreadableUpload:
     return UnreadableUpload(message, field=field, limit=limit, cure="make the plan again with waymark plan")
+
+
+# === A plan as GeoJSON (RFC 7946): markers, lanes, events and areas to avoid, for any map.
+
+
+_DECIMALS = 9  # of degrees, 0.1 mm; source: as drilling sheets
+_LANE_TOLERANCE_M = 0.02  # [m] of a lane's line on the map; source: chosen by hand, below what a map shows
+_M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radius
+
+
+def write_plan_geojson(plan: Plan) -> bytes:
+    """A FeatureCollection in WGS 84; each feature has a property `kind`: marker, lane, event, area."""
+    road = plan.alignment
+    features = [marker_feature(plan, marker) for marker in plan.markers]
+    features += [_feature(_line(lane), {"kind": "lane", "name": lane.name, "road": lane.road}) for lane in road.lanes]
+    for event in road.events:
+        lon, lat = road.lane(event.lane).position_at(event.chainage_m)
+        properties = {"event": event.kind.value, "lane": event.lane, "value": event.value}
+        features.append(_feature(_point(float(lon[0]), float(lat[0])), {"kind": "event", **properties}))
+    for area in road.areas:
+        rings = [np.round(area.ring_deg, _DECIMALS).tolist()]
+        features.append(_feature({"type": "Polygon", "coordinates": rings}, {"kind": "area", "area": area.kind}))
+    document = {"type": "FeatureCollection", "name": plan.name, "surveyed": road.surveyed, "features": features}
+    return orjson.dumps(document)
+
+
+def marker_feature(plan: Plan, marker: PlannedMarker) -> dict[str, Any]:
+    """One marker as a GeoJSON feature."""
+    road = plan.alignment
+    height = marker.height_m if road.vertical_datum == "ellipsoid" else None  # RFC 7946, section 3.1.1
+    properties = {
+        "kind": "marker",
+        "number": marker.number,
+        "family": marker.family,
+        "code": marker.code,
+        "purpose": marker.purpose.value,
+        "lane": marker.lane,
+        "station": format_station(road.displayed_station_m(marker.station_m)),
+        "chainage_m": round(marker.chainage_m, 4),
+        "offset_m": round(marker.offset_m, 4),
+        "heading_deg": round(marker.heading_deg, 4),
+        "height_m": marker.height_m,
+        **_details(marker.detail),
+    }
+    return {**_feature(_point(marker.lon_deg, marker.lat_deg, height), properties), "id": marker.number}
+
+
+def _details(detail: Detail) -> dict[str, Any]:
+    match detail:
+        case PlannedPlate():
+            return {"scheme": detail.code.scheme.value, "side_mm": detail.geometry.side_mm}
+        case PlannedTag():
+            return {"meaning": detail.meaning.text, "magnets": detail.tag.magnet_count}
+        case PlannedLineMagnet():
+            return {"side": _side(detail.side), "line": detail.style.value}
+        case PlannedCerpm():
+            limit = detail.speed_limit
+            return {"side": _side(detail.side), "speed_limit": None if limit is None else f"{limit.value} {limit.unit}"}
+
+
+def _side(side: LaneSide) -> str:
+    return side.name.lower()
+
+
+def _feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def _point(lon_deg: float, lat_deg: float, height_m: float | None = None) -> dict[str, Any]:
+    place = [round(lon_deg, _DECIMALS), round(lat_deg, _DECIMALS)]
+    return {"type": "Point", "coordinates": place if height_m is None else [*place, round(height_m, 4)]}
+
+
+def _line(lane: Lane) -> dict[str, Any]:
+    return {"type": "LineString", "coordinates": lane_points_deg(lane)}
+
+
+def lane_points_deg(lane: Lane) -> list[list[float]]:
+    """The centre line as [lon, lat], with the points that it needs to be drawn within 2 cm."""
+    line = LineString(np.column_stack([lane.lon_deg, lane.lat_deg]))
+    points = get_coordinates(simplify(line, _LANE_TOLERANCE_M / _M_PER_DEG, preserve_topology=False))
+    return [[lon, lat] for lon, lat in np.round(points, _DECIMALS).tolist()]
+
+
+# === What the CERPMs of a plan are programmed with, without keys: those are derived on the server when markers exist.
+
+
+_NO_KEY = bytes(KEY_BYTES)  # stands for the marker's own, which is never written here
+PROGRAMS_FORMAT = "waymark-cerpm-programs/1"
+
+
+def plan_programs(plan: Plan) -> tuple[MarkerProgram, ...]:
+    """Programs of all CERPMs of a plan, with the first message of each; empty without CERPMs.
+
+    Raises
+    ------
+    InvalidParameter
+        There are more than 100,000.
+    """
+    cerpms = [marker for marker in plan.markers if isinstance(marker.detail, PlannedCerpm)]
+    if not cerpms or plan.rules.cerpm is None:
+        return ()
+    if len(cerpms) > MAX_PROGRAMS:
+        raise InvalidParameter(
+            f"the plan has {len(cerpms)} CERPMs",
+            field="plan",
+            limit=f"{MAX_PROGRAMS} in one list",
+            cure="plan the road in sections",
+        )
+    radio = plan.radio or radio_settings(plan) or RadioSettings()
+    datum = plan.alignment.vertical_datum
+    return tuple(MarkerProgram(_message(marker, datum), _NO_KEY, radio) for marker in cerpms)
+
+
+def _message(marker: PlannedMarker, vertical_datum: str | None) -> CerpmMessage:
+    """A message holds heights above the ellipsoid only."""
+    detail = marker.detail
+    assert isinstance(detail, PlannedCerpm)
+    height = marker.height_m if vertical_datum == "ellipsoid" else None
+    if height is not None and not HEIGHT_M[0] <= height <= HEIGHT_M[1]:
+        height = None
+    return CerpmMessage(
+        detail.number, marker.lon_deg, marker.lat_deg, height, detail.side, detail.speed_limit, sequence=0
+    )
+
+
+def write_plan_programs_csv(programs: Sequence[MarkerProgram]) -> bytes:
+    """The programming list as CSV in UTF-8, without keys."""
+    return write_programs_csv(programs).encode()
+
+
+def write_plan_programs_json(plan: Plan, programs: Sequence[MarkerProgram]) -> bytes:
+    """The programming list as JSON, without keys: the radio's settings once, and number and message of each marker."""
+    document: dict[str, Any] = {
+        "format": PROGRAMS_FORMAT,
+        "plan": plan.name,
+        "keys": "not included: the server derives each marker's key when the plan is committed",
+        "radio": programs[0].radio if programs else None,
+        "markers": [
+            {
+                "number": program.message.number,
+                "side": program.message.side.name.lower(),
+                "lon_deg": program.message.lon_deg,
+                "lat_deg": program.message.lat_deg,
+                "height_m": program.message.height_m,
+                "body_hex": program.body.hex(),
+                "sequence_start": program.message.sequence,
+            }
+            for program in programs
+        ],
+    }
+    return orjson.dumps(document, option=orjson.OPT_INDENT_2)

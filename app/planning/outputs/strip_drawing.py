@@ -23,9 +23,10 @@ from app.planning.outputs.drawing_sheet import (
     PALE_ORANGE,
     RED,
     Sheet,
+    draw_magnet,
     draw_north_arrow,
+    draw_symbol,
 )
-from app.planning.outputs.drawing_symbols import draw_magnet, draw_symbol
 from app.planning.outputs.strip_layout import ROW_MM, SCALES, LanePiece, Strip
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
 

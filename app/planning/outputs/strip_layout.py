@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy
 
 from app.errors import InvalidParameter
-from app.geodesy.ellipsoid import ecef_from_wgs84, metres_per_radian
+from app.geodesy.frames import ecef_from_wgs84, metres_per_radian
 from app.planning.alignment import Alignment, Floats, Lane
 from app.planning.plan import Plan
 

@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 
 from app.markers.cerpm import LaneSide
-from app.markers.checks import Verdict
 from app.markers.magnet import Polarity
+from app.markers.reading import Verdict
 from app.planning.alignment import Floats, format_station
+from app.planning.outputs.bill import counts_sentence, finding_figures, verdict_counts
 from app.planning.outputs.drawing_sheet import (
     BLACK,
     BLUE,
@@ -27,12 +28,13 @@ from app.planning.outputs.drawing_sheet import (
     Sheet,
     SheetSet,
     TitleBlock,
+    draw_cerpm,
+    draw_magnet,
     draw_north_arrow,
+    draw_plate,
     draw_scale_bar,
     draw_title_block,
 )  # fmt: skip
-from app.planning.outputs.drawing_symbols import draw_cerpm, draw_magnet, draw_plate
-from app.planning.outputs.report import counts_sentence, finding_figures, verdict_counts
 from app.planning.outputs.strip_drawing import ROW_HEIGHT_MM, StripDrawing, StripPlace
 from app.planning.outputs.strip_layout import Strip, cut_strips
 from app.planning.plan import Plan

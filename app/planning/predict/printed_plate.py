@@ -17,18 +17,29 @@ import numpy.typing as npt
 
 from app.decoders.plate.reader import decode_plates
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.reading import PlateOutcome, PlateReading
 from app.planning.plate_view import camera_of
-from app.planning.predict.models import DAY, PlateModel, fitted_models, normal_quadrature
-from app.planning.predict.rates import FAR_M, MIN_UNIT_PX, read_rate_of_model, readable_frames
-from app.planning.proof.conditions import draw_drive
-from app.planning.proof.terms import Condition
+from app.planning.predict.rates import (
+    DAY,
+    FAR_M,
+    MIN_UNIT_PX,
+    CameraView,
+    PlateModel,
+    ViewReading,
+    check_view_size,
+    fitted_models,
+    normal_quadrature,
+    read_rate_of_model,
+    readable_frames,
+)
+from app.planning.proof.plates import draw_drive, draw_plate
+from app.planning.proof.report import Condition
 from app.planning.rules import CameraRules, PredictionRules
 from app.simulation.camera import render_plate_scene
-from app.simulation.conditions import Conditions
-from app.simulation.drive import Drive, drive_over_plate
-from app.simulation.plate_face import Face
-from app.simulation.plate_scene import PlateScene, face_truth
-from app.simulation.road import road_background, road_photos
+from app.simulation.conditions import Conditions, Drive, drive_over_plate
+from app.simulation.plate_face import Face, plate_face
+from app.simulation.plate_scene import PlacedFace, PlateScene, face_truth
+from app.simulation.thermal import road_background, road_photos
 
 WHITE_REFLECTANCE = 0.75
 """[1] assumed for the plate's white, which a photo does not show. Source: `PlateLook.light`."""
@@ -264,3 +275,79 @@ def _scenes(
     for scene in drive_over_plate(drive, rng):
         plate_share = geometry.side_mm / 1000 / face.side_m
         yield plate_share * face_truth(scene, scene.faces[0]).height_px / geometry.n, scene
+
+
+# === A picture of what a camera on a vehicle sees of a plate, and what the decoder reads in it.
+
+
+_SEED = 4  # draws light, sensor and noise, the same for every view; source: chosen by hand, a plain piece of road
+
+
+def render_view(
+    code: PlateCode,
+    geometry: PlateGeometry,
+    rules: CameraRules,
+    *,
+    speed_mps: float,
+    ahead_m: float,
+    left_m: float = 0.0,
+    condition: Condition = Condition.DAY,
+) -> CameraView:
+    """Render one frame of a pass over a plate, with the blur of the exposure, and decode it.
+
+    Parameters
+    ----------
+    code : PlateCode
+        Of the geometry's size.
+    geometry : PlateGeometry
+    rules : CameraRules
+    speed_mps : float
+        [m/s]
+    ahead_m, left_m : float
+        The plate's centre from the camera, at mid-exposure. [m]
+    condition : Condition
+        Light, weather and state of the plate.
+
+    Raises
+    ------
+    InvalidParameter
+        The picture would be too large.
+    """
+    check_view_size(rules)
+    cv2.setNumThreads(1)
+    rng = np.random.default_rng(_SEED)
+    parts = frozenset({condition})
+    drawn = draw_plate(draw_drive(rules, parts, rng), parts, rng)
+    sensor = replace(drawn.sensor, jpeg_quality=92)
+    camera = camera_of(rules)
+    face = plate_face(code, geometry, drawn.look, drawn.wear, rng)
+    scene = PlateScene(
+        camera=camera, faces=(PlacedFace(face, ahead_m, left_m),), speed_m_s=speed_mps, exposure_s=drawn.exposure_s,
+        road_reflectance=drawn.road_reflectance, night_light=drawn.night_light, shadow=drawn.shadow, air=drawn.air,
+        sensor=sensor,
+    )  # fmt: skip
+    background = road_background(road_photos()[0], camera, rng, grain=_GRAIN)
+    frame = render_plate_scene(scene, background, rng)
+    truth = frame.truths[0]
+    corners = truth.corners_px if truth.partly_in_view else np.empty((0, 2))
+    reading, confidence = _read_view(frame.image, code, geometry)
+    return CameraView(
+        frame.jpeg, tuple((round(x, 1), round(y, 1)) for x, y in corners.tolist()), reading, confidence,
+        drawn.exposure_s,
+    )  # fmt: skip
+
+
+def _read_view(image: npt.NDArray[np.uint8], code: PlateCode, geometry: PlateGeometry) -> tuple[ViewReading, float]:
+    tries: tuple[tuple[ViewReading, list[PlateCode]], ...] = (
+        (ViewReading.ALONE, []),
+        (ViewReading.WITH_REGISTRY, dense_codebook(code)),
+    )
+    for kind, codebook in tries:
+        found = [one for one in decode_plates(image, codebook=codebook, geometries=(geometry,)) if _is_right(one, code)]
+        if found:
+            return kind, round(max(one.confidence for one in found), 4)
+    return ViewReading.NOT_READ, 0.0
+
+
+def _is_right(reading: PlateReading, code: PlateCode) -> bool:
+    return reading.outcome is PlateOutcome.READ and reading.code is not None and reading.code.digits == code.digits

@@ -2,18 +2,201 @@
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
 from functools import lru_cache
+from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
+from app.errors import InvalidParameter
 from app.markers.plate import PlateGeometry
 from app.planning.alignment import Floats, Lane
-from app.planning.placement.cerpms import one_of_each_pair, path_error_m
-from app.planning.plate_view import camera_of, unit_heights_px
-from app.planning.predict.models import PlateModel, fitted_models, normal_quadrature
+from app.planning.placement.place import one_of_each_pair, path_error_m
+from app.planning.plate_view import camera_of, project_road, unit_heights_px
 from app.planning.rules import CameraRules, PredictionRules
+from app.sensors.camera import Camera
+
+# === Models of read rates and path errors, and their fitted parameters of app/planning/data/predictions.json.
+
+
+DAY = "day"
+"""The condition that the others are added to."""
+PLACING_SD_M = 0.01
+"""[m] of placing a marker, each axis. Source: `PLACING_SD_M` of app/planning/proof/drives.py."""
+_NODES, _WEIGHTS = (np.asarray(part) for part in np.polynomial.hermite_e.hermegauss(15))
+_SPACING_UNIT_M, _SPEED_UNIT_MPS = 15.0, 15.0  # units of the powers; source: near the middle of the fitted drives
+
+
+def normal_quadrature() -> tuple[Floats, Floats]:
+    """Nodes and weights of a standard normal variable, each of shape (15,)."""
+    return _NODES, _WEIGHTS / _WEIGHTS.sum()
+
+
+@dataclass(frozen=True, slots=True)
+class PlateModel:
+    """Read rate of plates in frames of one pass.
+
+    Attributes
+    ----------
+    slope, unit_px : float
+        Log-odds of reading a frame rise by the slope with the logarithm of a unit's height; they are 0 at this height
+        without blur. [1, px]
+    blur_slope : float
+        By how much the logarithm of that height rises with each unit of motion blur.
+    spread : float
+        Standard deviation of the log-odds between passes: light, sensor, state of the plate.
+    sharp, blur_limit : float
+        Log-odds that a pass can be read at all, without blur, and by how much a unit of blur lowers them.
+    fix_rms_m : float
+        Error of a vehicle's position from the nearest frame, horizontal, with an exact survey. [m]
+    exposures_s : tuple of float
+        The camera exposes at least for one of these, all equally likely; empty: as its rules state. [s]
+    """
+
+    slope: float
+    unit_px: float
+    blur_slope: float
+    spread: float
+    sharp: float
+    blur_limit: float
+    fix_rms_m: float
+    exposures_s: tuple[float, ...] = ()
+
+    def pass_log_odds(self, unit_px: Floats, blur_units: npt.ArrayLike) -> Floats:
+        """Mean log-odds of reading frames, of the shape of the unit heights."""
+        shifted = math.log(self.unit_px) + self.blur_slope * np.asarray(blur_units)
+        return np.asarray(self.slope * (np.log(np.maximum(unit_px, 1e-6)) - shifted))
+
+    def readable_share(self, blur_units: npt.ArrayLike) -> Floats:
+        """Share of passes that can be read at all."""
+        return np.asarray(scipy.special.expit(self.sharp - self.blur_limit * np.asarray(blur_units)))
+
+
+@dataclass(frozen=True, slots=True)
+class MagnetModel:
+    """Read rate of a tag or of a line's magnet: log-odds linear in clearance and curvature.
+
+    Attributes
+    ----------
+    at_16_cm, per_metre, per_curvature : float
+        Log-odds at a clearance of 0.16 m, and by how much they change with clearance [1/m] and curvature [m].
+    fix_share, fix_rms_m : float
+        Share of read tags that fix the position, and its error with an exact survey, horizontal. [1, m]
+    """
+
+    at_16_cm: float
+    per_metre: float
+    per_curvature: float
+    fix_share: float = 0.0
+    fix_rms_m: float = 0.0
+
+    def read_rate(self, clearance_m: float, curvature_1pm: npt.ArrayLike) -> Floats:
+        """Of the shape of the curvatures."""
+        bend = np.abs(np.asarray(curvature_1pm, dtype=np.float64))
+        return np.asarray(
+            scipy.special.expit(self.at_16_cm + self.per_metre * (clearance_m - 0.16) + self.per_curvature * bend)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PathModel:
+    """Root mean square distance of the path from the lane's centre line, of drives with an RTK receiver.
+
+    Attributes
+    ----------
+    exact_markers_m : float
+        With markers that are exactly surveyed, 15 m apart, at 15 m/s. [m]
+    marker_gain : float
+        What markers that are off by a distance on each axis add in square, as a share of that distance, there.
+    spacing_power, speed_power : float
+        Exponents of these two.
+    exact_share : float
+        Share of the squared error of the spline through exact markers that remains.
+    end_gain_m : float
+        Length of lane at each of its ends that would double the squared error there. [m]
+    worst_share : float
+        Mean greatest distance along 500 m, over the root mean square.
+    """
+
+    exact_markers_m: float
+    marker_gain: float
+    spacing_power: float
+    speed_power: float
+    exact_share: float
+    end_gain_m: float
+    worst_share: float
+
+    def rms_of(
+        self, survey_rmse_m: float, spacing_m: Floats, speed_mps: Floats, exact_rms_m: Floats, ends_per_m: Floats
+    ) -> Floats:
+        """Of stretches, shape (K,); see `app.planning.predict.rates.Stretches`. [m]"""
+        sigma = math.hypot(survey_rmse_m / math.sqrt(2), PLACING_SD_M)
+        own = (
+            math.hypot(self.exact_markers_m, self.marker_gain * sigma)
+            * (spacing_m / _SPACING_UNIT_M) ** self.spacing_power
+            * (np.maximum(speed_mps, 1.0) / _SPEED_UNIT_MPS) ** self.speed_power
+        )  # fmt: skip
+        return np.asarray(np.sqrt(own**2 * (1.0 + self.end_gain_m * ends_per_m) + self.exact_share * exact_rms_m**2))
+
+
+@dataclass(frozen=True, slots=True)
+class Models:
+    """All models; plates by condition."""
+
+    plates: Mapping[str, PlateModel]
+    tags: MagnetModel
+    lines: MagnetModel
+    path: PathModel
+    source: str
+
+    def plate_model(self, condition: str) -> PlateModel:
+        """Of a condition, also of several joined with ``+``.
+
+        Notes
+        -----
+        Of joined conditions each adds its difference from the day: to the logarithm of the height, to the variance
+        between passes, and to the odds against reading. The proof of ``night+rain`` and others may differ more.
+        """
+        day = self.plates[DAY]
+        parts = [self.plates[part] for part in sorted({part.strip() for part in condition.split("+")} - {DAY})]
+        if len(parts) < 2:
+            return parts[0] if parts else day
+        variance = day.spread**2 + sum(part.spread**2 - day.spread**2 for part in parts)
+        return PlateModel(
+            slope=min(part.slope for part in parts),
+            unit_px=day.unit_px * math.prod(max(part.unit_px / day.unit_px, 1.0) for part in parts),
+            blur_slope=max(part.blur_slope for part in parts),
+            spread=math.sqrt(max(variance, day.spread**2)),
+            sharp=day.sharp + sum(min(part.sharp - day.sharp, 0.0) for part in parts),
+            blur_limit=max(part.blur_limit for part in parts),
+            fix_rms_m=math.sqrt(sum(part.fix_rms_m**2 for part in parts)),
+            exposures_s=next((part.exposures_s for part in parts if part.exposures_s), ()),
+        )
+
+
+@lru_cache(maxsize=1)
+def fitted_models() -> Models:
+    """The models with the parameters of app/planning/data/predictions.json."""
+    text = (resources.files("app.planning") / "data" / "predictions.json").read_text("utf-8")
+    found = json.loads(text)
+    plates = {
+        name: PlateModel(**{**values, "exposures_s": tuple(values["exposures_s"])})
+        for name, values in found["plates"].items()
+    }
+    return Models(
+        plates, MagnetModel(**found["tags"]), MagnetModel(**found["lines"]), PathModel(**found["path"]), found["source"]
+    )
+
+
+# === Read rates and path errors that are predicted for the markers of a plan.
+
 
 FAR_M = 18.0
 """[m] ahead, from where frames count. Source: `FAR_M` of app/planning/proof/plates.py."""
@@ -174,3 +357,198 @@ def path_errors_m(lane: Lane, chainages_m: Floats, rules: PredictionRules) -> tu
     speed = found.speed_mps * rules.speed_share
     rms = model.rms_of(rules.survey_rmse_m, spacing, speed, found.exact_rms_m, found.ends_per_m)
     return rms, np.maximum(rms * model.worst_share, np.sqrt(model.exact_share) * found.exact_worst_m)
+
+
+# === Pictures of what a camera sees, as values; app/planning/predict/printed_plate.py renders them.
+
+
+MAX_VIEW_PIXELS = 9_000_000
+"""Pixels of a picture at most. Source: chosen by hand: 3840 x 2160, two seconds of a processor."""
+
+
+class ViewReading(StrEnum):
+    """How the plate was read in a picture."""
+
+    ALONE = "alone"
+    WITH_REGISTRY = "with-registry"
+    NOT_READ = "not-read"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """A picture and what was read in it.
+
+    Attributes
+    ----------
+    jpeg : bytes
+    corners_px : tuple of (x, y)
+        Outer corners of the plate, clockwise from the triangle's; empty where it is not in view. [px]
+    reading : ViewReading
+        Read from the picture alone; or only by a vehicle that knows the plate and its neighbours; or not.
+    confidence : float
+        Of the reading, 0 to 1.
+    exposure_s : float
+        Of the camera; by night at least as long as the light requires. [s]
+    """
+
+    jpeg: bytes
+    corners_px: tuple[tuple[float, float], ...]
+    reading: ViewReading
+    confidence: float
+    exposure_s: float
+
+
+def check_view_size(rules: CameraRules) -> None:
+    """Refuse a camera whose pictures are too large to render.
+
+    Raises
+    ------
+    InvalidParameter
+        They are.
+    """
+    pixels = rules.width_px * rules.height_px
+    if pixels > MAX_VIEW_PIXELS:
+        raise InvalidParameter(
+            f"the picture would have {pixels / 1e6:.1f} million pixels",
+            field="camera.width_px",
+            limit=f"{MAX_VIEW_PIXELS / 1e6:g} million pixels",
+            cure="choose a smaller width and height",
+        )
+
+
+# === What a camera sees of one pass over a plate: frames, motion blur, and how often the plate is predicted to be read.
+
+
+MAX_FRAMES = 40
+"""Frames of a pass that are listed; of more, so many at equal steps. Source: chosen by hand, a page of a table."""
+_PASS_GRID_M = 0.02  # [m] between distances at which the view is computed; source: as in app/planning/predict/rates.py
+
+
+@dataclass(frozen=True, slots=True)
+class PassFrame:
+    """One frame of a pass.
+
+    Attributes
+    ----------
+    ahead_m : float
+        From the camera to the plate's centre, along the road. [m]
+    unit_px : float
+        Height of a unit's image. [px]
+    plate_width_px, plate_height_px : float
+        Extent of the plate's image. [px]
+    blur_px : float
+        How far the plate's image moves during the exposure. [px]
+    read_probability : float
+        Of reading this frame by day, in mean circumstances.
+    """
+
+    ahead_m: float
+    unit_px: float
+    plate_width_px: float
+    plate_height_px: float
+    blur_px: float
+    read_probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPass:
+    """A pass over a plate at even speed on a flat and straight road.
+
+    Attributes
+    ----------
+    step_m : float
+        That the vehicle advances from frame to frame. [m]
+    near_m, far_m : float or None
+        Nearest and farthest distance at which a unit is `MIN_UNIT_PX` high or more and the plate is whole in view;
+        None where it never is. [m]
+    readable_frames : float
+        Mean number of frames of a pass between these two.
+    best_unit_px : float
+        Greatest height of a unit's image. [px]
+    blur_m, blur_units : float
+        Distance driven during the exposure, and as a share of the pitch of the units. [m, 1]
+    frames : tuple of PassFrame
+        Those between these two, far to near.
+    listed_every : int
+        `frames` has one of so many.
+    read_rates : dict of str to float
+        Probability that a pass reads the plate, by condition.
+    """
+
+    step_m: float
+    near_m: float | None
+    far_m: float | None
+    readable_frames: float
+    best_unit_px: float
+    blur_m: float
+    blur_units: float
+    frames: tuple[PassFrame, ...]
+    listed_every: int
+    read_rates: dict[str, float]
+
+
+def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_mps: float, left_m: float = 0.0) -> CameraPass:
+    """Predict a pass.
+
+    Parameters
+    ----------
+    geometry : PlateGeometry
+    rules : CameraRules
+    speed_mps : float
+        Above 0. [m/s]
+    left_m : float
+        Plate's centre left of the camera's path. [m]
+
+    Raises
+    ------
+    InvalidParameter
+        The speed is not positive.
+
+    Notes
+    -----
+    The rates are those of plans: `app.planning.predict.rates`. A single frame's probability is that of the same model
+    without the spread between passes.
+    """
+    if not speed_mps > 0:
+        raise InvalidParameter(f"the speed is {speed_mps:g} m/s", field="speed_kmh", limit="above 0")
+    camera = camera_of(rules)
+    grid = np.arange(_PASS_GRID_M, FAR_M, _PASS_GRID_M)
+    unit_px = unit_heights_px(camera, geometry, grid, left_m)
+    in_reach = grid[unit_px >= MIN_UNIT_PX]
+    step_m = speed_mps / rules.frames_per_s
+    blur_m = speed_mps * rules.exposure_s
+    ahead = np.arange(step_m / 2, FAR_M, step_m)
+    ahead = ahead[unit_heights_px(camera, geometry, ahead, left_m) >= MIN_UNIT_PX]
+    every = max(-(-len(ahead) // MAX_FRAMES), 1)
+    models = fitted_models()
+    return CameraPass(
+        step_m=step_m,
+        near_m=float(in_reach[0]) if len(in_reach) else None,
+        far_m=float(in_reach[-1]) if len(in_reach) else None,
+        readable_frames=readable_frames(geometry, rules, speed_mps)
+        if not left_m
+        else len(in_reach) * _PASS_GRID_M / step_m,
+        best_unit_px=float(unit_px.max()),
+        blur_m=blur_m,
+        blur_units=blur_m / (geometry.pitch_mm / 1000),
+        frames=_frames(camera, geometry, ahead[::every][::-1], left_m, blur_m),
+        listed_every=every,
+        read_rates={name: plate_read_rate(geometry, rules, name, speed_mps, left_m) for name in models.plates},
+    )
+
+
+def _frames(
+    camera: Camera, geometry: PlateGeometry, ahead_m: Floats, left_m: float, blur_m: float
+) -> tuple[PassFrame, ...]:
+    half = geometry.side_mm / 2000
+    corners = [(forward, across) for forward in (-half, half) for across in (-half, half)]
+    seen = [project_road(camera, ahead_m + forward, left_m + across) for forward, across in corners]
+    u, v = np.stack([columns for columns, _ in seen]), np.stack([rows for _, rows in seen])
+    ends = [project_road(camera, ahead_m + way, left_m) for way in (-blur_m / 2, blur_m / 2)]
+    blur_px = np.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1])
+    unit_px = unit_heights_px(camera, geometry, ahead_m, left_m)
+    model = fitted_models().plate_model(DAY)
+    blur_units = blur_m / (geometry.pitch_mm / 1000)
+    share = scipy.special.expit(model.pass_log_odds(unit_px, blur_units)) * float(model.readable_share(blur_units))
+    rows = np.column_stack([ahead_m, unit_px, np.ptp(u, axis=0), np.ptp(v, axis=0), np.nan_to_num(blur_px), share])
+    return tuple(PassFrame(*row) for row in rows.tolist())

@@ -4,38 +4,150 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections import defaultdict
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import scipy
 
 from app.errors import InvalidParameter
-from app.geodesy.ellipsoid import ecef_from_wgs84
+from app.geodesy.frames import ecef_from_wgs84
 from app.markers.plate import PlateCode
+from app.planning.alignment import Floats, Lane
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
-from app.planning.plan_checks.cerpms import radio_settings
+from app.planning.plan_checks.families import radio_settings
 from app.planning.plate_view import camera_of
-from app.planning.proof.cerpms import ASIDE_M, AUDIBLE_M, LanePass, drive_cerpms, simulated_radio
-from app.planning.proof.conditions import draw_drive, draw_plate
-from app.planning.proof.magnets import LEAD_M, TAIL_M, MagnetPass, drive_line, drive_tag
-from app.planning.proof.nearby import BesideLane, LaneFrame, markers_beside
-from app.planning.proof.plates import PLACEMENT_SD_M, ROTATION_SD_DEG, PlatePass, drive_plate
-from app.planning.proof.report import ProofReport, summarize
-from app.planning.proof.results import MarkerPass, UnitResult
-from app.planning.proof.sampling import cut_stretches, sample_markers, spread
-from app.planning.proof.terms import (
+from app.planning.proof.drives import (
+    ASIDE_M,
+    AUDIBLE_M,
+    LEAD_M,
+    TAIL_M,
+    LanePass,
+    MagnetPass,
+    drive_cerpms,
+    drive_line,
+    drive_tag,
+    simulated_radio,
+)
+from app.planning.proof.plates import PLACEMENT_SD_M, ROTATION_SD_DEG, PlatePass, draw_drive, draw_plate, drive_plate
+from app.planning.proof.report import (
     Condition,
     DriveTerms,
+    MarkerPass,
+    ProofReport,
     ProofTerms,
     ProofUnit,
     UnitKind,
+    UnitResult,
     drive_terms,
     parse_conditions,
+    summarize,
 )
 from app.radio.settings import RadioSettings
 from app.simulation.conditions import Conditions
 from app.simulation.radio.link import Radio
+
+# === Markers of a plan beside a lane, whatever lane they were placed for.
+
+
+BesideLane = tuple[PlannedMarker, float, float]
+"""A marker with its chainage and its offset on a lane, left positive. [m]"""
+
+
+class LaneFrame:
+    """A lane's samples with directions along and to the left, to find chainage and offset of positions."""
+
+    def __init__(self, lane: Lane) -> None:
+        self.lane = lane
+        self._points = ecef_from_wgs84(lane.lon_deg, lane.lat_deg)
+        along = np.gradient(self._points, axis=0)
+        self._along = along / np.linalg.norm(along, axis=1)[:, None]
+        up = self._points / np.linalg.norm(self._points, axis=1)[:, None]  # to 0.2 deg, no matter over some metres
+        self._left = np.cross(up, self._along)
+
+    @cached_property
+    def _tree(self) -> scipy.spatial.cKDTree:
+        return scipy.spatial.cKDTree(self._points)
+
+    def project(self, lon_deg: Floats, lat_deg: Floats, reach_m: float) -> tuple[Floats, Floats]:
+        """Chainage and offset, left positive, each shape (K,); NaN farther than a reach from the centre line. [m]"""
+        places = ecef_from_wgs84(lon_deg, lat_deg)
+        away, nearest = self._tree.query(places, distance_upper_bound=reach_m + self.lane.step_m)
+        found = np.isfinite(away)
+        at = np.where(found, nearest, 0)
+        off = places - self._points[at]
+        chainage = self.lane.chainage_m[at] + np.einsum("ij,ij->i", off, self._along[at])
+        left = np.einsum("ij,ij->i", off, self._left[at])
+        return np.where(found, chainage, np.nan), np.where(found, left, np.nan)
+
+
+def markers_beside(frame: LaneFrame, markers: Sequence[PlannedMarker], reach_m: float) -> list[BesideLane]:
+    """Markers within a reach of a lane with their chainage and offset on it, by chainage. [m]"""
+    if not markers:
+        return []
+    chainage, left = frame.project(
+        np.array([marker.lon_deg for marker in markers]), np.array([marker.lat_deg for marker in markers]), reach_m
+    )
+    found = [(markers[k], float(chainage[k]), float(left[k])) for k in np.flatnonzero(np.isfinite(chainage)).tolist()]
+    return sorted(found, key=lambda one: (one[1], one[0].number))
+
+
+# === Which markers and stretches a drive passes over, where a road has more than the terms allow.
+#
+# Strata are a lane's markers of one purpose at a similar speed, in bends and outside of them, and on changes of grade.
+# Each stratum gets a share of the sample in proportion to its size and at least one; within a stratum every k-th marker
+# along the road is taken from a random start. Over several drives the sample moves, so that weak markers are found.
+
+
+_SPEED_STEP_MPS = 5.0  # [m/s] of the strata; source: chosen by hand, 18 km/h
+_BEND_1PM = 1 / 400.0  # [1/m] source: the default of `road.curve_radius_m`
+_CREST_1PM = 1 / 1000.0  # [1/m] change of grade; source: chosen by hand, sharper than any crest at 60 km/h
+
+
+def stratum_of(marker: PlannedMarker, lane: Lane) -> tuple[int, bool, bool, str]:
+    """What makes markers alike: speed, bend, crest or sag, purpose."""
+    at = marker.chainage_m
+    speed = float(lane.value_at(lane.design_speed_mps, at))
+    bend = abs(float(lane.value_at(lane.curvature_per_m, at))) > _BEND_1PM
+    before = max(at - 10.0, 0.0)
+    change = float(lane.value_at(lane.grade, at) - lane.value_at(lane.grade, before)) / 10.0
+    return int(speed / _SPEED_STEP_MPS), bend, abs(change) > _CREST_1PM, str(marker.purpose)
+
+
+def sample_markers(
+    markers: Sequence[PlannedMarker], lanes: dict[str, Lane], most: int, rng: np.random.Generator
+) -> list[tuple[PlannedMarker, float]]:
+    """Markers with their weights, at most about `most` of them; all of them if there are no more than that."""
+    if len(markers) <= most:
+        return [(marker, 1.0) for marker in markers]
+    strata: dict[tuple[int, bool, bool, str], list[PlannedMarker]] = defaultdict(list)
+    for marker in markers:
+        strata[stratum_of(marker, lanes[marker.lane])].append(marker)
+    chosen = []
+    for key in sorted(strata):
+        members = strata[key]
+        count = min(max(round(most * len(members) / len(markers)), 1), len(members))
+        chosen += [(members[k], len(members) / count) for k in spread(len(members), count, rng)]
+    return sorted(chosen, key=lambda one: one[0].number)
+
+
+def spread(size: int, count: int, rng: np.random.Generator) -> list[int]:
+    """Indices of a systematic sample: every (size / count)-th from a random start."""
+    start = float(rng.random())
+    return [int((k + start) * size / count) for k in range(count)]
+
+
+def cut_stretches(length_m: float, longest_m: float) -> list[tuple[float, float]]:
+    """A lane as equal stretches of at most a length. [m]"""
+    count = max(int(np.ceil(length_m / longest_m - 1e-9)), 1)
+    borders = np.linspace(0.0, length_m, count + 1)
+    return [(float(a), float(b)) for a, b in pairwise(borders)]
+
+
+# === Units of a proof and how one is computed.
+
 
 PLATES_A_UNIT, TAGS_A_UNIT = 4, 8
 """Markers of a unit. Source: chosen by hand, some seconds of work."""

@@ -2,17 +2,285 @@
 
 from __future__ import annotations
 
+import io
 import math
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
+from enum import StrEnum
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from app.errors import InvalidParameter
+from app.formats.text import TableWriter
 from app.planning.plan import Plan, PlannedLineMagnet, PlannedMarker, PlannedPlate, PlannedTag
-from app.planning.proof.results import MarkerPass, UnitResult
-from app.planning.proof.terms import ProofTerms, UnitKind
+from app.planning.rules import CameraRules
+
+# === Terms of a proof: how many drives, of which vehicles, in which conditions; and the units that it is divided into.
+
+
+Whole = Annotated[int, Field(strict=True)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+
+class Condition(StrEnum):
+    """A condition of a drive; several are joined with ``+``, as in ``night+rain``."""
+
+    DAY = "day"
+    NIGHT = "night"
+    RAIN = "rain"
+    SHADE = "shade"
+    WEAR = "wear"
+    DIRT = "dirt"
+
+
+class UnitKind(StrEnum):
+    """What the vehicle reads in a unit of the proof."""
+
+    PLATES = "plates"
+    TAGS = "tags"
+    LINE = "line"
+    LANE = "lane"
+
+
+class ProofTerms(BaseModel):
+    """What is driven, and how. The same plan, terms and seed give the same result.
+
+    `lost_share` of the markers are missing, drawn anew for each drive. Drives take the conditions in turn, and the
+    cameras in turn after each round of conditions. The uncertainty of a survey is radial, as in the registry.
+    """
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+    drives: Whole = Field(default=6, ge=1, le=10_000)
+    seed: Whole = Field(default=1, ge=0, le=2**31 - 1)
+    conditions: tuple[str, ...] = Field(
+        default=("day",), min_length=1, max_length=20, description="Of the drives in turn; `night+rain` is both."
+    )
+    cameras: tuple[str, ...] | None = Field(
+        default=None, min_length=1, max_length=10, description="Names in the rules; without, all of them."
+    )
+    speed_share: Number = Field(default=1.0, ge=0.1, le=1.5, description="Of the design speed.")
+    lost_share: Number = Field(default=0.0, ge=0.0, le=0.9, description="Of the markers, missing in a drive.")
+    clearance_m: Number = Field(default=0.16, ge=0.05, le=0.6, description="Of the magnetometers above the road.")
+    survey_rmse_m: Number = Field(default=0.03, ge=0.0, le=2.0, description="Of the registered positions, horizontal.")
+    max_markers_per_drive: Whole = Field(
+        default=40, ge=1, le=1_000_000, description="Plates and tags each; more are sampled by strata."
+    )
+    max_sections_per_drive: Whole = Field(
+        default=6, ge=1, le=100_000, description="Stretches of line magnets and of lanes with CERPMs each."
+    )
+    weak_below: Number = Field(default=0.9, gt=0.0, le=1.0, description="Read rate below which a marker is weak.")
+
+    @field_validator("conditions")
+    @classmethod
+    def _known(cls, conditions: tuple[str, ...]) -> tuple[str, ...]:
+        for text in conditions:
+            parse_conditions(text)
+        return conditions
+
+
+def parse_conditions(text: str) -> frozenset[Condition]:
+    """The conditions of a drive, e.g. of ``night+rain``; ``day`` is what the others are added to.
+
+    Raises
+    ------
+    InvalidParameter
+        A name is unknown.
+    """
+    names = [part.strip() for part in text.split("+")]
+    unknown = [name for name in names if name not in list(Condition)]
+    if unknown:
+        raise InvalidParameter(
+            f"{unknown[0][:40]!r} is no condition",
+            field="conditions",
+            limit=", ".join(Condition),
+            cure="name one of these, or join several with +",
+        )
+    return frozenset(Condition(name) for name in names)
+
+
+@dataclass(frozen=True, slots=True)
+class ProofUnit:
+    """A part of the proof that is computed apart from the others, in any order and in any process.
+
+    Attributes
+    ----------
+    kind : UnitKind
+    drive : int
+        From 0.
+    lane : str
+    markers : tuple of int
+        Numbers of the plates or tags that are driven over; empty for the others.
+    from_m, to_m : float
+        Stretch of the lane that is driven for line magnets and CERPMs. [m]
+    weight : tuple of float
+        Of each marker: how many of its stratum it stands for; one value for a stretch.
+    """
+
+    kind: UnitKind
+    drive: int
+    lane: str
+    markers: tuple[int, ...] = ()
+    from_m: float = 0.0
+    to_m: float = 0.0
+    weight: tuple[float, ...] = (1.0,)
+
+    @property
+    def key(self) -> str:
+        """Identifies the unit among those of the same plan and terms."""
+        start = str(self.markers[0]) if self.markers else f"{self.from_m:.2f}"
+        return f"{self.drive}/{self.kind}/{self.lane}/{start}"
+
+
+@dataclass(frozen=True, slots=True)
+class DriveTerms:
+    """What is the same along one drive.
+
+    Attributes
+    ----------
+    drive : int
+    condition : str
+        As in the terms.
+    camera : CameraRules
+    """
+
+    drive: int
+    condition: str
+    camera: CameraRules
+
+
+def drive_terms(plan: Plan, terms: ProofTerms, drive: int) -> DriveTerms:
+    """Condition and camera of a drive: they take turns.
+
+    Raises
+    ------
+    InvalidParameter
+        The rules have no camera of this name.
+    """
+    condition = terms.conditions[drive % len(terms.conditions)]
+    known = {camera.name: camera for camera in plan.rules.cameras}
+    names = terms.cameras if terms.cameras is not None else tuple(known)
+    name = names[drive // len(terms.conditions) % len(names)]
+    if name not in known:
+        raise InvalidParameter(
+            f"the rules have no camera {name[:60]!r}",
+            field="cameras",
+            limit=", ".join(known)[:300],
+            cure="name a camera of the rules",
+        )
+    return DriveTerms(drive, condition, known[name])
+
+
+# === Results of units of a proof, as they are stored: one JSON object a unit.
+
+
+class MarkerPass(TypedDict):
+    """One pass of one drive over one marker.
+
+    Attributes
+    ----------
+    marker : int
+        Number in the plan.
+    weight : float
+        How many markers of its stratum it stands for.
+    lost : bool
+        It is missing in this drive.
+    readable, seen, read : int
+        Of plates: frames in which it is in view and a unit is a pixel high or more; of them, those that were rendered
+        (no more than it takes to read it in `plates.min_frames`), and those in which it was read. Of magnets: 1, 1,
+        and whether it was read.
+    fix_m : list of float or None
+        Error of the vehicle's position along and across the lane. [m]
+    cause : str or None
+        Why it was not read.
+    """
+
+    marker: int
+    weight: float
+    lost: bool
+    readable: int
+    seen: int
+    read: int
+    fix_m: list[float] | None
+    cause: str | None
+
+
+class WrongReading(TypedDict):
+    """Something that was read and is not there: what, and the number of the marker that was being passed."""
+
+    marker: int
+    text: str
+
+
+class LanePath(TypedDict):
+    """Path of one drive along a stretch of lane with CERPMs, against the true centre line.
+
+    Attributes
+    ----------
+    places : int
+        Places of the true centre line between the first and the last marker.
+    covered : int
+        Of them, those within 1 m of the path.
+    square_sum_m2, worst_m : float
+        Of the distances of the covered places from the path. [m2, m]
+    worst_at_m : float
+        Chainage of the greatest distance. [m]
+    heard, markers : int
+        Markers that were received and verified, of those along the stretch.
+    left_out : list of int
+        Numbers of markers that the path leaves out.
+    refusal : str or None
+        Why there is no path.
+    """
+
+    places: int
+    covered: int
+    square_sum_m2: float
+    worst_m: float
+    worst_at_m: float
+    heard: int
+    markers: int
+    left_out: list[int]
+    refusal: str | None
+
+
+class UnitResult(TypedDict):
+    """Result of one unit.
+
+    Attributes
+    ----------
+    key : str
+        Of the unit.
+    kind, drive, lane
+        As in the unit.
+    condition, camera : str
+        Of the drive.
+    weight : float
+        Of a stretch: how many of its kind it stands for.
+    passes : list of MarkerPass
+    wrong : list of WrongReading
+    path : LanePath or None
+        Of a lane with CERPMs.
+    """
+
+    key: str
+    kind: str
+    drive: int
+    lane: str
+    condition: str
+    camera: str
+    weight: float
+    passes: list[MarkerPass]
+    wrong: list[WrongReading]
+    path: LanePath | None
+
+
+# === Results of all units -> the report of a proof.
+
 
 _Z95 = 1.959964  # standard normal quantile of 97.5 %, for intervals of 95 %
 ALL = "all"
@@ -294,3 +562,42 @@ def _longest_gap(
 
 def _rms(values: Sequence[float]) -> float | None:
     return math.sqrt(sum(value**2 for value in values) / len(values)) if values else None
+
+
+# === The report of a proof as a JSON document and as a table of markers.
+
+
+PROOF_FORMAT = "waymark-proof/1"
+NOTE = (
+    "Simulated drives: rates are of passes, weighted by strata where markers are sampled; intervals are Wilson's of "
+    "95 %, which take passes as independent. Light, wear and dirt are drawn from the ranges of "
+    "app/simulation/conditions.py."
+)
+"""What the figures are, in every document."""
+
+
+def report_document(report: ProofReport) -> dict[str, Any]:
+    """The report as JSON values."""
+    return {
+        "format": PROOF_FORMAT,
+        "plan": report.plan,
+        "terms": report.terms.model_dump(mode="json"),
+        "complete": report.complete,
+        "note": NOTE,
+        "rates": [asdict(rate) for rate in report.rates],
+        "drives": [asdict(drive) for drive in report.drives],
+        "weak": [marker.number for marker in report.weak],
+        "wrong": [{"drive": drive, "marker": marker, "text": text} for drive, marker, text in report.wrong],
+        "markers": [asdict(marker) for marker in report.markers],
+    }
+
+
+def markers_csv(report: ProofReport) -> str:
+    """One row a marker that was driven over; empty where a figure is unknown."""
+    stream = io.StringIO()
+    writer = TableWriter(stream, "\n")
+    names = [field.name for field in fields(MarkerProof)]
+    writer.write_row(names)
+    for marker in report.markers:
+        writer.write_row(getattr(marker, name) for name in names)
+    return stream.getvalue()

@@ -17,7 +17,7 @@ from app.formats.alignments.geometry import AlignmentFile
 from app.formats.surveys.declaration import METRES
 from app.geodesy import normalize_crs, place_positions, reference_system
 from app.geodesy.systems import is_global
-from app.planning.alignment_declaration import AlignmentDeclaration
+from app.planning.alignment import AlignmentDeclaration
 
 Floats = npt.NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from app.errors import Unavailable
-from app.registry import cerpms
+from app.registry import markers
 
 AGENCY_KEY_BYTES = 32
 _NONCE_BYTES = 12
@@ -58,7 +58,7 @@ class AgencySecrets:
         Unavailable
             It was stored under another master key.
         """
-        wrapped = cerpms.find_secret(connection, agency_id)
+        wrapped = markers.find_secret(connection, agency_id)
         return None if wrapped is None else self.unseal(agency_id, wrapped)
 
     def ensure_key(self, connection: sa.Connection, agency_id: str, now: datetime) -> bytes:
@@ -66,5 +66,5 @@ class AgencySecrets:
         key = self.find_key(connection, agency_id)
         if key is None:
             key = secrets.token_bytes(AGENCY_KEY_BYTES)
-            cerpms.add_secret(connection, agency_id, self.seal(agency_id, key), now)
+            markers.add_secret(connection, agency_id, self.seal(agency_id, key), now)
         return key

@@ -1,4 +1,4 @@
-"""The audit log: who appends to it, and how an agency reads it."""
+"""The audit log: who appends to it, and how an agency reads it; what the API returns about it and about keys."""
 
 from __future__ import annotations
 
@@ -6,19 +6,103 @@ import re
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import sqlalchemy as sa
+from pydantic import Field, JsonValue
+from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter, NotFound
 from app.registry import agencies
 from app.registry import audit as store
-from app.registry.audit import Author, EntryFilter
-from app.registry.audit_check import ChainReport, Fault, check_history
+from app.registry.audit import Author, ChainReport, EntryFilter, Fault, check_history
 from app.registry.database import Database
-from app.services.access.access import Caller
-from app.services.access.documents import AuditEntryDocument, AuditHead, AuditPage
+from app.services.access.access import Caller, Scope
 from app.services.documents import document_of
+
+# === What the API returns about keys and the audit log.
+
+
+class KeyDocument(TypedDict):
+    """A key, without its text. Keys that replace one another have the same `holder_id`."""
+
+    id: str
+    holder_id: str
+    label: str
+    scope: Scope
+    prefix: Annotated[str, Field(description="The first characters of the key.")]
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+    last_used_at: Annotated[datetime | None, Field(description="To the minute.")]
+    valid: bool
+
+
+class NewKeyDocument(KeyDocument):
+    """A key with its text, which is shown only in this response."""
+
+    key: str
+
+
+class KeyPage(TypedDict):
+    """A page of keys; the Link header leads to the next one."""
+
+    items: list[KeyDocument]
+
+
+class AgencyDocument(TypedDict):
+    """An agency."""
+
+    id: str
+    name: str
+    created_at: datetime
+
+
+class NewAgencyDocument(AgencyDocument):
+    """An agency with its first key. The key's text is shown only in this response, and where the request is repeated
+    with its Idempotency-Key."""
+
+    admin_key: NewKeyDocument
+
+
+class AgencyPage(TypedDict):
+    """A page of agencies, oldest first; the Link header leads to the next one."""
+
+    items: list[AgencyDocument]
+
+
+class AuditHead(TypedDict):
+    """The newest entry of a log. Compare it with a copy that is stored elsewhere: a log that was cut differs."""
+
+    number: int
+    hash: str
+
+
+class AuditEntryDocument(TypedDict):
+    """One operation, with the hash of the entry before it."""
+
+    number: int
+    at: datetime
+    who: str
+    key_id: str | None
+    action: str
+    subject: str | None
+    detail: dict[str, JsonValue] | None
+    versions: int
+    digest: str
+    previous_hash: str
+    hash: str
+
+
+class AuditPage(TypedDict):
+    """A page of the log, oldest first, and its head."""
+
+    items: list[AuditEntryDocument]
+    head: AuditHead | None
+
+
+# === The audit log.
+
 
 _NUMBER = re.compile(r"[1-9][0-9]{0,14}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")

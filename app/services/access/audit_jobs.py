@@ -11,14 +11,13 @@ from typing_extensions import TypedDict
 from app.errors import Conflict, InvalidParameter
 from app.registry import audit as log
 from app.registry import jobs as store
-from app.registry.audit_check import ChainReport, check_history
+from app.registry.audit import ChainReport, check_history
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState, new_job
 from app.services.access.access import Caller
 from app.services.access.audit import parse_head
-from app.services.documents import document_of
-from app.services.error_documents import ErrorDocument
+from app.services.documents import ErrorDocument, document_of
 from app.services.idempotency import IdempotencyKey, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Clock, JobQueue

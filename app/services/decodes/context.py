@@ -3,17 +3,148 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime
-from typing import Any
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from typing import Any, Literal
 
 from app.errors import InvalidParameter
-from app.formats.images import ImageHeader, check_thermal_range
+from app.formats.format import ArchiveLimits
+from app.formats.images import ImageHeader, ImageLimits, check_thermal_range
+from app.formats.packets.rows import PacketLimits
+from app.formats.traces.declaration import TraceLimits
+from app.formats.video import VideoLimits
 from app.geodesy import check_lon_lat
+from app.registry.decodes import DecodeRow
 from app.sensors.camera import Camera
-from app.services.decodes.frame_terms import frame_terms
-from app.services.decodes.packet_task import packet_terms
-from app.services.decodes.trace_task import trace_terms
+from app.services.decodes.tasks import frame_terms, packet_terms, trace_terms
+
+# === Kinds of decodes.
+
+
+class DecodeKind(StrEnum):
+    """What was decoded."""
+
+    FRAME = "frame"
+    ARCHIVE = "archive"
+    VIDEO = "video"
+    TRACE = "trace"
+    PACKETS = "packets"
+
+
+# === Limits of decodes that a deployment can set.
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeRules:
+    """What uploads may cost.
+
+    Attributes
+    ----------
+    images : ImageLimits
+    archives : ArchiveLimits
+    videos : VideoLimits
+    traces : TraceLimits
+    packets : PacketLimits
+    immediate_trace_bytes : int
+        Recordings and packet logs up to this size are decoded while the caller waits, larger ones become jobs. [byte]
+    frames_in_flight : int
+        Frames of one archive that are decoded at the same time.
+    progress_every : timedelta
+        Shortest time between two reports of a job's progress.
+    idempotency_ttl : timedelta
+    """
+
+    images: ImageLimits = field(default_factory=ImageLimits)
+    archives: ArchiveLimits = field(default_factory=ArchiveLimits)
+    videos: VideoLimits = field(default_factory=VideoLimits)
+    traces: TraceLimits = field(default_factory=TraceLimits)
+    packets: PacketLimits = field(default_factory=PacketLimits)
+    immediate_trace_bytes: int = 8 * 1024**2
+    frames_in_flight: int = 2
+    progress_every: timedelta = timedelta(seconds=1)
+    idempotency_ttl: timedelta = timedelta(hours=24)
+
+
+# === Sentences about results.
+
+
+def count_of(number: int, what: str) -> str:
+    """A number with its noun, in the plural where it has to be."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+# === The times of a decode: UTC where the upload states when it was taken, else those of its recording.
+
+
+_EPOCH_S = 1e9
+"""[s] times beyond are seconds since 1970: no recording lasts 30 years."""
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeTimes:
+    """What the times of a decode count from.
+
+    Attributes
+    ----------
+    clock : str
+        ``utc``: seconds since 1970-01-01 UTC; ``recording``: of the recording.
+    zero_s : float
+        Added to times of a trace or of a video's frames. [s]
+    captured_s : float or None
+        When the upload was taken, by its context. [s]
+    alone : bool
+        The upload is a single frame, which was taken then.
+    """
+
+    clock: Literal["utc", "recording"]
+    zero_s: float = 0.0
+    captured_s: float | None = None
+    alone: bool = False
+
+    def trace_s(self, t_s: float) -> float:
+        """Time of a sample. [s]"""
+        return round(t_s + self.zero_s, 4)
+
+    def frame_s(self, frame: Mapping[str, Any]) -> float | None:
+        """Time of a frame, None if it is not known. [s]"""
+        if self.clock == "utc":
+            return _seconds(frame.get("captured_at")) or (self.captured_s if self.alone else None)
+        return frame.get("time_s")
+
+
+def clock_of(row: DecodeRow) -> DecodeTimes:
+    """The clock of a decode that has a result."""
+    result, captured_s = row.result or {}, _seconds(row.context.get("captured_at"))
+    if row.kind == DecodeKind.TRACE:
+        start_s = float((result.get("motion") or {}).get("start_s", 0.0))
+        if start_s > _EPOCH_S:
+            return DecodeTimes("utc")
+        return DecodeTimes("recording") if captured_s is None else DecodeTimes("utc", captured_s - start_s)
+    if row.kind == DecodeKind.PACKETS:
+        return DecodeTimes("utc")
+    frames = result.get("frames", ())
+    alone = len(frames) == 1 and row.kind == DecodeKind.FRAME
+    stated = any(frame.get("captured_at") for frame in frames) or (alone and captured_s is not None)
+    return DecodeTimes("utc" if stated else "recording", captured_s=captured_s, alone=alone)
+
+
+def stamp(time_s: float | None, clock: DecodeTimes) -> str | None:
+    """A time as RFC 3339; None unless it is UTC."""
+    if time_s is None or clock.clock != "utc":
+        return None
+    return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _seconds(value: str | datetime | None) -> float | None:
+    if value is None:
+        return None
+    return (datetime.fromisoformat(value) if isinstance(value, str) else value).timestamp()
+
+
+# === The context of an upload.
+
 
 VIEW_RANGE_M = 100.0
 MAX_ACCURACY_M = 20_000.0
@@ -193,15 +324,15 @@ class DecodeContext:
     captured_at : datetime, optional
         Aware.
     trace : dict, optional
-        The upload is a magnetometer trace, declared like this (`app.services.decodes.trace_task.trace_terms`).
+        The upload is a magnetometer trace, declared like this (`app.services.decodes.tasks.trace_terms`).
     packets : dict, optional
-        The upload is a packet log, declared like this (`app.services.decodes.packet_task.packet_terms`).
+        The upload is a packet log, declared like this (`app.services.decodes.tasks.packet_terms`).
     frames : dict, optional
         Frame rate, list and track of the frames of a drive, declared like this
-        (`app.services.decodes.frame_terms.frame_terms`).
+        (`app.services.decodes.tasks.frame_terms`).
     vehicle : dict, optional
         Id, name and version of the vehicle, and the source of each member
-        (`app.services.fleet.profiles.inherit`).
+        (`app.services.fleet.vehicles.inherit`).
     file_name : str, optional
         Of the uploaded file, for people.
     """

@@ -16,18 +16,16 @@ from app import __version__
 from app.decoders.plate import DECODER_VERSION
 from app.errors import WaymarkError
 from app.families import get_family, union_of
-from app.families.frames import FrameReading, Match
+from app.families.family import FrameReading, Match
 from app.families.plate.plates import PLATE
 from app.formats.images import ImageHeader
 from app.geodesy import LocalizationGrade
 from app.markers.reading import PlateOutcome
-from app.services.decodes.fixes import Fix
-from app.services.decodes.frame_poses import FramePose, GapDocument
-from app.services.decodes.matching import FRAME_READERS
-from app.services.decodes.receiver_positions import ReceiverPositions
-from app.services.decodes.wording import count_of
-from app.services.error_documents import ErrorDocument, error_document
-from app.services.health.evidence import FrameHealth
+from app.services.decodes.context import count_of
+from app.services.decodes.frame_poses import FramePose, GapDocument, ReceiverPositions
+from app.services.decodes.matching import FRAME_READERS, Fix
+from app.services.documents import ErrorDocument, error_document
+from app.services.health.record import FrameHealth
 
 if TYPE_CHECKING:  # it loads numba
     from app.decoders.plate.video_search import FoundPlate

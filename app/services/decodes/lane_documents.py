@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import TypedDict
 
-from app.lanes.local_plane import wgs84_from_plane
 from app.lanes.overlay import LaneOverlay, LineInFrame, PointsInFrame
+from app.lanes.smooth_line import wgs84_from_plane
 from app.lanes.types import Lane, TrackAgreement
 
 if TYPE_CHECKING:  # it loads numba

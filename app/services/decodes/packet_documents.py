@@ -10,15 +10,16 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from app import __version__
-from app.decoders.cerpm.merged_markers import Disagreement
+from app.decoders.cerpm.merge import Disagreement, vehicle_positions
 from app.decoders.cerpm.signal import SignalProfile
-from app.decoders.cerpm.vehicle_positions import vehicle_positions
 from app.decoders.cerpm.verify import Verdict
 from app.geodesy import LocalizationGrade
 from app.lanes.types import Lane
 from app.markers.cerpm import LaneSide
-from app.radio.path_loss import Estimate
+from app.radio.link import Estimate
 from app.registry.decodes import NewObservation
+from app.services.decodes.context import count_of
+from app.services.decodes.frame_poses import ReceiverPositions, receiver_positions
 from app.services.decodes.lane_documents import (
     DecodedLaneDocument,
     OverlayDocument,
@@ -27,10 +28,8 @@ from app.services.decodes.lane_documents import (
     overlay_document,
     steering_document,
 )
-from app.services.decodes.packet_matching import ReadPackets
-from app.services.decodes.packet_task import DriveFiles, LaneResult
-from app.services.decodes.receiver_positions import ReceiverPositions, receiver_positions
-from app.services.decodes.wording import count_of
+from app.services.decodes.matching import ReadPackets
+from app.services.decodes.tasks import DriveFiles, LaneResult
 
 DECODER_VERSION = "cerpm/3"
 MAX_REFUSED = 500

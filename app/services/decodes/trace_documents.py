@@ -9,12 +9,11 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from app import __version__
-from app.decoders.magnet.localize import TagFix
-from app.decoders.magnet.match import ReadTag, ReadTrace, TagMatch
+from app.decoders.magnet.identify import ReadTag, ReadTrace, TagFix, TagMatch
 from app.decoders.magnet.readings import LineCrossing, MagnetReading, NoiseFinding, TagReading
-from app.formats.traces.report import LeftOut, TraceGap
-from app.services.decodes.trace_task import TraceMotion, TraceResult
-from app.services.decodes.wording import count_of
+from app.formats.traces.declaration import LeftOut, TraceGap
+from app.services.decodes.context import count_of
+from app.services.decodes.tasks import TraceMotion, TraceResult
 
 MAX_NOISE = 500
 

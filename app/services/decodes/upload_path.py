@@ -5,39 +5,237 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, NotRequired, Protocol, TypeVar, cast
 
 import sqlalchemy as sa
+from prometheus_client import CollectorRegistry, Histogram, generate_latest
+from pydantic import Field, JsonValue
+from typing_extensions import TypedDict
 
-from app.errors import Unavailable
-from app.formats.spooled_file import SpooledFile
-from app.registry import audit, cerpms
+from app.errors import Unavailable, WaymarkError
+from app.formats.format import SpooledFile
+from app.registry import audit, markers
 from app.registry import decodes as store
 from app.registry.audit import Author
+from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.decodes import DecodeRow, NewObservation
 from app.registry.health import NewUnregistered, add_unregistered
-from app.registry.ids import new_id
+from app.registry.jobs import JobState
 from app.services.access.access import Caller
-from app.services.decodes.context import DecodeContext
-from app.services.decodes.documents import DecodeDocument, decode_document
-from app.services.decodes.frame_documents import FramesResult
-from app.services.decodes.kinds import DecodeKind
-from app.services.decodes.measures import MeasuredDecode, measured
-from app.services.decodes.packet_documents import PacketsResult
-from app.services.decodes.trace_documents import TraceResultDocument
-from app.services.fleet.vehicle_uploads import count_driven, count_upload
+from app.services.blobs import StagedBlobs, staged
+from app.services.decodes.context import DecodeContext, DecodeKind
+from app.services.decodes.frame_documents import (
+    AnyReading,
+    FixDocument,
+    FrameDocument,
+    FramesResult,
+    FrameSummary,
+    SeenPlateDocument,
+)
+from app.services.decodes.frame_poses import GapDocument, ReceiverPositions
+from app.services.decodes.lane_documents import DecodedLaneDocument, OverlayDocument, SteeringDocument
+from app.services.decodes.packet_documents import (
+    PacketReportDocument,
+    PacketsResult,
+    PacketSummary,
+    PathLossDocument,
+    ReceivedMarkerDocument,
+)
+from app.services.decodes.trace_documents import (
+    CrossingDocument,
+    NoiseDocument,
+    PassedMagnetDocument,
+    TagDocument,
+    TagFixDocument,
+    TraceMotionDocument,
+    TraceReportDocument,
+    TraceResultDocument,
+    TraceSummary,
+)
+from app.services.documents import ErrorDocument
+from app.services.fleet.vehicles import count_driven, count_upload
 from app.services.health.record import BAR, CAMERA, RADIO, ObservedDrive, record_drive
 from app.services.idempotency import IdempotencyKey, idempotent
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock
-from app.services.staged_blobs import StagedBlobs, staged
 from app.services.uploads.quotas import Quotas
+
+# === Times and outcomes of decodes, for /metrics: of this process, whichever app or worker in it decodes.
+
+
+Outcome = Literal["read", "none", "refused", "failed"]
+DECODE_METRICS = CollectorRegistry()
+_SECONDS = Histogram(
+    "waymark_decode_seconds",
+    "Time from the start of a decode to its stored result, waiting for a decoder process included",
+    ("kind", "outcome"),
+    buckets=(0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600),
+    registry=DECODE_METRICS,
+)
+
+
+class MeasuredDecode:
+    """A decode that goes on.
+
+    Attributes
+    ----------
+    has_read : bool
+        Whether a marker was read in it.
+    """
+
+    has_read = False
+
+
+@contextmanager
+def measured(kind: str) -> Iterator[MeasuredDecode]:
+    """Measure a decode: what was refused is the upload's fault, what failed is ours or a matter of load."""
+    decode, started_s = MeasuredDecode(), time.perf_counter()
+    outcome: Outcome = "failed"
+    try:
+        yield decode
+        outcome = "read" if decode.has_read else "none"
+    except Unavailable:
+        raise
+    except WaymarkError:
+        outcome = "refused"
+        raise
+    finally:
+        _SECONDS.labels(kind, outcome).observe(time.perf_counter() - started_s)
+
+
+def written_metrics(registry: CollectorRegistry) -> bytes:
+    """The metrics of an app or worker, and of the decodes of this process, as text."""
+    return generate_latest(registry) + generate_latest(DECODE_METRICS)
+
+
+# === Decodes as clients see them.
+
+
+class DecodeLinks(TypedDict):
+    """Paths of the decode and of what can be drawn from it."""
+
+    self: str
+    annotated: NotRequired[str]
+    samples: NotRequired[str]
+    packets: NotRequired[str]
+    track: NotRequired[str]
+    readings: NotRequired[str]
+    plot: NotRequired[str]
+    lane: NotRequired[str]
+    overlay: NotRequired[str]
+
+
+class DecodeHead(TypedDict):
+    """A decode without its result."""
+
+    id: str
+    state: JobState
+    kind: DecodeKind
+    progress: Annotated[float, Field(description="0 to 1.")]
+    attempts: int
+    created_at: datetime
+    finished_at: datetime | None
+    context: Annotated[dict[str, JsonValue], Field(description="What was declared of the upload.")]
+    file_name: Annotated[str | None, Field(description="Of the uploaded file, if it had one.")]
+    upload_bytes: Annotated[int | None, Field(description="Size of the upload; null of those of older versions.")]
+    error: ErrorDocument | None
+    links: DecodeLinks
+
+
+class DecodeDocument(DecodeHead):
+    """A decode. `decoder` and what follows it are there once it is done, or as far as it is done: then `partial`."""
+
+    partial: NotRequired[Annotated[bool, Field(description="The decode goes on; this is its result so far.")]]
+
+    decoder: NotRequired[str]
+    summary: NotRequired[FrameSummary | TraceSummary | PacketSummary]
+    codebook_plates: NotRequired[int]
+    readings: NotRequired[list[AnyReading]]
+    frames: NotRequired[list[FrameDocument]]
+    plates: NotRequired[list[SeenPlateDocument]]
+    gaps: NotRequired[list[GapDocument]]
+    receiver: NotRequired[ReceiverPositions | None]
+    warnings: NotRequired[list[str]]
+    fix: NotRequired[FixDocument | TagFixDocument | None]
+    codebook_tags: NotRequired[int]
+    report: NotRequired[TraceReportDocument | PacketReportDocument]
+    tags: NotRequired[list[TagDocument]]
+    crossings: NotRequired[list[CrossingDocument]]
+    magnets: NotRequired[list[PassedMagnetDocument]]
+    noise: NotRequired[list[NoiseDocument]]
+    motion: NotRequired[TraceMotionDocument]
+    markers: NotRequired[list[ReceivedMarkerDocument]]
+    lane: NotRequired[DecodedLaneDocument]
+    steering: NotRequired[SteeringDocument | None]
+    overlay: NotRequired[OverlayDocument | None]
+    path_loss: NotRequired[PathLossDocument | None]
+
+
+class DecodePage(TypedDict):
+    """A page of decodes without their results, newest first; the Link header leads to the next one."""
+
+    items: list[DecodeHead]
+
+
+def decode_document(row: DecodeRow) -> DecodeDocument:
+    """A decode with its result, once there is one."""
+    so_far = {"partial": True} if row.state == "running" and row.result else {}
+    return cast("DecodeDocument", {**decode_head(row), **so_far, **(row.result or {})})
+
+
+def decode_head(row: DecodeRow) -> DecodeHead:
+    """A decode without its result."""
+    return {
+        "id": row.id,
+        "state": row.state,
+        "kind": DecodeKind(row.kind),
+        "progress": row.progress,
+        "attempts": row.attempts,
+        "created_at": row.created_at,
+        "finished_at": row.finished_at,
+        "context": {name: value for name, value in row.context.items() if name != "file_name"},
+        "file_name": _file_name(row.context),
+        "upload_bytes": row.upload_bytes,
+        "error": cast("ErrorDocument | None", row.error),
+        "links": _links(f"/v1/decodes/{row.id}", row.kind, row.result or {}),
+    }
+
+
+def _file_name(context: Mapping[str, Any]) -> str | None:
+    declared = context.get("trace") or context.get("packets") or {}
+    return context.get("file_name") or declared.get("file_name")
+
+
+def _links(path: str, kind: str, result: Mapping[str, Any]) -> DecodeLinks:
+    links: DecodeLinks = {"self": path}
+    frames = [frame["frame"] for frame in result.get("frames", ()) if frame["error"] is None]
+    if kind in (DecodeKind.FRAME, DecodeKind.ARCHIVE):
+        links["annotated"] = f"{path}/annotated.jpg"
+    elif kind == DecodeKind.VIDEO and frames:
+        links["annotated"] = f"{path}/annotated.jpg?frame={frames[0]}"
+    elif kind != DecodeKind.VIDEO:
+        links["plot"] = f"{path}/plot.svg"
+    if kind == DecodeKind.TRACE:
+        links["samples"] = f"{path}/samples"
+    if kind == DecodeKind.PACKETS:
+        links["lane"] = f"{path}/lane.geojson"
+        links["packets"] = f"{path}/packets"
+        if result.get("overlay"):
+            links["overlay"] = f"{path}/overlay.jpg"
+    if result:
+        links["track"], links["readings"] = f"{path}/track.geojson", f"{path}/readings.geojson"
+    return links
+
+
+# === The path of every upload.
+
 
 UPLOADS, PICTURES = "uploads", "pictures"
 """Folders of the blob store."""
@@ -333,7 +531,7 @@ def with_upload(row: DecodeRow, stage: StagedBlobs, upload: Upload) -> DecodeRow
 
 
 def _store_decoded(connection: sa.Connection, upload: Upload, decode_id: str, decoded: Decoded, now: datetime) -> None:
-    cerpms.add_spans(connection, upload.agency_id, decode_id, decoded.spans)
+    markers.add_spans(connection, upload.agency_id, decode_id, decoded.spans)
     store.add_observations(connection, upload.agency_id, decode_id, decoded.observations)
     add_unregistered(connection, upload.agency_id, decode_id, decoded.unregistered)
     context = upload.context

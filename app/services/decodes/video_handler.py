@@ -11,17 +11,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sqlalchemy as sa
 
-from app.families.frames import FrameReading, Nearby, distance_to_row
-from app.formats.archives import ArchiveLimits, Member
+from app.families.family import FrameReading, Nearby, distance_to_row
+from app.formats.format import ArchiveLimits, Member, SpooledFile
 from app.formats.images import ImageHeader, ImageKind
-from app.formats.spooled_file import SpooledFile
-from app.formats.video.archive import holds_video, open_packed_video
-from app.formats.video.container import VideoFile, VideoKind, detect_video
-from app.formats.video.index import VideoIndex, VideoSegment
+from app.formats.video import (
+    VideoFile,
+    VideoIndex,
+    VideoKind,
+    VideoSegment,
+    detect_video,
+    holds_video,
+    open_packed_video,
+)
 from app.registry.database import Database
 from app.registry.spatial import distance_m
-from app.services.decoder_processes import DecoderProcesses, Pending
-from app.services.decodes.context import MAX_ACCURACY_M, CoarsePosition, DecodeContext
+from app.services.decodes.context import MAX_ACCURACY_M, CoarsePosition, DecodeContext, DecodeKind, DecodeRules
 from app.services.decodes.frame_documents import (
     DriveNotes,
     ReadFrame,
@@ -29,17 +33,19 @@ from app.services.decodes.frame_documents import (
     frames_result,
     seen_plate_document,
 )
-from app.services.decodes.frame_handler import FrameMoment, decoded_frames, read_frame
-from app.services.decodes.frame_poses import FrameLists, FrameListTask, FramePlaces, FramePose, GapDocument
-from app.services.decodes.frame_task import FrameResult
-from app.services.decodes.frame_terms import frame_terms
-from app.services.decodes.kinds import DecodeKind
+from app.services.decodes.frame_poses import (
+    FrameLists,
+    FrameListTask,
+    FramePlaces,
+    FramePose,
+    GapDocument,
+    ReceiverPositions,
+)
+from app.services.decodes.frames import FrameMoment, decoded_frames, read_frame
 from app.services.decodes.matching import FRAME_READERS, NearbyMarkers, find_nearby_markers
-from app.services.decodes.receiver_positions import ReceiverPositions
-from app.services.decodes.rules import DecodeRules
+from app.services.decodes.tasks import FrameResult, IndexVideoTask, SegmentResult, SegmentTask, frame_terms
 from app.services.decodes.upload_path import Decoded, Upload, UploadHandler
-from app.services.decodes.video_task import IndexVideoTask, SegmentResult, SegmentTask
-from app.services.ports import Clock
+from app.services.ports import Clock, DecoderProcesses, Pending
 
 if TYPE_CHECKING:  # it loads numba
     from app.decoders.plate.video_search import FoundPlate

@@ -13,7 +13,7 @@ import numpy as np
 from app.errors import Conflict, InvalidParameter
 from app.geodesy import LocalizationGrade
 from app.registry.decodes import DecodeRow
-from app.services.decodes.kinds import DecodeKind
+from app.services.decodes.context import DecodeKind
 from app.tracks import Clock, LanePath, LeftOutReason, PositionFix, Samples, TrackInput
 
 SPEED_SIGMA_M_S = 0.1

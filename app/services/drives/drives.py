@@ -12,22 +12,20 @@ import sqlalchemy as sa
 from app.errors import Conflict, InvalidParameter, NotFound
 from app.registry import decodes as decode_store
 from app.registry import jobs as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.decodes import DecodeRow
-from app.registry.ids import new_id
 from app.registry.jobs import UNFINISHED, JobKind, JobRow, new_job
 from app.registry.markers import find_markers
 from app.services.access.access import Caller
-from app.services.decoder_processes import DecoderProcesses
-from app.services.decodes.fixes import horizontal_rmse_m
+from app.services.blobs import delete_unused, staged
+from app.services.decodes.matching import horizontal_rmse_m
 from app.services.drives.collect import Collected, DecodeClock, collect
-from app.services.drives.documents import DrivePage, TrackedDriveDocument, drive_document, drive_head
-from app.services.drives.track_task import TrackTask
-from app.services.fleet.vehicle_uploads import find_vehicle
+from app.services.drives.documents import DrivePage, TrackedDriveDocument, TrackTask, drive_document, drive_head
+from app.services.fleet.vehicles import find_vehicle
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
-from app.services.ports import Blobs, Clock, JobQueue
-from app.services.staged_blobs import delete_unused, staged
+from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue
 from app.tracks.time_base import check_times
 from app.tracks.types import TrackRules
 

@@ -6,19 +6,17 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 
 from app import __version__
+from app.calibration.board_view import CameraCalibration, ViewReport
 from app.calibration.calibrate import COEFFICIENTS, VERSION
-from app.calibration.results import CameraCalibration, ViewReport
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
-from app.formats.archives import ArchiveLimits
+from app.formats.format import ArchiveLimits, SpooledFile
 from app.formats.images import ImageLimits
-from app.formats.spooled_file import SpooledFile
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.vehicles import CALIBRATIONS, CalibrationRow
-from app.sensors.calibration_board import DICTIONARY, CalibrationBoard
+from app.sensors.camera import DICTIONARY, CalibrationBoard
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
-from app.services.decoder_processes import DecoderProcesses, Task
 from app.services.documents import document_of
 from app.services.fleet.documents import (
     Board,
@@ -30,7 +28,7 @@ from app.services.fleet.documents import (
     CameraSigma,
 )
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
-from app.services.ports import Clock
+from app.services.ports import Clock, DecoderProcesses, Task
 
 MAX_PHOTOS = 60
 _BUSY_WAIT_S = 10.0

@@ -16,16 +16,16 @@ from app.errors import InvalidParameter
 from app.families import FAMILIES
 from app.families.family import Family
 from app.geodesy import LocalizationGrade, decimal_year, move_to_epoch
-from app.geodesy.grades import GRADE_LIMITS_M
+from app.geodesy.place import GRADE_LIMITS_M
 from app.markers.snapshot import MAX_MARKERS, MAX_VALIDITY, Trust
-from app.registry import bulk
-from app.registry.codebooks import CODEBOOKS, book_of
+from app.registry import markers
+from app.registry.column_types import row_of
 from app.registry.database import Database
 from app.registry.marker_rows import MarkerRow
-from app.registry.rows import row_of
+from app.registry.markers import CODEBOOKS, book_of
 from app.registry.spatial import Box
 from app.services.access.access import Caller
-from app.services.markers.codebook_documents import MAX_BOOKS_SEARCHED
+from app.services.markers.codebooks import MAX_BOOKS_SEARCHED
 from app.services.ports import Clock
 from app.services.request_work import check_deadline
 
@@ -95,13 +95,13 @@ def read_blocks(connection: sa.Connection, agency_id: str, box: Box, epoch: floa
     left = MAX_MARKERS
     for family in FAMILIES:
         found = (connection, agency_id, family.name, box)
-        left -= bulk.count_for_snapshot(*found, with_retired=family.snapshot.with_retired, limit=left + 1)
+        left -= markers.count_for_snapshot(*found, with_retired=family.snapshot.with_retired, limit=left + 1)
         if left < 0:
             raise too_many_markers()
     for family in FAMILIES:
         snapshot, found = family.snapshot, (connection, agency_id, family.name, box)
         known: dict[tuple[object, ...], bytes] = {}
-        for block in bulk.read_for_snapshot(*found, columns=snapshot.columns(), with_retired=snapshot.with_retired):
+        for block in markers.read_for_snapshot(*found, columns=snapshot.columns(), with_retired=snapshot.with_retired):
             check_deadline()
             moved = _at_epoch(block, epoch)
             code, kind = block["digits"], _kinds(family, block, moved["localization_grade"].tolist(), known)
@@ -109,7 +109,7 @@ def read_blocks(connection: sa.Connection, agency_id: str, box: Box, epoch: floa
 
 
 def _at_epoch(block: Block, epoch: float) -> dict[str, Any]:
-    """Columns of a block that change with the position, as `fixes.marker_at` moves it to an epoch."""
+    """Columns of a block that change with the position, as `matching.marker_at` moves it to an epoch."""
     names = ("lon_deg", "lat_deg", "epoch", "transform_accuracy_m", "horizontal_rmse_m")
     lon, lat, stated, frame_m, survey_m = (np.array(block[name], dtype=np.float64) for name in names)
     moves = np.isfinite(stated) & np.isfinite(frame_m)
@@ -134,7 +134,7 @@ def _kinds(
     family: Family[Any, Any], block: Block, grades: Sequence[str], known: dict[tuple[object, ...], bytes]
 ) -> list[bytes]:
     """The kind of each marker of a block, as it is in snapshots, made once for all markers that are `known` by it."""
-    spec = [name for name in block if name not in bulk.SNAPSHOT_COLUMNS and name not in _LANE]
+    spec = [name for name in block if name not in markers.SNAPSHOT_COLUMNS and name not in _LANE]
     notes = [
         note if grade == LocalizationGrade.UNFIT else None
         for note, grade in zip(block["transform_note"], grades, strict=True)

@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 import scipy
 
-from app.families.frames import Match, Nearby
+from app.families.family import Match, Nearby
+from app.families.plate.inputs import plate_geometry
 from app.families.plate.plates import PLATE
-from app.families.plate.rows import plate_geometry
-from app.families.rules import RETIRED
+from app.families.surveys import RETIRED
 from app.geodesy import decimal_year, enu_from_wgs84
 from app.markers.reading import PlateOutcome, PlatePose
 from app.planning.plate_view import unit_heights_px
-from app.planning.predict.models import DAY, fitted_models, normal_quadrature
+from app.planning.predict.rates import DAY, fitted_models, normal_quadrature
 from app.registry.decodes import NewObservation
 from app.registry.health import NewUnregistered
 from app.registry.marker_rows import MarkerRow
 from app.sensors.camera import Camera
 from app.services.decodes.context import DecodeContext
-from app.services.decodes.fixes import horizontal_rmse_m, marker_at
 from app.services.decodes.frame_documents import ReadFrame, ReadMarker
-from app.services.health.evidence import EVIDENCE, MISSED, FrameHealth, rounded
+from app.services.decodes.matching import horizontal_rmse_m, marker_at
+from app.services.health.record import EVIDENCE, MISSED, FrameHealth, rounded
 
 SIGMAS_IN_ACCURACY = 3.0
 """Standard deviations in the accuracy of a coarse position, which holds the vehicle with near certainty."""
@@ -39,7 +39,8 @@ SURVEY_SIGMA_M = 0.7
 MAX_SEEN_AHEAD_M = 18.0
 """[m] ahead, from where frames count. Source: `FAR_M` of app/planning/predict/rates.py."""
 MIN_EXPECTED = 0.3
-"""Probability from which a plate that was not read is observed as missed. Source: `app.health.drive.MIN_EXPECTED`."""
+"""Probability from which a plate that was not read is observed as missed. Source:
+`app.health.marker_tests.MIN_EXPECTED`."""
 GRADE_NOMINAL, GRADE_SIGMA = 3.0, 0.6
 """Usual overall grade of a plate, and its standard deviation between passes. Source: by hand; the tests compare it with
 the other plates of the drive and with the plate's own record."""
@@ -234,7 +235,7 @@ def _expected(row: MarkerRow, view: VehicleView) -> float:
 
 
 def _frame_rate(unit_px: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Read rate of a frame by day, by the height of a unit: `app.planning.predict.models.PlateModel`."""
+    """Read rate of a frame by day, by the height of a unit: `app.planning.predict.rates.PlateModel`."""
     model = fitted_models().plate_model(DAY)
     nodes, weights = normal_quadrature()
     odds = model.pass_log_odds(unit_px, 0.0)[:, None] + model.spread * nodes

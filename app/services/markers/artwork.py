@@ -5,29 +5,40 @@ from __future__ import annotations
 import hashlib
 import tempfile
 import threading
+import zipfile
+from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import IO, Any
 
-from app.encoders.plate import (
-    ArtworkFormat,
-    ArtworkOptions,
-    BundleOptions,
-    PlateReader,
-    write_artwork,
-    write_bundle,
-)
-from app.encoders.plate.bundle import NO_QR_CODE
-from app.encoders.plate.formats import DEFAULT_DPI
+import orjson
+
+from app.encoders.packer import Packer
+from app.encoders.plate import ArtworkFormat, ArtworkOptions, BundleOptions, PlateReader, write_artwork, write_bundle
+from app.encoders.plate.bundle import NO_QR_CODE, bundle_manifest, plate_names
+from app.encoders.plate.writers import DEFAULT_DPI
 from app.errors import NotFound, Unavailable
 from app.families import FAMILIES, get_family
-from app.families.files import ArtworkProof, MarkerArtwork
-from app.families.plate.artwork import is_unfit, plate_order
+from app.families.family import ArtworkProof, MarkerArtwork
+from app.families.plate.frames import is_unfit, plate_order
 from app.families.plate.plates import PLATE
+from app.registry import jobs as registry_jobs
 from app.registry import markers as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
+from app.registry.jobs import JobKind, new_job
 from app.registry.marker_rows import MarkerRow
 from app.services.access.access import Caller
-from app.services.markers.selection import Selection, select_markers
+from app.services.idempotency import IdempotencyKey, find_earlier, write_once
+from app.services.jobs import RunningJob
+from app.services.markers.searches import Selection, select_markers
+from app.services.markers.tasks import DrawPlateTask, WriteSheetsTask
+from app.services.plans.proofs import WAIT_S, tasks_in_order
+from app.services.ports import Clock, DecoderProcesses, JobQueue
+from app.services.progress import JobDocument, JobFiles, job_document
 
 MAX_PLATES = 5_000
 _BUNDLES_AT_ONCE = 2
@@ -167,3 +178,114 @@ def qr_code_header(public_url: str) -> str:
 
 def _lowest_confidence(manifest: dict[str, Any]) -> float:
     return float(min(plate["proof"]["confidence"] for plate in manifest["plates"]))
+
+
+# === Artwork of many plates as a job: each is drawn and read back in a decoder process, and the ZIP is written to disk.
+
+
+IMMEDIATE_PLATES = 10
+"""More plates become a job. Source: half a second each, drawn and read back; a client waits for five."""
+
+
+class ArtworkJobs:
+    """Use cases on artwork that is a job.
+
+    Parameters
+    ----------
+    database, clock, processes, queue
+    files : JobFiles
+    public_url : str
+        Start of the addresses of public pages, which go into the QR codes; empty: there are no QR codes.
+    in_flight : int
+        Plates that are drawn at the same time.
+    idempotency_ttl : timedelta
+    """
+
+    def __init__(
+        self, database: Database, clock: Clock, processes: DecoderProcesses, queue: JobQueue, files: JobFiles,
+        *, public_url: str, in_flight: int = 2, idempotency_ttl: timedelta = timedelta(hours=24),
+    ) -> None:  # fmt: skip
+        self._database, self._clock, self._processes, self._queue = database, clock, processes, queue
+        self._files, self._public_url = files, public_url
+        self._in_flight, self._ttl = in_flight, idempotency_ttl
+
+    def is_job(self, caller: Caller, selection: Selection) -> bool:
+        """Whether a selection has so many plates that nobody should wait for them; raises as `submit`."""
+        return len(self._select(caller, selection)) > IMMEDIATE_PLATES
+
+    def submit(
+        self, caller: Caller, selection: Selection, options: Mapping[str, Any], key: IdempotencyKey | None = None
+    ) -> tuple[JobDocument, bool]:
+        """Queue the artwork of the plates that are selected now; returns whether it was queued before.
+
+        Raises
+        ------
+        InvalidParameter
+            No plates or too many.
+        NotFound
+            A plate is missing.
+        """
+        now, agency_id = self._clock(), caller.agency_id
+        if earlier := find_earlier(self._database, agency_id, key, now):
+            return earlier, True
+        job_input = {"marker_ids": self._select(caller, selection), "options": dict(options), "label": caller.label}
+        job = new_job(JobKind.ARTWORK, new_id(now), agency_id, caller.key_id, now, job_input=job_input)
+        with write_once(self._database, agency_id, key, now, self._ttl) as (connection, answer):
+            if answer.replayed:
+                return answer.response, True
+            registry_jobs.add_job(connection, job)
+            document = answer.store(job_document(job, now))
+        self._queue.submit(job.id, agency_id, JobKind.ARTWORK)
+        return document, False
+
+    def run(self, job: RunningJob) -> None:
+        """Write the ZIP; the handler of jobs of the kind `JobKind.ARTWORK`."""
+        options = bundle_options(job.row.input["options"])
+        selection = Selection(tuple(job.row.input["marker_ids"]))
+        with self._database.read() as connection:
+            rows = select_markers(connection, job.row.agency_id, selection, PLATE.name, most=MAX_PLATES)
+        orders = tuple(plate_order(row, page_url(self._public_url, row.id)) for row in rows)
+        tasks = (DrawPlateTask(*one, options) for one in zip(orders, plate_names(orders), strict=True))
+        total, plates = len(orders), []
+        job.report_progress(0.0, steps=(0, total))
+        with TemporaryDirectory(prefix="waymark-artwork-") as folder:
+            path = Path(folder) / "artwork.zip"
+            with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+                packer = Packer(archive)
+                with closing(tasks_in_order(self._processes, tasks, self._in_flight)) as drawn:
+                    for done, (files, entry) in enumerate(drawn, 1):
+                        for name, content in files:
+                            packer.add(name, content)
+                        plates.append(entry)
+                        job.report_progress(done / (total + 1), steps=(done, total))
+                sheets = self._processes.submit(WriteSheetsTask(orders, options), wait_s=WAIT_S).result()
+                for name, content in sheets:
+                    packer.add(name, content)
+                manifest = bundle_manifest(plates, list(packer.entries), options, proved=True)
+                packer.add("manifest.json", orjson.dumps(manifest, option=orjson.OPT_INDENT_2))
+            lowest = min(plate["proof"]["confidence"] for plate in plates)
+            headers = {
+                "Waymark-Proof": f"read-back plates={total} lowest-confidence={lowest:.6f}",
+                "Waymark-QR-Code": qr_code_header(self._public_url),
+            }
+            if approximate := sum(is_unfit(row) for row in rows):
+                headers["Waymark-Note"] = (
+                    f"{approximate} of {total} plates have a position that is not for localization"
+                )
+            self._files.finish(job, path, name="waymark-artwork.zip", media_type="application/zip", headers=headers)
+
+    def _select(self, caller: Caller, selection: Selection) -> list[str]:
+        with self._database.read() as connection:
+            rows = select_markers(connection, caller.agency_id, selection, PLATE.name, most=MAX_PLATES)
+        return [row.id for row in rows]
+
+
+def bundle_options(given: Mapping[str, Any]) -> BundleOptions:
+    """Options from the members of a request, as they are stored in the job."""
+    sheet = given.get("sheet")
+    return BundleOptions(
+        formats=tuple(dict.fromkeys(ArtworkFormat(form) for form in given["formats"])),
+        artwork=ArtworkOptions(heaters=given["heaters"], leds=given["leds"]),
+        sheet_mm=(sheet["width_mm"], sheet["height_mm"]) if sheet else None,
+        dpi=given["resolution_dpi"],
+    )

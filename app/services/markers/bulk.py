@@ -12,7 +12,7 @@ from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter, Unavailable, WaymarkError
 from app.families.documents import WarningDocument
-from app.families.new_marker import NewMarker
+from app.families.surveys import NewMarker
 from app.registry.database import Database
 from app.services.access.access import Caller
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once

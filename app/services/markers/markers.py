@@ -3,38 +3,103 @@
 from __future__ import annotations
 
 import secrets
+import types
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any, NotRequired
 
 import sqlalchemy as sa
+from pydantic import JsonValue
+from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter
-from app.families import get_family
-from app.families.documents import MarkerDocument, WarningDocument
+from app.families import FAMILIES, get_family, union_of
+from app.families.documents import MarkerDocument, PositionIn, WarningDocument, place_input, position_columns
 from app.families.family import Family, Registration
-from app.families.inputs import PositionIn
-from app.families.new_marker import NewMarker
-from app.families.positions import place_input, position_columns
-from app.families.rules import MarkerRules
+from app.families.surveys import MarkerRules, NewMarker
+from app.registry import decodes as registry_observations
 from app.registry import markers as store
 from app.registry.audit import recording
+from app.registry.column_types import new_id
 from app.registry.database import Database
+from app.registry.decodes import ObservationRow, Place
 from app.registry.history import get_version, list_versions
-from app.registry.ids import new_id
 from app.registry.marker_rows import MarkerRow, VersionRow
+from app.registry.markers import get_marker
 from app.registry.resources import check_version
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
-from app.services.documents import document_of
+from app.services.documents import VersionKind, document_of, kind_of_change, kind_of_new
 from app.services.idempotency import IdempotencyKey, write_once
-from app.services.markers.accuracy import AccuracyDocument, accuracy_document
-from app.services.markers.documents import VersionDocument
-from app.services.markers.plausibility import WarningMode, check_position
+from app.services.markers.plausibility import AccuracyDocument, WarningMode, accuracy_document, check_position
 from app.services.ports import Clock
-from app.services.roads.routes import linear_references
-from app.services.version_kinds import kind_of_change, kind_of_new
+from app.services.roads.documents import linear_references
+
+# === Shapes of markers of all families, and of the answers that hold them.
+
+
+class AlongDocument(TypedDict):
+    """Where a marker is along the line of a search."""
+
+    distance_m: float
+    offset_m: float
+    ambiguous: bool
+
+
+class Found(TypedDict):
+    """What a search adds to a marker."""
+
+    distance_m: NotRequired[float]
+    along: NotRequired[AlongDocument]
+
+
+class FoundMarker(MarkerDocument, Found):
+    """A marker of any family that a search found; `distance_m` is from the place of the search. [m]"""
+
+
+def _found(document: Any) -> Any:
+    """The shape of a family's markers in the answer to a search."""
+    return types.new_class(f"Found{document.__name__}", (document, Found))
+
+
+if TYPE_CHECKING:
+    AnyMarker = MarkerDocument
+    AnyMarkerDetail = MarkerDocument
+    AnyFoundMarker = FoundMarker
+else:
+    AnyMarker = union_of(family.document_type for family in FAMILIES)
+    AnyMarkerDetail = union_of(family.detail_type for family in FAMILIES)
+    AnyFoundMarker = union_of(_found(family.document_type) for family in FAMILIES)
+
+
+class MarkerPage(TypedDict):
+    """A page of markers; the Link header leads to the next one."""
+
+    items: list[AnyFoundMarker]
+
+
+class VersionDocument(TypedDict):
+    """One entry of a marker's history."""
+
+    version: int
+    at: datetime
+    who: str
+    why: str | None
+    kind: VersionKind
+    sha256: str
+    audit_number: int
+    marker: AnyMarker
+
+
+class VersionPage(TypedDict):
+    """A page of a marker's history, oldest first."""
+
+    items: list[VersionDocument]
+
+
+# === Registering, finding and changing markers.
+
 
 Step = Callable[[sa.Connection], MarkerDocument]
 """What is left to do in the transaction: it returns the marker as it is then."""
@@ -276,3 +341,138 @@ def _spec_changes(family: Family[Any, Any], change: MarkerChange) -> dict[str, A
 def _version_document(row: VersionRow) -> VersionDocument:
     """An entry of a marker's history."""
     return document_of(VersionDocument, row, marker=_family(row.marker).document(row.marker))
+
+
+# === What vehicles saw of a marker.
+
+
+_THERE = frozenset({"seen", "ambiguous", "off-line", "wrong-way"})
+"""Kinds that say that a marker stands where it should, as far as they go."""
+
+
+class ObservationDocument(TypedDict):
+    """What one decode saw of the marker, in one frame if it was a video."""
+
+    decode_id: str
+    frame: int
+    at: datetime
+    what: str
+    detail: dict[str, JsonValue] | None
+
+
+class ObservationPage(TypedDict):
+    """A page of observations, newest first."""
+
+    items: list[ObservationDocument]
+
+
+class ObservationSummary(TypedDict):
+    """How often a marker was seen, and how."""
+
+    marker_id: str
+    observations: int
+    first_at: datetime | None
+    last_at: datetime | None
+    last_what: str | None
+    last_seen_at: datetime | None
+    counts: dict[str, int]
+
+
+class Observations:
+    """Reading observations, one transaction each."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def page(
+        self,
+        caller: Caller,
+        marker_id: str,
+        *,
+        what: str | None = None,
+        since: datetime | None = None,
+        until: datetime | None = None,
+        before: Place | None = None,
+        limit: int = 100,
+    ) -> tuple[ObservationPage, str | None]:
+        """A page, newest first, and where it ended if there is more.
+
+        Raises
+        ------
+        NotFound
+            There is no such marker, or it belongs to another agency.
+        """
+        with self._database.read() as connection:
+            get_marker(connection, caller.agency_id, marker_id)
+            rows = registry_observations.list_of_marker(
+                connection,
+                caller.agency_id,
+                marker_id,
+                what=what,
+                since=since,
+                until=until,
+                before=before,
+                limit=limit + 1,
+            )
+        page = ObservationPage(
+            items=[
+                {"decode_id": row.decode_id, "frame": row.frame, "at": row.at, "what": row.what, "detail": row.detail}
+                for row in rows[:limit]
+            ]
+        )
+        return page, cursor_of(rows[limit - 1]) if len(rows) > limit else None
+
+    def summary(self, caller: Caller, marker_id: str) -> ObservationSummary:
+        """How often a marker was seen and how, first and last.
+
+        Raises
+        ------
+        NotFound
+            There is no such marker, or it belongs to another agency.
+        """
+        with self._database.read() as connection:
+            get_marker(connection, caller.agency_id, marker_id)
+            rows = registry_observations.summarize(connection, caller.agency_id, marker_id)
+            newest = registry_observations.list_of_marker(connection, caller.agency_id, marker_id, limit=1)
+        there = [row.last for row in rows if row.what in _THERE]
+        return {
+            "marker_id": marker_id,
+            "observations": sum(row.number for row in rows),
+            "first_at": min((row.first for row in rows), default=None),
+            "last_at": max((row.last for row in rows), default=None),
+            "last_what": newest[0].what if newest else None,
+            "last_seen_at": max(there, default=None),
+            "counts": {row.what: row.number for row in rows},
+        }
+
+
+def cursor_of(row: ObservationRow) -> str:
+    """Where an observation stands, as text."""
+    return f"{row.at.isoformat()},{row.decode_id},{row.frame}"
+
+
+def place_of(cursor: str) -> Place:
+    """Where a page ended, from its text.
+
+    Raises
+    ------
+    InvalidParameter
+        It is not such a text.
+    """
+    parts = cursor.split(",")
+    try:
+        at, decode_id, frame = datetime.fromisoformat(parts[0]), parts[1], int(parts[2])
+    except (ValueError, IndexError) as error:
+        raise _bad_cursor() from error
+    if len(parts) != 3 or at.tzinfo is None or not 0 <= frame < 2**31 or not 1970 < at.year < 9999:
+        raise _bad_cursor()
+    return Place(at, decode_id[:36], frame)
+
+
+def _bad_cursor() -> InvalidParameter:
+    return InvalidParameter(
+        "this is not where a page of observations ended",
+        field="before",
+        limit="as the link to the next page has it",
+        cure="start without before, and follow the links",
+    )

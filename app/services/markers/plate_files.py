@@ -9,9 +9,8 @@ from app.encoders.plate import ArtworkFormat, ArtworkOptions, PlateOrder, PlateR
 from app.encoders.plate import encode_plate as draw_plate
 from app.errors import InvalidParameter
 from app.formats.images import ImageLimits, load_image
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import RECOMMENDED_POSITION_SCHEME, PlateCode, PlateGeometry, PlateScheme, recommended_geometry
 from app.markers.reading import PlateReading
-from app.markers.recommended_plate import RECOMMENDED_POSITION_SCHEME, recommended_geometry
 from app.services.decodes.frame_documents import FramesResult, ReadFrame, ReadMarker, frames_result
 
 

@@ -5,19 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from app.errors import InvalidParameter, UnreadableUpload, UploadTooLarge
+from app.families.plate.inputs import plate_code, plate_geometry
 from app.families.plate.plates import PLATE
-from app.families.plate.rows import plate_code, plate_geometry
-from app.formats.image_headers import FIELD, is_picture, unknown_picture
-from app.formats.images import ImageLimits
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
+from app.formats.images import FIELD, ImageLimits, is_picture, unknown_picture
 from app.markers.plate import PlateCode, PlateGeometry
 from app.planning.rules import CameraRules
 from app.registry import markers as store
 from app.registry.database import Database
 from app.services.access.access import Caller
-from app.services.decoder_processes import DecoderProcesses
-from app.services.markers.print_task import GradedPhoto, PrintGradeTask
-from app.services.ports import Clock
+from app.services.markers.tasks import GradedPhoto, PrintGradeTask
+from app.services.ports import Clock, DecoderProcesses
 
 _BUSY_WAIT_S = 10.0
 _SIGNATURE_BYTES = 16

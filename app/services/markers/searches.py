@@ -2,28 +2,241 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import cast
+from itertools import pairwise
+from typing import Any, cast
 
 import numpy as np
+import shapely
+import sqlalchemy as sa
+from shapely.errors import ShapelyError
 from typing_extensions import Unpack
 
 from app.errors import InvalidParameter, naming
 from app.families import get_family
 from app.families.documents import MarkerDocument
+from app.geodesy import check_lon_lat
 from app.registry import markers as store
 from app.registry.database import Database
 from app.registry.history import list_as_of
 from app.registry.marker_rows import MarkerRow
 from app.registry.markers import MarkerFilter
-from app.registry.nearest import find_nearest_at_once, list_nearest
-from app.registry.searches import list_places
-from app.registry.spatial import distances_m
+from app.registry.nearest import find_nearest_at_once, list_nearest, list_places
+from app.registry.spatial import Area, Box, distances_m
 from app.roads.axis import Axis, Foot
 from app.services.access.access import Caller
-from app.services.markers.documents import Found, FoundMarker
+from app.services.markers.markers import Found, FoundMarker
+
+# === Boxes that clients search in, as queries and bodies write them.
+
+
+MAX_OVER_ANTIMERIDIAN_DEG = 180.0
+"""Width of a box over the antimeridian. Source: RFC 7946 section 5.2 allows any; a wider one has its sides swapped."""
+
+
+def parse_box(text: str) -> Box:
+    """West, south, east, north as a query writes them."""
+    return checked_box(*parse_numbers(text, "bbox", "west,south,east,north"))
+
+
+def checked_box(west_deg: float, south_deg: float, east_deg: float, north_deg: float) -> Box:
+    """A box; a west above the east spans the antimeridian.
+
+    Raises
+    ------
+    InvalidParameter
+        A side is out of range, the south is above the north, or the box over the antimeridian is wider than half the
+        earth: its west and east are swapped.
+    """
+    check_lon_lat(west_deg, south_deg, field="bbox")
+    check_lon_lat(east_deg, north_deg, field="bbox")
+    if south_deg > north_deg:
+        raise InvalidParameter(
+            "bbox has its south above its north",
+            field="bbox",
+            limit="south <= north",
+            cure="send west,south,east,north; only the longitudes may be the other way round, over the antimeridian",
+        )
+    if west_deg > east_deg and (width_deg := 360.0 + east_deg - west_deg) > MAX_OVER_ANTIMERIDIAN_DEG:
+        raise InvalidParameter(
+            f"bbox has its west above its east, so it spans {width_deg:.6g} degrees over the antimeridian",
+            field="bbox",
+            limit=f"{MAX_OVER_ANTIMERIDIAN_DEG:g} degrees over the antimeridian",
+            cure="send west,south,east,north",
+        )
+    return Box(west_deg, south_deg, east_deg, north_deg)
+
+
+def parse_numbers(text: str, field: str, *forms: str) -> list[float]:
+    """Numbers between commas, as many as one of the forms has names; else InvalidParameter."""
+    parts = text.split(",")
+    if len(parts) not in [len(form.split(",")) for form in forms]:
+        form = " or ".join(forms)
+        raise InvalidParameter(f"{field} is {form}", field=field, limit=form, cure="separate the numbers by commas")
+    try:
+        return [float(part) for part in parts]
+    except ValueError as error:
+        raise InvalidParameter(f"{field} holds something that is not a number", field=field, limit=forms[0]) from error
+
+
+# === Polygons that clients search in: checked, and in the form that both databases ask.
+
+
+MAX_VERTICES = 10_000
+MAX_POLYGONS = 100
+_HALF_TURN_DEG = 180.0
+
+Ring = Sequence[Sequence[float]]
+
+
+def area_of(polygons: Sequence[Sequence[Ring]], field: str = "polygon") -> Area:
+    """Area of polygons, each its outer ring and its holes, as GeoJSON's MultiPolygon has them.
+
+    Raises
+    ------
+    InvalidParameter
+        Too many vertices, rings that are open, out of range or over the antimeridian, polygons that cross themselves.
+    """
+    count = sum(len(ring) for polygon in polygons for ring in polygon)
+    if not 4 <= count <= MAX_VERTICES or len(polygons) > MAX_POLYGONS:
+        raise InvalidParameter(
+            f"the polygon has {count} vertices in {len(polygons)} parts",
+            field=field,
+            limit=f"4 to {MAX_VERTICES} vertices in at most {MAX_POLYGONS} polygons",
+            cure="simplify it, or search in its parts",
+        )
+    for polygon in polygons:
+        if not polygon:
+            raise InvalidParameter(
+                "a polygon has no outer ring", field=field, limit="one ring at least", cure="leave it out"
+            )
+        for ring in polygon:
+            _check_ring(ring, field)
+    shapes = [
+        shapely.Polygon([p[:2] for p in polygon[0]], [[p[:2] for p in hole] for hole in polygon[1:]])
+        for polygon in polygons
+    ]
+    shape = shapes[0] if len(shapes) == 1 else shapely.MultiPolygon(shapes)
+    if not shape.is_valid:
+        raise InvalidParameter(
+            f"the polygon is not simple: {shapely.is_valid_reason(shape)}",
+            field=field,
+            limit="rings that neither cross nor touch along a line, holes inside",
+            cure="correct the place that is named, or let a GIS make the geometry valid",
+        )
+    return Area(shapely.to_wkb(shape, byte_order=1), tuple(Box(*part.bounds) for part in shapes))
+
+
+def area_of_text(text: str, field: str = "polygon") -> Area:
+    """Area of a POLYGON or MULTIPOLYGON in WKT.
+
+    Raises
+    ------
+    InvalidParameter
+        It is something else, or `area_of` refuses it.
+    """
+    try:
+        with np.errstate(invalid="ignore"):  # GEOS says so of NaN
+            shape: Any = shapely.from_wkt(text)
+        document = json.loads(shapely.to_geojson(shapely.force_2d(shape)))
+    except (ShapelyError, ValueError, TypeError) as error:
+        raise _not_wkt(field) from error
+    if not np.isfinite(shapely.get_coordinates(shape)).all():
+        raise _not_wkt(field)
+    if document["type"] == "Polygon":
+        return area_of([document["coordinates"]], field)
+    if document["type"] == "MultiPolygon":
+        return area_of(document["coordinates"], field)
+    raise _not_wkt(field)
+
+
+def _not_wkt(field: str) -> InvalidParameter:
+    return InvalidParameter(
+        "this is not the WKT of a polygon",
+        field=field,
+        limit="POLYGON or MULTIPOLYGON of longitude latitude",
+        cure="write POLYGON((8.4 49, 8.5 49, 8.5 49.1, 8.4 49)), or POST GeoJSON to /v1/markers/search",
+    )
+
+
+def _check_ring(ring: Ring, field: str) -> None:
+    if len(ring) < 4 or list(ring[0][:2]) != list(ring[-1][:2]):
+        raise InvalidParameter(
+            "a ring is not closed",
+            field=field,
+            limit="four positions at least, the last is the first",
+            cure="repeat the first position at the end",
+        )
+    for position in ring:
+        check_lon_lat(position[0], position[1], field)
+    if any(abs(a[0] - b[0]) > _HALF_TURN_DEG for a, b in pairwise(ring)):
+        raise InvalidParameter(
+            "an edge of the polygon is longer than half a turn",
+            field=field,
+            limit="180 deg of longitude",
+            cure="cut the polygon at the antimeridian into a MultiPolygon (RFC 7946, section 3.1.9)",
+        )
+
+
+# === Markers of one family, picked by id or by a filter.
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Markers by id, or all that a filter leaves."""
+
+    marker_ids: tuple[str, ...] = ()
+    filtered: MarkerFilter = field(default_factory=MarkerFilter)
+
+
+def select_markers(
+    connection: sa.Connection, agency_id: str, selection: Selection, family: str, *, most: int
+) -> list[MarkerRow]:
+    """The agency's markers of one family in a selection, 1 to `most` of them.
+
+    Raises
+    ------
+    InvalidParameter
+        None or too many, or one is named twice.
+    NotFound
+        One is missing.
+    """
+    count = len(selection.marker_ids)
+    if count > most:
+        raise _too_many(f"{count} {family}s were selected", family, most)
+    if len(set(selection.marker_ids)) != count:
+        raise InvalidParameter(
+            f"a {family} is selected twice", field="marker_ids", limit="each id once", cure="leave repetitions out"
+        )
+    if selection.marker_ids:
+        rows = store.get_markers(connection, agency_id, list(selection.marker_ids))
+    else:
+        filtered = replace(selection.filtered, family=family)
+        rows = store.list_markers(connection, agency_id, filtered, after=None, limit=most + 1)
+    found = [row for row in rows if row.family == family]
+    if len(found) > most:
+        raise _too_many(f"more than {most} {family}s were selected", family, most)
+    if not found:
+        raise InvalidParameter(
+            f"no {family} was selected", field="marker_ids", limit=f"1 to {most} {family}s", cure="widen the filter"
+        )
+    return found
+
+
+def _too_many(message: str, family: str, most: int) -> InvalidParameter:
+    return InvalidParameter(
+        message,
+        field="marker_ids",
+        limit=f"{most} {family}s at once",
+        cure="select by a smaller box, by status, or by fewer ids",
+    )
+
+
+# === Finding markers.
+
 
 MAX_ALONG = 20_000
 MAX_LINE_M = 1_000_000.0

@@ -7,15 +7,10 @@ from datetime import timedelta
 from typing import Any
 
 from app.errors import InvalidParameter
-from app.formats.alignments.registered_road import (
-    RegisteredRoad,
-    RoadLanes,
-    RoadStation,
-    write_registered_road,
-)
-from app.formats.spooled_file import SpooledFile
+from app.formats.alignments.read import RegisteredRoad, RoadLanes, RoadStation, write_registered_road
+from app.formats.format import SpooledFile
 from app.geodesy import LocalizationGrade
-from app.planning.alignment_declaration import AlignmentDeclaration
+from app.planning.alignment import AlignmentDeclaration
 from app.registry.database import Database
 from app.registry.markers import MarkerFilter
 from app.registry.plan_features import add_lanes
@@ -25,13 +20,12 @@ from app.registry.roads import ROADS, RoadRow
 from app.registry.spatial import Box
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
-from app.services.decoder_processes import DecoderProcesses
+from app.services.blobs import staged
 from app.services.documents import document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, idempotent
 from app.services.plans.documents import AlignmentDocument, AlignmentPage, AlignmentProfile
 from app.services.plans.tasks import MapForm, ProfileRoadTask, RoadFile, SummarizeRoadTask, WriteMapTask
-from app.services.ports import Blobs, Clock
-from app.services.staged_blobs import staged
+from app.services.ports import Blobs, Clock, DecoderProcesses
 
 BUSY_WAIT_S = 10.0
 """How long a request waits for a decoder process. [s] Source: chosen by hand, as imports."""

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from app.markers.checks import Verdict
-from app.planning.as_built import SurveyedPlace, plan_as_built, residual_of
-from app.planning.plan import Plan, PlanFinding
+from app.markers.reading import Verdict
+from app.planning.plan import Plan, PlanFinding, SurveyedPlace, plan_as_built, residual_of
 from app.planning.plan_checks import ExistingMarker, check_plan
 from app.registry.plans import BuiltRow
 from app.services.documents import document_of

@@ -3,11 +3,251 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from pydantic import Field
 from typing_extensions import TypedDict
 
-from app.services.plans.proof_documents import ProofSummary
+from app.families.cerpm import RadioDocument
+from app.planning.radio_checks import RadioCheck, RadioPlan, Recommendation, check_radio, recommend_settings
+from app.radio.reception import RoadReception
+from app.services.documents import document_of
+
+# === What the API returns about a radio plan.
+
+
+class RadioFindingDocument(TypedDict):
+    """One check: its figure, the limit, where that comes from, and what follows."""
+
+    name: str
+    verdict: str
+    figure: float
+    relation: Literal[">=", "<="]
+    limit: float
+    unit: str
+    source: str
+    sentence: str
+
+
+class RoadReceptionDocument(TypedDict):
+    """Reception at points along the road; null where no marker is in range."""
+
+    station_m: list[float]
+    markers_in_range: list[int]
+    packet_success_mean: list[float | None]
+    packet_success_min: list[float | None]
+
+
+class RadioSettingsDocument(RadioDocument):
+    """Settings of a marker's radio."""
+
+
+class RecommendationDocument(TypedDict):
+    """The best lawful settings that were found."""
+
+    sentence: str
+    reaches: Annotated[bool, Field(description="Whether the probability asked for is reached.")]
+    radio: Annotated[RadioSettingsDocument | None, Field(description="Null where nothing is lawful.")]
+    receiver_channels: int
+    read_probability: float
+    battery_days: float
+
+
+class RadioCheckDocument(TypedDict):
+    """The result of checking a radio plan."""
+
+    verdict: str
+    time_on_air_s: float
+    range_m: float
+    preview_m: float
+    packet_success: float
+    read_probability: float
+    battery_days: float
+    checks: list[RadioFindingDocument]
+    road: RoadReceptionDocument
+    recommendation: RecommendationDocument | None
+
+
+def radio_check_document(check: RadioCheck, advice: Recommendation | None) -> RadioCheckDocument:
+    """A radio check, with the recommendation if one was asked for."""
+    return {
+        "verdict": str(check.verdict),
+        "time_on_air_s": round(check.time_on_air_s, 6),
+        "range_m": round(check.range_m, 1),
+        "preview_m": round(check.preview_m, 1),
+        "packet_success": round(check.packet_success, 6),
+        "read_probability": round(check.read_probability, 6),
+        "battery_days": round(check.battery_days, 1),
+        "checks": [
+            document_of(RadioFindingDocument, finding, verdict=str(finding.verdict)) for finding in check.checks
+        ],
+        "road": _reception(check.road),
+        "recommendation": None if advice is None else _recommendation(advice),
+    }
+
+
+def _reception(road: RoadReception) -> RoadReceptionDocument:
+    return {
+        "station_m": road.station_m.round(2).tolist(),
+        "markers_in_range": road.in_range.tolist(),
+        "packet_success_mean": road.success_mean.round(5).tolist(),
+        "packet_success_min": road.success_min.round(5).tolist(),
+    }
+
+
+def _recommendation(advice: Recommendation) -> RecommendationDocument:
+    return {
+        "sentence": advice.sentence,
+        "reaches": advice.reaches,
+        "radio": None if advice.settings is None else document_of(RadioSettingsDocument, advice.settings),
+        "receiver_channels": advice.receiver_channels,
+        "read_probability": round(advice.read_probability, 6),
+        "battery_days": round(advice.battery_days, 1),
+    }
+
+
+# === Documents of proofs of plans, as clients see them.
+
+
+class ProofTermsDocument(TypedDict):
+    """What was driven, and how."""
+
+    drives: int
+    seed: int
+    conditions: list[str]
+    cameras: list[str] | None
+    speed_share: float
+    lost_share: float
+    clearance_m: float
+    survey_rmse_m: float
+    max_markers_per_drive: int
+    max_sections_per_drive: int
+    weak_below: float
+
+
+class ReadRateDocument(TypedDict):
+    """Share of passes in which markers of one kind were read, with its 95 % interval."""
+
+    kind: str
+    condition: str
+    passes: int
+    read: int
+    lost: int
+    rate: float
+    low: float
+    high: float
+
+
+class WeakMarker(TypedDict):
+    """A marker that is read too rarely, and the most frequent cause."""
+
+    number: int
+    kind: str
+    lane: str
+    chainage_m: float
+    passes: int
+    read: int
+    rate: float | None
+    """Null if it was missing in every pass."""
+    cause: str | None
+
+
+class ProofFigures(TypedDict):
+    """What a proof found, in short."""
+
+    passed: bool
+    """No reading was wrong. Weak markers do not count."""
+    units: int
+    rates: list[ReadRateDocument]
+    markers: int
+    """Markers that were driven over."""
+    weak: int
+    wrong: int
+    weak_markers: list[WeakMarker]
+    """The first 100; the report has all."""
+    terms: ProofTermsDocument
+
+
+class ProofSummary(ProofFigures):
+    """The latest proof of a plan as it is."""
+
+    job_id: str
+    at: datetime
+    """When it ended."""
+
+
+class MarkerProofDocument(TypedDict):
+    """What the drives show about one marker."""
+
+    number: int
+    code: str
+    kind: str
+    lane: str
+    chainage_m: float
+    station_m: float
+    lon_deg: float
+    lat_deg: float
+    passes: int
+    read: int
+    lost: int
+    wrong: int
+    rate: float | None
+    low: float | None
+    high: float | None
+    fix_rms_m: float | None
+    weak: bool
+    cause: str | None
+
+
+class DriveDocument(TypedDict):
+    """One drive on one lane."""
+
+    drive: int
+    lane: str
+    condition: str
+    camera: str
+    passes: int
+    read: int
+    fixes: int
+    wrong: int
+    fix_rms_m: float | None
+    fix_worst_m: float | None
+    longest_gap_m: float | None
+    gap_from_m: float | None
+    gap_estimated: bool
+    path_rms_m: float | None
+    path_worst_m: float | None
+    path_worst_at_m: float | None
+    path_coverage: float | None
+    refusals: list[str]
+
+
+class WrongReadingDocument(TypedDict):
+    """Something that was read and is not there."""
+
+    drive: int
+    marker: int
+    """That was being passed; 0 beside line magnets."""
+    text: str
+
+
+class ProofDocument(TypedDict):
+    """The report of a proof."""
+
+    format: str
+    plan: str
+    terms: ProofTermsDocument
+    complete: bool
+    note: str
+    rates: list[ReadRateDocument]
+    drives: list[DriveDocument]
+    weak: list[int]
+    wrong: list[WrongReadingDocument]
+    markers: list[MarkerProofDocument]
+
+
+# === Documents of alignments and plans, as clients see them.
+
 
 PlanStatus = Literal["draft", "checked", "proved", "approved", "committed", "built", "surveyed"]
 
@@ -304,3 +544,18 @@ class AsBuiltDocument(TypedDict):
     """Those out of tolerance first, then by the size of their residuals; at most 1,000."""
     checks: list[CheckComparison]
     """Empty before the first marker is surveyed."""
+
+
+# === Use case on radio plans: check one, and recommend settings. Nothing is stored.
+
+
+def check_plan(plan: RadioPlan, *, recommend: bool) -> RadioCheckDocument:
+    """The result of checking a radio plan, with recommended settings if asked for.
+
+    Raises
+    ------
+    InvalidParameter
+        More markers are in range of one receiver than a check allows.
+    """
+    advice = recommend_settings(plan) if recommend else None
+    return radio_check_document(check_radio(plan), advice)

@@ -16,25 +16,22 @@ from app.encoders.packer import Packer
 from app.encoders.plate import ArtworkFormat, ArtworkOptions
 from app.errors import NotFound
 from app.planning.outputs.drawing_sheet import TitleBlock
-from app.planning.outputs.files import OutputOptions
-from app.planning.outputs.package import MANIFEST, PackageOptions
+from app.planning.outputs.package import MANIFEST, OutputOptions, PackageOptions
 from app.planning.outputs.strip_map import DrawingOptions
-from app.plots.trade_off import draw_trade_off
+from app.plots.track import draw_trade_off
 from app.registry import jobs as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.jobs import JobKind, new_job
 from app.registry.plans import PLANS
 from app.services.access.access import Caller
-from app.services.decoder_processes import DecoderProcesses
+from app.services.blobs import delete_unused, staged
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.plans.alignments import BUSY_WAIT_S
-from app.services.plans.fan_out import WAIT_S, tasks_in_order
-from app.services.plans.package_tasks import ListPartsTask, WriteManifestTask, WritePartTask
-from app.services.plans.plan_jobs import PlanJobDocument, check_only_one, plan_job_document
-from app.services.ports import Blobs, Clock, JobQueue
-from app.services.staged_blobs import delete_unused, staged
+from app.services.plans.proofs import WAIT_S, PlanJobDocument, check_only_one, plan_job_document, tasks_in_order
+from app.services.plans.tasks import ListPartsTask, WriteManifestTask, WritePartTask
+from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue
 
 _FOLDER = "packages"
 

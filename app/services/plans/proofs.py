@@ -2,33 +2,274 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 import zlib
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Generator, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from datetime import timedelta
+from contextvars import copy_context
+from datetime import datetime, timedelta
 from functools import partial
-from typing import Any, cast
+from typing import Annotated, Any, Literal, NotRequired, TypeVar, cast
 
-from app.errors import NotFound
+import sqlalchemy as sa
+from pydantic import Field
+from typing_extensions import TypedDict
+
+from app.errors import Conflict, NotFound, Unavailable
 from app.planning.proof import ProofTerms, UnitResult
 from app.registry import jobs as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
-from app.registry.jobs import JobKind, new_job
-from app.registry.plans import PLANS, PlanRow
-from app.registry.proof_units import add_unit, delete_units, list_units
-from app.services.access.access import Caller
+from app.registry.jobs import UNFINISHED, JobKind, JobRow, JobState, new_job
+from app.registry.plans import PLANS, PlanRow, add_unit, delete_units, list_units
+from app.services.access.access import Caller, Scope
 from app.services.access.audit import log_change
-from app.services.decoder_processes import DecoderProcesses
+from app.services.blobs import delete_unused, staged
+from app.services.documents import ErrorDocument, document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.jobs import RunningJob
 from app.services.plans.alignments import BUSY_WAIT_S
-from app.services.plans.fan_out import WAIT_S, tasks_as_done
-from app.services.plans.plan_jobs import PlanJobDocument, caller_of, check_only_one, plan_job_document
-from app.services.plans.proof_tasks import ListUnitsTask, ProveUnitTask, WriteProofTask, WrittenProof
-from app.services.plans.statuses import CHECKED, PROVED
-from app.services.ports import Blobs, Clock, JobQueue
-from app.services.staged_blobs import delete_unused, staged
+from app.services.plans.tasks import ListUnitsTask, ProveUnitTask, WriteProofTask, WrittenProof
+from app.services.ports import Blobs, Clock, DecoderProcesses, JobQueue, Pending, Task
+
+# === Many tasks of one job in the decoder processes, a limited number of them at the same time.
+
+
+KeyT = TypeVar("KeyT")
+ResultT = TypeVar("ResultT")
+WAIT_S = 60.0
+"""How long a job waits for a place among the tasks of the decoder processes before it is put back. [s]
+Source: chosen by hand, as decodes."""
+
+
+def tasks_as_done(
+    processes: DecoderProcesses, tasks: Iterable[tuple[KeyT, Task[ResultT]]], in_flight: int
+) -> Generator[tuple[KeyT, ResultT]]:
+    """Results in the order in which they come. Those on their way are stopped where the caller goes no further.
+
+    Parameters
+    ----------
+    processes : DecoderProcesses
+    tasks : iterable of (key, task)
+    in_flight : int
+        Tasks that wait or are carried out at the same time; uploads of vehicles queue behind no more than these.
+    """
+    feeder = _Feeder(processes)
+    pool = ThreadPoolExecutor(in_flight, thread_name_prefix="plan-tasks")
+    done: queue.SimpleQueue[Future[ResultT]] = queue.SimpleQueue()  # in the order in which they ended
+    try:
+        futures = {pool.submit(copy_context().run, feeder.carry_out, task): key for key, task in tasks}
+        for future in futures:
+            future.add_done_callback(done.put)
+        for _ in range(len(futures)):
+            future = done.get()
+            yield futures.pop(future), future.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        feeder.stop()
+        pool.shutdown()
+
+
+def tasks_in_order(processes: DecoderProcesses, tasks: Iterable[Task[ResultT]], in_flight: int) -> Generator[ResultT]:
+    """Results in the order of the tasks; otherwise as `tasks_as_done`. Only `in_flight` results are in memory."""
+    waiting: deque[Pending[ResultT]] = deque()
+    try:
+        for task in tasks:
+            waiting.append(processes.submit(task, wait_s=WAIT_S))
+            if len(waiting) >= in_flight:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for pending in waiting:
+            pending.cancel()
+
+
+class _Feeder:
+    """Hands tasks over from several threads, and stops those that are on their way."""
+
+    def __init__(self, processes: DecoderProcesses) -> None:
+        self._processes = processes
+        self._lock = threading.Lock()
+        self._running: set[Pending[Any]] = set()
+        self._stopped = threading.Event()
+
+    def carry_out(self, task: Task[ResultT]) -> ResultT:
+        """Hand a task over and wait for its result."""
+        if self._stopped.is_set():
+            raise Unavailable("the job was stopped")
+        pending = self._processes.submit(task, wait_s=WAIT_S)
+        with self._lock:
+            self._running.add(pending)
+        if self._stopped.is_set():
+            pending.cancel()
+        try:
+            return pending.result()
+        finally:
+            with self._lock:
+                self._running.discard(pending)
+
+    def stop(self) -> None:
+        """Stop the tasks."""
+        self._stopped.set()
+        with self._lock:
+            running = list(self._running)
+        for pending in running:
+            pending.cancel()
+
+
+# === The life of a plan.
+
+
+DRAFT, CHECKED, PROVED, APPROVED, COMMITTED = "draft", "checked", "proved", "approved", "committed"
+
+
+# === Jobs about plans: making one of a long road, proving one, packing its files. Listed, read and cancelled alike.
+
+
+KINDS = (JobKind.PLAN, JobKind.PROOF, JobKind.PACKAGE)
+PlanJobKind = Literal["plan", "proof", "package"]
+
+
+class PlanJobLinks(TypedDict):
+    """Where to read the job again, and the plan."""
+
+    self: str
+    plan: NotRequired[str]
+
+
+class PlanJobResult(TypedDict):
+    """What a job has done. Members that do not belong to its kind are left out."""
+
+    plan_version: NotRequired[int]
+    """Version of the plan that was proved, packed or made."""
+    outdated: NotRequired[bool]
+    """The plan was changed while it was proved: the result is not its proof."""
+    passed: NotRequired[bool]
+    weak: NotRequired[int]
+    wrong: NotRequired[int]
+    size_bytes: NotRequired[int]
+    sha256: NotRequired[str]
+    files: NotRequired[int]
+
+
+class PlanJobSummary(TypedDict):
+    """A job about a plan, without its result."""
+
+    id: str
+    kind: PlanJobKind
+    plan_id: Annotated[str | None, Field(description="Null before the plan is made.")]
+    state: JobState
+    progress: Annotated[float, Field(description="0 to 1.")]
+    steps_done: Annotated[int | None, Field(description="Units of a proof, files of a package; null if unknown.")]
+    steps_total: int | None
+    attempts: Annotated[int, Field(description="Since the last part of the result was stored.")]
+    cancel_requested: Annotated[bool, Field(description="A running job stops at its next step.")]
+    created_at: datetime
+    finished_at: datetime | None
+    error: Annotated[ErrorDocument | None, Field(description="Why there is no result.")]
+    links: PlanJobLinks
+
+
+class PlanJobDocument(PlanJobSummary):
+    """A job about a plan."""
+
+    result: PlanJobResult | None
+
+
+class PlanJobPage(TypedDict):
+    """A page of jobs, newest first; the Link header leads to the next one."""
+
+    items: list[PlanJobSummary]
+
+
+class PlanJobs:
+    """Use cases on jobs about plans."""
+
+    def __init__(self, database: Database, clock: Clock) -> None:
+        self._database, self._clock = database, clock
+
+    def get(self, caller: Caller, job_id: str) -> PlanJobDocument:
+        """A job with its progress, and its result once there is one.
+
+        Raises
+        ------
+        NotFound
+            There is none with this id, or it belongs to another agency.
+        """
+        with self._database.read() as connection:
+            return plan_job_document(store.get_job(connection, caller.agency_id, KINDS, job_id))
+
+    def page(
+        self, caller: Caller, *, plan_id: str | None = None, state: str | None = None, before: str | None = None,
+        limit: int = 100,
+    ) -> tuple[PlanJobPage, str | None]:  # fmt: skip
+        """A page of jobs without their results, newest first, and the id to continue before."""
+        with self._database.read() as connection:
+            rows = store.list_jobs(
+                connection, caller.agency_id, KINDS, state=state, before=before, limit=limit + 1, subject_id=plan_id
+            )
+        page = PlanJobPage(items=[plan_job_summary(row) for row in rows[:limit]])
+        return page, rows[limit - 1].id if len(rows) > limit else None
+
+    def cancel(self, caller: Caller, job_id: str) -> PlanJobDocument:
+        """Cancel a job: a queued one never starts, a running one stops at its next step, a finished one stays.
+
+        Raises
+        ------
+        NotFound
+            There is none with this id, or it belongs to another agency.
+        """
+        with self._database.write() as connection:
+            store.get_job(connection, caller.agency_id, KINDS, job_id)
+            store.request_cancel(connection, caller.agency_id, job_id, self._clock())
+            return plan_job_document(store.get_job(connection, caller.agency_id, KINDS, job_id))
+
+
+def plan_job_document(job: JobRow) -> PlanJobDocument:
+    """A job as clients see it."""
+    result = None
+    if job.result is not None:
+        members = PlanJobResult.__annotations__
+        result = cast("PlanJobResult", {name: value for name, value in job.result.items() if name in members})
+    return {**plan_job_summary(job), "result": result}
+
+
+def plan_job_summary(job: JobRow) -> PlanJobSummary:
+    """A job without its result."""
+    links = PlanJobLinks(self=f"/v1/plan-jobs/{job.id}")
+    if job.subject_id is not None:
+        links["plan"] = f"/v1/plans/{job.subject_id}"
+    return document_of(PlanJobSummary, job, plan_id=job.subject_id, links=links)
+
+
+def check_only_one(connection: sa.Connection, agency_id: str, kind: JobKind, plan_id: str) -> None:
+    """Refuse a second job of a kind about a plan while one is unfinished.
+
+    Raises
+    ------
+    Conflict
+    """
+    other = store.find_job_about(connection, agency_id, kind, plan_id, UNFINISHED)
+    if other is not None:
+        raise Conflict(
+            f"job {other.id} about this plan is {other.state}",
+            field="plan_id",
+            limit=f"one {kind} of a plan at a time",
+            cure=f"wait for it, or cancel it: POST /v1/plan-jobs/{other.id}/cancel",
+        )
+
+
+def caller_of(job: RunningJob) -> Caller:
+    """Whom a job acts for: the permissions were checked when it was queued."""
+    return Caller(job.row.agency_id, job.row.holder_id or "", job.row.input["label"], Scope.PLANNER)
+
+
+# === Proofs of plans.
+
 
 REPORT_FILE, TABLE_FILE = "proof.json", "proof.csv"
 PROOF_FILES = (REPORT_FILE, TABLE_FILE)

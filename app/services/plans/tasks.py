@@ -2,18 +2,364 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from itertools import pairwise
+from typing import Any, Literal, cast
 
-from app.formats.spooled_file import SpooledFile
-from app.planning.alignment_declaration import AlignmentDeclaration
+import numpy as np
+import orjson
+
+from app.formats.format import SpooledFile
+from app.geodesy.systems import is_ellipsoidal
+from app.markers.reading import Verdict
+from app.planning.alignment import Alignment, AlignmentDeclaration, Floats, Lane, RoadEvent
+from app.planning.outputs.bill import plan_bill
+from app.planning.outputs.package import PackageOptions, PackagePart
+from app.planning.outputs.plan_document import lane_points_deg
+from app.planning.plan import Plan, PlanFinding, PlannedCerpm, PlannedLineMagnet, PlannedMarker
 from app.planning.plan_checks import ExistingMarker
-from app.registry.columns import Columns
+from app.planning.proof import ProofReport, ProofTerms, ProofUnit, UnitResult
+from app.registry.bulk_load import Columns
 from app.registry.marker_rows import MarkerRow
+from app.registry.plan_features import OF_MARKER
 from app.registry.plans import BuiltRow
-from app.services.decoder_processes import Task
-from app.services.plans.documents import AlignmentProfile, AsBuiltDocument
-from app.services.plans.features import LaneFeature
+from app.services.documents import document_of
+from app.services.plans.documents import (
+    AlignmentProfile,
+    AsBuiltDocument,
+    EventSummary,
+    FindingDocument,
+    LaneProfile,
+    LaneSummary,
+    LeftOutDocument,
+    PlanSummary,
+    ProfileEvent,
+    ProofFigures,
+    ProofTermsDocument,
+    ReadRateDocument,
+    RoadSummary,
+    WeakMarker,
+)
+from app.services.ports import Task
+
+# === Summaries of roads and plans, made where they are computed.
+
+
+MAX_LISTED = 1000
+"""Events, warnings and places left out that a summary lists; all are counted. Source: chosen by hand."""
+MAX_WEAK = 100
+"""Weak markers that the document of a plan lists; its report has all. Source: chosen by hand."""
+_STRAIGHT_PER_M = 1e-5  # [1/m] below it a lane is straight; source: chosen by hand, a radius of 100 km
+
+
+def road_summary(road: Alignment, format_name: str = "") -> RoadSummary:
+    """What a road has."""
+    return {
+        "format": format_name,
+        "lanes": [_lane_summary(lane) for lane in road.lanes],
+        "events": [document_of(EventSummary, event) for event in road.events[:MAX_LISTED]],
+        "areas": len(road.areas),
+        "lane_length_m": road.lane_length_m,
+        "extent_deg": extent_deg(road),
+        "crs": road.crs,
+        "realization": road.realization,
+        "surveyed": road.surveyed,
+        "localization_grade": str(road.grade),
+        "warnings": list(road.warnings[:MAX_LISTED]),
+    }
+
+
+def plan_summary(plan: Plan) -> dict[str, Any]:
+    """What a plan has, as `PlanSummary`."""
+    bill = plan_bill(plan)
+    summary: PlanSummary = {
+        "counts": plan.counts,
+        "lane_length_m": plan.alignment.lane_length_m,
+        "verdict": worst_verdict(plan.findings),
+        "findings": [document_of(FindingDocument, finding) for finding in plan.findings],
+        "left_out": [document_of(LeftOutDocument, left) for left in plan.left_out[:MAX_LISTED]],
+        "left_out_count": len(plan.left_out),
+        "cost": bill.total,
+        "cost_complete": bill.complete,
+        "currency": bill.currency,
+        "codebook_entries": len(plan.codebook.entries) if plan.codebook is not None else 0,
+    }
+    return dict(summary)
+
+
+def proof_figures(report: ProofReport, results: Sequence[UnitResult]) -> dict[str, Any]:
+    """What the plan's document shows of a proof, as `ProofFigures`."""
+    figures: ProofFigures = {
+        "passed": not report.wrong,
+        "units": len(results),
+        "rates": [document_of(ReadRateDocument, rate) for rate in report.rates],
+        "markers": len(report.markers),
+        "weak": len(report.weak),
+        "wrong": len(report.wrong),
+        "weak_markers": [document_of(WeakMarker, marker) for marker in report.weak[:MAX_WEAK]],
+        "terms": cast("ProofTermsDocument", report.terms.model_dump(mode="json")),
+    }
+    return dict(figures)
+
+
+def worst_verdict(findings: tuple[PlanFinding, ...]) -> str:
+    """The worst verdict of all findings."""
+    found = {finding.verdict for finding in findings}
+    return str(next((verdict for verdict in (Verdict.FAIL, Verdict.WARN) if verdict in found), Verdict.OK))
+
+
+def extent_deg(road: Alignment) -> list[float]:
+    """West, south, east, north of all lanes; the shorter way round the Earth. [deg]"""
+    lon = np.concatenate([lane.lon_deg for lane in road.lanes])
+    lat = np.concatenate([lane.lat_deg for lane in road.lanes])
+    across = (lon - lon[0] + 180.0) % 360.0 - 180.0
+    west, east = ((lon[0] + value + 180.0) % 360.0 - 180.0 for value in (across.min(), across.max()))
+    return [float(west), float(lat.min()), float(east), float(lat.max())]
+
+
+def _lane_summary(lane: Lane) -> LaneSummary:
+    sharpest = float(np.abs(lane.curvature_per_m).max())
+    speed = lane.design_speed_mps * 3.6
+    return {
+        "name": lane.name,
+        "road": lane.road,
+        "length_m": lane.length_m,
+        "width_m": [float(lane.width_m.min()), float(lane.width_m.max())],
+        "design_speed_kmh": [float(speed.min()), float(speed.max())] if np.isfinite(speed).all() else None,
+        "min_radius_m": 1 / sharpest if sharpest > _STRAIGHT_PER_M else None,
+        "max_grade": float(np.abs(lane.grade).max()),
+        "left_style": str(lane.left_style),
+        "right_style": str(lane.right_style),
+    }
+
+
+# === Lanes of an alignment to draw: their lines, stations and curvature, with few enough samples for a web page.
+
+
+MAX_SAMPLES = 5_000
+"""Of one lane. Source: chosen by hand, more than a screen has columns."""
+_MAX_ALL_SAMPLES = 100_000  # of all lanes together; source: chosen by hand, 5 MB of JSON
+_DECIMALS = 9  # of degrees, 0.1 mm; source: as maps of plans
+
+
+def alignment_profile(road: Alignment, samples: int) -> AlignmentProfile:
+    """The lanes of a road with at most so many samples each."""
+    per_lane = max(2, min(samples, _MAX_ALL_SAMPLES // len(road.lanes)))
+    return {
+        "lanes": [_lane_profile(road, lane, per_lane) for lane in road.lanes],
+        "events": [_event(road.lane(event.lane), event) for event in road.events],
+        "areas": [{"kind": area.kind, "ring_deg": np.round(area.ring_deg, _DECIMALS).tolist()} for area in road.areas],
+    }
+
+
+def _lane_profile(road: Alignment, lane: Lane, samples: int) -> LaneProfile:
+    at = np.unique(np.linspace(0, len(lane.chainage_m) - 1, min(samples, len(lane.chainage_m))).round().astype(int))
+    speed = lane.design_speed_mps[at] * 3.6
+    return {
+        "name": lane.name,
+        "road": lane.road,
+        "length_m": lane.length_m,
+        "left_style": str(lane.left_style),
+        "right_style": str(lane.right_style),
+        "line": lane_points_deg(lane),
+        "chainage_m": _rounded(lane.chainage_m[at], 3),
+        "station_m": [round(road.displayed_station_m(station), 3) for station in lane.station_m[at].tolist()],
+        "curvature_per_m": _rounded(_greatest_near(lane.curvature_per_m, at), 7),
+        "grade": _rounded(lane.grade[at], 5),
+        "design_speed_kmh": _rounded(speed, 2) if np.isfinite(speed).all() else None,
+        "lon_deg": _rounded(lane.lon_deg[at], _DECIMALS),
+        "lat_deg": _rounded(lane.lat_deg[at], _DECIMALS),
+    }
+
+
+def _greatest_near(values: Floats, at: np.ndarray[tuple[int], np.dtype[np.int_]]) -> Floats:
+    """The value of the greatest size between the middles to the neighbours of each sample."""
+    edges = np.concatenate([[0], (at[:-1] + at[1:] + 1) // 2])
+    high, low = np.maximum.reduceat(values, edges), np.minimum.reduceat(values, edges)
+    return np.asarray(np.where(high >= -low, high, low))
+
+
+def _event(lane: Lane, event: RoadEvent) -> ProfileEvent:
+    lon, lat = lane.position_at(event.chainage_m)
+    return {
+        "kind": event.kind.value,
+        "lane": event.lane,
+        "chainage_m": event.chainage_m,
+        "value": event.value,
+        "lon_deg": round(float(lon[0]), _DECIMALS),
+        "lat_deg": round(float(lat[0]), _DECIMALS),
+    }
+
+
+def _rounded(values: Floats, digits: int) -> list[float]:
+    found: list[float] = np.round(values, digits).tolist()
+    return found
+
+
+# === What GIS clients read of alignments and plans, made where these are computed.
+
+
+LaneFeature = tuple[dict[str, Any], list[list[float]]]
+"""Properties of a lane, and its points [lon, lat]."""
+
+
+def lane_features(road: Alignment) -> list[LaneFeature]:
+    """The lanes of a road; one across the antimeridian is two lines (RFC 7946, section 3.1.9)."""
+    found: list[LaneFeature] = []
+    for lane, summary in zip(road.lanes, road_summary(road)["lanes"], strict=True):
+        sharpest = summary["min_radius_m"]
+        slowest, fastest = summary["design_speed_kmh"] or (None, None)
+        properties = {
+            "lane": summary["name"],
+            "road": summary["road"],
+            "length_m": round(summary["length_m"], 3),
+            "min_width_m": round(summary["width_m"][0], 3),
+            "max_width_m": round(summary["width_m"][1], 3),
+            "min_speed_kmh": None if slowest is None else round(slowest, 3),
+            "max_speed_kmh": None if fastest is None else round(fastest, 3),
+            "min_radius_m": None if sharpest is None else round(sharpest, 3),
+            "max_curvature_per_m": 0.0 if sharpest is None else round(1 / sharpest, 9),
+            "max_grade": round(summary["max_grade"], 6),
+            "left_style": summary["left_style"],
+            "right_style": summary["right_style"],
+            "localization_grade": str(road.grade),
+        }
+        found += ((properties, part) for part in _parts(lane_points_deg(lane)))
+    return found
+
+
+def _parts(points: list[list[float]]) -> Iterator[list[list[float]]]:
+    """A line cut at the antimeridian."""
+    part = points[:1]
+    for (lon_a, lat_a), (lon, lat) in pairwise(points):
+        if abs(lon - lon_a) > 180.0:
+            edge = 180.0 if lon_a > 0 else -180.0
+            ahead = lon + 2 * edge
+            share = (edge - lon_a) / (ahead - lon_a) if ahead != lon_a else 0.0
+            middle = lat_a + share * (lat - lat_a)
+            yield [*part, [edge, middle]]
+            part = [[-edge, middle]]
+        part.append([lon, lat])
+    yield part
+
+
+def planned_columns(plan: Plan) -> Columns:
+    """The markers of a plan as rows of `planned_markers`, without ids."""
+    datum = plan.alignment.vertical_datum
+    rows = [_row(marker, datum) for marker in plan.markers]
+    lists = {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
+    return Columns.of(len(rows), {}, lists)
+
+
+def _row(marker: PlannedMarker, datum: str | None) -> dict[str, Any]:
+    detail, height_m = marker.detail, marker.height_m
+    values: dict[str, Any] = {
+        "number": marker.number,
+        "family": marker.family,
+        "code": marker.code,
+        "purpose": marker.purpose.value,
+        "lane": marker.lane,
+        "side": detail.side.name.lower() if isinstance(detail, PlannedLineMagnet | PlannedCerpm) else None,
+        "chainage_m": round(marker.chainage_m, 4),
+        "station_m": round(marker.station_m, 4),
+        "offset_m": round(marker.offset_m, 4),
+        "heading_deg": round(marker.heading_deg, 4),
+        "height_m": height_m,
+        "vertical_datum": None if height_m is None else datum,
+    }
+    place = [marker.lon_deg, marker.lat_deg]
+    if height_m is not None and is_ellipsoidal(datum):
+        place.append(height_m)
+    feature = {
+        "geometry": {"type": "Point", "coordinates": place},
+        "properties": {name: values[name] for name in OF_MARKER},
+    }
+    text = orjson.dumps(feature).decode()[1:-2]  # open at its end: what follows from the plan is added in queries
+    at = {"lon_deg": marker.lon_deg, "lat_deg": marker.lat_deg}
+    return {**values, **at, "feature": text}
+
+
+# === What decoder processes are asked to do for packages of plans.
+
+
+@dataclass(frozen=True, slots=True)
+class ListPartsTask(Task[list[PackagePart]]):
+    """A package to divide into parts; of one that is only checked, the list is empty."""
+
+    document: bytes
+    options: PackageOptions
+    only_check: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WritePartTask(Task[list[tuple[str, bytes]]]):
+    """A part of a package to write: names and contents of its files."""
+
+    document: bytes
+    options: PackageOptions
+    part: PackagePart
+
+
+@dataclass(frozen=True, slots=True)
+class WriteManifestTask(Task[bytes]):
+    """The manifest of a package to write."""
+
+    document: bytes
+    options: PackageOptions
+    entries: list[dict[str, Any]]
+
+
+# === What decoder processes are asked to do for proofs of plans.
+
+
+@dataclass(frozen=True, slots=True)
+class ListUnitsTask(Task[list[ProofUnit]]):
+    """A proof to divide into units; of one that is only checked, the list is empty."""
+
+    document: bytes
+    terms: ProofTerms
+    only_check: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ProveUnitTask(Task[UnitResult]):
+    """A unit of a proof to drive."""
+
+    document: bytes
+    terms: ProofTerms
+    unit: ProofUnit
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenProof:
+    """A finished proof.
+
+    Attributes
+    ----------
+    report : bytes
+        JSON, as `app.planning.proof.report.report_document` makes it, compressed by zlib.
+    table : bytes
+        CSV with the markers that were driven over, compressed by zlib.
+    summary : dict
+        What the plan's document shows, as `ProofFigures`.
+    """
+
+    report: bytes
+    table: bytes
+    summary: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class WriteProofTask(Task[WrittenProof]):
+    """A proof to report, from the results of all its units."""
+
+    document: bytes
+    terms: ProofTerms
+    results: list[UnitResult]
+
+
+# === What decoder processes are asked to do for plans.
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,21 +2,237 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
+import hmac
 import re
-from collections.abc import Sequence
-from typing import NamedTuple
+import secrets
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import ClassVar, Literal, NamedTuple, NotRequired
+
+from typing_extensions import TypedDict
 
 from app.errors import InvalidParameter, NotFound
-from app.markers.status import Status
+from app.formats.format import SpooledFile
+from app.formats.images import ImageLimits
+from app.markers.reading import Status
 from app.registry import public_pages as store
 from app.registry.database import Database
-from app.registry.public_pages import FIELDS, PublicMarkerRow, PublicPageRow
+from app.registry.engines import across_agencies
+from app.registry.public_pages import FIELDS, ContactRow, PublicMarkerRow, PublicPageRow, ReportRow
 from app.registry.resources import check_version
-from app.registry.tenancy import across_agencies
 from app.services.access.access import Caller
 from app.services.access.audit import log_change
-from app.services.ports import Clock
-from app.services.public_pages.documents import PublicField, PublicPageDocument, public_page_document
+from app.services.documents import document_of
+from app.services.ports import Clock, Task
+
+# === Tokens of forms that need no key: signed, for one marker, and valid for some hours.
+#
+# A token holds the time at which the form was made. A program that sends the form at once is refused, and so is one
+# that keeps the token for long. Its nonce identifies the form: one that is sent twice is one report.
+
+
+MIN_AGE_S = 3
+"""Nobody fills the form in faster. [s] Source: chosen by hand."""
+MAX_AGE_S = 6 * 3600
+"""Time in which a form has to be sent. [s] Source: chosen by hand: photographed on the road, sent at home."""
+_CLOCK_ERROR_S = 60
+"""How far the clocks of servers may differ. [s] Source: chosen by hand."""
+_PURPOSE = b"waymark damage report form 1"
+_TIME_BYTES, _NONCE_BYTES, _TAG_BYTES = 6, 12, 16
+
+
+class TokenRefused(ValueError):
+    """A form has no valid token."""
+
+
+class TokenTooYoung(TokenRefused):
+    """A form was sent sooner than a person can fill it in."""
+
+
+class FormTokens:
+    """Makes and checks tokens.
+
+    Parameters
+    ----------
+    secret : callable
+        The server's master key, from which the key of tokens is derived; asked for at the first use.
+    clock : Clock
+    """
+
+    def __init__(self, secret: Callable[[], bytes], clock: Clock) -> None:
+        self._secret, self._clock = secret, clock
+
+    def issue(self, marker_id: str, at: datetime | None = None) -> str:
+        """A new token for a marker's form, made at a time; now by default."""
+        issued_s = int((at or self._clock()).timestamp())
+        signed = issued_s.to_bytes(_TIME_BYTES, "big") + secrets.token_bytes(_NONCE_BYTES)
+        return base64.urlsafe_b64encode(signed + self._tag(marker_id, signed)).decode()
+
+    def check(self, marker_id: str, token: str) -> str:
+        """The nonce of a token, in hexadecimal digits.
+
+        Raises
+        ------
+        TokenTooYoung
+            The form was made a moment ago.
+        TokenRefused
+            The token is not one of a form of this marker, or it has expired.
+        """
+        signed, tag = self._parts(token)
+        if not hmac.compare_digest(tag, self._tag(marker_id, signed)):
+            raise TokenRefused("the token is not one of this form")
+        age_s = self._clock().timestamp() - int.from_bytes(signed[:_TIME_BYTES], "big")
+        if not -_CLOCK_ERROR_S <= age_s <= MAX_AGE_S:
+            raise TokenRefused(f"the form is older than {MAX_AGE_S} s")
+        if age_s < MIN_AGE_S:
+            raise TokenTooYoung(f"the form was sent within {MIN_AGE_S} s")
+        return signed[_TIME_BYTES:].hex()
+
+    def _parts(self, token: str) -> tuple[bytes, bytes]:
+        try:
+            content = base64.b64decode(token.encode("ascii"), altchars=b"-_", validate=True)
+        except (binascii.Error, UnicodeEncodeError):
+            content = b""
+        if len(content) != _TIME_BYTES + _NONCE_BYTES + _TAG_BYTES:
+            raise TokenRefused("the token is not one of a form")
+        return content[:-_TAG_BYTES], content[-_TAG_BYTES:]
+
+    def _tag(self, marker_id: str, signed: bytes) -> bytes:
+        key = hmac.digest(self._secret(), _PURPOSE, "sha256")
+        return hmac.digest(key, signed + marker_id.encode(), "sha256")[:_TAG_BYTES]
+
+
+# === Public pages, what agencies release, and damage reports as clients see them.
+
+
+PublicField = Literal["code", "agency", "status", "revision", "road", "measure"]
+ReportKind = Literal["damaged", "dirty", "missing", "loose", "other"]
+ReportStatus = Literal["new", "accepted", "rejected"]
+
+
+class ReportForm(TypedDict):
+    """How a damage report is sent: multipart/form-data to `href`, with the token, after `min_age_s` at the earliest."""
+
+    href: str
+    token: str
+    kinds: list[ReportKind]
+    min_age_s: int
+    max_age_s: int
+
+
+class PublicMarkerDocument(TypedDict):
+    """What the agency of a marker releases; members that it does not release are missing."""
+
+    code: NotRequired[str]
+    agency: NotRequired[str]
+    status: NotRequired[str]
+    revision: NotRequired[int]
+    road: NotRequired[str]
+    measure_m: NotRequired[float]
+    report: ReportForm | None
+
+
+class ReceivedReport(TypedDict):
+    """A damage report was received."""
+
+    status: Literal["received"]
+
+
+class PublicPageDocument(TypedDict):
+    """What an agency releases of its markers on their public pages, and whether the pages take damage reports.
+
+    Without fields there are no pages. Version 0 is the default: nothing was changed.
+    """
+
+    fields: list[PublicField]
+    damage_reports: bool
+    version: int
+    updated_at: datetime | None
+
+
+class DamageReport(TypedDict):
+    """A damage report from a public page, and what a person decided.
+
+    `item_id` is the item of the work list that it was accepted into.
+    """
+
+    id: str
+    marker_id: str
+    kind: ReportKind
+    text: str | None
+    language: str
+    has_photo: bool
+    has_contact: bool
+    status: ReportStatus
+    note: str | None
+    item_id: str | None
+    decided_by: str | None
+    decided_at: datetime | None
+    created_at: datetime
+
+
+class DamageReportPage(TypedDict):
+    """A page of damage reports, newest first."""
+
+    items: list[DamageReport]
+
+
+class ReportContact(TypedDict):
+    """How the sender of a damage report can be reached."""
+
+    report_id: str
+    email: str
+    created_at: datetime
+
+
+def public_page_document(row: PublicPageRow) -> PublicPageDocument:
+    """What an agency releases, as clients see it."""
+    return document_of(PublicPageDocument, row)
+
+
+def damage_report_document(row: ReportRow) -> DamageReport:
+    """A damage report as clients see it."""
+    report = row.report
+    return document_of(
+        DamageReport, report, status=report.state, has_photo=report.photo_key is not None, has_contact=row.has_contact
+    )
+
+
+def contact_document(row: ContactRow) -> ReportContact:
+    """A contact as clients see it."""
+    return document_of(ReportContact, row)
+
+
+# === What a decoder process is asked to do with the photo of a damage report.
+
+
+MAX_SIDE_PX = 2048
+"""Longest side of the stored photo. [px] Source: chosen by hand: damage is seen, and a photo takes 0.5 MB."""
+JPEG_QUALITY = 85
+
+
+@dataclass(frozen=True, slots=True)
+class ReportPhotoTask(Task[bytes]):
+    """A photo to decode and to write again as a JPEG: upright, smaller, and without metadata.
+
+    Attributes
+    ----------
+    photo : SpooledFile
+        JPEG or PNG.
+    limits : ImageLimits
+    """
+
+    is_long: ClassVar[bool] = False
+
+    photo: SpooledFile
+    limits: ImageLimits
+
+
+# === What everybody may see of a marker, and what an agency releases.
+
 
 _ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 

@@ -10,32 +10,30 @@ import sqlalchemy as sa
 import structlog
 
 from app.errors import Conflict, NotFound, QuotaExceeded, TooManyRequests, Unavailable, WaymarkError
-from app.formats.image_headers import FIELD, is_picture, unknown_picture
-from app.formats.images import ImageLimits
-from app.formats.spooled_file import SpooledFile
-from app.registry import damage_reports as store
-from app.registry.damage_reports import ReportRow, StoredReport
+from app.formats.format import SpooledFile
+from app.formats.images import FIELD, ImageLimits, is_picture, unknown_picture
+from app.registry import public_pages as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.events import add_event
-from app.registry.ids import new_id
+from app.registry.engines import across_agencies, acting_for
 from app.registry.markers import get_marker
-from app.registry.tenancy import across_agencies, acting_for
+from app.registry.public_pages import ReportRow, StoredReport
+from app.registry.webhooks import add_event
 from app.services.access.access import Caller, Scope
 from app.services.access.audit import log_change
-from app.services.decoder_processes import DecoderProcesses
-from app.services.health.items import open_reported_item
-from app.services.ports import Blobs, Clock
-from app.services.public_pages.documents import (
+from app.services.blobs import delete_unused, staged
+from app.services.health.maintenance import open_reported_item
+from app.services.ports import Blobs, Clock, DecoderProcesses
+from app.services.public_pages.pages import (
     DamageReport,
     DamageReportPage,
+    PublicMarker,
     ReportContact,
     ReportKind,
+    ReportPhotoTask,
     contact_document,
     damage_report_document,
 )
-from app.services.public_pages.pages import PublicMarker
-from app.services.public_pages.report_photo import ReportPhotoTask
-from app.services.staged_blobs import delete_unused, staged
 from app.services.uploads.quotas import Quotas
 
 MAX_NEW_OF_MARKER, MAX_NEW_OF_AGENCY = 20, 2000

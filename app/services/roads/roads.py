@@ -14,19 +14,21 @@ from app.families.documents import MarkerDocument
 from app.geodesy import check_lon_lat
 from app.registry import roads as store
 from app.registry.audit import recording
+from app.registry.column_types import row_of
 from app.registry.database import Database
 from app.registry.marker_rows import MarkerRow
 from app.registry.resources import first_version
 from app.registry.roads import ROAD_SUMMARIES, ROADS, RoadRow
-from app.registry.rows import row_of
 from app.services.access.access import Caller
 from app.services.access.audit import author_of, log_change
-from app.services.documents import document_of
+from app.services.documents import VersionKind, document_of
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
 from app.services.markers.searches import marker_document
 from app.services.ports import Clock
 from app.services.roads.documents import (
+    CalibrationInput,
     ChangedRoad,
+    LinesInput,
     MeasuredMarkers,
     OnRoad,
     RoadDocument,
@@ -35,20 +37,18 @@ from app.services.roads.documents import (
     RoadPlacedMany,
     RoadVersionDocument,
     RoadVersionPage,
-    located_position,
-    placed_reference,
-    road_document,
-    road_summary,
-    sections,
-)
-from app.services.roads.input import CalibrationInput, LinesInput, place_lines, resolve_calibration
-from app.services.roads.routes import (
     Route,
     build_route,
+    located_position,
+    place_lines,
+    placed_reference,
     references_of,
+    resolve_calibration,
+    road_document,
+    road_summary,
     route_of,
+    sections,
 )
-from app.services.version_kinds import VersionKind
 
 MAX_NAMED = 100
 _SAME_M = 5e-5

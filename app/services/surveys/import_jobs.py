@@ -7,20 +7,20 @@ from datetime import timedelta
 from typing import Any
 
 from app.errors import Conflict
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.registry import jobs as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
 from app.registry.jobs import UNFINISHED, JobKind, JobRow, new_job
 from app.services.access.access import Caller, Scope
+from app.services.blobs import staged
 from app.services.idempotency import IdempotencyKey, write_once
 from app.services.jobs import RunningJob
 from app.services.ports import Blobs, Clock, JobQueue
-from app.services.staged_blobs import staged
-from app.services.surveys.declarations import import_input
-from app.services.surveys.documents import (
+from app.services.surveys.import_report import (
     ImportJobDocument,
     ImportJobPage,
+    import_input,
     import_job_document,
     import_job_summary,
 )

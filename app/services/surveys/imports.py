@@ -14,37 +14,52 @@ import sqlalchemy as sa
 from app.errors import InvalidParameter
 from app.families import FAMILIES, FAMILY_NAMES, get_family
 from app.families.family import Family, Registration
-from app.families.rules import PLANNED, MarkerRules
-from app.families.surveys import RowCodes, Rows
-from app.formats.spooled_file import SpooledFile
+from app.families.surveys import PLANNED, MarkerRules, RowCodes, Rows
+from app.formats.format import SpooledFile
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.roles import CodeForm
 from app.formats.surveys.table import Fault, Severity, SurveyTable
-from app.registry import bulk
+from app.registry import markers as bulk
 from app.registry import markers as store
 from app.registry.audit import AuditEntry, EntryRow, find_head, recording
-from app.registry.bulk_load import LARGE
-from app.registry.columns import Columns
+from app.registry.bulk_load import LARGE, Columns
+from app.registry.column_types import new_ids
 from app.registry.database import Database
-from app.registry.ids import new_ids
 from app.registry.marker_rows import MarkerRow
 from app.services.access.access import Caller
 from app.services.access.audit import author_of
-from app.services.decoder_processes import DecoderProcesses, Task
+from app.services.documents import kind_of_change, kind_of_new
 from app.services.idempotency import IdempotencyKey, find_earlier, write_once
-from app.services.ports import Clock
-from app.services.roads.routes import linear_references
-from app.services.surveys.documents import ImportReport, Outcome, comparison_document
-from app.services.surveys.import_codes import assign_codes
-from app.services.surveys.import_neighbours import MAX_NEIGHBOURS, list_neighbours, places_of, survey_box
-from app.services.surveys.import_report import ALL, Found, ImportInput, import_report
-from app.services.surveys.import_rows import check_values, common_columns, marker_columns
-from app.services.version_kinds import kind_of_change, kind_of_new
-from app.surveys.comparison import Comparison, check_residuals, compare_survey
+from app.services.ports import Clock, DecoderProcesses, Task
+from app.services.roads.documents import linear_references
+from app.services.surveys.import_report import (
+    ALL,
+    Found,
+    ImportInput,
+    ImportReport,
+    Outcome,
+    comparison_document,
+    import_report,
+)
+from app.services.surveys.import_rows import (
+    MAX_NEIGHBOURS,
+    assign_codes,
+    check_values,
+    common_columns,
+    list_neighbours,
+    marker_columns,
+    places_of,
+    survey_box,
+)
+from app.surveys.comparison import Comparison, RegisteredPoints, check_residuals, compare_survey, find_duplicates
 from app.surveys.consistency_checks import check_accuracy, check_consistency
-from app.surveys.duplicates import RegisteredPoints, find_duplicates
-from app.surveys.georeference import GeoreferencedSurvey, georeference_survey, without_rows
-from app.surveys.local_grid import LocalGridDocument, apply_local_grid
+from app.surveys.georeference import (
+    GeoreferencedSurvey,
+    LocalGridDocument,
+    apply_local_grid,
+    georeference_survey,
+    without_rows,
+)
 from app.surveys.location_checks import KNOWN_M, check_location
 
 SURVEYED = tuple(name for name, family in zip(FAMILY_NAMES, FAMILIES, strict=True) if family.survey is not None)

@@ -26,24 +26,22 @@ from app.errors import (
     WaymarkError,
     WrongOffset,
 )
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.registry import uploads as store
+from app.registry.column_types import new_id
 from app.registry.database import Database
-from app.registry.ids import new_id
-from app.registry.tenancy import across_agencies, acting_for
+from app.registry.engines import across_agencies, acting_for
 from app.registry.uploads import PartRow, UploadRow
 from app.services.access.access import Caller, Scope
+from app.services.blobs import delete_unused, staged
 from app.services.decodes.context import ContextInput
 from app.services.decodes.decodes import Decodes
 from app.services.decodes.upload_path import UPLOADS
-from app.services.error_documents import error_document
+from app.services.documents import error_document
 from app.services.idempotency import IdempotencyKey
 from app.services.ports import Blobs, Clock
-from app.services.staged_blobs import delete_unused, staged
-from app.services.uploads.documents import UploadDocument, upload_document
-from app.services.uploads.quotas import Quotas, UploadRules, check_length
-from app.storage.blobs import new_blob_key
-from app.storage.s3_parts import PART_BYTES, S3Parts
+from app.services.uploads.quotas import Quotas, UploadDocument, UploadRules, check_length, upload_document
+from app.storage.blobs import PART_BYTES, S3Parts, new_blob_key
 from app.storage.spool import Spool
 
 PARTS = "parts"

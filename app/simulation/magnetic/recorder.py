@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +13,148 @@ from app.errors import InvalidParameter
 from app.formats.traces.wire import write_stream
 from app.sensors.magnetometer_bar import MagnetTrace
 
+# === From the field at a chip to the numbers that it sends: METRO's MLX90393 by default.
+
+
 Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Chip:
+    """A magnetometer and the loop that reads it (formats of the METRO array: OSR 0, DIG_FILT 2, GAIN_SEL 7, RES 0).
+
+    Attributes
+    ----------
+    rate_hz : float
+        Samples a second. [Hz]
+    noise_ut, count_ut : tuple of float
+        Standard deviation of a sample and size of a count, for x, y, z. [uT]
+    offset_ut, gain, misalignment_deg, soft_iron : float
+        Spread of the offset, of the gain, of each axis's direction, and of what the car's iron adds to the earth's
+        field, share of it. [uT, 1, deg, 1]
+    axis_delay_s : tuple of float
+        Axes are converted one after the other. [s]
+    jitter : float
+        Spread of the interval, share of it; one in a thousand is three times as long.
+    stale, spikes : float
+        Odds that a sensor repeats its last sample, or sends one that is far off.
+    range_ut : float
+        Largest field that an axis shows, its offset included: stronger ones saturate. [uT]
+    cross_axis, gain_error : float
+        Spread of the entries beside and on the diagonal of a 3x3 matrix about the identity, which mixes the axes of
+        each sensor after `gain` and `misalignment_deg`.
+    stamp_jitter_s : float
+        Spread of the true times of samples about the recorded ones. [s]
+
+    Notes
+    -----
+    The last four are off by default. They draw from a generator of their own, spawned from the drive's, so that all
+    else in a drive stays the same with and without them.
+    """
+
+    rate_hz: float = 350.0
+    noise_ut: tuple[float, float, float] = (1.5, 1.5, 1.9)
+    count_ut: tuple[float, float, float] = (0.150, 0.150, 0.242)
+    offset_ut: float = 200.0
+    gain: float = 0.02
+    misalignment_deg: float = 1.5
+    soft_iron: float = 0.05
+    axis_delay_s: tuple[float, float, float] = (0.0, 0.00045, 0.0009)
+    jitter: float = 0.03
+    stale: float = 1e-3
+    spikes: float = 2e-4
+    range_ut: float = math.inf
+    cross_axis: float = 0.0
+    gain_error: float = 0.0
+    stamp_jitter_s: float = 0.0
+
+    def sample_times_s(self, end_s: float, rng: np.random.Generator) -> Floats:
+        """Times of the samples from 0 to the end."""
+        n = int(end_s * self.rate_hz * 1.1) + 2
+        interval = np.maximum(rng.normal(1, self.jitter, n), 0.2) / self.rate_hz
+        interval[rng.random(n) < 1e-3 * (self.jitter > 0)] *= 3
+        t = np.cumsum(interval)
+        return t[t < end_s]
+
+    def axes(self, sensors: int, rng: np.random.Generator) -> Floats:
+        """Directions of the axes of each sensor with their gain, shape (S, 3, 3)."""
+        turned = np.eye(3) + np.radians(rng.normal(0, self.misalignment_deg, (sensors, 3, 3))) * (1 - np.eye(3))
+        turned /= np.linalg.norm(turned, axis=2, keepdims=True)
+        scaled: Floats = turned * (1 + rng.normal(0, self.gain, (sensors, 3, 1)))
+        return scaled
+
+    def mixed_axes(self, axes: Floats, rng: np.random.Generator) -> Floats:
+        """Axes of shape (S, 3, 3) mixed by each sensor's cross-axis sensitivity and gain errors."""
+        if not self.cross_axis and not self.gain_error:
+            return axes
+        spread = self.cross_axis + (self.gain_error - self.cross_axis) * np.eye(3)
+        matrix = np.eye(3) + rng.spawn(1)[0].normal(0, 1, axes.shape) * spread
+        mixed: Floats = matrix @ axes
+        return mixed
+
+    def true_times_s(self, t_s: Floats, rng: np.random.Generator) -> Floats:
+        """When samples were really taken, from their recorded times, shape (T,). [s]"""
+        if not self.stamp_jitter_s:
+            return t_s
+        return np.asarray(t_s + rng.spawn(1)[0].normal(0, self.stamp_jitter_s, len(t_s)))
+
+    def read(self, field_ut: Floats, rng: np.random.Generator) -> npt.NDArray[np.float32]:
+        """What is sent, from the field along each axis: offset, noise, counts, stale and spiked samples. [uT]"""
+        shape = field_ut.shape
+        out = field_ut + rng.normal(0, self.offset_ut, shape[1:])
+        for axis in range(3):
+            out[:, :, axis] += rng.standard_normal(shape[:2], np.float32) * self.noise_ut[axis]
+            if math.isfinite(self.range_ut):
+                np.clip(out[:, :, axis], -self.range_ut, self.range_ut, out=out[:, :, axis])
+            if count := self.count_ut[axis]:
+                out[:, :, axis] = np.round(out[:, :, axis] / count) * count
+        spiked = np.argwhere(rng.random(shape[:2], np.float32) < self.spikes)
+        out[spiked[:, 0], spiked[:, 1]] += rng.normal(0, 300, (len(spiked), 3))
+        for i, sensor in np.argwhere(rng.random(shape[:2], np.float32) < self.stale):
+            if i:
+                out[i, sensor] = out[i - 1, sensor]
+        return out.astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class CanBus:
+    """Speed and heading as a vehicle sends them.
+
+    Attributes
+    ----------
+    speed_hz, heading_hz : float
+        Rates. [Hz]
+    speed_latency_s, heading_latency_s : float
+        Age of a value when it is stamped. [s]
+    speed_scale : float
+        Share by which it shows too much.
+    speed_count_m_s, heading_count_deg : float
+        Smallest steps. [m/s, deg]
+    """
+
+    speed_hz: float = 10.0
+    heading_hz: float = 100.0
+    speed_latency_s: float = 0.05
+    heading_latency_s: float = 0.02
+    speed_scale: float = 0.01
+    speed_count_m_s: float = 0.01 / 3.6
+    heading_count_deg: float = 0.1
+
+    def speed(self, t_s: Floats, speed_m_s: Floats) -> tuple[Floats, Floats]:
+        """Times and values sent."""
+        at = np.arange(0, t_s[-1], 1 / self.speed_hz)
+        value = (1 + self.speed_scale) * np.interp(at - self.speed_latency_s, t_s, speed_m_s)
+        return at, np.round(value / self.speed_count_m_s) * self.speed_count_m_s
+
+    def heading(self, t_s: Floats, heading_deg: Floats) -> tuple[Floats, Floats]:
+        """Times and values sent, 0 to 360 degrees."""
+        at = np.arange(0, t_s[-1], 1 / self.heading_hz)
+        value = np.interp(at - self.heading_latency_s, t_s, heading_deg)
+        return at, np.round(value / self.heading_count_deg) * self.heading_count_deg % 360
+
+
+# === A trace as METRO's recorder and array write it.
+
 
 _VEHICLE_FROM_RECORDED = np.array((1.0, -1.0, -1.0), np.float32)  # FRD, as METRO's recorder writes
 

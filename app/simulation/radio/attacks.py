@@ -10,9 +10,8 @@ import numpy as np
 
 from app.errors import InvalidParameter
 from app.markers.cerpm import BODY_BYTES, MESSAGE_BYTES, TAG_BYTES
-from app.sensors.receiver import ReceivedPacket
-from app.simulation.radio.lanes import TrueLane
-from app.simulation.radio.markers import InstalledMarkers
+from app.sensors.pose_track import ReceivedPacket
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane
 
 _ON_THE_LINE_M = 1.0  # [m] from a boundary, where a wrong position is not detectable; source: by hand
 _TRIES = 1000  # source: by hand, bounds the search

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
+from app.errors import InvalidParameter
 from app.markers.cerpm import CerpmMessage, LaneSide
-from app.sensors.pose_track import PoseTrack
-from app.sensors.receiver import PlainClaim, ReceivedPacket
-from app.simulation.radio.driving import Drive, Driver, SatelliteReceiver, drive_lane, observe_track
-from app.simulation.radio.lanes import TrueLane
+from app.sensors.pose_track import PlainClaim, PoseTrack, ReceivedPacket
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane
 from app.simulation.radio.link import (
+    ANTENNA_M,
     Radio,
     Transmissions,
     draw_shadows_db,
@@ -21,10 +23,298 @@ from app.simulation.radio.link import (
     receive_transmissions,
     send_beacons,
 )
-from app.simulation.radio.markers import InstalledMarkers
-from app.simulation.radio.propagation import ANTENNA_M
+
+# === A driver's course in a lane, and the positions of the vehicle's satellite receiver.
+
 
 Floats = npt.NDArray[np.float64]
+
+MPH = 0.44704  # [m/s] source: definition
+_TICK_S = 0.05  # [s] source: by hand, the 20 Hz of RTK receivers
+_LATERAL_M_S2 = 2.5  # [m/s2] source: assumed, comfortable bends
+_CURVATURE_SD_M = 15.0  # [m] Gaussian over which drivers look at bends; source: assumed, a second of driving
+_SLOW_BEFORE_M = 60.0  # [m] over which speed is reduced about a bend; source: assumed, no measurement kept
+_SPEED_SD, _SPEED_LENGTH_M = 0.05, 60.0  # share and length [m] of uneven speed; source: assumed, no measurement kept
+
+
+@dataclass(frozen=True, slots=True)
+class Driver:
+    """Habits of a driver.
+
+    Attributes
+    ----------
+    speed_m_s : float
+        On straights; in bends limited by 2.5 m/s2 of lateral acceleration. [m/s]
+    wander_sd_m, wander_time_s : float
+        Slow wander about the driver's usual offset in the lane. [m, s]
+    habit_sd_m : float
+        Of that offset, from drive to drive: with the wander, 0.18 m RMS. [m]
+    cut_m2 : float
+        Offset towards the inside of bends per curvature, mean of drives; its standard deviation is as large. [m2]
+    lead_m : float
+        Driven straight on before the lane begins and after it ends. [m]
+    """
+
+    speed_m_s: float = 25 * MPH  # [m/s] source: the posted limit of the benchmark's lanes
+    wander_sd_m: float = 0.15  # [m] source: assumed, no measurement kept
+    wander_time_s: float = 2.5  # [s] source: assumed, no measurement kept
+    habit_sd_m: float = 0.09  # [m] source: assumed, no measurement kept
+    cut_m2: float = 1.0  # [m2] source: assumed, no measurement kept
+    lead_m: float = 40.0  # [m] source: assumed, no measurement kept
+
+
+@dataclass(frozen=True, slots=True)
+class Multipath:
+    """Errors by reflected signals: coloured noise, and steps when a reflection appears and when it goes.
+
+    Attributes
+    ----------
+    sd_m, time_s : float
+        Coloured noise of each axis: standard deviation and time constant. [m, s]
+    step_sd_m : float
+        Of a step, each axis. [m]
+    steps_per_min, step_time_s : float
+        Reflections that appear in a minute, and how long one lasts on average. [1/min, s]
+
+    Raises
+    ------
+    InvalidParameter
+        A value is negative, or a time is below 0.1 s.
+    """
+
+    sd_m: float = 0.05  # [m] source: Groves, Principles of GNSS, 2nd ed. 2013, 9.3: a quarter of a wavelength at most
+    time_s: float = 3.0  # [s] source: assumed; multipath of a moving receiver changes within seconds
+    step_sd_m: float = 0.3  # [m] source: assumed, a few decimetres
+    steps_per_min: float = 3.0  # [1/min] source: assumed
+    step_time_s: float = 6.0  # [s] source: assumed, 70 m of driving beside a reflecting wall or vehicle
+
+    def __post_init__(self) -> None:
+        lowest = min(self.sd_m, self.step_sd_m, self.steps_per_min, self.time_s - 0.1, self.step_time_s - 0.1)
+        if not lowest >= 0:
+            raise InvalidParameter(
+                "multipath with a negative value", field="receiver.multipath", limit="0 or more; times from 0.1 s"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class SatelliteReceiver:
+    """A satellite receiver: errors of each axis.
+
+    Attributes
+    ----------
+    white_sd_m : float
+        From fix to fix. [m]
+    slow_sd_m, slow_time_s : float
+        Slow errors, as of multipath and troposphere: size and time constant. [m, s]
+    heading_sd_deg : float
+        Of a heading; half of it is as slow. [deg]
+    reported_accuracy_m : float
+        As reported by the receiver; NaN if it reports none. [m]
+    rate_hz : float
+        Rate of fixes. [Hz]
+    lost : float
+        Share of fixes that are missing.
+    multipath : Multipath or None
+        Further errors, which the reported accuracy does not know.
+    """
+
+    white_sd_m: float
+    slow_sd_m: float
+    slow_time_s: float
+    heading_sd_deg: float
+    reported_accuracy_m: float
+    rate_hz: float = 10.0
+    lost: float = 0.01
+    multipath: Multipath | None = None
+
+    @classmethod
+    def rtk(cls, rate_hz: float = 20.0) -> SatelliteReceiver:
+        """Two centimetres, mostly slow; heading from two antennas."""
+        return cls(0.008, 0.018, 20.0, 0.3, 0.02, rate_hz)
+
+    @classmethod
+    def plain(cls, rate_hz: float = 10.0) -> SatelliteReceiver:
+        """Two metres, nearly all of it slow; heading by course over ground."""
+        return cls(0.1, 2.0, 40.0, 1.5, 2.0, rate_hz)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """A vehicle on a lane, every 50 ms.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (T,)
+        Since 1970-01-01 UTC. [s]
+    chainage_m, left_m : ndarray, shape (T,)
+        Of the vehicle along the lane, below 0 before it begins, and left of its centre. [m]
+    point_m : ndarray, shape (T, 2)
+        East and north. [m]
+    yaw_rad : ndarray, shape (T,)
+        Anticlockwise from east. [rad]
+    speed_m_s : ndarray, shape (T,)
+        [m/s]
+    """
+
+    time_s: Floats
+    chainage_m: Floats
+    left_m: Floats
+    point_m: Floats
+    yaw_rad: Floats
+    speed_m_s: Floats
+
+
+def drive_lane(lane: TrueLane, driver: Driver, rng: np.random.Generator, *, start_s: float = 1.78e9) -> Drive:
+    """Drive a lane from before its beginning to past its end.
+
+    Parameters
+    ----------
+    lane : TrueLane
+    driver : Driver
+    rng : numpy.random.Generator
+        Draws speed, wander, habit and how bends are cut.
+    start_s : float
+        Seconds since 1970-01-01 UTC. [s]
+
+    Raises
+    ------
+    InvalidParameter
+        The speed is not from 1 to 60 m/s, or another value is negative.
+
+    Notes
+    -----
+    The wander is Matern 3/2 noise in time, which has a finite lateral speed; its standard deviation and that of the
+    habit add up to the 0.18 m of the driver's own track.
+    """
+    lowest = min(driver.wander_sd_m, driver.wander_time_s - 0.1, driver.habit_sd_m, driver.lead_m)
+    if not 1 <= driver.speed_m_s <= 60 or lowest < 0:
+        raise InvalidParameter(
+            f"a drive of {driver.speed_m_s:g} m/s", field="driver", limit="1 to 60 m/s; spreads of zero or more"
+        )
+    time, chainage, speed = _advance(lane, driver, rng)
+    inside = np.clip(chainage, 0.0, lane.length_m)
+    bend = np.interp(
+        inside,
+        lane.chainage_m,
+        scipy.ndimage.gaussian_filter1d(lane.curvature_1pm, _CURVATURE_SD_M / lane.chainage_m[1]),
+    )
+    left = matern_noise(len(time), _TICK_S, driver.wander_time_s, rng) * driver.wander_sd_m
+    left = left + float(rng.normal(0, driver.habit_sd_m)) + float(rng.normal(1, 1)) * driver.cut_m2 * bend
+    point = lane.points_m(chainage, left)
+    step = np.gradient(point, axis=0)
+    return Drive(start_s + time, chainage, left, point, np.unwrap(np.arctan2(step[:, 1], step[:, 0])), speed)
+
+
+def observe_track(lane: TrueLane, drive: Drive, receiver: SatelliteReceiver, rng: np.random.Generator) -> PoseTrack:
+    """Track of a drive, as positioned by a receiver.
+
+    Parameters
+    ----------
+    lane : TrueLane
+    drive : Drive
+    receiver : SatelliteReceiver
+    rng : numpy.random.Generator
+        Draws its errors, its jitter and which fixes are missing.
+    """
+    period = 1.0 / receiver.rate_hz
+    span = drive.time_s[-1] - drive.time_s[0]
+    ticks = np.arange(0.0, span, period)
+    when = ticks + rng.uniform(0, 0.05, len(ticks)) * period
+    slow = ornstein_noise(len(ticks), period, receiver.slow_time_s, rng, 3)
+    kept = rng.random(len(ticks)) >= receiver.lost
+    if kept.sum() < 2:
+        raise InvalidParameter("a track of fewer than two fixes", field="receiver.lost", limit="two fixes or more")
+    since = drive.time_s - drive.time_s[0]
+    at = np.stack([np.interp(when, since, drive.point_m[:, k]) for k in range(2)], 1)
+    at = at + slow[:, :2] * receiver.slow_sd_m + rng.normal(0, 1, (len(ticks), 2)) * receiver.white_sd_m
+    if receiver.multipath is not None:  # from a generator of its own, so that all else stays the same
+        at = at + draw_multipath_m(receiver.multipath, when, rng.spawn(1)[0])
+    yaw_error = (slow[:, 2] + rng.normal(0, math.sqrt(3), len(ticks))) / 2 * receiver.heading_sd_deg
+    heading = (90.0 - np.degrees(np.interp(when, since, drive.yaw_rad)) + yaw_error) % 360.0
+    lon, lat = lane.wgs84_from_enu(at[kept])
+    accuracy = np.full(int(kept.sum()), receiver.reported_accuracy_m)
+    return PoseTrack(drive.time_s[0] + when[kept], lon, lat, heading[kept], accuracy)
+
+
+def draw_multipath_m(multipath: Multipath, time_s: Floats, rng: np.random.Generator) -> Floats:
+    """Errors of positions by reflected signals, east and north, shape (T, 2). [m]
+
+    Parameters
+    ----------
+    multipath : Multipath
+    time_s : ndarray, shape (T,)
+        Rising, nearly evenly; T is 2 or more. [s]
+    rng : numpy.random.Generator
+
+    Notes
+    -----
+    The coloured noise is a critically damped Gauss-Markov process of second order (Gelb, Applied Optimal Estimation,
+    1974, table 2.2-1), whose rate of change is finite. Steps begin as a Poisson process, last for exponential times and
+    add up; some have begun before the first fix.
+    """
+    step_s = float(np.mean(np.diff(time_s)))
+    noise = np.stack([matern_noise(len(time_s), step_s, multipath.time_s, rng) for _ in range(2)], 1)
+    error = multipath.sd_m * noise
+    begin, end = float(time_s[0]) - 5 * multipath.step_time_s, float(time_s[-1])
+    count = rng.poisson(multipath.steps_per_min * (end - begin) / 60)
+    starts = rng.uniform(begin, end, count)
+    ends = starts + rng.exponential(multipath.step_time_s, count)
+    for start, stop, step_m in zip(starts, ends, rng.normal(0, multipath.step_sd_m, (count, 2)), strict=True):
+        error[(time_s >= start) & (time_s < stop)] += step_m
+    return np.asarray(error)
+
+
+def ornstein_noise(count: int, step_s: float, time_s: float, rng: np.random.Generator, rows: int = 1) -> Floats:
+    """Noise with exponential correlation, standard deviation 1, shape (count, rows)."""
+    keep = math.exp(-step_s / time_s)
+    drawn = rng.normal(0, 1, (count, rows))
+    drawn[1:] *= math.sqrt(1 - keep**2)
+    return _recursed(drawn, keep)
+
+
+def matern_noise(count: int, step_s: float, time_s: float, rng: np.random.Generator) -> Floats:
+    """Noise with a finite rate of change (Matern 3/2), standard deviation 1, shape (count,).
+
+    Notes
+    -----
+    Two equal first-order filters on white noise; correlation (1 + t/T) exp(-t/T). The first 20 T are discarded.
+    """
+    lead = int(20 * time_s / step_s)
+    keep = math.exp(-step_s / time_s)
+    once = _recursed(rng.normal(0, 1, (count + lead, 1)), keep)
+    twice = _recursed(once, keep)[lead:, 0]
+    power = (1 + keep**2) / (1 - keep**2) ** 3  # sum of (k + 1)^2 keep^2k
+    return np.asarray(twice / math.sqrt(power))
+
+
+def _recursed(values: Floats, keep: float) -> Floats:
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -keep], values, axis=0))
+
+
+def _advance(lane: TrueLane, driver: Driver, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+    """Times, chainages and speeds of the drive: slower in bends, and uneven."""
+    step = float(lane.chainage_m[1])
+    cap = np.sqrt(_LATERAL_M_S2 / np.maximum(np.abs(lane.curvature_1pm), 1e-6))
+    cap = scipy.ndimage.minimum_filter1d(np.minimum(cap, driver.speed_m_s), int(_SLOW_BEFORE_M / step), mode="nearest")
+    cap = scipy.ndimage.gaussian_filter1d(cap, _CURVATURE_SD_M / step, mode="nearest")
+    pad = int(driver.lead_m / step) + 1
+    at = np.concatenate(
+        [
+            -step * np.arange(pad, 0, -1),
+            lane.chainage_m,
+            lane.length_m + step * np.arange(1, pad + 1),
+        ]
+    )
+    uneven = matern_noise(len(at), step, _SPEED_LENGTH_M, rng)
+    speed = np.pad(cap, pad, mode="edge") * np.clip(1 + _SPEED_SD * uneven, 0.8, 1.2)
+    clock = np.concatenate([[0.0], np.cumsum(step / ((speed[1:] + speed[:-1]) / 2))])
+    time = np.arange(0.0, clock[-1], _TICK_S)
+    return time, np.interp(time, clock, at), np.interp(time, clock, speed)
+
+
+# === A drive past markers.
+
+
 Ints = npt.NDArray[np.int64]
 Sign = Callable[[CerpmMessage], bytes]
 

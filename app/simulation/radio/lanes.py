@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,9 @@ import scipy
 
 from app.errors import InvalidParameter
 from app.lanes.cross_sections import cut_lane, direction_rad
+from app.lanes.types import MarkerPlace
+from app.markers.cerpm import DEGREE_STEP, LaneSide, SpeedLimit
+from app.radio.settings import check_between
 
 Floats = npt.NDArray[np.float64]
 Origin = tuple[float, float, float]
@@ -213,3 +217,268 @@ def _smoothed(points_m: Floats, step_m: float) -> Floats:
         [scipy.ndimage.gaussian_filter1d(points_m[:, k], _CAR_SMOOTHING_M / step_m, mode="nearest") for k in range(2)],
         1,
     )
+
+
+# === Lanes by the figures that describe them: bends, hairpins, widening, tapers, lay-bys, merges and shifts.
+
+
+MICHIGAN: Origin = (-83.7, 42.3, 250.0)
+"""Where the lanes lie: the CERPM paper's drives were in Michigan."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoadShape:
+    """A lane of two bends, whose boundaries part where lanes open, merge or shift. Angles are of the centre line.
+
+    Attributes
+    ----------
+    length_m : float
+        Of the centre line before boundaries part. [m]
+    radius_m, turn_deg, clothoid_m : float
+        Of the first bend: at its tightest, its direction after it against before, and of each of its clothoids.
+        Above 180 degrees a hairpin. [m, deg, m]
+    second_radius_m, second_turn_deg : float
+        Of a bend to the other side after it. [m, deg]
+    straight_m : float
+        Before the first bend and between the two. [m]
+    turns_left : bool
+        The first bend.
+    width_m : float
+        On straights. [m]
+    widening_m2 : float
+        Extra width in bends is this over the radius. [m2]
+    extra_m, extra_start, extra_length_m, taper_m : float
+        Extra width on one side: how much, where its taper begins as a share of the length, how long it keeps its
+        width, and the length of a taper. [m, 1, m, m]
+    extra_on_left, extra_stays : bool
+        Its side, and whether it goes on to the end: without it, it ends in a taper too.
+    shift_m, shift_length_m, shift_start : float
+        Both boundaries shift to the left by so much, over a length, from a share of the lane's length on. [m, m, 1]
+    heading_deg : float
+        Of the first straight. [deg]
+    """
+
+    length_m: float = 400.0
+    radius_m: float = 200.0
+    turn_deg: float = 40.0
+    clothoid_m: float = 30.0
+    second_radius_m: float = 300.0
+    second_turn_deg: float = 30.0
+    straight_m: float = 60.0
+    turns_left: bool = True
+    width_m: float = 3.3
+    widening_m2: float = 0.0
+    extra_m: float = 0.0
+    extra_start: float = 0.5
+    extra_length_m: float = 60.0
+    taper_m: float = 40.0
+    extra_on_left: bool = False
+    extra_stays: bool = False
+    shift_m: float = 0.0
+    shift_length_m: float = 40.0
+    shift_start: float = 0.3
+    heading_deg: float = 30.0
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            if not math.isfinite(getattr(self, one.name)):
+                raise InvalidParameter(f"{one.name} is not finite", field=one.name, limit="a finite value")
+        for name, low, high, unit in (
+            ("length_m", 50.0, 5000.0, "m"), ("radius_m", 6.0, 1e6, "m"), ("second_radius_m", 6.0, 1e6, "m"),
+            ("turn_deg", 0.0, 250.0, "deg"), ("second_turn_deg", 0.0, 250.0, "deg"), ("clothoid_m", 1.0, 500.0, "m"),
+            ("width_m", 2.0, 6.0, "m"), ("taper_m", 5.0, 500.0, "m"), ("shift_length_m", 5.0, 500.0, "m"),
+            ("extra_m", 0.0, 5.0, "m"), ("widening_m2", 0.0, 100.0, "m2"),
+        ):  # fmt: skip
+            check_between(name, getattr(self, name), low, high, unit)
+
+
+def lane_of_shape(shape: RoadShape) -> TrueLane:
+    """The lane of a shape.
+
+    Raises
+    ------
+    InvalidParameter
+        Its boundaries cross, as where a bend is tighter than half its width.
+    """
+    at = np.arange(0.0, shape.length_m + STEP_M / 2, STEP_M)
+    curvature = _curvature_1pm(shape, at)
+    turned = np.concatenate([[0.0], np.cumsum((curvature[1:] + curvature[:-1]) / 2 * STEP_M)])
+    yaw = math.pi / 2 - math.radians(shape.heading_deg) + turned
+    mid = (yaw[1:] + yaw[:-1]) / 2
+    step = STEP_M * np.stack([np.cos(mid), np.sin(mid)], 1)
+    centre = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
+    normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
+    start = shape.shift_start * shape.length_m
+    aside = shape.shift_m * _ramp((at - start) / shape.shift_length_m)
+    half = (shape.width_m + shape.widening_m2 * np.abs(curvature)) / 2
+    extra = _extra_m(shape, at)
+    left = aside + half + (extra if shape.extra_on_left else 0.0)
+    right = aside - half - (0.0 if shape.extra_on_left else extra)
+    return lane_between(centre + normal * left[:, None], centre + normal * right[:, None], MICHIGAN)
+
+
+def _curvature_1pm(shape: RoadShape, at_m: Floats) -> Floats:
+    """Positive to the left, linear along clothoids, shape (N,). [1/m]"""
+    sign, start, knots = (1.0 if shape.turns_left else -1.0), shape.straight_m, [(0.0, 0.0)]
+    for radius, turn in ((shape.radius_m, shape.turn_deg), (shape.second_radius_m, shape.second_turn_deg)):
+        clothoid, angle = shape.clothoid_m, math.radians(turn)
+        arc = max(angle * radius - clothoid, 0.0)
+        peak = angle / (arc + clothoid)
+        for more, value in ((0.0, 0.0), (clothoid, sign * peak), (arc, sign * peak), (clothoid, 0.0)):
+            start += more
+            knots.append((start, value))
+        sign, start = -sign, start + shape.straight_m
+    chainage, value = np.array(knots).T
+    return np.asarray(np.interp(at_m, chainage, value))
+
+
+def _extra_m(shape: RoadShape, at_m: Floats) -> Floats:
+    start = shape.extra_start * shape.length_m
+    opened = _ramp((at_m - start) / shape.taper_m)
+    end = start + shape.taper_m + shape.extra_length_m
+    closed = 0.0 if shape.extra_stays else _ramp((at_m - end) / shape.taper_m)
+    return np.asarray(shape.extra_m * (opened - closed))
+
+
+def _ramp(share: Floats) -> Floats:
+    """From 0 at 0 to 1 at 1, as a straight painted taper with its corners rounded over a tenth."""
+    inner = np.clip(share, 0.0, 1.0)
+    smooth: Floats = inner * inner * (3 - 2 * inner)
+    return 0.8 * inner + 0.2 * smooth
+
+
+# === Installed markers of a lane: true and surveyed positions, and missing markers.
+
+
+Ints = npt.NDArray[np.int64]
+
+SURVEY_SD_M = 0.02  # [m] of a surveyed coordinate, each axis; source: Trimble Catalyst DA2, CERPM paper, section 2.2
+_PLACING_SD_M = 0.01  # [m] of placing a marker, each axis; source: assumed, no measurement kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InstalledMarkers:
+    """Markers of a lane, by chainage.
+
+    Attributes
+    ----------
+    number : ndarray of int, shape (N,)
+        Within the agency.
+    side : ndarray of int, shape (N,)
+        True `LaneSide`, whatever the marker sends.
+    chainage_m : ndarray, shape (N,)
+        Along the lane's centre line. [m]
+    point_m : ndarray, shape (N, 2)
+        True position: east and north. [m]
+    lon_deg, lat_deg : ndarray, shape (N,)
+        Surveyed position, in steps of 1e-7 degrees. [deg]
+    broadcast_side : ndarray of int, shape (N,)
+        `LaneSide` that it is programmed with.
+    speed_limit : SpeedLimit or None
+    """
+
+    number: Ints
+    side: Ints
+    chainage_m: Floats
+    point_m: Floats
+    lon_deg: Floats
+    lat_deg: Floats
+    broadcast_side: Ints
+    speed_limit: SpeedLimit | None = None
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def chosen(self, which: npt.NDArray[np.bool_] | Ints) -> InstalledMarkers:
+        """Some of them, by mask or index."""
+        arrays = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name != "speed_limit"}
+        return InstalledMarkers(**arrays, speed_limit=self.speed_limit)
+
+    def without_sides(self) -> InstalledMarkers:
+        """The same, programmed without their sides."""
+        return replace(self, broadcast_side=np.full(len(self), int(LaneSide.UNKNOWN)))
+
+
+def install_markers(
+    lane: TrueLane,
+    places: Sequence[MarkerPlace],
+    rng: np.random.Generator,
+    *,
+    survey_sd_m: float = SURVEY_SD_M,
+    first_number: int = 1,
+    speed_limit: SpeedLimit | None = None,
+) -> InstalledMarkers:
+    """Install markers near places, within a centimetre, and survey them.
+
+    Parameters
+    ----------
+    lane : TrueLane
+    places : sequence of MarkerPlace
+        In the lane's local frame, as `app.planning.cerpm_placement.place_markers` gives them.
+    rng : numpy.random.Generator
+        Draws positions, survey errors and the order of numbers.
+    survey_sd_m : float
+        Standard deviation of a surveyed coordinate, each axis. [m]
+    first_number : int
+        Lowest number; numbers are in random order along the road.
+    speed_limit : SpeedLimit, optional
+        That all of them broadcast.
+
+    Raises
+    ------
+    InvalidParameter
+        The survey's standard deviation is not from 0 to 100 m.
+    """
+    if not 0 <= survey_sd_m <= 100:
+        raise InvalidParameter(f"a survey of {survey_sd_m:g} m", field="survey_sd_m", limit="0 to 100 m")
+    count = len(places)
+    point = np.array([place.point_m for place in places]).reshape(-1, 2) + rng.normal(0, _PLACING_SD_M, (count, 2))
+    lon, lat = lane.wgs84_from_enu(point + rng.normal(0, 1, (count, 2)) * survey_sd_m)
+    side = np.array([int(place.side) for place in places], int)
+    return InstalledMarkers(
+        number=first_number + rng.permutation(count),
+        side=side,
+        chainage_m=np.array([place.chainage_m for place in places], float),
+        point_m=point,
+        lon_deg=np.round(lon / DEGREE_STEP) * DEGREE_STEP,
+        lat_deg=np.round(lat / DEGREE_STEP) * DEGREE_STEP,
+        broadcast_side=side.copy(),
+        speed_limit=speed_limit,
+    )
+
+
+def lose_share(markers: InstalledMarkers, share: float, rng: np.random.Generator) -> InstalledMarkers:
+    """Markers without a share of them, drawn anywhere on both sides.
+
+    Raises
+    ------
+    InvalidParameter
+        The share is not from 0 to 1.
+    """
+    if not 0 <= share <= 1:
+        raise InvalidParameter(f"a share of {share:g}", field="share", limit="0 to 1")
+    keep = np.ones(len(markers), bool)
+    keep[rng.choice(len(markers), round(share * len(markers)), replace=False)] = False
+    return markers.chosen(keep)
+
+
+def lose_row(
+    markers: InstalledMarkers, count: int, rng: np.random.Generator, side: LaneSide | None = None
+) -> InstalledMarkers:
+    """Markers without some neighbours on one side; its first and last marker stay.
+
+    Raises
+    ------
+    InvalidParameter
+        The side has fewer than two markers more than are to be lost.
+    """
+    which = side if side is not None else LaneSide(int(rng.integers(1, 3)))
+    row = np.flatnonzero(markers.side == which)
+    if not 0 <= count <= len(row) - 2:
+        raise InvalidParameter(
+            f"{count} of {len(row)} markers on a side", field="count", limit="two less than the side has"
+        )
+    start = int(rng.integers(1, len(row) - count))
+    keep = np.ones(len(markers), bool)
+    keep[row[start : start + count]] = False
+    return markers.chosen(keep)

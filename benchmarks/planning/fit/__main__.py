@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import orjson
 
-from app.planning.proof.terms import Condition
+from app.planning.proof.report import Condition
 from benchmarks.planning.fit.fit import NIGHT_EXPOSURES_S, fit_lines, fit_path, fit_plates, fit_tags
 from benchmarks.planning.fit.observe import FIRST_SEED, line_drives, path_drives, plate_passes, tag_passes
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
-from app.planning.predict.models import MagnetModel, PathModel, PlateModel, normal_quadrature
+from app.planning.predict.rates import MagnetModel, PathModel, PlateModel, normal_quadrature
 from benchmarks.planning.fit.observe import LineSeen, PathSeen, PlatePassSeen, TagPassSeen
 
 Floats = npt.NDArray[np.float64]

@@ -17,11 +17,10 @@ from app.planning.placement import place_plan
 from app.planning.plan import Plan, PlannedPlate, PlannedTag
 from app.planning.predict.rates import lane_stretches
 from app.planning.proof import ProofTerms, ProofUnit, UnitKind
-from app.planning.proof.cerpms import drive_cerpms
-from app.planning.proof.magnets import drive_line, read_tag
+from app.planning.proof.drives import drive_cerpms, drive_line, read_tag
 from app.planning.proof.plates import read_frames
 from app.planning.proof.prove import Prover
-from app.planning.proof.terms import DriveTerms
+from app.planning.proof.report import DriveTerms
 from app.planning.rules import CameraRules, PlanRules
 from benchmarks.planning.roads import generated_road
 

@@ -6,8 +6,8 @@
 
 const MOMENT_AM2 = 2.47; // of METRO's magnet: MOMENT_AM2 of app/markers/magnet.py
 const FIELD_UT_M3 = 0.1; // mu0 / (4 pi): FIELD_UT_M3 of app/markers/magnet.py
-export const NOISE_UT = 1.5; // of a sample: noise_ut of app/markers/magnet_error.py
-export const SAMPLE_RATE_HZ = 350; // of the magnetometers: sample_rate_hz of app/markers/magnet_error.py
+export const NOISE_UT = 1.5; // of a sample: noise_ut of app/markers/magnet_design.py
+export const SAMPLE_RATE_HZ = 350; // of the magnetometers: sample_rate_hz of app/markers/magnet_design.py
 const MAGNETS = 7;
 const INFORMATION = /^([NS]{2,7})_(\d{1,3}(?:\.\d{1,4})?)_(\d{1,3}(?:\.\d{1,4})?)_(\d{1,5}(?:-\d{1,5}){0,5})$/;
 

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 from typer.testing import CliRunner
 
 from app.cli import cli
-from app.registry.tenancy import EVERY_AGENCY, set_whose
+from app.registry.engines import EVERY_AGENCY, set_whose
 from app.services.access.access import Scope
 from app.settings import Settings
 from tests.conftest import LiveServer, Place

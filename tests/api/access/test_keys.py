@@ -17,8 +17,7 @@ from app.errors import InvalidParameter, NotAuthenticated
 from app.registry.audit import list_entries
 from app.registry.database import Database
 from app.registry.tables import api_keys, metadata
-from app.services.access.access import Access, Caller, Scope
-from app.services.access.key_text import check_key, new_key
+from app.services.access.access import Access, Caller, Scope, check_key, new_key
 from app.services.access.keys import Keys, NewKey
 from tests.conftest import LiveServer
 from tests.http import refused

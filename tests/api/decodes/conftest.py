@@ -13,7 +13,7 @@ import pytest
 import sqlalchemy as sa
 
 from app.main import create_app
-from app.services.unused_blobs import OWNERS
+from app.services.blobs import OWNERS
 from app.settings import Settings
 from tests.conftest import ADMIN_KEY, LiveServer
 from tests.formats.pictures import corner_frame, png

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from app.errors import UnreadableUpload, UnsupportedUpload, UploadTooLarge
-from app.formats.archives import ArchiveLimits, count_members, read_members
+from app.formats.format import ArchiveLimits, count_members, read_members
 from app.main import create_app
 from app.settings import Settings
 from app.simulation.magnetic.recorder import write_recorder_files

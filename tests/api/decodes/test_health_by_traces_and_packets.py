@@ -16,20 +16,17 @@ import numpy as np
 import pytest
 
 from app.demo.cerpms import BuiltLane, build_lane, write_packets, write_poses
-from app.encoders.cerpm.payload import encode_message
+from app.encoders.cerpm import encode_message
 from app.geodesy import wgs84_from_enu
 from app.markers.magnet import InformationTag, parse_tag
 from app.services.access.access import Scope
-from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road
-from app.simulation.magnetic.vehicle import Course, Vehicle
 from app.simulation.radio.attacks import move_claim
-from app.simulation.radio.drive import drive_past
-from app.simulation.radio.driving import Driver, drive_lane
-from app.simulation.radio.lanes import lane_between
+from app.simulation.radio.drive import Driver, drive_lane, drive_past
+from app.simulation.radio.lanes import InstalledMarkers, lane_between
 from app.simulation.radio.link import Radio
-from app.simulation.radio.markers import InstalledMarkers
 from tests.api.decodes.conftest import post_frame
 from tests.conftest import LiveServer
 

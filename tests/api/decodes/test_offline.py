@@ -16,25 +16,23 @@ import httpx
 import numpy as np
 import pytest
 
-from app.decoders.cerpm.freshness import FreshnessRules
-from app.decoders.cerpm.match import grade_markers, list_numbers, match_known_markers
-from app.decoders.cerpm.verify import Verdict
+from app.decoders.cerpm.merge import grade_markers, list_numbers, match_known_markers
+from app.decoders.cerpm.verify import FreshnessRules, Verdict
 from app.decoders.magnet.decoder import decode_trace
-from app.decoders.magnet.match import match_tags
+from app.decoders.magnet.identify import match_tags
 from app.decoders.plate.reader import decode_plates
 from app.decoders.snapshot import Snapshot, open_snapshot
 from app.demo.cerpms import build_lane
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.formats.traces.read import read_trace
 from app.geodesy import decimal_year, move_to_epoch
-from app.jobs.packet_tasks import read_drive
+from app.jobs.drive_tasks import read_drive
 from app.lanes.estimate import fit_lane
 from app.lanes.types import LaneMarkers
 from app.main import create_app
 from app.markers.snapshot import Trust
 from app.services.access.access import Scope
-from app.services.decodes.packet_task import DriveTask
-from app.services.decodes.trace_task import trace_terms
+from app.services.decodes.tasks import DriveTask, trace_terms
 from app.settings import Settings
 from app.simulation.magnetic.recorder import write_recorder_files
 from app.simulation.radio.attacks import number_entries

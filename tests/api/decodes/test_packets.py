@@ -22,19 +22,19 @@ import pytest
 import sqlalchemy as sa
 
 from app.demo.cerpms import BuiltLane, build_lane, draw_frame, path_errors_m, write_packets, write_poses
-from app.encoders.cerpm.payload import encode_message
+from app.encoders.cerpm import encode_message
 from app.errors import TooManyRequests
 from app.main import create_app
 from app.markers.cerpm import CerpmMessage
 from app.registry.tables import decodes, observations
-from app.sensors.receiver import ReceivedPacket
+from app.sensors.pose_track import ReceivedPacket
 from app.services.access.access import Scope
-from app.services.decodes.invalid_tags import InvalidTagLimit
+from app.services.decodes.recordings import InvalidTagLimit
 from app.settings import Settings
 from app.simulation.radio.attacks import forge_packets, move_claim, number_entries, replay_packets
 from app.simulation.radio.drive import SimulatedDrive, drive_past
+from app.simulation.radio.lanes import InstalledMarkers
 from app.simulation.radio.link import Radio
-from app.simulation.radio.markers import InstalledMarkers
 from tests.conftest import ADMIN_KEY, LiveServer
 from tests.http import finished
 from tests.jobs import standin

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from app.geodesy import enu_from_heading, enu_from_wgs84, move_to_epoch, wgs84_from_enu
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
-from app.markers.plate_position import decimal_codes
+from app.markers.plate import PlateCode, PlateGeometry, PlateScheme, decimal_codes
 from app.sensors.camera import Camera
 from app.simulation.camera import render_plate_scene
 from app.simulation.plate_face import PlateWear, draw_look, plate_face

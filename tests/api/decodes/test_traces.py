@@ -16,12 +16,10 @@ import pytest
 
 from app.geodesy import enu_from_wgs84, wgs84_from_enu
 from app.markers.magnet import InformationTag, Polarity, parse_tag
-from app.services.decodes.rules import DecodeRules
-from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
-from app.simulation.magnetic.readout import CanBus
-from app.simulation.magnetic.recorder import write_array_stream, write_recorder_files
+from app.services.decodes.context import DecodeRules
+from app.simulation.magnetic.drive import Course, Scene, SimulatedDrive, Vehicle, simulate_drive
+from app.simulation.magnetic.recorder import CanBus, write_array_stream, write_recorder_files
 from app.simulation.magnetic.road import PlacedTag, Road, line_magnets
-from app.simulation.magnetic.vehicle import Course, Vehicle
 from tests.api.decodes.conftest import post_frame
 from tests.conftest import LiveServer
 from tests.http import finished, refused

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from app.formats.images import FRAME_FORMATS
-from app.formats.packets.formats import PACKET_FORMATS
-from app.formats.poses.formats import POSE_FORMATS
+from app.formats.packets.read import PACKET_FORMATS
+from app.formats.poses import POSE_FORMATS
 from app.formats.traces.formats import TRACE_FORMATS
 from app.main import create_app
 from app.services.access.access import Scope

@@ -18,9 +18,9 @@ import pytest
 
 from app.geodesy import wgs84_from_enu
 from app.main import create_app
+from app.registry.column_types import new_id
 from app.registry.database import Database
 from app.registry.decodes import DecodeRow, add_decode
-from app.registry.ids import new_id
 from app.registry.jobs import JobKind, add_job, new_job
 from app.services.access.access import Caller, Scope
 from app.settings import Settings

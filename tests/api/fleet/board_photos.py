@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from app.encoders.calibration_board import encode_board
 from app.encoders.plate import write_png
-from app.sensors.calibration_board import CalibrationBoard
+from app.sensors.camera import CalibrationBoard
 
 BOARD = CalibrationBoard()
 _PX_PER_MM = 10

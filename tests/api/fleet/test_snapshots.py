@@ -13,12 +13,12 @@ import pytest
 
 from app.decoders.snapshot import open_snapshot
 from app.geodesy import decimal_year, move_to_epoch
-from app.geodesy.plate_motion import MovedPositions
+from app.geodesy.operations import MovedPositions
 from app.markers.snapshot import ExpiredSnapshot, ForeignSnapshot, Trust
 from app.services.access.access import Scope
 from app.services.fleet import snapshots
 from app.settings import Settings
-from app.storage.signing_key import add_signing_key, remove_signing_key, switch_signing_keys
+from app.storage.keys import add_signing_key, remove_signing_key, switch_signing_keys
 from tests.conftest import LiveServer
 
 pytestmark = pytest.mark.both_databases

@@ -18,8 +18,8 @@ import sqlalchemy as sa
 from app.registry import agencies, vehicles
 from app.registry.database import Database
 from app.registry.decodes import DecodeRow, add_decode
+from app.registry.engines import across_agencies
 from app.registry.tables import metadata
-from app.registry.tenancy import across_agencies
 from tests.conftest import LiveServer
 
 pytestmark = pytest.mark.both_databases

@@ -12,7 +12,7 @@ import pytest
 
 from app.health import Fault
 from app.main import create_app
-from app.registry.events import list_events
+from app.registry.webhooks import list_events
 from app.services.access.access import Scope
 from app.settings import Settings
 from tests.api.health.items import add_test_item

@@ -13,12 +13,11 @@ import pytest
 from fastapi.routing import APIRoute
 from starlette.types import Message
 
-from app.api.http.costs import EXPENSIVE, MAX_WAITING, Budget, Slots, admitted, bounded
+from app.api.http.limits import EXPENSIVE, MAX_WAITING, Budget, RateLimit, Slots, admitted, bounded
 from app.api.http.permissions import PERMISSIONS
-from app.api.http.rate_limits import RateLimit
 from app.api.http.strict_json import StrictRoute
 from app.errors import ClientLeft, TooManyRequests, Unavailable
-from app.jobs.supervisor import Pending
+from app.jobs.pool import Pending
 from app.main import ROUTERS
 from app.registry.database import Database
 from app.services.access.access import Caller, Scope

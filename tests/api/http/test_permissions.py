@@ -17,7 +17,7 @@ from fastapi import FastAPI
 from starlette.routing import Mount
 
 from app.api.http.permissions import EVERYBODY, PERMISSIONS, PUBLIC, Permissions
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.main import create_app
 from app.registry.jobs import JobKind, add_job, new_job
 from app.registry.tables import api_keys, calibrations, reprocessings

@@ -15,7 +15,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from app.demo.free_ports import free_ports
+from app.demo.server import free_ports
 from tests.http import WITHIN_S
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -10,11 +10,10 @@ import httpx
 import numpy as np
 import pytest
 
-from app.api.http import rate_limits
-from app.api.http.rate_limits import RateLimit, address_of
+from app.api.http import limits
+from app.api.http.limits import RateLimit, address_of
 from app.errors import TooManyRequests
-from app.services.access.access import Scope
-from app.services.access.key_text import new_key
+from app.services.access.access import Scope, new_key
 from app.settings import Settings
 from tests.conftest import LiveServer
 
@@ -104,7 +103,7 @@ def test_reserved_tokens_come_one_after_the_other() -> None:
 
 
 def test_what_is_kept_does_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rate_limits, "_MAX_BUCKETS", 100)
+    monkeypatch.setattr(limits, "_MAX_BUCKETS", 100)
     clock = Clock()
     limit = _limit(1.0, 2, clock)
     for number in range(1000):

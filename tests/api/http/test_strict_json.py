@@ -11,7 +11,7 @@ import pytest
 from app.api.http.problems import MAX_ERRORS
 from app.errors import MalformedRequest
 from app.formats.json_text import MAX_DEPTH, MAX_MEMBERS, MAX_VALUES, parse_json
-from app.services.error_documents import cut_text
+from app.services.documents import cut_text
 
 JSON = {"Content-Type": "application/json"}
 MAX_ANSWER_BYTES = 64_000

@@ -27,7 +27,7 @@ from app.api.http.system import Readiness
 from app.errors import StorageFull, WaymarkError
 from app.logs import configure_logs
 from app.settings import Settings
-from app.storage import probe
+from app.storage import spool
 from tests.conftest import ADMIN_KEY, LiveServer
 from tests.http import refused, wait_until
 
@@ -54,7 +54,7 @@ def test_not_ready_while_nothing_can_be_written(
 
     with fresh_server.client(None) as anyone:
         assert anyone.get("/readyz").json()["parts"]["storage"] is True
-        for module, name, fault in ((os, "fsync", fail), (probe, "MIN_FREE_BYTES", 2**62)):
+        for module, name, fault in ((os, "fsync", fail), (spool, "MIN_FREE_BYTES", 2**62)):
             with monkeypatch.context() as broken:
                 broken.setattr(module, name, fault)
                 late = anyone.get("/readyz")

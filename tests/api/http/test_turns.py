@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 
-from app.api.http.turns import AT_ONCE, Turns
+from app.api.http.bodies import AT_ONCE, Turns
 
 
 def test_a_few_go_on_in_each_round_and_everybody_does_in_the_end() -> None:

@@ -16,8 +16,8 @@ import pytest
 
 from app.main import create_app
 from app.services.access.access import Scope
-from app.services.markers import artwork_jobs
-from app.services.progress.results import KEPT
+from app.services.markers import artwork
+from app.services.progress import KEPT
 from app.settings import Settings
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer
 from tests.http import created, finished, refused
@@ -53,7 +53,7 @@ def queued(answer: httpx.Response) -> str:
 def test_artwork_of_many_plates_is_a_job(
     client: httpx.Client, server: LiveServer, place: Callable[[], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(artwork_jobs, "IMMEDIATE_PLATES", 1)
+    monkeypatch.setattr(artwork, "IMMEDIATE_PLATES", 1)
     ids = plates(client, place, 2)
     body = {"marker_ids": ids, "formats": ["svg"], "sheet": {"width_mm": 1500, "height_mm": 1500}}
     key = {"Idempotency-Key": "artwork-1"}
@@ -76,7 +76,7 @@ def test_artwork_of_many_plates_is_a_job(
     assert [plate["record_url"] for plate in manifest["plates"]] == [None, None]
     assert {"quality.pdf", "quality.csv", "sheets/sheet-0001.svg"} < names
     # the ZIP that is answered at once has the same files
-    monkeypatch.setattr(artwork_jobs, "IMMEDIATE_PLATES", 2)
+    monkeypatch.setattr(artwork, "IMMEDIATE_PLATES", 2)
     at_once = client.post("/v1/artwork", json=body)
     assert at_once.status_code == 200
     with zipfile.ZipFile(io.BytesIO(at_once.content)) as archive:

@@ -15,15 +15,15 @@ import pytest
 
 from app.api.http import event_stream
 from app.errors import UnreadableUpload
-from app.registry import job_leases
+from app.registry import jobs as job_leases
 from app.registry import jobs as store
-from app.registry.events import add_event
-from app.registry.ids import new_id
+from app.registry.column_types import new_id
+from app.registry.engines import across_agencies
 from app.registry.jobs import JobKind, JobRow, new_job
-from app.registry.tenancy import across_agencies
+from app.registry.webhooks import add_event
 from app.services.access.access import Scope
-from app.services.error_documents import error_document
-from app.services.progress.kinds import RULES
+from app.services.documents import error_document
+from app.services.progress import RULES
 from tests.conftest import LiveServer
 from tests.http import WITHIN_S, refused, wait_until
 

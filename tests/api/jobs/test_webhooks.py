@@ -26,14 +26,13 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from app.errors import InvalidParameter
+from app.registry.engines import across_agencies
 from app.registry.jobs import JobKind
-from app.registry.tenancy import across_agencies
-from app.registry.webhook_tables import webhook_deliveries
-from app.registry.webhook_tables import webhooks as webhook_table
+from app.registry.work_tables import webhook_deliveries
+from app.registry.work_tables import webhooks as webhook_table
+from app.services import webhooks as delivery_module
 from app.services.access.access import Scope
-from app.services.webhooks import delivery as delivery_module
-from app.services.webhooks.delivery import GIVE_UP_AFTER, LEASE, WebhookDelivery, is_wanted
-from app.services.webhooks.signature import signed_headers
+from app.services.webhooks import GIVE_UP_AFTER, LEASE, WebhookDelivery, is_wanted, signed_headers
 from app.storage import webhook_sender
 from app.storage.webhook_sender import WebhookSender, check_url, is_public
 from tests.api.jobs.test_jobs import add, finish

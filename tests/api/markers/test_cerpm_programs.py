@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from app.decoders.cerpm.payload import decode_message, has_valid_tag
+from app.decoders.cerpm.verify import decode_message, has_valid_tag
 from app.errors import Unavailable
 from app.markers.cerpm import LaneSide
 from app.registry.agencies import find_first_agency

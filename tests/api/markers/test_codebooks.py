@@ -11,8 +11,7 @@ import pytest
 
 from app.encoders.magnet import CodebookRules, list_conflicts
 from app.markers.magnet import parse_tag
-from app.markers.magnet_codebook import Codebook, Meaning
-from app.markers.magnet_design import TagDesign
+from app.markers.magnet_design import Codebook, Meaning, TagDesign
 from app.services.access.access import Scope
 from tests.conftest import LiveServer
 from tests.http import created, refused

@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from app.registry import decodes
-from app.registry.ids import new_id
+from app.registry.column_types import new_id
 from app.registry.markers import get_marker
 from tests.conftest import LiveServer
 

@@ -12,11 +12,11 @@ import httpx
 import orjson
 import pytest
 
+from app.registry.column_types import row_of
 from app.registry.marker_rows import MarkerRow
-from app.registry.rows import row_of
 from app.services.access.access import Scope
-from app.services.decodes.fixes import horizontal_rmse_m
-from app.services.markers.accuracy import accuracy_document
+from app.services.decodes.matching import horizontal_rmse_m
+from app.services.markers.plausibility import accuracy_document
 from app.settings import Settings
 from tests.conftest import LiveServer, Place
 from tests.geodesy.test_geodesy import GRID, ntv2

@@ -8,7 +8,7 @@ import httpx
 import pytest
 from pyproj import Geod
 
-from app.registry import cerpm_runs
+from app.registry import lines
 from tests.api.ogc.test_features import MERCATOR, get, ids
 from tests.conftest import LiveServer
 
@@ -162,13 +162,13 @@ def test_a_page_reads_no_more_than_it_needs(client: httpx.Client, monkeypatch: p
         for measure_m in (0.0, 12.0, 24.0):
             _cerpm(client, measure_m, road=road)
     read: list[Any] = []
-    is_complete = cerpm_runs._is_complete
+    is_complete = lines._is_complete
 
     def counting(run: Any, growing: Any, row: Any) -> bool:
         read.append(row.id)
         return is_complete(run, growing, row)
 
-    monkeypatch.setattr(cerpm_runs, "_is_complete", counting)
+    monkeypatch.setattr(lines, "_is_complete", counting)
     first = get(client, ITEMS, limit=1)
     rows = set(read)
     read.clear()

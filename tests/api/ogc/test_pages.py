@@ -12,7 +12,7 @@ import lxml.html
 import pytest
 
 from app.api.ogc import pages
-from app.api.ogc.markup import Markup, anchor, element, table
+from app.api.ogc.pages import Markup, anchor, element, table
 from app.services.access.access import Scope
 from app.services.markers.features import COLLECTIONS
 from tests.api.ogc.test_features import ITEMS, MERCATOR, ROW, add

@@ -13,7 +13,7 @@ import pytest
 from pyproj import Geod
 
 from app.services.access.access import Scope
-from app.services.plans.features import _parts
+from app.services.plans.tasks import _parts
 from tests.api.ogc.test_features import MERCATOR, get, ids
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import LiveServer

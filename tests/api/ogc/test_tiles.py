@@ -17,7 +17,7 @@ import shapely
 
 from app.api.http.ui import STATIC
 from app.families import FAMILY_NAMES
-from app.markers.status import STATUSES
+from app.markers.reading import STATUSES
 from app.plots.map_symbols import SHAPES, sprite
 from app.services.markers.features import COLLECTIONS
 from app.services.plans.documents import PlanStatus

@@ -16,7 +16,7 @@ import pytest
 
 from app.errors import Unavailable
 from app.registry.jobs import JobKind
-from app.services.plans.package_tasks import WritePartTask
+from app.services.plans.tasks import WritePartTask
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import LiveServer
 from tests.http import created, finished, refused

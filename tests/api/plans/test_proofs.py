@@ -16,7 +16,7 @@ from app.main import create_app
 from app.planning.proof import prove
 from app.registry.jobs import JobKind
 from app.registry.tables import agencies
-from app.services.plans.proof_tasks import ProveUnitTask, WriteProofTask
+from app.services.plans.tasks import ProveUnitTask, WriteProofTask
 from app.settings import Settings
 from tests.api.plans.test_plans import road, send_road
 from tests.conftest import ADMIN_KEY, UNLIMITED, LiveServer

@@ -239,8 +239,7 @@ def test_addresses_are_not_tried_without_end(
 
 
 def test_every_text_is_in_both_languages() -> None:
-    from app.api.public_pages.texts_de import GERMAN
-    from app.api.public_pages.texts_en import ENGLISH
+    from app.api.public_pages.texts import ENGLISH, GERMAN
 
     for name in ENGLISH.__slots__:
         one, other = getattr(ENGLISH, name), getattr(GERMAN, name)

@@ -13,9 +13,9 @@ import pytest
 import sqlalchemy as sa
 from PIL import Image
 
-from app.registry.events import list_events
+from app.registry.engines import across_agencies
 from app.registry.tables import damage_report_contacts
-from app.registry.tenancy import across_agencies
+from app.registry.webhooks import list_events
 from app.services.access.access import Scope
 from app.services.public_pages import reports as service
 from app.settings import Settings

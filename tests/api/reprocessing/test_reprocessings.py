@@ -16,12 +16,12 @@ import sqlalchemy as sa
 from app.demo.cerpms import build_lane
 from app.errors import UnreadableUpload
 from app.main import create_app
+from app.registry.engines import across_agencies
 from app.registry.tables import decodes, observations, reprocessed_decodes
 from app.registry.tables import jobs as jobs_table
-from app.registry.tenancy import across_agencies
+from app.services import reprocessing as module
 from app.services.access.access import Scope
-from app.services.reprocessing import reprocessings as module
-from app.services.reprocessing.compare import compare_results
+from app.services.reprocessing import compare_results
 from app.settings import Settings
 from tests.api.decodes.conftest import near, post_frame
 from tests.api.decodes.test_packets import decoded, drive, packed

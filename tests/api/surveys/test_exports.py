@@ -21,7 +21,7 @@ from app.formats import exports as formats
 from app.formats.exports import FIELDS, SHAPEFILE_NAMES, write_csv
 from app.formats.surveys.declaration import ImportDeclaration
 from app.formats.surveys.read import read_survey
-from app.registry import bulk
+from app.registry import markers as bulk
 from app.services.surveys import exports
 from app.surveys.georeference import georeference_survey
 from tests.conftest import LiveServer

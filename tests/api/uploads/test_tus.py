@@ -16,9 +16,9 @@ import pytest
 import sqlalchemy as sa
 from tusclient.client import TusClient
 
-from app.formats.spooled_file import SpooledFile
+from app.formats.format import SpooledFile
 from app.registry.tables import decodes, uploads
-from app.registry.upload_tables import stored_bytes, upload_parts
+from app.registry.work_tables import stored_bytes, upload_parts
 from app.services.access.access import Scope
 from tests.api.uploads.conftest import PART, TUS, append, offset_of, problem_of, start, zip_of_frames
 from tests.conftest import LiveServer

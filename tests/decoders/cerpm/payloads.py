@@ -7,7 +7,7 @@ import struct
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.cmac import CMAC
 
-from app.sensors.receiver import ReceivedPacket
+from app.sensors.pose_track import ReceivedPacket
 
 LON_DEG, LAT_DEG = -85.6123456, 42.2834567
 START_S = 1_790_000_000.0

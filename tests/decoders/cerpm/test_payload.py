@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from app.decoders.cerpm.payload import UndecodablePayload, decode_message, has_valid_tag
+from app.decoders.cerpm.verify import UndecodablePayload, decode_message, has_valid_tag
 from app.errors import InvalidParameter
 from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, body, key_of, signed

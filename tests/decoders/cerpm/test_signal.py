@@ -17,10 +17,8 @@ from app.decoders.cerpm.signal import SignalHealth, SignalReport, SignalRules, p
 from app.decoders.cerpm.verify import Verdict, VerifiedPacket
 from app.errors import InvalidParameter
 from app.markers.cerpm import CerpmMessage
-from app.radio.link import EXPONENT
-from app.radio.path_loss import fit_path_loss
-from app.sensors.pose_track import PoseTrack
-from app.sensors.receiver import ReceivedPacket
+from app.radio.link import EXPONENT, fit_path_loss
+from app.sensors.pose_track import PoseTrack, ReceivedPacket
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, START_S
 
 M_EAST = 1 / (111_320 * math.cos(math.radians(LAT_DEG)))

@@ -9,10 +9,9 @@ from time import process_time
 import numpy as np
 import pytest
 
-from app.decoders.cerpm.freshness import FreshnessRules, SequenceSpan
-from app.decoders.cerpm.verify import Verdict, Verification, verify_packets
+from app.decoders.cerpm.verify import FreshnessRules, SequenceSpan, Verdict, Verification, verify_packets
 from app.errors import InvalidParameter
-from app.sensors.receiver import PlainClaim, ReceivedPacket
+from app.sensors.pose_track import PlainClaim, ReceivedPacket
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, START_S, body, heard, key_of, signed
 
 KEYS = {number: key_of(number) for number in range(1, 41)}

@@ -9,14 +9,20 @@ from time import process_time
 import numpy as np
 import pytest
 
-from app.decoders.cerpm.merge import merge_markers
-from app.decoders.cerpm.merged_markers import Disagreement, MergedMarkers, MergeRules, RegisteredMarker
-from app.decoders.cerpm.vehicle_positions import distances_m, offsets_m, vehicle_positions
+from app.decoders.cerpm.merge import (
+    Disagreement,
+    MergedMarkers,
+    MergeRules,
+    RegisteredMarker,
+    distances_m,
+    merge_markers,
+    offsets_m,
+    vehicle_positions,
+)
 from app.decoders.cerpm.verify import VerifiedPacket, verify_packets
 from app.errors import InvalidParameter
 from app.markers.cerpm import LaneSide
-from app.sensors.pose_track import PoseTrack
-from app.sensors.receiver import PlainClaim, ReceivedPacket
+from app.sensors.pose_track import PlainClaim, PoseTrack, ReceivedPacket
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, START_S, body, key_of, signed
 
 M_EAST, M_NORTH = 1 / (111_320 * math.cos(math.radians(LAT_DEG))), 1 / 111_080

@@ -7,8 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from app.decoders.fiducial import FiducialOutcome, decode_fiducials
-from app.decoders.fiducial.sample import detect_squares
+from app.decoders.fiducial import FiducialOutcome, decode_fiducials, detect_squares
 from app.encoders.plate import PlateOrder, encode_plate
 from app.encoders.plate.proof import render_face
 from app.errors import CodeMismatch, InvalidParameter

@@ -7,11 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.decoders.magnet.classify import MIN_PROBABILITY, Accepted, Rejected, classify_dipoles, with_log_odds
-from app.decoders.magnet.ferrous import is_ferrous, rows_beside
+from app.decoders.magnet.classify import (
+    FEATURES,
+    MIN_PROBABILITY,
+    WEIGHTS,
+    Accepted,
+    MagnetState,
+    Rejected,
+    classify_dipoles,
+    is_ferrous,
+    magnet_features,
+    own_log_odds,
+    rows_beside,
+    with_log_odds,
+)
 from app.decoders.magnet.fit_window import Dipole
-from app.decoders.magnet.magnet_odds import FEATURES, WEIGHTS, magnet_features, own_log_odds
-from app.decoders.magnet.magnet_state import MagnetState
 from app.decoders.magnet.readings import NoiseKind
 from app.markers.magnet import Orientation, Polarity
 

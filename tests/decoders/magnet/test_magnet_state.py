@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.decoders.magnet.classify import KNOWN_STD_M, MagnetState
 from app.decoders.magnet.fit_window import UPRIGHT, Dipole
-from app.decoders.magnet.magnet_state import KNOWN_STD_M, MagnetState
 from app.markers.magnet import MOMENT_AM2
 
 

@@ -16,10 +16,9 @@ from app.errors import InvalidParameter
 from app.markers.magnet import InformationTag, LineStyle, Orientation, Polarity
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace, SensorRole
 from app.simulation.magnetic.clutter import ferrous_clutter, town_clutter
-from app.simulation.magnetic.drive import Scene, SimulatedDrive, simulate_drive
-from app.simulation.magnetic.readout import CanBus, Chip
+from app.simulation.magnetic.drive import MPH, Course, Scene, SimulatedDrive, Vehicle, Wheel, simulate_drive
+from app.simulation.magnetic.recorder import CanBus, Chip
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet, line_magnets
-from app.simulation.magnetic.vehicle import MPH, Course, Vehicle, Wheel
 
 BAR = Vehicle.compact().bar
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.decoders.magnet import metro_steps as steps
+from app.decoders.magnet import metro as steps
 from app.decoders.magnet.metro import MetroSettings, decode_trace_metro
 from app.decoders.magnet.readings import MagnetReading, TagReading
 from app.markers.magnet import InformationTag, Orientation, Polarity
-from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.drive import MPH, Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.road import PlacedTag, Road, RoadMagnet
-from app.simulation.magnetic.vehicle import MPH, Course, Vehicle
 
 
 @pytest.mark.parametrize(("mph", "samples"), [(10, 15), (30, 9), (50, 5)])

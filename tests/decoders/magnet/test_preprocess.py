@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.decoders.magnet.preprocess import Blocks, Preprocessor
-from app.decoders.magnet.vehicle_path import VehiclePath
+from app.decoders.magnet.readings import VehiclePath
 from app.decoders.magnet.wheel_noise import WheelNoiseCanceller
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 

@@ -12,9 +12,8 @@ from app.decoders.magnet.recording_check import compare_with_dipoles, compare_wi
 from app.markers.magnet import InformationTag, parse_tag
 from app.sensors.magnetometer_bar import MagnetTrace
 from app.simulation.magnetic.clutter import ferrous_clutter
-from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.road import PlacedTag, Road
-from app.simulation.magnetic.vehicle import Course, Vehicle
 
 pytestmark = pytest.mark.slow
 

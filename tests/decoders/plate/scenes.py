@@ -16,8 +16,7 @@ from app.sensors.camera import Camera
 from app.simulation.camera import RenderedFrame, render_plate_scene
 from app.simulation.plate_face import Face, PlateLook, PlateWarmth, PlateWear, plate_face, warm_face
 from app.simulation.plate_scene import PlacedFace, PlateScene, Sensor
-from app.simulation.road import road_background
-from app.simulation.thermal import ThermalSensor, render_thermal_scene
+from app.simulation.thermal import ThermalSensor, render_thermal_scene, road_background
 
 Image = npt.NDArray[np.uint8]
 BACKGROUNDS = Path(__file__).parents[3] / "benchmarks" / "backgrounds"

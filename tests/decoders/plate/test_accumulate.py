@@ -11,9 +11,9 @@ import pytest
 from app.decoders.plate.accumulate import accumulate, count_effective, differing_units, read_accumulated
 from app.decoders.plate.evidence import PlateEvidence
 from app.decoders.plate.follow_plate import predict_corners, view_elsewhere
-from app.decoders.plate.plate_tracks import PlateTracker, SeenPlate
 from app.decoders.plate.pose import locate_plate
 from app.decoders.plate.reader import read_plates
+from app.decoders.plate.video_search import PlateTracker, SeenPlate
 from app.markers.plate import PlateCode
 from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.camera import render_plate_scene

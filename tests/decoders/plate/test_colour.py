@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.decoders.plate.colour import difference_signal, half_planes
-from app.decoders.plate.layout import marker_centroids, unit_centres
-from app.decoders.plate.marker_colours import MarkerColours, marker_colours
+from app.decoders.plate.detect_blobs import difference_signal, half_planes
+from app.decoders.plate.light_field import MarkerColours, marker_colours
+from app.decoders.plate.pose import marker_centroids, unit_centres
 from app.decoders.plate.reader import CAST_ALONE, MIN_TINT_ALONE
 from app.markers.plate import PlateGeometry
 

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.decoders.plate.confirm import MAX_JOINT_ERROR, confirm_frames
+from app.decoders.plate.confirm import MAX_JOINT_ERROR, UnitVerification, confirm_frames
 from app.decoders.plate.evidence import MAX_ERROR, MAX_TENTATIVE_ERROR
-from app.decoders.plate.unit_verification import UnitVerification
 from app.markers.plate import PlateCode
 from app.markers.reading import Certainty, PlateOutcome, PlateReading
 

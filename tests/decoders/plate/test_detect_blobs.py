@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
-from app.decoders.plate.colour import difference_signal, half_planes, ratio_signal
 from app.decoders.plate.detect_blobs import (
     AREA,
     MIN_AREA,
@@ -23,7 +22,10 @@ from app.decoders.plate.detect_blobs import (
     YY,
     X,
     Y,
+    difference_signal,
     find_blobs,
+    half_planes,
+    ratio_signal,
 )
 
 

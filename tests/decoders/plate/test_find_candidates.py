@@ -7,22 +7,45 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from app.decoders.plate.colour import difference_signal, half_planes
-from app.decoders.plate.detect_blobs import AREA, COLUMNS, PEAK, SIGN, WEIGHT, X0, X1, XX, Y0, Y1, YY, X, Y
-from app.decoders.plate.detect_quads import MARKER_RATIO, MarkerQuad
-from app.decoders.plate.filter_candidates import FEATURES, MIN_LOG_ODDS, candidate_features, candidate_log_odds
-from app.decoders.plate.find_candidates import Candidate, find_candidates, possible_geometries
-from app.decoders.plate.homography import homography_from_points, project
-from app.decoders.plate.join_quads import (
+from app.decoders.plate.detect_blobs import (
+    AREA,
+    COLUMNS,
+    PEAK,
+    SIGN,
+    WEIGHT,
+    X0,
+    X1,
+    XX,
+    Y0,
+    Y1,
+    YY,
+    X,
+    Y,
+    difference_signal,
+    half_planes,
+)
+from app.decoders.plate.detect_quads import (
+    MARKER_RATIO,
     MAX_GREENS,
     MAX_QUADS,
     MAX_REDS,
     QUAD_COLUMNS,
+    MarkerQuad,
     join_green_triples,
     join_red_quads,
     new_nearest,
 )
-from app.decoders.plate.layout import marker_centroids
+from app.decoders.plate.find_candidates import (
+    FEATURES,
+    MIN_LOG_ODDS,
+    Candidate,
+    candidate_features,
+    candidate_log_odds,
+    find_candidates,
+    possible_geometries,
+)
+from app.decoders.plate.fit import homography_from_points, project
+from app.decoders.plate.pose import marker_centroids
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES, MIN_SECOND_LOG_ODDS, _read_candidate, _Task
 from app.markers.plate import PlateCode, PlateGeometry
 from app.simulation.plate_scene import PlacedFace

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.decoders.plate.fit import fit_plate, refine_corners
-from app.decoders.plate.homography import project
-from app.decoders.plate.layout import marker_centroids
+from app.decoders.plate.fit import fit_plate, project, refine_corners
+from app.decoders.plate.pose import marker_centroids
 from app.markers.plate import PlateGeometry
 from app.simulation.plate_scene import PlacedFace
 from tests.decoders.plate.scenes import face_of, shoot, shoot_plate

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.decoders.plate.hypotheses import PlatePixels
 from app.decoders.plate.light_field import (
     ALBEDO_WEIGHT,
     EDGE_ERROR,
@@ -19,8 +20,7 @@ from app.decoders.plate.light_field import (
     SPREAD_FACTOR,
     fit_light,
 )
-from app.decoders.plate.linear import invert
-from app.decoders.plate.plate_pixels import PlatePixels
+from app.decoders.plate.normal_equations import invert
 
 SIDE_MM = 325.0
 

@@ -11,7 +11,7 @@ import reedsolo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.decoders.plate.likely_words import likely_codeword
+from app.decoders.plate.decode_symbols import likely_codeword
 from app.markers.plate import PlateCode, PlateScheme, code_cells, is_codeword, numbers, reed_solomon_words
 
 CHECKED = [(scheme, n) for scheme in PlateScheme if scheme.corrects for n in scheme.sizes]

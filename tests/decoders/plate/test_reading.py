@@ -9,9 +9,8 @@ import pytest
 from app.decoders.plate.reader import decode_plates
 from app.errors import InvalidParameter
 from app.formats.images import load_image
-from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
+from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode, PlateGeometry, PlateScheme
 from app.markers.reading import PlateOutcome, PlateReading
-from app.markers.recommended_plate import EXPECTED_GEOMETRIES
 from app.sensors.camera import Camera
 from app.simulation.plate_scene import PlacedFace
 from tests.decoders.plate.scenes import BACKGROUNDS, CAMERA, PAPER, face_of, photo, road, shoot, shoot_plate

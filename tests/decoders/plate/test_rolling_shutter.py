@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.decoders.plate.rolling_shutter import locate_moving_plate
+from app.decoders.plate.pose import locate_moving_plate
 from app.markers.plate import PlateGeometry
 from app.sensors.camera import Camera
 from app.simulation.plate_face import Face

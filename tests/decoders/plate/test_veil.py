@@ -9,12 +9,10 @@ import pytest
 
 from app.decoders.plate.decode_symbols import DecodedSymbols
 from app.decoders.plate.evidence import MAX_TENTATIVE_ERROR, MAX_VEILED_ERROR, TENTATIVE_CONFIDENCE, _tentative
-from app.decoders.plate.fit import PlateFit, fit_plate
-from app.decoders.plate.homography import homography_from_points, project
-from app.decoders.plate.layout import marker_centroids
-from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
-from app.decoders.plate.veil import DARK_SHARE, estimate_veil, uniform_haze, veil_log_odds
-from app.decoders.plate.verify_units import verify_units
+from app.decoders.plate.fit import PlateFit, fit_plate, homography_from_points, project
+from app.decoders.plate.light_field import DARK_SHARE, estimate_veil, uniform_haze, veil_log_odds
+from app.decoders.plate.pose import marker_centroids
+from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods, verify_units
 from app.markers.plate import PlateGeometry, unit_index
 from app.markers.reading import PlateOutcome, PlateReading
 from app.simulation.camera import RenderedFrame

@@ -11,18 +11,15 @@ import numpy as np
 import pytest
 import scipy
 
-from app.decoders.plate.colour import half_planes
+from app.decoders.plate.confirm import UnitVerification
+from app.decoders.plate.detect_blobs import half_planes
 from app.decoders.plate.evidence import MAX_ERROR
 from app.decoders.plate.find_candidates import find_candidates
-from app.decoders.plate.fit import fit_plate
-from app.decoders.plate.homography import homography_from_points, project
-from app.decoders.plate.hypotheses import set_unit_likelihoods
-from app.decoders.plate.layout import marker_centroids
-from app.decoders.plate.plate_pixels import LightPrior, PlatePattern, PlatePixels, Spots
+from app.decoders.plate.fit import fit_plate, homography_from_points, project
+from app.decoders.plate.hypotheses import LightPrior, PlatePattern, PlatePixels, Spots, set_unit_likelihoods
+from app.decoders.plate.pose import marker_centroids
 from app.decoders.plate.reader import DEFAULT_GEOMETRIES, _decode_colour, _Task, decode_plates
-from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods
-from app.decoders.plate.unit_verification import UnitVerification
-from app.decoders.plate.verify_units import verify_units
+from app.decoders.plate.unit_likelihoods import code_units, unit_log_likelihoods, verify_units
 from app.markers.plate import PlateCode, PlateGeometry, unit_index
 from app.simulation.plate_face import Face
 from app.simulation.plate_scene import PlacedFace, PlateScene, Shadow

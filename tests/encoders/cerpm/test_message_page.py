@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from app.decoders.cerpm.payload import decode_message, has_valid_tag
+from app.decoders.cerpm.verify import decode_message, has_valid_tag
 from app.encoders.cerpm import encode_message, hex_dump
-from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
-from app.markers.cerpm_keys import derive_marker_key
-from app.radio.lorawan import DATA_RATES, F_PORT, Region
+from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit, SpeedUnit, derive_marker_key
+from app.radio.settings import DATA_RATES, F_PORT, Region
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "cerpm-message.md").read_text()
 AGENCY_KEYS = dict(

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.encoders.cerpm.payload import encode_body, encode_message
+from app.encoders.cerpm import encode_body, encode_message
 from app.errors import InvalidParameter
-from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
-from app.markers.cerpm_keys import message_tag
+from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit, SpeedUnit, message_tag
 
 KEY = bytes.fromhex("2b7e151628aed2a6abf7158809cf4f3c")
 

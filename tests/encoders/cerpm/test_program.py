@@ -9,8 +9,7 @@ import pytest
 
 from app.encoders.cerpm import MarkerProgram, encode_message, explain_payload, write_programs_csv
 from app.errors import InvalidParameter
-from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit
-from app.markers.cerpm_keys import derive_marker_key, message_tag
+from app.markers.cerpm import CerpmMessage, LaneSide, SpeedLimit, derive_marker_key, message_tag
 from app.radio.settings import RadioSettings
 
 AGENCY_KEY = bytes(range(32))

@@ -18,9 +18,15 @@ from app.encoders.magnet.codebook import (
 )
 from app.errors import Conflict, InvalidParameter
 from app.markers.magnet import InformationTag, parse_tag
-from app.markers.magnet_codebook import Codebook, Meaning, MeaningKind
-from app.markers.magnet_design import TagDesign
-from app.markers.magnet_error import MagnetErrorModel, OdometerError, ReadingConditions
+from app.markers.magnet_design import (
+    Codebook,
+    MagnetErrorModel,
+    Meaning,
+    MeaningKind,
+    OdometerError,
+    ReadingConditions,
+    TagDesign,
+)
 
 FINE = TagDesign(3, 4.0, 0.05)
 HARD = ReadingConditions(20.0, 0.35)

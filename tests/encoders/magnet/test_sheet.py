@@ -19,11 +19,10 @@ from pyproj import Geod
 from shapely.geometry import shape
 
 from app.encoders.magnet import DrillingSheet, SheetFormat, place_line, place_tag, write_sheet
-from app.encoders.magnet.sheet_pdf import HOLE_LINE_MM, PAGE_MM, plan_scale
+from app.encoders.magnet.sheets import HOLE_LINE_MM, PAGE_MM, plan_scale
 from app.markers.magnet import InformationTag, LineStyle
-from app.markers.magnet_codebook import Meaning, MeaningKind
-from app.planning.drilling_sheet import drilling_sheet
-from app.planning.magnet_checks import Neighbour, Site
+from app.markers.magnet_design import Meaning, MeaningKind
+from app.planning.magnet_checks import Neighbour, Site, drilling_sheet
 from app.roads.lane_line import LaneLine
 
 WGS84 = Geod(ellps="WGS84")

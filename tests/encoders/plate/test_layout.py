@@ -12,9 +12,8 @@ from shapely import MultiPoint
 from shapely.geometry import Polygon, box
 
 from app.encoders.plate import ArtworkOptions, Drawing, PlateOrder, encode_plate, encode_sheets, quality_sheets
-from app.encoders.plate.drawing import Boxes, Layer, Modules, Shape, Stroke, Text
-from app.encoders.plate.lettering import contours_mm
-from app.encoders.plate.qr import qr_modules
+from app.encoders.plate.drawing import Boxes, Layer, Modules, Shape, Stroke, Text, contours_mm
+from app.encoders.plate.face import qr_modules
 from app.markers.plate import PlateCode, PlateGeometry
 
 SMALLEST = PlateGeometry(8, 20, 2, 5)

@@ -105,7 +105,7 @@ def test_the_vehicle_is_found_by_a_sign(
 
 @pytest.mark.slow
 def test_corners_are_found_to_parts_of_a_pixel(capsys: pytest.CaptureFixture[str]) -> None:
-    """`CORNER_SIGMA_PX` in app/decoders/fiducial/pose.py rests on the figure that this test prints."""
+    """`CORNER_SIGMA_PX` in app/decoders/fiducial.py rests on the figure that this test prints."""
     code = FiducialCode("apriltag-36h11", 17)
     known = KnownFiducial(code, FiducialGeometry(SIDE_MM, QUIET_MM, Mounting.UPRIGHT))
     panel = np.pad(np.kron(np.where(code.modules == 1, 25, 235), np.ones((16, 16))), 16, constant_values=235.0)

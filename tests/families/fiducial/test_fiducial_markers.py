@@ -13,8 +13,7 @@ import httpx
 import numpy as np
 import pytest
 
-from app.decoders.fiducial import decode_fiducials
-from app.decoders.fiducial.offline import known_fiducials, match_fiducial
+from app.decoders.fiducial import decode_fiducials, known_fiducials, match_fiducial
 from app.decoders.snapshot import open_snapshot
 from app.markers.fiducial import FiducialCode, FiducialGeometry, KnownFiducial
 from app.markers.snapshot import Trust

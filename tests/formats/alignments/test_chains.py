@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.formats.alignments.chains import JOIN_M, Link, chain_parts, join_chain
+from app.formats.alignments.features import JOIN_M, Link, chain_parts, join_chain
 
 
 def _parts(*lines: list[tuple[float, float]]) -> list[np.ndarray]:

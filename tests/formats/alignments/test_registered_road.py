@@ -11,14 +11,12 @@ from pyproj import Geod
 
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import BoundaryStyle
-from app.formats.alignments.read import read_alignment
-from app.formats.alignments.registered_road import RegisteredRoad, RoadLanes, RoadStation, write_registered_road
+from app.formats.alignments.read import RegisteredRoad, RoadLanes, RoadStation, read_alignment, write_registered_road
 from app.geodesy import LocalizationGrade
-from app.planning.alignment import Alignment
-from app.planning.alignment_declaration import AlignmentDeclaration
+from app.planning.alignment import Alignment, AlignmentDeclaration
 from app.planning.build_alignment import build_alignment
 from app.roads.axis import Axis
-from app.roads.parallel import cut_edges
+from app.roads.lane_line import cut_edges
 
 GEOD = Geod(ellps="WGS84")
 

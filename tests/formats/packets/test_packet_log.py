@@ -11,12 +11,11 @@ from time import process_time
 import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge
-from app.formats.log_times import LogClock, TimeScale, utc_from_gps_s
-from app.formats.packets.declaration import PacketDeclaration, PacketFormat, PacketLimits
+from app.formats.logs import LogClock, TimeScale, utc_from_gps_s
 from app.formats.packets.read import PacketLog, read_packets
-from app.formats.packets.rows import PayloadText
+from app.formats.packets.rows import PacketDeclaration, PacketFormat, PacketLimits, PayloadText
 from app.markers.cerpm import LaneSide, SpeedLimit, SpeedUnit
-from app.sensors.receiver import PlainClaim
+from app.sensors.pose_track import PlainClaim
 from tests.decoders.cerpm.events import STORED, chirpstack, things_stack
 from tests.decoders.cerpm.payloads import LAT_DEG, LON_DEG, body, signed
 

@@ -15,10 +15,8 @@ from app.errors import (
     UnsupportedUpload,
     UploadTooLarge,
 )
-from app.formats.log_report import LogReport
-from app.formats.log_times import LogClock
-from app.formats.poses.declaration import PoseDeclaration, PoseLimits
-from app.formats.poses.read import read_poses
+from app.formats.logs import LogClock, LogReport
+from app.formats.poses import PoseDeclaration, PoseLimits, read_poses
 from app.geodesy import enu_from_wgs84
 from app.sensors.pose_track import PoseTrack
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.formats.surveys.cells import NumberForm, detect_number_form, read_numbers
+from app.formats.surveys.table import NumberForm, detect_number_form, read_numbers
 
 
 def test_plain_numbers_are_read_at_once_and_one_by_one() -> None:

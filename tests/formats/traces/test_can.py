@@ -15,16 +15,15 @@ from app.formats.traces.declaration import (
     CanDeclaration,
     CanSignal,
     TraceDeclaration,
+    TraceFile,
     TraceFormat,
     TraceLimits,
 )
 from app.formats.traces.read import read_trace
-from app.formats.traces.report import TraceFile
 from app.sensors.magnetometer_bar import MagnetTrace
-from app.simulation.magnetic.drive import Scene, simulate_drive
+from app.simulation.magnetic.drive import Course, Scene, Vehicle, simulate_drive
 from app.simulation.magnetic.recorder import write_array_stream
 from app.simulation.magnetic.road import Road
-from app.simulation.magnetic.vehicle import Course, Vehicle
 from tests.formats.traces.recordings import make_trace
 from tests.machine import require_module
 

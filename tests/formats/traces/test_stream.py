@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from app.errors import UnreadableUpload, UploadTooLarge, WaymarkError
-from app.formats.traces.declaration import TraceDeclaration, TraceLimits
+from app.formats.traces.declaration import TraceDeclaration, TraceFile, TraceLimits
 from app.formats.traces.read import read_trace
-from app.formats.traces.report import TraceFile
 from app.simulation.magnetic.recorder import write_array_stream
 from tests.formats.traces.recordings import FRD, make_trace
 

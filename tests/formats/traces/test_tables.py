@@ -18,10 +18,10 @@ from app.formats.traces.declaration import (
     TimeUnit,
     TraceColumns,
     TraceDeclaration,
+    TraceFile,
     TraceLimits,
 )
 from app.formats.traces.read import read_trace
-from app.formats.traces.report import TraceFile
 from tests.formats.traces.recordings import make_trace, plain_csv
 from tests.machine import require_module
 

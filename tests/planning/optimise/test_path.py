@@ -7,8 +7,8 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.planning.alignment import Lane
-from app.planning.optimise.path import even_pairs, fewest_pairs
-from app.planning.placement.cerpms import path_error_m
+from app.planning.optimise.cover import even_pairs, fewest_pairs
+from app.planning.placement.place import path_error_m
 from tests.planning.roads import bend, lane_of_curvature, straight
 
 SPACING_M = 36.576  # three cycles of 40 ft: MUTCD's greatest on straight level freeways

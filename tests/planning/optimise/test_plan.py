@@ -15,7 +15,7 @@ from app.planning.alignment import Alignment, AvoidedArea, Lane, RoadEvent
 from app.planning.optimise import FamilyModel, OptimisedPlan, optimise_plan, pareto_points, site_costs
 from app.planning.outputs.bill import plan_bill
 from app.planning.placement import place_plan
-from app.planning.placement.cerpms import path_error_m
+from app.planning.placement.place import path_error_m
 from app.planning.rules import PlanRules
 from tests.planning.optimise.test_path import winding
 from tests.planning.roads import road, straight

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from app.errors import NotFound
-from app.planning.outputs.files import plan_files, write_plan_file
+from app.planning.outputs.package import plan_files, write_plan_file
 from app.planning.outputs.plan_document import read_plan, write_plan
 from tests.planning.outputs.made import full_plan
 

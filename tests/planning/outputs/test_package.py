@@ -16,8 +16,7 @@ from app.decoders.plate.reader import decode_plates
 from app.encoders.packer import file_entry
 from app.encoders.plate import ArtworkFormat
 from app.errors import InvalidParameter, ProofFailed
-from app.planning.outputs.files import OutputOptions, plan_files
-from app.planning.outputs.package import Package, PackageOptions, PartKind
+from app.planning.outputs.package import OutputOptions, Package, PackageOptions, PartKind, plan_files
 from app.planning.outputs.strip_map import DrawingOptions
 from app.planning.plan import PlannedTag
 from tests.planning.outputs.made import ALL, full_plan, plan_of, two_lanes

@@ -11,7 +11,7 @@ import pytest
 
 from app.errors import UnreadableUpload
 from app.formats.alignments.geometry import StationEquation
-from app.markers.checks import Verdict
+from app.markers.reading import Verdict
 from app.planning.alignment import Alignment, Lane
 from app.planning.outputs.plan_document import read_plan, write_plan
 from app.planning.plan import Plan, PlanFinding

@@ -10,8 +10,8 @@ import orjson
 import pytest
 
 from app.markers.cerpm import CerpmMessage
-from app.planning.outputs.cerpm_programs import plan_programs, write_plan_programs_csv, write_plan_programs_json
-from app.planning.outputs.schedule import plan_schedule, write_schedule_csv
+from app.planning.outputs.bill import plan_schedule, write_schedule_csv
+from app.planning.outputs.plan_document import plan_programs, write_plan_programs_csv, write_plan_programs_json
 from app.planning.plan import PlannedCerpm
 from tests.planning.outputs.made import ALL, full_plan, plan_of, two_lanes
 from tests.planning.roads import road, straight

@@ -16,13 +16,12 @@ from ezdxf.filemanagement import read as read_dxf
 from pyproj import Transformer
 
 from app.errors import InvalidParameter, ReferenceSystemError
+from app.formats.surveys.coordinates import crs_unit
 from app.formats.surveys.declaration import METRES, ImportDeclaration
-from app.formats.surveys.grids import crs_unit
 from app.formats.surveys.read import read_survey
 from app.geodesy import place_positions, reference_system
 from app.planning.alignment import Alignment
-from app.planning.outputs.stakeout import StakeoutFormat, write_stakeout
-from app.planning.outputs.stakeout_points import Stakeout, plan_stakeout
+from app.planning.outputs.stakeout import Stakeout, StakeoutFormat, plan_stakeout, write_stakeout
 from app.planning.plan import Plan, PlannedTag
 from tests.planning.outputs.made import full_plan
 from tests.planning.roads import GEOD

@@ -11,10 +11,10 @@ import pytest
 from app.errors import InvalidParameter
 from app.formats.alignments.geometry import BoundaryStyle, EventKind
 from app.markers.cerpm import LaneSide
-from app.markers.magnet_codebook import MeaningKind
+from app.markers.magnet_design import MeaningKind
 from app.planning.alignment import Alignment, AvoidedArea, RoadEvent
 from app.planning.placement import place_plan
-from app.planning.placement.cerpms import path_error_m
+from app.planning.placement.place import path_error_m
 from app.planning.plan import Plan, PlannedCerpm, PlannedLineMagnet, PlannedTag, Purpose
 from app.planning.rules import PlanRules
 from tests.planning.roads import GEOD, bend, opposite, road, straight

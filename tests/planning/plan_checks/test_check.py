@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from app.formats.alignments.geometry import EventKind
-from app.markers.checks import Verdict
 from app.markers.plate import PlateGeometry
+from app.markers.reading import Verdict
 from app.planning.alignment import Alignment, RoadEvent
 from app.planning.placement import place_plan
 from app.planning.plan import Plan, PlanFinding
 from app.planning.plan_checks import ExistingMarker, check_plan
-from app.planning.plan_checks.plates import frames_per_pass, readable_zone_m
+from app.planning.plan_checks.families import frames_per_pass, readable_zone_m
 from app.planning.plate_view import camera_of
 from app.planning.rules import CameraRules, PlanRules
 from tests.planning.roads import bend, opposite, road, straight

@@ -11,20 +11,18 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.formats.alignments.geometry import EventKind
-from app.markers.checks import Verdict
 from app.markers.plate import PlateGeometry
+from app.markers.reading import Verdict
 from app.planning.alignment import RoadEvent
 from app.planning.placement import place_plan
 from app.planning.plan import Plan, PlanFinding
 from app.planning.plan_checks import check_plan
-from app.planning.plan_checks.predictions import check_predictions
-from app.planning.predict.models import fitted_models
-from app.planning.predict.rates import line_rates, path_errors_m, plate_rates, plate_read_rate, tag_rates
+from app.planning.plan_checks.check import check_predictions
+from app.planning.predict.rates import fitted_models, line_rates, path_errors_m, plate_rates, plate_read_rate, tag_rates
 from app.planning.proof import ProofTerms, UnitKind
-from app.planning.proof.cerpms import drive_cerpms
+from app.planning.proof.drives import drive_cerpms
 from app.planning.proof.prove import Prover
-from app.planning.read_rules import check_rules
-from app.planning.rules import CameraRules, PlanRules, PredictionRules
+from app.planning.rules import CameraRules, PlanRules, PredictionRules, check_rules
 from tests.planning.roads import bend, road, straight
 
 PLATE = PlateGeometry()

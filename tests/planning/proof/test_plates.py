@@ -11,7 +11,7 @@ from app.planning.plan import Plan
 from app.planning.proof import ProofTerms
 from app.planning.proof.plates import PlatePass, scenes_of
 from app.planning.proof.prove import Prover
-from app.planning.proof.terms import drive_terms
+from app.planning.proof.report import drive_terms
 from app.simulation.plate_scene import PlateScene
 from tests.planning.roads import bend, straight
 

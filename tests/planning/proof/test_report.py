@@ -6,7 +6,7 @@ import pytest
 
 from app.planning.plan import Plan
 from app.planning.proof import ProofTerms, UnitResult, summarize, wilson
-from app.planning.proof.results import MarkerPass, WrongReading
+from app.planning.proof.report import MarkerPass, WrongReading
 
 
 @pytest.mark.parametrize(

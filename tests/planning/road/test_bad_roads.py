@@ -9,7 +9,7 @@ import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload
 from app.formats.alignments.geometry import AlignmentFile, LaneGeometry
-from app.planning.alignment_declaration import AlignmentDeclaration
+from app.planning.alignment import AlignmentDeclaration
 from app.planning.build_alignment import build_alignment
 from app.planning.rules import RoadRules
 

@@ -18,8 +18,7 @@ from app.formats.alignments.geometry import (
     LaneGeometry,
 )
 from app.geodesy import LocalizationGrade
-from app.planning.alignment import Alignment, Lane
-from app.planning.alignment_declaration import AlignmentDeclaration
+from app.planning.alignment import Alignment, AlignmentDeclaration, Lane
 from app.planning.build_alignment import build_alignment
 from app.planning.rules import RoadRules
 

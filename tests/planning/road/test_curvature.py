@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from app.formats.alignments.geometry import EventKind, LaneGeometry
-from app.planning.road.direction import smoothing_m, vertex_noise_m
-from app.planning.road.ground_line import make_ground_line
+from app.planning.road.ground_line import make_ground_line, smoothing_m, vertex_noise_m
 
 from .roads import build, centre_lane, east_north, straight_and_arc, wgs84
 

@@ -26,11 +26,9 @@ from app.main import create_app
 from app.registry.blob_references import blob_references
 from app.registry.database import Database, head_revision
 from app.registry.dumps import copy_sqlite
+from app.registry.engines import across_agencies
 from app.registry.tables import jobs
-from app.registry.tenancy import across_agencies
-from app.services.backups.backup import BackupOptions, Backups
-from app.services.backups.manifest import verify_backup
-from app.services.backups.restore import Restores
+from app.services.backups import BackupOptions, Backups, Restores, verify_backup
 from app.services.ports import utc_now
 from app.settings import Settings
 from app.storage.backup_files import DamagedBackup

@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from app.services.public_pages.form_tokens import MAX_AGE_S, MIN_AGE_S, FormTokens, TokenRefused, TokenTooYoung
+from app.services.public_pages.pages import MAX_AGE_S, MIN_AGE_S, FormTokens, TokenRefused, TokenTooYoung
 
 NOW = datetime(2026, 11, 25, 12, 0, 0, tzinfo=UTC)
 MARKER = "019cb624-0000-7000-8000-00000000aaaa"

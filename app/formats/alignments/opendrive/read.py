@@ -3,18 +3,222 @@
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from app.errors import UnreadableUpload
-from app.formats.alignments.geometry import MAX_VERTICES, AlignmentFile, AreaGeometry, EventGeometry, Floats
-from app.formats.alignments.georeference import usable_crs
-from app.formats.alignments.opendrive.furniture import Furniture, find_furniture
-from app.formats.alignments.opendrive.lanes import Grid, Track, build_tracks
-from app.formats.alignments.opendrive.road import Road, parse_road
+from app.formats.alignments.curves import MAX_STEP_M
+from app.formats.alignments.geometry import (
+    MAX_VERTICES,
+    AlignmentFile,
+    AreaGeometry,
+    EventGeometry,
+    EventKind,
+    Floats,
+    usable_crs,
+)
+from app.formats.alignments.opendrive.road import Grid, Road, Track, build_tracks, lane_edges, parse_road, speed_mps
 from app.formats.xml_tree import attribute, parse_xml
+
+# === What lies on an OpenDRIVE road: stop lines, crossings, speed limits, ends at junctions, bridges.
+
+
+_STOP_SIGNS = {("DE", "206"), ("DE", "294"), ("OPENDRIVE", "206"), ("OPENDRIVE", "294"), ("US", "R1-1")}
+_SPEED_SIGNS = {("DE", "274"), ("OPENDRIVE", "274"), ("US", "R2-1")}
+_CROSSING_SIGNS = {("DE", "293"), ("OPENDRIVE", "293")}
+"""Country and type of signals. Source: StVO annex 2 (206 stop, 274 limit, 293 zebra crossing, 294 stop line), whose
+numbers OpenDRIVE's own catalogue uses; MUTCD R1-1 and R2-1."""
+_STOP_LINE = re.compile(r"stop[ _-]?line", re.IGNORECASE)
+_CROSSING = re.compile(r"cross[ _-]?walk|zebra", re.IGNORECASE)
+_SAME_PLACE_M = 5.0
+"""A sign this near to a change of the lane's limit says the same. [m] Source: chosen by hand."""
+
+
+class Furniture(NamedTuple):
+    """Events and areas of roads."""
+
+    events: list[EventGeometry]
+    areas: list[AreaGeometry]
+
+    def __add__(self, other: object) -> Furniture:
+        assert isinstance(other, Furniture)
+        return Furniture(self.events + other.events, self.areas + other.areas)
+
+
+def find_furniture(road: Road, grid: Grid, tracks: list[Track], signals: dict[str, ET.Element]) -> Furniture:
+    """Events and areas of a road, events by lane.
+
+    Raises
+    ------
+    UnreadableUpload
+        A number of an object or signal is missing or wrong.
+    """
+    events = [event for track in tracks for event in _along(road, track)]
+    areas: list[AreaGeometry] = []
+    for holder in road.element.iterfind("signals/*"):
+        place = f"{road.place}, signal {holder.get('id', '')[:40]}"
+        signal = signals.get(holder.get("id", "")) if holder.tag == "signalReference" else holder
+        if signal is not None and holder.tag in ("signal", "signalReference"):
+            events += _signal(holder, signal, tracks, events, place)
+    for item in road.element.iterfind("objects/object"):
+        place = f"{road.place}, object {item.get('id', '')[:40]}"
+        label = " ".join(item.get(key, "") for key in ("type", "subtype", "name"))
+        if _CROSSING.search(label):
+            s, ring = _outline(road, item, place)
+            areas += [AreaGeometry("crossing", ring)] if ring is not None else []
+            events += _at(EventKind.CROSSING, s, item, tracks)
+        elif _STOP_LINE.search(label):
+            events += _at(EventKind.STOP_LINE, _outline(road, item, place)[0], item, tracks)
+    for bridge in road.element.iterfind("objects/bridge"):
+        place = f"{road.place}, bridge {bridge.get('id', '')[:40]}"
+        start = attribute(bridge, "s", place)
+        ring = _carriageway(road, grid, start, start + attribute(bridge, "length", place))
+        areas += [AreaGeometry("bridge", ring)] if ring is not None else []
+    return Furniture(events, areas)
+
+
+def _along(road: Road, track: Track) -> list[EventGeometry]:
+    """Changes of the speed limit along a lane, and its end at a junction."""
+    lane, found = track.geometry, []
+    assert lane.centre is not None
+    assert lane.station_m is not None
+    if lane.speed_limit_mps is not None:
+        speed = lane.speed_limit_mps
+        for i in np.flatnonzero((speed[1:] != speed[:-1]) & np.isfinite(speed[1:])) + 1:
+            found.append(_event(EventKind.SPEED_LIMIT, lane.centre[i], lane.name, round(speed[i] * 3.6, 1)))
+    end = road.curve.end_s if track.forward else 0.0
+    meets = road.ends_at_junction if track.forward else road.starts_at_junction
+    if meets and road.junction is None and abs(lane.station_m[-1] - end) <= MAX_STEP_M:
+        found.append(_event(EventKind.JUNCTION, lane.centre[-1], lane.name))
+    return found
+
+
+def _event(kind: EventKind, point: Floats, lane: str, value: float | None = None) -> EventGeometry:
+    return EventGeometry(kind, (float(point[0]), float(point[1])), lane, value)
+
+
+def _signal(
+    holder: ET.Element, signal: ET.Element, tracks: list[Track], events: list[EventGeometry], place: str
+) -> list[EventGeometry]:
+    country = signal.get("country", "").upper() or "OPENDRIVE"
+    sign = (country, signal.get("type", ""))
+    kinds = (
+        (_STOP_SIGNS, EventKind.STOP_LINE),
+        (_SPEED_SIGNS, EventKind.SPEED_LIMIT),
+        (_CROSSING_SIGNS, EventKind.CROSSING),
+    )
+    kind = next((kind for signs, kind in kinds if sign in signs), None)
+    if kind is None:
+        return []
+    s = attribute(holder, "s", place)
+    if kind is not EventKind.SPEED_LIMIT:
+        return _at(kind, (s, s), holder, tracks)
+    speed = ET.Element("speed", max=signal.get("value", ""), unit=signal.get("unit", _sign_unit(country)))
+    limit_mps = speed_mps(speed, place)
+    if math.isnan(limit_mps):
+        return []
+    known = [(event.lane, event.point) for event in events if event.kind is kind]
+    found = _at(kind, (s, s), holder, tracks, round(limit_mps * 3.6, 1))
+    return [
+        event
+        for event in found
+        if not any(lane == event.lane and math.dist(point, event.point) <= _SAME_PLACE_M for lane, point in known)
+    ]
+
+
+def _sign_unit(country: str) -> str:
+    return "mph" if country == "US" else "km/h"
+
+
+def _at(
+    kind: EventKind, span: tuple[float, float], holder: ET.Element, tracks: list[Track], value: float | None = None
+) -> list[EventGeometry]:
+    """Events on the lanes that the object or signal applies to, where vehicles reach it."""
+    orientation = holder.get("orientation", "none")
+    validity = [
+        (int(low), int(high))
+        for element in holder.iterfind("validity")
+        if _whole(low := element.get("fromLane", "")) and _whole(high := element.get("toLane", ""))
+    ]
+    found = []
+    for track in tracks:
+        s = span[0] if track.forward else span[1]
+        lane_id, point = track.lane_id_at(s), track.point_at(s)
+        if point is None or lane_id is None or orientation == ("-" if track.forward else "+"):
+            continue
+        if not validity or any(min(pair) <= lane_id <= max(pair) for pair in validity):
+            found.append(_event(kind, np.array(point), track.geometry.name, value))
+    return found
+
+
+def _whole(text: str) -> bool:
+    return re.fullmatch(r"-?[0-9]{1,9}", text) is not None
+
+
+def _outline(road: Road, item: ET.Element, place: str) -> tuple[tuple[float, float], Floats | None]:
+    """Extent along the road, and closed ring of an object, None where it has no area."""
+    s, t = attribute(item, "s", place), attribute(item, "t", place, 0.0)
+    corners = [
+        (attribute(c, "s", place), attribute(c, "t", place)) for c in _corners(item, "cornerRoad")
+    ]  # fmt: skip
+    local = [(attribute(c, "u", place), attribute(c, "v", place)) for c in _corners(item, "cornerLocal")]
+    if not corners and not local:
+        length, width = attribute(item, "length", place, 0.0) / 2.0, attribute(item, "width", place, 0.0) / 2.0
+        local = [(-length, -width), (length, -width), (length, width), (-length, width)] if length and width else []
+    if corners:
+        ring = _points(road, np.array([c[0] for c in corners]), np.array([c[1] for c in corners]))
+        span = [c[0] for c in corners]
+    else:
+        turn = attribute(item, "hdg", place, 0.0)
+        uv = np.array(local or [(0.0, 0.0)])
+        along = uv[:, 0] * math.cos(turn) - uv[:, 1] * math.sin(turn)
+        across = uv[:, 0] * math.sin(turn) + uv[:, 1] * math.cos(turn)
+        frame = road.curve.evaluate(np.array([s]), road.curve.piece_at(np.array([s])))
+        cos, sin = math.cos(frame.hdg[0]), math.sin(frame.hdg[0])
+        x, y = along, across + t
+        ring = np.stack([frame.x[0] + x * cos - y * sin, frame.y[0] + x * sin + y * cos], axis=1)
+        span = [s + float(value) for value in along]
+    low, high = max(min(span), 0.0), min(max(span), road.curve.end_s)
+    return (low, max(low, high)), np.concatenate([ring, ring[:1]]) if len(ring) >= 3 else None
+
+
+def _corners(item: ET.Element, tag: str) -> list[ET.Element]:
+    """Corners of the first outline that has some: of `outline`, or of `outlines`, which 1.5 brought."""
+    outlines = [*item.iterfind("outline"), *item.iterfind("outlines/outline")]
+    return next((found for outline in outlines if (found := outline.findall(tag))), [])
+
+
+def _points(road: Road, s: Floats, t: Floats) -> Floats:
+    frame = road.curve.evaluate(s, road.curve.piece_at(s))
+    return np.stack([frame.x - np.sin(frame.hdg) * t, frame.y + np.cos(frame.hdg) * t], axis=1)
+
+
+def _carriageway(road: Road, grid: Grid, start: float, end: float) -> Floats | None:
+    """Ring about all lanes between two distances along the road."""
+    sides: tuple[list[Floats], list[Floats]] = ([], [])
+    for number, section in enumerate(road.sections):
+        rows = grid.rows(number, grid.interval)
+        inside = (grid.s[rows] >= start) & (grid.s[rows] <= end)
+        s = np.unique(np.concatenate([[max(start, section.start)], grid.s[rows][inside], [min(end, section.end)]]))
+        if min(end, section.end) <= max(start, section.start):
+            continue
+        lookup = np.clip(s, section.start, section.end - 1e-9)
+        offset = road.offset.at(s, lookup)
+        edges = [outer[0] for _, _, outer in lane_edges(section, offset, s, lookup)] + [offset[0]]
+        sides[0].append(_points(road, s, np.max(edges, axis=0)))
+        sides[1].append(_points(road, s, np.min(edges, axis=0)))
+    if not sides[0]:
+        return None
+    ring = np.concatenate([*sides[1], np.concatenate(sides[0])[::-1]])
+    return np.concatenate([ring, ring[:1]])
+
+
+# === A file of OpenDRIVE.
+
 
 MAX_WARNINGS = 100
 """Warnings that are kept, the number of the others in one more. Source: chosen by hand."""

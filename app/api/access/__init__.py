@@ -1,1 +1,0 @@
-"""Routes on keys and the audit log."""

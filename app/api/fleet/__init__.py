@@ -1,1 +1,0 @@
-"""Routes on vehicles, calibrations and snapshots."""

@@ -1,1 +1,0 @@
-"""Routes of marker health: the work list, and the tests of a marker."""

@@ -1,1 +1,0 @@
-"""Routes about jobs of every kind, and about events."""

@@ -1,0 +1,143 @@
+"""Routes on reprocessings."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Request, Response
+from fastapi.responses import StreamingResponse
+from pydantic import ConfigDict, Field
+
+from app.api.http.dependencies import Caller, Identifier, LastId, Number, PageSize, Text, use_cases
+from app.api.http.problems import problem_responses
+from app.api.http.responses import (
+    Time,
+    created_response,
+    document_response,
+    file_response,
+    json_response,
+    page_response,
+)
+from app.api.http.strict_json import StrictRoute
+from app.families.documents import StrictModel
+from app.services.decodes.context import DecodeKind
+from app.services.markers.searches import checked_box
+from app.services.reprocessing import (
+    Criteria,
+    DecodeVersions,
+    ReprocessingDocument,
+    ReprocessingPage,
+    ReprocessingReport,
+    Reprocessings,
+)
+
+# === /v1/reprocessings: stored uploads are decoded again, and what changed is reported before it becomes current.
+
+
+router = APIRouter(prefix="/v1/reprocessings", tags=["reprocessing"], route_class=StrictRoute)
+decode_versions = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
+
+ReprocessingId = Annotated[Identifier, Path(description="Id of the reprocessing.")]
+Service = Annotated[Reprocessings, use_cases("reprocessings")]
+
+
+class ReprocessingIn(StrictModel):
+    """Which uploads are decoded again; without criteria, all that are stored."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"kinds": ["frame", "archive"], "older_than": "0.3.0"}]})
+
+    kinds: list[DecodeKind] | None = Field(None, min_length=1, max_length=20)
+    since: Time | None = Field(None, description="Uploaded at this time or later.")
+    until: Time | None = Field(None, description="Uploaded before this time.")
+    vehicle_id: Identifier | None = None
+    bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
+        None, description="west, south, east, north of the coarse positions. [deg]"
+    )
+    decoder: Text | None = Field(None, max_length=200, description="Results of this decoder, as they name it.")
+    older_than: Text | None = Field(None, max_length=40, description="Results of earlier releases: 0.3.0.")
+
+    def criteria(self) -> Criteria:
+        """The criteria as the use cases know them."""
+        box = self.bbox
+        if box is not None:
+            checked_box(*box)
+        return Criteria(
+            tuple(self.kinds) if self.kinds is not None else None, self.since, self.until, self.vehicle_id,
+            (box[0], box[1], box[2], box[3]) if box is not None else None, self.decoder, self.older_than,
+        )  # fmt: skip
+
+
+@router.post(
+    "",
+    status_code=202,
+    responses=document_response(ReprocessingDocument, status=202, description="Queued; Location leads to its progress"),
+)
+def post_reprocessing(wanted: ReprocessingIn, caller: Caller, reprocessings: Service) -> Response:
+    """Decode stored uploads again with the present decoders, when no other work waits.
+
+    The results are kept beside the current ones. Nothing changes until the reprocessing is accepted.
+    """
+    return created_response(
+        reprocessings.create(caller, wanted.criteria()), False, path="/v1/reprocessings", status=202
+    )
+
+
+@router.get("", responses=document_response(ReprocessingPage))
+def list_reprocessings(
+    request: Request, caller: Caller, reprocessings: Service, limit: PageSize = 100, after: LastId = None
+) -> Response:
+    """The agency's reprocessings, oldest first."""
+    page, last = reprocessings.page(caller, after=after, limit=limit)
+    return page_response(request, page, after=last)
+
+
+@router.get("/{reprocessing_id}", responses=document_response(ReprocessingDocument, 404))
+def get_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
+    """A reprocessing with its progress and its sums."""
+    return json_response(reprocessings.get(caller, reprocessing_id))
+
+
+@router.get("/{reprocessing_id}/report", responses=document_response(ReprocessingReport, 404))
+def get_reprocessing_report(
+    request: Request,
+    reprocessing_id: ReprocessingId,
+    caller: Caller,
+    reprocessings: Service,
+    limit: PageSize = 100,
+    after: LastId = None,
+) -> Response:
+    """Uploads whose readings differ, reading by reading: gained, lost, changed in code, position or confidence."""
+    page, last = reprocessings.report(caller, reprocessing_id, after=after, limit=limit)
+    return page_response(request, page, after=last)
+
+
+@router.get(
+    "/{reprocessing_id}/report.csv",
+    response_class=StreamingResponse,
+    responses={**file_response(["text/csv"]), **problem_responses(404)},
+)
+def get_reprocessing_csv(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
+    """The report as CSV."""
+    headers = {"Content-Disposition": f'attachment; filename="reprocessing-{reprocessing_id}.csv"'}
+    lines = reprocessings.report_csv(caller, reprocessing_id)
+    return StreamingResponse(lines, headers=headers, media_type="text/csv; charset=utf-8")
+
+
+@router.post("/{reprocessing_id}/cancel", responses=document_response(ReprocessingDocument, 404))
+def cancel_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
+    """Stop a reprocessing; one that has ended stays as it is."""
+    return json_response(reprocessings.cancel(caller, reprocessing_id))
+
+
+@router.post("/{reprocessing_id}/accept", responses=document_response(ReprocessingDocument, 404, 409))
+def accept_reprocessing(reprocessing_id: ReprocessingId, caller: Caller, reprocessings: Service) -> Response:
+    """Make the new results current. Those of before are kept: `GET /v1/decodes/{decode_id}/versions`."""
+    return json_response(reprocessings.accept(caller, reprocessing_id))
+
+
+@decode_versions.get("/{decode_id}/versions", responses=document_response(DecodeVersions, 404))
+def list_decode_versions(
+    decode_id: Annotated[Identifier, Path(description="Id of the decode.")], caller: Caller, reprocessings: Service
+) -> Response:
+    """Results of a decode that were replaced by reprocessings, newest first."""
+    return json_response(reprocessings.versions(caller, decode_id))

@@ -1,0 +1,350 @@
+"""Routes on roads."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from pydantic import ConfigDict, Field, JsonValue
+
+from app.api.http.dependencies import (
+    AfterLink,
+    AfterVersion,
+    Caller,
+    Idempotency,
+    Identifier,
+    LastId,
+    Number,
+    PageSize,
+    Text,
+    Version,
+    use_cases,
+)
+from app.api.http.problems import problem_responses
+from app.api.http.responses import (
+    NOT_MODIFIED,
+    IfNoneMatch,
+    created_response,
+    cursor_of,
+    document_response,
+    json_response,
+    page_response,
+    versioned_response,
+)
+from app.api.http.strict_json import AnyLine, StrictRoute
+from app.errors import InvalidParameter
+from app.families.documents import Metres, StrictModel
+from app.services.markers.markers import MarkerPage
+from app.services.roads.documents import (
+    CalibrationInput,
+    ChangedRoad,
+    LinesInput,
+    OnRoad,
+    RoadDocument,
+    RoadLocated,
+    RoadLocatedMany,
+    RoadPage,
+    RoadPlaced,
+    RoadPlacedMany,
+    RoadVersionPage,
+)
+from app.services.roads.roads import NewRoad, RoadChange
+from app.services.roads.roads import Roads as RoadsService
+
+# === Schemas of roads and of linear references.
+
+
+MAX_CALIBRATION = 5_000
+MAX_POSITIONS = 1_000
+MAX_REACH_M = 1_000.0
+MAX_OFFSET_M = 1_000.0
+
+RoadId = Annotated[Identifier, Path(description="Id of the road.")]
+Reason = Annotated[Text, Field(min_length=1, max_length=500, description="Why; goes into the history.")]
+Offset = Annotated[float, Field(allow_inf_nan=False, ge=-MAX_OFFSET_M, le=MAX_OFFSET_M)]
+Count = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+
+
+class StationIn(StrictModel):
+    """A calibration point: a place with a known measure. The place is a vertex, a position or a chainage."""
+
+    measure_m: Metres = Field(description="Measure there, coming from before. [m]")
+    ahead_m: Metres | None = Field(None, description="At an equation of stationing: the measure going on. [m]")
+    part: Count = Field(0, description="Line of a MultiLineString, from 0; with `vertex` or `chainage_m`.")
+    vertex: Count | None = Field(None, description="Vertex of the line, from 0.")
+    position: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="Instead of a vertex: a position within 50 m of the axis, in the road's CRS."
+    )
+    chainage_m: Metres | None = Field(
+        None, description="Instead of a vertex: distance along the axis from the start of its first line. [m]"
+    )
+
+    def given(self) -> CalibrationInput:
+        """The point as the use cases know it."""
+        position = (self.position[0], self.position[1]) if self.position is not None else None
+        return CalibrationInput(self.measure_m, self.ahead_m, self.part, self.vertex, position, self.chainage_m)
+
+
+class _AxisIn(StrictModel):
+    crs: Text | None = Field(None, max_length=100, description="EPSG code or URN of the geometry; WGS 84 if left out.")
+    realization: Text | None = Field(None, min_length=1, max_length=64)
+    epoch: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1900, le=2200)] | None = None
+    measure_markers: Annotated[bool, Field(strict=True)] = Field(
+        True, description="Give the markers that name the road the measure and offset of their position."
+    )
+    dry_run: Annotated[bool, Field(strict=True)] = Field(False, description="Say what would happen; store nothing.")
+    reason: Reason | None = None
+
+    def lines(self, geometry: AnyLine) -> LinesInput:
+        """The geometry as the use cases know it."""
+        several = geometry.type == "MultiLineString"
+        parts: list[Any] = geometry.coordinates if several else [geometry.coordinates]
+        return LinesInput(
+            tuple(tuple((p[0], p[1]) for p in part) for part in parts),
+            self.crs,
+            self.realization,
+            self.epoch,
+            several,
+        )
+
+
+ROAD_EXAMPLE: dict[str, JsonValue] = {
+    "name": "A 5 northbound",
+    "crs": "EPSG:25832",
+    "geometry": {"type": "LineString", "coordinates": [[456000, 5427000], [456060, 5427210], [456150, 5427400]]},
+    "calibration": [{"measure_m": 612000, "vertex": 0}, {"measure_m": 612430, "vertex": 2}],
+}
+
+
+class RoadIn(_AxisIn):
+    """A road to register."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [ROAD_EXAMPLE]})
+
+    name: Text = Field(min_length=1, max_length=200, description="As the markers on it say in `road`.")
+    geometry: AnyLine = Field(description="The axis in the direction of rising measures; heights are left out.")
+    calibration: Annotated[list[StationIn], Field(max_length=MAX_CALIBRATION)] = Field(
+        default_factory=list, description="Known measures; without, true metres from 0."
+    )
+
+
+class RoadPatch(_AxisIn):
+    """Members to change; one that is left out stays. A new geometry comes with its calibration."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"calibration": [{"measure_m": 612000, "vertex": 0}], "reason": "new kilometre posts"}]
+        },
+    )
+
+    geometry: AnyLine | None = None
+    calibration: Annotated[list[StationIn], Field(max_length=MAX_CALIBRATION)] | None = None
+
+
+class PositionsIn(StrictModel):
+    """Positions to find on a road."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"positions": [[8.4012, 49.0003]], "max_offset_m": 20}]})
+
+    positions: Annotated[
+        list[Annotated[list[Number], Field(min_length=2, max_length=2)]],
+        Field(min_length=1, max_length=MAX_POSITIONS, description="Longitude and latitude of each. [deg]"),
+    ]
+    max_offset_m: Annotated[float, Field(allow_inf_nan=False, gt=0, le=MAX_REACH_M)] = 100.0
+
+
+class ReferenceIn(StrictModel):
+    """A place along a road."""
+
+    measure_m: Metres
+    offset_m: Offset = 0.0
+
+
+class ReferencesIn(StrictModel):
+    """Places along a road."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"references": [{"measure_m": 612100, "offset_m": -3.5}]}]}
+    )
+
+    references: Annotated[list[ReferenceIn], Field(min_length=1, max_length=MAX_POSITIONS)]
+
+
+# === /v1/roads: axes with measures; positions to measures and offsets, and back.
+
+
+router = APIRouter(prefix="/v1/roads", tags=["roads"], route_class=StrictRoute)
+
+_MetresQuery = Annotated[float | None, Query(ge=-1e8, le=1e8, allow_inf_nan=False)]
+_OfVersion = Annotated[
+    int | None, Query(alias="version", ge=1, lt=2**31, description="On an earlier version of the road.")
+]
+Roads = Annotated[RoadsService, use_cases("roads")]
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses={
+        200: {"model": ChangedRoad, "description": "Checked; nothing was stored"},
+        201: {"model": ChangedRoad, "description": "Registered"},
+        **problem_responses(409),
+    },
+)
+def post_road(road: RoadIn, caller: Caller, roads: Roads, idempotency: Idempotency) -> Response:
+    """Register a road. The markers that name it get the measure and offset of their position."""
+    new = NewRoad(
+        road.name,
+        road.lines(road.geometry),
+        tuple(point.given() for point in road.calibration),
+        road.measure_markers,
+        road.dry_run,
+        road.reason,
+    )
+    document, replayed = roads.register(caller, new, idempotency)
+    return json_response(document) if road.dry_run else created_response(document, replayed, path="/v1/roads")
+
+
+@router.get("", responses=document_response(RoadPage))
+def list_roads(
+    request: Request,
+    caller: Caller,
+    roads: Roads,
+    name: Annotated[Text | None, Query(min_length=1, max_length=200)] = None,
+    limit: PageSize = 100,
+    after: LastId = None,
+) -> Response:
+    """Roads in the order they were registered, without their geometry."""
+    page, last = roads.page(caller, name=name, after=after, limit=limit)
+    return page_response(request, page, after=last)
+
+
+@router.get("/{road_id}", responses={**NOT_MODIFIED, **document_response(RoadDocument, 404)})
+def get_road(road_id: RoadId, caller: Caller, roads: Roads, if_none_match: IfNoneMatch = None) -> Response:
+    """One road, with its version as ETag."""
+    return versioned_response(roads.get(caller, road_id), if_none_match)
+
+
+@router.patch("/{road_id}", responses=document_response(ChangedRoad, 404, 412, 428))
+def patch_road(road_id: RoadId, patch: RoadPatch, caller: Caller, roads: Roads, version: Version) -> Response:
+    """Change a road's axis or calibration. Its markers stay where they are; their measures follow."""
+    if patch.geometry is None and patch.calibration is None:
+        raise InvalidParameter(
+            "the patch changes nothing",
+            field="body",
+            limit="geometry or calibration",
+            cure="name what to change",
+        )
+    change = RoadChange(
+        patch.lines(patch.geometry) if patch.geometry is not None else None,
+        tuple(point.given() for point in patch.calibration) if patch.calibration is not None else None,
+        patch.measure_markers,
+        patch.dry_run,
+        patch.reason,
+    )
+    document = roads.change(caller, road_id, change, version)
+    return json_response(document) if patch.dry_run else versioned_response(document)
+
+
+@router.get("/{road_id}/versions", responses=document_response(RoadVersionPage, 404))
+def list_road_versions(
+    road_id: RoadId,
+    request: Request,
+    caller: Caller,
+    roads: Roads,
+    limit: Annotated[int, Query(ge=1, le=100)] = 10,
+    after: AfterVersion = 0,
+) -> Response:
+    """The road's history, oldest first."""
+    page, last = roads.history(caller, road_id, after=after, limit=limit)
+    return page_response(request, page, after=last)
+
+
+@router.get("/{road_id}/locate", responses=document_response(RoadLocated, 404))
+def locate_on_road(
+    road_id: RoadId,
+    caller: Caller,
+    roads: Roads,
+    lon: Annotated[float, Query(allow_inf_nan=False, description="Longitude. [deg]")],
+    lat: Annotated[float, Query(allow_inf_nan=False, description="Latitude. [deg]")],
+    max_offset_m: Annotated[float, Query(gt=0, le=MAX_REACH_M, allow_inf_nan=False)] = 100.0,
+    version: _OfVersion = None,
+) -> Response:
+    """Measure and offset of a position, left positive; several feet where the road passes more than once."""
+    many = roads.locate(caller, road_id, [(lon, lat)], max_offset_m, version)
+    return json_response(RoadLocated(**_of(many), **many["items"][0]))
+
+
+@router.post("/{road_id}/locate", responses=document_response(RoadLocatedMany, 404))
+def locate_many_on_road(
+    road_id: RoadId, body: PositionsIn, caller: Caller, roads: Roads, version: _OfVersion = None
+) -> Response:
+    """Measures and offsets of up to 1000 positions."""
+    positions = [(position[0], position[1]) for position in body.positions]
+    return json_response(roads.locate(caller, road_id, positions, body.max_offset_m, version))
+
+
+@router.get("/{road_id}/position", responses=document_response(RoadPlaced, 404))
+def get_position_on_road(
+    road_id: RoadId,
+    caller: Caller,
+    roads: Roads,
+    measure_m: Annotated[float, Query(ge=-1e8, le=1e8, allow_inf_nan=False)],
+    offset_m: Annotated[float, Query(ge=-MAX_OFFSET_M, le=MAX_OFFSET_M, allow_inf_nan=False)] = 0.0,
+    version: _OfVersion = None,
+) -> Response:
+    """Position of a measure and an offset; refused where the measure is on no road, several where it repeats."""
+    many = roads.place(caller, road_id, [(measure_m, offset_m)], version)
+    document = RoadPlaced(**_of(many), **many["items"][0])
+    if not document["places"]:
+        ranges = ", ".join(f"{s['from_m']:.3f} to {s['to_m']:.3f} m" for s in document["sections"][:20])
+        raise InvalidParameter(
+            f"the measure {measure_m:.3f} m is on no part of road {document['road']}",
+            field="measure_m",
+            limit=ranges,
+            cure="choose a measure of the road; equations of stationing leave gaps",
+        )
+    return json_response(document)
+
+
+@router.post("/{road_id}/position", responses=document_response(RoadPlacedMany, 404))
+def get_positions_on_road(
+    road_id: RoadId, body: ReferencesIn, caller: Caller, roads: Roads, version: _OfVersion = None
+) -> Response:
+    """Positions of up to 1000 measures and offsets; no place where a measure is on no road."""
+    references = [(reference.measure_m, reference.offset_m) for reference in body.references]
+    return json_response(roads.place(caller, road_id, references, version))
+
+
+@router.get("/{road_id}/markers", responses=document_response(MarkerPage, 404))
+def list_markers_on_road(
+    road_id: RoadId,
+    request: Request,
+    caller: Caller,
+    roads: Roads,
+    from_m: _MetresQuery = None,
+    to_m: _MetresQuery = None,
+    min_offset_m: _MetresQuery = None,
+    max_offset_m: _MetresQuery = None,
+    limit: PageSize = 100,
+    after: AfterLink = None,
+) -> Response:
+    """Markers on the road in the order of their measures."""
+    page, last = roads.markers(
+        caller,
+        road_id,
+        measures_m=(from_m, to_m),
+        offsets_m=(min_offset_m, max_offset_m),
+        after=cursor_of(after),
+        limit=limit,
+    )
+    return page_response(request, {"items": page}, after=last)
+
+
+def _of(many: OnRoad) -> OnRoad:
+    return {
+        "road_id": many["road_id"],
+        "road": many["road"],
+        "version": many["version"],
+        "sections": many["sections"],
+    }

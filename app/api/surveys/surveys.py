@@ -1,0 +1,261 @@
+"""/v1/imports and /v1/exports: surveys come in, markers go out as files."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.responses import StreamingResponse
+from pydantic import ConfigDict, Field
+
+from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, idempotency_of, read_declaration
+from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, PageSize, Text, use_cases
+from app.api.http.problems import FieldError, Problem, problem_responses, report_problem
+from app.api.http.responses import (
+    BINARY,
+    IdempotencyKeyHeader,
+    Prefer,
+    created_response,
+    document_response,
+    file_response,
+    json_response,
+    page_response,
+    wants_job,
+)
+from app.api.http.strict_json import StrictRoute
+from app.api.jobs import queued_job
+from app.api.markers.searches import Filtered, check_measures
+from app.api.surveys.schemas import DECLARATION_EXAMPLE, DeclarationIn
+from app.errors import InvalidParameter, UnreadableUpload
+from app.families import FamilyName
+from app.families.documents import StrictModel
+from app.markers.reading import Status
+from app.registry.jobs import JobState
+from app.services.idempotency import IdempotencyKey
+from app.services.markers.searches import checked_box
+from app.services.progress import JobDocument
+from app.services.request_work import counted_steps
+from app.services.surveys.exports import MAX_LEFT_OUT_IDS, STREAMED, SUFFIXES, WHOLE, ExportJobs, filter_of
+from app.services.surveys.exports import Exports as ExportsService
+from app.services.surveys.import_jobs import ImportJobs, takes_long
+from app.services.surveys.import_report import ImportInput, ImportJobDocument, ImportJobPage, ImportReport, import_input
+from app.services.surveys.imports import Imports as ImportsService
+
+# === /v1/imports: surveys come in.
+
+
+import_router = APIRouter(prefix="/v1/imports", tags=["imports"], route_class=StrictRoute)
+
+MAX_DECLARATION_BYTES = 64 * 1024
+_CURE = "send multipart/form-data with the parts file and declaration"
+_FORM = DeclaredForm("an import", "file", MAX_DECLARATION_BYTES, _CURE)
+_BODY = form_body(
+    {"file": {**BINARY, "description": "The survey."}},
+    "declaration",
+    DeclarationIn,
+    {"file": "survey.csv", "declaration": DECLARATION_EXAMPLE},
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    given: ImportInput
+    declared: dict[str, Any]
+    idempotency: IdempotencyKey | None
+    as_job: bool
+
+
+class RefusedImport(Problem):
+    """The problem document of an import that was refused, with the report."""
+
+    report: ImportReport
+
+
+async def get_asked(
+    request: Request, idempotency_key: IdempotencyKeyHeader = None, prefer: Prefer = None
+) -> AsyncIterator[_Asked]:
+    """Read the file and its declaration from the form; the file is deleted when the request ends.
+
+    Raises
+    ------
+    UnsupportedUpload
+        The request is no form.
+    UnreadableUpload
+        There is no file in it, or an empty one.
+    MalformedRequest
+        The form or the declaration's JSON cannot be read.
+    """
+    async with _FORM.received(request) as (form, text):
+        part = form.get("file")
+        if not isinstance(part, SpooledPart):
+            raise UnreadableUpload("there is no file in the form", field="file", limit="a part file", cure=_CURE)
+        file = part.spooled
+        if not file.size:
+            raise UnreadableUpload("the file is empty", field="file", limit="one row at least", cure="send the survey")
+        declared = (await read_declaration(DeclarationIn, text, "body", "declaration")).declared()
+        as_job = wants_job(prefer) or takes_long(file)
+        key = idempotency_of(request, idempotency_key, text, file)
+        yield _Asked(import_input(declared, file), declared, key, as_job)
+
+
+Asked = Annotated[_Asked, Depends(get_asked)]
+Imports = Annotated[ImportsService, use_cases("imports")]
+Jobs = Annotated[ImportJobs, use_cases("import_jobs")]
+
+
+@import_router.post(
+    "",
+    status_code=201,
+    openapi_extra=_BODY,
+    responses={
+        200: {"model": ImportReport, "description": "Checked; nothing was stored"},
+        201: {"model": ImportReport, "description": "Stored"},
+        202: {"model": ImportJobDocument, "description": "Queued; Location leads to its progress and its report"},
+        **problem_responses(409, 415, refused=RefusedImport),
+    },
+)
+def post_import(request: Request, asked: Asked, caller: Caller, imports: Imports, jobs: Jobs) -> Response:
+    """Import a survey: CSV, GeoJSON, GeoPackage, zipped Shapefile, KML, KMZ, GPX, LandXML, JobXML, GSI or DXF.
+
+    With `dry_run` the report says what would be stored. A refused import answers 422 with the report in the problem;
+    nothing of it is stored. A file of more than 4 MiB or 20,000 lines becomes a job, and so does one that is
+    sent with `Prefer: respond-async`: 202, the report comes at Location.
+    """
+    if asked.as_job:
+        document, replayed = jobs.submit(caller, asked.declared, asked.given.file, asked.idempotency)
+        response = created_response(document, replayed, path="/v1/imports", status=202)
+        response.headers["Retry-After"] = "1"
+        return response
+    try:
+        report, replayed = imports.run(caller, asked.given, asked.idempotency)
+    except InvalidParameter as error:
+        if error.field is not None and not error.field.startswith(("declaration", "file")):
+            error.field = f"declaration.{error.field.removeprefix('position.')}"
+        raise
+    if report["outcome"] == "refused":
+        return _refused(request, report)
+    return created_response(report, replayed, status=200 if report["dry_run"] else 201)
+
+
+@import_router.get("", responses=document_response(ImportJobPage))
+def list_imports(
+    request: Request,
+    caller: Caller,
+    jobs: Jobs,
+    state: JobState | None = None,
+    limit: PageSize = 100,
+    before: LastId = None,
+) -> Response:
+    """Imports that are or were jobs, without their reports, newest first. Those that were answered at once are none."""
+    page, last = jobs.page(caller, state=state, before=before, limit=limit)
+    return page_response(request, page, before=last)
+
+
+@import_router.get("/{import_id}", responses=document_response(ImportJobDocument, 404))
+def get_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
+    """An import that was queued: its state, and its report once it is done. A refused one is done too."""
+    return json_response(jobs.get(caller, import_id))
+
+
+@import_router.post("/{import_id}/cancel", responses=document_response(ImportJobDocument, 404, 409))
+def cancel_import(import_id: Identifier, caller: Caller, jobs: Jobs) -> Response:
+    """Call an import off: a queued one never starts, a running one stops before it stores anything.
+
+    409 where it is too late: it is storing already, or finished.
+    """
+    return json_response(jobs.cancel(caller, import_id))
+
+
+def _refused(request: Request, report: ImportReport) -> Response:
+    first = report["faults"][0]
+    place = f"row {first['row']}: " if first["row"] is not None else ""
+    fault = FieldError(
+        f"file.{first['field']}",
+        f"{place}{first['message']}; {report['refused_rows']} of {report['rows']} rows are refused",
+        "all rows good" if report["mode"] == "all" else "one good row at least",
+        first["proposal"] or 'correct the rows, or declare mode "good" to store the others',
+    )
+    return report_problem("import-refused", "The import was refused", fault, request.scope, report)
+
+
+# === /v1/exports: markers as files.
+
+
+export_router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=StrictRoute)
+
+ExportFormat = Literal["csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"]
+_Measure = Annotated[float, Field(strict=True, ge=-1e8, le=1e8, allow_inf_nan=False)]
+Exports = Annotated[ExportsService, use_cases("exports")]
+
+
+class ExportIn(StrictModel):
+    """Markers to write into a file; without a filter, all of them."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"format": "gpkg", "bbox": [114.1, 22.2, 114.3, 22.4]}]})
+
+    format: ExportFormat
+    bbox: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = Field(
+        None, description="west, south, east, north. [deg]"
+    )
+    polygon: Text | None = Field(None, max_length=8_000, description="WKT of a POLYGON or MULTIPOLYGON.")
+    road: Text | None = Field(None, min_length=1, max_length=200)
+    from_m: _Measure | None = Field(None, description="Least measure on the road. [m]")
+    to_m: _Measure | None = Field(None, description="Greatest measure on the road. [m]")
+    status: Status | None = None
+    family: FamilyName | None = None
+
+    def wanted(self) -> dict[str, Any]:
+        """What is wanted, checked, as it is stored in a job."""
+        if self.bbox is not None:
+            checked_box(*self.bbox)
+        wanted = self.model_dump(mode="json", exclude_none=True)
+        check_measures(filter_of(wanted))
+        return wanted
+
+
+@export_router.post(
+    "",
+    status_code=202,
+    responses=document_response(JobDocument, status=202, description="Queued; Location leads to its progress"),
+)
+def post_export(
+    wanted: ExportIn,
+    caller: Caller,
+    jobs: Annotated[ExportJobs, use_cases("export_jobs")],
+    idempotency: Idempotency,
+) -> Response:
+    """Write markers into a file as a job; the file is at its `links.result` for seven days."""
+    return queued_job(*jobs.submit(caller, wanted.wanted(), idempotency))
+
+
+@export_router.get(
+    "/{kind}",
+    responses={
+        **file_response(media.partition(";")[0] for media in (STREAMED | WHOLE).values()),
+        **problem_responses(),
+    },
+)
+def get_export(
+    kind: ExportFormat,
+    caller: Caller,
+    exports: Exports,
+    filtered: Filtered,
+) -> Response:
+    """The markers of a filter, or all: CSV and GeoJSON as a stream, the others as one file.
+
+    The filters are those of GET /v1/markers.
+
+    Positions are longitude and latitude in WGS 84 / ITRF; LandXML and DXF are in the UTM zone that most of them lie in.
+    Markers too far from it are left out: the file lists them, and the header Waymark-Left-Out has their number and the
+    first ids. Retired markers are in LandXML and DXF only with status=retired.
+    """
+    headers = {"Content-Disposition": f'attachment; filename="markers.{SUFFIXES.get(kind, kind)}"'}
+    if kind in STREAMED:
+        chunks, media_type = exports.stream(caller, kind, filtered), STREAMED[kind]
+    else:
+        (chunks, left_out), media_type = exports.whole(caller, kind, filtered), WHOLE[kind]
+        if left_out:
+            headers["Waymark-Left-Out"] = f"{len(left_out)}; {' '.join(left_out[:MAX_LEFT_OUT_IDS])}"
+    return StreamingResponse(counted_steps(chunks), headers=headers, media_type=media_type)

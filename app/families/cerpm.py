@@ -1,0 +1,592 @@
+"""The family of chip-enabled raised pavement markers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import sqlalchemy as sa
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from typing_extensions import TypedDict
+
+from app.errors import CodeTaken, InvalidParameter, naming
+from app.families.documents import (
+    FamilyChange,
+    Flag,
+    Headed,
+    MarkerDocument,
+    MarkerIn,
+    Number,
+    PositionIn,
+    StrictModel,
+    Whole,
+    marker_head,
+    marker_place,
+    place_input,
+    position_columns,
+)
+from app.families.family import Family, Registration, SnapshotRecord, map_point
+from app.families.surveys import (
+    Commitment,
+    Flags,
+    MarkerRules,
+    NewMarker,
+    PlannedMarkers,
+    PlannedRow,
+    RowCodes,
+    Rows,
+    SurveyImport,
+    listed_codes,
+    texts_of,
+    unknown_texts,
+)
+from app.formats.surveys.declaration import ImportDeclaration
+from app.formats.surveys.roles import CodeForm
+from app.formats.surveys.table import Fault
+from app.geodesy import PlacedPosition
+from app.markers.cerpm import HEIGHT_M, MAX_NUMBER, MAX_SPEED_LIMIT, CerpmMessage, LaneSide, SpeedLimit, SpeedUnit
+from app.planning.outputs.hd_map import MapMarker
+from app.planning.plan import PlannedCerpm, PlannedMarker
+from app.radio.settings import RadioSettings
+from app.registry import markers as cerpms
+from app.registry.bulk_load import Columns
+from app.registry.column_types import row_of
+from app.registry.lines import CerpmRuns
+from app.registry.marker_rows import CodeRow, MarkerRow
+from app.registry.tables import markers
+from app.surveys.georeference import GeoreferencedSurvey
+
+# === The row of a CERPM as values of the core: what it sends, its side, its speed limit and its radio.
+
+
+def speed_limit_document(limit: SpeedLimit | None) -> dict[str, Any] | None:
+    """A speed limit as it is stored."""
+    return None if limit is None else {"value": limit.value, "unit": limit.unit.value}
+
+
+def speed_limit_of(row: MarkerRow) -> SpeedLimit | None:
+    """Speed limit of a CERPM's row."""
+    stored = row.spec["speed_limit"]
+    return None if stored is None else SpeedLimit(stored["value"], SpeedUnit(stored["unit"]))
+
+
+def side_of(row: MarkerRow) -> LaneSide:
+    """Lane side of a CERPM's row."""
+    return LaneSide[row.spec["side"].upper()]
+
+
+def radio_of(row: MarkerRow) -> RadioSettings:
+    """Radio of a CERPM's row."""
+    return RadioSettings(**row.spec["radio"])
+
+
+def message_of(row: MarkerRow, sequence: int = 0) -> CerpmMessage:
+    """The message that a CERPM sends; with its height only if that is above the ellipsoid.
+
+    Raises
+    ------
+    InvalidParameter
+        It does not fit a message.
+    """
+    ellipsoidal = row.vertical_datum in (None, "ellipsoid")
+    return CerpmMessage(
+        number=int(row.digits),
+        lon_deg=row.lon_deg,
+        lat_deg=row.lat_deg,
+        height_m=row.height_m if ellipsoidal else None,
+        side=side_of(row),
+        speed_limit=speed_limit_of(row),
+        sequence=sequence,
+    )
+
+
+# === A CERPM that is to be registered, as its use case knows it.
+
+
+@dataclass(frozen=True, slots=True)
+class NewCerpm(NewMarker):
+    """A CERPM to register."""
+
+    family: ClassVar[str] = "cerpm"
+    position: PositionIn
+    number: int | None = None
+    side: LaneSide = LaneSide.UNKNOWN
+    speed_limit: SpeedLimit | None = None
+    dev_eui: str | None = None
+    radio: RadioSettings = field(default_factory=RadioSettings)
+    heading_deg: float | None = None
+
+
+# === Schemas of requests that register or change CERPMs.
+
+
+Side = Literal["left", "right", "unknown"]
+DevEui = Annotated[str, Field(pattern=r"^[0-9a-fA-F]{16}$")]
+
+
+class SpeedLimitIn(StrictModel):
+    """A speed limit as it is posted."""
+
+    value: Annotated[int, Field(strict=True, ge=1, le=MAX_SPEED_LIMIT)]
+    unit: SpeedUnit = SpeedUnit.KM_H
+
+
+class RadioIn(StrictModel):
+    """How the marker's radio is set."""
+
+    frequency_hz: Whole = Field(915_000_000, description="Carrier, or the first of several. [Hz]")
+    spreading_factor: Whole = Field(7, description="7 to 12, or 6 without a header.")
+    bandwidth_hz: Whole = Field(500_000, description="125000, 250000 or 500000. [Hz]")
+    interval_s: Number = Field(1.6, description="From one transmission to the next on average. [s]")
+    jitter_share: Number = Field(0.2, description="Each interval is drawn evenly around that, this share to each side.")
+    power_dbm: Number = Field(
+        20.0, description="At the antenna's connector, -4 to 20; above 17 it may send 1 % of the time. [dBm]"
+    )
+    antenna_gain_dbi: Number = Field(2.15, description="-10 to 6. [dBi]")
+    channels: Whole = Field(1, description="Over which packets are spread, 1 to 128.")
+    hopping: Flag = Field(False, description="Every marker uses all channels in turn; else each has one.")
+    coding_rate: Whole = Field(5, description="5 to 8: 4/5 to 4/8.")
+    preamble_symbols: Whole = Field(8, description="Length of the preamble.")
+    explicit_header: Flag = Field(True, description="Whether packets have a header.")
+    crc: Flag = Field(True, description="Whether packets have a checksum of the radio.")
+    lorawan: Flag = Field(False, description="The message travels in a LoRaWAN frame.")
+
+    def settings(self) -> RadioSettings:
+        """The radio as the encoders know it."""
+        with naming("radio"):
+            return RadioSettings(**self.model_dump())
+
+
+CERPM_EXAMPLES: list[JsonValue] = [
+    {
+        "family": "cerpm",
+        "position": {
+            "lon_deg": -85.6436,
+            "lat_deg": 42.2531,
+            "height_m": 236.4,
+            "realization": "ITRF2014",
+            "horizontal_rmse_m": 0.02,
+            "vertical_rmse_m": 0.02,
+            "survey_method": "GNSS RTK",
+        },
+        "number": 17,
+        "side": "right",
+        "speed_limit": {"value": 25, "unit": "mph"},
+        "radio": {"interval_s": 2.0, "spreading_factor": 7, "bandwidth_hz": 500_000},
+        "status": "surveyed",
+        "road": "Parkview Campus Drive",
+    }
+]
+
+
+class CerpmIn(Headed, MarkerIn):
+    """A chip-enabled raised pavement marker to register."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": CERPM_EXAMPLES})
+
+    family: Literal["cerpm"]
+    position: PositionIn
+    number: Annotated[int, Field(strict=True, ge=1, le=MAX_NUMBER)] | None = Field(
+        None, description="Within the agency; the next free one if left out."
+    )
+    side: Side = Field("unknown", description="Boundary of the lane that it stands on, in the direction of travel.")
+    speed_limit: SpeedLimitIn | None = Field(None, description="As it is posted; nothing where none is.")
+    dev_eui: DevEui | None = Field(None, description="LoRaWAN DevEUI, where the marker joins a network.")
+    radio: RadioIn = Field(default_factory=lambda: RadioIn())
+
+    def new(self) -> NewCerpm:
+        """The marker as the use cases know it."""
+        return NewCerpm(
+            position=self.position,
+            number=self.number,
+            side=LaneSide[self.side.upper()],
+            speed_limit=SpeedLimit(self.speed_limit.value, self.speed_limit.unit) if self.speed_limit else None,
+            radio=self.radio.settings(),
+            dev_eui=self.dev_eui.lower() if self.dev_eui is not None else None,
+            heading_deg=self.heading_deg,
+            **self.shared(),
+        )
+
+
+class CerpmChange(FamilyChange):
+    """Members of a change that CERPMs have."""
+
+    side: Side = Field("unknown", description="Of a CERPM.")
+    speed_limit: SpeedLimitIn | None = Field(None, description="Of a CERPM.")
+    dev_eui: DevEui | None = Field(None, description="Of a CERPM.")
+    radio: RadioIn = Field(default_factory=lambda: RadioIn(), description="Of a CERPM; replaces the whole of the old.")
+
+    def spec_changes(self, named: set[str]) -> dict[str, Any]:
+        """Side, speed limit, DevEUI and radio where the request names them."""
+        limit = self.speed_limit
+        spec: dict[str, Any] = {
+            "side": self.side,
+            "speed_limit": None if limit is None else limit.model_dump(mode="json"),
+            "dev_eui": self.dev_eui.lower() if self.dev_eui is not None else None,
+        }
+        spec = {name: value for name, value in spec.items() if name in named}
+        return {**spec, "radio": asdict(self.radio.settings())} if "radio" in named else spec
+
+
+# === CERPMs as clients see them.
+
+
+class CerpmCodeDocument(TypedDict):
+    """What identifies a CERPM within its agency."""
+
+    scheme: Literal["cerpm"]
+    text: str
+    number: int
+
+
+class SpeedLimitDocument(TypedDict):
+    """A posted speed limit."""
+
+    value: int
+    unit: Literal["km/h", "mph"]
+
+
+class RadioDocument(TypedDict):
+    """Settings of a CERPM's radio."""
+
+    frequency_hz: int
+    spreading_factor: int
+    bandwidth_hz: int
+    interval_s: float
+    jitter_share: float
+    power_dbm: float
+    antenna_gain_dbi: float
+    channels: int
+    hopping: bool
+    coding_rate: int
+    preamble_symbols: int
+    explicit_header: bool
+    crc: bool
+    lorawan: bool
+
+
+class CerpmSpec(TypedDict):
+    """What the row of a CERPM has in its column `spec`."""
+
+    side: Literal["left", "right", "unknown"]
+    speed_limit: SpeedLimitDocument | None
+    dev_eui: str | None
+    radio: RadioDocument
+
+
+class CerpmDocument(MarkerDocument, CerpmSpec):
+    """A CERPM."""
+
+    code: CerpmCodeDocument
+
+
+def cerpm_document(row: MarkerRow) -> CerpmDocument:
+    """A CERPM's row as clients see it."""
+    spec: CerpmSpec = row.spec
+    return {
+        **marker_head(row),
+        "code": {"scheme": "cerpm", "text": row.digits, "number": int(row.digits)},
+        "side": spec["side"],
+        "speed_limit": spec["speed_limit"],
+        "dev_eui": spec["dev_eui"],
+        "radio": spec["radio"],
+        **marker_place(row),
+    }
+
+
+# === Planned CERPMs as rows of the registry.
+
+
+class PlannedCerpms(PlannedMarkers):
+    """Number, side, speed limit and radio."""
+
+    def taken_numbers(self, agency_id: str, known: Iterable[CodeRow]) -> set[int]:
+        """A number names one CERPM of its agency."""
+        return {int(row.digits) for row in known if row.agency_id == agency_id}
+
+    def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
+        """One row for each CERPM."""
+        radio = asdict(commitment.radio)
+        for marker in markers:
+            detail = marker.detail
+            assert isinstance(detail, PlannedCerpm)
+            spec = {
+                "side": detail.side.name.lower(),
+                "speed_limit": speed_limit_document(detail.speed_limit),
+                "dev_eui": None,
+                "radio": radio,
+            }
+            columns = {
+                **commitment.position(marker),
+                "scheme": "cerpm",
+                "digits": str(detail.number),
+                "spec": spec,
+            }
+            yield PlannedRow(marker.number, columns)
+
+
+# === CERPMs in the snapshot of an area.
+
+
+_HEARD = ("first_sequence", "last_sequence", "first_heard_s", "last_heard_s")
+
+
+class CerpmSnapshot(SnapshotRecord):
+    """Side, speed limit and interval of CERPMs, and which transmissions were heard.
+
+    Retired ones are included: whoever has their keys can still send.
+    """
+
+    with_retired = True
+
+    def columns(self) -> tuple[sa.ColumnElement[Any], ...]:
+        """Side, speed limit and interval."""
+        spec = markers.c.spec
+        radio = spec["radio"]
+        return (
+            spec["side"].as_string().label("side"),
+            spec["speed_limit"].label("speed_limit"),
+            radio["interval_s"].as_float().label("interval_s"),
+            radio["jitter_share"].as_float().label("jitter_share"),
+        )
+
+    def kind(self, row: MarkerRow) -> dict[str, Any]:
+        """Side, speed limit and the shortest interval between two transmissions."""
+        spec = row.spec
+        min_interval_s = spec["interval_s"] * (1 - spec["jitter_share"])
+        return {"side": spec["side"], "speed_limit": spec["speed_limit"], "min_interval_s": min_interval_s}
+
+    def members(self, connection: sa.Connection, agency_id: str, codes: Sequence[str]) -> Mapping[str, Sequence[Any]]:
+        """First and last transmission that was heard of each."""
+        heard = cerpms.list_span_ends(connection, agency_id, map(int, codes))
+        ends = [heard.get(int(code)) for code in codes]
+        return {name: [None if end is None else getattr(end, name) for end in ends] for name in _HEARD}
+
+
+# === Surveys of CERPMs.
+
+
+class CerpmSurveyIn(BaseModel):
+    """Members of a survey's declaration that CERPMs have."""
+
+    side: Literal["unknown", "left", "right"] = Field("unknown", description="Of CERPMs without one of their own.")
+    speed_limit: SpeedLimitIn | None = Field(None, description="Of CERPMs.")
+
+
+@dataclass(frozen=True, slots=True)
+class CerpmDefaults:
+    """What a survey's CERPMs have in common."""
+
+    side: LaneSide = LaneSide.UNKNOWN
+    speed_limit: SpeedLimit | None = None
+
+
+class CerpmSurvey(SurveyImport[CerpmDefaults]):
+    """Points that become CERPMs: rows without a number get the next ones of the agency."""
+
+    members = CerpmSurveyIn
+
+    def defaults(self, declared: Mapping[str, Any]) -> CerpmDefaults:
+        """Side and speed limit."""
+        limit = declared.get("speed_limit")
+        return CerpmDefaults(
+            LaneSide[str(declared.get("side", "unknown")).upper()],
+            SpeedLimit(limit["value"], SpeedUnit(limit["unit"])) if limit is not None else None,
+        )
+
+    def check_values(
+        self, survey: GeoreferencedSurvey, wanted: Flags, declaration: ImportDeclaration
+    ) -> Iterator[Fault]:
+        """Unknown sides, and heights that do not fit a message."""
+        sides = {side.name for side in LaneSide}
+        known = sides | {name.lower() for name in sides}
+        yield from unknown_texts(survey.table.texts.get("side"), wanted, "side", known, "left, right, unknown")
+        if declaration.vertical_datum not in (None, "ellipsoid"):
+            return
+        height = survey.placed.height_m
+        cure = "leave the height out where it does not fit"
+        for row in np.flatnonzero(wanted & ((height < HEIGHT_M[0]) | (height > HEIGHT_M[1]))):
+            message = f"height_m is {height[row]:g}, a message holds {HEIGHT_M[0]:g} to {HEIGHT_M[1]:g} m"
+            yield Fault(int(row) + 1, "position.height_m", "not_a_marker", message, cure)
+
+    def code_form(self, defaults: CerpmDefaults, *, compare: bool) -> CodeForm:
+        """Numbers."""
+        return CodeForm("[1-9][0-9]{0,9}", True, "numbers of CERPMs")
+
+    def read_codes(
+        self, survey: GeoreferencedSurvey, rows: Rows, defaults: CerpmDefaults
+    ) -> tuple[RowCodes, list[Fault]]:
+        """Numbers."""
+        return _read_numbers(survey, rows)
+
+    def assign_missing(self, connection: sa.Connection, agency_id: str, codes: RowCodes) -> None:
+        """The next numbers of the agency."""
+        highest = int(codes.digits[codes.from_file].astype(np.int64).max()) if codes.from_file.any() else 0
+        last = max(cerpms.last_number(connection, agency_id), highest)
+        missing = codes.digits == b""
+        count = int(missing.sum())
+        if last + count > MAX_NUMBER:
+            raise InvalidParameter(
+                "there are not enough numbers left",
+                field="code",
+                limit=f"1 to {MAX_NUMBER}",
+                cure="add the numbers to the file",
+            )
+        codes.digits[missing] = np.arange(last + 1, last + 1 + count).astype("S10")
+
+    def is_unique(self, codes: RowCodes) -> bool:
+        """A number names one CERPM of its agency."""
+        return True
+
+    def collides(
+        self,
+        codes: RowCodes,
+        defaults: CerpmDefaults,
+        place: tuple[float, float],
+        known: CodeRow,
+        agency_id: str,
+        rules: MarkerRules,
+    ) -> bool:
+        """Only with CERPMs of the same agency."""
+        return known.agency_id == agency_id
+
+    def columns(self, survey: GeoreferencedSurvey, codes: RowCodes, defaults: CerpmDefaults) -> Columns:
+        """The spec, by the side of the row."""
+        specs = _specs(defaults)
+        same: dict[str, Any] = {"scheme": codes.scheme}
+        own: dict[str, Sequence[Any]] = {}
+        if "side" in survey.table.texts:
+            own["spec"] = [specs[side.upper()] for side in texts_of(survey, codes.rows, "side")]
+        else:
+            same["spec"] = specs[""]
+        return Columns(len(codes.rows), same, own)
+
+
+def _read_numbers(survey: GeoreferencedSurvey, rows: Rows) -> tuple[RowCodes, list[Fault]]:
+    """Numbers of CERPMs, and the rows whose number is none."""
+    numbers = np.zeros(len(rows), dtype=np.int64)
+    faults: list[Fault] = []
+    for k, text in listed_codes(survey, rows):
+        if text.isdigit() and text.isascii() and len(text) <= 10 and 1 <= (number := int(text)) <= MAX_NUMBER:
+            numbers[k] = number
+        else:
+            numbers[k] = -1
+            message = f"{text[:40]!r} is no number of a CERPM"
+            faults.append(Fault(int(rows[k]) + 1, "code", "not_a_marker", message, "a whole number"))
+    good = numbers >= 0
+    digits = np.where(numbers > 0, numbers, 0).astype("S10")
+    digits[numbers == 0] = b""
+    return RowCodes(rows, digits, numbers > 0, "cerpm").of(good), faults
+
+
+def _specs(defaults: CerpmDefaults) -> dict[str, dict[str, Any]]:
+    """What CERPMs of each side keep; rows share these, and none changes them."""
+    limit, radio = speed_limit_document(defaults.speed_limit), _default_radio()
+    of_side = {
+        side.name: {"side": side.name.lower(), "speed_limit": limit, "dev_eui": None, "radio": radio}
+        for side in LaneSide
+    }
+    return {**of_side, "": of_side[defaults.side.name]}
+
+
+@lru_cache
+def _default_radio() -> dict[str, Any]:
+    return asdict(RadioSettings())
+
+
+# === The family of CERPMs: their numbers, the properties that they broadcast, and their radio.
+
+
+class Cerpms(Family[NewCerpm, PlacedPosition]):
+    """The family of chip-enabled raised pavement markers."""
+
+    name = "cerpm"
+    label = "CERPM"
+    title = "CERPMs"
+    schema = CerpmIn
+    examples = CERPM_EXAMPLES
+    change = CerpmChange
+    snapshot = CerpmSnapshot()
+    survey = CerpmSurvey()
+    planned = PlannedCerpms()
+    lines = CerpmRuns()
+    document_type = CerpmDocument
+    detail_type = CerpmDocument
+
+    def prepare(self, registration: Registration, new: NewCerpm) -> PlacedPosition:
+        """The marker's place in WGS 84."""
+        return place_input(new.position, registration.rules.crs_accuracy_m)
+
+    def columns(
+        self, connection: sa.Connection, registration: Registration, new: NewCerpm, prepared: PlacedPosition
+    ) -> dict[str, Any]:
+        """Number, place and spec.
+
+        Raises
+        ------
+        InvalidParameter
+            It does not fit a message.
+        CodeTaken
+            Another marker carries the number, or once did.
+        """
+        number = new.number
+        if number is None:
+            number = cerpms.last_number(connection, registration.agency_id) + 1
+        elif (other := cerpms.find_number(connection, registration.agency_id, number)) is not None:
+            raise CodeTaken(
+                f"the number {number} is marker {other.id}'s",
+                field="number",
+                limit="a number names one marker of its agency for ever",
+                cure="leave the number out and the next free one is assigned",
+            )
+        columns = {
+            "family": self.name,
+            "scheme": self.name,
+            "digits": str(number),
+            "heading_deg": new.heading_deg,
+            **position_columns(new.position, prepared),
+            "spec": {
+                "side": new.side.name.lower(),
+                "speed_limit": speed_limit_document(new.speed_limit),
+                "dev_eui": new.dev_eui,
+                "radio": asdict(new.radio),
+            },
+        }
+        message_of(row_of(MarkerRow, columns))
+        return columns
+
+    def revise(
+        self, connection: sa.Connection, registration: Registration, row: MarkerRow, values: dict[str, Any]
+    ) -> dict[str, Any]:
+        """The spec after a change.
+
+        Raises
+        ------
+        InvalidParameter
+            It does not fit a message.
+        """
+        spec = {**row.spec, **values.get("spec", {})}
+        message_of(row._replace(**{**values, "spec": spec}))
+        return {"spec": spec}
+
+    def feature_members(self, properties: Mapping[str, Any]) -> dict[str, Any]:
+        """The number."""
+        if "code" not in properties:
+            return {}
+        digits = str(properties["code"])
+        return {"number": int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 20 else digits}
+
+    def document(self, row: MarkerRow) -> CerpmDocument:
+        """A CERPM."""
+        return cerpm_document(row)
+
+    def map_markers(self, row: MarkerRow) -> Sequence[MapMarker]:
+        """A point, with the side of the lane that it is on."""
+        side = row.spec["side"]
+        return (map_point(row, kind="" if side == "unknown" else side),)
+
+
+CERPM = Cerpms()

@@ -1,1 +1,0 @@
-"""The family of chip-enabled raised pavement markers."""

@@ -1,1 +1,0 @@
-"""The family of square fiducial signs: ArUco and AprilTag."""

@@ -1,0 +1,401 @@
+"""Packet logs as JSON: entries of documents, arrays and lines, and uplinks of LoRaWAN network servers."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from enum import StrEnum
+from itertools import islice
+from typing import Any
+
+from app.errors import UploadTooLarge
+from app.formats.logs import LogClock, TimeScale, utc_from_gps_s
+from app.formats.packets.rows import (
+    ALIASES,
+    NEEDED,
+    BrokenEntry,
+    PacketSource,
+    PayloadText,
+    packet_from_values,
+    payload_text,
+    read_payload,
+)
+from app.formats.text import MAX_LINE, clean_text, match_columns, numbered_lines
+from app.sensors.pose_track import ReceivedPacket
+
+# === Entries of packet logs in JSON: a document, an array, lines, or documents one after the other.
+#
+# Every character is parsed at most three times whatever the file holds, so that no file takes longer than its length.
+
+
+Record = tuple[int, "dict[str, Any] | BrokenEntry"]
+
+_LISTS = ("packets", "uplinks", "events", "records", "messages", "results")
+_MAX_DEPTH = 32  # levels of nesting; chosen by hand
+_SPACE = " \t\r\n,\x1e\ufeff"
+
+
+def read_records(name: str, text: str, document_chars: int) -> Iterator[Record]:
+    """Objects with the numbers of their entries; an entry that is no object is a `BrokenEntry`.
+
+    Raises
+    ------
+    UploadTooLarge
+        One document, rather than lines, of more characters than the limit.
+    """
+    text = text.lstrip(_SPACE)
+    first = text.split("\n", 1)[0].rstrip()
+    if text[:1] in ("{", "[") and not isinstance(_parse(first[:MAX_LINE]), dict):
+        # no object in the first line: one document over many lines, several of them, or broken lines
+        if len(text) <= document_chars:
+            whole = _parse(text)
+            if not isinstance(whole, BrokenEntry):
+                return _from_document(whole)
+            several = list(_read_concatenated(text))
+            if several and isinstance(several[0][1], dict):
+                return iter(several)
+        elif first in ("[", "{"):
+            raise UploadTooLarge(
+                f"{name} is one JSON document of {len(text)} characters",
+                field="file",
+                limit=f"{document_chars} characters in one document",
+                cure="write one JSON object a line",
+            )
+    elif "\n" not in text.rstrip():
+        return _from_document(_parse(text))
+    return _read_lines(text)
+
+
+def _from_document(document: Any) -> Iterator[Record]:
+    if isinstance(document, dict):
+        within = next((document[n] for n in _LISTS if isinstance(document.get(n), list)), None)
+        document = [document] if within is None else within
+    for entry, item in enumerate(document if isinstance(document, list) else [document]):
+        yield entry, _checked(item)
+
+
+def _read_lines(text: str) -> Iterator[Record]:
+    entry = -1
+    for _number, line in numbered_lines(text):
+        at = line.find("{", 0, 1024)
+        if at < 0 and line.startswith(("event:", "id:", ":", "retry:", "#")):
+            continue
+        entry += 1
+        if at < 0:
+            yield entry, BrokenEntry("json", "the line holds no JSON object")
+        elif len(line) > MAX_LINE:
+            yield entry, BrokenEntry("long-line", f"the line has more than {MAX_LINE} characters")
+        else:
+            yield entry, _checked(_parse(line[at:].rstrip(",")))
+
+
+def _read_concatenated(text: str) -> Iterator[Record]:
+    """Documents one after the other, over several lines each; what follows a broken one is lost with it."""
+    at, entry = 0, 0
+    while True:
+        while at < len(text) and text[at] in _SPACE:
+            at += 1
+        if at >= len(text):
+            return
+        try:
+            found, at = _DECODER.raw_decode(text, at)
+        except (ValueError, RecursionError) as error:
+            yield entry, BrokenEntry("json", f"{_why(error)}; from character {at} on nothing is read")
+            return
+        yield entry, _checked(found)
+        entry += 1
+
+
+class _Ambiguous(dict[str, Any]):
+    """An object that has a key twice."""
+
+
+def _parse(text: str) -> Any:
+    """A JSON value, or the reason why the text is none."""
+    try:
+        return _DECODER.decode(text)
+    except (ValueError, RecursionError) as error:
+        return BrokenEntry("json", _why(error))
+
+
+def _checked(value: Any) -> dict[str, Any] | BrokenEntry:
+    """An object that is neither deep nor ambiguous, or the reason why it is left out."""
+    if isinstance(value, BrokenEntry):
+        return value
+    if not isinstance(value, dict):
+        return BrokenEntry("json", "the entry is no JSON object")
+    wrong = _what_is_wrong(value, _MAX_DEPTH)
+    return BrokenEntry("json", wrong) if wrong else value
+
+
+def _what_is_wrong(value: Any, levels: int) -> str | None:
+    if levels == 0:
+        return f"more than {_MAX_DEPTH} levels"
+    if isinstance(value, _Ambiguous):
+        return "an object has a key twice"
+    for item in value.values() if isinstance(value, dict) else value:
+        if isinstance(item, dict | list) and (wrong := _what_is_wrong(item, levels - 1)):
+            return wrong
+    return None
+
+
+def _why(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return f"more than {_MAX_DEPTH} levels"
+    return f"not JSON: {str(error)[:120]}"
+
+
+def _object_of(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    return found if len(found) == len(pairs) else _Ambiguous(found)
+
+
+_DECODER = json.JSONDecoder(object_pairs_hook=_object_of)
+"""NaN and infinity become floats that are refused where a number is read."""
+
+
+# === Packets from uplink events of LoRaWAN network servers: ChirpStack v4 and The Things Stack v3.
+#
+# Both write proto3 JSON: what is zero, false or empty is left out. Sources: ChirpStack's api/proto/integration and
+# api/proto/gw (v4); The Things Stack's "Data Formats" and "Storage Integration" pages (v3).
+
+
+_LEVELS = 5  # envelopes around an event; chosen by hand
+_ENVELOPES = ("payload", "result", "data", "message", "msg", "body", "event")
+_DURATION = re.compile(r"(\d{1,12}(?:\.\d{1,9})?)s\Z", re.ASCII)
+_OTHER_EVENTS = (
+    "join_accept", "downlink_ack", "downlink_nack", "downlink_sent", "downlink_failed", "downlink_queued",
+    "downlink_queue_invalidated", "location_solved", "service_data", "uplink_normalized",
+)  # fmt: skip
+
+
+class UplinkKind(StrEnum):
+    """The network server that an event is from."""
+
+    CHIRPSTACK = "chirpstack-v4"
+    THINGS_STACK = "things-stack-v3"
+
+
+def open_envelope(record: Mapping[str, Any]) -> tuple[Mapping[str, Any], str | None]:
+    """The event inside the envelopes of brokers, dumps and storage, and the time of the outermost envelope.
+
+    `{"topic": ..., "payload": {...} or its text}` of MQTT dumps, `{"result": {...}}` of The Things Stack's storage,
+    `{"name": "as.up.data.forward", "data": {...}}` of its event streams.
+
+    Raises
+    ------
+    BrokenEntry
+        The text inside is no JSON, or the entry is an error message.
+    """
+    outer_time: str | None = None
+    for _level in range(_LEVELS):
+        if find_kind(record) is not None:
+            break
+        inner = next((record[name] for name in _ENVELOPES if _is_event(record.get(name))), None)
+        if inner is None:
+            break
+        outer_time = outer_time or next(
+            (str(record[n]) for n in ("received_at", "time", "timestamp", "tst") if record.get(n)), None
+        )
+        if isinstance(inner, str):
+            try:
+                inner = json.loads(inner)
+            except (ValueError, RecursionError):
+                raise BrokenEntry("json", "the text in the envelope is not JSON") from None
+            if not isinstance(inner, dict):
+                raise BrokenEntry("json", "the text in the envelope is no JSON object")
+        record = inner
+    if isinstance(record.get("error"), dict):
+        raise BrokenEntry("error", f"an error in place of an event: {clean_text(record['error'].get('message'))}")
+    return record, outer_time
+
+
+def _is_event(value: object) -> bool:
+    return isinstance(value, dict) or (isinstance(value, str) and value.lstrip()[:1] == "{")
+
+
+def find_kind(record: Mapping[str, Any]) -> UplinkKind | None:
+    """The network server that a JSON object is from; None if it is no uplink event."""
+    if "end_device_ids" in record:
+        return UplinkKind.THINGS_STACK
+    if (
+        "deduplicationId" in record
+        or isinstance(record.get("deviceInfo"), dict)
+        or isinstance(record.get("rxInfo"), list)
+    ):
+        return UplinkKind.CHIRPSTACK
+    if "devEUI" in record and "applicationID" in record:
+        return UplinkKind.CHIRPSTACK
+    return None
+
+
+def packet_from_uplink(entry: int, kind: UplinkKind, record: Mapping[str, Any], clock: LogClock) -> ReceivedPacket:
+    """One packet of an uplink event.
+
+    Raises
+    ------
+    BrokenEntry
+        It is another kind of event, or has no payload that can be read.
+    """
+    if kind is UplinkKind.CHIRPSTACK:
+        return _from_chirpstack(entry, record, clock)
+    return _from_things_stack(entry, record, clock)
+
+
+# --- ChirpStack v4 ------------------------------------------------------------------------------------------------
+
+
+def _from_chirpstack(entry: int, record: Mapping[str, Any], clock: LogClock) -> ReceivedPacket:
+    if "devEUI" in record and "deviceInfo" not in record:
+        raise BrokenEntry("old-version", "an event of ChirpStack v3 or older; v4 is read")
+    receptions = _objects(record.get("rxInfo"))
+    if not receptions and not record.get("data"):
+        raise BrokenEntry("not-uplink", "a ChirpStack event that is no uplink")
+    if record.get("joinServerContext"):
+        raise BrokenEntry(
+            "encrypted", "the payload is still encrypted: ChirpStack has no session key (joinServerContext)"
+        )
+    payload = read_payload(record.get("data"), PayloadText.BASE64)
+    if payload is None:
+        raise BrokenEntry("no-payload", "an uplink without a payload")
+    best = _best(receptions)
+    device = record.get("deviceInfo")
+    times = (record.get("time"), best.get("gwTime"), best.get("nsTime"))
+    received_at_s = _first_time(times, clock)
+    if math.isnan(received_at_s):
+        received_at_s = _gps_time(best.get("timeSinceGpsEpoch"), clock)
+    return ReceivedPacket(
+        entry,
+        received_at_s,
+        payload,
+        rssi_dbm=_signal(best.get("rssi"), math.nan),
+        snr_db=_signal(best.get("snr"), 0.0 if best else math.nan),  # 0 is left out
+        device=clean_text(device.get("devEui")) if isinstance(device, dict) else None,
+        event=clean_text(record.get("deduplicationId")),
+    )
+
+
+def _gps_time(value: object, clock: LogClock) -> float:
+    found = _DURATION.match(value) if isinstance(value, str) else None
+    return LogClock(TimeScale.UNIX_S, clock.offset_s).read(utc_from_gps_s(float(found[1]))) if found else math.nan
+
+
+# --- The Things Stack v3 ------------------------------------------------------------------------------------------
+
+
+def _from_things_stack(entry: int, record: Mapping[str, Any], clock: LogClock) -> ReceivedPacket:
+    uplink = record.get("uplink_message")
+    if not isinstance(uplink, dict):
+        other = next((name for name in _OTHER_EVENTS if name in record), "of no known kind")
+        raise BrokenEntry("not-uplink", f"an event of The Things Stack that is no uplink: {other}")
+    if record.get("simulated"):
+        raise BrokenEntry("simulated", "a simulated uplink: nothing was received")
+    payload = read_payload(uplink.get("frm_payload"), PayloadText.BASE64)
+    if payload is None:
+        raise BrokenEntry("no-payload", "an uplink without a payload")
+    best = _best(_objects(uplink.get("rx_metadata")))
+    settings = uplink.get("settings")
+    times = (
+        uplink.get("received_at"),
+        record.get("received_at"),
+        best.get("time"),
+        settings.get("time") if isinstance(settings, dict) else None,
+    )
+    ids = record["end_device_ids"] if isinstance(record["end_device_ids"], dict) else {}
+    eui = clean_text(ids.get("dev_eui"))
+    session = clean_text(uplink.get("session_key_id"))
+    count = uplink.get("f_cnt", 0)
+    return ReceivedPacket(
+        entry,
+        _first_time(times, clock),
+        payload,
+        rssi_dbm=_signal(best.get("rssi"), _signal(best.get("channel_rssi"), math.nan)),
+        snr_db=_signal(best.get("snr"), 0.0 if best else math.nan),
+        device=eui or clean_text(ids.get("device_id")),
+        event=f"{eui}/{session}/{clean_text(count)}" if eui and session else None,
+    )
+
+
+# --- both ---------------------------------------------------------------------------------------------------------
+
+
+def _objects(value: object) -> list[dict[str, Any]]:
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def _best(receptions: list[dict[str, Any]]) -> dict[str, Any]:
+    """The reception of the strongest gateway; an RSSI of zero, which is left out, was not measured."""
+    return max(receptions, key=lambda reception: _signal(reception.get("rssi"), -math.inf), default={})
+
+
+def _first_time(values: tuple[object, ...], clock: LogClock) -> float:
+    for value in values:
+        if isinstance(value, str):
+            at = clock.read(value)
+            if not math.isnan(at):
+                return at
+    return math.nan
+
+
+def _signal(value: object, missing: float) -> float:
+    """An RSSI or SNR; those that no receiver measures are missing."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -200 <= value <= 60:
+        return missing
+    return float(value)
+
+
+# === Packet logs as JSON: objects with named values, or uplink events of LoRaWAN network servers.
+
+
+_MAX_SHAPES = 100  # sets of names whose columns are remembered; chosen by hand
+_Shapes = dict[tuple[str, ...], dict[str, int]]
+
+
+def read_json(source: PacketSource) -> Iterator[ReceivedPacket]:
+    """Packets of the entries; an entry that cannot be read is left out.
+
+    Raises
+    ------
+    UploadTooLarge
+        One document has more characters than the limit.
+    """
+    sample, report = source.sample, source.report
+    shapes: _Shapes = {}
+    for entry, record in read_records(sample.name, sample.text, source.limits.document_bytes):
+        report.entries += 1
+        try:
+            if isinstance(record, BrokenEntry):
+                raise record
+            yield _packet_from_record(entry, record, source, shapes)
+        except BrokenEntry as broken:
+            report.leave_out(entry, broken.kind, broken.reason)
+
+
+def _packet_from_record(entry: int, record: Mapping[str, Any], source: PacketSource, shapes: _Shapes) -> ReceivedPacket:
+    declaration = source.declaration
+    event, outer_time = open_envelope(record)
+    kind = find_kind(event)
+    if kind is not None:
+        source.report.format = str(kind)
+        return packet_from_uplink(entry, kind, event, declaration.clock)
+    names = tuple(event)[:256]
+    places = match_columns(names, ALIASES, declaration.columns) if names not in shapes else shapes[names]
+    if len(shapes) < _MAX_SHAPES:
+        shapes[names] = places
+    if "payload" not in places and not all(quantity in places for quantity in NEEDED):
+        raise BrokenEntry(
+            "unknown", "neither an uplink nor an object with a payload, or with id, latitude and longitude"
+        )
+    values = {quantity: event[names[place]] for quantity, place in places.items()}
+    values.setdefault("time", outer_time)
+    written = payload_text(names[places["payload"]] if "payload" in places else "", declaration)
+    return packet_from_values(entry, values, declaration.clock, written)
+
+
+def looks_like_json_dump(text: str) -> bool:
+    """Whether lines hold a word or two and then a JSON object: what mosquitto_sub -v and event streams write."""
+    lines = [line for _number, line in islice(numbered_lines(text[: 1 << 16]), 20)]
+    found = sum(1 for line in lines if re.match(r"[^{},;\"]{1,512}[\s:]\{\s*\"", line[:1024]))
+    return 2 * found > len(lines) or (found > 0 and lines[0].startswith(("data:", "event:", "id:", ":")))

@@ -1,1 +1,0 @@
-"""A vehicle's own track: CSV, GPX and NMEA 0183."""

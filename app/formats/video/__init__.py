@@ -1,1 +1,0 @@
-"""Videos: which files are videos, what they hold, and their frames."""

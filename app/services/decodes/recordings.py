@@ -1,0 +1,404 @@
+"""Recordings of magnetometers and packet logs of CERPMs: decoded, then matched against the registry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, time, timedelta
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+
+from app.decoders.cerpm.merge import list_numbers, vehicle_positions
+from app.decoders.cerpm.verify import Verdict, Verification
+from app.decoders.magnet.identify import ReadTrace, TagFormat, match_tags
+from app.errors import TooManyRequests, UnreadableUpload
+from app.formats.format import SpooledFile
+from app.geodesy import decimal_year
+from app.markers.cerpm import MAX_INVALID_TAGS_PER_DAY, MAX_INVALID_TAGS_PER_LOG
+from app.registry import markers
+from app.registry.database import Database
+from app.registry.decodes import NewObservation
+from app.registry.markers import CODEBOOKS, book_of
+from app.sensors.camera import Camera
+from app.services.access.agency_secrets import AgencySecrets
+from app.services.decodes.context import DecodeContext, DecodeKind, DecodeRules
+from app.services.decodes.matching import (
+    NearbyTags,
+    ReadPackets,
+    find_known,
+    find_nearby_tags,
+    lane_markers,
+    read_packets_of,
+    spans_of,
+)
+from app.services.decodes.packet_documents import claimed_place, packet_observations, packets_document
+from app.services.decodes.tasks import (
+    DriveFiles,
+    DriveTask,
+    LaneResult,
+    LaneTask,
+    PacketTerms,
+    TraceResult,
+    TraceTask,
+    packet_terms,
+    trace_terms,
+)
+from app.services.decodes.trace_documents import trace_document
+from app.services.decodes.upload_path import Decoded, OutdatedMatch, Upload, UploadHandler
+from app.services.health.record import EVIDENCE
+from app.services.health.traces import (
+    lane_directions,
+    missed_cerpms,
+    missed_tags,
+    packet_evidence,
+    tag_evidence,
+    with_evidence,
+)
+from app.services.markers.codebooks import MAX_BOOKS_SEARCHED
+from app.services.ports import DecoderProcesses, Pending
+
+# === Limits how often the tags of CERPMs can be guessed by uploading packets.
+
+
+_SUSPICIOUS = (Verdict.FORGED, Verdict.WRONG_KEY, Verdict.UNCHECKED)
+
+
+class InvalidTagLimit:
+    """Counts the invalid tags that each holder of a key has uploaded today (UTC), in this process."""
+
+    def __init__(self, per_day: int = MAX_INVALID_TAGS_PER_DAY) -> None:
+        self._per_day = per_day
+        self._day = date.min
+        self._counts: dict[str, int] = {}
+
+    def left(self, holder_id: str, now: datetime) -> int:
+        """Invalid tags that the next log of a holder may contain, at least one.
+
+        Raises
+        ------
+        TooManyRequests
+            There were too many today.
+        """
+        left = self._per_day - self._of(now).get(holder_id, 0)
+        if left <= 0:
+            tomorrow = datetime.combine(now.astimezone(UTC).date() + timedelta(days=1), time(), UTC)
+            raise TooManyRequests(
+                "too many packets with invalid tags were uploaded with this key today",
+                limit=f"{self._per_day} invalid tags in a day (UTC)",
+                cure="upload the log after midnight UTC, and look for the source of the packets: see docs/cerpms.md",
+                retry_after_s=max(1, math.ceil((tomorrow - now).total_seconds())),
+            )
+        return min(left, MAX_INVALID_TAGS_PER_LOG)
+
+    def add(self, holder_id: str, invalid_tags: int, now: datetime) -> None:
+        """Count the invalid tags of a log."""
+        if invalid_tags:
+            counts = self._of(now)
+            counts[holder_id] = counts.get(holder_id, 0) + invalid_tags
+
+    def _of(self, now: datetime) -> dict[str, int]:
+        day = now.astimezone(UTC).date()
+        if day > self._day:
+            self._day, self._counts = day, {}
+        return self._counts
+
+
+def forgery_detail(verification: Verification) -> dict[str, int] | None:
+    """What the audit log records of a log with forged packets; None if there are none."""
+    counts = verification.counts()
+    if not any(counts[verdict] for verdict in _SUSPICIOUS):
+        return None
+    return {**{str(verdict): counts[verdict] for verdict in _SUSPICIOUS}, "invalid_tags": verification.invalid_tags}
+
+
+# === Recordings of magnetometers: through a decoder process, then matched against the registered information tags.
+
+
+@dataclass(frozen=True, slots=True)
+class TraceSignal:
+    """What a decoder process found in a recording, and the tags that it was looking for."""
+
+    result: TraceResult
+    nearby: NearbyTags
+
+
+@dataclass(frozen=True, slots=True)
+class StartedTrace:
+    """A recording in a decoder process."""
+
+    nearby: NearbyTags
+    pending: Pending[TraceResult]
+
+    def result(self) -> TraceSignal:
+        """Wait for the findings."""
+        return TraceSignal(self.pending.result(), self.nearby)
+
+    def cancel(self) -> None:
+        """Stop the process."""
+        self.pending.cancel()
+
+
+class TraceHandler(UploadHandler[TraceSignal]):
+    """Magnetometer traces. Short ones are decoded while the caller waits."""
+
+    kind = DecodeKind.TRACE
+
+    def __init__(self, database: Database, processes: DecoderProcesses, rules: DecodeRules) -> None:
+        self._database, self._processes, self._rules = database, processes, rules
+
+    def accepts(self, context: DecodeContext, file: SpooledFile) -> bool:
+        """Uploads whose context declares a trace."""
+        return context.trace is not None
+
+    def is_job(self, file: SpooledFile) -> bool:
+        """Whether the recording is longer than `DecodeRules.immediate_trace_bytes`."""
+        check_not_empty(file)
+        return file.size > self._rules.immediate_trace_bytes
+
+    def start(self, upload: Upload) -> StartedTrace:
+        """Hand the recording over with the tags that the drive can have passed."""
+        declared = upload.context.trace or {}
+        position, reach_m = upload.context.coarse_position, trace_terms(declared).reach_m
+        with self._database.read() as connection:
+            epoch = decimal_year(upload.observed_at)
+            nearby = find_nearby_tags(connection, upload.agency_id, position, reach_m, epoch)
+            formats = () if nearby.texts else _book_formats(connection, upload.agency_id)
+        name = str(declared.get("file_name") or "recording")
+        task = TraceTask(name, upload.file, declared, nearby.texts, formats, self._rules.traces)
+        return StartedTrace(nearby, self._processes.submit(task, wait_s=upload.wait_s))
+
+    def plot(self, signal: TraceSignal) -> bytes:
+        """The trace with what was found in it."""
+        return signal.result.plot
+
+    def match(self, connection: sa.Connection, upload: Upload, signal: TraceSignal) -> Decoded:
+        """Match the findings against the registered tags."""
+        terms = trace_terms(upload.context.trace or {})
+        trace = match_tags(signal.result.findings, signal.nearby.tags, terms.bar)
+        document = trace_document(signal.result, trace, codebook_tags=len(signal.nearby.texts))
+        nearby, at = signal.nearby, upload.observed_at
+        missed = missed_tags(trace, nearby.tags, nearby.complete, terms.bar, at)
+        return Decoded(document, [*_observations(trace, at), *missed])
+
+
+def check_not_empty(file: SpooledFile) -> None:
+    """Raise `UnreadableUpload` for a file without content."""
+    if not file.size:
+        raise UnreadableUpload("the file is empty", field="file", cure="send the recording again, whole")
+
+
+def _book_formats(connection: sa.Connection, agency_id: str) -> tuple[TagFormat, ...]:
+    """Formats of the agency's codebooks: what tags look like where none is registered near by."""
+    rows, _ = CODEBOOKS.page(connection, agency_id, limit=MAX_BOOKS_SEARCHED)
+    designs = [book_of(row).design for row in rows]
+    return tuple(dict.fromkeys(TagFormat(d.magnets, d.length_m, d.segment_m) for d in designs))
+
+
+def _observations(trace: ReadTrace, observed_at: datetime) -> list[NewObservation]:
+    """One row for each registered tag; of one that was passed twice the more confident reading counts."""
+    rows: dict[str, NewObservation] = {}
+    evidence = tag_evidence(trace)
+    for tag in sorted(trace.tags, key=lambda tag: -tag.reading.confidence):
+        if tag.match is None or tag.match.tag is None:
+            continue
+        reading, marker_id = tag.reading, tag.match.tag.marker_id
+        detail = {
+            "confidence": float(reading.confidence),
+            "missing_magnets": reading.missing,
+            "extra_magnets": reading.extra,
+            "lateral_cm": round(float(reading.lateral_cm), 2),
+            EVIDENCE: evidence[marker_id],
+        }
+        what = _what(reading.wrong_way, evidence[marker_id])
+        rows.setdefault(marker_id, NewObservation(marker_id, 0, observed_at, what, detail))
+    return list(rows.values())
+
+
+def _what(wrong_way: bool, evidence: dict[str, Any]) -> str:
+    if evidence.get("two_places"):
+        return "cloned"
+    if "elsewhere_deg" in evidence:
+        return "out-of-place"
+    return "wrong-way" if wrong_way else "seen"
+
+
+# === Packet logs of CERPMs: verified against the registry, and a lane estimated through their markers.
+
+
+Pose = tuple[float, float, float]
+"""Longitude, latitude and heading of a vehicle. [deg]"""
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSignal:
+    """A drive past CERPMs: its packets, verified against the registry, and the lane through their markers."""
+
+    files: DriveFiles
+    read: ReadPackets
+    result: LaneResult
+
+
+class PacketHandler(UploadHandler[DriveSignal]):
+    """Packet logs. Short ones are decoded while the caller waits."""
+
+    kind = DecodeKind.PACKETS
+
+    def __init__(
+        self, database: Database, processes: DecoderProcesses, secrets: AgencySecrets, rules: DecodeRules
+    ) -> None:
+        self._database, self._processes = database, processes
+        self._secrets, self._rules = secrets, rules
+        self._invalid_tags = InvalidTagLimit()
+
+    def accepts(self, context: DecodeContext, file: SpooledFile) -> bool:
+        """Uploads whose context declares packets."""
+        return context.packets is not None
+
+    def is_job(self, file: SpooledFile) -> bool:
+        """Whether the log is longer than `DecodeRules.immediate_trace_bytes`."""
+        check_not_empty(file)
+        return file.size > self._rules.immediate_trace_bytes
+
+    def start(self, upload: Upload) -> StartedDrive:
+        """Have the files of the drive read."""
+        if upload.again_id is None:
+            self._invalid_tags.left(_holder(upload), upload.received_at)
+        declared = upload.context.packets or {}
+        name = str(declared.get("file_name") or "packets")
+        task = DriveTask(name, upload.file, declared, self._rules.packets, self._rules.images)
+        files = self._processes.submit(task, wait_s=upload.wait_s)
+        return StartedDrive(upload, files, self._database, self._processes, self._secrets, self._invalid_tags)
+
+    def plot(self, signal: DriveSignal) -> bytes:
+        """The lane and the radio signals."""
+        return signal.result.plot
+
+    def match(self, connection: sa.Connection, upload: Upload, signal: DriveSignal) -> Decoded:
+        """Check that the packets were verified against the newest state of the registry.
+
+        Raises
+        ------
+        OutdatedMatch
+            Another upload about these markers was stored since, so that these packets may be repetitions of its own.
+        """
+        verification = signal.read.verification
+        forged = forgery_detail(verification)
+        spans = markers.list_spans(connection, upload.agency_id, verification.spans, upload.again_id)
+        newest = markers.newest_row(spans)
+        if newest > signal.read.known.last_span:
+            raise OutdatedMatch
+        if upload.again_id is None:
+            self._invalid_tags.add(_holder(upload), verification.invalid_tags, upload.received_at)
+        return Decoded(
+            packets_document(signal.files, signal.read, signal.result),
+            self._observations(connection, upload, signal),
+            spans_of(verification),
+            {} if forged is None else {"packets.forged": forged},
+        )
+
+    def _observations(self, connection: sa.Connection, upload: Upload, signal: DriveSignal) -> list[NewObservation]:
+        """What was received of registered markers, and which were passed without a packet."""
+        read, at = signal.read, upload.observed_at
+        rows = packet_observations(read, signal.result.lane, at)
+        if not rows:
+            return []
+        kinds = {finding.number: finding.kind for finding in read.merged.findings}
+        observed = {row.marker_id for row in rows}
+        received = {number: row for number, row in read.known.rows.items() if row.id in observed}
+        evidence = {
+            row.id: packet_evidence(read, row, kinds.get(number), signal.files) for number, row in received.items()
+        }
+        directions = lane_directions(list(received.values()), signal.files.track)
+        missed = missed_cerpms(connection, upload.agency_id, read, signal.files, at)
+        return [*with_evidence(rows, evidence, directions), *missed]
+
+
+@dataclass(frozen=True, slots=True)
+class StartedDrive:
+    """The files of a drive in a decoder process."""
+
+    upload: Upload
+    files: Pending[DriveFiles]
+    database: Database
+    processes: DecoderProcesses
+    secrets: AgencySecrets
+    invalid_tags: InvalidTagLimit
+
+    def result(self) -> DriveSignal:
+        """Verify the packets against the registry as it is now, and estimate the lane."""
+        upload, files = self.upload, self.files.result()
+        terms = packet_terms(upload.context.packets or {})
+        camera, pose = _view(files, upload.context)
+        with self.database.read() as connection:
+            known = find_known(connection, upload.agency_id, self.secrets, list_numbers(files.packets), upload.again_id)
+        max_invalid_tags = self.invalid_tags.left(_holder(upload), upload.received_at)
+        read = read_packets_of(
+            files,
+            known,
+            terms,
+            max_invalid_tags,
+            received_at=upload.received_at,
+            observed_at=upload.observed_at,
+        )
+        task = _lane_task(files, read, terms, camera, pose)
+        return DriveSignal(files, read, self.processes.submit(task, wait_s=upload.wait_s).result())
+
+    def cancel(self) -> None:
+        """Stop the process."""
+        self.files.cancel()
+
+
+def _holder(upload: Upload) -> str:
+    return upload.author.key_id or upload.agency_id
+
+
+def _lane_task(
+    files: DriveFiles, read: ReadPackets, terms: PacketTerms, camera: Camera | None, pose: Pose | None
+) -> LaneTask:
+    profiles = [profile for profile in read.signal.profiles.values() if len(profile.distance_m)]
+    none = np.empty(0)
+    distance_m = np.concatenate([profile.distance_m for profile in profiles] or [none])
+    rssi_dbm = np.concatenate([profile.rssi_dbm for profile in profiles] or [none])
+    measured = np.isfinite(distance_m) & np.isfinite(rssi_dbm)
+    loss = read.signal.path_loss
+    return LaneTask(
+        lane_markers(read.merged),
+        _left_out(read),
+        files.track,
+        terms,
+        (distance_m[measured], rssi_dbm[measured]),
+        None if loss is None else (loss.at_1m_dbm, loss.exponent.value),
+        camera,
+        pose,
+    )
+
+
+def _left_out(read: ReadPackets) -> tuple[tuple[int, float, float, str], ...]:
+    found = []
+    for number, reason in read.merged.left_out.items():
+        lon_deg, lat_deg = claimed_place(number, read)
+        if lon_deg is not None and lat_deg is not None:
+            found.append((number, lon_deg, lat_deg, reason.partition(":")[0].partition(" (")[0]))
+    return tuple(found)
+
+
+def _view(files: DriveFiles, context: DecodeContext) -> tuple[Camera | None, Pose | None]:
+    """Camera of the frame, and where the vehicle was and pointed when it was taken."""
+    if files.frame is None or context.camera is None:
+        return None, None
+    camera = context.camera.camera_for(files.frame[1])
+    track = files.track
+    if track is not None and context.captured_at is not None:
+        at_s = context.captured_at.timestamp()
+        lon_deg, lat_deg = vehicle_positions(track, [at_s])[0]
+        headings = np.isfinite(track.heading_deg)
+        if np.isfinite(lon_deg) and headings.any():
+            turned = np.unwrap(track.heading_deg[headings], period=360.0)
+            heading_deg = float(np.interp(at_s, track.time_s[headings], turned)) % 360.0
+            return camera, (float(lon_deg), float(lat_deg), heading_deg)
+    coarse = context.coarse_position
+    if coarse is not None and context.heading_deg is not None:
+        return camera, (coarse.lon_deg, coarse.lat_deg, context.heading_deg)
+    return camera, None

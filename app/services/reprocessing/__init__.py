@@ -1,1 +1,0 @@
-"""Stored uploads are decoded again by the present decoders, and compared reading by reading."""

@@ -1,1 +1,0 @@
-"""Webhooks: events of an agency, sent to addresses that it chose."""
