@@ -234,7 +234,7 @@ def test_connections_have_a_number(start: Start, gate: Gate) -> None:
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n", b"GET /large HTTP/1.1\r\nHost: x\r\n\r\n"])
 def test_connections_that_are_held_lock_nobody_out(start: Start, sent: bytes) -> None:
-    port = start(ConnectionLimits(header_s=1000, stall_s=1000, total=20, per_address=5))
+    port = start(ConnectionLimits(header_s=1000, stall_s=1000, check_s=1000, total=20, per_address=5))
     attackers = [f"127.0.0.{number}" for number in range(1, 5)]
     held = [connect(port, sent, source=address) for _ in range(5) for address in attackers]
     with ExitStack() as clients:
