@@ -808,12 +808,11 @@ def rotation_of(frame: VideoFrame) -> int:
 
 def _display_matrix(frame: VideoFrame) -> tuple[float, float, float, float] | None:
     """Upper left part of the frame's display matrix (ISO/IEC 14496-12, section 8.3.2); None without one."""
-    known: Any = frame.side_data  # a mapping of its own that iterates over values
-    for side in known:
-        if side.type.name == "DISPLAYMATRIX":
-            a, b, _u, c, d, *_rest = struct.unpack_from("<9i", bytes(side))
-            return (a / 65536, b / 65536, c / 65536, d / 65536) if a or b or c or d else None
-    return None
+    side: Any = frame.side_data.get("DISPLAYMATRIX")
+    if side is None:
+        return None
+    a, b, _u, c, d, *_rest = struct.unpack_from("<9i", bytes(side))
+    return (a / 65536, b / 65536, c / 65536, d / 65536) if a or b or c or d else None
 
 
 def _plane(frame: VideoFrame, number: int) -> Pixels:

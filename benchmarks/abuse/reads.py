@@ -102,7 +102,8 @@ def main() -> int:
     parser.add_argument("--only", action="append", choices=READS)
     arguments = parser.parse_args()
     broken = 0
-    print(f"### reads of {arguments.rows} markers, {'PostgreSQL' if arguments.postgres else 'SQLite'}\n")
+    engine = "PostgreSQL" if arguments.postgres else "SQLite"
+    print(f"### abuse-reads-{engine.lower()}\n\nA registry of {arguments.rows} markers, {engine}.\n")
     print("| read | processor time | memory | /healthz | answer | abandoned | a second later | limits |")
     print("|---|---|---|---|---|---|---|---|")
     with (

@@ -6,10 +6,12 @@ import asyncio
 import errno
 import socket
 import struct
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
+from pathlib import Path
 
 import httpx
 import pytest
@@ -26,8 +28,11 @@ from app.api.http.connections import (
     LimitedConnection,
     limited_connections,
 )
+from app.demo.free_ports import free_ports
 from tests.http import WITHIN_S, wait_until
+from tests.machine import require_tool
 
+ROOT = Path(__file__).parents[3]
 LARGE_BYTES = 64 * 1024**2
 """More than the buffers of two sockets hold. [byte]"""
 Start = Callable[[ConnectionLimits], int]
@@ -229,7 +234,7 @@ def test_connections_have_a_number(start: Start, gate: Gate) -> None:
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n", b"GET /large HTTP/1.1\r\nHost: x\r\n\r\n"])
 def test_connections_that_are_held_lock_nobody_out(start: Start, sent: bytes) -> None:
-    port = start(ConnectionLimits(header_s=1000, stall_s=1000, total=20, per_address=5))
+    port = start(ConnectionLimits(header_s=1000, stall_s=1000, check_s=1000, total=20, per_address=5))
     attackers = [f"127.0.0.{number}" for number in range(1, 5)]
     held = [connect(port, sent, source=address) for _ in range(5) for address in attackers]
     with ExitStack() as clients:
@@ -247,6 +252,52 @@ def test_connections_that_are_held_lock_nobody_out(start: Start, sent: bytes) ->
 
 
 CHUNKED = b"POST /seen HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n3\r\nabc\r\n0\r\n"
+
+
+@pytest.fixture
+def proxy(tmp_path: Path) -> Iterator[Callable[[int], int]]:
+    """Start the proxy of `docker/nginx.conf` in front of the server on a port; it returns its own port."""
+    nginx = require_tool("nginx")
+    (port,) = free_ports(1)
+
+    def serve(server_port: int) -> int:
+        text = (ROOT / "docker/nginx.conf").read_text()
+        for shipped, here in (
+            ("server waymark:8000", f"server 127.0.0.1:{server_port}"),
+            ("listen 8080", f"listen 127.0.0.1:{port}"),
+            ("/tmp/", f"{tmp_path}/"),
+        ):
+            assert shipped in text
+            text = text.replace(shipped, here)
+        (tmp_path / "nginx.conf").write_text(text)
+        running.append(subprocess.Popen([nginx, "-p", str(tmp_path), "-c", "nginx.conf", "-g", "daemon off;"]))
+        wait_until(lambda: _listens(port), "nginx to start")
+        return port
+
+    running: list[subprocess.Popen[bytes]] = []
+    yield serve
+    for process in running:
+        process.terminate()
+        process.wait(WITHIN_S)
+
+
+def _listens(port: int) -> bool:
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
+        return True
+    return False
+
+
+def test_trailers_are_dropped_behind_the_shipped_proxy(start: Start, proxy: Callable[[int], int]) -> None:
+    port = proxy(start(ConnectionLimits()))
+    client = connect(port, CHUNKED + b"X-API-Key: secret\r\n\r\n")
+    client.sendall(b"GET / HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+    answers = read_all(client)
+    assert answers.count(b"HTTP/1.1 200") == 2
+    assert b"abc" in answers
+    assert b"x-api-key" not in answers
+    with connect(port, CHUNKED) as endless, suppress(ConnectionError):
+        endless.sendall(b"a:b\r\n" * 2_000_000)
+    assert httpx.get(f"http://127.0.0.1:{port}/", timeout=WITHIN_S, trust_env=False).text == "hello"
 
 
 def test_trailers_are_dropped(start: Start) -> None:
