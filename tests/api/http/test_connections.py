@@ -16,6 +16,7 @@ from pathlib import Path
 import httpx
 import pytest
 import uvicorn
+from app.demo.free_ports import free_ports
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
@@ -28,7 +29,6 @@ from app.api.http.connections import (
     LimitedConnection,
     limited_connections,
 )
-from app.demo.free_ports import free_ports
 from tests.http import WITHIN_S, wait_until
 from tests.machine import require_tool
 
