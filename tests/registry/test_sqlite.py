@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -86,8 +87,12 @@ def test_a_commit_whose_fsync_fails_is_unknown_and_its_blobs_stay(tmp_path: Path
     with pytest.raises(CommitUnknown):
         store()
     assert blobs.get(keys[0]) == b"x"
-    with pytest.raises(Unavailable, match="disk of the database"), database.write():
-        Failing.commit(Failing(":memory:"))
+    with (
+        closing(Failing(":memory:")) as failing,
+        pytest.raises(Unavailable, match="disk of the database"),
+        database.write(),
+    ):
+        failing.commit()
     database.close()
 
 

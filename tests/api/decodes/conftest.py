@@ -73,7 +73,7 @@ class Stored:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._engine = sa.create_engine(f"sqlite:///{folder / 'waymark.sqlite3'}")
+        self._engine = sa.create_engine(f"sqlite:///{folder / 'waymark.sqlite3'}", poolclass=sa.NullPool)
 
     def counts(self) -> dict[str, int]:
         """Rows and blobs."""

@@ -16,7 +16,6 @@ from pathlib import Path
 import httpx
 import pytest
 import uvicorn
-from app.demo.free_ports import free_ports
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
@@ -29,6 +28,7 @@ from app.api.http.connections import (
     LimitedConnection,
     limited_connections,
 )
+from app.demo.server import free_ports
 from tests.http import WITHIN_S, wait_until
 from tests.machine import require_tool
 
