@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 
-from app.decoders.plate import decode_symbols, detect_thermal, reader, unit_likelihoods
+from app.decoders.plate import decode_symbols, detect_thermal, evidence, reader, unit_likelihoods
 from app.decoders.plate.reader import decode_plates
 from benchmarks.plates.evaluate import find_right
 from benchmarks.plates.sets import Job, Shot, read_trials, shoot
@@ -40,13 +40,13 @@ class Threshold:
 THRESHOLDS = (
     Threshold(decode_symbols, "TEMPER", 1.0),
     Threshold(decode_symbols, "OUTLIER_CONFIDENCE", 1.0),
-    Threshold(reader, "MAX_DAMAGE", math.inf),
+    Threshold(evidence, "MAX_DAMAGE", math.inf),
     Threshold(decode_symbols, "MAX_DECIMAL_COST", math.inf),
-    Threshold(reader, "MIN_CONFIDENCE", 0.5),
-    Threshold(reader, "MIN_EXPLAINED_ALONE", 0.0),
-    Threshold(reader, "MIN_EXPLAINED_SMALL", 0.0),
-    Threshold(reader, "MIN_ROWS_ALONE", 0.0),
-    Threshold(reader, "CLEAN_EXPLAINED", 0.0),
+    Threshold(evidence, "MIN_CONFIDENCE", 0.5),
+    Threshold(evidence, "MIN_EXPLAINED_ALONE", 0.0),
+    Threshold(evidence, "MIN_EXPLAINED_SMALL", 0.0),
+    Threshold(evidence, "MIN_ROWS_ALONE", 0.0),
+    Threshold(evidence, "CLEAN_EXPLAINED", 0.0),
     Threshold(reader, "MIN_MARGIN_ALONE", -math.inf),
     Threshold(reader, "MIN_TINT_ALONE", -math.inf),
     Threshold(reader, "MIN_TRIANGLE_TINT_ALONE", -math.inf),

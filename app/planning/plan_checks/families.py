@@ -374,8 +374,8 @@ def _ecef(markers: list[PlannedMarker]) -> Floats:
 
 
 ROWS_PER_UNIT = 2.0
-"""Rows of the image that a unit must cover to be readable. [px] Source: the decoder's bound of 1.5 rows for digits that
-nothing else confirms (docs/decisions/0010), with a third in reserve."""
+"""Rows of the image that a unit must cover to be readable. [px] Source: the decoder's bound of rows for digits that
+nothing else confirms is 1.25 (docs/decisions/0010); the rest is in reserve."""
 MAX_BLUR_UNITS = 1.0
 """Units that a plate may move during the exposure. Source: PolyU trials (docs/benchmarks.md): 80 km/h with 1/1000 s is
 0.6 units and read."""

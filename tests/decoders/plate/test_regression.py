@@ -8,6 +8,7 @@ from app.decoders.plate.reader import decode_plates
 from app.markers.reading import PlateOutcome
 from benchmarks.plates.evaluate import Record, evaluate_job
 from benchmarks.plates.sets import Job, Shot, find_shot, read_trials
+from benchmarks.plates.thresholds import THRESHOLDS
 
 pytestmark = pytest.mark.slow
 
@@ -60,3 +61,7 @@ def test_a_look_alike_is_not_read(name: str, index: int, seed: int, number: int,
     readings = decode_plates(shot.frame.image)
     assert [reading.digits for reading in readings if reading.digits] == []
     assert outcome in {reading.outcome for reading in readings}
+
+
+def test_the_decoder_has_the_thresholds_that_the_benchmark_takes_out() -> None:
+    assert all(threshold.value is not None for threshold in THRESHOLDS)
