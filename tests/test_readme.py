@@ -105,7 +105,7 @@ def test_every_benchmark_has_its_block() -> None:
     planning = [f"planning-{item}" for item in ("run", *PLANNING)]
     hunts = [f"hunt-{family}" for family in HUNTED]
     blocks = ["demo", "run", *hunts, *PLATES, *magnets, *cerpm, *imports, *registry, *planning, *service]
-    blocks += ["bundle", "http", "video", "track", "health"]
+    blocks += ["bundle", "http", "video", "track", "health", "abuse", "abuse-reads-sqlite", "abuse-reads-postgresql"]
     filled = [name for page in PAGES for name in re.findall(r"<!-- bench:([\w-]+) -->", page.read_text())]
     assert sorted(filled) == sorted(blocks)
 

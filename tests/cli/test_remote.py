@@ -240,9 +240,10 @@ def test_an_upload_goes_on_in_the_next_run_of_the_command(
     run: Callable[..., Result], cut: Callable[[int], Cut], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = long_archive(tmp_path / "drive.zip")
-    monkeypatch.setattr("app.cli.remote._PAUSES_S", ())
     cut(1)
-    broken = run("upload", str(path))
+    with monkeypatch.context() as impatient:
+        impatient.setattr("app.cli.remote._PAUSES_S", ())
+        broken = run("upload", str(path))
     assert broken.exit_code == 1
     assert "run the command again" in str(getattr(broken.exception, "cure", ""))
     connection = cut(0)
