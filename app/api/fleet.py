@@ -249,13 +249,13 @@ class ProfileIn(StrictModel):
     packets: PacketsIn | None = Field(None, description="Receiver, poses and clock of packet logs; {} for the usual.")
 
     def given(self) -> dict[str, Any]:
-        """What was said and nothing else."""
+        """The values that the request sets."""
         return self.model_dump(exclude_unset=True, exclude_none=True)
 
     def sections(self) -> dict[str, Any]:
-        """Sections that were named; None for those to take out."""
-        said = self.given()
-        return {name: said.get(name) for name in self.model_fields_set}
+        """Sections that the request names; None for those that are removed."""
+        values = self.given()
+        return {name: values.get(name) for name in self.model_fields_set}
 
 
 def _checked_name(name: str) -> str:

@@ -222,7 +222,7 @@ def _module_px(corners_px: Floats, n: int) -> float:
 # === Corners of a sign and the camera -> pose of the sign.
 #
 # IPPE gives the two poses of a square in closed form (Collins and Bartoli, IJCV 109, 2014). Signs are mounted plumb or
-# flat, and the mount says how the camera is held, so the pose that fits both is taken, and a few Gauss-Newton steps
+# flat, and the mount gives the camera's attitude: the pose that fits both is taken, and a few Gauss-Newton steps
 # weigh the corners against the mounting.
 
 

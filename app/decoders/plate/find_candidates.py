@@ -124,7 +124,7 @@ def candidate_features(signal: MarkerSignal, quads: Sequence[MarkerQuad], geomet
 def candidate_log_odds(signal: MarkerSignal, quads: Sequence[MarkerQuad], geometry: PlateGeometry) -> Floats:
     """Logarithms of the odds that candidates are plates of a geometry whose fit succeeds, shape (Q,).
 
-    Parameters as of `candidate_features`. Source: logistic regression, as `WEIGHTS` says.
+    Parameters as of `candidate_features`. Source: logistic regression, fitted like `WEIGHTS`.
     """
     features = candidate_features(signal, quads, geometry)
     log_odds = features @ WEIGHTS[:-1] + WEIGHTS[-1]
