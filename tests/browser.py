@@ -68,7 +68,13 @@ class Browser:
         os.close(self._read)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """One command of the DevTools protocol and its answer."""
+        """One command of the DevTools protocol and its result."""
+        answer = self._answer(method, parameters)
+        assert "error" not in answer, f"{method}: {answer['error']}"
+        result: dict[str, Any] = answer["result"]
+        return result
+
+    def _answer(self, method: str, parameters: dict[str, Any]) -> dict[str, Any]:
         self._last += 1
         message: dict[str, Any] = {"id": self._last, "method": method, "params": parameters}
         if self._session:
@@ -78,9 +84,7 @@ class Browser:
         while True:
             answer = self._next(deadline)
             if answer.get("id") == self._last:
-                assert "error" not in answer, f"{method}: {answer['error']}"
-                result: dict[str, Any] = answer["result"]
-                return result
+                return answer
             self._note(answer)
 
     def run(self, script: str) -> Any:
@@ -97,9 +101,10 @@ class Browser:
     def until(self, condition: str) -> Any:
         """Wait until an expression is true in the page; one that fails, as in a page just replaced, is not true."""
         deadline = time.monotonic() + WITHIN_S
+        evaluation = {"expression": condition, "awaitPromise": True, "returnByValue": True}
         while True:
-            answer = self.call("Runtime.evaluate", expression=condition, awaitPromise=True, returnByValue=True)
-            if value := answer["result"].get("value"):
+            answer = self._answer("Runtime.evaluate", evaluation)  # an error if the page is replaced meanwhile
+            if value := answer.get("result", {}).get("result", {}).get("value"):
                 return value
             assert time.monotonic() < deadline, f"never came true: {condition}; {answer}; {self.complaints}"
             time.sleep(0.05)
