@@ -104,21 +104,11 @@ _LOG = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class MqttSource:
-    """The broker that uplinks come from.
+    """The broker that uplinks come from."""
 
-    Attributes
-    ----------
-    url : str
-        mqtt://[USER:PASSWORD@]HOST[:PORT], or mqtts:// for TLS.
-    topics : tuple of str
-        ChirpStack v4 and The Things Stack v3 unless others are named.
-    client_id : str
-        The broker keeps what it could not deliver under this name.
-    """
-
-    url: str
-    topics: tuple[str, ...] = DEFAULT_TOPICS
-    client_id: str = "waymark-ingest"
+    url: str  # mqtt://[USER:PASSWORD@]HOST[:PORT], or mqtts:// for TLS
+    topics: tuple[str, ...] = DEFAULT_TOPICS  # ChirpStack v4 and The Things Stack v3 unless others are named
+    client_id: str = "waymark-ingest"  # the broker keeps what it could not deliver under this name
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
@@ -134,21 +124,13 @@ class MqttSource:
 
 @dataclass(frozen=True, slots=True)
 class Sink:
-    """The server that packet logs are sent to.
+    """The server that packet logs are sent to."""
 
-    Attributes
-    ----------
-    server, key : str
-        Waymark's URL and a key with the scope `vehicle`.
-    context : dict
-        Of each upload, as POST /v1/decodes takes it.
-    batch_messages, batch_s : int, float
-        A batch is sent when it has so many messages, or is so old. [s]
-    """
-
+    # `server`, `key`: waymark's URL and a key with the scope `vehicle`
     server: str
     key: str
-    context: dict[str, Any] = field(default_factory=dict)
+    context: dict[str, Any] = field(default_factory=dict)  # of each upload, as POST /v1/decodes takes it
+    # `batch_messages`, `batch_s`: [s] a batch is sent when it has so many messages, or is so old
     batch_messages: int = 1000
     batch_s: float = 10.0
 

@@ -29,39 +29,21 @@ class FiducialOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FiducialReading:
-    """One candidate sign in a frame.
-
-    Attributes
-    ----------
-    outcome : FiducialOutcome
-    corners_px : ndarray, shape (4, 2)
-        Outer corners of the border, clockwise from the sign's upper left, pixel centres at integers. [px]
-    code : FiducialCode or None
-    confidence : float
-        Posterior probability of the most likely code, 0 to 1.
-    bit_errors : int
-        Modules that differ from the most likely code.
-    contrast : float
-        Quiet zone minus border. [grey levels]
-    side_px : float
-        Mean length of the sides. [px]
-    pose : PlatePose or None
-        Of a sign whose dimensions are known, in a frame whose camera is known. Its axes are x right, y travel, z up,
-        as a plate's, whatever the sign's mounting.
-    reason : str
-        Why the code was refused.
-    """
+    """One candidate sign in a frame."""
 
     family: ClassVar[str] = "fiducial"
     outcome: FiducialOutcome
+    # shape (4, 2): [px] outer corners of the border, clockwise from the sign's upper left, pixel centres at integers
     corners_px: npt.NDArray[np.float64]
     code: FiducialCode | None
-    confidence: float
-    bit_errors: int
-    contrast: float
-    side_px: float
+    confidence: float  # posterior probability of the most likely code, 0 to 1
+    bit_errors: int  # modules that differ from the most likely code
+    contrast: float  # [grey levels] quiet zone minus border
+    side_px: float  # [px] mean length of the sides
+    # of a sign whose dimensions are known, in a frame whose camera is known. Its axes are x right, y travel, z up, as a
+    # plate's, whatever the sign's mounting.
     pose: PlatePose | None = None
-    reason: str = ""
+    reason: str = ""  # why the code was refused
 
 
 # === Frame -> candidate squares -> the grey values of their modules.
@@ -85,27 +67,13 @@ _MIN_CONTRAST = 20.0  # [grey levels] of 255 between border and quiet zone; chos
 
 @dataclass(frozen=True, slots=True)
 class SampledSquare:
-    """A candidate with the values of its modules.
+    """A candidate with the values of its modules."""
 
-    Attributes
-    ----------
-    corners_px : ndarray, shape (4, 2)
-        Clockwise from any corner. [px]
-    darkness : ndarray, shape (n, n)
-        0 is the level of the quiet zone, 1 that of the border.
-    spread : float
-        Standard deviation of border and quiet zone in the same unit.
-    contrast : float
-        [grey levels]
-    middle : float
-        Grey value between the levels of border and quiet zone.
-    """
-
-    corners_px: Floats
-    darkness: Floats
-    spread: float
-    contrast: float
-    middle: float
+    corners_px: Floats  # shape (4, 2): [px] clockwise from any corner
+    darkness: Floats  # shape (n, n): 0 is the level of the quiet zone, 1 that of the border
+    spread: float  # standard deviation of border and quiet zone in the same unit
+    contrast: float  # [grey levels]
+    middle: float  # grey value between the levels of border and quiet zone
 
 
 def detect_squares(grey: Image) -> list[Floats]:

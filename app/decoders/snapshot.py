@@ -48,33 +48,14 @@ _CURE = "fetch the snapshot again"
 
 @dataclass(frozen=True, slots=True)
 class SnapshotMarker:
-    """A marker of a snapshot.
+    """A marker of a snapshot."""
 
-    Attributes
-    ----------
-    marker_id, family, status, code : str
-        The code is digits of a plate, text of a tag, or number of a CERPM.
-    lon_deg, lat_deg : float
-        WGS 84 / ITRF. [deg]
-    height_m, heading_deg, horizontal_rmse_m, vertical_rmse_m, heading_rmse_deg : float or None
-    ellipsoidal : bool
-        The height is above the ellipsoid.
-    exact : bool
-        Fit for localization by its survey and its reference frame.
-    kind : mapping
-        What it has in common with others: scheme and geometry, or side and speed limit.
-    distance_m : float
-        From the place it was looked for. [m]
-    lane_start_deg : (float, float) or None
-        Longitude and latitude of where the lane of an information tag begins. [deg]
-    earlier_spans : SequenceSpan or None
-        First and last transmission of a CERPM that the server accepted.
-    """
-
+    # `marker_id`, `family`, `status`, `code`: the code is digits of a plate, text of a tag, or number of a CERPM
     marker_id: str
     family: str
     status: str
     code: str
+    # `lon_deg`, `lat_deg`: [deg] WGS 84 / ITRF
     lon_deg: float
     lat_deg: float
     height_m: float | None
@@ -82,12 +63,13 @@ class SnapshotMarker:
     horizontal_rmse_m: float | None
     vertical_rmse_m: float | None
     heading_rmse_deg: float | None
-    ellipsoidal: bool
-    exact: bool
-    kind: Mapping[str, Any]
-    distance_m: float
+    ellipsoidal: bool  # the height is above the ellipsoid
+    exact: bool  # fit for localization by its survey and its reference frame
+    kind: Mapping[str, Any]  # what it has in common with others: scheme and geometry, or side and speed limit
+    distance_m: float  # [m] from the place it was looked for
+    # [deg] longitude and latitude of where the lane of an information tag begins
     lane_start_deg: tuple[float, float] | None = None
-    earlier_spans: SequenceSpan | None = None
+    earlier_spans: SequenceSpan | None = None  # first and last transmission of a CERPM that the server accepted
 
     @property
     def plate_code(self) -> PlateCode:

@@ -59,20 +59,12 @@ class LaneDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BuiltLane:
-    """What was registered and programmed.
-
-    Attributes
-    ----------
-    markers : list of dict
-        As the registry has them.
-    keys : dict of int to bytes
-        As the programming station got them.
-    """
+    """What was registered and programmed."""
 
     lane: TrueLane
     installed: InstalledMarkers
-    markers: list[dict[str, Any]]
-    keys: dict[int, bytes]
+    markers: list[dict[str, Any]]  # as the registry has them
+    keys: dict[int, bytes]  # as the programming station got them
     table: str
 
 

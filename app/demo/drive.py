@@ -29,22 +29,13 @@ _STEP_M = 0.5
 
 @dataclass(frozen=True, slots=True)
 class LanePlace:
-    """A place on a lane's centre line.
+    """A place on a lane's centre line."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg : float
-        [deg]
-    heading_deg : float
-        Direction of travel, clockwise from true north. [deg]
-    chainage_m : float
-        Along the lane. [m]
-    """
-
+    # `lon_deg`, `lat_deg`: [deg]
     lon_deg: float
     lat_deg: float
-    heading_deg: float
-    chainage_m: float
+    heading_deg: float  # [deg] direction of travel, clockwise from true north
+    chainage_m: float  # [m] along the lane
 
 
 def list_lane_places(lane: dict[str, Any], chainages_m: npt.ArrayLike, height_m: float) -> list[LanePlace]:
@@ -131,25 +122,15 @@ class DemoPlate:
 
 @dataclass(frozen=True, slots=True)
 class DemoFrame:
-    """A frame and the truth about it.
-
-    Attributes
-    ----------
-    jpeg : bytes
-    rows : float
-        Height of the plate's image. [px]
-    lon_deg, lat_deg, heading_deg : float
-        Of the vehicle. [deg]
-    context : dict
-        What is uploaded with the frame: a coarse position some metres off, heading, camera.
-    """
+    """A frame and the truth about it."""
 
     jpeg: bytes
-    rows: float
+    rows: float  # [px] height of the plate's image
+    # `lon_deg`, `lat_deg`, `heading_deg`: [deg] of the vehicle
     lon_deg: float
     lat_deg: float
     heading_deg: float
-    context: dict[str, Any]
+    context: dict[str, Any]  # what is uploaded with the frame: a coarse position some metres off, heading, camera
 
 
 def list_plates(rng: np.random.Generator) -> list[DemoPlate]:

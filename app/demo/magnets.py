@@ -57,17 +57,10 @@ TAGS_M = (40.0, 95.0, 190.0, 240.0, 320.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lane:
-    """The lane as it is driven, the legal way or against it.
-
-    Attributes
-    ----------
-    road : Road
-    shift_m : ndarray, shape (2,)
-        What leads from the road's world to east and north of `ORIGIN`. [m]
-    """
+    """The lane as it is driven, the legal way or against it."""
 
     road: Road
-    shift_m: Floats
+    shift_m: Floats  # shape (2,): [m] what leads from the road's world to east and north of `ORIGIN`
 
     @classmethod
     def legal(cls) -> Lane:

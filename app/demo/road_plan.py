@@ -30,18 +30,10 @@ _HEAD = ("condition", "read", "passes", "read", "share", "95 % interval")
 
 @dataclass(slots=True)
 class PlanResult:
-    """A plan that was placed, checked, costed and proved.
+    """A plan that was placed, checked, costed and proved."""
 
-    Attributes
-    ----------
-    plan : dict
-        As the server has it.
-    proof : dict
-        Its report.
-    """
-
-    plan: dict[str, Any]
-    proof: dict[str, Any] = field(default_factory=dict)
+    plan: dict[str, Any]  # as the server has it
+    proof: dict[str, Any] = field(default_factory=dict)  # its report
 
     @property
     def path_rms_m(self) -> list[float]:

@@ -34,13 +34,7 @@ _HEAD = ("plate", "scheme", "digits", "in view", "decoded", "wrong", "matched", 
 
 @dataclass(slots=True)
 class Pass:
-    """Result of one drive over a plate.
-
-    Attributes
-    ----------
-    position_errors_m, heading_errors_deg : list of float
-        Of the vehicle, horizontal, for each frame with a fix.
-    """
+    """Result of one drive over a plate."""
 
     name: str
     scheme: str
@@ -49,6 +43,7 @@ class Pass:
     decoded: int = 0
     wrong: int = 0
     matched: int = 0
+    # `position_errors_m`, `heading_errors_deg`: of the vehicle, horizontal, for each frame with a fix
     position_errors_m: list[float] = field(default_factory=list)
     heading_errors_deg: list[float] = field(default_factory=list)
 
@@ -61,27 +56,17 @@ class Pass:
 
 @dataclass(slots=True)
 class TraceResult:
-    """Result of one drive over magnets.
-
-    Attributes
-    ----------
-    passed, found, false : int
-        Magnets under the bar, those decoded with the right polarity and orientation, readings without a magnet.
-    tags, right, matched, wrong, flagged : int
-        Tags on the road, decoded correctly, matched with their own marker, decoded as something else, reported as
-        passed the wrong way.
-    deviations : list of float
-        Measured over true distance ratio.
-    along_m, across_m : list of float
-        Errors of the vehicle's position at a tag. [m]
-    departures : dict of line style to (true positives, actual, false positives)
-    """
+    """Result of one drive over magnets."""
 
     name: str
     clearance_m: float
     speed_kmh: float
     wrong_way: bool
+    # `tags`, `right`, `matched`, `wrong`, `flagged`: tags on the road, decoded correctly, matched with their own
+    # marker, decoded as something else, reported as passed the wrong way
     tags: int
+    # `passed`, `found`, `false`: magnets under the bar, those decoded with the right polarity and orientation, readings
+    # without a magnet
     passed: int = 0
     found: int = 0
     false: int = 0
@@ -89,7 +74,8 @@ class TraceResult:
     matched: int = 0
     wrong: int = 0
     flagged: int = 0
-    deviations: list[float] = field(default_factory=list)
+    deviations: list[float] = field(default_factory=list)  # measured over true distance ratio
+    # `along_m`, `across_m`: [m] errors of the vehicle's position at a tag
     along_m: list[float] = field(default_factory=list)
     across_m: list[float] = field(default_factory=list)
     departures: dict[str, tuple[int, int, int]] = field(default_factory=dict)
@@ -104,38 +90,23 @@ class TraceResult:
 
 @dataclass(slots=True)
 class LaneResult:
-    """Result of one drive past CERPMs.
-
-    Attributes
-    ----------
-    packets, authentic, true_packets : int
-        Uploaded packets, accepted ones, and those that the markers themselves sent in this drive.
-    left_out : list of int
-        Numbers of the markers that the path leaves out.
-    moved : int or None
-        Number of the marker that sends a wrong position.
-    path_rms_m, path_max_m : float
-        Of the path from the lane's true centre line. [m]
-    coverage : float
-        Share of the true centre line that has a path.
-    track_rms_m : float
-        Of the vehicle's own track from it. [m]
-    steering_rms_m : float
-        Of a simulated drive along the path. [m]
-    """
+    """Result of one drive past CERPMs."""
 
     name: str
     markers: int
+    # `packets`, `authentic`, `true_packets`: uploaded packets, accepted ones, and those that the markers themselves
+    # sent in this drive
     packets: int
     authentic: int
     true_packets: int
-    left_out: list[int]
-    moved: int | None
+    left_out: list[int]  # numbers of the markers that the path leaves out
+    moved: int | None  # number of the marker that sends a wrong position
+    # `path_rms_m`, `path_max_m`: [m] of the path from the lane's true centre line
     path_rms_m: float = math.nan
     path_max_m: float = math.nan
-    coverage: float = 0.0
-    track_rms_m: float = math.nan
-    steering_rms_m: float = math.nan
+    coverage: float = 0.0  # share of the true centre line that has a path
+    track_rms_m: float = math.nan  # [m] of the vehicle's own track from it
+    steering_rms_m: float = math.nan  # [m] of a simulated drive along the path
 
     @property
     def is_good(self) -> bool:

@@ -88,23 +88,12 @@ def _steps(value: float, step: float, zero: float = 0.0) -> int:
 
 @dataclass(frozen=True, slots=True)
 class ExplainedBytes:
-    """Some bytes of a message and their meaning.
+    """Some bytes of a message and their meaning."""
 
-    Attributes
-    ----------
-    offset : int
-        Of the first of them.
-    hex : str
-        Two digits a byte.
-    field : str
-    value : str
-        For people, with its unit.
-    """
-
-    offset: int
-    hex: str
+    offset: int  # of the first of them
+    hex: str  # two digits a byte
     field: str
-    value: str
+    value: str  # for people, with its unit
 
 
 def explain_payload(payload: bytes, key: bytes | None = None) -> tuple[ExplainedBytes, ...]:

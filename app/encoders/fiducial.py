@@ -34,25 +34,13 @@ _UP = {Mounting.UPRIGHT: "this edge is up", Mounting.LYING: "this edge points in
 
 @dataclass(frozen=True, slots=True)
 class FiducialOrder:
-    """One sign to make.
+    """One sign to make."""
 
-    Attributes
-    ----------
-    sign_id : str
-        The registry's name for it.
-    code : FiducialCode
-    geometry : FiducialGeometry
-    record_url : str
-        Address of the marker's public page, for the QR code on the margin; empty for none.
-    revision : int
-        Revision of the record that the artwork shows.
-    """
-
-    sign_id: str
+    sign_id: str  # the registry's name for it
     code: FiducialCode
     geometry: FiducialGeometry
-    record_url: str = ""
-    revision: int = 1
+    record_url: str = ""  # address of the marker's public page, for the QR code on the margin; empty for none
+    revision: int = 1  # revision of the record that the artwork shows
 
 
 def encode_fiducial(order: FiducialOrder) -> Drawing:

@@ -30,23 +30,12 @@ from fontTools.ttLib import TTFont
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Typeface:
-    """One weight of the typeface.
+    """One weight of the typeface."""
 
-    Attributes
-    ----------
-    content : bytes
-        The TrueType file.
-    font : fontTools.ttLib.TTFont
-    glyphs : mapping of str to glyph
-        Outlines by the names of glyphs.
-    names : dict of int to str
-        Name of the glyph of each character that the typeface has.
-    """
-
-    content: bytes
+    content: bytes  # the TrueType file
     font: Any
-    glyphs: Any
-    names: dict[int, str]
+    glyphs: Any  # outlines by the names of glyphs
+    names: dict[int, str]  # name of the glyph of each character that the typeface has
 
     @property
     def units_per_em(self) -> int:

@@ -42,15 +42,9 @@ class ArtworkProof:
 
 
 class MarkerArtwork(ABC):
-    """Drawings of a family's markers at true size.
+    """Drawings of a family's markers at true size."""
 
-    Attributes
-    ----------
-    version : str
-        Changes when the same marker would get another drawing.
-    """
-
-    version: str
+    version: str  # changes when the same marker would get another drawing
 
     @abstractmethod
     def draw(self, row: MarkerRow, options: ArtworkOptions, *, record_url: str) -> Drawing:
@@ -75,18 +69,10 @@ class MarkerArtwork(ABC):
 
 @dataclass(frozen=True, slots=True)
 class MarkerSheet:
-    """Sheets of a family's markers for the crew.
+    """Sheets of a family's markers for the crew."""
 
-    Attributes
-    ----------
-    version : int
-        Goes up when the same marker would get another sheet.
-    write : callable
-        The sheet of a marker in a format.
-    """
-
-    version: int
-    write: Callable[[MarkerRow, SheetFormat], bytes]
+    version: int  # goes up when the same marker would get another sheet
+    write: Callable[[MarkerRow, SheetFormat], bytes]  # the sheet of a marker in a format
 
 
 # === Parts of readings as clients see them, which every family has.
@@ -150,50 +136,25 @@ class ApproximatePosition(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Nearby:
-    """The agency's markers of one family that could be in view.
+    """The agency's markers of one family that could be in view."""
 
-    Attributes
-    ----------
-    rows : tuple of row
-        Nearest first.
-    complete : bool
-        False if there are more than a search may hold.
-    """
-
-    rows: tuple[MarkerRow, ...] = ()
-    complete: bool = True
+    rows: tuple[MarkerRow, ...] = ()  # nearest first
+    complete: bool = True  # False if there are more than a search may hold
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """The registered marker that a reading is of, or where an unregistered one would be.
+    """The registered marker that a reading is of, or where an unregistered one would be."""
 
-    Attributes
-    ----------
-    row : row or None
-        The registered marker.
-    lon_deg, lat_deg : float or None
-        Of the registered marker, or by the digits of an unregistered one. [deg]
-    distance_m : float or None
-        From the approximate position. [m]
-    plausible : bool
-        Whether that is within the accuracy of the approximate position and the range of view.
-    others : tuple of str
-        Ids of further markers with the same code within reach.
-    note : str
-        What to know about the match.
-    fits_two_places : bool
-        The digits of an unregistered marker fit two places within reach.
-    """
-
-    row: MarkerRow | None
+    row: MarkerRow | None  # the registered marker
+    # `lon_deg`, `lat_deg`: [deg] of the registered marker, or by the digits of an unregistered one
     lon_deg: float | None = None
     lat_deg: float | None = None
-    distance_m: float | None = None
-    plausible: bool = False
-    others: tuple[str, ...] = ()
-    note: str = ""
-    fits_two_places: bool = False
+    distance_m: float | None = None  # [m] from the approximate position
+    plausible: bool = False  # whether that is within the accuracy of the approximate position and the range of view
+    others: tuple[str, ...] = ()  # ids of further markers with the same code within reach
+    note: str = ""  # what to know about the match
+    fits_two_places: bool = False  # the digits of an unregistered marker fit two places within reach
 
     @property
     def ambiguous(self) -> bool:
@@ -206,15 +167,9 @@ SearchT = TypeVar("SearchT")
 
 
 class FrameReader(ABC, Generic[ReadingT, SearchT]):
-    """Searches frames for the markers of a family, and matches what was read against the registry.
+    """Searches frames for the markers of a family, and matches what was read against the registry."""
 
-    Attributes
-    ----------
-    document_type : type
-        Shape of a reading as clients see it.
-    """
-
-    document_type: ClassVar[Any]
+    document_type: ClassVar[Any]  # shape of a reading as clients see it
 
     @abstractmethod
     def search(self, nearby: Nearby, camera: Camera | None) -> SearchT | None:
@@ -261,15 +216,9 @@ def distance_to_row(row: MarkerRow, position: ApproximatePosition) -> float:
 
 
 class SnapshotRecord(ABC):
-    """A family's part of a snapshot.
+    """A family's part of a snapshot."""
 
-    Attributes
-    ----------
-    with_retired : bool
-        Whether retired markers are in snapshots too.
-    """
-
-    with_retired: bool = False
+    with_retired: bool = False  # whether retired markers are in snapshots too
 
     def columns(self) -> tuple[sa.ColumnElement[Any], ...]:
         """What is read of the spec of each marker, with labels; the whole spec without any."""
@@ -293,73 +242,33 @@ Prepared = TypeVar("Prepared")
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """What a family may ask while it registers or changes a marker.
+    """What a family may ask while it registers or changes a marker."""
 
-    Attributes
-    ----------
-    agency_id : str
-        Agency of the marker.
-    now : datetime
-    rules : MarkerRules
-    database : Database
-        For reads before the transaction begins, such as a codebook, which never changes.
-    random_bits : callable
-        Source of the registry numbers that plates get.
-    """
-
-    agency_id: str
+    agency_id: str  # agency of the marker
     now: datetime
     rules: MarkerRules
-    database: Database
-    random_bits: Callable[[int], int] = secrets.randbits
+    database: Database  # for reads before the transaction begins, such as a codebook, which never changes
+    random_bits: Callable[[int], int] = secrets.randbits  # source of the registry numbers that plates get
 
 
 class Family(ABC, Generic[New, Prepared]):
-    """One family of markers: everything that distinguishes it from the others.
+    """One family of markers: everything that distinguishes it from the others."""
 
-    Attributes
-    ----------
-    name : str
-        As it is stored and as clients send it.
-    label, title : str
-        One marker in a sentence, and the family in a heading.
-    schema : type of MarkerIn
-        Body of a request that registers a marker.
-    examples : sequence of JSON value
-        Bodies that the API's documentation shows.
-    lines : LineSource or None
-        Lines that the family's markers make along a road.
-    survey : SurveyImport or None
-        How points of a survey become the family's markers.
-    artwork : MarkerArtwork or None
-        Drawing of a marker at true size, for the workshop.
-    frames : FrameReader or None
-        How the family's markers are read in camera frames.
-    sheet : MarkerSheet or None
-        Sheet of a marker for the crew that builds it.
-    planned : PlannedMarkers or None
-        How markers of a plan become the family's markers.
-    snapshot : SnapshotRecord
-        What vehicles get of a marker in the snapshot of an area.
-    change : type of FamilyChange or None
-        Members of a change that only this family has.
-    document_type, detail_type : type
-        Shapes of a marker in lists and histories, and by itself.
-    """
-
-    name: ClassVar[str]
+    name: ClassVar[str]  # as it is stored and as clients send it
+    # `label`, `title`: one marker in a sentence, and the family in a heading
     label: ClassVar[str]
     title: ClassVar[str]
-    schema: ClassVar[type[MarkerIn]]
-    examples: ClassVar[Sequence[JsonValue]]
-    change: ClassVar[type[FamilyChange] | None] = None
-    snapshot: ClassVar[SnapshotRecord]
-    lines: ClassVar[LineSource | None] = None
-    survey: ClassVar[SurveyImport[Any] | None] = None
-    artwork: ClassVar[MarkerArtwork | None] = None
-    frames: ClassVar[FrameReader[Any, Any] | None] = None
-    sheet: ClassVar[MarkerSheet | None] = None
-    planned: ClassVar[PlannedMarkers | None] = None
+    schema: ClassVar[type[MarkerIn]]  # body of a request that registers a marker
+    examples: ClassVar[Sequence[JsonValue]]  # bodies that the API's documentation shows
+    change: ClassVar[type[FamilyChange] | None] = None  # members of a change that only this family has
+    snapshot: ClassVar[SnapshotRecord]  # what vehicles get of a marker in the snapshot of an area
+    lines: ClassVar[LineSource | None] = None  # lines that the family's markers make along a road
+    survey: ClassVar[SurveyImport[Any] | None] = None  # how points of a survey become the family's markers
+    artwork: ClassVar[MarkerArtwork | None] = None  # drawing of a marker at true size, for the workshop
+    frames: ClassVar[FrameReader[Any, Any] | None] = None  # how the family's markers are read in camera frames
+    sheet: ClassVar[MarkerSheet | None] = None  # sheet of a marker for the crew that builds it
+    planned: ClassVar[PlannedMarkers | None] = None  # how markers of a plan become the family's markers
+    # `document_type`, `detail_type`: shapes of a marker in lists and histories, and by itself
     document_type: ClassVar[Any]
     detail_type: ClassVar[Any]
 

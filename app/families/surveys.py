@@ -52,26 +52,15 @@ def is_placed_anew(row: MarkerRow, values: dict[str, Any]) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NewMarker:
-    """Members that markers of every family have; each family adds its own.
+    """Members that markers of every family have; each family adds its own."""
 
-    Attributes
-    ----------
-    family : str
-        Name of the family.
-    status : str
-    heading_rmse_deg : float or None
-    road : str or None
-    measure_m, offset_m : float or None
-    kind, reason : str or None
-        Kind of the first version in the marker's history, and why it was made.
-    """
-
-    family: ClassVar[str]
+    family: ClassVar[str]  # name of the family
     status: str = PLANNED
     heading_rmse_deg: float | None = None
     road: str | None = None
     measure_m: float | None = None
     offset_m: float | None = None
+    # `kind`, `reason`: kind of the first version in the marker's history, and why it was made
     kind: str | None = None
     reason: str | None = None
 
@@ -98,26 +87,14 @@ class PlannedRow(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Commitment:
-    """What a family needs to know of a plan that is committed.
-
-    Attributes
-    ----------
-    plan_id : str
-    alignment : Alignment
-    rules : MarkerRules
-    now : datetime
-    codebook_id : str or None
-        Of the tags.
-    radio : RadioSettings
-        Of the CERPMs.
-    """
+    """What a family needs to know of a plan that is committed."""
 
     plan_id: str
     alignment: Alignment
     rules: MarkerRules
     now: datetime
-    codebook_id: str | None = None
-    radio: RadioSettings = field(default_factory=RadioSettings)
+    codebook_id: str | None = None  # of the tags
+    radio: RadioSettings = field(default_factory=RadioSettings)  # of the CERPMs
 
     def original(self, marker: PlannedMarker) -> dict[str, Any]:
         """Where a planned marker's position comes from."""
@@ -150,15 +127,9 @@ class Commitment:
 
 
 class PlannedMarkers(ABC):
-    """The part of committing a plan that only one family knows.
+    """The part of committing a plan that only one family knows."""
 
-    Attributes
-    ----------
-    needs_index : bool
-        Whether `Family.index` stores something for these markers.
-    """
-
-    needs_index: ClassVar[bool] = False
+    needs_index: ClassVar[bool] = False  # whether `Family.index` stores something for these markers
 
     @abstractmethod
     def rows(self, commitment: Commitment, markers: Sequence[PlannedMarker]) -> Iterator[PlannedRow]:
@@ -189,22 +160,11 @@ Flags = npt.NDArray[np.bool_]
 
 @dataclass(slots=True)
 class RowCodes:
-    """Codes of the rows of a survey that can have one.
+    """Codes of the rows of a survey that can have one."""
 
-    Attributes
-    ----------
-    rows : ndarray of int, shape (N,)
-        Indices of the rows, rising.
-    digits : ndarray of bytes, shape (N,)
-        Empty where a code is still to be assigned.
-    from_file : ndarray of bool, shape (N,)
-        Whether the file has it.
-    scheme : str
-    """
-
-    rows: Rows
-    digits: Digits
-    from_file: Flags
+    rows: Rows  # shape (N,): indices of the rows, rising
+    digits: Digits  # shape (N,): empty where a code is still to be assigned
+    from_file: Flags  # bool, shape (N,): whether the file has it
     scheme: str
 
     def of(self, chosen: Flags | slice) -> RowCodes:
@@ -246,15 +206,9 @@ DefaultsT = TypeVar("DefaultsT")
 
 
 class SurveyImport(ABC, Generic[DefaultsT]):
-    """The part of an import that only one family knows: its codes, its columns, and when two codes collide.
+    """The part of an import that only one family knows: its codes, its columns, and when two codes collide."""
 
-    Attributes
-    ----------
-    members : type of pydantic model
-        Members of a survey's declaration that only this family has.
-    """
-
-    members: ClassVar[type[BaseModel]]
+    members: ClassVar[type[BaseModel]]  # members of a survey's declaration that only this family has
 
     @abstractmethod
     def defaults(self, declared: Mapping[str, Any]) -> DefaultsT:

@@ -133,20 +133,11 @@ class Confidence(IntEnum):
 
 @dataclass(frozen=True)
 class Sample:
-    """What detection looks at.
+    """What detection looks at."""
 
-    Attributes
-    ----------
-    name : str
-        Of the file; its suffix is a hint.
-    data : bytes
-        The file, or its beginning.
-    declared : mapping of str to str
-        Names of columns that the uploader declares, by quantity.
-    """
-
-    name: str
-    data: bytes
+    name: str  # of the file; its suffix is a hint
+    data: bytes  # the file, or its beginning
+    # names of columns that the uploader declares, by quantity
     declared: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -190,26 +181,13 @@ _START_CHARS = 1 << 16  # [character] chosen by hand
 
 @dataclass(frozen=True, slots=True)
 class Format(Generic[ReadT_co]):
-    """A format of uploaded files.
+    """A format of uploaded files."""
 
-    Attributes
-    ----------
-    name : str
-        As reports and declarations have it.
-    use : Use
-    description : str
-        For messages that list what is accepted.
-    detect : callable
-        How sure it is that a sample has this format.
-    read : callable
-        Reads a file; each use has its own parameters.
-    """
-
-    name: str
+    name: str  # as reports and declarations have it
     use: Use
-    description: str
-    detect: Callable[[Sample], Confidence]
-    read: ReadT_co
+    description: str  # for messages that list what is accepted
+    detect: Callable[[Sample], Confidence]  # how sure it is that a sample has this format
+    read: ReadT_co  # reads a file; each use has its own parameters
 
 
 def detect_format(
@@ -260,22 +238,13 @@ _DEFECTS = (
 
 @dataclass(frozen=True, slots=True)
 class ArchiveLimits:
-    """Limits of an archive.
+    """Limits of an archive."""
 
-    Attributes
-    ----------
-    members : int
-        Largest number of frames.
-    member_bytes, total_bytes : int
-        Largest size of one frame and of all, as stored in the archive's files. [byte]
-    ratio : float
-        Largest expansion of one compressed byte; pictures are compressed already.
-    """
-
-    members: int = 500
+    members: int = 500  # largest number of frames
+    # `member_bytes`, `total_bytes`: [byte] largest size of one frame and of all, as stored in the archive's files
     member_bytes: int = 32 * 1024**2
     total_bytes: int = 512 * 1024**2
-    ratio: float = 50.0
+    ratio: float = 50.0  # largest expansion of one compressed byte; pictures are compressed already
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,26 +32,15 @@ _ALIASES = {"file": _NAMES, **ALIASES}
 
 @dataclass(frozen=True, slots=True)
 class ListedFrame:
-    """A row about one picture; NaN where it states nothing.
+    """A row about one picture; NaN where it states nothing."""
 
-    Attributes
-    ----------
-    name : str
-        Of the picture, without its folder.
-    time_s : float
-        Seconds since 1970-01-01 UTC. [s]
-    lon_deg, lat_deg, heading_deg : float
-        [deg]
-    accuracy_m : float
-        Standard deviation of the position. [m]
-    """
-
-    name: str
-    time_s: float = math.nan
+    name: str  # of the picture, without its folder
+    time_s: float = math.nan  # [s] seconds since 1970-01-01 UTC
+    # `lon_deg`, `lat_deg`, `heading_deg`: [deg]
     lon_deg: float = math.nan
     lat_deg: float = math.nan
     heading_deg: float = math.nan
-    accuracy_m: float = math.nan
+    accuracy_m: float = math.nan  # [m] standard deviation of the position
 
     @property
     def has_position(self) -> bool:
@@ -61,18 +50,10 @@ class ListedFrame:
 
 @dataclass(frozen=True, slots=True)
 class FrameList:
-    """What a list of frames states.
+    """What a list of frames states."""
 
-    Attributes
-    ----------
-    frames : mapping of str to ListedFrame
-        By the name of the picture.
-    report : LogReport
-        What was left out, and why.
-    """
-
-    frames: Mapping[str, ListedFrame] = field(default_factory=dict)
-    report: LogReport = field(default_factory=LogReport)
+    frames: Mapping[str, ListedFrame] = field(default_factory=dict)  # by the name of the picture
+    report: LogReport = field(default_factory=LogReport)  # what was left out, and why
 
 
 def is_frame_list(name: str) -> bool:

@@ -37,21 +37,12 @@ _MAX_TEXT = 64  # [byte] chosen by hand; a date has 20
 
 @dataclass(frozen=True, slots=True)
 class Exif:
-    """What is read of a picture's EXIF.
+    """What is read of a picture's EXIF."""
 
-    Attributes
-    ----------
-    orientation : int
-        1 to 8; 1 if there is none or it is invalid.
-    taken : str or None
-        When the picture was taken, as RFC 3339 writes it; without a zone where the camera states none.
-    focal_35mm : float or None
-        Focal length that gives the same view on film of 36 x 24 mm. [mm]
-    """
-
-    orientation: int = 1
+    orientation: int = 1  # 1 to 8; 1 if there is none or it is invalid
+    # when the picture was taken, as RFC 3339 writes it; without a zone where the camera states none
     taken: str | None = None
-    focal_35mm: float | None = None
+    focal_35mm: float | None = None  # [mm] focal length that gives the same view on film of 36 x 24 mm
 
 
 def read_exif(tiff: bytes) -> Exif:
@@ -157,56 +148,30 @@ class ImageKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ImageLimits:
-    """Limits of a picture.
+    """Limits of a picture."""
 
-    Attributes
-    ----------
-    pixels : int
-        Largest number of pixels of a frame.
-    side_min_px, side_max_px : int
-        Shortest and longest side of a frame. [px]
-    file_bytes : int
-        Largest file that is read. [byte]
-    """
-
-    pixels: int = 50_000_000
+    pixels: int = 50_000_000  # largest number of pixels of a frame
+    # `side_min_px`, `side_max_px`: [px] shortest and longest side of a frame
     side_min_px: int = 32
     side_max_px: int = 32_768
-    file_bytes: int = 32 * 1024**2
+    file_bytes: int = 32 * 1024**2  # [byte] largest file that is read
 
 
 @dataclass(frozen=True, slots=True)
 class ImageHeader:
-    """Properties of a picture by its header.
-
-    Attributes
-    ----------
-    kind : ImageKind
-    width_px, height_px : int
-        Size upright, after the orientation is applied. [px]
-    channels : int
-        1 grey, 3 colour (palettes count as colour), 2 and 4 with an alpha channel, which is ignored.
-    bit_depth : int
-        8 or 16.
-    orientation : int
-        EXIF orientation as stored: 1, 3, 6 or 8.
-    trailing_bytes : int
-        Bytes after the picture's end, which are ignored.
-    taken : str or None
-        When it was taken by its EXIF, as RFC 3339 writes it; without a zone where the camera states none.
-    focal_35mm : float or None
-        Focal length by its EXIF, for film of 36 x 24 mm. [mm]
-    """
+    """Properties of a picture by its header."""
 
     kind: ImageKind
+    # `width_px`, `height_px`: [px] size upright, after the orientation is applied
     width_px: int
     height_px: int
-    channels: int
-    bit_depth: int = 8
-    orientation: int = 1
-    trailing_bytes: int = 0
+    channels: int  # 1 grey, 3 colour (palettes count as colour), 2 and 4 with an alpha channel, which is ignored
+    bit_depth: int = 8  # 8 or 16
+    orientation: int = 1  # EXIF orientation as stored: 1, 3, 6 or 8
+    trailing_bytes: int = 0  # bytes after the picture's end, which are ignored
+    # when it was taken by its EXIF, as RFC 3339 writes it; without a zone where the camera states none
     taken: str | None = None
-    focal_35mm: float | None = None
+    focal_35mm: float | None = None  # [mm] focal length by its EXIF, for film of 36 x 24 mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -487,16 +452,9 @@ _ROTATIONS = {3: cv2.ROTATE_180, 6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_CO
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A decoded picture.
+    """A decoded picture."""
 
-    Attributes
-    ----------
-    pixels : ndarray of uint8
-        BGR, shape (H, W, 3), or grey, shape (H, W), for thermal frames.
-    header : ImageHeader
-    """
-
-    pixels: npt.NDArray[np.uint8]
+    pixels: npt.NDArray[np.uint8]  # BGR, shape (H, W, 3), or grey, shape (H, W), for thermal frames
     header: ImageHeader
 
 

@@ -19,42 +19,21 @@ MAX_LISTED = 200
 
 @dataclass(frozen=True, slots=True)
 class LeftOutEntry:
-    """An entry that is not in the result.
+    """An entry that is not in the result."""
 
-    Attributes
-    ----------
-    entry : int
-        Which row, line or event it is, from 0.
-    reason : str
-    """
-
-    entry: int
+    entry: int  # which row, line or event it is, from 0
     reason: str
 
 
 @dataclass(slots=True)
 class LogReport:
-    """About reading a log.
+    """About reading a log."""
 
-    Attributes
-    ----------
-    format : str
-        Name of the detected format.
-    entries : int
-        Rows, lines or events in it.
-    left_out : list of LeftOutEntry
-        The first ones.
-    left_out_count : int
-    reasons : dict of str to int
-        Entries left out, by kind.
-    warnings : list of str
-    """
-
-    format: str = ""
-    entries: int = 0
-    left_out: list[LeftOutEntry] = field(default_factory=list)
+    format: str = ""  # name of the detected format
+    entries: int = 0  # rows, lines or events in it
+    left_out: list[LeftOutEntry] = field(default_factory=list)  # the first ones
     left_out_count: int = 0
-    reasons: dict[str, int] = field(default_factory=dict)
+    reasons: dict[str, int] = field(default_factory=dict)  # entries left out, by kind
     warnings: list[str] = field(default_factory=list)
 
     def leave_out(self, entry: int, kind: str, reason: str) -> None:
@@ -114,24 +93,16 @@ _SCALE_S = {
 class LogClock:
     """How the times of a log are read.
 
-    Attributes
-    ----------
-    scale : TimeScale
-        Of numbers; `auto` distinguishes seconds, ms, us and ns since 1970 by their size.
-    offset_s : float
-        Added to each time: the true time less the log's clock. [s]
-    utc_offset_s : float
-        Of texts without a zone: local time less UTC. [s]
-
     Raises
     ------
     InvalidParameter
         An offset is not finite, or local time is more than 14 hours from UTC.
     """
 
+    # of numbers; `auto` distinguishes seconds, ms, us and ns since 1970 by their size
     scale: TimeScale = TimeScale.AUTO
-    offset_s: float = 0.0
-    utc_offset_s: float = 0.0
+    offset_s: float = 0.0  # [s] added to each time: the true time less the log's clock
+    utc_offset_s: float = 0.0  # [s] of texts without a zone: local time less UTC
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.offset_s):

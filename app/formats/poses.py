@@ -80,30 +80,17 @@ ALIASES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class PoseDeclaration:
-    """What the uploader declares of a track; everything is optional.
-
-    Attributes
-    ----------
-    clock : LogClock
-    columns : mapping of str to str
-        Names of columns in place of the usual ones: time, lon, lat, heading, accuracy, crs.
-    crs : str or None
-        Coordinate reference system of the positions; WGS 84 without.
-    date : date or None
-        UTC date of the first position, for NMEA without dates.
-    forward_m, left_m : float
-        Position of the antenna from the vehicle's reference point (ISO 8855). [m]
-    accuracy_m : float or None
-        Standard deviation of a position where the track has none. [m]
-    """
+    """What the uploader declares of a track; everything is optional."""
 
     clock: LogClock = field(default_factory=LogClock)
+    # names of columns in place of the usual ones: time, lon, lat, heading, accuracy, crs
     columns: Mapping[str, str] = field(default_factory=dict)
-    crs: str | None = None
-    date: date | None = None
+    crs: str | None = None  # coordinate reference system of the positions; WGS 84 without
+    date: date | None = None  # UTC date of the first position, for NMEA without dates
+    # `forward_m`, `left_m`: [m] position of the antenna from the vehicle's reference point (ISO 8855)
     forward_m: float = 0.0
     left_m: float = 0.0
-    accuracy_m: float | None = None
+    accuracy_m: float | None = None  # [m] standard deviation of a position where the track has none
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.columns) - set(ALIASES))
@@ -123,22 +110,12 @@ class PoseLimits:
 
 @dataclass(frozen=True, slots=True)
 class PoseSource:
-    """A track while it is read.
+    """A track while it is read."""
 
-    Attributes
-    ----------
-    sample : Sample
-        All of the file.
-    declaration : PoseDeclaration
-    limits : PoseLimits
-    report : LogReport
-        Filled while points are read.
-    """
-
-    sample: Sample
+    sample: Sample  # all of the file
     declaration: PoseDeclaration
     limits: PoseLimits
-    report: LogReport
+    report: LogReport  # filled while points are read
 
 
 def too_many_points(name: str, limits: PoseLimits) -> UploadTooLarge:
@@ -161,20 +138,11 @@ _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radiu
 
 @dataclass(frozen=True, slots=True)
 class PosePoint:
-    """One position.
+    """One position."""
 
-    Attributes
-    ----------
-    entry : int
-        Row, line or point of the file, from 0.
-    time_s : float
-        Seconds since 1970-01-01 UTC; NaN where it is not known. [s]
-    lon_deg, lat_deg, heading_deg, accuracy_m : float
-        As in `PoseTrack`.
-    """
-
-    entry: int
-    time_s: float
+    entry: int  # row, line or point of the file, from 0
+    time_s: float  # [s] seconds since 1970-01-01 UTC; NaN where it is not known
+    # `lon_deg`, `lat_deg`, `heading_deg`, `accuracy_m`: as in `PoseTrack`
     lon_deg: float
     lat_deg: float
     heading_deg: float = math.nan

@@ -246,21 +246,11 @@ _NUMPY_CALL = b"np.float"  # numpy 2 writes its scalars as np.float64(1.5); the 
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How the cells of a row are written.
+    """How the cells of a row are written."""
 
-    Attributes
-    ----------
-    delimiter : str
-        One character, or `SPACES`.
-    decimal : str
-        ``.`` or ``,``.
-    removed : bytes
-        Characters that columns of numbers are read without: quotes, brackets.
-    """
-
-    delimiter: str = ","
-    decimal: str = "."
-    removed: bytes = b'"'
+    delimiter: str = ","  # one character, or `SPACES`
+    decimal: str = "."  # ``.`` or ``,``
+    removed: bytes = b'"'  # characters that columns of numbers are read without: quotes, brackets
 
 
 # --- delimiter and header -----------------------------------------------------------------------------------------
@@ -337,20 +327,11 @@ def read_number(value: object, decimal: str = ".") -> float:
 
 @dataclass(frozen=True, slots=True)
 class DelimitedLog:
-    """A log with a header, read line by line.
+    """A log with a header, read line by line."""
 
-    Attributes
-    ----------
-    columns : tuple of str
-        Names as written; empty if the header cannot be split.
-    dialect : Dialect
-    text : str
-        All of the file, or its beginning where only the header is wanted.
-    """
-
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # names as written; empty if the header cannot be split
     dialect: Dialect
-    text: str
+    text: str  # all of the file, or its beginning where only the header is wanted
 
     @classmethod
     def open(cls, text: str) -> DelimitedLog:
@@ -430,26 +411,13 @@ def split_rows(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
 
 @dataclass(frozen=True, slots=True)
 class NumberColumns:
-    """Columns of numbers that are read from a file.
+    """Columns of numbers that are read from a file."""
 
-    Attributes
-    ----------
-    name : str
-        Of the file, for messages.
-    places : tuple of int
-        Indices of the wanted cells, in the order of the result.
-    width : int
-        Cells of a row.
-    dialect : Dialect
-    convert_first : callable, optional
-        Reads the first wanted cell from text that is no number.
-    """
-
-    name: str
-    places: tuple[int, ...]
-    width: int
+    name: str  # of the file, for messages
+    places: tuple[int, ...]  # indices of the wanted cells, in the order of the result
+    width: int  # cells of a row
     dialect: Dialect = Dialect()
-    convert_first: Callable[[str], float] | None = None
+    convert_first: Callable[[str], float] | None = None  # reads the first wanted cell from text that is no number
 
 
 LeaveOut = Callable[[str, str], None]

@@ -84,18 +84,11 @@ def detect_video(head: bytes, *, is_stream: bool = False) -> VideoKind | None:
 
 @dataclass(frozen=True, slots=True)
 class VideoFile:
-    """A video, or the part of a file that is one.
-
-    Attributes
-    ----------
-    file : SpooledFile
-    kind : VideoKind
-    offset, size : int
-        Of the video in the file; size 0 is all that follows. [byte]
-    """
+    """A video, or the part of a file that is one."""
 
     file: SpooledFile
     kind: VideoKind
+    # `offset`, `size`: [byte] of the video in the file; size 0 is all that follows
     offset: int = 0
     size: int = 0
 
@@ -245,22 +238,13 @@ time for each frame. Source: that of `frames.rate_hz`."""
 
 @dataclass(frozen=True, slots=True)
 class VideoLimits:
-    """What a video may be.
+    """What a video may be."""
 
-    Attributes
-    ----------
-    pixels : int
-        Of a frame; 4096 x 2304. [px]
-    side_min_px : int
-    frames, streams : int
-    duration_s, key_frame_s : float
-        Length, and longest time between two frames at which decoding can begin. [s]
-    """
-
-    pixels: int = 4096 * 2304
+    pixels: int = 4096 * 2304  # [px] of a frame; 4096 x 2304
     side_min_px: int = 64
     frames: int = 500_000
     streams: int = 16
+    # `duration_s`, `key_frame_s`: [s] length, and longest time between two frames at which decoding can begin
     duration_s: float = 4 * 3600.0
     key_frame_s: float = 60.0
 
@@ -277,59 +261,33 @@ class VideoGap:
 
 @dataclass(frozen=True, slots=True)
 class VideoSegment:
-    """A stretch that begins where decoding can begin.
+    """A stretch that begins where decoding can begin."""
 
-    Attributes
-    ----------
-    first, end : int
-        Its frames: numbers in the order of their times, the end is not included.
-    decode_from : int or None
-        Where decoding has to begin: at the key frame before, where frames are counted (`is_counted`). None: at the
-        first.
-    """
-
+    # `first`, `end`: its frames: numbers in the order of their times, the end is not included
     first: int
     end: int
+    # where decoding has to begin: at the key frame before, where frames are counted (`is_counted`). None: at the first.
     decode_from: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoIndex:
-    """The frames of a video.
-
-    Attributes
-    ----------
-    file : VideoFile
-    codec : str
-    width_px, height_px : int
-        As coded, before a rotation. [px]
-    stamps : ndarray of int64, shape (frames,)
-        The container's times in the order of presentation, or numbers of frames where it has none.
-    time_s : ndarray, shape (frames,)
-        After the first frame. [s]
-    segments : tuple of VideoSegment
-    created_at : datetime or None
-        By the container.
-    gaps : tuple of VideoGap
-    warnings : tuple of str
-    has_clock : bool
-        Whether `created_at` is the time of the first frame by the recorder's clock.
-    track : PoseTrack or None
-        Of the vehicle, where the recording has one.
-    """
+    """The frames of a video."""
 
     file: VideoFile
     codec: str
+    # `width_px`, `height_px`: [px] as coded, before a rotation
     width_px: int
     height_px: int
+    # shape (frames,): the container's times in the order of presentation, or numbers of frames where it has none
     stamps: npt.NDArray[np.int64]
-    time_s: npt.NDArray[np.float64]
+    time_s: npt.NDArray[np.float64]  # shape (frames,): [s] after the first frame
     segments: tuple[VideoSegment, ...]
-    created_at: datetime | None
+    created_at: datetime | None  # by the container
     gaps: tuple[VideoGap, ...]
     warnings: tuple[str, ...]
-    has_clock: bool = False
-    track: PoseTrack | None = None
+    has_clock: bool = False  # whether `created_at` is the time of the first frame by the recorder's clock
+    track: PoseTrack | None = None  # of the vehicle, where the recording has one
 
     @property
     def duration_s(self) -> float:
@@ -557,21 +515,11 @@ Pixels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class DecodedFrame:
-    """One frame of a video.
+    """One frame of a video."""
 
-    Attributes
-    ----------
-    number : int
-        Among the frames of the video.
-    time_s : float
-        After the first frame of the video. [s]
-    rotation_deg : int
-        Clockwise, by which it is turned upright: 0, 90, 180 or 270. [deg]
-    """
-
-    number: int
-    time_s: float
-    rotation_deg: int
+    number: int  # among the frames of the video
+    time_s: float  # [s] after the first frame of the video
+    rotation_deg: int  # [deg] clockwise, by which it is turned upright: 0, 90, 180 or 270
     _frame: VideoFrame
     _reformatter: VideoReformatter
 
@@ -641,18 +589,10 @@ AnyFrame = DecodedFrame | PictureFrame
 
 @dataclass(slots=True)
 class ReadReport:
-    """Frames of a segment that are not among those that were read: together they are all of the segment.
+    """Frames of a segment that are not among those that were read: together they are all of the segment."""
 
-    Attributes
-    ----------
-    damaged : int
-        Frames that could not be decoded.
-    other_size : int
-        Frames that have another size than the video.
-    """
-
-    damaged: int = 0
-    other_size: int = 0
+    damaged: int = 0  # frames that could not be decoded
+    other_size: int = 0  # frames that have another size than the video
 
 
 def read_frames(index: VideoIndex, segment: VideoSegment, report: ReadReport, *, beyond: int = 0) -> Iterator[AnyFrame]:

@@ -27,23 +27,12 @@ _MAX_NAME = 200  # characters; source: by hand, a note has 500
 
 @dataclass(frozen=True, slots=True)
 class BoundedOperation:
-    """A transformation to ITRF2014.
-
-    Attributes
-    ----------
-    transformer : Transformer
-    bound_m : float
-        Its stated accuracy. [m]
-    name : str
-        Its name in PROJ.
-    needs_epoch : bool
-        Whether it depends on time: PROJ assumes an epoch if there is none.
-    """
+    """A transformation to ITRF2014."""
 
     transformer: Transformer
-    bound_m: float
-    name: str
-    needs_epoch: bool
+    bound_m: float  # [m] its stated accuracy
+    name: str  # its name in PROJ
+    needs_epoch: bool  # whether it depends on time: PROJ assumes an epoch if there is none
 
     def covers(self, lon_deg: npt.NDArray[np.float64], lat_deg: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
         """Which places are in its area of use, where its stated accuracy holds."""
@@ -174,18 +163,11 @@ class PlateMotion(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MovedPositions:
-    """Positions at another epoch, each of shape (N,).
-
-    Attributes
-    ----------
-    lon_deg, lat_deg : ndarray
-    accuracy_m : ndarray
-        RMSE that the move adds. [m]
-    """
+    """Positions at another epoch, each of shape (N,)."""
 
     lon_deg: Floats
     lat_deg: Floats
-    accuracy_m: Floats
+    accuracy_m: Floats  # [m] RMSE that the move adds
 
 
 def plate_motion(lon_deg: npt.ArrayLike, lat_deg: npt.ArrayLike) -> PlateMotion:

@@ -90,33 +90,18 @@ UNSTATED_YEARS = 10.0
 
 @dataclass(frozen=True, slots=True)
 class PlacedPosition:
-    """A position in WGS 84 / ITRF, with its transformation.
+    """A position in WGS 84 / ITRF, with its transformation."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg : float
-        Longitude and latitude. [deg]
-    height_m : float or None
-        Above the ellipsoid if it was, else above the vertical datum it came with. [m]
-    crs : str
-        The original CRS, in the form ``EPSG:code`` or ``OGC:CRS84``.
-    realization : str or None
-        Frame of lon_deg, lat_deg: as stated, or the one it was transformed into.
-    epoch : float or None
-        Of lon_deg, lat_deg in this frame. [decimal year]
-    transform_accuracy_m : float or None
-        Horizontal accuracy of the transformation, the realization and the epoch together; None if it is unknown. [m]
-    note : str or None
-        Which transformation was used, and which declaration would make the position more accurate.
-    """
-
+    # `lon_deg`, `lat_deg`: [deg] longitude and latitude
     lon_deg: float
     lat_deg: float
-    height_m: float | None
-    crs: str
-    realization: str | None
-    epoch: float | None
+    height_m: float | None  # [m] above the ellipsoid if it was, else above the vertical datum it came with
+    crs: str  # the original CRS, in the form ``EPSG:code`` or ``OGC:CRS84``
+    realization: str | None  # frame of lon_deg, lat_deg: as stated, or the one it was transformed into
+    epoch: float | None  # [decimal year] of lon_deg, lat_deg in this frame
+    # [m] horizontal accuracy of the transformation, the realization and the epoch together; None if it is unknown
     transform_accuracy_m: float | None
+    # which transformation was used, and which declaration would make the position more accurate
     note: str | None = None
 
     @property
@@ -407,50 +392,25 @@ _OUTSIDE_DEG = 1.0  # [deg] margin about an area of use; source: as for position
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """How positions came to WGS 84 / ITRF.
+    """How positions came to WGS 84 / ITRF."""
 
-    Attributes
-    ----------
-    crs : str
-        System that they were submitted in.
-    stated : bool
-        Transformed with a stated accuracy, or global from the start.
-    epoch : float or None
-        Of the positions. [decimal year]
-    ellipsoidal_height : bool
-        Heights are above the ellipsoid.
-    realization : str or None
-        Realization of `crs` that they were submitted in, as it was stated.
-    """
-
-    crs: str
-    stated: bool
-    epoch: float | None
-    ellipsoidal_height: bool
-    realization: str | None = None
+    crs: str  # system that they were submitted in
+    stated: bool  # transformed with a stated accuracy, or global from the start
+    epoch: float | None  # [decimal year] of the positions
+    ellipsoidal_height: bool  # heights are above the ellipsoid
+    realization: str | None = None  # realization of `crs` that they were submitted in, as it was stated
 
 
 @dataclass(frozen=True, slots=True)
 class SystemPositions:
-    """Positions in a reference system.
+    """Positions in a reference system."""
 
-    Attributes
-    ----------
-    first, second : ndarray, shape (N,)
-        Longitude and latitude [deg], or easting and northing in the unit of the system.
-    height_m : ndarray, shape (N,)
-        NaN where unknown. [m]
-    accuracy_m : float
-        Stated accuracy of the transformation; 0 without one. [m]
-    note : str
-        The transformation, for people.
-    """
-
+    # `first`, `second`: shape (N,): longitude and latitude [deg], or easting and northing in the unit of the system
     first: Floats
     second: Floats
-    height_m: Floats
-    accuracy_m: float
-    note: str
+    height_m: Floats  # shape (N,): [m] NaN where unknown
+    accuracy_m: float  # [m] stated accuracy of the transformation; 0 without one
+    note: str  # the transformation, for people
 
 
 def positions_in_system(

@@ -459,24 +459,12 @@ _MAD_SIGMA, _MEDIAN_LOSS = 1.4826, 1.2533  # of a normal distribution: MAD to si
 
 @dataclass(frozen=True, slots=True)
 class JudgedDrive:
-    """Evidence of a drive on markers and on the vehicle.
+    """Evidence of a drive on markers and on the vehicle."""
 
-    Attributes
-    ----------
-    evidence : list of Evidence
-        In the order of the passes.
-    wrong_way : bool
-        The driver is on the wrong way.
-    only_one : bool
-        A single marker shows it, which may itself be installed in reverse.
-    shift_m : (float, float) or None
-        Median offset, forward and left. [m]
-    """
-
-    evidence: list[Evidence]
-    wrong_way: bool
-    only_one: bool
-    shift_m: tuple[float, float] | None
+    evidence: list[Evidence]  # in the order of the passes
+    wrong_way: bool  # the driver is on the wrong way
+    only_one: bool  # a single marker shows it, which may itself be installed in reverse
+    shift_m: tuple[float, float] | None  # [m] median offset, forward and left
 
 
 def judge_drive(passes: Sequence[Pass], vehicle: VehicleState, at_s: float) -> JudgedDrive:

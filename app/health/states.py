@@ -38,36 +38,24 @@ nothing covers a magnet. Source: chosen by hand; `python -m benchmarks.health` d
 
 @dataclass(frozen=True, slots=True)
 class HealthRules:
-    """Error rates and bounds of the tests.
+    """Error rates and bounds of the tests."""
 
-    Attributes
-    ----------
-    false_alarm_share : float
-        Share of healthy markers that become suspects in a month of traffic, at most.
-    lower : float
-        Logarithm of the ratio at which a marker is accepted as healthy, and the test starts anew. [nat]
-    vehicles : int
-        Distinct vehicles without which no marker becomes a suspect.
-    vehicle_bound : float
-        What one vehicle adds to a test at most, however often it passes. [nat]
-    month_passes : float
-        Passes in a month that are assumed at least.
-    moved_test_starts : float
-        Share of the passes of healthy markers with which a test for a displacement begins.
-    moved_m : float
-        Smallest estimated displacement of a suspect. [m]
-    disc_m : float
-        A marker that stands this near to its registered position has not moved; two standard deviations of the survey
-        where they are more. [m]
-    """
-
+    # share of healthy markers that become suspects in a month of traffic, at most
     false_alarm_share: float = 1e-3  # source: the registry's requirement, one marker in a thousand
+    # [nat] logarithm of the ratio at which a marker is accepted as healthy, and the test starts anew
     lower: float = 0.0  # [nat] source: Page, Biometrika 41, 1954: tests in a row find a fault whenever it begins
+    # distinct vehicles without which no marker becomes a suspect
     vehicles: int = 3  # source: chosen by hand; two may share a workshop, and so a wrong calibration
+    # [nat] what one vehicle adds to a test at most, however often it passes
     vehicle_bound: float = 5.0  # [nat] source: by hand; at 10,000 passes a month four vehicles are needed, and five do
+    # passes in a month that are assumed at least
     month_passes: float = 100.0  # source: chosen by hand, three vehicles a day
+    # share of the passes of healthy markers with which a test for a displacement begins
     moved_test_starts: float = 0.01  # source: the scenes of `python -m benchmarks.health`: 0.6 to 1.2 %, once 2.3 %
+    # [m] smallest estimated displacement of a suspect
     moved_m: float = 0.75  # [m] source: `python -m benchmarks.health`, finds 1.0 m in five passes
+    # [m] a marker that stands this near to its registered position has not moved; two standard deviations of the survey
+    # where they are more
     disc_m: float = 0.25  # [m] source: by hand, what crews and surveys of roads are good to
 
     def upper(self, fault: Fault, month_passes: float) -> float:
@@ -96,87 +84,45 @@ LonLat = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """What one upload of a vehicle shows of one marker.
-
-    Attributes
-    ----------
-    marker_id, family : str
-    read : bool
-        Whether the marker was read.
-    expected : float
-        Probability that a healthy, clean marker is read in such a pass; 0 where it is not known.
-    along : float
-        Order in the drive: time, frame or odometer.
-    offset_m : (float, float) or None
-        Observed less registered position by the vehicle's own position, east and north. [m]
-    sigma_m : float
-        Standard deviation of the observation relative to the vehicle, each axis. [m]
-    position_sigma_m : float or None
-        Standard deviation of the vehicle's own position, each axis; None if unknown. [m]
-    offset_is_absolute : bool
-        The offset rests on no position of the vehicle: by a marker's own message.
-    survey_m : float
-        Standard deviation of the registered position, each axis. [m]
-    heading_deg : float or None
-        Of the vehicle. [deg]
-    reversed : bool or None
-        Whether it was met against its direction; None where it shows none.
-    quality : float or None
-        Signal or grade less the nominal one, in standard deviations.
-    quality_is_relative : bool
-        The quality is compared with the other markers of the drive already.
-    elsewhere : (float, float) or None
-        Where it was read, far from its place: longitude and latitude. [deg]
-    two_places : bool
-        One drive received it from two places.
-    """
+    """What one upload of a vehicle shows of one marker."""
 
     marker_id: str
     family: str
-    read: bool
-    expected: float = 0.0
-    along: float = 0.0
+    read: bool  # whether the marker was read
+    expected: float = 0.0  # probability that a healthy, clean marker is read in such a pass; 0 where it is not known
+    along: float = 0.0  # order in the drive: time, frame or odometer
+    # [m] observed less registered position by the vehicle's own position, east and north
     offset_m: tuple[float, float] | None = None
-    sigma_m: float = 0.0
+    sigma_m: float = 0.0  # [m] standard deviation of the observation relative to the vehicle, each axis
+    # [m] standard deviation of the vehicle's own position, each axis; None if unknown
     position_sigma_m: float | None = None
-    offset_is_absolute: bool = False
-    survey_m: float = 0.0
-    heading_deg: float | None = None
-    reversed: bool | None = None
-    quality: float | None = None
-    quality_is_relative: bool = False
-    elsewhere: LonLat | None = None
-    two_places: bool = False
+    offset_is_absolute: bool = False  # the offset rests on no position of the vehicle: by a marker's own message
+    survey_m: float = 0.0  # [m] standard deviation of the registered position, each axis
+    heading_deg: float | None = None  # [deg] of the vehicle
+    reversed: bool | None = None  # whether it was met against its direction; None where it shows none
+    quality: float | None = None  # signal or grade less the nominal one, in standard deviations
+    quality_is_relative: bool = False  # the quality is compared with the other markers of the drive already
+    elsewhere: LonLat | None = None  # [deg] where it was read, far from its place: longitude and latitude
+    two_places: bool = False  # one drive received it from two places
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence of a pass on its marker after the vehicle's own errors.
-
-    Attributes
-    ----------
-    read_probability : float
-        That this vehicle reads a healthy, clean marker in this pass; 0 where a miss is no evidence.
-    offset_m, sigma_m : (float, float) or None, float
-        Less the drive's common shift, east and north, and the standard deviation of each with that of the shift. [m]
-    reversed : bool or None
-        Against the direction of the other markers of the drive.
-    alone : bool
-        The drive shows no other direction to compare with.
-    quality : float or None
-        Less that of the drive's other markers, in standard deviations.
-    """
+    """Evidence of a pass on its marker after the vehicle's own errors."""
 
     marker_id: str
     family: str
     read: bool
+    # that this vehicle reads a healthy, clean marker in this pass; 0 where a miss is no evidence
     read_probability: float
+    # `offset_m`, `sigma_m`: [m] less the drive's common shift, east and north, and the standard deviation of each with
+    # that of the shift
     offset_m: tuple[float, float] | None = None
     sigma_m: float = 0.0
     survey_m: float = 0.0
-    reversed: bool | None = None
-    alone: bool = False
-    quality: float | None = None
+    reversed: bool | None = None  # against the direction of the other markers of the drive
+    alone: bool = False  # the drive shows no other direction to compare with
+    quality: float | None = None  # less that of the drive's other markers, in standard deviations
     elsewhere: LonLat | None = None
     two_places: bool = False
 
@@ -186,31 +132,18 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A fault that is suspected by the evidence of several vehicles.
-
-    Attributes
-    ----------
-    fault : Fault
-    ratio, limit : float
-        Logarithm of the likelihood ratio, and the limit that it has passed. [nat]
-    vehicles, passes : int
-        That added to it, and their passes where these are kept.
-    since_s : float
-        When the evidence began. [s since 1970]
-    offset_m : (float, float) or None
-        Estimated displacement, east and north. [m]
-    elsewhere : (float, float) or None
-        Where it was read, far from its place. [deg]
-    """
+    """A fault that is suspected by the evidence of several vehicles."""
 
     fault: Fault
+    # `ratio`, `limit`: [nat] logarithm of the likelihood ratio, and the limit that it has passed
     ratio: float
     limit: float
+    # `vehicles`, `passes`: that added to it, and their passes where these are kept
     vehicles: int
     passes: int
-    since_s: float
-    offset_m: tuple[float, float] | None = None
-    elsewhere: LonLat | None = None
+    since_s: float  # when the evidence began. [s since 1970]
+    offset_m: tuple[float, float] | None = None  # [m] estimated displacement, east and north
+    elsewhere: LonLat | None = None  # [deg] where it was read, far from its place
 
 
 # === State of the tests of a marker and of a vehicle's own errors, as they are stored.
@@ -243,50 +176,30 @@ class FarEntry:
 
 @dataclass(slots=True)
 class MarkerState:
-    """Evidence on one marker.
-
-    Attributes
-    ----------
-    family : str
-    ratios : dict of str to float
-        Logarithm of the likelihood ratio of each fault that has evidence. [nat]
-    shares : dict of str to dict
-        What each vehicle added to the current test, by fault: missing, wrong-way, fading and unregistered.
-    levels : list of float
-        Probabilities of the factors of `READING_LEVELS` by the marker's own record.
-    offsets : list of OffsetEntry
-        Of the current test for a moved marker, oldest first.
-    survey_m : float
-        Standard deviation of the registered position, each axis. [m]
-    far : list of FarEntry
-    quality, quality_passes : float
-        Mean quality of the record, and on how many passes it rests.
-    passes, reads : int
-        In all.
-    month_passes : float
-        Passes that count less the longer ago they were, by the factor e in 30 days.
-    first_s, last_s, read_s : float
-        First and last pass, and last reading at its place. [s since 1970]
-    since : dict of str to float
-        When the current evidence of a fault began. [s since 1970]
-    """
+    """Evidence on one marker."""
 
     family: str = ""
+    # [nat] logarithm of the likelihood ratio of each fault that has evidence
     ratios: dict[str, float] = field(default_factory=dict)
+    # what each vehicle added to the current test, by fault: missing, wrong-way, fading and unregistered
     shares: dict[str, dict[str, float]] = field(default_factory=dict)
+    # probabilities of the factors of `READING_LEVELS` by the marker's own record
     levels: list[float] = field(default_factory=list)
-    offsets: list[OffsetEntry] = field(default_factory=list)
-    survey_m: float = 0.0
+    offsets: list[OffsetEntry] = field(default_factory=list)  # of the current test for a moved marker, oldest first
+    survey_m: float = 0.0  # [m] standard deviation of the registered position, each axis
     far: list[FarEntry] = field(default_factory=list)
+    # `quality`, `quality_passes`: mean quality of the record, and on how many passes it rests
     quality: float = 0.0
     quality_passes: float = 0.0
+    # `passes`, `reads`: in all
     passes: int = 0
     reads: int = 0
-    month_passes: float = 0.0
+    month_passes: float = 0.0  # passes that count less the longer ago they were, by the factor e in 30 days
+    # `first_s`, `last_s`, `read_s`: first and last pass, and last reading at its place. [s since 1970]
     first_s: float = 0.0
     last_s: float = 0.0
     read_s: float = 0.0
-    since: dict[str, float] = field(default_factory=dict)
+    since: dict[str, float] = field(default_factory=dict)  # when the current evidence of a fault began. [s since 1970]
 
     @classmethod
     def new(cls, family: str) -> MarkerState:
@@ -342,24 +255,16 @@ _STEP_M = 0.3  # [m] at most by one pass, so that a marker that has moved teache
 
 @dataclass(slots=True)
 class VehicleState:
-    """A vehicle's own errors by its last passes.
+    """A vehicle's own errors by its last passes."""
 
-    Attributes
-    ----------
-    forward_m, left_m, offsets : float
-        Mean offset in the vehicle's frame, and on how many passes it rests. [m]
-    reads, expected : float
-        Of the last minutes, decaying.
-    at_s : float
-        Of the last pass. [s since 1970]
-    """
-
+    # `forward_m`, `left_m`, `offsets`: [m] mean offset in the vehicle's frame, and on how many passes it rests
     forward_m: float = 0.0
     left_m: float = 0.0
     offsets: float = 0.0
+    # `reads`, `expected`: of the last minutes, decaying
     reads: float = 0.0
     expected: float = 0.0
-    at_s: float = 0.0
+    at_s: float = 0.0  # of the last pass. [s since 1970]
 
     def age(self, at_s: float) -> None:
         """Let the readings decay until a time."""

@@ -51,24 +51,13 @@ _CALLS = {"x86_64": (0xC000003E, (41, 42, 425)), "aarch64": (0xC00000B7, (198, 2
 
 @dataclass(frozen=True, slots=True)
 class ProcessLimits:
-    """What a decoder process may use.
+    """What a decoder process may use."""
 
-    Attributes
-    ----------
-    memory_bytes : int
-        Its private memory. Libraries add 0.1 to 0.2 GB that processes share, so it has at most 1.5 GB resident. [byte]
-    timeout_s : float
-        Longest time on one frame. [s]
-    trace_timeout_s : float
-        Longest time on one recording. [s]
-    file_bytes : int
-        Largest file that it may write. [byte]
-    """
-
+    # [byte] its private memory. Libraries add 0.1 to 0.2 GB that processes share, so it has at most 1.5 GB resident.
     memory_bytes: int = 1_280_000_000
-    timeout_s: float = 20.0
-    trace_timeout_s: float = 300.0
-    file_bytes: int = 256 * 1024**2
+    timeout_s: float = 20.0  # [s] longest time on one frame
+    trace_timeout_s: float = 300.0  # [s] longest time on one recording
+    file_bytes: int = 256 * 1024**2  # [byte] largest file that it may write
 
 
 def limit_resources(limits: ProcessLimits) -> None:

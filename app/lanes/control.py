@@ -45,25 +45,17 @@ class Controller(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SteeringSettings:
-    """Assumptions and gains of a controller.
+    """Assumptions and gains of a controller."""
 
-    Attributes
-    ----------
-    gain_per_s : float
-        k of equations 4 and 5. [1/s]
-    lookahead_m : float
-        d_l of equation 5. [m]
-    latency_s, lag_s, wheelbase_m : float
-        Of the vehicle, as assumed by the predictive controller. [s, s, m]
-    integral_per_m_s : float
-        Steering of the predictive controller per integrated cross-track error. [rad/(m s)]
-    """
-
+    # [1/s] k of equations 4 and 5
     gain_per_s: float = 1.0  # [1/s] source: by hand, `suited_to`
+    # [m] d_l of equation 5
     lookahead_m: float = 15.0  # [m] source: CERPM paper, section 2.3.2
+    # `latency_s`, `lag_s`, `wheelbase_m`: of the vehicle, as assumed by the predictive controller. [s, s, m]
     latency_s: float = 0.12  # [s] source: `simulation.steering.Vehicle`
     lag_s: float = 0.10  # [s] source: `simulation.steering.Vehicle`
     wheelbase_m: float = 2.70  # [m] source: Kia Niro, the paper's car
+    # [rad/(m s)] steering of the predictive controller per integrated cross-track error
     integral_per_m_s: float = 0.06  # [rad/(m s)] source: by hand, no measurement kept
 
     def __post_init__(self) -> None:
@@ -82,23 +74,12 @@ class SteeringSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowedPath:
-    """A path on an even grid of its length.
+    """A path on an even grid of its length."""
 
-    Attributes
-    ----------
-    position_enu_m : ndarray, shape (N, 2)
-        East, north. [m]
-    heading_rad : ndarray, shape (N,)
-        Counter-clockwise from east, without jumps, from chords of two metres. [rad]
-    curvature_per_m : ndarray, shape (N,)
-        From headings six metres apart; bends to the left positive. [1/m]
-    step_m, length_m : float
-        Between points, and in all. [m]
-    """
-
-    position_enu_m: Floats
-    heading_rad: Floats
-    curvature_per_m: Floats
+    position_enu_m: Floats  # shape (N, 2): [m] east, north
+    heading_rad: Floats  # shape (N,): [rad] Counter-clockwise from east, without jumps, from chords of two metres
+    curvature_per_m: Floats  # shape (N,): [1/m] from headings six metres apart; bends to the left positive
+    # `step_m`, `length_m`: [m] between points, and in all
     step_m: float
     length_m: float
 

@@ -26,28 +26,17 @@ _ROUNDS = 3  # source: below a millimetre on lanes with radii of 10 m and more (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossSections:
-    """A lane cut square to its centre line at even steps.
+    """A lane cut square to its centre line at even steps."""
 
-    Attributes
-    ----------
-    chainage_m : ndarray, shape (N,)
-        Along the centre line from the first cut that meets both boundaries. [m]
-    centre_m, left_m, right_m : ndarray, shape (N, 2)
-        East and north where a cut meets the centre line and the boundaries; the centre is halfway between the two. [m]
-    yaw_rad : ndarray, shape (N,)
-        Direction of the smoothed centre line, anticlockwise from east, unwrapped. [rad]
-    curvature_1pm : ndarray, shape (N,)
-        Of the smoothed centre line, positive to the left. [1/m]
-    along_left_m, along_right_m : ndarray, shape (N,)
-        Chainages on the boundaries where the cut meets them. [m]
-    """
-
-    chainage_m: Floats
+    chainage_m: Floats  # shape (N,): [m] along the centre line from the first cut that meets both boundaries
+    # `centre_m`, `left_m`, `right_m`: shape (N, 2): [m] east and north where a cut meets the centre line and the
+    # boundaries; the centre is halfway between the two
     centre_m: Floats
     left_m: Floats
     right_m: Floats
-    yaw_rad: Floats
-    curvature_1pm: Floats
+    yaw_rad: Floats  # shape (N,): [rad] direction of the smoothed centre line, anticlockwise from east, unwrapped
+    curvature_1pm: Floats  # shape (N,): [1/m] of the smoothed centre line, positive to the left
+    # `along_left_m`, `along_right_m`: shape (N,): [m] chainages on the boundaries where the cut meets them
     along_left_m: Floats
     along_right_m: Floats
 

@@ -167,24 +167,12 @@ _MAD_TO_SIGMA = 1.4826  # source: normal distribution, 1 / 0.6745
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivenLine:
-    """A track in the plane.
+    """A track in the plane."""
 
-    Attributes
-    ----------
-    line : SmoothLine
-        Along the fixes, smoothed.
-    fix_m : ndarray, shape (F, 2)
-        Fixes without outliers, at most one each metre. [m]
-    sigma_m : float
-        Standard deviation from one fix to the next. [m]
-    accuracy_m : float
-        As reported by the receiver; NaN if it reports none. [m]
-    """
-
-    line: SmoothLine
-    fix_m: Floats
-    sigma_m: float
-    accuracy_m: float
+    line: SmoothLine  # along the fixes, smoothed
+    fix_m: Floats  # shape (F, 2): [m] fixes without outliers, at most one each metre
+    sigma_m: float  # [m] standard deviation from one fix to the next
+    accuracy_m: float  # [m] as reported by the receiver; NaN if it reports none
 
 
 def driven_line_from_track(track: PoseTrack, origin: tuple[float, float], markers_m: Floats) -> DrivenLine | None:

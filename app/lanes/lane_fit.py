@@ -50,24 +50,12 @@ _OPENING_COST = 5.0  # [1/m] of a width that changes, in squared sigmas; source:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SideAssignment:
-    """The boundary that each marker was assigned to.
+    """The boundary that each marker was assigned to."""
 
-    Attributes
-    ----------
-    side : ndarray of int, shape (K,)
-        `LaneSide`; UNKNOWN for a marker on no boundary.
-    off_m : ndarray, shape (K,)
-        Distance left of its boundary; of a marker on no boundary, left of the nearer one. [m]
-    contradicts : ndarray of bool, shape (K,)
-        The marker is on the boundary that its message does not name.
-    width_m : float
-        Of the lane. [m]
-    """
-
-    side: Ints
-    off_m: Floats
-    contradicts: Bools
-    width_m: float
+    side: Ints  # shape (K,): `LaneSide`; UNKNOWN for a marker on no boundary
+    off_m: Floats  # shape (K,): [m] distance left of its boundary; of a marker on no boundary, left of the nearer one
+    contradicts: Bools  # shape (K,): the marker is on the boundary that its message does not name
+    width_m: float  # [m] of the lane
 
 
 class _BoundaryErrors(NamedTuple):

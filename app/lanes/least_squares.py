@@ -147,55 +147,40 @@ _MIN_VARIANCE_SHARE = 1e-9  # source: keeps the division by 1 - h finite
 
 @dataclass(frozen=True, slots=True)
 class Hyperparameters:
-    """Strengths of the priors.
+    """Strengths of the priors."""
 
-    Attributes
-    ----------
-    bend : float
-        Standard deviation of the change of curvature over a metre. [1/(m^2 sqrt(m))]
-    wander_m, wander_length_m : float
-        Of the vehicle's offset: standard deviation, and correlation length. [m]
-    drift, slow_m : float
-        Of the receiver's slow error, which replaces the wander if not 0: growth [m/sqrt(m)], and size. [m]
-    width_m, width_sd_m, width_length_m : float
-        Of the lane's width: mean, standard deviation, correlation length. [m]
-    opens : bool
-        The width is Matern 3/2 noise, as of a lane that opens or merges over tapers.
-    """
-
+    # standard deviation of the change of curvature over a metre. [1/(m^2 sqrt(m))]
     bend: float = 0.003  # source: middle of `BENDS`
+    # `wander_m`, `wander_length_m`: [m] of the vehicle's offset: standard deviation, and correlation length
     wander_m: float = 0.2  # source: drivers keep 0.18 m RMS (`simulation.radio.driving.Driver`)
     wander_length_m: float = 30.0  # source: 2.5 s (`Driver.wander_time_s`) at 45 km/h
+    # `drift`, `slow_m`: [m] of the receiver's slow error, which replaces the wander if not 0: growth [m/sqrt(m)], and
+    # size
     drift: float = 0.0
     slow_m: float = 3.0  # source: by hand, sensitivity 1.00, 1.00
+    # `width_m`, `width_sd_m`, `width_length_m`: [m] of the lane's width: mean, standard deviation, correlation length
     width_m: float = 3.3  # source: `LaneRules.usual_width_m`
     width_sd_m: float = 0.25  # source: by hand, sensitivity 1.42, 0.96
     width_length_m: float = 60.0  # source: by hand, sensitivity 1.03, 1.00
-    opens: bool = False
+    opens: bool = False  # the width is Matern 3/2 noise, as of a lane that opens or merges over tapers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:
-    """Measurements at stations of a line.
+    """Measurements at stations of a line."""
 
-    Attributes
-    ----------
-    station_m, left_m, sigma_m, sign : ndarray, shape (M,)
-        Markers: station, left offset, standard deviation [m]; 1 on the left boundary, -1 on the right.
-    fix_station_m, fix_left_m, fix_sigma_m : ndarray, shape (F,)
-        Fixes of the vehicle. [m]
-    pair_station_m, pair_slope, pair_sigma : ndarray, shape (P,)
-        Slope of the centre against the line, from pairs of markers.
-    known_lengths : KnownLengths
-    """
-
+    # `station_m`, `left_m`, `sigma_m`, `sign`: shape (M,): markers: station, left offset, standard deviation [m]; 1 on
+    # the left boundary, -1 on the right
     station_m: TypesFloats
     left_m: TypesFloats
     sigma_m: TypesFloats
     sign: TypesFloats
+    # `fix_station_m`, `fix_left_m`, `fix_sigma_m`: shape (F,): [m] fixes of the vehicle
     fix_station_m: TypesFloats
     fix_left_m: TypesFloats
     fix_sigma_m: TypesFloats
+    # `pair_station_m`, `pair_slope`, `pair_sigma`: shape (P,): slope of the centre against the line, from pairs of
+    # markers
     pair_station_m: TypesFloats
     pair_slope: TypesFloats
     pair_sigma: TypesFloats

@@ -31,31 +31,17 @@ _NO_SIDE = 9  # source: above every `LaneSide`
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneObservations:
-    """Markers that a lane may be fitted to, one row a number.
+    """Markers that a lane may be fitted to, one row a number."""
 
-    Attributes
-    ----------
-    origin : tuple of float
-        lon_deg, lat_deg of the plane.
-    row : ndarray of int, shape (M,)
-        First row of `LaneMarkers` with this number.
-    number : ndarray of int, shape (M,)
-    point_m : ndarray, shape (M, 2)
-        East and north. [m]
-    side : ndarray of int, shape (M,)
-    sigma_m, speed_limit_km_h : ndarray, shape (M,)
-    of_row : ndarray of int, shape (K,)
-        Row of these for each row of `LaneMarkers`; -1 for none.
-    """
-
-    origin: tuple[float, float]
-    row: Ints
-    number: Ints
-    point_m: Floats
-    side: Ints
+    origin: tuple[float, float]  # lon_deg, lat_deg of the plane
+    row: Ints  # shape (M,): first row of `LaneMarkers` with this number
+    number: Ints  # shape (M,)
+    point_m: Floats  # shape (M, 2): [m] east and north
+    side: Ints  # shape (M,)
+    # `sigma_m`, `speed_limit_km_h`: shape (M,)
     sigma_m: Floats
     speed_limit_km_h: Floats
-    of_row: Ints
+    of_row: Ints  # shape (K,): row of these for each row of `LaneMarkers`; -1 for none
 
 
 def observations_from_markers(markers: LaneMarkers, rules: LaneRules, notes: Notes) -> LaneObservations:
@@ -140,23 +126,12 @@ def _common_sides(side: Ints, which: Ints, count: int, notes: Notes) -> Ints:
 
 
 class Pairs(NamedTuple):
-    """Pairs of markers along a line, each shape (P,).
-
-    Attributes
-    ----------
-    station_m : ndarray
-        [m]
-    slope : ndarray
-        Of the lane's centre against the line.
-    sigma : ndarray
-        Its standard deviation, if the pair was set as carefully as most are.
-    cautious_sigma : ndarray
-        Larger where the slope differs from those of the pairs beside it: the lane bends there, or the pair is oblique.
-    """
+    """Pairs of markers along a line, each shape (P,)."""
 
     station_m: Floats
-    slope: Floats
-    sigma: Floats
+    slope: Floats  # of the lane's centre against the line
+    sigma: Floats  # its standard deviation, if the pair was set as carefully as most are
+    # larger where the slope differs from those of the pairs beside it: the lane bends there, or the pair is oblique
     cautious_sigma: Floats
 
 

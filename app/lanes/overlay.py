@@ -42,21 +42,14 @@ _MAX_STEPS = 200  # between two points of a line; source: by hand, bounds the ti
 class VehiclePose:
     """Position of a vehicle's reference point on the road, and its heading.
 
-    Attributes
-    ----------
-    position_ned_m : tuple of float
-        North, east, down in the frame of the lane. [m]
-    heading_deg : float
-        Clockwise from north. [deg]
-
     Raises
     ------
     InvalidParameter
         A value is not finite.
     """
 
-    position_ned_m: tuple[float, float, float]
-    heading_deg: float
+    position_ned_m: tuple[float, float, float]  # [m] north, east, down in the frame of the lane
+    heading_deg: float  # [deg] clockwise from north
 
     def __post_init__(self) -> None:
         if len(self.position_ned_m) != 3 or not all(math.isfinite(v) for v in self.position_ned_m):
@@ -69,55 +62,30 @@ class VehiclePose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointsInFrame:
-    """Images of points.
+    """Images of points."""
 
-    Attributes
-    ----------
-    points_px : ndarray, shape (N, 2)
-        u right, v down; NaN behind the camera and far beyond the frame's border. [px]
-    visible : ndarray of bool, shape (N,)
-        Within the frame.
-    ahead_m : ndarray, shape (N,)
-        Along the optical axis. [m]
-    """
-
-    points_px: Floats
-    visible: Bools
-    ahead_m: Floats
+    points_px: Floats  # shape (N, 2): [px] u right, v down; NaN behind the camera and far beyond the frame's border
+    visible: Bools  # shape (N,): within the frame
+    ahead_m: Floats  # shape (N,): [m] along the optical axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineInFrame:
-    """Image of a line.
+    """Image of a line."""
 
-    Attributes
-    ----------
-    points : PointsInFrame
-        Of the line's own points.
-    pieces_px : tuple of ndarray, shape (M, 2)
-        Parts of the line within the frame, cut at its border and at the camera. [px]
-    """
-
-    points: PointsInFrame
+    points: PointsInFrame  # of the line's own points
+    # shape (M, 2): [px] parts of the line within the frame, cut at its border and at the camera
     pieces_px: tuple[Floats, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneOverlay:
-    """A lane in a frame.
-
-    Attributes
-    ----------
-    left, right, centre : LineInFrame
-    area_px : tuple of ndarray, shape (M, 2)
-        Polygons between the boundaries, within the frame. [px]
-    markers : PointsInFrame
-    """
+    """A lane in a frame."""
 
     left: LineInFrame
     right: LineInFrame
     centre: LineInFrame
-    area_px: tuple[Floats, ...]
+    area_px: tuple[Floats, ...]  # shape (M, 2): [px] polygons between the boundaries, within the frame
     markers: PointsInFrame
 
 

@@ -17,24 +17,12 @@ from app.markers.cerpm import LaneSide
 
 @dataclass(frozen=True, slots=True)
 class MarkerPlace:
-    """The place of one marker.
+    """The place of one marker."""
 
-    Attributes
-    ----------
-    side : LaneSide
-        LEFT or RIGHT.
-    chainage_m : float
-        Along the lane's centre line; the same for both of a pair. [m]
-    point_m : tuple of float
-        East and north in the frame of the boundaries, on the boundary. [m]
-    heading_deg : float
-        Direction of travel there, clockwise from north of the frame. [deg]
-    """
-
-    side: LaneSide
-    chainage_m: float
-    point_m: tuple[float, float]
-    heading_deg: float
+    side: LaneSide  # LEFT or RIGHT
+    chainage_m: float  # [m] along the lane's centre line; the same for both of a pair
+    point_m: tuple[float, float]  # [m] east and north in the frame of the boundaries, on the boundary
+    heading_deg: float  # [deg] direction of travel there, clockwise from north of the frame
 
 
 # === Inputs and results of estimating a lane.
@@ -101,40 +89,27 @@ class LaneMarkers:
 
 @dataclass(frozen=True, slots=True)
 class LaneRules:
-    """Limits of the lane estimate. All are checked to be positive and finite.
+    """Limits of the lane estimate. All are checked to be positive and finite."""
 
-    Attributes
-    ----------
-    usual_width_m : float
-        Lane width where only one side is known. [m]
-    off_the_line_m, off_the_line_z : float
-        A marker is left out if the line through its neighbours is at least this far away, both in metres and in
-        standard deviations. [m, 1]
-    same_place_m : float
-        Two positions of one marker number further apart than this are two places. [m]
-    reach_m : float
-        How far past the outermost markers the path follows the vehicle's track. [m]
-    max_end_sigma_m : float
-        Past the outermost markers, the path ends where its standard deviation exceeds this. [m]
-    bridge_m : float
-        Without a track, the longest stretch without a marker that the path bridges. [m]
-    max_median_sigma_m : float
-        The lane is refused if the median standard deviation of its stations exceeds this. [m]
-    max_outlier_ratio : float
-        The lane is refused if more than this share of the markers lies off the line.
-    tolerance_m : float
-        Confidence is the probability that the path is within this distance of the lane's centre. [m]
-    """
-
+    # [m] lane width where only one side is known
     usual_width_m: float = 3.3  # [m] source: by hand, 11 ft; lanes are 9 to 12 ft wide (AASHTO Green Book, 4.3)
+    # `off_the_line_m`, `off_the_line_z`: a marker is left out if the line through its neighbours is at least this far
+    # away, both in metres and in standard deviations. [m, 1]
     off_the_line_m: float = 0.6  # [m] source: by hand, sensitivity 1.00, 0.99
     off_the_line_z: float = 5.0  # source: by hand, sensitivity 1.00, 0.99
+    # [m] two positions of one marker number further apart than this are two places
     same_place_m: float = 0.3  # [m] source: by hand, a survey of 0.1 m at three sigma
+    # [m] how far past the outermost markers the path follows the vehicle's track
     reach_m: float = 25.0  # [m] source: by hand, two spacings of the paper's 12.2 m
+    # [m] past the outermost markers, the path ends where its standard deviation exceeds this
     max_end_sigma_m: float = 0.5  # [m] source: by hand, sensitivity 1.00, 1.00
+    # [m] without a track, the longest stretch without a marker that the path bridges
     bridge_m: float = 150.0  # [m] source: by hand, sensitivity 1.00, 1.00
+    # [m] the lane is refused if the median standard deviation of its stations exceeds this
     max_median_sigma_m: float = 1.0  # [m] source: by hand, sensitivity 1.00, 1.00
+    # the lane is refused if more than this share of the markers lies off the line
     max_outlier_ratio: float = 0.25  # source: by hand, sensitivity 1.00, 1.00
+    # [m] Confidence is the probability that the path is within this distance of the lane's centre
     tolerance_m: float = 0.25  # [m] source: the definition of confidence (docs/nomenclature.md)
 
     def __post_init__(self) -> None:
@@ -161,53 +136,31 @@ class LeftOutReason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A marker that was left out.
+    """A marker that was left out."""
 
-    Attributes
-    ----------
-    row : int
-        Row of `LaneMarkers`.
-    number : int
-    reason : LeftOutReason
-    off_m : float
-        Distance from the position that the other markers predict; NaN where there is no prediction. [m]
-    """
-
-    row: int
+    row: int  # row of `LaneMarkers`
     number: int
     reason: LeftOutReason
-    off_m: float
+    off_m: float  # [m] distance from the position that the other markers predict; NaN where there is no prediction
 
 
 @dataclass(frozen=True, slots=True)
 class TrackAgreement:
-    """The transformation that brings a vehicle's track onto a path, with standard deviations.
+    """The transformation that brings a vehicle's track onto a path, with standard deviations."""
 
-    Attributes
-    ----------
-    east_m, north_m : float
-        Shift of the markers' path against the track. [m]
-    shift_sigma_m : float
-        Of the shift in its own direction: driver, receiver and geometry. [m]
-    turn_deg, turn_sigma_deg : float
-        Turn about the middle of the track, anticlockwise. [deg]
-    scale_ppm, scale_sigma_ppm : float
-        The path is longer than the track by this. [ppm]
-    significance : float
-        Of shift, turn and scale, together or of one of them alone, whichever is larger. In standard deviations.
-    effect_m : float
-        How far the transformation moves the track, across the path, RMS. [m]
-    """
-
+    # `east_m`, `north_m`: [m] shift of the markers' path against the track
     east_m: float
     north_m: float
-    shift_sigma_m: float
+    shift_sigma_m: float  # [m] of the shift in its own direction: driver, receiver and geometry
+    # `turn_deg`, `turn_sigma_deg`: [deg] turn about the middle of the track, anticlockwise
     turn_deg: float
     turn_sigma_deg: float
+    # `scale_ppm`, `scale_sigma_ppm`: [ppm] the path is longer than the track by this
     scale_ppm: float
     scale_sigma_ppm: float
+    # of shift, turn and scale, together or of one of them alone, whichever is larger. In standard deviations.
     significance: float
-    effect_m: float
+    effect_m: float  # [m] how far the transformation moves the track, across the path, RMS
 
     @property
     def disagrees(self) -> bool:
@@ -230,68 +183,35 @@ class TrackAgreement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lane:
-    """The reference path of a lane, at stations in the direction of travel; without stations if it was refused.
+    """The reference path of a lane, at stations in the direction of travel; without stations if it was refused."""
 
-    Attributes
-    ----------
-    origin_lon_deg, origin_lat_deg : float
-        Origin of the local frames, on the ellipsoid. [deg]
-    station_m : ndarray, shape (S,)
-        Distance along the path. [m]
-    position_enu_m, left_enu_m, right_enu_m : ndarray, shape (S, 2)
-        Path and boundaries, east and north of the origin; boundaries are NaN where no marker determines
-        them. [m]
-    lon_deg, lat_deg : ndarray, shape (S,)
-        Of the path. [deg]
-    heading_deg : ndarray, shape (S,)
-        In the direction of travel, clockwise from true north there. [deg]
-    curvature_1pm : ndarray, shape (S,)
-        Positive to the left. [1/m]
-    width_m : ndarray, shape (S,)
-        NaN where only the usual width is known. [m]
-    speed_limit_km_h : ndarray, shape (S,)
-        Sent by the marker passed last; NaN where none is posted. [km/h]
-    sigma_m : ndarray, shape (S,)
-        Standard deviation of the path across its direction. [m]
-    confidence : ndarray, shape (S,)
-        Probability that the path is within `LaneRules.tolerance_m` of the centre.
-    side : ndarray of int, shape (K,)
-        Boundary that each marker was assigned to; 0 for markers that were not used.
-    residual_m : ndarray, shape (K,)
-        Distance of each marker from its boundary, left positive; NaN for markers that were not used. [m]
-    left_out : tuple of LeftOut
-    localization_warnings : tuple of str
-        Why the path may be wrong or less accurate than usual, for people.
-    refusal : str or None
-        Why there is no path.
-    method : str
-    track_agreement : TrackAgreement or None
-        With the vehicle's track; None without a track beside the path.
-    track_apart : bool
-        The vehicle's track was used, but does not run beside the path: the path may be anywhere.
-    """
-
+    # `origin_lon_deg`, `origin_lat_deg`: [deg] origin of the local frames, on the ellipsoid
     origin_lon_deg: float
     origin_lat_deg: float
-    station_m: Floats
+    station_m: Floats  # shape (S,): [m] distance along the path
+    # `position_enu_m`, `left_enu_m`, `right_enu_m`: shape (S, 2): [m] path and boundaries, east and north of the
+    # origin; boundaries are NaN where no marker determines them
     position_enu_m: Floats
     left_enu_m: Floats
     right_enu_m: Floats
+    # `lon_deg`, `lat_deg`: shape (S,): [deg] of the path
     lon_deg: Floats
     lat_deg: Floats
-    heading_deg: Floats
-    curvature_1pm: Floats
-    width_m: Floats
-    speed_limit_km_h: Floats
-    sigma_m: Floats
-    confidence: Floats
-    side: Ints
+    heading_deg: Floats  # shape (S,): [deg] in the direction of travel, clockwise from true north there
+    curvature_1pm: Floats  # shape (S,): [1/m] positive to the left
+    width_m: Floats  # shape (S,): [m] NaN where only the usual width is known
+    speed_limit_km_h: Floats  # shape (S,): [km/h] sent by the marker passed last; NaN where none is posted
+    sigma_m: Floats  # shape (S,): [m] standard deviation of the path across its direction
+    confidence: Floats  # shape (S,): probability that the path is within `LaneRules.tolerance_m` of the centre
+    side: Ints  # shape (K,): boundary that each marker was assigned to; 0 for markers that were not used
+    # shape (K,): [m] distance of each marker from its boundary, left positive; NaN for markers that were not used
     residual_m: Floats
     left_out: tuple[LeftOut, ...] = ()
-    localization_warnings: tuple[str, ...] = ()
-    refusal: str | None = None
+    localization_warnings: tuple[str, ...] = ()  # why the path may be wrong or less accurate than usual, for people
+    refusal: str | None = None  # why there is no path
     method: str = "waymark"
-    track_agreement: TrackAgreement | None = None
+    track_agreement: TrackAgreement | None = None  # with the vehicle's track; None without a track beside the path
+    # the vehicle's track was used, but does not run beside the path: the path may be anywhere
     track_apart: bool = False
 
     @property

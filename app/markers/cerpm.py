@@ -90,32 +90,20 @@ class SpeedLimit:
 class CerpmMessage:
     """Contents of a message.
 
-    Attributes
-    ----------
-    number : int
-        Of the marker within its agency.
-    lon_deg, lat_deg : float
-        WGS 84 / ITRF. [deg]
-    height_m : float or None
-        Above the ellipsoid. [m]
-    side : LaneSide
-    speed_limit : SpeedLimit or None
-    sequence : int
-        Number of the transmission.
-
     Raises
     ------
     InvalidParameter
         A value does not fit its field.
     """
 
-    number: int
+    number: int  # of the marker within its agency
+    # `lon_deg`, `lat_deg`: [deg] WGS 84 / ITRF
     lon_deg: float
     lat_deg: float
-    height_m: float | None = None
+    height_m: float | None = None  # [m] above the ellipsoid
     side: LaneSide = LaneSide.UNKNOWN
     speed_limit: SpeedLimit | None = None
-    sequence: int = 0
+    sequence: int = 0  # number of the transmission
 
     def __post_init__(self) -> None:
         check_lon_lat(self.lon_deg, self.lat_deg)

@@ -27,27 +27,13 @@ MAX_QUIET_MM = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class FiducialDictionary:
-    """A set of codewords.
+    """A set of codewords."""
 
-    Attributes
-    ----------
-    name : str
-        As markers are registered, at most 16 characters.
-    series : str
-        Dictionaries of one series share their codewords: 17 of `aruco-4x4-50` is 17 of `aruco-4x4-250`.
-    opencv : str
-        Name of the constant in `cv2.aruco`.
-    size : int
-        How many codewords there are.
-    modules : int
-        Along a side, without the border.
-    """
-
-    name: str
-    series: str
-    opencv: str
-    size: int
-    modules: int
+    name: str  # as markers are registered, at most 16 characters
+    series: str  # dictionaries of one series share their codewords: 17 of `aruco-4x4-50` is 17 of `aruco-4x4-250`
+    opencv: str  # name of the constant in `cv2.aruco`
+    size: int  # how many codewords there are
+    modules: int  # along a side, without the border
 
 
 _SIZES = (50, 100, 250, 1000)

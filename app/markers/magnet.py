@@ -89,16 +89,9 @@ class LineStyle(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Magnet:
-    """One magnet of a tag.
+    """One magnet of a tag."""
 
-    Attributes
-    ----------
-    along_m, lateral_m : float
-        In the tag frame: along the lane in the direction of travel, and to the left. [m]
-    polarity : Polarity
-    orientation : Orientation
-    """
-
+    # `along_m`, `lateral_m`: [m] in the tag frame: along the lane in the direction of travel, and to the left
     along_m: float
     lateral_m: float
     polarity: Polarity

@@ -208,30 +208,17 @@ def _check_fields(values: MagnetErrorModel | OdometerError, may_be_zero: tuple[s
 
 @dataclass(frozen=True, slots=True)
 class MagnetErrorModel:
-    """Errors of reading one tag. The defaults are those of Waymark's decoder, to be kept in step with its benchmarks.
+    """Errors of reading one tag. The defaults are those of our decoder, to be kept in step with its benchmarks."""
 
-    Attributes
-    ----------
-    placement_m : float
-        Standard deviation of a magnet's place in the road. [m] Source: METRO section 8.2 saw less than 3 mm.
-    noise_ut : float
-        Noise of a sample on the forward axis. [uT] Source: MLX90393 as METRO sets it (section 6.1).
-    moment_am2 : float
-        Magnetic moment of a magnet. [A m2]
-    sample_rate_hz : float
-        Of the magnetometers. [Hz] Source: METRO section 6.1.
-    channels : float
-        Sensor axes of like strength whose evidence the decoder adds up. Source: chosen by hand.
-    timing_s : float
-        Standard deviation of the time at which a magnet is placed, beyond noise: jitter of the samples, or their
-        interval / sqrt(12) for a decoder that works in whole samples. [s] Source: chosen by hand.
-    """
-
+    # standard deviation of a magnet's place in the road. [m] Source: METRO section 8.2 saw less than 3 mm.
     placement_m: float = 0.0015
+    # noise of a sample on the forward axis. [uT] Source: MLX90393 as METRO sets it (section 6.1).
     noise_ut: float = 1.5
-    moment_am2: float = MOMENT_AM2
-    sample_rate_hz: float = 350.0
-    channels: float = 4.0
+    moment_am2: float = MOMENT_AM2  # [A m2] magnetic moment of a magnet
+    sample_rate_hz: float = 350.0  # of the magnetometers. [Hz] Source: METRO section 6.1.
+    channels: float = 4.0  # sensor axes of like strength whose evidence the decoder adds up. Source: chosen by hand.
+    # standard deviation of the time at which a magnet is placed, beyond noise: jitter of the samples, or their interval
+    # / sqrt(12) for a decoder that works in whole samples. [s] Source: chosen by hand.
     timing_s: float = 0.0001
 
     def __post_init__(self) -> None:
@@ -257,21 +244,12 @@ METRO_ERROR = MagnetErrorModel(channels=1.0, timing_s=1 / 350 / math.sqrt(12))
 
 @dataclass(frozen=True, slots=True)
 class OdometerError:
-    """Errors of the vehicle's speed that do not cancel in a ratio.
+    """Errors of the vehicle's speed that do not cancel in a ratio."""
 
-    Attributes
-    ----------
-    quantum_mps : float
-        Step of the speed signal. [m/s] Source: chosen by hand.
-    rate_hz : float
-        Speeds per second. [Hz] Source: METRO section 7.1.
-    drift : float
-        Standard deviation of the relative change of scale from one gap to the next (slip, braking, latency). Source:
-        chosen by hand.
-    """
-
-    quantum_mps: float = 0.01
-    rate_hz: float = 10.0
+    quantum_mps: float = 0.01  # step of the speed signal. [m/s] Source: chosen by hand.
+    rate_hz: float = 10.0  # speeds per second. [Hz] Source: METRO section 7.1.
+    # standard deviation of the relative change of scale from one gap to the next (slip, braking, latency). Source:
+    # chosen by hand.
     drift: float = 0.001
 
     def __post_init__(self) -> None:
@@ -285,20 +263,10 @@ class OdometerError:
 
 @dataclass(frozen=True, slots=True)
 class ReadingConditions:
-    """Conditions under which a code must be read: the fastest and highest vehicle, its odometer and its decoder.
-
-    Attributes
-    ----------
-    speed_mps : float
-        [m/s]
-    clearance_m : float
-        Of the sensors above the magnets. [m]
-    odometer : OdometerError
-    model : MagnetErrorModel
-    """
+    """Conditions under which a code must be read: the fastest and highest vehicle, its odometer and its decoder."""
 
     speed_mps: float = 13.4
-    clearance_m: float = 0.30
+    clearance_m: float = 0.30  # [m] of the sensors above the magnets
     odometer: OdometerError = field(default_factory=OdometerError)
     model: MagnetErrorModel = field(default_factory=MagnetErrorModel)
 
@@ -395,22 +363,12 @@ def separation_for(confusion: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Distinguishable:
-    """How many codes of a design can be distinguished when all are in use.
+    """How many codes of a design can be distinguished when all are in use."""
 
-    Attributes
-    ----------
-    share : float
-        Share of the codes that are read right with the probability asked for.
-    codes : int
-        The same as a number of codes, of `capacity`.
-    capacity : int
-    mean_accuracy, worst_accuracy : float
-        Probability that the ratios of a code are read right, at least.
-    """
-
-    share: float
-    codes: int
+    share: float  # share of the codes that are read right with the probability asked for
+    codes: int  # the same as a number of codes, of `capacity`
     capacity: int
+    # `mean_accuracy`, `worst_accuracy`: probability that the ratios of a code are read right, at least
     mean_accuracy: float
     worst_accuracy: float
 

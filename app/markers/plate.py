@@ -44,20 +44,12 @@ MAX_SYMBOLS = 15
 
 @dataclass(frozen=True, slots=True)
 class ReedSolomonWord:
-    """One word of a plate: where its symbols stand and how many are data.
+    """One word of a plate: where its symbols stand and how many are data."""
 
-    Attributes
-    ----------
-    cells : tuple of int
-        Indices of the cells in reading order, data first.
-    digits : tuple of int
-        Places of its data among the hexadecimal digits of the plate's number; the other symbols are checks.
-    mask : tuple of int
-        XORed on the symbols, so that words of another scheme, and blank faces, are far from those of this one.
-    """
-
-    cells: tuple[int, ...]
+    cells: tuple[int, ...]  # indices of the cells in reading order, data first
+    # places of its data among the hexadecimal digits of the plate's number; the other symbols are checks
     digits: tuple[int, ...]
+    # XORed on the symbols, so that words of another scheme, and blank faces, are far from those of this one
     mask: tuple[int, ...]
 
     @property
@@ -556,22 +548,13 @@ def numbers(n: int, scheme: PlateScheme) -> int:
 
 @dataclass(frozen=True, slots=True)
 class ResolvedPosition:
-    """A position plate's full coordinates.
+    """A position plate's full coordinates."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg : float
-        The candidate nearest to the coarse position. [deg]
-    distance_deg : float
-        How far it is from the coarse position, per axis at most. [deg]
-    next_distance_deg : float
-        How far the second candidate is on the axis where the two are closest. [deg]
-    """
-
+    # `lon_deg`, `lat_deg`: [deg] the candidate nearest to the coarse position
     lon_deg: float
     lat_deg: float
-    distance_deg: float
-    next_distance_deg: float
+    distance_deg: float  # [deg] how far it is from the coarse position, per axis at most
+    next_distance_deg: float  # [deg] how far the second candidate is on the axis where the two are closest
 
 
 def resolve_position(code: PlateCode, coarse_lon_deg: float, coarse_lat_deg: float) -> ResolvedPosition:

@@ -36,22 +36,12 @@ class PrintParameterName(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PrintThresholds:
-    """Limits of a parameter.
+    """Limits of a parameter."""
 
-    Attributes
-    ----------
-    limits : tuple of float
-        Values at which the grades A, B, C and D end, in the unit of the parameter.
-    unit : str
-        ``%`` or ``1``.
-    rising : bool
-        Whether a higher value is better.
-    source : str
-    """
-
+    # values at which the grades A, B, C and D end, in the unit of the parameter
     limits: tuple[float, float, float, float]
-    unit: str
-    rising: bool
+    unit: str  # ``%`` or ``1``
+    rising: bool  # whether a higher value is better
     source: str
 
     def grade(self, value: float) -> float:
@@ -80,29 +70,14 @@ THRESHOLDS = {
 
 @dataclass(frozen=True, slots=True)
 class PrintParameter:
-    """A graded parameter.
-
-    Attributes
-    ----------
-    name : PrintParameterName
-    value : float
-        In the unit of its thresholds.
-    grade : float
-        4 (A) to 0 (F).
-    finding : str
-        What was measured, in words.
-    cure : str
-        What the printer can do about it; empty where the grade is A.
-    unit_at : (int, int) or None
-        Row and column of the unit that limits, from 1, of the triangle's corner.
-    """
+    """A graded parameter."""
 
     name: PrintParameterName
-    value: float
-    grade: float
-    finding: str
-    cure: str = ""
-    unit_at: tuple[int, int] | None = None
+    value: float  # in the unit of its thresholds
+    grade: float  # 4 (A) to 0 (F)
+    finding: str  # what was measured, in words
+    cure: str = ""  # what the printer can do about it; empty where the grade is A
+    unit_at: tuple[int, int] | None = None  # row and column of the unit that limits, from 1, of the triangle's corner
 
     @property
     def letter(self) -> str:
@@ -112,70 +87,33 @@ class PrintParameter:
 
 @dataclass(frozen=True, slots=True)
 class PrintView:
-    """How the photo shows the plate.
+    """How the photo shows the plate."""
 
-    Attributes
-    ----------
-    side_px : float
-        Mean side of the plate. [px]
-    tilt_deg : float
-        Between the camera's axis and the plate's normal. [deg]
-    edge_mm : float
-        Width of edges, from 10 to 90 %. [mm]
-    light_ratio : float
-        Brightest over darkest light on the plate.
-    white_level : float
-        Brightest channel of the light units as the photo stores it, 0 to 255.
-    focal_known : bool
-        Whether the focal length is that of the photo's EXIF.
-    """
-
-    side_px: float
-    tilt_deg: float
-    edge_mm: float
-    light_ratio: float
-    white_level: float
-    focal_known: bool
+    side_px: float  # [px] mean side of the plate
+    tilt_deg: float  # [deg] between the camera's axis and the plate's normal
+    edge_mm: float  # [mm] width of edges, from 10 to 90 %
+    light_ratio: float  # Brightest over darkest light on the plate
+    white_level: float  # Brightest channel of the light units as the photo stores it, 0 to 255
+    focal_known: bool  # whether the focal length is that of the photo's EXIF
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintGrade:
-    """Grade of a printed plate by a photo.
+    """Grade of a printed plate by a photo."""
 
-    Attributes
-    ----------
-    code : PlateCode
-        What the plate should be: as expected, or as read.
-    geometry : PlateGeometry
-        Of the drawing.
-    expected : bool
-        Whether the code was given, not read.
-    outcome : PlateOutcome
-        Of reading the photo without a registry.
-    read : str or None
-        Digits that were read.
-    view : PrintView
-    parameters : tuple of PrintParameter
-    modulation : ndarray, shape (n, n)
-        Reflectance margin of each unit, NaN in the corner cells. [1]
-    wrong : ndarray of bool, shape (n, n)
-        Units that are dark in place of light, or light in place of dark.
-    face : ndarray of uint8, shape (H, W, 3)
-        The plate rectified, in even light, as sRGB in the order blue, green, red.
-    reflectance : ndarray of float32, shape (H, W, 3)
-        The same, linear, relative to the light units.
-    """
-
-    code: PlateCode
-    geometry: PlateGeometry
-    expected: bool
-    outcome: PlateOutcome
-    read: str | None
+    code: PlateCode  # what the plate should be: as expected, or as read
+    geometry: PlateGeometry  # of the drawing
+    expected: bool  # whether the code was given, not read
+    outcome: PlateOutcome  # of reading the photo without a registry
+    read: str | None  # digits that were read
     view: PrintView
     parameters: tuple[PrintParameter, ...]
-    modulation: Floats = field(repr=False)
+    modulation: Floats = field(repr=False)  # shape (n, n): [1] reflectance margin of each unit, NaN in the corner cells
+    # shape (n, n): units that are dark in place of light, or light in place of dark
     wrong: npt.NDArray[np.bool_] = field(repr=False)
+    # shape (H, W, 3): the plate rectified, in even light, as sRGB in the order blue, green, red
     face: npt.NDArray[np.uint8] = field(repr=False)
+    # shape (H, W, 3): the same, linear, relative to the light units
     reflectance: npt.NDArray[np.float32] = field(repr=False)
 
     @property

@@ -51,28 +51,14 @@ def position_warnings(what: str, *, grade: str, transform_note: str | None, stat
 
 @dataclass(frozen=True, slots=True)
 class ComparedFigure:
-    """A figure beside its limit.
+    """A figure beside its limit."""
 
-    Attributes
-    ----------
-    name : str
-        Which check, e.g. ``magnet-spacing`` or ``dwell-time``.
-    figure : float
-        What the layout or the plan has, in `unit`.
-    relation : ">=" or "<="
-        How the figure must compare with the limit.
-    limit : float
-    unit : str
-    source : str
-        Where the limit comes from.
-    """
-
-    name: str
-    figure: float
-    relation: Literal[">=", "<="]
+    name: str  # which check, e.g. ``magnet-spacing`` or ``dwell-time``.
+    figure: float  # what the layout or the plan has, in `unit`
+    relation: Literal[">=", "<="]  # how the figure must compare with the limit
     limit: float
     unit: str
-    source: str
+    source: str  # where the limit comes from
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,24 +134,14 @@ class Certainty(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlatePose:
-    """Pose of a plate in the camera frame (OpenCV: x right, y down, z forward).
+    """Pose of a plate in the camera frame (OpenCV: x right, y down, z forward)."""
 
-    Attributes
-    ----------
-    rotation : ndarray, shape (3, 3)
-        camera_from_plate; plate axes x right, y travel, z up out of the road.
-    translation_m : ndarray, shape (3,)
-        Plate centre in the camera frame. [m]
-    covariance : ndarray, shape (6, 6)
-        Of (rotation vector [rad] about the camera's axes, translation [m]).
-    reprojection_rms_px : float
-        Root mean square of the corners' residuals. [px]
-    """
-
+    # shape (3, 3): camera_from_plate; plate axes x right, y travel, z up out of the road
     rotation: npt.NDArray[np.float64]
-    translation_m: npt.NDArray[np.float64]
+    translation_m: npt.NDArray[np.float64]  # shape (3,): [m] plate centre in the camera frame
+    # shape (6, 6): of (rotation vector [rad] about the camera's axes, translation [m])
     covariance: npt.NDArray[np.float64]
-    reprojection_rms_px: float
+    reprojection_rms_px: float  # [px] root mean square of the corners' residuals
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,62 +167,34 @@ class PlateGrade:
 
 @dataclass(frozen=True, slots=True)
 class PlateReading:
-    """One candidate plate in a frame and what was read from it.
-
-    Attributes
-    ----------
-    outcome : PlateOutcome
-    corners_px : ndarray, shape (4, 2), or None
-        Outer corners, clockwise from the triangle's, pixel centres at integers. [px]
-    corners_covariance_px2 : ndarray, shape (8, 8), or None
-        Covariance of the flattened corners. [px2]
-    code : PlateCode or None
-        The digits with their scheme; only when the outcome is READ.
-    likely_code : PlateCode or None
-        Digits that are likely, but too unsure to be returned as read: a tentative reading. They give no position.
-    doubtful_cells : tuple of int
-        Of a tentative reading, the cells that may be wrong.
-    confidence : float
-        Probability that all digits, or the likely ones, are right, 0 to 1.
-    cell_confidence : tuple of float
-        Probability that each cell's symbol is right, in reading order.
-    corrected_cells : tuple of int
-        Cells whose symbol came from error correction or from the codebook.
-    from_codebook : bool
-        The codebook decided, or confirmed digits that the frame alone may have been too unsure to give.
-    geometry : PlateGeometry or None
-    grade : PlateGrade or None
-    pose : PlatePose or None
-        With camera parameters only.
-    height_px, width_px : float
-        Extent of the corners in the image. [px]
-    reason : str
-        Why it was refused, as a sentence.
-    frames : tuple of int
-        Frames whose evidence the code rests on together; empty where this frame alone shows it.
-    unit_log_likelihoods : ndarray, shape (units, 5), or None
-        Of the hypotheses on each unit under the digits, where the frame's pixels were compared: other frames of the
-        plate are added to them.
-    """
+    """One candidate plate in a frame and what was read from it."""
 
     family: ClassVar[str] = "plate"
     outcome: PlateOutcome
+    # shape (4, 2), or None: [px] outer corners, clockwise from the triangle's, pixel centres at integers
     corners_px: npt.NDArray[np.float64] | None = None
+    # shape (8, 8), or None: [px2] covariance of the flattened corners
     corners_covariance_px2: npt.NDArray[np.float64] | None = None
-    code: PlateCode | None = None
+    code: PlateCode | None = None  # the digits with their scheme; only when the outcome is READ
+    # digits that are likely, but too unsure to be returned as read: a tentative reading. They give no position.
     likely_code: PlateCode | None = None
-    doubtful_cells: tuple[int, ...] = ()
-    confidence: float = 0.0
-    cell_confidence: tuple[float, ...] = ()
-    corrected_cells: tuple[int, ...] = ()
+    doubtful_cells: tuple[int, ...] = ()  # of a tentative reading, the cells that may be wrong
+    confidence: float = 0.0  # probability that all digits, or the likely ones, are right, 0 to 1
+    cell_confidence: tuple[float, ...] = ()  # probability that each cell's symbol is right, in reading order
+    corrected_cells: tuple[int, ...] = ()  # cells whose symbol came from error correction or from the codebook
+    # the codebook decided, or confirmed digits that the frame alone may have been too unsure to give
     from_codebook: bool = False
     geometry: PlateGeometry | None = None
     grade: PlateGrade | None = None
-    pose: PlatePose | None = None
+    pose: PlatePose | None = None  # with camera parameters only
+    # `height_px`, `width_px`: [px] extent of the corners in the image
     height_px: float = 0.0
     width_px: float = 0.0
-    reason: str = ""
+    reason: str = ""  # why it was refused, as a sentence
+    # frames whose evidence the code rests on together; empty where this frame alone shows it
     frames: tuple[int, ...] = ()
+    # shape (units, 5), or None: of the hypotheses on each unit under the digits, where the frame's pixels were
+    # compared: other frames of the plate are added to them
     unit_log_likelihoods: npt.NDArray[np.float64] | None = None
 
     @property

@@ -26,40 +26,23 @@ MAX_EPOCH = (1900.0, 2100.0)
 class AlignmentDeclaration:
     """What is declared of a file with a road.
 
-    Attributes
-    ----------
-    crs : str, optional
-        CRS of the coordinates; one that contradicts the file is an error.
-    realization : str, optional
-        Frame, e.g. ``ITRF2014``.
-    epoch : float, optional
-        Coordinate epoch. [decimal year]
-    vertical_datum : str, optional
-        ``ellipsoid``, or the datum of the heights, e.g. ``EPSG:5703``; needed where a file with a CRS has heights.
-    unit, height_unit : str, optional
-        ``m``, ``ft-us`` or ``ft-intl``; those of the file or of its CRS without.
-    ignore_heights : bool
-        Leave heights out.
-    origin : tuple of two floats, optional
-        Longitude and latitude of the origin of local coordinates. [deg]
-    bearing_deg : float
-        Direction of the local y axis, clockwise from true north; only with `origin`. [deg]
-
     Raises
     ------
     InvalidParameter
         A value is not allowed, or both a CRS and an origin are declared.
     """
 
-    crs: str | None = None
-    realization: str | None = None
-    epoch: float | None = None
+    crs: str | None = None  # CRS of the coordinates; one that contradicts the file is an error
+    realization: str | None = None  # frame, e.g. ``ITRF2014``.
+    epoch: float | None = None  # [decimal year] coordinate epoch
+    # ``ellipsoid``, or the datum of the heights, e.g. ``EPSG:5703``; needed where a file with a CRS has heights.
     vertical_datum: str | None = None
+    # `unit`, `height_unit`: ``m``, ``ft-us`` or ``ft-intl``; those of the file or of its CRS without
     unit: str | None = None
     height_unit: str | None = None
-    ignore_heights: bool = False
-    origin: tuple[float, float] | None = None
-    bearing_deg: float = 0.0
+    ignore_heights: bool = False  # leave heights out
+    origin: tuple[float, float] | None = None  # [deg] longitude and latitude of the origin of local coordinates
+    bearing_deg: float = 0.0  # [deg] direction of the local y axis, clockwise from true north; only with `origin`
 
     def __post_init__(self) -> None:
         for field, value in (("unit", self.unit), ("height_unit", self.height_unit)):
@@ -114,48 +97,25 @@ _GEOD = Geod(ellps="WGS84")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lane:
-    """One lane in its direction of travel, sampled along its centre line.
+    """One lane in its direction of travel, sampled along its centre line."""
 
-    Attributes
-    ----------
-    name : str
-        Unique in the alignment.
-    road : str
-    chainage_m : ndarray, shape (N,)
-        True distance along the centre line from the lane's start, at even steps of at most 1 m, from 0. [m]
-    lon_deg, lat_deg : ndarray, shape (N,)
-        WGS 84. [deg]
-    height_m : ndarray, shape (N,)
-        Above the ellipsoid or the datum of the source; NaN where unknown. [m]
-    heading_deg : ndarray, shape (N,)
-        Direction of travel, clockwise from true north, 0 to 360. [deg]
-    curvature_per_m : ndarray, shape (N,)
-        Left positive. [1/m]
-    grade : ndarray, shape (N,)
-        Rise per distance, 0 where heights are unknown. [-]
-    superelevation_rad : ndarray, shape (N,)
-        Positive falls to the right. [rad]
-    width_m : ndarray, shape (N,)
-    design_speed_mps : ndarray, shape (N,)
-    station_m : ndarray, shape (N,)
-        True distance along the road's reference line; decreases in lanes of the opposite direction. [m]
-    left_style, right_style : BoundaryStyle
-        Paint of the boundaries.
-    """
-
-    name: str
+    name: str  # unique in the alignment
     road: str
+    # shape (N,): [m] True distance along the centre line from the lane's start, at even steps of at most 1 m, from 0
     chainage_m: Floats
+    # `lon_deg`, `lat_deg`: shape (N,): [deg] WGS 84
     lon_deg: Floats
     lat_deg: Floats
-    height_m: Floats
-    heading_deg: Floats
-    curvature_per_m: Floats
-    grade: Floats
-    superelevation_rad: Floats
-    width_m: Floats
-    design_speed_mps: Floats
+    height_m: Floats  # shape (N,): [m] above the ellipsoid or the datum of the source; NaN where unknown
+    heading_deg: Floats  # shape (N,): [deg] direction of travel, clockwise from true north, 0 to 360
+    curvature_per_m: Floats  # shape (N,): [1/m] left positive
+    grade: Floats  # shape (N,): [-] rise per distance, 0 where heights are unknown
+    superelevation_rad: Floats  # shape (N,): [rad] positive falls to the right
+    width_m: Floats  # shape (N,)
+    design_speed_mps: Floats  # shape (N,)
+    # shape (N,): [m] True distance along the road's reference line; decreases in lanes of the opposite direction
     station_m: Floats
+    # `left_style`, `right_style`: paint of the boundaries
     left_style: BoundaryStyle = BoundaryStyle.UNKNOWN
     right_style: BoundaryStyle = BoundaryStyle.UNKNOWN
 
@@ -205,78 +165,46 @@ class Lane:
 
 @dataclass(frozen=True, slots=True)
 class RoadEvent:
-    """Something on a lane that vehicles must know ahead of time.
-
-    Attributes
-    ----------
-    kind : EventKind
-    lane : str
-    chainage_m : float
-        Along the lane. [m]
-    value : float, str or None
-        Speed limit [km/h], direction of an arrow, or turn of a curve [deg, left positive].
-    """
+    """Something on a lane that vehicles must know ahead of time."""
 
     kind: EventKind
     lane: str
-    chainage_m: float
+    chainage_m: float  # [m] along the lane
+    # speed limit [km/h], direction of an arrow, or turn of a curve [deg, left positive]
     value: float | str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AvoidedArea:
-    """An area in which nothing may be installed.
-
-    Attributes
-    ----------
-    kind : str
-    ring_deg : ndarray, shape (N, 2)
-        Closed ring of longitudes and latitudes that do not jump: across the antimeridian they run beyond 180, and the
-        area stands a second time, 360 degrees away. [deg]
-    """
+    """An area in which nothing may be installed."""
 
     kind: str
+    # shape (N, 2): [deg] closed ring of longitudes and latitudes that do not jump: across the antimeridian they run
+    # beyond 180, and the area stands a second time, 360 degrees away
     ring_deg: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Lanes of a road, with what lies on them.
-
-    Attributes
-    ----------
-    name : str
-    lanes : tuple of Lane
-    events : tuple of RoadEvent
-        By lane and chainage; curves are found by `build_alignment`, the others come with the file.
-    areas : tuple of AvoidedArea
-    surveyed : bool
-        Whether the file states coordinates on Earth; False where an origin placed a road of local coordinates.
-    crs, vertical_datum
-        As declared or stated by the file; the datum is None where heights are unknown.
-    realization, epoch
-        Of the lanes' positions.
-    transform_accuracy_m : float or None
-        Horizontal accuracy of the transformation, the realization and the epoch; None if it is unknown. [m]
-    declared_realization : str or None
-    start_station_m : float
-        Displayed station of the start of the reference line. [m]
-    station_equations : tuple of StationEquation
-    warnings : tuple of str
-    """
+    """Lanes of a road, with what lies on them."""
 
     name: str
     lanes: tuple[Lane, ...]
+    # by lane and chainage; curves are found by `build_alignment`, the others come with the file
     events: tuple[RoadEvent, ...] = ()
     areas: tuple[AvoidedArea, ...] = ()
+    # whether the file states coordinates on Earth; False where an origin placed a road of local coordinates
     surveyed: bool = True
+    # `crs`, `vertical_datum`: as declared or stated by the file; the datum is None where heights are unknown
     crs: str = "EPSG:4326"
+    # `realization`, `epoch`: of the lanes' positions
     realization: str | None = None
     epoch: float | None = None
     vertical_datum: str | None = None
+    # [m] horizontal accuracy of the transformation, the realization and the epoch; None if it is unknown
     transform_accuracy_m: float | None = 0.0
     declared_realization: str | None = None
-    start_station_m: float = 0.0
+    start_station_m: float = 0.0  # [m] displayed station of the start of the reference line
     station_equations: tuple[StationEquation, ...] = ()
     warnings: tuple[str, ...] = ()
 

@@ -26,30 +26,14 @@ from app.radio.settings import RadioSettings
 
 @dataclass(frozen=True, slots=True)
 class TradeOffPoint:
-    """One requirement and the cheapest plan found for it.
-
-    Attributes
-    ----------
-    fix_every_m : float
-        [m]
-    path_error_m : float or None
-        Greatest path error; None where none is required. [m]
-    cost : float
-        Of the whole plan, in the currency of the rules.
-    bound : float
-        No plan that has the same pairs along the path is cheaper.
-    even_cost : float or None
-        With even spacing at equal quality; None where no even spacing has it.
-    counts : tuple of (str, int)
-        Markers by family.
-    """
+    """One requirement and the cheapest plan found for it."""
 
     fix_every_m: float
-    path_error_m: float | None
-    cost: float
-    bound: float
-    even_cost: float | None
-    counts: tuple[tuple[str, int], ...]
+    path_error_m: float | None  # [m] greatest path error; None where none is required
+    cost: float  # of the whole plan, in the currency of the rules
+    bound: float  # no plan that has the same pairs along the path is cheaper
+    even_cost: float | None  # with even spacing at equal quality; None where no even spacing has it
+    counts: tuple[tuple[str, int], ...]  # markers by family
 
     def is_better(self, other: TradeOffPoint) -> bool:
         """Whether it is at least as good in all and better in one of cost, fixes and path error."""
@@ -62,24 +46,12 @@ class TradeOffPoint:
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """How a plan was optimised.
+    """How a plan was optimised."""
 
-    Attributes
-    ----------
-    quality : Quality
-        As required; `fix_every_m` is the best that the budget buys, where there is one.
-    cost : float
-        Of the whole plan, in the currency of the rules; working days are not rounded, and there is one more.
-    bound : float
-        No plan with the same pairs along the path and the same markers ahead of events is cheaper.
-    table : tuple of TradeOffPoint
-        The required quality first.
-    """
-
-    quality: Quality
-    cost: float
-    bound: float
-    table: tuple[TradeOffPoint, ...]
+    quality: Quality  # as required; `fix_every_m` is the best that the budget buys, where there is one
+    cost: float  # of the whole plan, in the currency of the rules; working days are not rounded, and there is one more
+    bound: float  # no plan with the same pairs along the path and the same markers ahead of events is cheaper
+    table: tuple[TradeOffPoint, ...]  # the required quality first
 
 
 def pareto_points(points: Sequence[TradeOffPoint]) -> tuple[TradeOffPoint, ...]:
@@ -143,82 +115,43 @@ Detail = PlannedPlate | PlannedTag | PlannedLineMagnet | PlannedCerpm
 
 @dataclass(frozen=True, slots=True)
 class PlannedMarker:
-    """One marker of a plan.
+    """One marker of a plan."""
 
-    Attributes
-    ----------
-    number : int
-        In the plan, from 1, by lane and chainage.
-    family : str
-        ``plate``, ``magnet`` or ``cerpm``.
-    code : str
-        Digits of a plate, text of a tag, registry number of a CERPM.
-    lane : str
-    chainage_m, offset_m : float
-        Along the lane's centre line, and from it, left positive; of a tag its first magnet. [m]
-    station_m : float
-        True distance along the road's reference line. [m]
-    lon_deg, lat_deg : float
-        WGS 84. [deg]
-    height_m : float or None
-        Of the road surface, in the datum of the alignment. [m]
-    heading_deg : float
-        Direction of travel, clockwise from true north. [deg]
-    purpose : Purpose
-    detail : Detail
-        What distinguishes the family.
-    """
-
-    number: int
-    family: str
-    code: str
+    number: int  # in the plan, from 1, by lane and chainage
+    family: str  # ``plate``, ``magnet`` or ``cerpm``
+    code: str  # digits of a plate, text of a tag, registry number of a CERPM
     lane: str
+    # `chainage_m`, `offset_m`: [m] along the lane's centre line, and from it, left positive; of a tag its first magnet
     chainage_m: float
     offset_m: float
-    station_m: float
+    station_m: float  # [m] True distance along the road's reference line
+    # `lon_deg`, `lat_deg`: [deg] WGS 84
     lon_deg: float
     lat_deg: float
-    height_m: float | None
-    heading_deg: float
+    height_m: float | None  # [m] of the road surface, in the datum of the alignment
+    heading_deg: float  # [deg] direction of travel, clockwise from true north
     purpose: Purpose
-    detail: Detail
+    detail: Detail  # what distinguishes the family
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A place that the rules ask for and that got no marker, or a moved one.
-
-    Attributes
-    ----------
-    family, lane, chainage_m
-    reason : str
-        A sentence for people.
-    moved_m : float or None
-        How far it was moved along the lane; None: left out. [m]
-    """
+    """A place that the rules ask for and that got no marker, or a moved one."""
 
     family: str
     lane: str
     chainage_m: float
-    reason: str
-    moved_m: float | None = None
+    reason: str  # a sentence for people
+    moved_m: float | None = None  # [m] how far it was moved along the lane; None: left out
 
 
 @dataclass(frozen=True, slots=True)
 class PlanFinding(ComparedFigure):
-    """One check of a plan, at its worst place.
-
-    Attributes
-    ----------
-    verdict : Verdict
-    sentence : str
-        The result for people, with the cure if it is not met.
-    lane, station_m, lon_deg, lat_deg
-        Where the figure was found; None for figures of the whole plan.
-    """
+    """One check of a plan, at its worst place."""
 
     verdict: Verdict
-    sentence: str
+    sentence: str  # the result for people, with the cure if it is not met
+    # `lane`, `station_m`, `lon_deg`, `lat_deg`: where the figure was found; None for figures of the whole plan
     lane: str | None = None
     station_m: float | None = None
     lon_deg: float | None = None
@@ -227,35 +160,17 @@ class PlanFinding(ComparedFigure):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """Markers placed on an alignment.
-
-    Attributes
-    ----------
-    name : str
-    alignment : Alignment
-    rules : PlanRules
-    markers : tuple of PlannedMarker
-        By number.
-    left_out : tuple of LeftOut
-    findings : tuple of PlanFinding
-        Empty until `check_plan` ran.
-    codebook : Codebook or None
-        Of the tags.
-    radio : RadioSettings or None
-        Of the CERPMs; None until `check_plan` ran, and without CERPMs.
-    optimum : Optimum or None
-        Of rules with a `quality`.
-    """
+    """Markers placed on an alignment."""
 
     name: str
     alignment: Alignment
     rules: PlanRules
-    markers: tuple[PlannedMarker, ...]
+    markers: tuple[PlannedMarker, ...]  # by number
     left_out: tuple[LeftOut, ...] = ()
-    findings: tuple[PlanFinding, ...] = ()
-    codebook: Codebook | None = None
-    radio: RadioSettings | None = None
-    optimum: Optimum | None = None
+    findings: tuple[PlanFinding, ...] = ()  # empty until `check_plan` ran
+    codebook: Codebook | None = None  # of the tags
+    radio: RadioSettings | None = None  # of the CERPMs; None until `check_plan` ran, and without CERPMs
+    optimum: Optimum | None = None  # of rules with a `quality`
 
     @property
     def counts(self) -> dict[str, int]:
@@ -279,21 +194,11 @@ class SurveyedPlace(NamedTuple):
 
 
 class Residual(NamedTuple):
-    """A surveyed marker against its planned place. [m, deg]
+    """A surveyed marker against its planned place. [m, deg]"""
 
-    Attributes
-    ----------
-    along_m : float
-        Ahead of its planned place in the direction of travel.
-    across_m : float
-        To the left of it.
-    heading_deg : float or None
-        Clockwise of the planned heading, -180 to 180.
-    """
-
-    along_m: float
-    across_m: float
-    heading_deg: float | None
+    along_m: float  # ahead of its planned place in the direction of travel
+    across_m: float  # to the left of it
+    heading_deg: float | None  # clockwise of the planned heading, -180 to 180
 
 
 def residual_of(marker: PlannedMarker, surveyed: SurveyedPlace) -> Residual:

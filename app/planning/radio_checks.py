@@ -142,31 +142,18 @@ class RadioPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RadioCheck:
-    """Results of checking a radio plan.
+    """Results of checking a radio plan."""
 
-    Attributes
-    ----------
-    time_on_air_s, range_m, preview_m : float
-        Of a packet; distance at which its mean level falls to the receiver's sensitivity; distance ahead at which a
-        marker must have been read. [s], [m], [m]
-    road : RoadReception
-        Markers in range and share of packets read at points of the road; one spacing of it where it is even.
-    packet_success : float
-        Share of a marker's packets read at the preview distance, minimum over the road's markers.
-    read_probability : float
-        That a marker is read in time, minimum over the road's markers.
-    battery_days : float
-        [day]
-    checks : tuple of RadioFinding
-    """
-
+    # `time_on_air_s`, `range_m`, `preview_m`: of a packet; distance at which its mean level falls to the receiver's
+    # sensitivity; distance ahead at which a marker must have been read
     time_on_air_s: float
     range_m: float
     preview_m: float
+    # markers in range and share of packets read at points of the road; one spacing of it where it is even
     road: RoadReception
-    packet_success: float
-    read_probability: float
-    battery_days: float
+    packet_success: float  # share of a marker's packets read at the preview distance, minimum over the road's markers
+    read_probability: float  # that a marker is read in time, minimum over the road's markers
+    battery_days: float  # [day]
     checks: tuple[RadioFinding, ...]
 
     @property
@@ -322,30 +309,16 @@ _WANTED = 8  # markers that are approached; source: by hand, bounds the time of 
 
 @dataclass(frozen=True, slots=True)
 class Recommendation:
-    """The best lawful settings found for a plan.
+    """The best lawful settings found for a plan."""
 
-    Attributes
-    ----------
-    settings : RadioSettings or None
-        Those with the longest battery life that reach the required probability; if none does, those with the highest
-        probability. None if no settings are lawful.
-    receiver_channels : int
-        Channels that the receiver must receive at the same time.
-    read_probability : float
-    battery_days : float
-        [day]
-    reaches : bool
-        Whether the required probability is reached.
-    sentence : str
-        For people.
-    """
-
+    # those with the longest battery life that reach the required probability; if none does, those with the highest
+    # probability. None if no settings are lawful.
     settings: RadioSettings | None
-    receiver_channels: int
+    receiver_channels: int  # channels that the receiver must receive at the same time
     read_probability: float
-    battery_days: float
-    reaches: bool
-    sentence: str
+    battery_days: float  # [day]
+    reaches: bool  # whether the required probability is reached
+    sentence: str  # for people
 
 
 def recommend_settings(plan: RadioPlan, *, more_channels: bool = True) -> Recommendation:

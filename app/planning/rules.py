@@ -47,22 +47,14 @@ from app.radio.settings import RadioSettings, Region
 
 @dataclass(frozen=True, slots=True)
 class MarkingRules:
-    """The cycle N of the markings of a country in an edition of its manual.
-
-    Attributes
-    ----------
-    key, title, country, edition : str
-    cycle_m : float
-        Distance from the start of a line segment to the next one, or between studs. [m]
-    straight_cycles, curve_cycles : float
-        Spacing of raised markers that guide, in cycles.
-    """
+    """The cycle N of the markings of a country in an edition of its manual."""
 
     key: str
     title: str
     country: str
     edition: str
-    cycle_m: float
+    cycle_m: float  # [m] distance from the start of a line segment to the next one, or between studs
+    # `straight_cycles`, `curve_cycles`: spacing of raised markers that guide, in cycles
     straight_cycles: float
     curve_cycles: float
 

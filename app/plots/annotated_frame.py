@@ -21,17 +21,9 @@ _MARKER_BGR = (60, 230, 250)
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """One reading to draw over its frame.
+    """One reading to draw over its frame."""
 
-    Attributes
-    ----------
-    corners_px : tuple of (float, float)
-        Clockwise from the triangle's corner; may be empty.
-    outcome : str
-    label : str
-    """
-
-    corners_px: tuple[tuple[float, float], ...]
+    corners_px: tuple[tuple[float, float], ...]  # clockwise from the triangle's corner; may be empty
     outcome: str
     label: str
 

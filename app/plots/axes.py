@@ -88,22 +88,15 @@ def _linear(values: npt.ArrayLike) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Values to pixels; values beyond the ends are drawn at the ends.
+    """Values to pixels; values beyond the ends are drawn at the ends."""
 
-    Attributes
-    ----------
-    first, last : float
-        Values at the ends.
-    start_px, end_px : float
-        Where the ends are drawn. [px]
-    warp : callable
-        np.log for a logarithmic scale, np.sqrt for one of roots; linear by default.
-    """
-
+    # `first`, `last`: values at the ends
     first: float
     last: float
+    # `start_px`, `end_px`: [px] where the ends are drawn
     start_px: float
     end_px: float
+    # np.log for a logarithmic scale, np.sqrt for one of roots; linear by default
     warp: Callable[[npt.ArrayLike], Floats] = _linear
 
     def px(self, values: npt.ArrayLike) -> Floats:

@@ -51,18 +51,12 @@ _PAPER_POINTS = ((50.0, -108.0), (340.0, -125.0))  # [m, dBm] CERPM paper, secti
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalPicture:
-    """Strength of packets over distance.
+    """Strength of packets over distance."""
 
-    Attributes
-    ----------
-    distance_m, rssi_dbm : ndarray, shape (P,)
-        NaN where either is not known. [m, dBm]
-    at_1m_dbm, exponent : float or None
-        Fitted path loss: RSSI = at_1m - 10 exponent log10(distance). [dBm, 1]
-    """
-
+    # `distance_m`, `rssi_dbm`: shape (P,): NaN where either is not known. [m, dBm]
     distance_m: Floats
     rssi_dbm: Floats
+    # `at_1m_dbm`, `exponent`: fitted path loss: RSSI = at_1m - 10 exponent log10(distance). [dBm, 1]
     at_1m_dbm: float | None = None
     exponent: float | None = None
 
@@ -123,37 +117,25 @@ _CONFIDENCE, _CONFIDENCE_LABEL, _TICK = "#8fb7b2", "#4e8a83", "#aaa"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LanePicture:
-    """What a picture of a lane shows; east and north of one origin throughout.
+    """What a picture of a lane shows; east and north of one origin throughout."""
 
-    Attributes
-    ----------
-    centre_m, left_m, right_m : ndarray, shape (S, 2)
-        Centre line and boundaries, NaN where they are not known; empty where the lane was refused. [m]
-    station_m, sigma_m, confidence : ndarray, shape (S,)
-    marker_m : ndarray, shape (K, 2)
-        NaN where a marker has no place. [m]
-    marker_number, marker_side : ndarray of int, shape (K,)
-        Sides as in `LaneSide`: 0 unknown, 1 left, 2 right.
-    left_out : dict of int to str
-        Why markers were left out, by their row.
-    track_m : ndarray, shape (T, 2)
-        Where the vehicle drove; may be empty. [m]
-    refusal : str or None
-        Why there is no lane.
-    """
-
+    # `centre_m`, `left_m`, `right_m`: shape (S, 2): [m] centre line and boundaries, NaN where they are not known; empty
+    # where the lane was refused
     centre_m: Floats
     left_m: Floats
     right_m: Floats
+    # `station_m`, `sigma_m`, `confidence`: shape (S,)
     station_m: Floats
     sigma_m: Floats
     confidence: Floats
-    marker_m: Floats
+    marker_m: Floats  # shape (K, 2): [m] NaN where a marker has no place
+    # `marker_number`, `marker_side`: shape (K,): sides as in `LaneSide`: 0 unknown, 1 left, 2 right
     marker_number: Ints
     marker_side: Ints
-    left_out: dict[int, str] = field(default_factory=dict)
+    left_out: dict[int, str] = field(default_factory=dict)  # why markers were left out, by their row
+    # shape (T, 2): [m] where the vehicle drove; may be empty
     track_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
-    refusal: str | None = None
+    refusal: str | None = None  # why there is no lane
 
 
 def picture_of_lane(lane: Lane, markers: LaneMarkers, track: PoseTrack | None = None) -> LanePicture:

@@ -31,35 +31,17 @@ _JPEG_QUALITY = 90
 
 @dataclass(frozen=True, slots=True)
 class PrintReport:
-    """What the page shows.
-
-    Attributes
-    ----------
-    grade : PrintGrade
-    prediction : PrintPrediction
-    design : DesignSpeed
-    sha256 : str
-        Of the photo.
-    at : datetime
-        Of the request.
-    marker_id : str or None
-    decoder : str
-        With its version.
-    basis : str
-        What the prediction rests on.
-    notes : sequence of str
-        What a photo does not show.
-    """
+    """What the page shows."""
 
     grade: PrintGrade
     prediction: PrintPrediction
     design: DesignSpeed
-    sha256: str
-    at: datetime
+    sha256: str  # of the photo
+    at: datetime  # of the request
     marker_id: str | None
-    decoder: str
-    basis: str
-    notes: Sequence[str]
+    decoder: str  # with its version
+    basis: str  # what the prediction rests on
+    notes: Sequence[str]  # what a photo does not show
 
 
 def write_print_report(report: PrintReport) -> bytes:

@@ -138,28 +138,14 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class PathLoss:
-    """RSSI = level - 10 exponent log10(distance / 50 m), with a normal spread about it.
+    """RSSI = level - 10 exponent log10(distance / 50 m), with a normal spread about it."""
 
-    Attributes
-    ----------
-    level_dbm : Estimate
-        At 50 m. [dBm]
-    exponent : Estimate
-    spread_db : float
-        Standard deviation of shadows and fading. [dB]
-    sensitivity_dbm : float
-        Half of the packets of this strength are received; a guess if all were much stronger. [dBm]
-    packets : int
-    fitted_exponent : bool
-        False if distances were too similar and the exponent is the paper's.
-    """
-
-    level_dbm: Estimate
+    level_dbm: Estimate  # [dBm] at 50 m
     exponent: Estimate
-    spread_db: float
-    sensitivity_dbm: float
+    spread_db: float  # [dB] standard deviation of shadows and fading
+    sensitivity_dbm: float  # [dBm] half of the packets of this strength are received; a guess if all were much stronger
     packets: int
-    fitted_exponent: bool
+    fitted_exponent: bool  # False if distances were too similar and the exponent is the paper's
 
     @property
     def at_1m_dbm(self) -> float:

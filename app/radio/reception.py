@@ -325,25 +325,14 @@ class Air:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StationReception:
-    """Reception at one point of a road: the markers in range, nearest first.
-
-    Attributes
-    ----------
-    station_m : float
-        [m]
-    index : ndarray of int, shape (H,)
-        Index of each marker.
-    distance_m, level_dbm : ndarray, shape (H,)
-        [m], [dBm]
-    success : ndarray, shape (H,)
-        Share of each marker's packets that are read.
-    """
+    """Reception at one point of a road: the markers in range, nearest first."""
 
     station_m: float
-    index: npt.NDArray[np.intp]
+    index: npt.NDArray[np.intp]  # shape (H,): index of each marker
+    # `distance_m`, `level_dbm`: shape (H,): [dBm] [m],
     distance_m: Floats
     level_dbm: Floats
-    success: Floats
+    success: Floats  # shape (H,): share of each marker's packets that are read
 
 
 def reception_at(markers: RoadMarkers, station_m: float, air: Air) -> StationReception:
@@ -367,20 +356,12 @@ def reception_at(markers: RoadMarkers, station_m: float, air: Air) -> StationRec
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadReception:
-    """Reception along a road.
+    """Reception along a road."""
 
-    Attributes
-    ----------
-    station_m : ndarray, shape (S,)
-        [m]
-    in_range : ndarray of int, shape (S,)
-        Number of markers in range.
-    success_mean, success_min : ndarray, shape (S,)
-        Share of packets read, mean and minimum over the markers in range; NaN if there are none.
-    """
-
-    station_m: Floats
-    in_range: npt.NDArray[np.intp]
+    station_m: Floats  # shape (S,) [m]
+    in_range: npt.NDArray[np.intp]  # shape (S,): number of markers in range
+    # `success_mean`, `success_min`: shape (S,): share of packets read, mean and minimum over the markers in range; NaN
+    # if there are none
     success_mean: Floats
     success_min: Floats
 
@@ -407,21 +388,11 @@ def road_reception(markers: RoadMarkers, stations_m: npt.ArrayLike, air: Air) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """Reception of one marker while a vehicle drives towards it.
+    """Reception of one marker while a vehicle drives towards it."""
 
-    Attributes
-    ----------
-    ahead_m : ndarray, shape (U,)
-        Distance from the vehicle to the marker along the road, rising. [m]
-    level_dbm : ndarray, shape (U,)
-        [dBm]
-    harmful : ndarray, shape (U, Q)
-        Others that can destroy its packets (`harmful_others`).
-    """
-
-    ahead_m: Floats
-    level_dbm: Floats
-    harmful: Floats
+    ahead_m: Floats  # shape (U,): [m] distance from the vehicle to the marker along the road, rising
+    level_dbm: Floats  # shape (U,) [dBm]
+    harmful: Floats  # shape (U, Q): others that can destroy its packets (`harmful_others`)
 
 
 def approach(markers: RoadMarkers, index: int, nearest_m: float, air: Air) -> Approach:

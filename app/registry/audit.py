@@ -258,21 +258,13 @@ def count_history(connection: sa.Connection, agency_id: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class EntryFilter:
-    """Which entries of a log; what is None is not filtered by.
+    """Which entries of a log; what is None is not filtered by."""
 
-    Attributes
-    ----------
-    who, subject : str, optional
-        Exactly.
-    action : str, optional
-        Exactly, or all that begin so, with a ``*`` at the end.
-    since, until : datetime, optional
-        At this time or later; before this time.
-    """
-
+    # `who`, `subject`: exactly
     who: str | None = None
-    action: str | None = None
+    action: str | None = None  # exactly, or all that begin so, with a ``*`` at the end
     subject: str | None = None
+    # `since`, `until`: at this time or later; before this time
     since: datetime | None = None
     until: datetime | None = None
 
@@ -336,22 +328,13 @@ class Fault(NamedTuple):
 
 @dataclass(slots=True)
 class ChainReport:
-    """What a check went through; complete when its faults are exhausted.
+    """What a check went through; complete when its faults are exhausted."""
 
-    Attributes
-    ----------
-    since : int
-        Number of the entry up to which an earlier check is relied on; 0 for a full check.
-    entries, versions : int
-        How many there are.
-    head : tuple of int and str, optional
-        Number and hash of the last entry.
-    """
-
-    since: int = 0
+    since: int = 0  # number of the entry up to which an earlier check is relied on; 0 for a full check
+    # `entries`, `versions`: how many there are
     entries: int = 0
     versions: int = 0
-    head: tuple[int, str] | None = None
+    head: tuple[int, str] | None = None  # number and hash of the last entry
     watch: Callable[[], None] | None = None
     """Called from time to time."""
 

@@ -30,21 +30,11 @@ class JsonTexts(list[str]):
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Rows that have the same columns.
+    """Rows that have the same columns."""
 
-    Attributes
-    ----------
-    count : int
-        Rows.
-    same : dict
-        Columns in which all rows agree: name to value.
-    own : dict
-        The others: name to `count` values; of JSON columns either values or `JsonTexts`.
-    """
-
-    count: int
-    same: dict[str, Any]
-    own: dict[str, Sequence[Any]]
+    count: int  # rows
+    same: dict[str, Any]  # columns in which all rows agree: name to value
+    own: dict[str, Sequence[Any]]  # the others: name to `count` values; of JSON columns either values or `JsonTexts`
 
     @classmethod
     def of(cls, count: int, same: Mapping[str, Any], lists: Mapping[str, Sequence[Any]]) -> Columns:

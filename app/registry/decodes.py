@@ -20,73 +20,43 @@ from app.registry.tables import decodes, jobs, observations
 
 
 class DecodeRow(NamedTuple):
-    """A decode with the state of its job.
-
-    Attributes
-    ----------
-    kind : str
-        Of the upload: frame, archive, trace or packets.
-    context : dict
-        What was declared of the upload.
-    upload_key, picture_key : str or None
-        Keys of the blobs of the upload and of the plot.
-    upload_bytes : int or None
-        Size of the upload; None of those that were stored before it was recorded. [byte]
-    upload_sha256 : str or None
-        Its hash, in hexadecimal digits.
-    result : dict or None
-        None until the decode is done.
-    """
+    """A decode with the state of its job."""
 
     id: str
-    kind: str
-    context: dict[str, Any]
+    kind: str  # of the upload: frame, archive, trace or packets
+    context: dict[str, Any]  # what was declared of the upload
     created_at: datetime
     finished_at: datetime | None = None
+    # `upload_key`, `picture_key`: keys of the blobs of the upload and of the plot
     upload_key: str | None = None
     picture_key: str | None = None
-    result: dict[str, Any] | None = None
+    result: dict[str, Any] | None = None  # None until the decode is done
     state: JobState = "queued"
     progress: float = 0.0
     attempts: int = 0
     error: dict[str, str] | None = None
-    upload_bytes: int | None = None
-    upload_sha256: str | None = None
+    upload_bytes: int | None = None  # [byte] size of the upload; None of those that were stored before it was recorded
+    upload_sha256: str | None = None  # its hash, in hexadecimal digits
 
 
 class DecodeFilter(NamedTuple):
-    """Which decodes a list has; None: any.
-
-    Attributes
-    ----------
-    vehicle : str or None
-        Name or id of the vehicle that the upload named.
-    since, until : datetime or None
-        Uploaded then or later, and before then.
-    """
+    """Which decodes a list has; None: any."""
 
     state: str | None = None
     kind: str | None = None
-    vehicle: str | None = None
+    vehicle: str | None = None  # name or id of the vehicle that the upload named
+    # `since`, `until`: uploaded then or later, and before then
     since: datetime | None = None
     until: datetime | None = None
 
 
 class NewObservation(NamedTuple):
-    """What a decode observed of a marker.
-
-    Attributes
-    ----------
-    frame : int
-        Index of the frame in an archive; 0 for every other upload.
-    what : str
-        ``seen``, or what was wrong.
-    """
+    """What a decode observed of a marker."""
 
     marker_id: str
-    frame: int
+    frame: int  # index of the frame in an archive; 0 for every other upload
     at: datetime
-    what: str
+    what: str  # ``seen``, or what was wrong
     detail: dict[str, Any]
 
 

@@ -55,21 +55,11 @@ class TableDump(NamedTuple):
 
 
 class DatabaseSummary(NamedTuple):
-    """What a dump contains.
+    """What a dump contains."""
 
-    Attributes
-    ----------
-    revision : str
-        Of the schema.
-    tables : tuple of TableDump
-        In an order in which no row refers to one that is loaded later.
-    heads : dict
-        By the name of each agency, its newest audit entry as NUMBER:HASH.
-    """
-
-    revision: str
-    tables: tuple[TableDump, ...]
-    heads: dict[str, str]
+    revision: str  # of the schema
+    tables: tuple[TableDump, ...]  # in an order in which no row refers to one that is loaded later
+    heads: dict[str, str]  # by the name of each agency, its newest audit entry as NUMBER:HASH
 
 
 # --- SQLite ---------------------------------------------------------------------------------------------------------

@@ -80,38 +80,17 @@ _RETIRED: sa.BindParameter[str] = sa.bindparam("retired", "retired", sa.String()
 
 @dataclass(frozen=True, eq=False)
 class FeatureTable:
-    """Rows that are the features of a collection of points.
+    """Rows that are the features of a collection of points."""
 
-    Attributes
-    ----------
-    table : Table
-        With the columns row, id, agency_id, lon_deg, lat_deg and height_m, and a spatial index.
-    fields : tuple of Field
-    owned : condition
-        Which rows of the table they are.
-    text : column
-        The feature as GeoJSON, in one line.
-    changed : column
-        Time of the last change.
-    tiled : tuple of str
-        Fields that points in tiles have.
-    cheap_to_count : frozenset of str
-        Fields by which rows are counted in little time.
-    epoch : column, optional
-        Coordinate epoch of a row. [decimal year]
-    plans : Table, optional
-        What the columns refer to besides: the plan of each row.
-    """
-
-    table: sa.Table
+    table: sa.Table  # with the columns row, id, agency_id, lon_deg, lat_deg and height_m, and a spatial index
     fields: tuple[Field, ...]
-    owned: sa.ColumnElement[bool]
-    text: sa.ColumnElement[Any]
-    changed: sa.ColumnElement[Any]
-    tiled: tuple[str, ...]
-    cheap_to_count: frozenset[str]
-    epoch: sa.ColumnElement[Any] | None = None
-    plans: sa.Table | None = None
+    owned: sa.ColumnElement[bool]  # which rows of the table they are
+    text: sa.ColumnElement[Any]  # the feature as GeoJSON, in one line
+    changed: sa.ColumnElement[Any]  # time of the last change
+    tiled: tuple[str, ...]  # fields that points in tiles have
+    cheap_to_count: frozenset[str]  # fields by which rows are counted in little time
+    epoch: sa.ColumnElement[Any] | None = None  # [decimal year] coordinate epoch of a row
+    plans: sa.Table | None = None  # what the columns refer to besides: the plan of each row
 
     @property
     def source(self) -> sa.FromClause:
@@ -147,30 +126,17 @@ RETIRED = FeatureTable(markers, FIELDS, _C.status == _RETIRED, *_MARKERS)
 
 @dataclass(frozen=True, slots=True)
 class FeatureFilter:
-    """Which features are asked for; None does not narrow.
+    """Which features are asked for; None does not narrow."""
 
-    Attributes
-    ----------
-    table : FeatureTable
-        Of which collection.
-    box : Box or None
-    heights_m : tuple of float or None
-        Lowest and highest ellipsoidal height; markers without one are included. [m]
-    since, until : datetime or None
-        Bounds of the last change, both inclusive.
-    equal : tuple of (name, value)
-        Properties with a value.
-    where : Condition or None
-        Anything else that is asked of the properties.
-    """
-
-    table: FeatureTable = ON_ROAD
+    table: FeatureTable = ON_ROAD  # of which collection
     box: Box | None = None
+    # [m] lowest and highest ellipsoidal height; markers without one are included
     heights_m: tuple[float, float] | None = None
+    # `since`, `until`: bounds of the last change, both inclusive
     since: datetime | None = None
     until: datetime | None = None
-    equal: tuple[tuple[str, str | float], ...] = ()
-    where: Condition | None = None
+    equal: tuple[tuple[str, str | float], ...] = ()  # properties with a value
+    where: Condition | None = None  # anything else that is asked of the properties
 
 
 class _Shape(NamedTuple):

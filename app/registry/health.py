@@ -182,31 +182,16 @@ _M = maintenance_items.c
 
 
 class ItemRow(NamedTuple):
-    """A fault that is suspected.
-
-    Attributes
-    ----------
-    subject : str
-        As of `HealthRow`, or the drive of a driver on the wrong way.
-    decode_id : str or None
-        The upload that made it an item; None for damage reports.
-    what : str
-        A fault, ``wrong-way-driver``, or ``reported`` by people.
-    state, outcome : str, str or None
-        open, approved or dismissed; and what was approved.
-    ratio : float
-        Logarithm of the likelihood ratio. [nat]
-    evidence : dict
-        JSON: limits, displacement, uploads, damage reports.
-    """
+    """A fault that is suspected."""
 
     id: str
-    subject: str
+    subject: str  # as of `HealthRow`, or the drive of a driver on the wrong way
     marker_id: str | None
-    decode_id: str | None
+    decode_id: str | None  # the upload that made it an item; None for damage reports
     family: str
     code: str | None
-    what: str
+    what: str  # a fault, ``wrong-way-driver``, or ``reported`` by people
+    # `state`, `outcome`: open, approved or dismissed; and what was approved
     state: str
     outcome: str | None
     road: str | None
@@ -215,12 +200,12 @@ class ItemRow(NamedTuple):
     lat_deg: float
     height_m: float | None
     priority: float
-    ratio: float
+    ratio: float  # [nat] logarithm of the likelihood ratio
     vehicles: int
     passes: int
     first_at: datetime
     last_at: datetime
-    evidence: dict[str, Any]
+    evidence: dict[str, Any]  # JSON: limits, displacement, uploads, damage reports
     note: str | None
     decided_by: str | None
     decided_at: datetime | None

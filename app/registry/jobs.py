@@ -45,49 +45,29 @@ class JobKind(StrEnum):
 
 
 class JobRow(NamedTuple):
-    """A job.
-
-    Attributes
-    ----------
-    holder_id : str or None
-        Of the key that asked for it.
-    progress : float
-        From 0 to 1.
-    input : dict
-        What the job needs to know besides its upload.
-    upload_key : str or None
-        Key of the blob that the job reads.
-    result, error : dict or None
-        What the job returned, or why it failed.
-    subject_id : str or None
-        Of the row that it is about, e.g. a plan.
-    steps_done, steps_total : int or None
-        Of jobs that are divided into steps, once they are known.
-    started_at : datetime or None
-        When it was started first.
-    dead_letter : bool
-        Whether it failed because it stopped the processes that worked on it.
-    """
+    """A job."""
 
     id: str
     agency_id: str
-    holder_id: str | None
+    holder_id: str | None  # of the key that asked for it
     kind: str
     state: JobState
     attempts: int
-    progress: float
+    progress: float  # from 0 to 1
     cancel_requested: bool
-    input: dict[str, Any]
-    upload_key: str | None
+    input: dict[str, Any]  # what the job needs to know besides its upload
+    upload_key: str | None  # key of the blob that the job reads
+    # `result`, `error`: what the job returned, or why it failed
     result: dict[str, Any] | None
     error: dict[str, str] | None
     created_at: datetime
     finished_at: datetime | None
-    subject_id: str | None = None
+    subject_id: str | None = None  # of the row that it is about, e.g. a plan.
+    # `steps_done`, `steps_total`: of jobs that are divided into steps, once they are known
     steps_done: int | None = None
     steps_total: int | None = None
-    started_at: datetime | None = None
-    dead_letter: bool = False
+    started_at: datetime | None = None  # when it was started first
+    dead_letter: bool = False  # whether it failed because it stopped the processes that worked on it
 
 
 class UnfinishedJob(NamedTuple):

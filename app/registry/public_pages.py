@@ -19,21 +19,11 @@ _P = public_pages.c
 
 
 class PublicPageRow(NamedTuple):
-    """What an agency releases.
+    """What an agency releases."""
 
-    Attributes
-    ----------
-    fields : list of str
-        Some of `FIELDS`; none: its markers have no public pages.
-    damage_reports : bool
-        Whether the pages have a form for damage reports.
-    version : int
-        0: the agency has changed nothing.
-    """
-
-    fields: list[str]
-    damage_reports: bool
-    version: int
+    fields: list[str]  # some of `FIELDS`; none: its markers have no public pages
+    damage_reports: bool  # whether the pages have a form for damage reports
+    version: int  # 0: the agency has changed nothing
     updated_at: datetime | None
 
 
@@ -104,34 +94,23 @@ NO_CONTACT_CURE = "has_contact of the report is true if there is one"
 
 
 class StoredReport(NamedTuple):
-    """A damage report as it is stored.
-
-    Attributes
-    ----------
-    form_nonce : str
-        Of the form that it was sent with.
-    kind, text, language : str, str or None, str
-        What the sender chose and wrote, and the language of the page.
-    photo_key, photo_bytes : str or None, int or None
-        Blob of the photo.
-    state, note : str, str or None
-        new, accepted or rejected; and why.
-    item_id : str or None
-        Item of the work list that it was accepted into.
-    """
+    """A damage report as it is stored."""
 
     id: str
     agency_id: str
     marker_id: str
-    form_nonce: str
+    form_nonce: str  # of the form that it was sent with
+    # `kind`, `text`, `language`: what the sender chose and wrote, and the language of the page
     kind: str
     text: str | None
     language: str
+    # `photo_key`, `photo_bytes`: blob of the photo
     photo_key: str | None
     photo_bytes: int | None
+    # `state`, `note`: new, accepted or rejected; and why
     state: str
     note: str | None
-    item_id: str | None
+    item_id: str | None  # item of the work list that it was accepted into
     decided_by: str | None
     decided_at: datetime | None
     created_at: datetime

@@ -27,30 +27,14 @@ class VersionRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Resource(Generic[RowT]):
-    """The queries on one kind of resource. All see one agency only.
+    """The queries on one kind of resource. All see one agency only."""
 
-    Attributes
-    ----------
-    name : str
-        In errors, and of its columns in the history.
-    row : type
-        A NamedTuple of the columns that are read.
-    table : Table
-        With the columns `id` and `agency_id`.
-    cure : str, optional
-        Where the agency's own are listed.
-    versions : Table, optional
-        The history. Its columns `{name}_id` and `{name}` have the id and the resource.
-    unversioned : tuple of str
-        Columns that no version keeps.
-    """
-
-    name: str
-    row: type[RowT]
-    table: sa.Table
-    cure: str | None = None
-    versions: sa.Table | None = None
-    unversioned: tuple[str, ...] = ()
+    name: str  # in errors, and of its columns in the history
+    row: type[RowT]  # a NamedTuple of the columns that are read
+    table: sa.Table  # with the columns `id` and `agency_id`
+    cure: str | None = None  # where the agency's own are listed
+    versions: sa.Table | None = None  # the history. Its columns `{name}_id` and `{name}` have the id and the resource.
+    unversioned: tuple[str, ...] = ()  # columns that no version keeps
 
     def find(self, connection: sa.Connection, agency_id: str, **equal: Any) -> RowT | None:
         """The only resource whose columns have these values."""

@@ -210,20 +210,11 @@ _PREPARED: WeakValueDictionary[bytes, _PreparedArea] = WeakValueDictionary()
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """One polygon or several, with straight edges in longitude and latitude; none spans the antimeridian.
+    """One polygon or several, with straight edges in longitude and latitude; none spans the antimeridian."""
 
-    Attributes
-    ----------
-    wkb : bytes
-        Well-known binary, little-endian.
-    boxes : tuple of Box
-        One around each polygon.
-    key : bytes
-        Names the area in statements of SQLite, for which a call of a function with 10,000 vertices takes 0.3 ms.
-    """
-
-    wkb: bytes
-    boxes: tuple[Box, ...]
+    wkb: bytes  # Well-known binary, little-endian
+    boxes: tuple[Box, ...]  # one around each polygon
+    # names the area in statements of SQLite, for which a call of a function with 10,000 vertices takes 0.3 ms
     key: bytes = field(init=False, compare=False, repr=False)
     _prepared: _PreparedArea = field(init=False, compare=False, repr=False)
 

@@ -268,23 +268,12 @@ _CELLS = 32  # across a tile; by hand: 16 px of a map that shows tiles 512 px wi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureGrid:
-    """An agency's features of a table, counted by cell, family and status.
+    """An agency's features of a table, counted by cell, family and status."""
 
-    Attributes
-    ----------
-    lon_lat_deg : ndarray of float, shape (N, 2)
-        Mean position of the features of a row. [deg]
-    count : ndarray of int, shape (N,)
-    kind : ndarray of int, shape (N,)
-        Index into `kinds`.
-    kinds : tuple of str
-        ``{family}_{status}``, "other" in place of a family that is not known.
-    """
-
-    lon_lat_deg: npt.NDArray[np.float64]
-    count: npt.NDArray[np.int64]
-    kind: npt.NDArray[np.int64]
-    kinds: tuple[str, ...]
+    lon_lat_deg: npt.NDArray[np.float64]  # shape (N, 2): [deg] mean position of the features of a row
+    count: npt.NDArray[np.int64]  # shape (N,)
+    kind: npt.NDArray[np.int64]  # shape (N,): index into `kinds`
+    kinds: tuple[str, ...]  # ``{family}_{status}``, "other" in place of a family that is not known
 
     def count_on(self, tile: Tile) -> int:
         """Features on a tile, those of a cell all at their mean position."""

@@ -16,40 +16,26 @@ _U, _P = uploads.c, upload_parts.c
 
 
 class UploadRow(NamedTuple):
-    """An upload that arrives in parts.
-
-    Attributes
-    ----------
-    holder_id, label, scope : str
-        Of the key that uploads.
-    method : str
-        ``tus`` or ``s3-parts``.
-    state : str
-        ``open``, then ``done`` (there is a decode), ``refused`` (there is an error) or ``expired``.
-    length, received : int
-        Of the whole file, and of what is stored durably. [byte]
-    declared : dict
-        ``file_name``, ``context`` (its members that were stated) and ``vehicle``.
-    lock_id, locked_until
-        The request that writes, and until when nobody else may.
-    store_key, store_upload_id : str or None
-        Of an upload whose parts go to S3 directly.
-    """
+    """An upload that arrives in parts."""
 
     id: str
     agency_id: str
+    # `holder_id`, `label`, `scope`: of the key that uploads
     holder_id: str
     label: str
     scope: str
-    method: str
-    state: str
+    method: str  # ``tus`` or ``s3-parts``
+    state: str  # ``open``, then ``done`` (there is a decode), ``refused`` (there is an error) or ``expired``
+    # `length`, `received`: [byte] of the whole file, and of what is stored durably
     length: int
     received: int
-    declared: dict[str, Any]
+    declared: dict[str, Any]  # ``file_name``, ``context`` (its members that were stated) and ``vehicle``
     created_at: datetime
     expires_at: datetime
+    # `lock_id`, `locked_until`: the request that writes, and until when nobody else may
     lock_id: str | None = None
     locked_until: datetime | None = None
+    # `store_key`, `store_upload_id`: of an upload whose parts go to S3 directly
     store_key: str | None = None
     store_upload_id: str | None = None
     decode_id: str | None = None

@@ -22,25 +22,13 @@ _E = events.c
 
 
 class EventRow(NamedTuple):
-    """Something that happened.
+    """Something that happened."""
 
-    Attributes
-    ----------
-    id : int
-        Rises in the order of commits.
-    kind : str
-        For example ``maintenance.suspect``.
-    subject_id : str or None
-        What it is about: an id of the resource that the kind names.
-    detail : dict or None
-        Small JSON values, without anything secret.
-    """
-
-    id: int
-    kind: str
-    subject_id: str | None
+    id: int  # rises in the order of commits
+    kind: str  # for example ``maintenance.suspect``
+    subject_id: str | None  # what it is about: an id of the resource that the kind names
     at: datetime
-    detail: dict[str, Any] | None
+    detail: dict[str, Any] | None  # small JSON values, without anything secret
 
 
 def add_event(
@@ -113,56 +101,35 @@ _W, _D = webhooks.c, webhook_deliveries.c
 
 
 class WebhookRow(NamedTuple):
-    """A webhook.
-
-    Attributes
-    ----------
-    events : list of str
-        Kinds of events that it is sent; ``job.*`` are all that begin so.
-    sealed_secret : bytes
-        Under the server's key.
-    reason : str or None
-        Why it is disabled.
-    last_event_id : int
-        Events up to this one have become deliveries.
-    """
+    """A webhook."""
 
     id: str
     agency_id: str
     url: str
-    events: list[str]
-    sealed_secret: bytes
+    events: list[str]  # kinds of events that it is sent; ``job.*`` are all that begin so
+    sealed_secret: bytes  # under the server's key
     state: str
-    reason: str | None
-    last_event_id: int
+    reason: str | None  # why it is disabled
+    last_event_id: int  # events up to this one have become deliveries
     last_success_at: datetime | None
     who: str
     created_at: datetime
 
 
 class DeliveryRow(NamedTuple):
-    """One event for one webhook.
-
-    Attributes
-    ----------
-    body : str
-        JSON, as it is signed and sent.
-    due_at : datetime
-        When it is sent next; while it is being sent, when another process may send it.
-    status, error : int or None, str or None
-        Of the last attempt.
-    """
+    """One event for one webhook."""
 
     id: str
     agency_id: str
     webhook_id: str
     event_id: int
     kind: str
-    body: str
+    body: str  # JSON, as it is signed and sent
     state: str
     attempts: int
-    due_at: datetime
+    due_at: datetime  # when it is sent next; while it is being sent, when another process may send it
     give_up_at: datetime
+    # `status`, `error`: of the last attempt
     status: int | None
     error: str | None
     created_at: datetime

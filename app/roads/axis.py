@@ -50,27 +50,14 @@ _MAX_DETOUR = 1.01  # of a strip's foot against the nearest place on the axis; s
 
 @dataclass(frozen=True, slots=True)
 class Foot:
-    """Foot of a place on an axis.
+    """Foot of a place on an axis."""
 
-    Attributes
-    ----------
-    part : int
-        Part of the axis, from 0.
-    chainage_m : float
-        Along the axis. [m]
-    offset_m : float
-        From the axis, left positive. [m]
-    beyond_m : float
-        Distance of the place before the start (negative) or after the end of its part. [m]
-    exact : bool
-        Whether the place can be computed from chainage and offset: not beyond an end, outside of a corner, or beyond
-        the centre of a bend.
-    """
-
-    part: int
-    chainage_m: float
-    offset_m: float
-    beyond_m: float = 0.0
+    part: int  # part of the axis, from 0
+    chainage_m: float  # [m] along the axis
+    offset_m: float  # [m] from the axis, left positive
+    beyond_m: float = 0.0  # [m] distance of the place before the start (negative) or after the end of its part
+    # whether the place can be computed from chainage and offset: not beyond an end, outside of a corner, or beyond the
+    # centre of a bend
     exact: bool = True
 
     @property

@@ -25,21 +25,11 @@ _SAME_PLACE_M = 1e-4  # [m] points nearer than this are one; source: by hand, th
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneLine:
-    """A line in the direction of travel, e.g. a lane's centre line or a painted line.
+    """A line in the direction of travel, e.g. a lane's centre line or a painted line."""
 
-    Attributes
-    ----------
-    origin : (lon_deg, lat_deg, height_m)
-        Of the local east, north, up frame: the line's first point.
-    points_enu_m : ndarray, shape (K, 3)
-        Vertices; up follows the ellipsoid away from the origin. [m]
-    chainages_m : ndarray, shape (K,)
-        Of the vertices, from 0. [m]
-    """
-
-    origin: tuple[float, float, float]
-    points_enu_m: FloatArray
-    chainages_m: FloatArray
+    origin: tuple[float, float, float]  # of the local east, north, up frame: the line's first point
+    points_enu_m: FloatArray  # shape (K, 3): [m] vertices; up follows the ellipsoid away from the origin
+    chainages_m: FloatArray  # shape (K,): [m] of the vertices, from 0
 
     @classmethod
     def from_lon_lat(cls, points_deg: Sequence[Sequence[float]], height_m: float = 0.0) -> LaneLine:
@@ -207,24 +197,12 @@ _MIN_APART_M = 1e-3  # [m] between calibration points; source: a millimetre, bel
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPoint:
-    """A place whose measure is known.
+    """A place whose measure is known."""
 
-    Attributes
-    ----------
-    part : int
-        Part of the axis, from 0.
-    chainage_m : float
-        Along the axis. [m]
-    measure_m : float
-        Measure signed there. [m]
-    ahead_m : float or None
-        At an equation of stationing, the measure after it. [m]
-    """
-
-    part: int
-    chainage_m: float
-    measure_m: float
-    ahead_m: float | None = None
+    part: int  # part of the axis, from 0
+    chainage_m: float  # [m] along the axis
+    measure_m: float  # [m] measure signed there
+    ahead_m: float | None = None  # [m] at an equation of stationing, the measure after it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -134,31 +134,15 @@ class PlainClaim:
 
 @dataclass(frozen=True, slots=True)
 class ReceivedPacket:
-    """One packet as logged by a receiver or a network server.
+    """One packet as logged by a receiver or a network server."""
 
-    Attributes
-    ----------
-    entry : int
-        Which row, line or event of the log it came from, from 0.
-    received_at_s : float
-        Time of reception, seconds since 1970-01-01 UTC; NaN if the log has none. [s]
-    payload : bytes or None
-        The message as it was sent, with its tag; None for a packet in clear.
-    claim : PlainClaim or None
-        Contents of a packet in clear; None where there is a payload.
-    rssi_dbm, snr_db : float
-        NaN if the log has none.
-    device : str or None
-        LoRaWAN DevEUI or another name of the sender in the log.
-    event : str or None
-        Identifier of the uplink on its network server; packets with the same one are one uplink received twice.
-    """
-
-    entry: int
-    received_at_s: float
-    payload: bytes | None = None
-    claim: PlainClaim | None = None
+    entry: int  # which row, line or event of the log it came from, from 0
+    received_at_s: float  # [s] time of reception, seconds since 1970-01-01 UTC; NaN if the log has none
+    payload: bytes | None = None  # the message as it was sent, with its tag; None for a packet in clear
+    claim: PlainClaim | None = None  # contents of a packet in clear; None where there is a payload
+    # `rssi_dbm`, `snr_db`: NaN if the log has none
     rssi_dbm: float = float("nan")
     snr_db: float = float("nan")
-    device: str | None = None
+    device: str | None = None  # LoRaWAN DevEUI or another name of the sender in the log
+    # Identifier of the uplink on its network server; packets with the same one are one uplink received twice
     event: str | None = None

@@ -195,21 +195,12 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class BackupOptions:
-    """What a backup contains.
+    """What a backup contains."""
 
-    Attributes
-    ----------
-    with_keys : bool
-        The key files, too.
-    copy_blobs : bool
-        The blobs themselves; otherwise only their names, for a store that is kept and backed up by itself.
-    allow_missing : bool
-        Go on although blobs are lost, and name them.
-    """
-
-    with_keys: bool = False
+    with_keys: bool = False  # the key files, too
+    # the blobs themselves; otherwise only their names, for a store that is kept and backed up by itself
     copy_blobs: bool = True
-    allow_missing: bool = False
+    allow_missing: bool = False  # go on although blobs are lost, and name them
 
 
 class _BlobGone(Exception):
@@ -366,21 +357,11 @@ _SHOWN_FAULTS = 20
 
 @dataclass(frozen=True, slots=True)
 class RestoreReport:
-    """What was restored.
+    """What was restored."""
 
-    Attributes
-    ----------
-    manifest : Manifest
-        Of the backup.
-    faults : tuple of str
-        What is not as it should be, although the backup is as it was written.
-    absent_keys : tuple of str
-        Key files that are neither in the backup nor here.
-    """
-
-    manifest: Manifest
-    faults: tuple[str, ...]
-    absent_keys: tuple[str, ...]
+    manifest: Manifest  # of the backup
+    faults: tuple[str, ...]  # what is not as it should be, although the backup is as it was written
+    absent_keys: tuple[str, ...]  # key files that are neither in the backup nor here
 
 
 class Restores:

@@ -19,18 +19,12 @@ ResponseT = TypeVar("ResponseT")
 
 @dataclass(frozen=True, slots=True)
 class IdempotencyKey:
-    """A client's key, the hash of the request that it came with, and whose request it is.
-
-    Attributes
-    ----------
-    key, request_sha256 : str
-    holder_id : str
-        `Caller.key_id`. Other callers of the agency have other scopes, and may not see the response. Empty for the
-        server's own jobs.
-    """
+    """A client's key, the hash of the request that it came with, and whose request it is."""
 
     key: str
     request_sha256: str
+    # `Caller.key_id`. Other callers of the agency have other scopes, and may not see the response. Empty for the
+    # server's own jobs.
     holder_id: str
 
 

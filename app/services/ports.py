@@ -22,15 +22,10 @@ class Task(Generic[ResultT]):
     """Base of everything that a decoder process is asked to do: plain values that can be pickled, and no database.
 
     `app.jobs.tasks` names the function that carries each task out.
-
-    Attributes
-    ----------
-    is_long : bool
-        Whether the time limit of recordings applies to it, instead of the limit of frames.
     """
 
     __slots__ = ()
-    is_long: ClassVar[bool] = True
+    is_long: ClassVar[bool] = True  # whether the time limit of recordings applies to it, instead of the limit of frames
 
     def steps(self) -> tuple[object, ...]:
         """Arguments of the task's steps, in their order; one that is a Future is sent when the caller has set it."""

@@ -39,22 +39,13 @@ _PLANNERS = frozenset({Scope.PLANNER, Scope.ADMIN})
 
 @dataclass(frozen=True, slots=True)
 class JobRules:
-    """What holds for the jobs of one kind.
+    """What holds for the jobs of one kind."""
 
-    Attributes
-    ----------
-    readers, cancellers : frozenset of Scope
-        Scopes of keys that may read them, and that may cancel those of others of the agency.
-    result_path : callable
-        Path of the result of a job that is done; None if it has none.
-    too_late_progress : float
-        A job beyond this progress cannot be cancelled any more; over 1: it always can.
-    """
-
+    # `readers`, `cancellers`: scopes of keys that may read them, and that may cancel those of others of the agency
     readers: frozenset[Scope]
     cancellers: frozenset[Scope]
-    result_path: Callable[[JobRow], str | None]
-    too_late_progress: float = 2.0
+    result_path: Callable[[JobRow], str | None]  # path of the result of a job that is done; None if it has none
+    too_late_progress: float = 2.0  # a job beyond this progress cannot be cancelled any more; over 1: it always can
 
 
 def _about_plan(end: str) -> Callable[[JobRow], str | None]:

@@ -333,29 +333,16 @@ _CSV = (
 
 
 class Criteria(NamedTuple):
-    """Which uploads are decoded again.
-
-    Attributes
-    ----------
-    kinds : tuple of str or None
-    since, until : datetime or None
-        When they were uploaded.
-    vehicle_id : str or None
-    bbox : tuple or None
-        West, south, east, north of their coarse positions. [deg]
-    decoder : str or None
-        Only results of this decoder.
-    older_than : str or None
-        Only results of earlier releases, e.g. ``0.3.0``.
-    """
+    """Which uploads are decoded again."""
 
     kinds: tuple[str, ...] | None = None
+    # `since`, `until`: when they were uploaded
     since: datetime | None = None
     until: datetime | None = None
     vehicle_id: str | None = None
-    bbox: tuple[float, float, float, float] | None = None
-    decoder: str | None = None
-    older_than: str | None = None
+    bbox: tuple[float, float, float, float] | None = None  # [deg] west, south, east, north of their coarse positions
+    decoder: str | None = None  # only results of this decoder
+    older_than: str | None = None  # only results of earlier releases, e.g. ``0.3.0``.
 
 
 class Reprocessings:

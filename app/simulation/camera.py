@@ -30,18 +30,10 @@ _CELLS, _CELL_M = 600, 0.015
 
 @dataclass(frozen=True, slots=True)
 class Shade:
-    """Light on a square patch of road; beyond it the values of its border hold.
+    """Light on a square patch of road; beyond it the values of its border hold."""
 
-    Attributes
-    ----------
-    share : ndarray of float32, shape (N, N)
-        Of the full light, 0 to 1; a single value is everywhere.
-    cell_from_ground : ndarray, shape (2, 3)
-        Affine map from the ground frame to columns and rows.
-    """
-
-    share: FloatArray
-    cell_from_ground: Matrix
+    share: FloatArray  # float32, shape (N, N): of the full light, 0 to 1; a single value is everywhere
+    cell_from_ground: Matrix  # shape (2, 3): affine map from the ground frame to columns and rows
 
     @property
     def varies(self) -> bool:
@@ -508,21 +500,12 @@ _NO_EMISSION = np.empty((0, 0, 3), np.float32)
 
 @dataclass(frozen=True, slots=True)
 class RenderedFrame:
-    """A frame and the truth about it.
+    """A frame and the truth about it."""
 
-    Attributes
-    ----------
-    image : ndarray of uint8, shape (H, W, 3) or, thermal, (H, W)
-        Blue, green, red; after the JPEG round trip if there is one.
-    jpeg : bytes
-        The coded frame; empty without a JPEG round trip.
-    truths : tuple of FaceTruth
-        One for each of the scene's faces, in order.
-    """
-
+    # uint8, shape (H, W, 3) or, thermal, (H, W): blue, green, red; after the JPEG round trip if there is one
     image: Image
-    jpeg: bytes
-    truths: tuple[FaceTruth, ...]
+    jpeg: bytes  # the coded frame; empty without a JPEG round trip
+    truths: tuple[FaceTruth, ...]  # one for each of the scene's faces, in order
 
 
 def render_plate_scene(scene: PlateScene, background: Image | None, rng: np.random.Generator) -> RenderedFrame:

@@ -79,17 +79,11 @@ class PlateWear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Face:
-    """A square that lies on the road.
+    """A square that lies on the road."""
 
-    Attributes
-    ----------
-    side_m : float
-        Outer side. [m]
-    reflectance, emission : ndarray of float32, shape (T, T, 3)
-        Diffuse reflectance, and radiance that it emits by itself; the latter may be None.
-    """
-
-    side_m: float
+    side_m: float  # [m] outer side
+    # `reflectance`, `emission`: float32, shape (T, T, 3): Diffuse reflectance, and radiance that it emits by itself;
+    # the latter may be None
     reflectance: FloatArray = field(repr=False)
     emission: FloatArray | None = field(default=None, repr=False)
 

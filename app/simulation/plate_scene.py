@@ -277,34 +277,18 @@ class PlateScene:
 
 @dataclass(frozen=True, slots=True)
 class FaceTruth:
-    """Where a square really is.
+    """Where a square really is."""
 
-    Attributes
-    ----------
-    corners_px : ndarray, shape (4, 2)
-        Outer corners at mid-exposure, clockwise from top-left; NaN behind the camera. [px]
-    in_view : bool
-        All four corners are inside the image.
-    partly_in_view : bool
-        Some of it is.
-    height_px, width_px : float
-        Extent of the corners. [px]
-    camera_from_face : ndarray, shape (3, 3)
-        When the row that shows its centre is exposed, as are the next two.
-    translation_m : ndarray, shape (3,)
-        Its centre in the camera frame. [m]
-    camera_position_m : ndarray, shape (3,)
-        Optical centre in the face's frame (x right, y up, z out of the road). [m]
-    """
-
+    # shape (4, 2): [px] outer corners at mid-exposure, clockwise from top-left; NaN behind the camera
     corners_px: Matrix
-    in_view: bool
-    partly_in_view: bool
+    in_view: bool  # all four corners are inside the image
+    partly_in_view: bool  # some of it is
+    # `height_px`, `width_px`: [px] extent of the corners
     height_px: float
     width_px: float
-    camera_from_face: Matrix
-    translation_m: Matrix
-    camera_position_m: Matrix
+    camera_from_face: Matrix  # shape (3, 3): when the row that shows its centre is exposed, as are the next two
+    translation_m: Matrix  # shape (3,): [m] its centre in the camera frame
+    camera_position_m: Matrix  # shape (3,): [m] optical centre in the face's frame (x right, y up, z out of the road)
 
 
 def face_truth(scene: PlateScene, placed: PlacedFace) -> FaceTruth:

@@ -35,30 +35,21 @@ STEP_S = 0.01  # [s] time step of simulation and controller; source: by hand, 10
 class Vehicle:
     """Parameters of the car.
 
-    Attributes
-    ----------
-    wheelbase_m : float
-        [m]
-    max_steer_deg, max_steer_rate_deg_s : float
-        Of the front wheels. [deg, deg/s]
-    steer_lag_s, latency_s : float
-        Time constant of the wheels, and delay of a command. [s]
-    steer_offset_deg : float
-        Misalignment of the wheels, left positive. [deg]
-    max_acceleration_m_s2, max_braking_m_s2, drive_lag_s : float
-        Limits of speed control and its time constant.
-
     Notes
     -----
     Tyres do not slip: valid for comfortable driving (2 m/s2 sideways), not for emergencies.
     """
 
+    # [m]
     wheelbase_m: float = 2.70  # [m] source: Kia Niro, the paper's car
+    # `max_steer_deg`, `max_steer_rate_deg_s`: of the front wheels. [deg, deg/s]
     max_steer_deg: float = 32.0  # [deg] source: assumed, no measurement kept
     max_steer_rate_deg_s: float = 30.0  # [deg/s] source: assumed, no measurement kept
+    # `steer_lag_s`, `latency_s`: [s] time constant of the wheels, and delay of a command
     steer_lag_s: float = 0.10  # [s] source: assumed, no measurement kept
     latency_s: float = 0.12  # [s] source: assumed, no measurement kept
-    steer_offset_deg: float = 0.0
+    steer_offset_deg: float = 0.0  # [deg] Misalignment of the wheels, left positive
+    # `max_acceleration_m_s2`, `max_braking_m_s2`, `drive_lag_s`: limits of speed control and its time constant
     max_acceleration_m_s2: float = 2.0  # [m/s2] source: assumed, comfortable driving
     max_braking_m_s2: float = 3.0  # [m/s2] source: assumed, comfortable driving
     drive_lag_s: float = 0.3  # [s] source: assumed, no measurement kept
@@ -76,23 +67,17 @@ class Vehicle:
 class PoseNoise:
     """Errors of the poses for a controller: RTK with two antennas.
 
-    Attributes
-    ----------
-    drift_m, drift_over_s : float
-        Standard deviation on each axis, and time constant of errors that change slowly. [m, s]
-    jitter_m : float
-        Standard deviation on each axis from one fix to the next. [m]
-    heading_deg : float
-        Standard deviation of the heading from one fix to the next. [deg]
-
     Notes
     -----
     By default 0.02 m in the plane, as stated for the paper's receiver: 0.014 m on each axis, most of it slow.
     """
 
+    # `drift_m`, `drift_over_s`: standard deviation on each axis, and time constant of errors that change slowly. [m, s]
     drift_m: float = 0.0135  # [m] source: the paper's receiver, 0.02 m in the plane
     drift_over_s: float = 20.0  # [s] source: assumed, no measurement kept
+    # [m] standard deviation on each axis from one fix to the next
     jitter_m: float = 0.004  # [m] source: assumed, no measurement kept
+    # [deg] standard deviation of the heading from one fix to the next
     heading_deg: float = 0.1  # [deg] source: assumed, two antennas
 
     def __post_init__(self) -> None:
@@ -356,32 +341,20 @@ _SPARE_S, _SPARE_SHARE = 30.0, 1.5  # [s, 1] time allowed beyond the planned one
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SteeringTrace:
-    """A simulated drive, at 100 Hz.
+    """A simulated drive, at 100 Hz."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (T,)
-    front_enu_m, rear_enu_m : ndarray, shape (T, 2)
-        Centres of the axles. [m]
-    heading_deg : ndarray, shape (T,)
-        Clockwise from north. [deg]
-    speed_m_s, planned_speed_m_s : ndarray, shape (T,)
-    steer_deg : ndarray, shape (T,)
-        Of the front wheels, left positive. [deg]
-    station_m : ndarray, shape (T,)
-        Along the path driven. [m]
-    path_error_m, cross_track_m : ndarray, shape (T,)
-        Front axle left of the path driven, and of the true line; NaN before and after the latter. [m]
-    """
-
-    time_s: Floats
+    time_s: Floats  # shape (T,)
+    # `front_enu_m`, `rear_enu_m`: shape (T, 2): [m] centres of the axles
     front_enu_m: Floats
     rear_enu_m: Floats
-    heading_deg: Floats
+    heading_deg: Floats  # shape (T,): [deg] clockwise from north
+    # `speed_m_s`, `planned_speed_m_s`: shape (T,)
     speed_m_s: Floats
     planned_speed_m_s: Floats
-    steer_deg: Floats
-    station_m: Floats
+    steer_deg: Floats  # shape (T,): [deg] of the front wheels, left positive
+    station_m: Floats  # shape (T,): [m] along the path driven
+    # `path_error_m`, `cross_track_m`: shape (T,): [m] front axle left of the path driven, and of the true line; NaN
+    # before and after the latter
     path_error_m: Floats
     cross_track_m: Floats
 
@@ -389,28 +362,6 @@ class SteeringTrace:
 @dataclass(frozen=True, slots=True, eq=False)
 class SteeringCheck:
     """Errors of a simulated drive along a path.
-
-    Attributes
-    ----------
-    controller : Controller
-    rms_m, max_m : float
-        Cross-track error of the front axle's centre against the true line, over the distance driven. [m]
-    mse_east_m2, mse_north_m2, mse_m2 : float
-        Mean squares of the error vector's two components, and their magnitude (see Notes). [m2]
-    path_rms_m, rear_rms_m : float
-        Front axle against the path driven, rear axle's centre against the true line. [m]
-    steer_rate_rms_deg_s : float
-        Steering effort: RMS rate of the front wheels. [deg/s]
-    lateral_acceleration_m_s2 : float
-        Largest. [m/s2]
-    mean_speed_m_s, excess_speed_m_s : float
-        Mean speed, and the maximum by which the planned speed (the limit or less) was exceeded. [m/s]
-    distance_m, duration_s : float
-    completed : bool
-        Whether the front axle reached the path's end.
-    ended : str
-        Why the drive ended.
-    trace : SteeringTrace
 
     Notes
     -----
@@ -423,21 +374,27 @@ class SteeringCheck:
     """
 
     controller: Controller
+    # `rms_m`, `max_m`: [m] Cross-track error of the front axle's centre against the true line, over the distance driven
     rms_m: float
     max_m: float
+    # `mse_east_m2`, `mse_north_m2`, `mse_m2`: [m2] mean squares of the error vector's two components, and their
+    # magnitude (see Notes)
     mse_east_m2: float
     mse_north_m2: float
     mse_m2: float
+    # `path_rms_m`, `rear_rms_m`: [m] front axle against the path driven, rear axle's centre against the true line
     path_rms_m: float
     rear_rms_m: float
-    steer_rate_rms_deg_s: float
-    lateral_acceleration_m_s2: float
+    steer_rate_rms_deg_s: float  # [deg/s] steering effort: RMS rate of the front wheels
+    lateral_acceleration_m_s2: float  # [m/s2] largest
+    # `mean_speed_m_s`, `excess_speed_m_s`: [m/s] mean speed, and the maximum by which the planned speed (the limit or
+    # less) was exceeded
     mean_speed_m_s: float
     excess_speed_m_s: float
     distance_m: float
     duration_s: float
-    completed: bool
-    ended: str
+    completed: bool  # whether the front axle reached the path's end
+    ended: str  # why the drive ended
     trace: SteeringTrace
 
 

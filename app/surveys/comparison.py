@@ -40,17 +40,10 @@ class ComparisonFigures(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Rows of a survey beside the registered markers that they measured.
+    """Rows of a survey beside the registered markers that they measured."""
 
-    Attributes
-    ----------
-    matched : ndarray of int, shape (N,)
-        Index of the marker of each row; -1 without one.
-    east_m, north_m, up_m : ndarray, shape (N,)
-        Surveyed minus registered; NaN where unknown. [m]
-    """
-
-    matched: npt.NDArray[np.intp]
+    matched: npt.NDArray[np.intp]  # shape (N,): index of the marker of each row; -1 without one
+    # `east_m`, `north_m`, `up_m`: shape (N,): [m] surveyed minus registered; NaN where unknown
     east_m: Floats
     north_m: Floats
     up_m: Floats
@@ -176,20 +169,14 @@ _CURE = 'declare compare: true if the survey measures registered markers, or dup
 
 @dataclass(frozen=True, slots=True)
 class RegisteredPoints:
-    """Registered markers around a survey, as they were surveyed.
+    """Registered markers around a survey, as they were surveyed."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg : ndarray, shape (M,)
-    marker_ids, families : sequence of str
-    points, files : sequence of str or None
-        Point number in the survey, and SHA-256 of its file.
-    """
-
+    # `lon_deg`, `lat_deg`: shape (M,)
     lon_deg: Floats
     lat_deg: Floats
     marker_ids: tuple[str, ...]
     families: tuple[str, ...]
+    # `points`, `files`: point number in the survey, and SHA-256 of its file
     points: tuple[str | None, ...]
     files: tuple[str | None, ...]
 

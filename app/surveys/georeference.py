@@ -51,17 +51,10 @@ class LocalGridDocument(TypedDict):
 
 
 class Similarity(NamedTuple):
-    """A similarity transformation of the plane, with points as complex numbers: east + i north.
+    """A similarity transformation of the plane, with points as complex numbers: east + i north."""
 
-    Attributes
-    ----------
-    factor : complex
-        Scale and rotation.
-    local_origin, origin : complex
-        Centroids of the control points in both grids.
-    """
-
-    factor: complex
+    factor: complex  # scale and rotation
+    # `local_origin`, `origin`: centroids of the control points in both grids
     local_origin: complex
     origin: complex
 
@@ -243,23 +236,15 @@ _ZONES = (  # first and last EPSG code of the zones of a grid, and its name; sou
 
 @dataclass(frozen=True, slots=True)
 class GeoreferencedSurvey:
-    """A survey with the positions of its rows.
-
-    Attributes
-    ----------
-    table : SurveyTable
-    placed : PlacedPositions
-    east_m, north_m : ndarray, shape (N,)
-        From the median position; good for distances of a few kilometres; NaN where a row has no position. [m]
-    height_m : ndarray, shape (N,)
-        Above the vertical datum of the declaration; NaN where there is none. [m]
-    """
+    """A survey with the positions of its rows."""
 
     table: SurveyTable
     placed: PlacedPositions
+    # `east_m`, `north_m`: shape (N,): [m] from the median position; good for distances of a few kilometres; NaN where a
+    # row has no position
     east_m: Floats
     north_m: Floats
-    height_m: Floats
+    height_m: Floats  # shape (N,): [m] above the vertical datum of the declaration; NaN where there is none
 
     @property
     def origin_deg(self) -> tuple[float, float]:

@@ -32,15 +32,9 @@ _GRADE = 0.06  # [m/m] grade of the road that is allowed for between a row and a
 
 @dataclass(frozen=True, slots=True)
 class Neighbours:
-    """Registered markers around a survey.
+    """Registered markers around a survey."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg, height_m : ndarray, shape (M,)
-        NaN where there is no height.
-    vertical_datum : tuple of str or None
-    """
-
+    # `lon_deg`, `lat_deg`, `height_m`: shape (M,): NaN where there is no height
     lon_deg: Floats
     lat_deg: Floats
     height_m: Floats

@@ -80,32 +80,16 @@ class Segment:
 
 @dataclass(slots=True, eq=False)
 class Smoothed:
-    """The drive after the last round.
+    """The drive after the last round."""
 
-    Attributes
-    ----------
-    states : ndarray, shape (N, n)
-    position_m2 : ndarray, shape (N, 3)
-        East-east, east-north, north-north.
-    heading_rad2 : ndarray, shape (N,)
-    ends : ndarray, shape (2, n)
-        Variances of the first and of the last state.
-    used : ndarray of bool, shape (K,)
-    square : ndarray, shape (K,)
-        Squared distances of the fixes from the track by all others.
-    residual_m : ndarray, shape (K, 3)
-        From the track by all others.
-    offset_m, spread : ndarray, shape (K, 3) and (K, 3, 3)
-        From the track, and its covariance there.
-    """
-
-    states: Floats
-    position_m2: Floats
-    heading_rad2: Floats
-    ends: Floats
-    used: Bools
-    square: Floats
-    residual_m: Floats
+    states: Floats  # shape (N, n)
+    position_m2: Floats  # shape (N, 3): East-east, east-north, north-north
+    heading_rad2: Floats  # shape (N,)
+    ends: Floats  # shape (2, n): variances of the first and of the last state
+    used: Bools  # shape (K,)
+    square: Floats  # shape (K,): squared distances of the fixes from the track by all others
+    residual_m: Floats  # shape (K, 3): from the track by all others
+    # `offset_m`, `spread`: shape (K, 3) and (K, 3, 3): from the track, and its covariance there
     offset_m: Floats
     spread: Floats
     rounds: int

@@ -188,38 +188,22 @@ _HUBER = 4.0  # sigmas from which a sample of speed or heading counts less; sour
 
 
 class Measurements(NamedTuple):
-    """Measurements in the order of their nodes, M of them.
+    """Measurements in the order of their nodes, M of them."""
 
-    Attributes
-    ----------
-    node : ndarray of int
-        Nearest node in time.
-    kind : ndarray of int
-    clock : ndarray of int
-        Place of its clock's offset in the state; -1: the clock has none.
-    after_s : ndarray
-        From the node's time, with `assumed_s` as the offset of the clock. [s]
-    assumed_s : ndarray
-        [s]
-    value : ndarray, shape (M, 3)
-        FIX: longitude, latitude, heading [rad]; SPEED_SAMPLE [m/s]; HEADING_SAMPLE [rad]; PATH: left of the path, at
-        the place that `value[1:]` has (longitude, latitude of the path's point [rad]) [m].
-    noise : ndarray, shape (M, 6)
-        FIX: covariance, upper triangle by rows [m, m, rad]; else the variance, and for PATH the path's heading [rad].
-    rate : ndarray, shape (M, 3)
-        What a measurement changes by with time: FIX: velocity east and north and yaw rate, SPEED_SAMPLE: acceleration
-        [m/s2], HEADING_SAMPLE: yaw rate; of the pass before, averaged over seconds: noise of the speed must not look
-        like changes of it, by which the offset of a clock is observed. NaN in the first pass.
-    used : ndarray of bool
-    """
-
-    node: Ints
+    node: Ints  # nearest node in time
     kind: Ints
-    clock: Ints
-    after_s: Floats
+    clock: Ints  # place of its clock's offset in the state; -1: the clock has none
+    after_s: Floats  # [s] from the node's time, with `assumed_s` as the offset of the clock
     assumed_s: Floats
+    # shape (M, 3): [m] FIX: longitude, latitude, heading [rad]; SPEED_SAMPLE [m/s]; HEADING_SAMPLE [rad]; PATH: left of
+    # the path, at the place that `value[1:]` has (longitude, latitude of the path's point [rad])
     value: Floats
+    # shape (M, 6): [rad] FIX: covariance, upper triangle by rows [m, m, rad]; else the variance, and for PATH the
+    # path's heading
     noise: Floats
+    # shape (M, 3): what a measurement changes by with time: FIX: velocity east and north and yaw rate, SPEED_SAMPLE:
+    # acceleration [m/s2], HEADING_SAMPLE: yaw rate; of the pass before, averaged over seconds: noise of the speed must
+    # not look like changes of it, by which the offset of a clock is observed. NaN in the first pass.
     rate: Floats
     used: npt.NDArray[np.bool_]
 

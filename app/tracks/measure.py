@@ -91,30 +91,18 @@ _MIN_PATH_SIGMA_M = 0.02  # [m] source: app/lanes/initial_line.py
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FixArrays:
-    """Fixes in the order of time, K of them.
+    """Fixes in the order of time, K of them."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (K,)
-        On the sensors' own clocks. [s]
-    lon_rad, lat_rad, heading_rad : ndarray, shape (K,)
-    cov_m2 : ndarray, shape (K, 3)
-    heading_var : ndarray, shape (K,)
-        `_NO_HEADING` where there is none. [rad2]
-    cross_m_rad : ndarray, shape (K, 2)
-    common_m2 : ndarray, shape (K,)
-    passage : ndarray of int, shape (K,)
-        The same for fixes by one marker in one pass, and for positions of a receiver in one minute.
-    """
-
-    time_s: Floats
+    time_s: Floats  # shape (K,): [s] on the sensors' own clocks
+    # `lon_rad`, `lat_rad`, `heading_rad`: shape (K,)
     lon_rad: Floats
     lat_rad: Floats
     heading_rad: Floats
-    cov_m2: Floats
-    heading_var: Floats
-    cross_m_rad: Floats
-    common_m2: Floats
+    cov_m2: Floats  # shape (K, 3)
+    heading_var: Floats  # shape (K,): [rad2] `_NO_HEADING` where there is none
+    cross_m_rad: Floats  # shape (K, 2)
+    common_m2: Floats  # shape (K,)
+    # shape (K,): the same for fixes by one marker in one pass, and for positions of a receiver in one minute
     passage: Ints
 
     @property

@@ -21,15 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeadReckoning:
-    """The drive without fixes.
+    """The drive without fixes."""
 
-    Attributes
-    ----------
-    east_m, north_m, odometer_m, speed_m_s, heading_rad : ndarray, shape (N,)
-        At the nodes; the headings are unwrapped, and 0 where there are none.
-    has_heading, has_speed : bool
-    """
-
+    # `east_m`, `north_m`, `odometer_m`, `speed_m_s`, `heading_rad`: shape (N,): at the nodes; the headings are
+    # unwrapped, and 0 where there are none
     east_m: Floats
     north_m: Floats
     odometer_m: Floats

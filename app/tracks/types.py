@@ -44,21 +44,11 @@ class ClockState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A sensor's clock, as it is declared.
+    """A sensor's clock, as it is declared."""
 
-    Attributes
-    ----------
-    name : str
-        Of the sensor; each once.
-    offset_s : float
-        What is to be added to the sensor's times. [s]
-    sigma_s : float
-        How far that may be off; 0: it is exact. [s]
-    """
-
-    name: str
-    offset_s: float = 0.0
-    sigma_s: float = 0.5
+    name: str  # of the sensor; each once
+    offset_s: float = 0.0  # [s] what is to be added to the sensor's times
+    sigma_s: float = 0.5  # [s] how far that may be off; 0: it is exact
 
     def __post_init__(self) -> None:
         if not (
@@ -74,46 +64,23 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class PositionFix:
-    """Where the vehicle was, by one marker or by one position of its receiver.
+    """Where the vehicle was, by one marker or by one position of its receiver."""
 
-    Attributes
-    ----------
-    clock : str
-        Name of the sensor whose time it has.
-    time_s : float
-        Seconds since 1970-01-01 UTC on that clock. [s]
-    lon_deg, lat_deg : float
-        WGS 84 / ITRF. [deg]
-    covariance_m2 : (float, float, float)
-        East-east, east-north, north-north. [m2]
-    heading_deg, heading_sigma_deg : float
-        Clockwise from true north; NaN where it is not known. [deg]
-    common_m2 : float
-        Part of the variance of each axis that all fixes by the same marker share: its survey. [m2]
-    marker_id : str or None
-        None for a position of the vehicle's own receiver.
-    family : str
-    source : str
-        What it was read from, e.g. the id of a decode.
-    place : int
-        Index in the source, e.g. of the frame.
-    heading_cross_m_rad : (float, float)
-        Covariances of the heading with east and north. [m rad]
-    """
-
-    clock: str
-    time_s: float
+    clock: str  # name of the sensor whose time it has
+    time_s: float  # [s] seconds since 1970-01-01 UTC on that clock
+    # `lon_deg`, `lat_deg`: [deg] WGS 84 / ITRF
     lon_deg: float
     lat_deg: float
-    covariance_m2: tuple[float, float, float]
+    covariance_m2: tuple[float, float, float]  # [m2] East-east, east-north, north-north
+    # `heading_deg`, `heading_sigma_deg`: [deg] clockwise from true north; NaN where it is not known
     heading_deg: float = math.nan
     heading_sigma_deg: float = math.nan
-    common_m2: float = 0.0
-    marker_id: str | None = None
+    common_m2: float = 0.0  # [m2] part of the variance of each axis that all fixes by the same marker share: its survey
+    marker_id: str | None = None  # None for a position of the vehicle's own receiver
     family: str = ""
-    source: str = ""
-    place: int = 0
-    heading_cross_m_rad: tuple[float, float] = (0.0, 0.0)
+    source: str = ""  # what it was read from, e.g. the id of a decode.
+    place: int = 0  # index in the source, e.g. of the frame.
+    heading_cross_m_rad: tuple[float, float] = (0.0, 0.0)  # [m rad] covariances of the heading with east and north
 
     def __post_init__(self) -> None:
         east, cross, north = self.covariance_m2
@@ -130,23 +97,14 @@ class PositionFix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Speeds or headings over time.
+    """Speeds or headings over time."""
 
-    Attributes
-    ----------
-    clock : str
-        Name of the sensor whose times they have.
-    time_s, value : ndarray, shape (N,)
-        Seconds since 1970-01-01 UTC; speed along the vehicle, backwards negative [m/s], or heading clockwise from
-        true north [deg].
-    sigma : float
-        Noise of one value, without scale error or bias. [m/s or deg]
-    """
-
-    clock: str
+    clock: str  # name of the sensor whose times they have
+    # `time_s`, `value`: shape (N,): [deg] seconds since 1970-01-01 UTC; speed along the vehicle, backwards negative
+    # [m/s], or heading clockwise from true north
     time_s: Floats
     value: Floats
-    sigma: float
+    sigma: float  # [m/s or deg] noise of one value, without scale error or bias
 
     def __post_init__(self) -> None:
         time, value = np.asarray(self.time_s, float), np.asarray(self.value, float)
@@ -160,21 +118,13 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LanePath:
-    """A lane's path: where it leads is known, not when it was driven.
-
-    Attributes
-    ----------
-    source : str
-    lon_deg, lat_deg : ndarray, shape (N,)
-        In the direction of travel. [deg]
-    sigma_m : float
-        Standard deviation of the path across. [m]
-    """
+    """A lane's path: where it leads is known, not when it was driven."""
 
     source: str
+    # `lon_deg`, `lat_deg`: shape (N,): [deg] in the direction of travel
     lon_deg: Floats
     lat_deg: Floats
-    sigma_m: float
+    sigma_m: float  # [m] standard deviation of the path across
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,29 +140,15 @@ class TrackInput:
 
 @dataclass(frozen=True, slots=True)
 class TrackRules:
-    """How a track is estimated.
+    """How a track is estimated."""
 
-    Attributes
-    ----------
-    rate_hz : float
-        Of the positions that are returned. [Hz]
-    max_sigma_m : float
-        Where the larger standard deviation of a position exceeds this, the track has a gap. [m]
-    outlier_probability : float
-        Share of good markers that the gate leaves out.
-    speed_scale_sigma : float
-        Scale error of the speed to be expected.
-    heading_bias_sigma_deg : float
-        Bias of the heading to be expected. [deg]
-    wander_m, wander_length_m : float
-        How far from the middle of its lane a vehicle drives, and over which length that changes. [m]
-    """
-
-    rate_hz: float = 2.0
-    max_sigma_m: float = 2.0
-    outlier_probability: float = 1e-3
-    speed_scale_sigma: float = 0.03
-    heading_bias_sigma_deg: float = 3.0
+    rate_hz: float = 2.0  # [Hz] of the positions that are returned
+    max_sigma_m: float = 2.0  # [m] where the larger standard deviation of a position exceeds this, the track has a gap
+    outlier_probability: float = 1e-3  # share of good markers that the gate leaves out
+    speed_scale_sigma: float = 0.03  # scale error of the speed to be expected
+    heading_bias_sigma_deg: float = 3.0  # [deg] bias of the heading to be expected
+    # `wander_m`, `wander_length_m`: [m] how far from the middle of its lane a vehicle drives, and over which length
+    # that changes
     wander_m: float = 0.4
     wander_length_m: float = 100.0
 
@@ -243,74 +179,46 @@ _LIMITS = {
 
 @dataclass(frozen=True, slots=True)
 class FixResult:
-    """What became of a fix.
-
-    Attributes
-    ----------
-    fix : PositionFix
-    used : bool
-    reason : LeftOutReason or None
-    time_s : float
-        On the reference clock. [s]
-    distance : float
-        Mahalanobis distance to the track that the other fixes give.
-    along_m, across_m : float
-        From that track, forward and left positive. [m]
-    """
+    """What became of a fix."""
 
     fix: PositionFix
     used: bool
     reason: LeftOutReason | None
-    time_s: float
-    distance: float
+    time_s: float  # [s] on the reference clock
+    distance: float  # Mahalanobis distance to the track that the other fixes give
+    # `along_m`, `across_m`: [m] from that track, forward and left positive
     along_m: float
     across_m: float
 
 
 @dataclass(frozen=True, slots=True)
 class ReceiverResult:
-    """What became of the positions of one receiver.
-
-    Attributes
-    ----------
-    source, clock : str
-    used, left_out : int
-        Positions.
-    stated_m, believed_m : float
-        Median of their stated standard deviations, both axes together, and what the markers show of it. [m]
-    """
+    """What became of the positions of one receiver."""
 
     source: str
     clock: str
+    # `used`, `left_out`: positions
     used: int
     left_out: int
+    # `stated_m`, `believed_m`: [m] median of their stated standard deviations, both axes together, and what the markers
+    # show of it
     stated_m: float
     believed_m: float
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """The offset of a sensor's clock, from one time on.
-
-    Attributes
-    ----------
-    clock : str
-    state : ClockState
-    offset_s, sigma_s : float
-        To be added to the sensor's times. [s]
-    from_s, to_s : float
-        First and last time on the sensor's clock that it holds for. [s]
-    jumped : bool
-        The clock was set before `from_s`.
-    """
+    """The offset of a sensor's clock, from one time on."""
 
     clock: str
     state: ClockState
+    # `offset_s`, `sigma_s`: [s] to be added to the sensor's times
     offset_s: float
     sigma_s: float
+    # `from_s`, `to_s`: [s] first and last time on the sensor's clock that it holds for
     from_s: float
     to_s: float
-    jumped: bool = False
+    jumped: bool = False  # the clock was set before `from_s`
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,31 +234,18 @@ class TrackGap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A drive as positions on one time base.
+    """A drive as positions on one time base."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (N,)
-        Seconds since 1970-01-01 UTC on the reference clock. [s]
-    lon_deg, lat_deg, heading_deg, speed_m_s : ndarray, shape (N,)
-    covariance_m2 : ndarray, shape (N, 3)
-        East-east, east-north, north-north. [m2]
-    heading_sigma_deg : ndarray, shape (N,)
-    in_gap : ndarray of bool, shape (N,)
-    fixes : tuple of FixResult
-        By markers.
-    receivers : tuple of ReceiverResult
-    """
-
-    time_s: Floats
+    time_s: Floats  # shape (N,): [s] seconds since 1970-01-01 UTC on the reference clock
+    # `lon_deg`, `lat_deg`, `heading_deg`, `speed_m_s`: shape (N,)
     lon_deg: Floats
     lat_deg: Floats
     heading_deg: Floats
     speed_m_s: Floats
-    covariance_m2: Floats
-    heading_sigma_deg: Floats
-    in_gap: Bools
-    fixes: tuple[FixResult, ...]
+    covariance_m2: Floats  # shape (N, 3): [m2] East-east, east-north, north-north
+    heading_sigma_deg: Floats  # shape (N,)
+    in_gap: Bools  # shape (N,)
+    fixes: tuple[FixResult, ...]  # by markers
     clocks: tuple[ClockOffset, ...]
     gaps: tuple[TrackGap, ...]
     length_m: float

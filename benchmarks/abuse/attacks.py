@@ -18,27 +18,15 @@ class AttackSucceeded(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Attack:
-    """An attack and its limits.
-
-    Attributes
-    ----------
-    name : str
-    run : callable
-        Attacks a server; the second argument asks for a smaller attack. Returns what happened, for the table, or raises
-        `AttackSucceeded`.
-    cpu_s : float
-        Processor time of the server until it is idle again. [s]
-    memory_mb : float
-        Growth of memory at its peak. [MB]
-    health_ms : float
-        Longest answer of /healthz to another address meanwhile. [ms]
-    """
+    """An attack and its limits."""
 
     name: str
+    # attacks a server; the second argument asks for a smaller attack. Returns what happened, for the table, or raises
+    # `AttackSucceeded`.
     run: Run
-    cpu_s: float
-    memory_mb: float
-    health_ms: float
+    cpu_s: float  # [s] processor time of the server until it is idle again
+    memory_mb: float  # [MB] growth of memory at its peak
+    health_ms: float  # [ms] longest answer of /healthz to another address meanwhile
 
 
 ATTACKS: dict[str, Attack] = {}

@@ -32,24 +32,12 @@ _IDLE_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What a request or an attack cost.
+    """What a request or an attack cost."""
 
-    Attributes
-    ----------
-    cpu_s : float
-        Processor time. [s]
-    memory_mb : float
-        Growth of memory at its peak. [MB]
-    health_ms : float
-        Greatest delay of /healthz for another address. [ms]
-    failed : int
-        Requests of /healthz without an answer of 200.
-    """
-
-    cpu_s: float
-    memory_mb: float
-    health_ms: float
-    failed: int
+    cpu_s: float  # [s] processor time
+    memory_mb: float  # [MB] growth of memory at its peak
+    health_ms: float  # [ms] greatest delay of /healthz for another address
+    failed: int  # requests of /healthz without an answer of 200
 
 
 class ObservedServer:

@@ -74,21 +74,15 @@ class Tally:
 
 
 class PlaceErrors(NamedTuple):
-    """A path at true places every 0.25 m that are beside it.
+    """A path at true places every 0.25 m that are beside it."""
 
-    Attributes
-    ----------
-    off_m, confidence, sigma_m, curvature_off_1pm : ndarray, shape (N,)
-        Distance of the true centre line from the path, what the path reports there, and the error of its curvature.
-    coverage : float
-        Share of all true places that a path covers.
-    """
-
+    # `off_m`, `confidence`, `sigma_m`, `curvature_off_1pm`: shape (N,): distance of the true centre line from the path,
+    # what the path reports there, and the error of its curvature
     off_m: Floats
     confidence: Floats
     sigma_m: Floats
     curvature_off_1pm: Floats
-    coverage: float
+    coverage: float  # share of all true places that a path covers
 
     @property
     def rms_m(self) -> float:

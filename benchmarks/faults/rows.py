@@ -6,23 +6,13 @@ from typing import NamedTuple
 
 
 class FaultRow(NamedTuple):
-    """What was tried, what came of it, and what was required.
-
-    Attributes
-    ----------
-    test : str
-    tried : str
-    survived : str
-    goal : str
-    met : bool or None
-        None: it could not be tried.
-    """
+    """What was tried, what came of it, and what was required."""
 
     test: str
     tried: str
     survived: str
     goal: str
-    met: bool | None
+    met: bool | None  # None: it could not be tried
 
 
 _WORDS = {True: "yes", False: "**no**", None: "not tried"}

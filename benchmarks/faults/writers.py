@@ -30,30 +30,17 @@ IMPORT_ROAD = "import "
 
 @dataclass(frozen=True)
 class WriteRequest:
-    """A request that is sent until it is acknowledged, always with the same key.
-
-    Attributes
-    ----------
-    path : str
-    json, file, declaration
-        The body: JSON, or a form.
-    headers : mapping
-    accepted : tuple of int
-        Statuses that acknowledge it.
-    then : callable, optional
-        Makes the request that follows from the response's document.
-    key : str
-        The Idempotency-Key.
-    """
+    """A request that is sent until it is acknowledged, always with the same key."""
 
     path: str
+    # `json`, `file`, `declaration`: the body: JSON, or a form
     json: object = None
     file: tuple[str, bytes] | None = None
     declaration: Mapping[str, Any] | None = None
     headers: Mapping[str, str] = field(default_factory=dict)
-    accepted: tuple[int, ...] = (200, 201, 202)
-    then: Callable[[Any], WriteRequest] | None = None
-    key: str = field(default_factory=lambda: uuid.uuid4().hex)
+    accepted: tuple[int, ...] = (200, 201, 202)  # statuses that acknowledge it
+    then: Callable[[Any], WriteRequest] | None = None  # makes the request that follows from the response's document
+    key: str = field(default_factory=lambda: uuid.uuid4().hex)  # the Idempotency-Key
 
     def send(self, client: httpx.Client) -> httpx.Response:
         """Send it once."""
@@ -68,30 +55,14 @@ class WriteRequest:
 
 @dataclass
 class Acknowledged:
-    """What the server has acknowledged.
+    """What the server has acknowledged."""
 
-    Attributes
-    ----------
-    markers : set of str
-        Ids of markers.
-    uploads : dict
-        Id of a decode to the SHA-256 of its upload.
-    jobs : set of str
-        Ids of decodes and imports that were answered with 202.
-    imports : dict
-        Id of an import to the name of the road of its markers.
-    plans : dict
-        Id of a committed plan to the number of its markers.
-    unexpected : list of str
-        Answers that are neither 2xx nor `ALLOWED`.
-    """
-
-    markers: set[str] = field(default_factory=set)
-    uploads: dict[str, str] = field(default_factory=dict)
-    jobs: set[str] = field(default_factory=set)
-    imports: dict[str, str] = field(default_factory=dict)
-    plans: dict[str, int] = field(default_factory=dict)
-    unexpected: list[str] = field(default_factory=list)
+    markers: set[str] = field(default_factory=set)  # ids of markers
+    uploads: dict[str, str] = field(default_factory=dict)  # id of a decode to the SHA-256 of its upload
+    jobs: set[str] = field(default_factory=set)  # ids of decodes and imports that were answered with 202
+    imports: dict[str, str] = field(default_factory=dict)  # id of an import to the name of the road of its markers
+    plans: dict[str, int] = field(default_factory=dict)  # id of a committed plan to the number of its markers
+    unexpected: list[str] = field(default_factory=list)  # answers that are neither 2xx nor `ALLOWED`
 
     @property
     def count(self) -> int:

@@ -55,23 +55,13 @@ class Parser:
 
 @dataclass(slots=True)
 class Outcome:
-    """What came of many files.
-
-    Attributes
-    ----------
-    tried, accepted : int
-    refused : Counter
-        By class of error.
-    slowest_s : float
-        Most time of one file: processor time of a parser, waiting time of a picture. [s]
-    failures : list of str
-        Errors of no domain, and files that take too long, at the smallest input found.
-    """
+    """What came of many files."""
 
     tried: int = 0
     accepted: int = 0
-    refused: Counter[str] = field(default_factory=Counter)
-    slowest_s: float = 0.0
+    refused: Counter[str] = field(default_factory=Counter)  # by class of error
+    slowest_s: float = 0.0  # [s] most time of one file: processor time of a parser, waiting time of a picture
+    # errors of no domain, and files that take too long, at the smallest input found
     failures: list[str] = field(default_factory=list)
 
 

@@ -17,43 +17,23 @@ DAY_S = 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What is simulated.
-
-    Attributes
-    ----------
-    roads, markers : int
-        Roads, and markers of each.
-    vehicles, drives : int
-        A drive follows one road; the drives are spread over 30 days.
-    families : tuple of float
-        Shares of `FAMILIES`.
-    bias_m : float
-        Standard deviation of a vehicle's own shift, each axis. [m]
-    miscalibrated : float
-        Share of vehicles with a shift of 1 to 2.5 m.
-    noise_m : float
-        Of a plate's position relative to the vehicle, each axis; Student's t with 3 degrees of freedom. [m]
-    dirty : float
-        Share of plates that are read 30 to 70 % as often as clean ones.
-    fog : float
-        Share of drives in fog, half of them over the whole road.
-    other_lane : float
-        Share of drives on a lane from which markers are half as visible.
-    wrong_way_drives : int
-    """
+    """What is simulated."""
 
     name: str
+    # `roads`, `markers`: roads, and markers of each
     roads: int = 10
     markers: int = 40
+    # `vehicles`, `drives`: a drive follows one road; the drives are spread over 30 days
     vehicles: int = 100
     drives: int = 1000
-    families: tuple[float, float, float] = (0.6, 0.25, 0.15)
-    bias_m: float = 0.3
-    miscalibrated: float = 0.05
+    families: tuple[float, float, float] = (0.6, 0.25, 0.15)  # shares of `FAMILIES`
+    bias_m: float = 0.3  # [m] standard deviation of a vehicle's own shift, each axis
+    miscalibrated: float = 0.05  # share of vehicles with a shift of 1 to 2.5 m
+    # [m] of a plate's position relative to the vehicle, each axis; Student's t with 3 degrees of freedom
     noise_m: float = 0.08
-    dirty: float = 0.05
-    fog: float = 0.05
-    other_lane: float = 0.15
+    dirty: float = 0.05  # share of plates that are read 30 to 70 % as often as clean ones
+    fog: float = 0.05  # share of drives in fog, half of them over the whole road
+    other_lane: float = 0.15  # share of drives on a lane from which markers are half as visible
     wrong_way_drives: int = 3
 
 
@@ -73,33 +53,15 @@ SCENES = (
 
 @dataclass(slots=True)
 class Markers:
-    """Truth about the markers of a network, arrays of shape (roads, markers).
+    """Truth about the markers of a network, arrays of shape (roads, markers)."""
 
-    Attributes
-    ----------
-    family : ndarray of int
-        Index in `FAMILIES`.
-    expected : ndarray
-        Reading probability of a clean one by the tables.
-    dirt : ndarray
-        Factor on it.
-    survey_m : ndarray, shape (roads, markers, 2)
-        Error of the registered position. [m]
-    fault : ndarray of str
-        Empty where healthy.
-    since_s : ndarray
-        When the fault begins. [s]
-    offset_m : ndarray, shape (roads, markers, 2)
-        Of those that move. [m]
-    """
-
-    family: np.ndarray
-    expected: np.ndarray
-    dirt: np.ndarray
-    survey_m: np.ndarray
-    fault: np.ndarray
-    since_s: np.ndarray
-    offset_m: np.ndarray
+    family: np.ndarray  # index in `FAMILIES`
+    expected: np.ndarray  # reading probability of a clean one by the tables
+    dirt: np.ndarray  # factor on it
+    survey_m: np.ndarray  # shape (roads, markers, 2): [m] error of the registered position
+    fault: np.ndarray  # empty where healthy
+    since_s: np.ndarray  # [s] when the fault begins
+    offset_m: np.ndarray  # shape (roads, markers, 2): [m] of those that move
 
 
 SURVEY_SIGMA_M = 0.05
@@ -137,18 +99,10 @@ def draw_markers(scene: Scene, rng: Rng, fault_share: float) -> Markers:
 
 @dataclass(slots=True)
 class Vehicles:
-    """Truth about vehicles, arrays of shape (vehicles,).
+    """Truth about vehicles, arrays of shape (vehicles,)."""
 
-    Attributes
-    ----------
-    shift_m : ndarray, shape (vehicles, 2)
-        [m]
-    miss : ndarray
-        Share of markers that it misses, 2 to 30 %.
-    """
-
-    shift_m: np.ndarray
-    miss: np.ndarray
+    shift_m: np.ndarray  # shape (vehicles, 2) [m]
+    miss: np.ndarray  # share of markers that it misses, 2 to 30 %
 
 
 def draw_vehicles(scene: Scene, rng: Rng) -> Vehicles:

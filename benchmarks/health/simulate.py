@@ -38,28 +38,17 @@ class Found:
 
 @dataclass(slots=True)
 class Outcome:
-    """Of one scene with one seed.
+    """Of one scene with one seed."""
 
-    Attributes
-    ----------
-    found : dict of str to list of Found or None
-        Of each injected fault, by kind; None where it was not found.
-    false_alarms : list of str
-        Kinds of the faults that healthy markers were accused of, or faulty ones of another fault.
-    healthy : int
-        Markers without a fault.
-    wrong_way_drives, wrong_way_found, wrong_way_false : int
-    fewest_vehicles : int
-        Of all suspects.
-    """
-
+    # of each injected fault, by kind; None where it was not found
     found: dict[str, list[Found | None]] = field(default_factory=lambda: defaultdict(list))
+    # kinds of the faults that healthy markers were accused of, or faulty ones of another fault
     false_alarms: list[str] = field(default_factory=list)
-    healthy: int = 0
+    healthy: int = 0  # markers without a fault
     wrong_way_drives: int = 0
     wrong_way_found: int = 0
     wrong_way_false: int = 0
-    fewest_vehicles: int = 99
+    fewest_vehicles: int = 99  # of all suspects
 
 
 @dataclass(slots=True)

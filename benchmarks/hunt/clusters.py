@@ -17,20 +17,11 @@ MIN_FAILURES = 2
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """Scenes of one leaf that failed in the same way.
-
-    Attributes
-    ----------
-    kind : Kind
-    conditions : str
-        On the parameters.
-    failures, scenes : int
-        In the leaf.
-    worst : Scene
-    """
+    """Scenes of one leaf that failed in the same way."""
 
     kind: Kind
-    conditions: str
+    conditions: str  # on the parameters
+    # `failures`, `scenes`: in the leaf
     failures: int
     scenes: int
     worst: Scene

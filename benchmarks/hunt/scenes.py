@@ -16,28 +16,16 @@ Parameters = Mapping[str, float]
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """How far a parameter of a scene may go.
-
-    Attributes
-    ----------
-    low, high : float
-    simple : float
-        Its value in the simplest scene.
-    source : str
-        Of the bounds.
-    logarithmic, whole : bool
-        Drawn evenly as a logarithm; drawn as a whole number.
-    plain : float
-        Share of scenes in which it has its simple value.
-    """
+    """How far a parameter of a scene may go."""
 
     low: float
     high: float
-    simple: float
-    source: str
+    simple: float  # its value in the simplest scene
+    source: str  # of the bounds
+    # `logarithmic`, `whole`: drawn evenly as a logarithm; drawn as a whole number
     logarithmic: bool = False
     whole: bool = False
-    plain: float = 0.0
+    plain: float = 0.0  # share of scenes in which it has its simple value
 
     def draw(self, rng: np.random.Generator) -> float:
         """A value within the bounds."""
@@ -87,25 +75,14 @@ FAILURES = (Kind.WRONG, Kind.OVERCONFIDENT, Kind.MISSED)
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of one scene.
-
-    Attributes
-    ----------
-    kind : Kind
-    badness : float
-        How bad a failure is, to find the worst: in units of the family.
-    detail : str
-        What happened, in a few words.
-    sure : list of (float, bool)
-        Reported confidence of each reading, and whether it was right.
-    squared : list of (float, int)
-        Normalised squared error of each estimate and its degrees of freedom (NEES).
-    """
+    """What came of one scene."""
 
     kind: Kind
-    badness: float = 0.0
-    detail: str = ""
+    badness: float = 0.0  # how bad a failure is, to find the worst: in units of the family
+    detail: str = ""  # what happened, in a few words
+    # reported confidence of each reading, and whether it was right
     sure: list[tuple[float, bool]] = field(default_factory=list)
+    # normalised squared error of each estimate and its degrees of freedom (NEES)
     squared: list[tuple[float, int]] = field(default_factory=list)
 
 

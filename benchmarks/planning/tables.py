@@ -8,21 +8,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One section of the output.
+    """One section of the output."""
 
-    Attributes
-    ----------
-    name : str
-        After ``### ``, as `benchmarks.readme` looks for it.
-    text : str
-        Markdown.
-    met : bool
-        Whether its goals are met.
-    """
-
-    name: str
-    text: str
-    met: bool
+    name: str  # after ``### ``, as `benchmarks.readme` looks for it
+    text: str  # Markdown
+    met: bool  # whether its goals are met
 
     def __str__(self) -> str:
         return f"### {self.name}\n\n{self.text}\n\nGoals: {'kept' if self.met else 'missed'}.\n"

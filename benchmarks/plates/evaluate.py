@@ -22,82 +22,47 @@ from benchmarks.plates.sets import LIGHT, Job, Shot, Unseen, replace_face, shoot
 
 @dataclass(frozen=True, slots=True)
 class PositionAccuracy:
-    """Errors of a camera's position at the time of the frame, with the speed known where the shutter rolls.
+    """Errors of a camera's position at the time of the frame, with the speed known where the shutter rolls."""
 
-    Attributes
-    ----------
-    error_m : float
-        Distance to the truth. [m]
-    within_2_sigma : tuple of bool
-        Across, along and up in the plate frame: the error is below two reported standard deviations.
-    noise_error_m : float
-        Distance to the truth of the position from true corners with errors as if those of the pixels were independent.
-        [m]
-    """
-
-    error_m: float
+    error_m: float  # [m] distance to the truth
+    # across, along and up in the plate frame: the error is below two reported standard deviations
     within_2_sigma: tuple[bool, ...]
+    # [m] distance to the truth of the position from true corners with errors as if those of the pixels were independent
     noise_error_m: float
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One frame.
+    """One frame."""
 
-    Attributes
-    ----------
-    set_name, label, seed, share
-        Where it comes from; ``share`` of that set's frames was taken.
-    index, number : int
-        Job and place in it: what ``python -m benchmarks.plates.show`` takes.
-    height_px : float
-        Of the plate's image; NaN where there is none.
-    decoded, decoded_known : bool
-        Its digits were read from the frame alone, or with the codebook.
-    wrong, wrong_known : tuple of str
-        Digits returned as valid that are on no plate in the frame.
-    tentative : bool
-        Its digits were returned as likely, from the frame alone.
-    wrong_tentative : tuple of str
-        Likely digits that are on no plate in the frame.
-    claims : tuple of (float, bool, bool)
-        Of each reading with digits or likely ones, from the frame alone: its confidence, whether it is sure, and
-        whether it is right.
-    together, wrong_together
-        As `decoded` and `wrong`, with what the frames of its drive confirm together.
-    corner_errors_px : tuple of float
-        Distance of each corner to the truth, where decoded.
-    position_error_m : float
-        Distance of the camera's position to the truth, where decoded; else NaN.
-    rolling : bool
-        The camera has a rolling shutter.
-    accuracy : PositionAccuracy or None
-        Of the camera's position, where decoded in a trial.
-    tags : tuple of bool or None
-        Whether each peer's tag was read in the same scene.
-    """
-
+    # `set_name`, `label`, `seed`, `share`: where it comes from; ``share`` of that set's frames was taken
     set_name: str
     label: str
     seed: int
     share: float
+    # `index`, `number`: job and place in it: what ``python -m benchmarks.plates.show`` takes
     index: int
     number: int
-    height_px: float
+    height_px: float  # of the plate's image; NaN where there is none
+    # `decoded`, `decoded_known`: its digits were read from the frame alone, or with the codebook
     decoded: bool = False
     decoded_known: bool = False
+    # `wrong`, `wrong_known`: digits returned as valid that are on no plate in the frame
     wrong: tuple[str, ...] = ()
     wrong_known: tuple[str, ...] = ()
-    tentative: bool = False
-    wrong_tentative: tuple[str, ...] = ()
+    tentative: bool = False  # its digits were returned as likely, from the frame alone
+    wrong_tentative: tuple[str, ...] = ()  # likely digits that are on no plate in the frame
+    # of each reading with digits or likely ones, from the frame alone: its confidence, whether it is sure, and whether
+    # it is right
     claims: tuple[tuple[float, bool, bool], ...] = ()
+    # `together`, `wrong_together`: as `decoded` and `wrong`, with what the frames of its drive confirm together
     together: bool = False
     wrong_together: tuple[str, ...] = ()
-    corner_errors_px: tuple[float, ...] = ()
-    position_error_m: float = math.nan
-    rolling: bool = False
-    accuracy: PositionAccuracy | None = None
-    tags: tuple[bool, ...] | None = None
+    corner_errors_px: tuple[float, ...] = ()  # distance of each corner to the truth, where decoded
+    position_error_m: float = math.nan  # distance of the camera's position to the truth, where decoded; else NaN
+    rolling: bool = False  # the camera has a rolling shutter
+    accuracy: PositionAccuracy | None = None  # of the camera's position, where decoded in a trial
+    tags: tuple[bool, ...] | None = None  # whether each peer's tag was read in the same scene
 
 
 def evaluate_job(job: Job) -> list[Record]:

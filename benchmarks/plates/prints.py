@@ -29,26 +29,13 @@ Fault = Callable[[PlateCode, PlateLook, float], tuple[PlateLook, PrintFaults]]
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """A fault of a print.
+    """A fault of a print."""
 
-    Attributes
-    ----------
-    name : str
-        With the unit of its strength.
-    parameter : PrintParameterName
-        That it lowers.
-    strengths : tuple of float
-    make : callable
-        Look and faults of a strength.
-    scheme : str
-        Of the plate: ``position`` or ``id``.
-    """
-
-    name: str
-    parameter: PrintParameterName
+    name: str  # with the unit of its strength
+    parameter: PrintParameterName  # that it lowers
     strengths: tuple[float, ...]
-    make: Fault
-    scheme: str = "position"
+    make: Fault  # look and faults of a strength
+    scheme: str = "position"  # of the plate: ``position`` or ``id``
 
 
 @dataclass(slots=True)

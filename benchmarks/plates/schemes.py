@@ -83,25 +83,15 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class SchemeRecord:
-    """What one scheme, or one tag, gave on one drive.
-
-    Attributes
-    ----------
-    drive : SchemeDrive
-    name : str
-    frames : int
-    alone, together, known : Counts
-        From each frame alone, from the drive's frames together, and with the registry; tags have only the first.
-    tentative : Counts
-        Frames whose digits were returned as likely, from the frame alone.
-    is_tag : bool
-    """
+    """What one scheme, or one tag, gave on one drive."""
 
     drive: SchemeDrive
     name: str
     frames: int
+    # `alone`, `together`, `known`: from each frame alone, from the drive's frames together, and with the registry; tags
+    # have only the first
     alone: Counts
-    tentative: Counts = Counts()
+    tentative: Counts = Counts()  # frames whose digits were returned as likely, from the frame alone
     together: Counts = Counts()
     known: Counts = Counts()
     is_tag: bool = False

@@ -101,29 +101,14 @@ class Job:
 
 @dataclass(slots=True, eq=False)
 class Shot:
-    """A frame to evaluate.
+    """A frame to evaluate."""
 
-    Attributes
-    ----------
-    label : str
-        Where it comes from.
-    frame : RenderedFrame
-    code : PlateCode or None
-        On the first face; None where there is no plate.
-    codebook : tuple of PlateCode
-        Of plates registered near by.
-    camera : Camera
-    scene : PlateScene or None
-        To render it again with other faces, with the ``background`` and the seed of its noise.
-    conditions : Conditions or None
-    thermal : bool
-    """
-
-    label: str
+    label: str  # where it comes from
     frame: RenderedFrame
-    code: PlateCode | None
-    codebook: tuple[PlateCode, ...]
+    code: PlateCode | None  # on the first face; None where there is no plate
+    codebook: tuple[PlateCode, ...]  # of plates registered near by
     camera: Camera
+    # to render it again with other faces, with the ``background`` and the seed of its noise
     scene: PlateScene | None = None
     conditions: Conditions | None = None
     background: Image | None = None

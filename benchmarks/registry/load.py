@@ -17,25 +17,14 @@ CONNECTIONS = 16
 
 @dataclass(frozen=True)
 class Timing:
-    """What a server answered in a while.
+    """What a server answered in a while."""
 
-    Attributes
-    ----------
-    per_s : float
-        Requests answered. [1/s]
-    p50_ms, p99_ms : float
-        Time from the request to the last byte of its answer. [ms]
-    size_kb : float
-        Mean size of a body. [kB]
-    answered : int
-        Requests, with those of the warm-up.
-    """
-
-    per_s: float
+    per_s: float  # [1/s] requests answered
+    # `p50_ms`, `p99_ms`: [ms] time from the request to the last byte of its answer
     p50_ms: float
     p99_ms: float
-    size_kb: float
-    answered: int
+    size_kb: float  # [kB] mean size of a body
+    answered: int  # requests, with those of the warm-up
 
 
 def ask(port: int, paths: Sequence[str], *, key: str = "", seconds: float, connections: int = CONNECTIONS) -> Timing:

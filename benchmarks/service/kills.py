@@ -39,28 +39,18 @@ _COMMAND = ("-c", "import sys; sys.argv[1:] = ['worker']; from app.cli import ma
 
 @dataclass
 class Result:
-    """What the kills of a run did.
-
-    Attributes
-    ----------
-    faults : list of str
-        What was lost, stored in part, or twice; rows without their blob; answers that are no refusal for a time; jobs
-        that failed or were not done; faults of the audit log; processes that ended without being killed.
-    ready_s : dict
-        By what was killed: seconds from its start to `/readyz`, the slowest. [s]
-    slowest_running_s : float
-        The longest time for which one start of a job was seen running. [s]
-    last_jobs_s : float
-        From the last kill until all jobs were done. [s]
-    """
+    """What the kills of a run did."""
 
     engine: str
     done: Acknowledged = field(default_factory=Acknowledged)
+    # what was lost, stored in part, or twice; rows without their blob; answers that are no refusal for a time; jobs
+    # that failed or were not done; faults of the audit log; processes that ended without being killed
     faults: list[str] = field(default_factory=list)
     kills: dict[str, int] = field(default_factory=dict)
+    # [s] by what was killed: seconds from its start to `/readyz`, the slowest
     ready_s: dict[str, float] = field(default_factory=dict)
-    slowest_running_s: float = 0.0
-    last_jobs_s: float = 0.0
+    slowest_running_s: float = 0.0  # [s] the longest time for which one start of a job was seen running
+    last_jobs_s: float = 0.0  # [s] from the last kill until all jobs were done
 
     def table(self) -> str:
         """As Markdown."""

@@ -52,17 +52,10 @@ BUSY_SHARE = 0.7
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What a fleet needs.
+    """What a fleet needs."""
 
-    Attributes
-    ----------
-    decode_cores : float
-        Cores of workers.
-    stores_per_s, jobs_per_s : float
-        Write transactions and jobs. [1/s]
-    """
-
-    decode_cores: float
+    decode_cores: float  # cores of workers
+    # `stores_per_s`, `jobs_per_s`: [1/s] write transactions and jobs
     stores_per_s: float
     jobs_per_s: float
 

@@ -43,21 +43,13 @@ _CONTEXTS = {"traces": {"trace": {}}, "packets": {"packets": {}}}
 
 @dataclass(slots=True)
 class Outcome:
-    """What came of the files of one format.
-
-    Attributes
-    ----------
-    slowest_s : float
-        Longest time from the request to the end of its job. [s]
-    slowest : int
-        Number of that file in `make_files`.
-    """
+    """What came of the files of one format."""
 
     files: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
     jobs: Counter[str] = field(default_factory=Counter)
-    slowest_s: float = 0.0
-    slowest: int = 0
+    slowest_s: float = 0.0  # [s] longest time from the request to the end of its job
+    slowest: int = 0  # number of that file in `make_files`
     failures: list[str] = field(default_factory=list)
 
 

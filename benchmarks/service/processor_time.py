@@ -14,22 +14,14 @@ from benchmarks.faults.server import FaultServer
 
 @dataclass(slots=True)
 class ProcessorTime:
-    """Processor time, user and system. [s]
+    """Processor time, user and system. [s]"""
 
-    Attributes
-    ----------
-    server, decoders : float
-        The web process with the worker, if there is one; and their children.
-    database : float
-        Processes of PostgreSQL that serve this database; 0 for SQLite, which runs inside the server.
-    clients : float
-        This process.
-    """
-
+    # `server`, `decoders`: the web process with the worker, if there is one; and their children
     server: float = 0.0
     decoders: float = 0.0
+    # processes of PostgreSQL that serve this database; 0 for SQLite, which runs inside the server
     database: float = 0.0
-    clients: float = 0.0
+    clients: float = 0.0  # this process
 
     def per_file(self, files: int) -> str:
         """Milliseconds a file of each part. [ms]"""

@@ -30,24 +30,16 @@ WARM_SHARE = 1 / 6
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The service at one moment.
-
-    Attributes
-    ----------
-    web_mb, children_mb : float
-        Resident memory of the web process, and of its decoder processes together. [MB]
-    files, threads : int
-        Open files and threads of the web process.
-    temporary : int
-        Files in the folder for uploads on their way.
-    """
+    """The service at one moment."""
 
     at_s: float
+    # `web_mb`, `children_mb`: [MB] Resident memory of the web process, and of its decoder processes together
     web_mb: float
     children_mb: float
+    # `files`, `threads`: open files and threads of the web process
     files: int
     threads: int
-    temporary: int
+    temporary: int  # files in the folder for uploads on their way
 
 
 def look_at(pid: int, folder: Path, began_s: float) -> Sample:

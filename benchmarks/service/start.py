@@ -33,22 +33,13 @@ _PSS = re.compile(r"^Pss: +(\d+) kB$", re.MULTILINE)
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """One start of a server.
+    """One start of a server."""
 
-    Attributes
-    ----------
-    server_s, all_s : float
-        Processor time until it was ready: of the server's process, and with its children. [s]
-    openapi_s : float
-        Processor time of the server for the first request of /openapi.json. [s]
-    pss_mib : dict of str to float
-        Memory of each process when the decoders are ready. [MiB]
-    """
-
+    # `server_s`, `all_s`: [s] processor time until it was ready: of the server's process, and with its children
     server_s: float
     all_s: float
-    openapi_s: float
-    pss_mib: dict[str, float]
+    openapi_s: float  # [s] processor time of the server for the first request of /openapi.json
+    pss_mib: dict[str, float]  # [MiB] memory of each process when the decoders are ready
 
 
 def measure(folder: Path) -> Start:

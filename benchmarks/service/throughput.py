@@ -49,27 +49,14 @@ _REGISTERED = 5
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of the table.
-
-    Attributes
-    ----------
-    per_s : float
-        Files decoded in a second. [1/s]
-    client_share : float
-        Processor time of the clients over that of both cores.
-    bare_ms : float
-        Processor time of a bare process for a file. [ms]
-    files : int
-    spent : ProcessorTime, optional
-        Of the parts of the service, for all files.
-    """
+    """One line of the table."""
 
     what: str
-    per_s: float
-    client_share: float = 0.0
-    bare_ms: float = 0.0
+    per_s: float  # [1/s] files decoded in a second
+    client_share: float = 0.0  # processor time of the clients over that of both cores
+    bare_ms: float = 0.0  # [ms] processor time of a bare process for a file
     files: int = 0
-    spent: ProcessorTime | None = None
+    spent: ProcessorTime | None = None  # of the parts of the service, for all files
 
     def processor_ms(self) -> str:
         """Processor time of each part for a file."""

@@ -55,23 +55,14 @@ _POSITION = {"realization": "ITRF2014", "epoch": 2026.4, "horizontal_rmse_m": 0.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstalledRoad:
-    """A straight lane with registered markers of all families.
+    """A straight lane with registered markers of all families."""
 
-    Attributes
-    ----------
-    origin : (float, float, float)
-        Longitude, latitude [deg] and height [m] of its first point.
-    plates : list of PlateCode
-    keys : dict of int to bytes
-        Of the CERPMs, by number.
-    """
-
-    origin: tuple[float, float, float]
+    origin: tuple[float, float, float]  # longitude, latitude [deg] and height [m] of its first point
     road: Road
     lane: TrueLane
     plates: list[PlateCode]
     installed: InstalledMarkers
-    keys: dict[int, bytes]
+    keys: dict[int, bytes]  # of the CERPMs, by number
 
     def place(self, chainage_m: float, left_m: float = 0.0) -> tuple[float, float]:
         """Longitude and latitude of a point beside the lane. [deg]"""

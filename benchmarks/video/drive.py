@@ -34,23 +34,12 @@ FAR_M = 14.0
 
 @dataclass(frozen=True, slots=True)
 class PassedPlate:
-    """A plate of a drive.
-
-    Attributes
-    ----------
-    code : PlateCode
-    at_m : float
-        Along the drive. [m]
-    frames : tuple of int
-        In which all of it is in view.
-    is_hard : bool
-        Under drawn degradations.
-    """
+    """A plate of a drive."""
 
     code: PlateCode
-    at_m: float
-    frames: tuple[int, ...]
-    is_hard: bool
+    at_m: float  # [m] along the drive
+    frames: tuple[int, ...]  # in which all of it is in view
+    is_hard: bool  # under drawn degradations
 
 
 @dataclass(frozen=True, slots=True)

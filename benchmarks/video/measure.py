@@ -26,44 +26,31 @@ from benchmarks.video.drive import PassedPlate
 
 @dataclass(slots=True)
 class VideoScore:
-    """What decoding one video gave.
-
-    Attributes
-    ----------
-    frames, decoded : int
-    processor_s, codec_s : float
-        Of the whole decode, and of the codec's part of the wall time. [s]
-    plates, alone, together : int
-        Plates that were in view in at least one frame, read from a single frame (also where all frames together take
-        its digits back), and as the video's result has them.
-    hard, hard_alone, hard_together : int
-        The same of plates under drawn degradations.
-    wrong_alone, wrong_together : int
-        Different digits than any plate in view has.
-    missed, wrong : list of str
-        Plates that were not read, and digits that no plate in view has.
-    correlations : list of float
-        Of the residuals of two frames of one plate, for each pair of frames with large units.
-    doubt : float
-        Wrong plates that the stated confidences expect among those that were read together.
-    """
+    """What decoding one video gave."""
 
     frames: int = 0
     decoded: int = 0
+    # `processor_s`, `codec_s`: [s] of the whole decode, and of the codec's part of the wall time
     processor_s: float = 0.0
     codec_s: float = 0.0
+    # `plates`, `alone`, `together`: plates that were in view in at least one frame, read from a single frame (also
+    # where all frames together take its digits back), and as the video's result has them
     plates: int = 0
     alone: int = 0
     together: int = 0
+    # `hard`, `hard_alone`, `hard_together`: the same of plates under drawn degradations
     hard: int = 0
     hard_alone: int = 0
     hard_together: int = 0
+    # `wrong_alone`, `wrong_together`: different digits than any plate in view has
     wrong_alone: int = 0
     wrong_together: int = 0
+    # `missed`, `wrong`: plates that were not read, and digits that no plate in view has
     missed: list[str] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
+    # of the residuals of two frames of one plate, for each pair of frames with large units
     correlations: list[float] = field(default_factory=list)
-    doubt: float = 0.0
+    doubt: float = 0.0  # wrong plates that the stated confidences expect among those that were read together
 
 
 def measure_video(

@@ -210,27 +210,13 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 @dataclass(frozen=True, slots=True)
 class DeclaredForm:
-    """A form with files and the part `declaration`.
+    """A form with files and the part `declaration`."""
 
-    Attributes
-    ----------
-    what : str
-        The request, in a sentence such as "an import is a form".
-    part : str
-        Name of the part with the file, or of those with files.
-    max_declaration_bytes : int
-        [byte]
-    cure : str
-        Of a request that is another one.
-    max_files : int
-        In `part`.
-    """
-
-    what: str
-    part: str
-    max_declaration_bytes: int
-    cure: str
-    max_files: int = 1
+    what: str  # the request, in a sentence such as "an import is a form"
+    part: str  # name of the part with the file, or of those with files
+    max_declaration_bytes: int  # [byte]
+    cure: str  # of a request that is another one
+    max_files: int = 1  # in `part`
 
     @asynccontextmanager
     async def received(self, request: Request) -> AsyncIterator[tuple[FormData, bytes]]:

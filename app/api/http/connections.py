@@ -59,33 +59,17 @@ _LOG = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ConnectionLimits:
-    """What clients may take.
+    """What clients may take."""
 
-    Attributes
-    ----------
-    header_s : float
-        From the first byte of a request, or from connecting, to the end of the headers. [s]
-    stall_s : float
-        Time in which a client that does not keep up has to read `stall_s` x `min_bytes_per_s` of a response. [s]
-    min_bytes_per_s : float
-        Lowest rate at which a client has to read. [byte/s]
-    total : int
-        Connections at a time.
-    per_address : int
-        Connections from one address (`address_of`) at a time.
-    proxies : frozenset of str
-        Addresses that may have all connections, because many clients are behind them.
-    check_s : float
-        Time between two checks of a connection. [s]
-    """
-
-    header_s: float = 10.0
+    header_s: float = 10.0  # [s] from the first byte of a request, or from connecting, to the end of the headers
+    # [s] time in which a client that does not keep up has to read `stall_s` x `min_bytes_per_s` of a response
     stall_s: float = 30.0
-    min_bytes_per_s: float = 8000.0
-    total: int = 1000
-    per_address: int = 200
+    min_bytes_per_s: float = 8000.0  # [byte/s] lowest rate at which a client has to read
+    total: int = 1000  # connections at a time
+    per_address: int = 200  # connections from one address (`address_of`) at a time
+    # addresses that may have all connections, because many clients are behind them
     proxies: frozenset[str] = frozenset()
-    check_s: float = _CHECK_S
+    check_s: float = _CHECK_S  # [s] time between two checks of a connection
 
 
 class _Refused(Exception):

@@ -51,16 +51,9 @@ class FormRefused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class ReportForm:
-    """The parts of a form, without characters that no text contains.
+    """The parts of a form, without characters that no text contains."""
 
-    Attributes
-    ----------
-    values : mapping
-        Texts by field; empty where there is none.
-    photo : SpooledFile or None
-    """
-
-    values: Mapping[str, str]
+    values: Mapping[str, str]  # texts by field; empty where there is none
     photo: SpooledFile | None
 
     def checked(self, marker_id: str, tokens: FormTokens, language: str) -> SentReport:

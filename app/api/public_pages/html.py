@@ -24,24 +24,14 @@ MAX_EMAIL = 254
 
 @dataclass(frozen=True, slots=True)
 class FormState:
-    """A form as it is shown.
-
-    Attributes
-    ----------
-    token : str
-    photo_mb, contact_days : int
-        Limits that the hints name. [MB, d]
-    values : mapping
-        What was typed before, by field.
-    faults : mapping
-        What is wrong, by field; the key of a text and what it names.
-    """
+    """A form as it is shown."""
 
     token: str
+    # `photo_mb`, `contact_days`: limits that the hints name. [MB, d]
     photo_mb: int
     contact_days: int
-    values: Mapping[str, str]
-    faults: Mapping[str, str]
+    values: Mapping[str, str]  # what was typed before, by field
+    faults: Mapping[str, str]  # what is wrong, by field; the key of a text and what it names
     had_photo: bool = False
 
 

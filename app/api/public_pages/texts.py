@@ -14,19 +14,9 @@ from app.services.public_pages.pages import ReportKind
 
 @dataclass(frozen=True, slots=True)
 class Texts:
-    """All texts of the public pages in one language.
+    """All texts of the public pages in one language."""
 
-    Attributes
-    ----------
-    language, name : str
-        Its tag (RFC 5646), and what it calls itself.
-    decimal_point : str
-    statuses, kinds, faults : mapping
-        Statuses of markers, kinds of damage, and what is wrong with a form, by `forms.Fault`.
-    problems : mapping of int to (str, str)
-        Title and text of error pages by status; 0 is any other.
-    """
-
+    # `language`, `name`: its tag (RFC 5646), and what it calls itself
     language: str
     name: str
     decimal_point: str
@@ -37,6 +27,8 @@ class Texts:
     revision: str
     road: str
     measure: str
+    # `statuses`, `kinds`, `faults`: statuses of markers, kinds of damage, and what is wrong with a form, by
+    # `forms.Fault`
     statuses: Mapping[Status, str]
     report: str
     report_intro: str
@@ -59,7 +51,7 @@ class Texts:
     thanks: str
     thanks_text: str
     back: str
-    problems: Mapping[int, tuple[str, str]]
+    problems: Mapping[int, tuple[str, str]]  # title and text of error pages by status; 0 is any other
 
 
 # === The public pages in German.

@@ -112,68 +112,38 @@ USED_ANYWAY = frozenset((Disagreement.REPROGRAMMED, Disagreement.OTHER_SIDE))
 
 @dataclass(frozen=True, slots=True)
 class RegisteredMarker:
-    """A marker as it is registered.
+    """A marker as it is registered."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg : float
-        WGS 84 / ITRF. [deg]
-    height_m : float or None
-        Above the ellipsoid. [m]
-    side : LaneSide
-    speed_limit_km_h : float
-        NaN where none is posted. [km/h]
-    sigma_m : float
-        Standard deviation of its survey on each axis; NaN if unknown. [m]
-    """
-
+    # `lon_deg`, `lat_deg`: [deg] WGS 84 / ITRF
     lon_deg: float
     lat_deg: float
-    height_m: float | None = None
+    height_m: float | None = None  # [m] above the ellipsoid
     side: LaneSide = LaneSide.UNKNOWN
-    speed_limit_km_h: float = math.nan
-    sigma_m: float = math.nan
+    speed_limit_km_h: float = math.nan  # [km/h] NaN where none is posted
+    sigma_m: float = math.nan  # [m] standard deviation of its survey on each axis; NaN if unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A disagreement about one marker.
-
-    Attributes
-    ----------
-    number : int
-    kind : Disagreement
-    reason : str
-    distance_m : float
-        Between the positions that disagree; NaN where there are none. [m]
-    """
+    """A disagreement about one marker."""
 
     number: int
     kind: Disagreement
     reason: str
-    distance_m: float = math.nan
+    distance_m: float = math.nan  # [m] between the positions that disagree; NaN where there are none
 
 
 @dataclass(frozen=True, slots=True)
 class MergeRules:
-    """Limits of a disagreement.
+    """Limits of a disagreement."""
 
-    Attributes
-    ----------
-    apart_m : float
-        Positions closer than this to the registered one, or to each other, agree. [m]
-    sigmas : float
-        They also agree within this many standard deviations of the survey.
-    reach_m : float
-        No marker is received from further away. [m]
-    accept_clear : bool
-        Use packets in clear of markers without an authentic packet.
-    """
-
+    # [m] positions closer than this to the registered one, or to each other, agree
     apart_m: float = 0.5  # [m] source: by hand; a marker that is moved by less still marks the boundary
+    # they also agree within this many standard deviations of the survey
     sigmas: float = 3.0  # source: three sigma, one false alarm in 370
+    # [m] no marker is received from further away
     reach_m: float = 2000.0  # [m] source: by hand; six times the 340 m of the CERPM paper, section 4.1
-    accept_clear: bool = False
+    accept_clear: bool = False  # use packets in clear of markers without an authentic packet
 
     def __post_init__(self) -> None:
         for name in ("apart_m", "sigmas", "reach_m"):
@@ -183,38 +153,21 @@ class MergeRules:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedMarkers:
-    """One row for each marker that may be used, and the findings on all.
+    """One row for each marker that may be used, and the findings on all."""
 
-    Attributes
-    ----------
-    number : ndarray of int, shape (K,)
-    lon_deg, lat_deg : ndarray, shape (K,)
-        Registered position, or that of the newest authentic message. [deg]
-    side : ndarray of int, shape (K,)
-        `LaneSide` values.
-    sigma_m, speed_limit_km_h : ndarray, shape (K,)
-        [m, km/h]
-    packets : ndarray of int, shape (K,)
-        Accepted ones.
-    registered : ndarray of bool, shape (K,)
-    left_out : dict of int to str
-        Markers without a row, with the reason.
-    findings : list of Finding
-    shift_m : (float, float) or None
-        Common shift of sent against registered positions, east and north, from another datum. [m]
-    warnings : list of str
-    """
-
-    number: npt.NDArray[np.int64]
+    number: npt.NDArray[np.int64]  # shape (K,)
+    # `lon_deg`, `lat_deg`: shape (K,): [deg] registered position, or that of the newest authentic message
     lon_deg: Floats
     lat_deg: Floats
-    side: npt.NDArray[np.int64]
+    side: npt.NDArray[np.int64]  # shape (K,): `LaneSide` values
+    # `sigma_m`, `speed_limit_km_h`: shape (K,): [m, km/h]
     sigma_m: Floats
     speed_limit_km_h: Floats
-    packets: npt.NDArray[np.int64]
-    registered: npt.NDArray[np.bool_]
-    left_out: dict[int, str]
+    packets: npt.NDArray[np.int64]  # shape (K,): accepted ones
+    registered: npt.NDArray[np.bool_]  # shape (K,)
+    left_out: dict[int, str]  # markers without a row, with the reason
     findings: list[Finding]
+    # [m] common shift of sent against registered positions, east and north, from another datum
     shift_m: tuple[float, float] | None
     warnings: list[str]
 
@@ -530,26 +483,15 @@ RETIRED_REASON = "it is retired: its messages are not used any more"
 
 @dataclass(frozen=True, slots=True)
 class KnownCerpms:
-    """What is known of markers, by their numbers.
-
-    Attributes
-    ----------
-    registered : dict of int to RegisteredMarker
-    earlier_spans : dict of int to list of SequenceSpan
-        Of earlier drives.
-    min_interval_s : dict of int to float
-        Shortest programmed time between two transmissions of a marker. [s]
-    localization_warnings : dict of int to tuple of str
-        Why a registered position is unfit for localization.
-    retired : frozenset of int
-        Their messages are not used.
-    """
+    """What is known of markers, by their numbers."""
 
     registered: dict[int, RegisteredMarker] = field(default_factory=dict)
-    earlier_spans: dict[int, list[SequenceSpan]] = field(default_factory=dict)
+    earlier_spans: dict[int, list[SequenceSpan]] = field(default_factory=dict)  # of earlier drives
+    # [s] shortest programmed time between two transmissions of a marker
     min_interval_s: dict[int, float] = field(default_factory=dict)
+    # why a registered position is unfit for localization
     localization_warnings: dict[int, tuple[str, ...]] = field(default_factory=dict)
-    retired: frozenset[int] = frozenset()
+    retired: frozenset[int] = frozenset()  # their messages are not used
 
 
 def list_numbers(packets: Iterable[ReceivedPacket]) -> list[int]:

@@ -60,26 +60,16 @@ class SignalHealth(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SignalRules:
-    """Limits of weak and failing radios.
+    """Limits of weak and failing radios."""
 
-    Attributes
-    ----------
-    weak_db, failing_db : float
-        Level below the line, negative. The 95 % interval must be below half of it. [dB]
-    weak_share, failing_share : float
-        Delivery ratio over that of the fleet; the whole 95 % interval must be below.
-    sensitivity_dbm : float or None
-        Of the receiver; fitted if None. [dBm]
-    antenna_height_m : float
-        Of the receiver above the road. [m]
-    """
-
+    # `weak_db`, `failing_db`: [dB] level below the line, negative. The 95 % interval must be below half of it.
     weak_db: float = -6.0  # [dB] source: half the range at the paper's exponent of 2.04
     failing_db: float = -12.0  # [dB] source: a quarter of the range
+    # `weak_share`, `failing_share`: delivery ratio over that of the fleet; the whole 95 % interval must be below
     weak_share: float = 0.5  # source: by hand, no measurement kept
     failing_share: float = 0.25  # source: by hand, no measurement kept
-    sensitivity_dbm: float | None = None
-    antenna_height_m: float = ANTENNA_M
+    sensitivity_dbm: float | None = None  # [dBm] of the receiver; fitted if None
+    antenna_height_m: float = ANTENNA_M  # [m] of the receiver above the road
 
     def __post_init__(self) -> None:
         if not self.failing_db < self.weak_db < 0:
@@ -98,40 +88,24 @@ class SignalRules:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalProfile:
-    """Strength and delivery of one marker's packets.
-
-    Attributes
-    ----------
-    number : int
-    distance_m, rssi_dbm : ndarray, shape (P,)
-        Of each packet, in the order received; NaN if unknown. [m, dBm]
-    received, expected : int
-        Packets, and transmissions from the first to the last packet of each pass, by their sequences.
-    delivery : Estimate or None
-        Ratio of both; None without sequences.
-    nearest_m, farthest_m : float
-        Of the packets; NaN if no position is known. [m]
-    level_db : Estimate or None
-        Above the fleet's line or, without a fleet, the paper's. [dB]
-    compared_with : str
-        ``fleet`` or ``paper``.
-    health : SignalHealth
-    reason : str
-        With the figures.
-    """
+    """Strength and delivery of one marker's packets."""
 
     number: int
+    # `distance_m`, `rssi_dbm`: shape (P,): of each packet, in the order received; NaN if unknown. [m, dBm]
     distance_m: Floats
     rssi_dbm: Floats
+    # `received`, `expected`: packets, and transmissions from the first to the last packet of each pass, by their
+    # sequences
     received: int
     expected: int
-    delivery: Estimate | None
+    delivery: Estimate | None  # ratio of both; None without sequences
+    # `nearest_m`, `farthest_m`: [m] of the packets; NaN if no position is known
     nearest_m: float
     farthest_m: float
-    level_db: Estimate | None
-    compared_with: str
+    level_db: Estimate | None  # [dB] above the fleet's line or, without a fleet, the paper's
+    compared_with: str  # ``fleet`` or ``paper``
     health: SignalHealth
-    reason: str
+    reason: str  # with the figures
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,30 +176,15 @@ def profile_signals(
 
 @dataclass(slots=True)
 class _Scene:
-    """Values common to all markers of a drive.
-
-    Attributes
-    ----------
-    compared_with : str
-    line : PathLoss
-    correlation : float
-    interval_s : float
-        Between transmissions; NaN if unknown. [s]
-    missed_m : dict of int to ndarray
-        Distance of the vehicle at transmissions that were not received. [m]
-    received_share : float
-        Share of strong transmissions that are received.
-    usual : float or None
-        Median delivery ratio of the fleet.
-    """
+    """Values common to all markers of a drive."""
 
     compared_with: str
     line: PathLoss
     correlation: float
-    interval_s: float
-    missed_m: dict[int, Floats]
-    received_share: float = _DEFAULT_RECEIVED_SHARE
-    usual: float | None = None
+    interval_s: float  # [s] between transmissions; NaN if unknown
+    missed_m: dict[int, Floats]  # [m] distance of the vehicle at transmissions that were not received
+    received_share: float = _DEFAULT_RECEIVED_SHARE  # share of strong transmissions that are received
+    usual: float | None = None  # median delivery ratio of the fleet
 
     def set_received_share(self, markers: Sequence[_MarkerPackets]) -> None:
         """Estimate it from transmissions so near that only collisions can lose them."""

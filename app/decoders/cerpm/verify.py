@@ -162,19 +162,13 @@ _SAFETY = 0.5  # of the interval found, taken as the shortest; source: by hand, 
 
 @dataclass(frozen=True, slots=True)
 class SequenceSpan:
-    """Sequences of one marker that were received in one drive.
+    """Sequences of one marker that were received in one drive."""
 
-    Attributes
-    ----------
-    first_sequence, last_sequence : int
-        Lowest and highest.
-    first_heard_s, last_heard_s : float
-        Times of reception, seconds since 1970-01-01 UTC; NaN if the log had no times: then no message up to the
-        highest sequence is fresh any more. [s]
-    """
-
+    # `first_sequence`, `last_sequence`: lowest and highest
     first_sequence: int
     last_sequence: int
+    # `first_heard_s`, `last_heard_s`: [s] times of reception, seconds since 1970-01-01 UTC; NaN if the log had no
+    # times: then no message up to the highest sequence is fresh any more
     first_heard_s: float
     last_heard_s: float
 
@@ -183,31 +177,22 @@ class SequenceSpan:
 class FreshnessRules:
     """Tolerances when times and sequences are compared.
 
-    Attributes
-    ----------
-    clock_tolerance_s : float
-        Maximum difference between the clocks of two drives. [s]
-    log_tolerance_s : float
-        Maximum by which times within one log are out of order. [s]
-    echo_s : float
-        The same sequence again within this time is an echo (another gateway, a repeated delivery), later a replay. [s]
-    min_interval_s : float or None
-        Shortest time from one transmission of a marker to the next, if known. Without it, half of the interval found
-        in the log is used within the log, and the time on air at the fastest setting between logs. [s]
-    uploaded_at_s : float or None
-        When the log was uploaded: no packet can have been received later. [s]
-
     Raises
     ------
     InvalidParameter
         A value is negative or not finite.
     """
 
+    # [s] maximum difference between the clocks of two drives
     clock_tolerance_s: float = 60.0  # [s] source: by hand, no measurement kept
+    # [s] maximum by which times within one log are out of order
     log_tolerance_s: float = 3.0  # [s] source: by hand, no measurement kept
+    # [s] the same sequence again within this time is an echo (another gateway, a repeated delivery), later a replay
     echo_s: float = 3.0  # [s] source: `log_tolerance_s`
+    # [s] shortest time from one transmission of a marker to the next, if known. Without it, half of the interval found
+    # in the log is used within the log, and the time on air at the fastest setting between logs.
     min_interval_s: float | None = None
-    uploaded_at_s: float | None = None
+    uploaded_at_s: float | None = None  # [s] when the log was uploaded: no packet can have been received later
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -361,25 +346,15 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class VerifiedPacket:
-    """A packet and its verdict.
-
-    Attributes
-    ----------
-    packet : ReceivedPacket
-    verdict : Verdict
-    number : int or None
-        Of its marker, as sent; only authentic, replayed, out-of-order and duplicate packets have that marker's tag.
-    message : CerpmMessage or None
-        Of a payload that can be decoded, whoever sent it; for a packet in clear see `packet.claim`.
-    reason : str
-        Why it is not accepted; of an authentic packet, what could not be checked.
-    """
+    """A packet and its verdict."""
 
     packet: ReceivedPacket
     verdict: Verdict
+    # of its marker, as sent; only authentic, replayed, out-of-order and duplicate packets have that marker's tag
     number: int | None = None
+    # of a payload that can be decoded, whoever sent it; for a packet in clear see `packet.claim`
     message: CerpmMessage | None = None
-    reason: str = ""
+    reason: str = ""  # why it is not accepted; of an authentic packet, what could not be checked
 
     @property
     def entry(self) -> int:
@@ -402,23 +377,13 @@ _SIGNED = frozenset((Verdict.AUTHENTIC, Verdict.REPLAYED, Verdict.OUT_OF_ORDER, 
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """All packets of a log with their verdicts.
+    """All packets of a log with their verdicts."""
 
-    Attributes
-    ----------
-    packets : list of VerifiedPacket
-        In the order they came.
-    spans : dict of int to tuple of SequenceSpan
-        Accepted sequences of each marker, to be stored and passed as `earlier_spans` next time.
-    warnings : list of str
-    invalid_tags : int
-        Different payloads whose tag was checked and failed: guesses, if they were no accidents.
-    """
-
-    packets: list[VerifiedPacket]
+    packets: list[VerifiedPacket]  # in the order they came
+    # accepted sequences of each marker, to be stored and passed as `earlier_spans` next time
     spans: dict[int, tuple[SequenceSpan, ...]]
     warnings: list[str]
-    invalid_tags: int
+    invalid_tags: int  # different payloads whose tag was checked and failed: guesses, if they were no accidents
 
     def counts(self) -> dict[Verdict, int]:
         """Number of packets of each verdict."""

@@ -279,13 +279,7 @@ speed."""
 
 @dataclass(slots=True, eq=False)
 class DipoleDetector:
-    """Detects the dipoles of regions.
-
-    Attributes
-    ----------
-    bank : FilterBank
-    array : SensorArray
-    """
+    """Detects the dipoles of regions."""
 
     bank: FilterBank
     array: SensorArray

@@ -37,57 +37,26 @@ MIN_BLOCK_M, MAX_BLOCK_M = 0.001, 1.0
 
 
 class FitData(NamedTuple):
-    """Whitened samples of a stretch of road.
+    """Whitened samples of a stretch of road."""
 
-    Attributes
-    ----------
-    s_m : ndarray, shape (K,)
-        Odometer of the blocks. [m]
-    field : ndarray, shape (S, 3, K)
-        Field times weight, background and common mode removed. [noise standard deviations]
-    weight : ndarray, shape (S, 3, K)
-        1 / noise, 0 where a sample is missing. [1/uT]
-    delay_m : ndarray, shape (3, K)
-        Distance driven between a block's time and the time at which each axis is read. [m]
-    positions_m : ndarray, shape (S, 3)
-        Sensors: x and z relative to the bar's middle, y from the vehicle's middle. [m]
-    basis : ndarray, shape (Q, K)
-        Orthonormal background functions.
-    common_share : ndarray, shape (3,)
-        Share of the common mode that is taken out of each axis.
-    """
-
-    s_m: Floats
+    s_m: Floats  # shape (K,): [m] odometer of the blocks
+    # shape (S, 3, K): field times weight, background and common mode removed. [noise standard deviations]
     field: Floats
-    weight: Floats
-    delay_m: Floats
-    positions_m: Floats
-    basis: Floats
-    common_share: Floats
+    weight: Floats  # shape (S, 3, K): [1/uT] 1 / noise, 0 where a sample is missing
+    delay_m: Floats  # shape (3, K): [m] distance driven between a block's time and the time at which each axis is read
+    positions_m: Floats  # shape (S, 3): [m] sensors: x and z relative to the bar's middle, y from the vehicle's middle
+    basis: Floats  # shape (Q, K): Orthonormal background functions
+    common_share: Floats  # shape (3,): share of the common mode that is taken out of each axis
 
 
 class Samples(NamedTuple):
-    """Blocks about a region of road, N of them, and their noise.
+    """Blocks about a region of road, N of them, and their noise."""
 
-    Attributes
-    ----------
-    s_m : ndarray, shape (N,)
-        Odometer. [m]
-    field_ut : ndarray, shape (S, 3, N)
-        [uT]
-    good : ndarray, shape (S, N)
-        Share of good samples.
-    quiet : ndarray, shape (S, 3)
-        1 over the noise of each channel in that of its axis.
-    common_share : ndarray, shape (3,)
-        Share of the common mode that is taken out of each axis.
-    """
-
-    s_m: Floats
-    field_ut: Floats
-    good: Floats
-    quiet: Floats
-    common_share: Floats
+    s_m: Floats  # shape (N,): [m] odometer
+    field_ut: Floats  # shape (S, 3, N) [uT]
+    good: Floats  # shape (S, N): share of good samples
+    quiet: Floats  # shape (S, 3): 1 over the noise of each channel in that of its axis
+    common_share: Floats  # shape (3,): share of the common mode that is taken out of each axis
 
 
 @kernel
@@ -283,47 +252,30 @@ LOCAL_HEIGHTS, LOCAL_M = 1.2, 0.1
 
 
 class MagnetPrior(NamedTuple):
-    """What magnets are expected to be like.
+    """What magnets are expected to be like."""
 
-    Attributes
-    ----------
-    moment_am2, moment_std_am2 : float
-        Moment and its standard deviation. [A m2]
-    clearance_m, clearance_std_m : float
-        Of the bar above the magnet. [m]
-    tilt_std_am2, yaw_std_am2 : float
-        Standard deviation of the moment's components across the magnet's axis, and of a forward one's y. [A m2]
-    """
-
+    # `moment_am2`, `moment_std_am2`: [A m2] moment and its standard deviation
     moment_am2: float
     moment_std_am2: float
+    # `clearance_m`, `clearance_std_m`: [m] of the bar above the magnet
     clearance_m: float
     clearance_std_m: float
+    # `tilt_std_am2`, `yaw_std_am2`: [A m2] standard deviation of the moment's components across the magnet's axis, and
+    # of a forward one's y
     tilt_std_am2: float
     yaw_std_am2: float
 
 
 class FittedDipoles(NamedTuple):
-    """Result of `fit_dipoles` for n dipoles.
+    """Result of `fit_dipoles` for n dipoles."""
 
-    Attributes
-    ----------
-    dipoles : ndarray, shape (n, 6)
-        s, y, h [m], moment [A m2].
-    covariance : ndarray, shape (n, 6, 6)
-    explained : ndarray, shape (n,)
-        Energy that the residual gains without the dipole. [noise variances]
-    local_energy, local_rows : ndarray, shape (n,)
-        Weighted residual energy near the dipole and the number of samples there.
-    prior_cost : ndarray, shape (n,)
-    """
-
-    dipoles: Floats
-    covariance: Floats
-    explained: Floats
+    dipoles: Floats  # shape (n, 6): [A m2] s, y, h [m], moment
+    covariance: Floats  # shape (n, 6, 6)
+    explained: Floats  # shape (n,): energy that the residual gains without the dipole. [noise variances]
+    # `local_energy`, `local_rows`: shape (n,): weighted residual energy near the dipole and the number of samples there
     local_energy: Floats
     local_rows: Floats
-    prior_cost: Floats
+    prior_cost: Floats  # shape (n,)
 
 
 # --- priors ---------------------------------------------------------------------------------------------------------

@@ -57,35 +57,16 @@ chosen by hand, no measurement kept."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dipole:
-    """A fitted dipole.
+    """A fitted dipole."""
 
-    Attributes
-    ----------
-    params : ndarray, shape (6,)
-        s, y, h [m], moment [A m2].
-    covariance : ndarray, shape (6, 6)
-    explained : float
-        Energy that it explains, in variances of the noise.
-    misfit : float
-        Energy left about it beyond the noise, as a share of what it explains.
-    prior_cost : float
-        Chi-squared of its clearance, moment and axis under the prior, with four degrees of freedom.
-    kind : int
-        `UPRIGHT` or `FORWARD`: index of the moment's main component.
-    margin : float
-        By how much its kind costs less than the other.
-    log_odds : float
-        Of a magnet against iron, by its depth and moment alone (`app.decoders.magnet.classify`).
-    """
-
-    params: Floats
-    covariance: Floats
-    explained: float
-    misfit: float
-    prior_cost: float
-    kind: int
-    margin: float
-    log_odds: float = 0.0
+    params: Floats  # shape (6,): [A m2] s, y, h [m], moment
+    covariance: Floats  # shape (6, 6)
+    explained: float  # energy that it explains, in variances of the noise
+    misfit: float  # energy left about it beyond the noise, as a share of what it explains
+    prior_cost: float  # Chi-squared of its clearance, moment and axis under the prior, with four degrees of freedom
+    kind: int  # `UPRIGHT` or `FORWARD`: index of the moment's main component
+    margin: float  # by how much its kind costs less than the other
+    log_odds: float = 0.0  # of a magnet against iron, by its depth and moment alone (`app.decoders.magnet.classify`)
 
     @property
     def resembles_iron(self) -> bool:
@@ -112,21 +93,11 @@ def magnet_prior(moment_am2: float, moment_spread: float, clearance_m: float, cl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorArray:
-    """The array sensors of a bar.
+    """The array sensors of a bar."""
 
-    Attributes
-    ----------
-    positions_m : ndarray, shape (A, 3)
-        x and z relative to the bar's middle. [m]
-    indices : ndarray of int, shape (A,)
-        Their places among all sensors.
-    axis_delay_s : tuple of float
-        Times after the time stamp at which x, y and z are read. [s]
-    """
-
-    positions_m: Floats
-    indices: npt.NDArray[np.intp]
-    axis_delay_s: tuple[float, float, float]
+    positions_m: Floats  # shape (A, 3): [m] x and z relative to the bar's middle
+    indices: npt.NDArray[np.intp]  # shape (A,): their places among all sensors
+    axis_delay_s: tuple[float, float, float]  # [s] times after the time stamp at which x, y and z are read
 
     @property
     def half_width_m(self) -> float:
@@ -136,33 +107,15 @@ class SensorArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
-    """A stretch of road in which the matched filters saw something.
+    """A stretch of road in which the matched filters saw something."""
 
-    Attributes
-    ----------
-    x : ndarray, shape (N + 2 HALF_BINS, 3 A)
-        Field of the bins. [uT]
-    start : int
-        Number of the first of them.
-    scores : BinScores
-        Of the N bins in the middle.
-    variance : ndarray, shape (nD, 3)
-        Noise of the matched filters.
-    common_share : ndarray, shape (3,)
-        Share of the common mode that was taken out.
-    loudness : ndarray, shape (A, 3)
-        Variance of each channel over the median of its axis.
-    window_m : tuple of float
-        From where to where blocks count in fits. [m]
-    """
-
-    x: npt.NDArray[np.float32]
-    start: int
-    scores: BinScores
-    variance: npt.NDArray[np.float32]
-    common_share: Floats
-    loudness: npt.NDArray[np.float32]
-    window_m: tuple[float, float]
+    x: npt.NDArray[np.float32]  # shape (N + 2 HALF_BINS, 3 A): [uT] field of the bins
+    start: int  # number of the first of them
+    scores: BinScores  # of the N bins in the middle
+    variance: npt.NDArray[np.float32]  # shape (nD, 3): noise of the matched filters
+    common_share: Floats  # shape (3,): share of the common mode that was taken out
+    loudness: npt.NDArray[np.float32]  # shape (A, 3): variance of each channel over the median of its axis
+    window_m: tuple[float, float]  # [m] from where to where blocks count in fits
 
 
 class FitWindow:

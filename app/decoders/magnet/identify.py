@@ -29,40 +29,23 @@ from app.sensors.magnetometer_bar import MagnetometerBar
 
 @dataclass(frozen=True, slots=True)
 class RegisteredTag:
-    """What the registry knows of an information tag.
-
-    Attributes
-    ----------
-    marker_id, status : str
-    tag : InformationTag
-    lon_deg, lat_deg : float
-        Of its first magnet, WGS 84 / ITRF. [deg]
-    height_m : float or None
-    bearing_deg : float
-        Of the tag in the east, north, up frame at `lane_lon_deg`, `lane_lat_deg`; clockwise from north. [deg]
-    lane_lon_deg, lane_lat_deg : float
-        Where its lane begins. [deg]
-    horizontal_rmse_m : float or None
-        Of both axes together; None where it is not stated. [m]
-    grade : str
-        A `LocalizationGrade`.
-    localization_warnings : tuple of str
-        What makes its position unfit for localization.
-    meaning : Meaning or None
-    """
+    """What the registry knows of an information tag."""
 
     marker_id: str
     status: str
     tag: InformationTag
+    # `lon_deg`, `lat_deg`: [deg] of its first magnet, WGS 84 / ITRF
     lon_deg: float
     lat_deg: float
     height_m: float | None
+    # [deg] of the tag in the east, north, up frame at `lane_lon_deg`, `lane_lat_deg`; clockwise from north
     bearing_deg: float
+    # `lane_lon_deg`, `lane_lat_deg`: [deg] where its lane begins
     lane_lon_deg: float
     lane_lat_deg: float
-    horizontal_rmse_m: float | None
-    grade: str
-    localization_warnings: tuple[str, ...] = ()
+    horizontal_rmse_m: float | None  # [m] of both axes together; None where it is not stated
+    grade: str  # a `LocalizationGrade`
+    localization_warnings: tuple[str, ...] = ()  # what makes its position unfit for localization
     meaning: Meaning | None = None
 
 
@@ -107,31 +90,16 @@ class TagFormat:
 
 @dataclass(frozen=True, slots=True)
 class Identification:
-    """A tag found in a row of magnets.
+    """A tag found in a row of magnets."""
 
-    Attributes
-    ----------
-    members : tuple of int
-        Indices in the row of the tag's magnets.
-    tag : InformationTag or None
-        None if magnets are missing and the format alone does not show where they were.
-    wrong_way : bool
-        The tag was passed against the direction of legal travel.
-    missing, extra : int
-        Magnets of the tag that are not in the row, and magnets between its own that are not of it.
-    cost : float
-        Chi-squared of its places with penalties.
-    probability : float
-        Against the other tags that fit.
-    """
-
-    members: tuple[int, ...]
-    tag: InformationTag | None
-    wrong_way: bool
+    members: tuple[int, ...]  # indices in the row of the tag's magnets
+    tag: InformationTag | None  # None if magnets are missing and the format alone does not show where they were
+    wrong_way: bool  # the tag was passed against the direction of legal travel
+    # `missing`, `extra`: magnets of the tag that are not in the row, and magnets between its own that are not of it
     missing: int
     extra: int
-    cost: float
-    probability: float = 1.0
+    cost: float  # Chi-squared of its places with penalties
+    probability: float = 1.0  # against the other tags that fit
 
 
 class _Row(NamedTuple):
@@ -339,32 +307,18 @@ hand."""
 
 @dataclass(frozen=True, slots=True)
 class TagFix:
-    """Where the vehicle was when the bar passed a tag's last magnet.
+    """Where the vehicle was when the bar passed a tag's last magnet."""
 
-    Attributes
-    ----------
-    t_s : float
-        Time in the trace. [s]
-    lon_deg, lat_deg, heading_deg : float
-        Of the vehicle's reference point. [deg]
-    covariance : ndarray, shape (3, 3)
-        East, north, heading. [m, m, rad]
-    along_std_m, across_std_m : float
-        Along and across the lane. [m]
-    across_m : float
-        Of the bar's middle from the tag's line, left positive. [m]
-    grade : LocalizationGrade
-    notes : tuple of str
-    """
-
-    t_s: float
+    t_s: float  # [s] time in the trace
+    # `lon_deg`, `lat_deg`, `heading_deg`: [deg] of the vehicle's reference point
     lon_deg: float
     lat_deg: float
     heading_deg: float
-    covariance: Floats
+    covariance: Floats  # shape (3, 3): east, north, heading. [m, m, rad]
+    # `along_std_m`, `across_std_m`: [m] along and across the lane
     along_std_m: float
     across_std_m: float
-    across_m: float
+    across_m: float  # [m] of the bar's middle from the tag's line, left positive
     grade: LocalizationGrade
     notes: tuple[str, ...]
 

@@ -69,55 +69,34 @@ hand, no measurement kept."""
 
 
 class FilterBank(NamedTuple):
-    """Filters of a bar with S array sensors.
+    """Filters of a bar with S array sensors."""
 
-    Attributes
-    ----------
-    kernels : ndarray, shape (3, nD, HALF_BINS + 1)
-        A, E0 (even) and E1 (odd), offset or slope removed, for dx >= 0. [uT / (A m2) times powers of m]
-    taps : ndarray, shape (nD,)
-        Bins on each side that each D uses.
-    energy : ndarray, shape (nD, 2)
-        Squared filters of a channel for which the moment is along the axis, even (2 A - 3 D2 E0) and odd (E1).
-    distances_m : ndarray, shape (nD,)
-        D of the kernels. [m]
-    lateral_m, height_m : ndarray, shape (P,)
-        Counts: positions on the bar and clearances. [m]
-    first : ndarray, shape (P + 1,)
-        Where the rows of each cell begin in the arrays below.
-    site : ndarray of int, shape (R,)
-        Index of D times S, plus the array sensor, of each row.
-    share : ndarray, shape (R, SITE_SUMS)
-        What each sum of `_sum_sites` contributes to the filters: the field is that of the kernel's D times a scale.
-    squared : ndarray, shape (2, 3 nD, P)
-        Squared filters of each cell, forward and upright, for each D and axis.
-    """
-
+    # shape (3, nD, HALF_BINS + 1): a, E0 (even) and E1 (odd), offset or slope removed, for dx >= 0. [uT / (A m2) times
+    # powers of m]
     kernels: Floats32
-    taps: Integers
+    taps: Integers  # shape (nD,): bins on each side that each D uses
+    # shape (nD, 2): squared filters of a channel for which the moment is along the axis, even (2 A - 3 D2 E0) and odd
+    # (E1)
     energy: Floats32
-    distances_m: Floats32
+    distances_m: Floats32  # shape (nD,): [m] d of the kernels
+    # `lateral_m`, `height_m`: shape (P,): [m] counts: positions on the bar and clearances
     lateral_m: Floats
     height_m: Floats
-    first: Integers
-    site: Integers
+    first: Integers  # shape (P + 1,): where the rows of each cell begin in the arrays below
+    site: Integers  # shape (R,): index of D times S, plus the array sensor, of each row
+    # shape (R, SITE_SUMS): what each sum of `_sum_sites` contributes to the filters: the field is that of the kernel's
+    # D times a scale
     share: Floats32
-    squared: Floats32
+    squared: Floats32  # shape (2, 3 nD, P): squared filters of each cell, forward and upright, for each D and axis
 
 
 class BinScores(NamedTuple):
-    """Scores of N bins, for forward (column 0) and upright magnets (column 1).
+    """Scores of N bins, for forward (column 0) and upright magnets (column 1)."""
 
-    Attributes
-    ----------
-    statistic : ndarray, shape (N, 2)
-        Largest matched-filter statistic over the cells: chi-squared with one degree of freedom without a magnet.
-    cell : ndarray of int, shape (N, 2)
-        Its cell in the bank.
-    """
-
+    # shape (N, 2): largest matched-filter statistic over the cells: chi-squared with one degree of freedom without a
+    # magnet
     statistic: Floats32
-    cell: Integers
+    cell: Integers  # shape (N, 2): its cell in the bank
 
     @classmethod
     def empty(cls, count: int) -> BinScores:

@@ -152,24 +152,14 @@ _CONFIDENCE = 0.5  # of every reading; source: by hand, the paper gives none
 
 @dataclass(frozen=True, slots=True)
 class MetroSettings:
-    """Thresholds of the pipeline.
+    """Thresholds of the pipeline."""
 
-    Attributes
-    ----------
-    amplitude_ut : float
-        Smallest step of an extremum. [uT] Source: METRO's published code; a phi = 0 magnet gives less at 30 cm.
-    cancel_wheels : bool
-        Adaptive magnetic field neutralization (section 5.3) on the array sensors nearest to a reference.
-    tag_magnets : int
-        Magnets that make a tag.
-    tag_gap_m : float
-        A longer gap ends a tag. [m]
-    """
-
+    # smallest step of an extremum. [uT] Source: METRO's published code; a phi = 0 magnet gives less at 30 cm.
     amplitude_ut: float = 16.0
+    # Adaptive magnetic field neutralization (section 5.3) on the array sensors nearest to a reference
     cancel_wheels: bool = True
-    tag_magnets: int = 3
-    tag_gap_m: float = 5.0
+    tag_magnets: int = 3  # magnets that make a tag
+    tag_gap_m: float = 5.0  # [m] a longer gap ends a tag
     only: Orientation | None = None
 
 

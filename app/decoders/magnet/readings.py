@@ -34,44 +34,20 @@ class NoiseKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class MagnetReading:
-    """A magnet that was passed.
+    """A magnet that was passed."""
 
-    Attributes
-    ----------
-    t_s : float
-        When the bar was over it. [s]
-    odometer_m : float
-        Distance driven since the trace began, by the vehicle's speed. [m]
-    lateral_cm : float
-        On the bar, from its middle, left positive. [cm]
-    polarity : Polarity
-        As driven over: of a forward magnet (phi = 0) the other one if the vehicle is on the wrong way.
-    orientation : Orientation
-    confidence : float
-        Probability that polarity and orientation are right, 0 to 1.
-    clearance_cm : float
-        Of the bar above the magnet. [cm]
-    moment_am2 : tuple of float
-        Fitted moment in vehicle axes. [A m2]
-    along_std_m : float
-        Standard error of its place along the drive. [m]
-    relative_std_m : float
-        The same against magnets near it, with which it shares the error of the time stamps. [m]
-    snr : float
-        Root of the energy that the magnet explains, in standard deviations of the noise.
-    """
-
-    t_s: float
-    odometer_m: float
-    lateral_cm: float
-    polarity: Polarity
+    t_s: float  # [s] when the bar was over it
+    odometer_m: float  # [m] distance driven since the trace began, by the vehicle's speed
+    lateral_cm: float  # [cm] on the bar, from its middle, left positive
+    polarity: Polarity  # as driven over: of a forward magnet (phi = 0) the other one if the vehicle is on the wrong way
     orientation: Orientation
-    confidence: float
-    clearance_cm: float = 0.0
-    moment_am2: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    along_std_m: float = 0.0
+    confidence: float  # probability that polarity and orientation are right, 0 to 1
+    clearance_cm: float = 0.0  # [cm] of the bar above the magnet
+    moment_am2: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [A m2] fitted moment in vehicle axes
+    along_std_m: float = 0.0  # [m] standard error of its place along the drive
+    # [m] the same against magnets near it, with which it shares the error of the time stamps
     relative_std_m: float = 0.0
-    snr: float = 0.0
+    snr: float = 0.0  # root of the energy that the magnet explains, in standard deviations of the noise
 
     @property
     def phi_deg(self) -> int:
@@ -89,98 +65,51 @@ class PlacedMagnet:
 
 @dataclass(frozen=True, slots=True)
 class LineCrossing:
-    """The bar came over a line: a lane departure unless it was meant.
+    """The bar came over a line: a lane departure unless it was meant."""
 
-    Attributes
-    ----------
-    t_s, odometer_m : float
-        When and where the first magnet of the line was passed. [s, m]
-    style : LineStyle
-        Solid or dashed.
-    side : Side
-        Side on which the line lies.
-    lateral_cm : float
-        Of the first magnet, left positive. [cm]
-    confidence : float
-        Of the first magnet.
-    """
-
+    # `t_s`, `odometer_m`: when and where the first magnet of the line was passed. [s, m]
     t_s: float
     odometer_m: float
-    style: LineStyle
-    side: Side
-    lateral_cm: float
-    confidence: float
+    style: LineStyle  # solid or dashed
+    side: Side  # side on which the line lies
+    lateral_cm: float  # [cm] of the first magnet, left positive
+    confidence: float  # of the first magnet
 
 
 @dataclass(frozen=True, slots=True)
 class TagReading:
-    """An information tag that was passed.
+    """An information tag that was passed."""
 
-    Attributes
-    ----------
-    start_s, end_s : float
-        When its first and last magnet were passed. [s]
-    polarities : tuple of Polarity
-        As met.
-    gaps_m : tuple of float
-        Distances from each magnet to the next, as measured. [m]
-    gap_std_m : tuple of float
-        Their standard errors. [m]
-    length_m : float
-        First magnet to last, as measured. [m]
-    ratios, ratio_std : tuple of float
-        d_2/d_1 .. d_(M-1)/d_1 and their standard errors.
-    lateral_cm : float
-        Mean place on the bar, left positive. [cm]
-    tag : InformationTag or None
-        The tag that it is, where registered tags or a format are known.
-    wrong_way : bool
-        It is that tag met from behind: the vehicle drives against the legal direction.
-    missing, extra : int
-        Magnets of the tag that were not seen, and seen magnets that are not of it.
-    confidence : float
-        Probability that it is that tag (without candidates: that all polarities are right).
-    magnets : tuple of MagnetReading
-    """
-
+    # `start_s`, `end_s`: [s] when its first and last magnet were passed
     start_s: float
     end_s: float
-    polarities: tuple[Polarity, ...]
-    gaps_m: tuple[float, ...]
-    gap_std_m: tuple[float, ...]
-    length_m: float
+    polarities: tuple[Polarity, ...]  # as met
+    gaps_m: tuple[float, ...]  # [m] distances from each magnet to the next, as measured
+    gap_std_m: tuple[float, ...]  # [m] their standard errors
+    length_m: float  # [m] first magnet to last, as measured
+    # `ratios`, `ratio_std`: d_2/d_1 .. d_(M-1)/d_1 and their standard errors.
     ratios: tuple[float, ...]
     ratio_std: tuple[float, ...]
-    lateral_cm: float
-    tag: InformationTag | None
-    wrong_way: bool
+    lateral_cm: float  # [cm] mean place on the bar, left positive
+    tag: InformationTag | None  # the tag that it is, where registered tags or a format are known
+    wrong_way: bool  # it is that tag met from behind: the vehicle drives against the legal direction
+    # `missing`, `extra`: magnets of the tag that were not seen, and seen magnets that are not of it
     missing: int
     extra: int
-    confidence: float
+    confidence: float  # probability that it is that tag (without candidates: that all polarities are right)
     magnets: tuple[MagnetReading, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseFinding:
-    """Something that stood out and is not taken for a magnet, or a part of the trace that could not be used.
+    """Something that stood out and is not taken for a magnet, or a part of the trace that could not be used."""
 
-    Attributes
-    ----------
-    t_s, odometer_m : float
-        When and where. [s, m]
-    lateral_cm : float
-        On the bar, left positive. [cm]
-    kind : NoiseKind
-    reason : str
-        For people, with the figures.
-    """
-
+    # `t_s`, `odometer_m`: when and where. [s, m]
     t_s: float
     odometer_m: float
-    lateral_cm: float
+    lateral_cm: float  # [cm] on the bar, left positive
     kind: NoiseKind
-    reason: str
+    reason: str  # for people, with the figures
 
 
 Finding = MagnetReading | LineCrossing | TagReading | NoiseFinding

@@ -76,21 +76,11 @@ CONTRADICTED_M = 0.06
 
 @dataclass(frozen=True, slots=True)
 class LikelyMistake:
-    """A declaration that the recording contradicts.
+    """A declaration that the recording contradicts."""
 
-    Attributes
-    ----------
-    field : str
-        Of the declaration.
-    reason : str
-        What does not fit, with figures.
-    cure : str
-        What to declare.
-    """
-
-    field: str
-    reason: str
-    cure: str
+    field: str  # of the declaration
+    reason: str  # what does not fit, with figures
+    cure: str  # what to declare
 
     @property
     def text(self) -> str:

@@ -30,15 +30,10 @@ hand."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnitVerification:
-    """How well the pixels of one frame or of several agree with a pattern of units.
+    """How well the pixels of one frame or of several agree with a pattern of units."""
 
-    Attributes
-    ----------
-    log_likelihoods : ndarray, shape (units, 5)
-        Of the pixels around each unit, in the order of the symbols' units: the unit as in the pattern, flipped, the
-        same two under a smooth stain, and flipped under a spot of paint.
-    """
-
+    # shape (units, 5): of the pixels around each unit, in the order of the symbols' units: the unit as in the pattern,
+    # flipped, the same two under a smooth stain, and flipped under a spot of paint
     log_likelihoods: Array
 
     @property

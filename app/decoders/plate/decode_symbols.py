@@ -46,23 +46,14 @@ Symbols = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class LikelyCodeword:
-    """The likeliest codeword of a scheme.
+    """The likeliest codeword of a scheme."""
 
-    Attributes
-    ----------
-    symbols : tuple of int
-        One value from 0 to 15 a cell.
-    log_evidence : float
-        Of the codewords of the scheme together against random symbols: log of the mean, over all codewords, of the
-        product of 16 times the probability of each cell's symbol. Random symbols exceed L with a probability of
-        exp(-L) at most, because the mean over all symbols is 1 (Markov's inequality).
-    wrong : float
-        Probability that another codeword of the scheme is on the plate, given that one is. [probability]
-    """
-
-    symbols: tuple[int, ...]
+    symbols: tuple[int, ...]  # one value from 0 to 15 a cell
+    # of the codewords of the scheme together against random symbols: log of the mean, over all codewords, of the
+    # product of 16 times the probability of each cell's symbol. Random symbols exceed L with a probability of exp(-L)
+    # at most, because the mean over all symbols is 1 (Markov's inequality).
     log_evidence: float
-    wrong: float
+    wrong: float  # [probability] probability that another codeword of the scheme is on the plate, given that one is
 
 
 def likely_codeword(probabilities: Array, n: int, scheme: PlateScheme) -> LikelyCodeword | None:
@@ -133,27 +124,15 @@ def _information(scores: Array, word: ReedSolomonWord, cells: Array) -> tuple[Ar
 
 
 class _Listing(NamedTuple):
-    """Words to list.
+    """Words to list."""
 
-    Attributes
-    ----------
-    rows : ndarray of uint8, shape (data, 16, length)
-        What each value of the cells that determine the others adds to a word.
-    base : ndarray of uint8, shape (length,)
-        The word whose symbols in these cells are the likeliest.
-    certain : ndarray of int, shape (data,)
-        The most certain cells.
-    likeliest : ndarray of int, shape (length,)
-        Likeliest symbol of each cell.
-    is_second : bool
-        One of the cells is changed, not two, and words that differ in at most two of the certain cells are left out:
-        they were listed before.
-    """
-
+    # uint8, shape (data, 16, length): what each value of the cells that determine the others adds to a word
     rows: Symbols
-    base: Symbols
-    certain: npt.NDArray[np.intp]
-    likeliest: npt.NDArray[np.intp]
+    base: Symbols  # uint8, shape (length,): the word whose symbols in these cells are the likeliest
+    certain: npt.NDArray[np.intp]  # shape (data,): the most certain cells
+    likeliest: npt.NDArray[np.intp]  # shape (length,): likeliest symbol of each cell
+    # one of the cells is changed, not two, and words that differ in at most two of the certain cells are left out: they
+    # were listed before
     is_second: bool
 
 
@@ -274,40 +253,18 @@ UNCERTAIN_CELL = 0.99
 
 @dataclass(frozen=True, slots=True)
 class DecodedSymbols:
-    """A code with its probabilities, or the reason why there is none.
-
-    Attributes
-    ----------
-    code : PlateCode or None
-    confidence : float
-        Probability that the code, or the likely one, is right.
-    cell_confidence : tuple of float
-    corrected : tuple of int
-        Cells that a check or the codebook corrected.
-    from_codebook : bool
-        The codebook decided.
-    confirmed : bool
-        A plate with this code is in the codebook.
-    checked : bool
-        Reed-Solomon checks confirm the code by themselves, whatever else the plate lacks.
-    reason : str
-        Why there is no code.
-    likely : PlateCode or None
-        The most likely code where none is sure enough to be returned.
-    verification : UnitVerification or None
-        Of the code or the likely one, where its pixels were compared.
-    """
+    """A code with its probabilities, or the reason why there is none."""
 
     code: PlateCode | None
-    confidence: float
+    confidence: float  # probability that the code, or the likely one, is right
     cell_confidence: tuple[float, ...]
-    corrected: tuple[int, ...] = ()
-    from_codebook: bool = False
-    confirmed: bool = False
-    checked: bool = False
-    reason: str = ""
-    likely: PlateCode | None = None
-    verification: UnitVerification | None = None
+    corrected: tuple[int, ...] = ()  # cells that a check or the codebook corrected
+    from_codebook: bool = False  # the codebook decided
+    confirmed: bool = False  # a plate with this code is in the codebook
+    checked: bool = False  # Reed-Solomon checks confirm the code by themselves, whatever else the plate lacks
+    reason: str = ""  # why there is no code
+    likely: PlateCode | None = None  # the most likely code where none is sure enough to be returned
+    verification: UnitVerification | None = None  # of the code or the likely one, where its pixels were compared
 
 
 def decode_symbols(

@@ -48,30 +48,16 @@ class Planes:
 
 @dataclass(frozen=True, slots=True)
 class MarkerSignal:
-    """Where a frame is red (positive) or green (negative).
+    """Where a frame is red (positive) or green (negative)."""
 
-    Attributes
-    ----------
-    opponent : ndarray of int16, shape (H // scale, W // scale)
-        Strength of the colour.
-    planes : Planes
-        The scaled frame. [grey levels]
-    peak : ndarray of int16, shape (H // scale, blocks)
-        Strongest signal in every run of `BLOCK` pixels of a row.
-    threshold : ndarray of int16, shape (blocks, blocks)
-        Signal that exceeds the roughness around a block.
-    levels : tuple of (int, int)
-        Thresholds at which blobs are cut out: strength, and share of the brightness in 32nds.
-    scale : int
-        Pixels of the frame that make one of the signal, along a side.
-    """
-
-    opponent: npt.NDArray[Any]
-    planes: Planes
+    opponent: npt.NDArray[Any]  # int16, shape (H // scale, W // scale): strength of the colour
+    planes: Planes  # [grey levels] the scaled frame
+    # int16, shape (H // scale, blocks): strongest signal in every run of `BLOCK` pixels of a row
     peak: npt.NDArray[Any]
-    threshold: npt.NDArray[Any]
+    threshold: npt.NDArray[Any]  # int16, shape (blocks, blocks): signal that exceeds the roughness around a block
+    # thresholds at which blobs are cut out: strength, and share of the brightness in 32nds
     levels: tuple[tuple[int, int], ...]
-    scale: int = 2
+    scale: int = 2  # pixels of the frame that make one of the signal, along a side
 
 
 def half_planes(image: Array) -> Planes:

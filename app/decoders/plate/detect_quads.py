@@ -478,24 +478,12 @@ two units and a gap, units of 35 mm and gaps of 5 mm."""
 
 @dataclass(frozen=True, slots=True)
 class MarkerQuad:
-    """Centroids of a plate's four markers.
+    """Centroids of a plate's four markers."""
 
-    Attributes
-    ----------
-    centroids_px : ndarray, shape (4, 2)
-        Red triangle, then the green squares clockwise; full-resolution pixels.
-    found : int
-        Bits 1, 2, 4: which of the three green squares were seen; the others are implied by the affine map.
-    rank : float
-        How likely it is a plate by its markers alone, 0 for even odds.
-    size_ratio : float
-        Distance between marker centres over the side of a marker; distinguishes 8, 10 and 12 units.
-    """
-
-    centroids_px: Floats
-    found: int
-    rank: float
-    size_ratio: float
+    centroids_px: Floats  # shape (4, 2): red triangle, then the green squares clockwise; full-resolution pixels
+    found: int  # bits 1, 2, 4: which of the three green squares were seen; the others are implied by the affine map
+    rank: float  # how likely it is a plate by its markers alone, 0 for even odds
+    size_ratio: float  # distance between marker centres over the side of a marker; distinguishes 8, 10 and 12 units
 
 
 def detect_marker_quads(signal: MarkerSignal) -> list[MarkerQuad]:

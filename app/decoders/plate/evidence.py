@@ -66,47 +66,26 @@ Verify = Callable[[PlateCode], UnitVerification | None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateEvidence:
-    """What one frame, or several together, show of a plate.
+    """What one frame, or several together, show of a plate."""
 
-    Attributes
-    ----------
-    units : UnitEvidence
-        Costs of the symbols.
-    geometry : PlateGeometry
-    corners_px, corners_covariance_px2 : ndarray, shapes (4, 2) and (8, 8)
-        In the frame; of several frames, in the one that shows the plate largest. [px, px2]
-    explained : float
-        Share of the pixels' variance that the plate's pattern explains.
-    unit_px, extent_px : float
-        Size of a unit, and the shorter extent of the plate, in the image. [px]
-    weakest_marker : float
-        Colour margin of the marker that stands out least.
-    thermal : bool
-    missing : (PlateOutcome, str) or None
-        What the plate lacks without a registry that confirms it.
-    frames : int
-        That the evidence is of.
-    colours : MarkerColours or None
-        Of the markers; None of thermal frames, and of views that were found by following a plate.
-    agreeing : int
-        Frames of these whose units are about the same.
-    verification : UnitVerification or None
-        Of the code that the units show, where the frame's pixels were compared.
-    """
-
-    units: UnitEvidence
+    units: UnitEvidence  # costs of the symbols
     geometry: PlateGeometry
+    # `corners_px`, `corners_covariance_px2`: in the frame; of several frames, in the one that shows the plate largest.
+    # [px, px2]
     corners_px: Array
     corners_covariance_px2: Array
-    explained: float
+    explained: float  # share of the pixels' variance that the plate's pattern explains
+    # `unit_px`, `extent_px`: [px] size of a unit, and the shorter extent of the plate, in the image
     unit_px: float
     extent_px: float
-    weakest_marker: float = math.inf
+    weakest_marker: float = math.inf  # colour margin of the marker that stands out least
     thermal: bool = False
-    missing: tuple[PlateOutcome, str] | None = None
-    frames: int = 1
+    missing: tuple[PlateOutcome, str] | None = None  # what the plate lacks without a registry that confirms it
+    frames: int = 1  # that the evidence is of
+    # of the markers; None of thermal frames, and of views that were found by following a plate
     colours: MarkerColours | None = None
-    agreeing: int = 1
+    agreeing: int = 1  # frames of these whose units are about the same
+    # of the code that the units show, where the frame's pixels were compared
     verification: UnitVerification | None = None
 
 

@@ -166,24 +166,12 @@ GREY_LEVEL = 1.0 / 255
 
 
 class FitQuality(NamedTuple):
-    """How well the shapes explain the pixels.
+    """How well the shapes explain the pixels."""
 
-    Attributes
-    ----------
-    is_plate : bool
-        False where the steps were given up.
-    variance : float
-        Weighted mean squared residual of the pixels on the plate, at least one grey level squared. [1]
-    explained : float
-        Share of their variance that the shapes explain.
-    pixels : int
-        Pixels that were used.
-    """
-
-    is_plate: bool
-    variance: float
-    explained: float
-    pixels: int
+    is_plate: bool  # False where the steps were given up
+    variance: float  # [1] weighted mean squared residual of the pixels on the plate, at least one grey level squared
+    explained: float  # share of their variance that the shapes explain
+    pixels: int  # pixels that were used
 
 
 class Move(NamedTuple):
@@ -392,54 +380,28 @@ deviations (decision record 0012; chosen on seeds 301 to 304, checked on 401 to 
 
 @dataclass(slots=True)
 class PlateFit:
-    """What explains a plate's pixels.
+    """What explains a plate's pixels."""
 
-    Attributes
-    ----------
-    plate_from_image : ndarray, shape (3, 3)
-        Pixels to plate coordinates: (0, 0) at the triangle's corner, (1, 1) opposite.
-    units : ndarray, shape (n, n)
-        Light that each unit sends, linear, corners NaN. [1]
-    units_covariance : ndarray, shape (cells * 4, cells * 4)
-        Of the units in the order of `unit_order`, everything else free.
-    unit_order : ndarray of int
-        Flat indices into the grid.
-    unit_misfit : ndarray, shape (n, n)
-        Mean squared residual of the pixels on each unit and its halves of the gaps. [1]
-    markers : ndarray, shape (5,)
-        Triangle, its other half, squares clockwise. [1]
-    gap, road : float
-        Mean light of the gaps and of the road around. [1]
-    corners_px : ndarray, shape (4, 2)
-    corners_covariance_px2 : ndarray, shape (8, 8)
-    residual : float
-        Root mean square residual on the camera's scale. [1]
-    explained : float
-        Share of the pixels' variance that the model explains, at most 1.
-    blur_px, motion : float
-        Standard deviation of the lens blur [px], length of the motion [plate sides].
-    pixels : int
-        Number of pixels that were used.
-    model : PlateModel
-        What was fitted.
-    """
-
+    # shape (3, 3): pixels to plate coordinates: (0, 0) at the triangle's corner, (1, 1) opposite
     plate_from_image: Array
-    units: Array
+    units: Array  # shape (n, n): [1] light that each unit sends, linear, corners NaN
+    # shape (cells * 4, cells * 4): of the units in the order of `unit_order`, everything else free
     units_covariance: Array
-    unit_order: npt.NDArray[np.intp]
-    unit_misfit: Array
-    markers: Array
+    unit_order: npt.NDArray[np.intp]  # flat indices into the grid
+    unit_misfit: Array  # shape (n, n): [1] mean squared residual of the pixels on each unit and its halves of the gaps
+    markers: Array  # shape (5,): [1] triangle, its other half, squares clockwise
+    # `gap`, `road`: [1] mean light of the gaps and of the road around
     gap: float
     road: float
-    corners_px: Array
-    corners_covariance_px2: Array
-    residual: float
-    explained: float
+    corners_px: Array  # shape (4, 2)
+    corners_covariance_px2: Array  # shape (8, 8)
+    residual: float  # [1] root mean square residual on the camera's scale
+    explained: float  # share of the pixels' variance that the model explains, at most 1
+    # `blur_px`, `motion`: [plate sides] standard deviation of the lens blur [px], length of the motion
     blur_px: float
     motion: float
-    pixels: int
-    model: PlateModel
+    pixels: int  # number of pixels that were used
+    model: PlateModel  # what was fitted
 
     @property
     def unit_px(self) -> float:

@@ -79,98 +79,56 @@ def cut_patch(image: Frame, corners_px: Array, wanted_px: float, linear: bool) -
 
 
 class PlatePixels(NamedTuple):
-    """The pixels on a plate.
+    """The pixels on a plate."""
 
-    Attributes
-    ----------
-    light : ndarray, shape (P,)
-        Without the haze. [linear, 1 = saturation]
-    weight : ndarray, shape (P,)
-        Of the squared error, 1 on average.
-    units : ndarray, shape (P, units)
-        Share of each unit in each pixel, in the order of the symbols' units.
-    rest : ndarray, shape (P, 6)
-        Shares of the gaps, the triangle, the other half of its cell and the three squares.
-    places_mm : ndarray, shape (P, 2)
-    level : float
-        Light of the lightest units without the haze.
-    blur_mm : float
-        Standard deviation of the blur on the plate. [mm]
-    """
-
-    light: Floats
-    weight: Floats
-    units: Floats
-    rest: Floats
-    places_mm: Floats
-    level: float
-    blur_mm: float
+    light: Floats  # shape (P,): without the haze. [linear, 1 = saturation]
+    weight: Floats  # shape (P,): of the squared error, 1 on average
+    units: Floats  # shape (P, units): share of each unit in each pixel, in the order of the symbols' units
+    rest: Floats  # shape (P, 6): shares of the gaps, the triangle, the other half of its cell and the three squares
+    places_mm: Floats  # shape (P, 2)
+    level: float  # light of the lightest units without the haze
+    blur_mm: float  # [mm] standard deviation of the blur on the plate
 
 
 class PlatePattern(NamedTuple):
-    """The pattern that is verified, and its units.
+    """The pattern that is verified, and its units."""
 
-    Attributes
-    ----------
-    dark : ndarray, shape (units,)
-        1 for the dark units of the pattern, 0 for the light ones.
-    seen : ndarray, shape (P,)
-        Reflectance that each pixel sees of the pattern; white is 1.
-    dark_albedo : float
-        Reflectance of dark units.
-    white_spread, dark_spread : float
-        Standard deviations of the reflectances of light and of dark units, each unit's own. [white]
-    centres_mm : ndarray, shape (units, 2)
-    reach_mm, inner_mm : float
-        Around a unit's centre, within which pixels are compared, and within which lies what pixels see of it.
-    """
-
-    dark: Floats
-    seen: Floats
-    dark_albedo: float
+    dark: Floats  # shape (units,): 1 for the dark units of the pattern, 0 for the light ones
+    seen: Floats  # shape (P,): reflectance that each pixel sees of the pattern; white is 1
+    dark_albedo: float  # reflectance of dark units
+    # `white_spread`, `dark_spread`: [white] standard deviations of the reflectances of light and of dark units, each
+    # unit's own
     white_spread: float
     dark_spread: float
-    centres_mm: Floats
+    centres_mm: Floats  # shape (units, 2)
+    # `reach_mm`, `inner_mm`: around a unit's centre, within which pixels are compared, and within which lies what
+    # pixels see of it
     reach_mm: float
     inner_mm: float
 
 
 class LightPrior(NamedTuple):
-    """Light on the plate before the pixels around a unit are compared.
+    """Light on the plate before the pixels around a unit are compared."""
 
-    Attributes
-    ----------
-    field, noise : ndarray, shape (P,)
-        Light on each pixel, and variance of its error.
-    spread : float
-        Standard deviation of the light, relative.
-    length_mm, level_variance : float
-        Distance over which the correlation of the light falls to 1/e, and the variance of its mean, relative.
-    veil_variance, veil_length_mm : float
-        Variance of the error of light that the plate does not send, and length over which that changes.
-    """
-
+    # `field`, `noise`: shape (P,): light on each pixel, and variance of its error
     field: Floats
     noise: Floats
-    spread: float
+    spread: float  # standard deviation of the light, relative
+    # `length_mm`, `level_variance`: distance over which the correlation of the light falls to 1/e, and the variance of
+    # its mean, relative
     length_mm: float
     level_variance: float
+    # `veil_variance`, `veil_length_mm`: variance of the error of light that the plate does not send, and length over
+    # which that changes
     veil_variance: float = 0.0
     veil_length_mm: float = 1.0
 
 
 class Spots(NamedTuple):
-    """Spots of paint that may hide a unit.
+    """Spots of paint that may hide a unit."""
 
-    Attributes
-    ----------
-    shapes : ndarray, shape (6, spots)
-        Centre around the unit's, inverse shape xx, xy, yy, mean radius. [mm]
-    paints, opacities : ndarray
-        Reflectances [white] and shares of the light that the paint hides.
-    """
-
-    shapes: Floats
+    shapes: Floats  # shape (6, spots): [mm] centre around the unit's, inverse shape xx, xy, yy, mean radius
+    # `paints`, `opacities`: reflectances [white] and shares of the light that the paint hides
     paints: Floats
     opacities: Floats
 
@@ -202,25 +160,13 @@ class ShownUnits(NamedTuple):
 
 
 class Around(NamedTuple):
-    """The pixels around one unit.
-
-    Attributes
-    ----------
-    unit : int
-    pixels : ndarray of int, shape (size,)
-    light : float
-        Mean of the light on them.
-    change : float
-        What its other value adds to the unit's reflectance.
-    own : float
-        What its other value adds to the variance of the unit's reflectance.
-    """
+    """The pixels around one unit."""
 
     unit: int
-    pixels: Ints
-    light: float
-    change: float
-    own: float
+    pixels: Ints  # shape (size,)
+    light: float  # mean of the light on them
+    change: float  # what its other value adds to the unit's reflectance
+    own: float  # what its other value adds to the variance of the unit's reflectance
 
 
 @routine
@@ -315,32 +261,20 @@ def _find_around(pixels: PlatePixels, pattern: PlatePattern, field: Floats, unit
 
 
 class Local(NamedTuple):
-    """The pixels around one unit, their light and covariances relative to the mean light.
+    """The pixels around one unit, their light and covariances relative to the mean light."""
 
-    Attributes
-    ----------
-    x_mm, y_mm : ndarray, shape (size,)
-        From the unit's centre.
-    seen, flipped, share : ndarray, shape (size,)
-        Reflectance that each pixel sees of the pattern, and with the unit flipped; share of the unit.
-    reach : ndarray, shape (size,)
-        What the distance from the unit takes off a smooth stain.
-    noise : ndarray, shape (size,)
-    units : ndarray, shape (units, size)
-        Shares of all units.
-    paint : ndarray, shape (size,)
-        Memory for a row of the paints' covariance.
-    """
-
+    # `x_mm`, `y_mm`: shape (size,): from the unit's centre
     x_mm: Floats
     y_mm: Floats
+    # `seen`, `flipped`, `share`: shape (size,): reflectance that each pixel sees of the pattern, and with the unit
+    # flipped; share of the unit
     seen: Floats
     flipped: Floats
     share: Floats
-    reach: Floats
-    noise: Floats
-    units: Floats
-    paint: Floats
+    reach: Floats  # shape (size,): what the distance from the unit takes off a smooth stain
+    noise: Floats  # shape (size,)
+    units: Floats  # shape (units, size): shares of all units
+    paint: Floats  # shape (size,): memory for a row of the paints' covariance
 
 
 @step

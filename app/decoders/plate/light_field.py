@@ -64,40 +64,22 @@ ALBEDO_WEIGHT = 0.05
 
 
 class LightField(NamedTuple):
-    """The light on a plate and what it was fitted with.
+    """The light on a plate and what it was fitted with."""
 
-    Attributes
-    ----------
-    light, noise : ndarray, shape (P,)
-        Light on each pixel, and the variance of its error.
-    albedo : ndarray, shape (parts,)
-        Reflectances of the parts; white is 1.
-    spread : float
-        Standard deviation of the light, relative.
-    """
-
+    # `light`, `noise`: shape (P,): light on each pixel, and the variance of its error
     light: Array
     noise: Array
-    albedo: Array
-    spread: float
+    albedo: Array  # shape (parts,): reflectances of the parts; white is 1
+    spread: float  # standard deviation of the light, relative
 
 
 class Knots(NamedTuple):
-    """The knots of the light.
+    """The knots of the light."""
 
-    Attributes
-    ----------
-    along : int
-        Knots along a side.
-    side_mm : float
-        Of the plate. [mm]
-    precision : ndarray, shape (K, band + ROWS)
-        Inverse of the correlation of the light at all knots: row i holds the entries of the columns i to i + band, and
-        zeros.
-    """
-
-    along: int
-    side_mm: float
+    along: int  # knots along a side
+    side_mm: float  # [mm] of the plate
+    # shape (K, band + ROWS): inverse of the correlation of the light at all knots: row i holds the entries of the
+    # columns i to i + band, and zeros
     precision: ProfilesFloats
 
 
@@ -359,18 +341,10 @@ lightest. Source: chosen by hand."""
 
 
 class Veil(NamedTuple):
-    """Light that the plate does not send.
+    """Light that the plate does not send."""
 
-    Attributes
-    ----------
-    light : ndarray, shape (n, n)
-        On each unit and marker. [linear, 1 = saturation]
-    level : float
-        Light of light units without it. [linear, 1 = saturation]
-    """
-
-    light: Array
-    level: float
+    light: Array  # shape (n, n): on each unit and marker. [linear, 1 = saturation]
+    level: float  # light of light units without it. [linear, 1 = saturation]
 
     @property
     def is_even(self) -> bool:
@@ -501,35 +475,22 @@ plate, and half the side of all. Source: chosen by hand: as far from the edges a
 
 @dataclass(frozen=True, slots=True)
 class MarkerColours:
-    """How red the triangle of a fitted plate is, and how green its squares are.
+    """How red the triangle of a fitted plate is, and how green its squares are."""
 
-    Attributes
-    ----------
-    margins : ndarray, shape (4,)
-        How far the signal of the triangle and the squares stands out of the units', in their spreads.
-    tints : ndarray, shape (4,)
-        Red of the triangle, green of the squares above their other colours, as shares of the median square's; grey
-        being the units' colour. A black square in the dark has none, whatever the ratio of its few grey levels.
-    cast : ndarray, shape (2,)
-        Blue and red of the units as shares of their green.
-    rest : float
-        Red of the other half of the triangle's cell over the triangle's own: near 1 where the marker is a square.
-    beside : float
-        The same of the reddest spot beside the plate: above 1 where red spreads from there into a dark corner.
-    paleness : float
-        The lower of blue and red of the palest square, from 0 as of dark units to 1 as of light ones: near 1 where the
-        square is white.
-    triangle_red : float
-        Red of the triangle on the same scale: below 0 where it is black.
-    """
-
+    # shape (4,): how far the signal of the triangle and the squares stands out of the units', in their spreads
     margins: Floats
+    # shape (4,): red of the triangle, green of the squares above their other colours, as shares of the median square's;
+    # grey being the units' colour. A black square in the dark has none, whatever the ratio of its few grey levels.
     tints: Floats
-    cast: Floats
+    cast: Floats  # shape (2,): blue and red of the units as shares of their green
+    # red of the other half of the triangle's cell over the triangle's own: near 1 where the marker is a square
     rest: float = 0.0
+    # the same of the reddest spot beside the plate: above 1 where red spreads from there into a dark corner
     beside: float = 0.0
+    # the lower of blue and red of the palest square, from 0 as of dark units to 1 as of light ones: near 1 where the
+    # square is white
     paleness: float = 0.0
-    triangle_red: float = 1.0
+    triangle_red: float = 1.0  # red of the triangle on the same scale: below 0 where it is black
 
 
 def red_around_triangle(

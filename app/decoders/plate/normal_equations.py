@@ -149,65 +149,37 @@ Source: chosen by hand; commit `a lane line beside a plate does not spoil its fi
 
 
 class PatchArea(NamedTuple):
-    """The pixels of a patch that are used; changes in place.
+    """The pixels of a patch that are used; changes in place."""
 
-    Attributes
-    ----------
-    box : ndarray of int, shape (4,)
-        First column and row, and those after the last.
-    margin : ndarray, shape (2,)
-        How far around the plate pixels are used, along u and v. [plate sides]
-    extents : ndarray, shape (2,)
-        Width and height of the plate's image. [px]
-    """
-
-    box: Ints
-    margin: Floats
-    extents: Floats
+    box: Ints  # shape (4,): first column and row, and those after the last
+    margin: Floats  # shape (2,): [plate sides] how far around the plate pixels are used, along u and v
+    extents: Floats  # shape (2,): [px] width and height of the plate's image
 
 
 class NormalEquations(NamedTuple):
-    """Sums over the pixels of weight times products of derivatives; only lower triangles are used.
+    """Sums over the pixels of weight times products of derivatives; only lower triangles are used."""
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (shapes + 10, shapes + 10)
-        Shapes first, then the pose.
-    cross : ndarray, shape (shapes, 10)
-        The block of shapes and pose, with rows that lie together in memory.
-    pose : ndarray, shape (10, 10)
-        The block of the pose.
-    rhs : ndarray, shape (shapes + 10,)
-        Right side: weight times derivative times light.
-    misfit : ndarray, shape (n, n, 2)
-        Weight of the pixels on each unit with its half of the gaps around it, and their squared residuals.
-    """
-
-    matrix: Floats
-    cross: Floats
-    pose: Floats
-    rhs: Floats
+    matrix: Floats  # shape (shapes + 10, shapes + 10): shapes first, then the pose
+    cross: Floats  # shape (shapes, 10): the block of shapes and pose, with rows that lie together in memory
+    pose: Floats  # shape (10, 10): the block of the pose
+    rhs: Floats  # shape (shapes + 10,): right side: weight times derivative times light
+    # shape (n, n, 2): weight of the pixels on each unit with its half of the gaps around it, and their squared
+    # residuals
     misfit: Floats
 
 
 class PixelSums(NamedTuple):
-    """Sums over pixels: their number and squared light, then of those on the plate.
+    """Sums over pixels: their number and squared light, then of those on the plate."""
 
-    Attributes
-    ----------
-    pixels, inside : float
-        Number of pixels, and of those on the plate.
-    weight, light, light2 : float
-        Weight of all pixels, weighted light and squared light.
-    inside_weight, inside_light, inside_light2, inside_residual2 : float
-        The same of the pixels on the plate, and their weighted squared residuals.
-    """
-
+    # `pixels`, `inside`: number of pixels, and of those on the plate
     pixels: float
+    # `weight`, `light`, `light2`: weight of all pixels, weighted light and squared light
     weight: float
     light: float
     light2: float
     inside: float
+    # `inside_weight`, `inside_light`, `inside_light2`, `inside_residual2`: the same of the pixels on the plate, and
+    # their weighted squared residuals
     inside_weight: float
     inside_light: float
     inside_light2: float

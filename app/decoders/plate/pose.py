@@ -90,25 +90,14 @@ infinity), and with 5 the error of 95 % is below two standard deviations on each
 
 @dataclass(frozen=True, slots=True)
 class VehicleFix:
-    """Position and heading of a vehicle's reference point.
+    """Position and heading of a vehicle's reference point."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg : float
-        [deg]
-    height_m : float
-        Of the road below the reference point, in the datum of the plate's height. [m]
-    heading_deg : float
-        Clockwise from true north. [deg]
-    covariance : ndarray, shape (4, 4)
-        Of east, north, up [m] and heading [rad].
-    """
-
+    # `lon_deg`, `lat_deg`: [deg]
     lon_deg: float
     lat_deg: float
-    height_m: float
-    heading_deg: float
-    covariance: Array
+    height_m: float  # [m] of the road below the reference point, in the datum of the plate's height
+    heading_deg: float  # [deg] clockwise from true north
+    covariance: Array  # shape (4, 4): [rad] of east, north, up [m] and heading
 
 
 def locate_plate(corners_px: Array, covariance_px2: Array, geometry: PlateGeometry, camera: Camera) -> PlatePose | None:

@@ -45,50 +45,24 @@ Floats = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredFace:
-    """A plate's face as it was printed.
+    """A plate's face as it was printed."""
 
-    Attributes
-    ----------
-    reflectance : ndarray of float32, shape (H, W, 3)
-        Linear, relative to the light units; blue, green, red.
-    image_from_face : ndarray, shape (3, 3)
-        Millimetres to pixels of the photo.
-    levels : ndarray, shape (n, n)
-        Luminance of each unit relative to the light ones, NaN in the corner cells.
-    dark : ndarray of bool, shape (n, n)
-        Whether a unit looks dark; False in the corner cells.
-    dark_level, gap_level : float
-        Medians of the dark units and of the gaps.
-    light_ratio : float
-        Brightest over darkest light on the plate.
-    white_level : float
-        Brightest channel of the light units in the photo. [grey level]
-    clipped : float
-        Share of the light units' pixels that are over-exposed.
-    offsets_mm : ndarray, shape (n, n, 2)
-        How far units lie right of and below their places, by one edge where they touch a neighbour; NaN where they
-        were not measured. [mm]
-    widths_mm : ndarray, shape (n, n, 2)
-        Widths and heights of units, NaN where they were not measured. [mm]
-    merged : float
-        Share of the units that stand out of the gaps and touch a neighbour.
-    edge_mm : float
-        Median width of edges from 10 to 90 %; of the steepest ones where the gaps are closed. [mm]
-    """
-
-    reflectance: Floats
-    image_from_face: Array
-    levels: Array
-    dark: npt.NDArray[np.bool_]
+    reflectance: Floats  # float32, shape (H, W, 3): linear, relative to the light units; blue, green, red
+    image_from_face: Array  # shape (3, 3): millimetres to pixels of the photo
+    levels: Array  # shape (n, n): luminance of each unit relative to the light ones, NaN in the corner cells
+    dark: npt.NDArray[np.bool_]  # shape (n, n): whether a unit looks dark; False in the corner cells
+    # `dark_level`, `gap_level`: medians of the dark units and of the gaps
     dark_level: float
     gap_level: float
-    light_ratio: float
-    white_level: float
-    clipped: float
+    light_ratio: float  # Brightest over darkest light on the plate
+    white_level: float  # [grey level] Brightest channel of the light units in the photo
+    clipped: float  # share of the light units' pixels that are over-exposed
+    # shape (n, n, 2): [mm] how far units lie right of and below their places, by one edge where they touch a neighbour;
+    # NaN where they were not measured
     offsets_mm: Array
-    widths_mm: Array
-    merged: float
-    edge_mm: float
+    widths_mm: Array  # shape (n, n, 2): [mm] widths and heights of units, NaN where they were not measured
+    merged: float  # share of the units that stand out of the gaps and touch a neighbour
+    edge_mm: float  # [mm] median width of edges from 10 to 90 %; of the steepest ones where the gaps are closed
 
     @property
     def luminance(self) -> Floats:

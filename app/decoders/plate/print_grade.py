@@ -54,29 +54,14 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class PrintEvidence:
-    """What a print is graded by.
-
-    Attributes
-    ----------
-    face : MeasuredFace
-    code : PlateCode
-        What the plate should be.
-    geometry : PlateGeometry
-        Of the drawing.
-    axes : (ndarray, ndarray)
-        The print's axes, right and down, in the camera's frame, shape (3,) each.
-    reading : PlateReading
-        Of the photo, without a registry.
-    with_registry : bool
-        Whether it is read with the registry that has the code.
-    """
+    """What a print is graded by."""
 
     face: MeasuredFace
-    code: PlateCode
-    geometry: PlateGeometry
-    axes: tuple[Array, Array]
-    reading: PlateReading
-    with_registry: bool
+    code: PlateCode  # what the plate should be
+    geometry: PlateGeometry  # of the drawing
+    axes: tuple[Array, Array]  # the print's axes, right and down, in the camera's frame, shape (3,) each
+    reading: PlateReading  # of the photo, without a registry
+    with_registry: bool  # whether it is read with the registry that has the code
 
 
 def grade_parameters(evidence: PrintEvidence) -> tuple[PrintParameter, ...]:

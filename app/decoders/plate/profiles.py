@@ -40,19 +40,12 @@ Source: chosen by hand."""
 
 
 class AxisProfiles(NamedTuple):
-    """Profiles at one point of an axis.
+    """Profiles at one point of an axis."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (n + 3, 4)
-        Rows: the n units, the low marker, the high marker, the whole plate. Columns: value, and its derivatives by the
-        point, by the standard deviation of the blur and by the square of the motion's length.
-    span : ndarray of int, shape (2,)
-        First and last unit that the blur reaches; the rows of other units are not set.
-    """
-
+    # shape (n + 3, 4): rows: the n units, the low marker, the high marker, the whole plate. Columns: value, and its
+    # derivatives by the point, by the standard deviation of the blur and by the square of the motion's length.
     values: Floats
-    span: Ints
+    span: Ints  # shape (2,): first and last unit that the blur reaches; the rows of other units are not set
 
 
 class AxisBlur(NamedTuple):
@@ -163,27 +156,17 @@ Source: chosen by hand."""
 
 
 class Quadrature(NamedTuple):
-    """Nodes along the part of the blur that lies on neither axis of the plate; one node where there is none.
+    """Nodes along the part of the blur that lies on neither axis of the plate; one node where there is none."""
 
-    Attributes
-    ----------
-    nodes, weights : ndarray, shape (K,)
-        Places along `direction` [plate sides], and weights that sum to 1.
-    direction : ndarray, shape (2,)
-        Unit vector on the plate.
-    by_spread : ndarray, shape (2,)
-        Relative change of the nodes with the logarithm of the lens blur and with the motion's square.
-    is_turned : bool
-        The profiles along both axes have the blur of the ellipse's short axis, and the nodes have the motion too.
-    share : float
-        Share of the blur's variance along u and v that is left to the profiles of a plate that is not turned.
-    """
-
+    # `nodes`, `weights`: shape (K,): places along `direction` [plate sides], and weights that sum to 1
     nodes: Floats
     weights: Floats
-    direction: Floats
+    direction: Floats  # shape (2,): unit vector on the plate
+    # shape (2,): relative change of the nodes with the logarithm of the lens blur and with the motion's square
     by_spread: Floats
+    # the profiles along both axes have the blur of the ellipse's short axis, and the nodes have the motion too
     is_turned: bool
+    # share of the blur's variance along u and v that is left to the profiles of a plate that is not turned
     share: float
 
 

@@ -45,46 +45,25 @@ _PRESENT = 1e-300  # [1] marks a shape as present before its share is added; sou
 
 
 class PlateModel(NamedTuple):
-    """The plate's shapes and their present state; `pose` and `values` change in place.
+    """The plate's shapes and their present state; `pose` and `values` change in place."""
 
-    Attributes
-    ----------
-    edges : ndarray, shape (n, 2)
-        Low and high edge of the units along a side. [plate sides]
-    unit_shape : ndarray of int, shape (n, n)
-        Number of each unit's shape; -1 in the corner cells.
-    frame : ndarray, shape (3,)
-        Origin and scale of the normalised image coordinates that the homography takes. [px]
-    pose : ndarray, shape (10,)
-        Eight entries of plate_from_image on normalised coordinates (the ninth is 1), logarithm of the lens blur [px],
-        square of the motion's length [plate sides^2].
-    values : ndarray, shape (shapes,)
-        Light of each shape: units, then the 13 others. [1]
-    table : ndarray, shape (entries, 2)
-        `profiles.NORMAL_TABLE`.
-    """
-
-    edges: Floats
-    unit_shape: Ints
-    frame: Floats
+    edges: Floats  # shape (n, 2): [plate sides] low and high edge of the units along a side
+    unit_shape: Ints  # shape (n, n): number of each unit's shape; -1 in the corner cells
+    frame: Floats  # shape (3,): [px] origin and scale of the normalised image coordinates that the homography takes
+    # shape (10,): [plate sides^2] eight entries of plate_from_image on normalised coordinates (the ninth is 1),
+    # logarithm of the lens blur [px], square of the motion's length
     pose: Floats
-    values: Floats
-    table: Floats
+    values: Floats  # shape (shapes,): [1] light of each shape: units, then the 13 others
+    table: Floats  # shape (entries, 2): `profiles.NORMAL_TABLE`
 
 
 class PlatePatch(NamedTuple):
-    """The image around a plate.
+    """The image around a plate."""
 
-    Attributes
-    ----------
-    light, weights : ndarray of float32, shape (h, w)
-        Linear light of each pixel, and the weight of its squared error. [1]
-    grid : ndarray, shape (4,)
-        Place of pixel (0, 0) in the frame, x and y, and the distance to the next one, x and y. [px]
-    """
-
+    # `light`, `weights`: float32, shape (h, w): [1] linear light of each pixel, and the weight of its squared error
     light: Light
     weights: Light
+    # shape (4,): [px] place of pixel (0, 0) in the frame, x and y, and the distance to the next one, x and y
     grid: Floats
 
 
@@ -111,23 +90,12 @@ class PixelPlace(NamedTuple):
 
 
 class PixelRow(NamedTuple):
-    """One pixel's row of the design matrix, sparse in the shapes.
+    """One pixel's row of the design matrix, sparse in the shapes."""
 
-    Attributes
-    ----------
-    shape : ndarray of int, shape (shapes,)
-        Numbers of the shapes in the pixel, in its first entries.
-    share : ndarray, shape (shapes,)
-        Share of each shape in the pixel; 0 for all that are not in it.
-    by_pose : ndarray, shape (10,)
-        Derivative of the pixel's light by the pose.
-    by : ndarray, shape (5,)
-        Derivatives by u, v, the blur along u, the blur along v and the motion's square, at one node.
-    """
-
-    shape: Ints
-    share: Floats
-    by_pose: Floats
+    shape: Ints  # shape (shapes,): numbers of the shapes in the pixel, in its first entries
+    share: Floats  # shape (shapes,): share of each shape in the pixel; 0 for all that are not in it
+    by_pose: Floats  # shape (10,): derivative of the pixel's light by the pose
+    # shape (5,): derivatives by u, v, the blur along u, the blur along v and the motion's square, at one node
     by: Floats
 
 

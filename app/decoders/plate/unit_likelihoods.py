@@ -117,57 +117,30 @@ hand."""
 
 @dataclass(frozen=True, slots=True)
 class UnitEvidence:
-    """Evidence of a fit about the symbols.
+    """Evidence of a fit about the symbols."""
 
-    Attributes
-    ----------
-    cell_costs : ndarray, shape (cells, 16)
-        Cost of each symbol above the best pattern of all units, the other cells as in that pattern.
-    best : ndarray of int, shape (cells,)
-        Most likely symbols, any of sixteen.
-    dark : ndarray of bool, shape (units,)
-        The best pattern, in the order of the symbols' units.
-    weight, residual : ndarray
-        Quadratic form of the costs and its vector at the best pattern, for other patterns.
-    contrast : float
-        Between light and dark units, the light level being about 1.
-    disputed : ndarray of bool, shape (cells,)
-        Where the two classifiers differ.
-    level_residual : ndarray, shape (cells,)
-        Distance of each cell's worst unit from its level towards the other level, as a share of the contrast; scaled
-        up on plates whose units are large, or so blurred that they run into each other.
-    damage : float
-        Largest level residual times the outlier ratio of some unit's pixels: their residual over what is usual. A stain
-        that turns a light unit dark ends beside it, on gaps and neighbours, and the plate has others that end half way.
-    outlier_ratio : float
-        Of the worst unit's pixels, as in `damage`.
-    scatter : float
-        Mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model.
-    gap : float
-        Light of the gaps between units over that of the light units, the haze taken off.
-    span : float
-        Light of the light units above the dark ones. [linear, 1 = saturation]
-    veils : tuple of Veil
-        Light that the plate does not send: what was taken off, and the other explanation if it is not much less likely.
-    veil_log_odds : float
-        Of the first against the other.
-    """
-
+    # shape (cells, 16): cost of each symbol above the best pattern of all units, the other cells as in that pattern
     cell_costs: Array
-    best: npt.NDArray[np.intp]
-    dark: npt.NDArray[np.bool_]
-    disputed: npt.NDArray[np.bool_]
+    best: npt.NDArray[np.intp]  # shape (cells,): most likely symbols, any of sixteen
+    dark: npt.NDArray[np.bool_]  # shape (units,): the best pattern, in the order of the symbols' units
+    disputed: npt.NDArray[np.bool_]  # shape (cells,): where the two classifiers differ
+    # shape (cells,): distance of each cell's worst unit from its level towards the other level, as a share of the
+    # contrast; scaled up on plates whose units are large, or so blurred that they run into each other
     level_residual: Array
+    # largest level residual times the outlier ratio of some unit's pixels: their residual over what is usual. A stain
+    # that turns a light unit dark ends beside it, on gaps and neighbours, and the plate has others that end half way.
     damage: float
-    outlier_ratio: float
+    outlier_ratio: float  # of the worst unit's pixels, as in `damage`
+    # `weight`, `residual`: quadratic form of the costs and its vector at the best pattern, for other patterns
     weight: Array
     residual: Array
-    contrast: float
-    scatter: float
-    gap: float
-    span: float
+    contrast: float  # between light and dark units, the light level being about 1
+    scatter: float  # mean cost of a unit's distance from its level; about 1 or less on a plate that follows the model
+    gap: float  # light of the gaps between units over that of the light units, the haze taken off
+    span: float  # light of the light units above the dark ones. [linear, 1 = saturation]
+    # light that the plate does not send: what was taken off, and the other explanation if it is not much less likely
     veils: tuple[Veil, ...]
-    veil_log_odds: float = math.inf
+    veil_log_odds: float = math.inf  # of the first against the other
 
     @property
     def cell_margin(self) -> Array:

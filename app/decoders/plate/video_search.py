@@ -49,27 +49,14 @@ MIN_FIT_ADVANCE_M = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPlate:
-    """A candidate plate in one frame.
-
-    Attributes
-    ----------
-    frame : int
-    time_s : float
-        Of the frame, from any moment on. [s]
-    reading : PlateReading
-        By this frame alone.
-    evidence : PlateEvidence or None
-    pose : PlatePose or None
-        Also of a plate that was not read.
-    ahead_m, left_m : float
-        Of the vehicle's reference point; NaN without a pose. [m]
-    """
+    """A candidate plate in one frame."""
 
     frame: int
-    time_s: float
-    reading: PlateReading
+    time_s: float  # [s] of the frame, from any moment on
+    reading: PlateReading  # by this frame alone
     evidence: PlateEvidence | None
-    pose: PlatePose | None
+    pose: PlatePose | None  # also of a plate that was not read
+    # `ahead_m`, `left_m`: [m] of the vehicle's reference point; NaN without a pose
     ahead_m: float = math.nan
     left_m: float = math.nan
 
@@ -89,17 +76,10 @@ def place_candidate(
 
 @dataclass(slots=True)
 class PlateTrack:
-    """One plate over the frames in which it was seen.
+    """One plate over the frames in which it was seen."""
 
-    Attributes
-    ----------
-    seen : list of SeenPlate
-        In which it was found by its colours.
-    followed : dict of int to PlateEvidence or None
-        Of frames that were searched for it at its predicted place; None where it was not seen.
-    """
-
-    seen: list[SeenPlate] = field(default_factory=list)
+    seen: list[SeenPlate] = field(default_factory=list)  # in which it was found by its colours
+    # of frames that were searched for it at its predicted place; None where it was not seen
     followed: dict[int, PlateEvidence | None] = field(default_factory=dict)
 
     @property
@@ -260,27 +240,13 @@ class _RecentFrame:
 
 @dataclass(frozen=True, slots=True)
 class FoundPlate:
-    """One plate of a video.
+    """One plate of a video."""
 
-    Attributes
-    ----------
-    reading : PlateReading
-        By all frames together, placed in the one that shows it largest.
-    seen : tuple of SeenPlate
-        Each frame; its reading has the joint code where the frame shows it.
-    alone : tuple of int
-        Frames that were read by themselves.
-    speed_m_s : float or None
-        Of the vehicle, as the plate's places show it. [m/s]
-    taken_back : tuple of str
-        Digits that single frames showed and all together refused.
-    """
-
-    reading: PlateReading
-    seen: tuple[SeenPlate, ...]
-    alone: tuple[int, ...]
-    speed_m_s: float | None
-    taken_back: tuple[str, ...] = ()
+    reading: PlateReading  # by all frames together, placed in the one that shows it largest
+    seen: tuple[SeenPlate, ...]  # each frame; its reading has the joint code where the frame shows it
+    alone: tuple[int, ...]  # frames that were read by themselves
+    speed_m_s: float | None  # [m/s] of the vehicle, as the plate's places show it
+    taken_back: tuple[str, ...] = ()  # digits that single frames showed and all together refused
 
 
 class PlateVideoSearch:

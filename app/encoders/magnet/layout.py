@@ -29,38 +29,23 @@ MAX_OFFSET_M = 50.0
 
 @dataclass(frozen=True, slots=True)
 class Hole:
-    """One magnet to be set.
+    """One magnet to be set."""
 
-    Attributes
-    ----------
-    number : int
-        From 1, in the direction of travel.
-    along_m : float
-        From the first magnet: along the tag, or along the line for line tags. [m]
-    chainage_m, offset_m : float
-        Along the lane's line, and from it, left positive. [m]
-    lon_deg, lat_deg : float
-        WGS 84. [deg]
-    east_m, north_m, up_m : float
-        In the lane's local frame. [m]
-    polarity : Polarity
-    orientation : Orientation
-    north_pole_bearing_deg : float or None
-        Clockwise from true north; None for upright magnets. [deg]
-    """
-
-    number: int
-    along_m: float
+    number: int  # from 1, in the direction of travel
+    along_m: float  # [m] from the first magnet: along the tag, or along the line for line tags
+    # `chainage_m`, `offset_m`: [m] along the lane's line, and from it, left positive
     chainage_m: float
     offset_m: float
+    # `lon_deg`, `lat_deg`: [deg] WGS 84
     lon_deg: float
     lat_deg: float
+    # `east_m`, `north_m`, `up_m`: [m] in the lane's local frame
     east_m: float
     north_m: float
     up_m: float
     polarity: Polarity
     orientation: Orientation
-    north_pole_bearing_deg: float | None
+    north_pole_bearing_deg: float | None  # [deg] clockwise from true north; None for upright magnets
 
     @property
     def north_pole(self) -> str:
@@ -76,26 +61,13 @@ class Hole:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MagnetLayout:
-    """The holes of one tag, or of one line of tags.
+    """The holes of one tag, or of one line of tags."""
 
-    Attributes
-    ----------
-    name : str
-        The agency's name for it.
-    tag : InformationTag or LineTag
-    lane : LaneLine
-    holes : tuple of Hole
-        In the direction of travel.
-    bearing_deg : float
-        Of the tag, or of the line at its first magnet; clockwise from true north. [deg]
-    meaning : Meaning or None
-    """
-
-    name: str
+    name: str  # the agency's name for it
     tag: Tag
     lane: LaneLine
-    holes: tuple[Hole, ...]
-    bearing_deg: float
+    holes: tuple[Hole, ...]  # in the direction of travel
+    bearing_deg: float  # [deg] of the tag, or of the line at its first magnet; clockwise from true north
     meaning: Meaning | None = None
 
     @property
@@ -311,18 +283,10 @@ class CostRow:
 
 @dataclass(frozen=True, slots=True)
 class Bill:
-    """Materials of a layout and their alternatives.
+    """Materials of a layout and their alternatives."""
 
-    Attributes
-    ----------
-    materials : tuple of CostRow
-        What is bought: the magnets in their shells.
-    alternatives : tuple of CostRow
-        Paint along the same length; for an information tag also one rugged RFID tag.
-    """
-
-    materials: tuple[CostRow, ...]
-    alternatives: tuple[CostRow, ...]
+    materials: tuple[CostRow, ...]  # what is bought: the magnets in their shells
+    alternatives: tuple[CostRow, ...]  # paint along the same length; for an information tag also one rugged RFID tag
 
     @property
     def total_usd(self) -> float:

@@ -135,28 +135,16 @@ Part = Boxes | Modules | Shape | Stroke | Text
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawing:
-    """A sheet in millimetres.
+    """A sheet in millimetres."""
 
-    Attributes
-    ----------
-    title : str
-        For the document's properties.
-    width_mm, height_mm : float
-        The sheet. [mm]
-    parts : tuple of Part
-        Everything on it; a writer paints the layers in its own order, the parts of a layer in this one.
-    trim_mm : tuple of (left, bottom, right, top)
-        Outer edge of each plate. [mm]
-    bleed_mm : float
-        How far the base's ink runs over the trim. [mm]
-    """
-
-    title: str
+    title: str  # for the document's properties
+    # `width_mm`, `height_mm`: [mm] the sheet
     width_mm: float
     height_mm: float
+    # everything on it; a writer paints the layers in its own order, the parts of a layer in this one
     parts: tuple[Part, ...]
-    trim_mm: tuple[tuple[float, float, float, float], ...] = ()
-    bleed_mm: float = 5.0
+    trim_mm: tuple[tuple[float, float, float, float], ...] = ()  # [mm] outer edge of each plate
+    bleed_mm: float = 5.0  # [mm] how far the base's ink runs over the trim
 
     def by_layer(self) -> dict[Layer, list[Part]]:
         """Parts of every layer that is in use."""
@@ -191,28 +179,14 @@ _GREEN: Chromaticity = ((0.026, 0.399), (0.166, 0.364), (0.286, 0.446), (0.207, 
 
 @dataclass(frozen=True, slots=True)
 class ColourSpec:
-    """What one area of the plate must look like.
-
-    Attributes
-    ----------
-    layer : Layer
-    area : str
-        Part of the plate, in words.
-    ral : str
-        Nearest RAL Classic colour.
-    sheeting : str
-        ASTM D4956 colour, or why there is none.
-    marking : str
-        ASTM D6628 colour, or why there is none.
-    chromaticity_xy : tuple of (x, y)
-        Corners of the permitted daytime region, CIE 1931, illuminant D65, 45/0; empty where none is specified.
-    """
+    """What one area of the plate must look like."""
 
     layer: Layer
-    area: str
-    ral: str
-    sheeting: str
-    marking: str
+    area: str  # part of the plate, in words
+    ral: str  # nearest RAL Classic colour
+    sheeting: str  # ASTM D4956 colour, or why there is none
+    marking: str  # ASTM D6628 colour, or why there is none
+    # corners of the permitted daytime region, CIE 1931, illuminant D65, 45/0; empty where none is specified
     chromaticity_xy: Chromaticity = ()
 
 

@@ -33,20 +33,11 @@ _CORNER_TOLERANCE_PX = 1.5
 
 @dataclass(frozen=True, slots=True)
 class PlateProof:
-    """What the reader made of a rendered plate.
+    """What the reader made of a rendered plate."""
 
-    Attributes
-    ----------
-    digits : str
-        As read.
-    confidence : float
-        The reader's, 0 to 1.
-    corner_error_px : float
-        Largest distance of a corner from where it was drawn; NaN where the reader gives no corners. [px]
-    """
-
-    digits: str
-    confidence: float
+    digits: str  # as read
+    confidence: float  # the reader's, 0 to 1
+    # [px] largest distance of a corner from where it was drawn; NaN where the reader gives no corners
     corner_error_px: float
 
 

@@ -54,20 +54,11 @@ _M_PER_DEG = 111_000.0
 
 @dataclass(frozen=True, slots=True)
 class PlateSearch:
-    """What to look for in a frame.
-
-    Attributes
-    ----------
-    camera : Camera or None
-    codebook : tuple of PlateCode
-        Plates that the registry knows near by.
-    geometries : tuple of PlateGeometry
-        Dimensions to look for; the decoder's own where there are none.
-    """
+    """What to look for in a frame."""
 
     camera: Camera | None = None
-    codebook: tuple[PlateCode, ...] = ()
-    geometries: tuple[PlateGeometry, ...] = ()
+    codebook: tuple[PlateCode, ...] = ()  # plates that the registry knows near by
+    geometries: tuple[PlateGeometry, ...] = ()  # dimensions to look for; the decoder's own where there are none
 
 
 class PlateGradeDocument(TypedDict):

@@ -87,20 +87,11 @@ def _registry_number(digits: str, n: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class CodedPlate:
-    """A code with its relation to the position.
-
-    Attributes
-    ----------
-    code : PlateCode
-    digits_match_position : bool or None
-        None for registry numbers, and where no position is known.
-    is_explicit : bool
-        The request has the code, and it does not follow from the position.
-    """
+    """A code with its relation to the position."""
 
     code: PlateCode
-    digits_match_position: bool | None
-    is_explicit: bool
+    digits_match_position: bool | None  # None for registry numbers, and where no position is known
+    is_explicit: bool  # the request has the code, and it does not follow from the position
 
 
 def coded_plate(

@@ -37,35 +37,24 @@ _PROBES = np.linspace(0.0, 1.0, 5)
 
 
 class Piece(NamedTuple):
-    """One element of a reference line.
+    """One element of a reference line."""
 
-    Attributes
-    ----------
-    place : str
-        Where it is in the file, for errors.
-    s, length : float
-        Distance of its start along the line, and its length. [m]
-    x, y, hdg : float
-        Start [m] and direction there, counter-clockwise from x. [rad]
-    k0, k1 : float
-        Curvature at start and end, left positive, linear between them. [1/m]
-    u, v : tuple of 4 floats, or None
-        Cubics of a parameter from 0 to 1, along and across the direction at the start; then k0 and k1 have no meaning.
-    by_length : bool
-        The cubics go on until `length` instead of to 1; u is the parameter itself.
-    """
-
-    place: str
+    place: str  # where it is in the file, for errors
+    # `s`, `length`: [m] distance of its start along the line, and its length
     s: float
     length: float
+    # `x`, `y`, `hdg`: [rad] start [m] and direction there, counter-clockwise from x
     x: float
     y: float
     hdg: float
+    # `k0`, `k1`: [1/m] curvature at start and end, left positive, linear between them
     k0: float = 0.0
     k1: float = 0.0
+    # `u`, `v`: cubics of a parameter from 0 to 1, along and across the direction at the start; then k0 and k1 have no
+    # meaning
     u: tuple[float, ...] | None = None
     v: tuple[float, ...] | None = None
-    by_length: bool = False
+    by_length: bool = False  # the cubics go on until `length` instead of to 1; u is the parameter itself
 
 
 class Frame(NamedTuple):
@@ -80,20 +69,9 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """A reference line of n pieces, m of which are cubics.
+    """A reference line of n pieces, m of which are cubics."""
 
-    Attributes
-    ----------
-    s, length, x, y, hdg, k0, k1 : ndarray, shape (n,)
-        As in `Piece`.
-    cubic : ndarray of int, shape (n,)
-        Row of the piece in `u`, `v`, `table`; -1 for lines, arcs and clothoids.
-    u, v : ndarray, shape (m, 4)
-    table : ndarray, shape (m, 33)
-        Distance along the piece at even steps of the parameter. [m]
-    warnings : tuple of str
-    """
-
+    # `s`, `length`, `x`, `y`, `hdg`, `k0`, `k1`: shape (n,): as in `Piece`
     s: Floats
     length: Floats
     x: Floats
@@ -101,10 +79,11 @@ class Curve:
     hdg: Floats
     k0: Floats
     k1: Floats
-    cubic: Ints
+    cubic: Ints  # shape (n,): row of the piece in `u`, `v`, `table`; -1 for lines, arcs and clothoids
+    # `u`, `v`: shape (m, 4)
     u: Floats
     v: Floats
-    table: Floats
+    table: Floats  # shape (m, 33): [m] distance along the piece at even steps of the parameter
     warnings: tuple[str, ...]
 
     @property
@@ -360,46 +339,28 @@ def _cubic_tables(cubics: Sequence[Piece]) -> tuple[Floats, Floats, Floats, list
 
 
 class VerticalPoint(NamedTuple):
-    """A point of vertical intersection, and how it is rounded.
+    """A point of vertical intersection, and how it is rounded."""
 
-    Attributes
-    ----------
-    place : str
-        Where it is in the file, for errors.
-    s, height : float
-        Distance along the line, and height. [m]
-    before, after : float
-        Lengths of the parabola before and after the point, zero without one. [m]
-    radius : float or None
-        Of a circle instead of a parabola. [m]
-    """
-
-    place: str
+    place: str  # where it is in the file, for errors
+    # `s`, `height`: [m] distance along the line, and height
     s: float
     height: float
+    # `before`, `after`: [m] lengths of the parabola before and after the point, zero without one
     before: float = 0.0
     after: float = 0.0
-    radius: float | None = None
+    radius: float | None = None  # [m] of a circle instead of a parabola
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profile:
-    """Heights along a line.
+    """Heights along a line."""
 
-    Attributes
-    ----------
-    s, heights : ndarray, shape (N,)
-        Points of intersection. [m]
-    rounding : tuple of (point, change of grade)
-        The rounded ones, with the lengths of the rounding along the line.
-    breaks : ndarray
-        Where grade or curvature change. [m]
-    """
-
+    # `s`, `heights`: shape (N,): [m] points of intersection
     s: Floats
     heights: Floats
+    # the rounded ones, with the lengths of the rounding along the line
     rounding: tuple[tuple[VerticalPoint, float], ...]
-    breaks: Floats
+    breaks: Floats  # [m] where grade or curvature change
 
     def height(self, s: Floats) -> Floats:
         """Heights at distances along the line, NaN beyond the ends of the profile. [m]"""

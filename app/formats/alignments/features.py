@@ -55,29 +55,14 @@ class Shape(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoadFeature:
-    """A feature of a file.
+    """A feature of a file."""
 
-    Attributes
-    ----------
-    where : str
-        Place in the file, for messages: ``feature 3``.
-    shape : Shape
-    parts : tuple of ndarray, shape (N, 3)
-        Lines, points, or outer rings of areas; height is NaN where there is none.
-    properties : mapping
-        By lower-case name.
-    layer : str
-        Name of its layer; decides the kind of a feature that states none.
-    curvature_per_m : ndarray, shape (N,), or None
-        Of a line with one part; left positive. [1/m]
-    """
-
-    where: str
+    where: str  # place in the file, for messages: ``feature 3``
     shape: Shape
-    parts: tuple[Floats, ...]
-    properties: Mapping[str, Any] = field(default_factory=dict)
-    layer: str = ""
-    curvature_per_m: Floats | None = None
+    parts: tuple[Floats, ...]  # shape (N, 3): lines, points, or outer rings of areas; height is NaN where there is none
+    properties: Mapping[str, Any] = field(default_factory=dict)  # by lower-case name
+    layer: str = ""  # name of its layer; decides the kind of a feature that states none
+    curvature_per_m: Floats | None = None  # shape (N,), or None: [1/m] of a line with one part; left positive
 
     @property
     def kind(self) -> str:

@@ -40,21 +40,11 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class _Scale:
-    """Coordinates of the file from metres about an origin near the road.
-
-    Attributes
-    ----------
-    unit_m : float
-        [m]
-    origin : tuple of two floats
-        Northing and easting in the unit of the file.
-    named : dict
-        Texts of CgPoints by name.
-    """
+    """Coordinates of the file from metres about an origin near the road."""
 
     unit_m: float
-    origin: tuple[float, float]
-    named: dict[str, str]
+    origin: tuple[float, float]  # northing and easting in the unit of the file
+    named: dict[str, str]  # texts of CgPoints by name
 
     def length(self, element: ET.Element, name: str, place: str) -> float:
         return attribute(element, name, place) * self.unit_m

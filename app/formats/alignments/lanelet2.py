@@ -61,31 +61,16 @@ class Relation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OsmMap:
-    """A map.
+    """A map."""
 
-    Attributes
-    ----------
-    ways, relations : dict
-        By id.
-    places : dict of str to int
-        Row of each node in the arrays.
-    points : ndarray, shape (N, 3)
-        Longitude, latitude [deg], or local x, y [m]; height [m], NaN without one.
-    metres : ndarray, shape (N, 2)
-        Places on a plane, good enough to see what touches what. [m]
-    scale : ndarray, shape (2,)
-        Metres per unit of the coordinates.
-    is_local : bool
-        Whether the coordinates are local.
-    """
-
+    # `ways`, `relations`: by id
     ways: dict[str, Way]
     relations: dict[str, Relation]
-    places: dict[str, int]
-    points: Floats
-    metres: Floats
-    scale: Floats
-    is_local: bool
+    places: dict[str, int]  # row of each node in the arrays
+    points: Floats  # shape (N, 3): longitude, latitude [deg], or local x, y [m]; height [m], NaN without one
+    metres: Floats  # shape (N, 2): [m] places on a plane, good enough to see what touches what
+    scale: Floats  # shape (2,): metres per unit of the coordinates
+    is_local: bool  # whether the coordinates are local
 
     def rows(self, nodes: tuple[str, ...]) -> list[int]:
         """Rows of nodes."""

@@ -169,32 +169,21 @@ class RoadStation(_Part):
 
 
 class RegisteredRoad(_Part):
-    """A road of the registry with its lanes.
-
-    Attributes
-    ----------
-    road_id, version
-        Of the registry.
-    parts : list of lines of (lon, lat)
-        In WGS 84 / ITRF. [deg]
-    exact : bool
-        Whether a transformation with a stated accuracy brought them there; otherwise they are not for localization.
-    accuracy_m : float or None
-        Of the positions' reference frame; None in documents that were written without it. [m]
-    note : str or None
-        How they were transformed before.
-    """
+    """A road of the registry with its lanes."""
 
     format: Literal["waymark-road/1"] = ROAD_FORMAT
+    # `road_id`, `version`: of the registry
     road_id: str
     version: int
     name: str
+    # whether a transformation with a stated accuracy brought them there; otherwise they are not for localization
     exact: bool
-    note: str | None
+    note: str | None  # how they were transformed before
+    # [m] of the positions' reference frame; None in documents that were written without it
     accuracy_m: float | None = None
     lanes: RoadLanes
     calibration: list[RoadStation]
-    parts: list[list[tuple[Longitude, Latitude]]]
+    parts: list[list[tuple[Longitude, Latitude]]]  # [deg] in WGS 84 / ITRF
 
 
 def write_registered_road(road: RegisteredRoad) -> bytes:

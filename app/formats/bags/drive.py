@@ -99,21 +99,11 @@ _APART = 3.0
 
 
 class BagFields(NamedTuple):
-    """What a bag records of a trace.
+    """What a bag records of a trace."""
 
-    Attributes
-    ----------
-    t_s : ndarray, shape (N,)
-        Times of the first sensor. [s since 1970]
-    field_t : ndarray, shape (N, S, 3)
-        As published; in tesla by the definition of the message.
-    speed : (ndarray, ndarray) or None
-        Times [s since 1970] and speeds [m/s].
-    """
-
-    t_s: Floats
-    field_t: npt.NDArray[np.float32]
-    speed: tuple[Floats, Floats] | None
+    t_s: Floats  # shape (N,): times of the first sensor. [s since 1970]
+    field_t: npt.NDArray[np.float32]  # shape (N, S, 3): as published; in tesla by the definition of the message
+    speed: tuple[Floats, Floats] | None  # [m/s] times [s since 1970] and speeds
 
 
 def read_fields(file: SpooledFile, sensors: int, max_rows: int) -> BagFields:

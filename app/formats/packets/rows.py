@@ -271,15 +271,6 @@ class PacketFormat(StrEnum):
 class PacketDeclaration:
     """What the uploader declares of a log; everything is optional.
 
-    Attributes
-    ----------
-    clock : LogClock
-    columns : mapping of str to str
-        Names of columns in place of the usual ones, by quantity: payload, number, lon, lat, height, rssi, snr, time,
-        side, speed_km_h, speed_mph, device, event, crs.
-    payload_text : PayloadText
-        How the payload column is written; `auto` takes what gives 24 bytes.
-
     Raises
     ------
     InvalidParameter
@@ -287,8 +278,10 @@ class PacketDeclaration:
     """
 
     clock: LogClock = field(default_factory=LogClock)
+    # names of columns in place of the usual ones, by quantity: payload, number, lon, lat, height, rssi, snr, time,
+    # side, speed_km_h, speed_mph, device, event, crs
     columns: Mapping[str, str] = field(default_factory=dict)
-    payload_text: PayloadText = PayloadText.AUTO
+    payload_text: PayloadText = PayloadText.AUTO  # how the payload column is written; `auto` takes what gives 24 bytes
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.columns) - set(ALIASES))
@@ -300,40 +293,21 @@ class PacketDeclaration:
 
 @dataclass(frozen=True, slots=True)
 class PacketLimits:
-    """Limits of reading a log.
+    """Limits of reading a log."""
 
-    Attributes
-    ----------
-    file_bytes : int
-        Largest file. [byte]
-    document_bytes : int
-        Largest single JSON document; JSON lines may be longer together. [byte]
-    packets : int
-    """
-
-    file_bytes: int = 64 * 1024**2
-    document_bytes: int = 16 * 1024**2
+    file_bytes: int = 64 * 1024**2  # [byte] largest file
+    document_bytes: int = 16 * 1024**2  # [byte] largest single JSON document; JSON lines may be longer together
     packets: int = 500_000
 
 
 @dataclass(frozen=True, slots=True)
 class PacketSource:
-    """A packet log while it is read.
+    """A packet log while it is read."""
 
-    Attributes
-    ----------
-    sample : Sample
-        All of the file.
-    declaration : PacketDeclaration
-    limits : PacketLimits
-    report : LogReport
-        Filled while packets are read.
-    """
-
-    sample: Sample
+    sample: Sample  # all of the file
     declaration: PacketDeclaration
     limits: PacketLimits
-    report: LogReport
+    report: LogReport  # filled while packets are read
 
 
 # === Packet logs as delimited text with a header.

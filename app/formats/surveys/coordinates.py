@@ -137,30 +137,16 @@ _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radiu
 
 @dataclass(slots=True)
 class Coordinates:
-    """Coordinates of the rows as the file has them.
+    """Coordinates of the rows as the file has them."""
 
-    Attributes
-    ----------
-    first, second : ndarray, shape (N,)
-        Longitude and latitude, or easting and northing; NaN where there is none.
-    height : ndarray, shape (N,), or None
-    projected : bool or None
-        None where the columns do not show it.
-    form : NumberForm
-        Of the file's numbers.
-    check_deg : tuple of two arrays, or None
-        Longitudes and latitudes beside eastings and northings.
-    crs : str or None
-        Of the geometry.
-    """
-
+    # `first`, `second`: shape (N,): longitude and latitude, or easting and northing; NaN where there is none
     first: Floats
     second: Floats
-    height: Floats | None
-    projected: bool | None
-    form: NumberForm = PLAIN
-    check_deg: tuple[Floats, Floats] | None = None
-    crs: str | None = None
+    height: Floats | None  # shape (N,), or None
+    projected: bool | None  # None where the columns do not show it
+    form: NumberForm = PLAIN  # of the file's numbers
+    check_deg: tuple[Floats, Floats] | None = None  # longitudes and latitudes beside eastings and northings
+    crs: str | None = None  # of the geometry
     faults: list[Fault] = field(default_factory=list)
     detected: list[Detected] = field(default_factory=list)
 

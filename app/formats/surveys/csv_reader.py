@@ -45,23 +45,12 @@ _COORDINATES = ("lon_deg", "lat_deg", "easting", "northing")
 
 @dataclass(slots=True)
 class Header:
-    """Names of the columns, and where the rows begin.
-
-    Attributes
-    ----------
-    names : tuple of str
-    start : int
-        Index of the first row of data.
-    last_takes_rest : bool
-        Whether further cells of a row belong to the last column, a description.
-    min_width : int
-        Cells that a row of such a table must have.
-    """
+    """Names of the columns, and where the rows begin."""
 
     names: tuple[str, ...]
-    start: int
-    last_takes_rest: bool = False
-    min_width: int = 0
+    start: int  # index of the first row of data
+    last_takes_rest: bool = False  # whether further cells of a row belong to the last column, a description
+    min_width: int = 0  # cells that a row of such a table must have
     detected: list[Detected] = field(default_factory=list)
     faults: Faults = field(default_factory=Faults)
 

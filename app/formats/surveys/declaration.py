@@ -35,41 +35,25 @@ MAX_AREA_DEG = 30.0
 
 @dataclass(frozen=True, slots=True)
 class ControlPoint:
-    """A point that is known in a local grid and in the declared CRS.
+    """A point that is known in a local grid and in the declared CRS."""
 
-    Attributes
-    ----------
-    point : str
-        Its point number, which names it in reports and in the file.
-    easting, northing : float
-        In the CRS and its unit.
-    local_easting, local_northing : float, optional
-        In the local grid, in the unit of the file; those of the row with the same point number without.
-    """
-
-    point: str
+    point: str  # its point number, which names it in reports and in the file
+    # `easting`, `northing`: in the CRS and its unit
     easting: float
     northing: float
+    # `local_easting`, `local_northing`: in the local grid, in the unit of the file; those of the row with the same
+    # point number without
     local_easting: float | None = None
     local_northing: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class LocalGrid:
-    """How coordinates of a local grid are transformed to the declared CRS.
-
-    Attributes
-    ----------
-    control_points : tuple of ControlPoint
-    scale : str
-        ``fixed`` (1, as for distances that are reduced to the grid) or ``free`` (estimated).
-    limit_m : float
-        Largest residual of a control point. [m]
-    """
+    """How coordinates of a local grid are transformed to the declared CRS."""
 
     control_points: tuple[ControlPoint, ...]
-    scale: str = "fixed"
-    limit_m: float = 0.05
+    scale: str = "fixed"  # ``fixed`` (1, as for distances that are reduced to the grid) or ``free`` (estimated)
+    limit_m: float = 0.05  # [m] largest residual of a control point
 
     def __post_init__(self) -> None:
         needed = 2 if self.scale == "fixed" else 3
@@ -91,74 +75,43 @@ class LocalGrid:
 
 @dataclass(frozen=True, slots=True)
 class ImportDeclaration:
-    """What is declared of a survey.
+    """What is declared of a survey."""
 
-    Attributes
-    ----------
-    format : str, optional
-        One of `FORMATS`; detected by the content if it is left out.
-    layout : str, optional
-        Of CSV: one of `FIXED_LAYOUTS` (no header needed), or ``named`` columns; detected without.
-    columns : mapping
-        Role to the column's name, or None where the file has no column of this role; common names are found without.
-        Roles are `ROLES`.
-    layer : str, optional
-        Of a GeoPackage or a DXF.
-    decimal, delimiter, encoding : str, optional
-        Of CSV; detected without.
-    crs, realization, epoch, vertical_datum
-        Frame of the coordinates. [epoch: decimal year]
-    unit, height_unit : str, optional
-        ``m``, ``ft-us`` or ``ft-intl``; that of the CRS without.
-    local_grid : LocalGrid, optional
-        Where easting and northing are those of a local grid.
-    ignore_heights : bool
-        Leave heights out.
-    area_deg : tuple of four floats, optional
-        west, south, east, north of a box that contains all rows. [deg]
-    height_range_m : tuple of two floats, optional
-        Lowest and highest plausible height. [m]
-    family, status, road
-        Of the markers.
-    compare : bool
-        The survey finds registered markers as built: rows are matched, and moved markers get a new version.
-    duplicates : str
-        ``refuse`` what is already registered, or ``store`` it once more.
-    match : str
-        ``code`` or ``nearest``.
-    tolerance_m : float
-        Residuals beyond it are reported. [m]
-    leave_out : tuple of int
-        Numbers of rows, counted from 1, that are neither checked nor stored.
-    survey : mapping
-        horizontal_rmse_m, vertical_rmse_m, survey_method, surveyor, instrument, check_points.
-    """
-
-    format: str | None = None
+    format: str | None = None  # one of `FORMATS`; detected by the content if it is left out
+    # of CSV: one of `FIXED_LAYOUTS` (no header needed), or ``named`` columns; detected without
     layout: str | None = None
+    # role to the column's name, or None where the file has no column of this role; common names are found without.
+    # Roles are `ROLES`.
     columns: Mapping[str, str | None] = field(default_factory=dict)
-    layer: str | None = None
+    layer: str | None = None  # of a GeoPackage or a DXF
+    # `decimal`, `delimiter`, `encoding`: of CSV; detected without
     decimal: str | None = None
     delimiter: str | None = None
     encoding: str | None = None
+    # `crs`, `realization`, `epoch`, `vertical_datum`: frame of the coordinates. [epoch: decimal year]
     crs: str | None = None
     realization: str | None = None
     epoch: float | None = None
     vertical_datum: str | None = None
+    # `unit`, `height_unit`: ``m``, ``ft-us`` or ``ft-intl``; that of the CRS without
     unit: str | None = None
     height_unit: str | None = None
-    local_grid: LocalGrid | None = None
-    ignore_heights: bool = False
+    local_grid: LocalGrid | None = None  # where easting and northing are those of a local grid
+    ignore_heights: bool = False  # leave heights out
+    # [deg] west, south, east, north of a box that contains all rows
     area_deg: tuple[float, float, float, float] | None = None
-    height_range_m: tuple[float, float] | None = None
+    height_range_m: tuple[float, float] | None = None  # [m] lowest and highest plausible height
+    # `family`, `status`, `road`: of the markers
     family: str = "plate"
     status: str | None = None
     road: str | None = None
+    # the survey finds registered markers as built: rows are matched, and moved markers get a new version
     compare: bool = False
-    duplicates: str = "refuse"
-    match: str = "code"
-    tolerance_m: float = 0.1
-    leave_out: tuple[int, ...] = ()
+    duplicates: str = "refuse"  # ``refuse`` what is already registered, or ``store`` it once more
+    match: str = "code"  # ``code`` or ``nearest``
+    tolerance_m: float = 0.1  # [m] residuals beyond it are reported
+    leave_out: tuple[int, ...] = ()  # numbers of rows, counted from 1, that are neither checked nor stored
+    # horizontal_rmse_m, vertical_rmse_m, survey_method, surveyor, instrument, check_points
     survey: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -50,21 +50,11 @@ _SIDES = ("left", "right", "unknown")
 
 
 class CodeForm(NamedTuple):
-    """What the codes of a family's markers look like in a survey.
+    """What the codes of a family's markers look like in a survey."""
 
-    Attributes
-    ----------
-    pattern : str
-        Regular expression of a code.
-    differ : bool
-        Whether two markers never have the same code.
-    name : str
-        For people.
-    """
-
-    pattern: str
-    differ: bool
-    name: str
+    pattern: str  # Regular expression of a code
+    differ: bool  # whether two markers never have the same code
+    name: str  # for people
 
 
 class Roles(NamedTuple):

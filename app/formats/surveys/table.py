@@ -32,44 +32,22 @@ class Severity(StrEnum):
 
 
 class Change(NamedTuple):
-    """A member of the declaration, and the value that it should have.
+    """A member of the declaration, and the value that it should have."""
 
-    Attributes
-    ----------
-    member : str
-        Its path, such as ``unit`` or ``columns.easting``.
-    value : str, float, bool or None
-    """
-
-    member: str
+    member: str  # its path, such as ``unit`` or ``columns.easting``
     value: str | float | bool | None
 
 
 class Fault(NamedTuple):
-    """A mistake, or a possible one.
+    """A mistake, or a possible one."""
 
-    Attributes
-    ----------
-    row : int or None
-        Number of the row, counted from 1; None for the whole file.
-    field : str
-    code : str
-        Kind of the fault, for programs.
-    message : str
-    proposal : str or None
-        How to correct it.
-    severity : Severity
-    changes : tuple of Change
-        How the declaration would have to be changed, where that is the correction.
-    """
-
-    row: int | None
+    row: int | None  # number of the row, counted from 1; None for the whole file
     field: str
-    code: str
+    code: str  # kind of the fault, for programs
     message: str
-    proposal: str | None = None
+    proposal: str | None = None  # how to correct it
     severity: Severity = Severity.REFUSED
-    changes: tuple[Change, ...] = ()
+    changes: tuple[Change, ...] = ()  # how the declaration would have to be changed, where that is the correction
 
 
 def warn(
@@ -85,16 +63,9 @@ def warn(
 
 
 class Detected(NamedTuple):
-    """A property of a file that was not declared, with the evidence for it.
+    """A property of a file that was not declared, with the evidence for it."""
 
-    Attributes
-    ----------
-    what : str
-        The property, such as ``encoding`` or ``column of code``.
-    value, evidence : str
-    """
-
-    what: str
+    what: str  # the property, such as ``encoding`` or ``column of code``
     value: str
     evidence: str
 
@@ -213,35 +184,18 @@ class Texts(Sequence[str]):
 
 @dataclass(frozen=True, slots=True)
 class SourceTable:
-    """The contents of a file: named columns, and the coordinates of its points where it has geometry.
-
-    Attributes
-    ----------
-    format : str
-    names : tuple of str
-    columns : tuple of sequences
-        One a name, of text or of numbers; None where a value is missing.
-    points : tuple of three float64 arrays, or None
-        x, y, z of each row; NaN where there is none.
-    crs : str or None
-        As the file declares it, in the form ``EPSG:code``.
-    unit : str or None
-        Unit of length of the coordinates, as the file declares it; ``ft`` where it does not state which foot.
-    faults : Faults
-    detected : tuple of Detected
-    has_names : bool
-        Whether the names are the file's own; those of a layout by position are not.
-    """
+    """The contents of a file: named columns, and the coordinates of its points where it has geometry."""
 
     format: str
     names: tuple[str, ...]
-    columns: tuple[Sequence[Any], ...]
-    points: tuple[Floats, Floats, Floats] | None = None
-    crs: str | None = None
+    columns: tuple[Sequence[Any], ...]  # one a name, of text or of numbers; None where a value is missing
+    points: tuple[Floats, Floats, Floats] | None = None  # x, y, z of each row; NaN where there is none
+    crs: str | None = None  # as the file declares it, in the form ``EPSG:code``
+    # unit of length of the coordinates, as the file declares it; ``ft`` where it does not state which foot
     unit: str | None = None
     faults: Faults = field(default_factory=Faults)
     detected: tuple[Detected, ...] = ()
-    has_names: bool = True
+    has_names: bool = True  # whether the names are the file's own; those of a layout by position are not
 
     @property
     def rows(self) -> int:
@@ -251,42 +205,26 @@ class SourceTable:
 
 @dataclass(frozen=True, slots=True)
 class SurveyTable:
-    """Rows of a survey with their coordinates as in the file.
-
-    Attributes
-    ----------
-    format : str
-    first, second : ndarray of float64, shape (N,)
-        Longitude and latitude [deg], or easting and northing in `unit`; NaN where they could not be read.
-    height : ndarray of float64, shape (N,), or None
-        In `height_unit`; NaN where there is none.
-    projected : bool
-    crs : str
-    unit, height_unit : str
-        ``m``, ``ft-us``, ``ft-intl`` or ``deg``.
-    texts : dict of Texts
-        By role: point, code, description, road, side, status; empty where there is none.
-    numbers : dict of arrays
-        By role: heading_deg, measure_m, offset_m, horizontal_rmse_m, vertical_rmse_m.
-    faults : Faults
-    detected : tuple of Detected
-        What was not declared.
-    written : tuple of two arrays, or None
-        Coordinates as the file has them, where `first` and `second` are others.
-    """
+    """Rows of a survey with their coordinates as in the file."""
 
     format: str
+    # `first`, `second`: float64, shape (N,): longitude and latitude [deg], or easting and northing in `unit`; NaN where
+    # they could not be read
     first: Floats
     second: Floats
-    height: Floats | None
+    height: Floats | None  # float64, shape (N,), or None: in `height_unit`; NaN where there is none
     projected: bool
     crs: str
+    # `unit`, `height_unit`: ``m``, ``ft-us``, ``ft-intl`` or ``deg``
     unit: str
     height_unit: str
+    # by role: point, code, description, road, side, status; empty where there is none
     texts: dict[str, Texts] = field(default_factory=dict)
+    # by role: heading_deg, measure_m, offset_m, horizontal_rmse_m, vertical_rmse_m
     numbers: dict[str, Floats] = field(default_factory=dict)
     faults: Faults = field(default_factory=Faults)
-    detected: tuple[Detected, ...] = ()
+    detected: tuple[Detected, ...] = ()  # what was not declared
+    # coordinates as the file has them, where `first` and `second` are others
     written: tuple[Floats, Floats] | None = None
 
     @property

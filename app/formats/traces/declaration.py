@@ -97,29 +97,18 @@ class ByteOrder(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TraceColumns:
-    """Names and units of the columns of plain CSV and Parquet files.
+    """Names and units of the columns of plain CSV and Parquet files."""
 
-    Attributes
-    ----------
-    time : str
-        Column of times.
-    time_unit : TimeUnit
-    field : tuple of (str, str, str)
-        Columns x, y, z of each sensor; empty means `s1_x, s1_y, s1_z, s2_x, ...`, as many as there are sensors.
-    speed, heading : str or None
-        Columns of speed over ground and of heading clockwise from true north, in any of the files.
-    speed_unit, heading_unit
-    delimiter, decimal : str
-        Of CSV files.
-    """
-
-    time: str = "t_s"
+    time: str = "t_s"  # column of times
     time_unit: TimeUnit = TimeUnit.SECOND
+    # columns x, y, z of each sensor; empty means `s1_x, s1_y, s1_z, s2_x, ...`, as many as there are sensors
     field: tuple[tuple[str, str, str], ...] = ()
+    # `speed`, `heading`: columns of speed over ground and of heading clockwise from true north, in any of the files
     speed: str | None = "speed_m_s"
     speed_unit: SpeedUnit = SpeedUnit.M_S
     heading: str | None = "heading_deg"
     heading_unit: AngleUnit = AngleUnit.DEGREE
+    # `delimiter`, `decimal`: of CSV files
     delimiter: str = ","
     decimal: str = "."
 
@@ -138,34 +127,21 @@ class TraceColumns:
 
 @dataclass(frozen=True, slots=True)
 class CanSignal:
-    """Where a value is in the frames of a CAN log: by its name in a DBC, or by its bits.
+    """Where a value is in the frames of a CAN log: by its name in a DBC, or by its bits."""
 
-    Attributes
-    ----------
-    name : str or None
-        Of the signal in the DBC, `Message.Signal` where the name alone is not unique.
-    arbitration_id : int or None
-        Identifier of the frames.
-    start_bit, length : int
-        As a DBC counts them: bit 0 is the lowest of byte 0; a big-endian signal starts at its highest bit. [bit]
-    byte_order, signed
-    factor, offset : float
-        Value = raw x factor + offset.
-    unit : str or None
-        Of the value: a `SpeedUnit` or `AngleUnit`; None takes the DBC's.
-    minimum, maximum : float or None
-        Values outside mean that there is no value; they are left out.
-    """
-
-    name: str | None = None
-    arbitration_id: int | None = None
+    name: str | None = None  # of the signal in the DBC, `Message.Signal` where the name alone is not unique
+    arbitration_id: int | None = None  # Identifier of the frames
+    # `start_bit`, `length`: [bit] as a DBC counts them: bit 0 is the lowest of byte 0; a big-endian signal starts at
+    # its highest bit
     start_bit: int = 0
     length: int = 16
     byte_order: ByteOrder = ByteOrder.LITTLE
     signed: bool = False
+    # `factor`, `offset`: value = raw x factor + offset
     factor: float = 1.0
     offset: float = 0.0
-    unit: str | None = None
+    unit: str | None = None  # of the value: a `SpeedUnit` or `AngleUnit`; None takes the DBC's
+    # `minimum`, `maximum`: values outside mean that there is no value; they are left out
     minimum: float | None = None
     maximum: float | None = None
 
@@ -188,22 +164,14 @@ class CanSignal:
 
 @dataclass(frozen=True, slots=True)
 class CanDeclaration:
-    """How CAN logs become speed and heading.
-
-    Attributes
-    ----------
-    speed, heading : CanSignal or None
-    offset_s : float or None
-        Trace time of the log's first frame. The log's own clock is never believed: only differences of its times are
-        used. None asks for alignment by the wheels' magnetic noise in the reference sensors. [s]
-    channel : int, str or None
-        Only frames of this channel.
-    """
+    """How CAN logs become speed and heading."""
 
     speed: CanSignal | None = None
     heading: CanSignal | None = None
+    # [s] trace time of the log's first frame. The log's own clock is never believed: only differences of its times are
+    # used. None asks for alignment by the wheels' magnetic noise in the reference sensors.
     offset_s: float | None = None
-    channel: int | str | None = None
+    channel: int | str | None = None  # only frames of this channel
 
     def __post_init__(self) -> None:
         if self.offset_s is not None and not np.isfinite(self.offset_s):
@@ -212,54 +180,26 @@ class CanDeclaration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TraceDeclaration:
-    """What the uploader declares about the files.
+    """What the uploader declares about the files."""
 
-    Attributes
-    ----------
-    sensors : int
-        Number of magnetometers.
-    unit : FieldUnit or None
-        None means microtesla in METRO's formats; CSV and Parquet need it.
-    axes : AxisConvention or None
-        None means FRD in METRO's formats; CSV and Parquet need it, or rotations.
-    vehicle_from_sensor : ndarray, shape (S, 3, 3), or None
-        Rotations from the recorded axes of each sensor to ISO 8855, in place of `axes`.
-    offsets_ut : ndarray, shape (S, 3), or None
-        Calibration: subtracted from the recorded values, in their axes. [uT]
-    calibrated : bool
-        The offsets are already subtracted: the field has the earth field's magnitude.
-    background_removed : bool
-        The earth's field is subtracted too, so its magnitude cannot confirm the unit.
-    references : tuple of int
-        Indices of the reference sensors near the wheels.
-    columns : TraceColumns
-    can : CanDeclaration or None
-    formats : mapping of str to TraceFormat
-        Of files whose content does not show it, by name.
-    clock_offsets_s : mapping of str to float
-        Added to the times of a file, by its name, to get the trace's. [s]
-    speed_m_s : float or None
-        Constant speed, where no file has one. [m/s]
-    rate_hz : float or None
-        Expected sample rate: resolves the phase of a stream where it is ambiguous. [Hz]
-    interval_extra_us : float
-        Added to each interval of a stream: the firmware's intervals leave out the time of the serial write. [us]
-    """
-
-    sensors: int = 14
-    unit: FieldUnit | None = None
-    axes: AxisConvention | None = None
+    sensors: int = 14  # number of magnetometers
+    unit: FieldUnit | None = None  # None means microtesla in METRO's formats; CSV and Parquet need it
+    axes: AxisConvention | None = None  # None means FRD in METRO's formats; CSV and Parquet need it, or rotations
+    # shape (S, 3, 3), or None: rotations from the recorded axes of each sensor to ISO 8855, in place of `axes`
     vehicle_from_sensor: Floats | None = None
+    # shape (S, 3), or None: [uT] calibration: subtracted from the recorded values, in their axes
     offsets_ut: Floats | None = None
-    calibrated: bool = False
-    background_removed: bool = False
-    references: tuple[int, ...] = (6, 13)
+    calibrated: bool = False  # the offsets are already subtracted: the field has the earth field's magnitude
+    background_removed: bool = False  # the earth's field is subtracted too, so its magnitude cannot confirm the unit
+    references: tuple[int, ...] = (6, 13)  # indices of the reference sensors near the wheels
     columns: TraceColumns = field(default_factory=TraceColumns)
     can: CanDeclaration | None = None
-    formats: Mapping[str, TraceFormat] = field(default_factory=dict)
+    formats: Mapping[str, TraceFormat] = field(default_factory=dict)  # of files whose content does not show it, by name
+    # [s] added to the times of a file, by its name, to get the trace's
     clock_offsets_s: Mapping[str, float] = field(default_factory=dict)
-    speed_m_s: float | None = None
-    rate_hz: float | None = None
+    speed_m_s: float | None = None  # [m/s] constant speed, where no file has one
+    rate_hz: float | None = None  # [Hz] expected sample rate: resolves the phase of a stream where it is ambiguous
+    # [us] added to each interval of a stream: the firmware's intervals leave out the time of the serial write
     interval_extra_us: float = 0.0
 
     def __post_init__(self) -> None:
@@ -297,30 +237,14 @@ class TraceDeclaration:
 
 @dataclass(frozen=True, slots=True)
 class TraceLimits:
-    """Limits of reading.
+    """Limits of reading."""
 
-    Attributes
-    ----------
-    file_bytes : int
-        Largest file, expanded. [byte]
-    rows : int
-        Largest number of samples.
-    duration_s : float
-        Longest trace. [s]
-    can_frames : int
-        Largest number of frames of CAN logs.
-    min_rate_hz : float
-        Slowest trace. [Hz]
-    left_out : float
-        Largest share of rows that may be left out before the file is refused.
-    """
-
-    file_bytes: int = 3 * 1024**3 // 2
-    rows: int = 3_000_000
-    duration_s: float = 7200.0
-    can_frames: int = 20_000_000
-    min_rate_hz: float = 100.0
-    left_out: float = 0.05
+    file_bytes: int = 3 * 1024**3 // 2  # [byte] largest file, expanded
+    rows: int = 3_000_000  # largest number of samples
+    duration_s: float = 7200.0  # [s] longest trace
+    can_frames: int = 20_000_000  # largest number of frames of CAN logs
+    min_rate_hz: float = 100.0  # [Hz] slowest trace
+    left_out: float = 0.05  # largest share of rows that may be left out before the file is refused
 
 
 def _check_range(name: str, value: float | None, low: float, high: float) -> None:
@@ -337,82 +261,39 @@ MAX_LISTED = 200
 
 @dataclass(frozen=True, slots=True)
 class TraceGap:
-    """A stretch without usable samples.
+    """A stretch without usable samples."""
 
-    Attributes
-    ----------
-    part : str
-        File.
-    sample : int
-        Index in the trace of the first sample after it.
-    t_s : float
-        Time of the sample before it. [s]
-    lost_s : float
-        Time lost; for a stream a lower bound, as bytes that were cut out cannot be counted. [s]
-    skipped_bytes : int
-        Bytes of the file that belong to no sample. [byte]
-    """
-
-    part: str
-    sample: int
-    t_s: float
-    lost_s: float
-    skipped_bytes: int = 0
+    part: str  # file that it comes from
+    sample: int  # index in the trace of the first sample after it
+    t_s: float  # [s] time of the sample before it
+    lost_s: float  # [s] time lost; for a stream a lower bound, as bytes that were cut out cannot be counted
+    skipped_bytes: int = 0  # [byte] bytes of the file that belong to no sample
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Values or rows of a file that are not in the trace.
+    """Values or rows of a file that are not in the trace."""
 
-    Attributes
-    ----------
-    part : str
-        File.
-    what : str
-        Kind of loss, e.g. `rows-malformed`.
-    count : int
-    reason : str
-        For people, with the first place.
-    """
-
-    part: str
-    what: str
+    part: str  # file that it comes from
+    what: str  # kind of loss, e.g. `rows-malformed`.
     count: int
-    reason: str
+    reason: str  # for people, with the first place
 
 
 @dataclass(slots=True)
 class TraceReport:
-    """About reading a trace.
+    """About reading a trace."""
 
-    Attributes
-    ----------
-    formats : dict of str to TraceFormat
-        Detected or declared format of each file.
-    samples : int
-    rate_hz : float
-        Median. [Hz]
-    duration_s : float
-        From the first sample to the last. [s]
-    gaps : list of TraceGap
-        The first ones.
-    gap_count : int
-    left_out : list of LeftOut
-    clock_offsets_s : dict of str to float
-        Added to the times of a file to get the trace's. [s]
-    speed_coverage, heading_coverage : float
-        Share of the trace with a value within a second, 0 to 1.
-    warnings : list of str
-    """
-
-    formats: dict[str, TraceFormat] = field(default_factory=dict)
+    formats: dict[str, TraceFormat] = field(default_factory=dict)  # detected or declared format of each file
     samples: int = 0
-    rate_hz: float = 0.0
-    duration_s: float = 0.0
-    gaps: list[TraceGap] = field(default_factory=list)
+    rate_hz: float = 0.0  # [Hz] median
+    duration_s: float = 0.0  # [s] from the first sample to the last
+    gaps: list[TraceGap] = field(default_factory=list)  # the first ones
     gap_count: int = 0
     left_out: list[LeftOut] = field(default_factory=list)
+    # [s] added to the times of a file to get the trace's
     clock_offsets_s: dict[str, float] = field(default_factory=dict)
+    # `speed_coverage`, `heading_coverage`: share of the trace with a value within a second, 0 to 1
     speed_coverage: float = 0.0
     heading_coverage: float = 0.0
     warnings: list[str] = field(default_factory=list)

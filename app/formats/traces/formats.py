@@ -39,28 +39,17 @@ _TRACE_COLUMN = re.compile(r"(s\d+_[xyz]|sensor .*|arbitration_id|time stamp)\Z"
 
 @dataclass(slots=True)
 class TraceContents:
-    """What the files of a recording hold, before it is assembled.
+    """What the files of a recording hold, before it is assembled."""
 
-    Attributes
-    ----------
-    t_s, field_ut, field_part
-        Times [s], fields [uT], and the file they are from.
-    metro : bool
-        The fields are METRO's: axes and unit are known.
-    unit : FieldUnit or None
-        Of the fields, where the format fixes it.
-    speeds, headings : list of (Series, unit)
-    can : list of (str, dict of CanSeries)
-        Series `speed` and `heading` of each CAN log.
-    """
-
+    # `t_s`, `field_ut`, `field_part`: times [s], fields [uT], and the file they are from
     t_s: Floats | None = None
     field_ut: npt.NDArray[np.float32] | None = None
     field_part: str = ""
-    metro: bool = False
-    unit: FieldUnit | None = None
+    metro: bool = False  # the fields are METRO's: axes and unit are known
+    unit: FieldUnit | None = None  # of the fields, where the format fixes it
     speeds: list[tuple[Series, SpeedUnit]] = field(default_factory=list)
     headings: list[tuple[Series, AngleUnit]] = field(default_factory=list)
+    # series `speed` and `heading` of each CAN log
     can: list[tuple[str, dict[str, CanSeries]]] = field(default_factory=list)
 
     def set_field(self, part: str, t_s: Floats, field_ut: npt.NDArray[np.float32], *, metro: bool) -> None:
@@ -83,25 +72,13 @@ class TraceContents:
 
 @dataclass(frozen=True, slots=True)
 class TraceReading:
-    """A recording while its files are read.
-
-    Attributes
-    ----------
-    declaration : TraceDeclaration
-    limits : TraceLimits
-    report : TraceReport
-        Filled while files are read.
-    dbc : sequence of Part
-        Descriptions of CAN signals among the files.
-    contents : TraceContents
-        Filled while files are read.
-    """
+    """A recording while its files are read."""
 
     declaration: TraceDeclaration
     limits: TraceLimits
-    report: TraceReport
-    dbc: Sequence[Part] = ()
-    contents: TraceContents = field(default_factory=TraceContents)
+    report: TraceReport  # filled while files are read
+    dbc: Sequence[Part] = ()  # descriptions of CAN signals among the files
+    contents: TraceContents = field(default_factory=TraceContents)  # filled while files are read
 
     def shift_s(self, part: Part) -> float:
         """What is added to the times of a file. [s]"""

@@ -36,24 +36,12 @@ _DEFECTS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, Val
 
 @dataclass(slots=True)
 class Part:
-    """A file of an upload.
+    """A file of an upload."""
 
-    Attributes
-    ----------
-    name : str
-        Shown in messages; its suffix is a hint.
-    head : bytes
-        Its beginning.
-    stream : BinaryIO
-        The rest.
-    limit_bytes : int
-        Largest size, expanded. [byte]
-    """
-
-    name: str
-    head: bytes
-    stream: BinaryIO
-    limit_bytes: int
+    name: str  # shown in messages; its suffix is a hint
+    head: bytes  # its beginning
+    stream: BinaryIO  # the rest
+    limit_bytes: int  # [byte] largest size, expanded
 
     def blocks(self) -> Iterator[bytes]:
         """The content in pieces.
@@ -188,16 +176,10 @@ _MAX_RATE_HZ = 20_000.0  # [Hz] largest plausible rate of a bar; source: by hand
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """A quantity over time.
+    """A quantity over time."""
 
-    Attributes
-    ----------
-    part : str
-        File that it comes from.
-    t_s, value : ndarray, shape (N,)
-    """
-
-    part: str
+    part: str  # file that it comes from
+    # `t_s`, `value`: shape (N,)
     t_s: Floats
     value: Floats
 

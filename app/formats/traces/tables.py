@@ -108,17 +108,11 @@ _CURE = "declare the names of the columns"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """Columns of a file, in the units of the file but for time.
+    """Columns of a file, in the units of the file but for time."""
 
-    Attributes
-    ----------
-    t_s : ndarray, shape (T,)
-    field : ndarray of float32, shape (T, S, 3), or None
-    speed, heading : ndarray, shape (T,), or None
-    """
-
-    t_s: Floats
-    field: npt.NDArray[np.float32] | None
+    t_s: Floats  # shape (T,)
+    field: npt.NDArray[np.float32] | None  # shape (T, S, 3), or None
+    # `speed`, `heading`: shape (T,), or None
     speed: Floats | None
     heading: Floats | None
 

@@ -55,20 +55,11 @@ _TOUCH_M = 1e-9  # [m] by which a window is closed at its end; source: rounding 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cover:
-    """Chosen candidates.
+    """Chosen candidates."""
 
-    Attributes
-    ----------
-    chosen : ndarray of int, shape (K,)
-        Increasing.
-    cost : float
-    bound : float
-        No choice is cheaper than this.
-    """
-
-    chosen: Indices
+    chosen: Indices  # shape (K,): increasing
     cost: float
-    bound: float
+    bound: float  # no choice is cheaper than this
 
     @property
     def is_optimal(self) -> bool:

@@ -88,24 +88,14 @@ _ALMOST_SURE = 1 - 1e-9  # highest probability of a fix that counts; source: by 
 
 @dataclass(frozen=True, slots=True)
 class FamilyModel:
-    """What one site of a family costs, and what it does for a vehicle.
+    """What one site of a family costs, and what it does for a vehicle."""
 
-    Attributes
-    ----------
-    family : str
-        ``plate``, ``magnet`` (an information tag) or ``cerpm`` (a pair, one on each side).
-    cost : float
-        Of a site, in the currency of the rules (see `site_costs`).
-    fix : FixModel or None
-        None: it fixes no position, and serves the path or an event only. Where no family fixes positions, only the
-        path is optimised.
-    selectable : bool
-        Whether places may be chosen; if not, those ahead of events count as fixes, and no others are.
-    """
-
-    family: str
-    cost: float
+    family: str  # ``plate``, ``magnet`` (an information tag) or ``cerpm`` (a pair, one on each side)
+    cost: float  # of a site, in the currency of the rules (see `site_costs`)
+    # None: it fixes no position, and serves the path or an event only. Where no family fixes positions, only the path
+    # is optimised.
     fix: FixModel | None
+    # whether places may be chosen; if not, those ahead of events count as fixes, and no others are
     selectable: bool = True
 
 
@@ -121,30 +111,14 @@ class ChosenSite:
 
 @dataclass(frozen=True, slots=True)
 class OptimisedPlan:
-    """Chosen places and what they cost.
+    """Chosen places and what they cost."""
 
-    Attributes
-    ----------
-    quality : Quality
-        As required; `fix_every_m` is the best that the budget buys, where there is one.
-    sites : tuple of ChosenSite
-        By lane and chainage.
-    cost : float
-        With what does not depend on the number of markers.
-    bound : float
-        No plan with the same pairs along the path and the same markers ahead of events is cheaper.
-    table : tuple of TradeOffPoint
-        Other requirements; the required one among them.
-    sought : tuple of (str, str)
-        Lanes and families whose places were sought.
-    """
-
-    quality: Quality
-    sites: tuple[ChosenSite, ...]
-    cost: float
-    bound: float
-    table: tuple[TradeOffPoint, ...]
-    sought: tuple[tuple[str, str], ...] = ()
+    quality: Quality  # as required; `fix_every_m` is the best that the budget buys, where there is one
+    sites: tuple[ChosenSite, ...]  # by lane and chainage
+    cost: float  # with what does not depend on the number of markers
+    bound: float  # no plan with the same pairs along the path and the same markers ahead of events is cheaper
+    table: tuple[TradeOffPoint, ...]  # other requirements; the required one among them
+    sought: tuple[tuple[str, str], ...] = ()  # lanes and families whose places were sought
 
     @property
     def counts(self) -> dict[str, int]:

@@ -33,23 +33,13 @@ _CONTINUED = 3.0  # longest gap in a line of magnets, in spacings; source: chose
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """Something that is bought.
-
-    Attributes
-    ----------
-    family, item : str
-    quantity : int
-    priced_by : tuple of str
-        `CostItem.per` of the unit costs that cover it.
-    priced : bool
-        Whether the agency gives one of them.
-    """
+    """Something that is bought."""
 
     family: str
     item: str
     quantity: int
-    priced_by: tuple[str, ...]
-    priced: bool
+    priced_by: tuple[str, ...]  # `CostItem.per` of the unit costs that cover it
+    priced: bool  # whether the agency gives one of them
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,21 +57,12 @@ class BillRow:
 
 @dataclass(frozen=True, slots=True)
 class PlanBill:
-    """Materials and costs of a plan.
-
-    Attributes
-    ----------
-    currency : str
-    materials : tuple of Material
-    rows : tuple of BillRow
-        In the order of the agency's list.
-    comparisons : tuple of CostRow
-        Figures that the METRO paper publishes, in US dollars. They are no part of the total.
-    """
+    """Materials and costs of a plan."""
 
     currency: str
     materials: tuple[Material, ...]
-    rows: tuple[BillRow, ...]
+    rows: tuple[BillRow, ...]  # in the order of the agency's list
+    # figures that the METRO paper publishes, in US dollars. They are no part of the total.
     comparisons: tuple[CostRow, ...]
 
     @property
@@ -366,23 +347,12 @@ SCHEDULE_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One stretch of a lane that is built without a break, in the direction of travel.
+    """One stretch of a lane that is built without a break, in the direction of travel."""
 
-    Attributes
-    ----------
-    order : int
-        From 1, in the order of installation.
-    day : int or None
-        Working day from 1; None without a daily rate.
-    lane : str
-    markers : tuple of PlannedMarker
-        By number.
-    """
-
-    order: int
-    day: int | None
+    order: int  # from 1, in the order of installation
+    day: int | None  # working day from 1; None without a daily rate
     lane: str
-    markers: tuple[PlannedMarker, ...]
+    markers: tuple[PlannedMarker, ...]  # by number
 
     def count(self, family: str) -> int:
         """Markers of a family."""

@@ -29,24 +29,11 @@ _LABELS_PT, _VALUES_PT = 5.0, 8.0
 
 @dataclass(frozen=True, slots=True)
 class TitleBlock:
-    """What the title block of a set of drawings states; empty fields are left to be filled in by hand.
+    """What the title block of a set of drawings states; empty fields are left to be filled in by hand."""
 
-    Attributes
-    ----------
-    owner : str
-        Legal owner, as the agency's name.
-    number : str
-        Identification number of the set, 16 characters.
-    date : str
-        Date of issue.
-    creator, approver : str
-    title : str
-    document_type : str
-    """
-
-    owner: str = ""
-    number: str = ""
-    date: str = ""
+    owner: str = ""  # legal owner, as the agency's name
+    number: str = ""  # Identification number of the set, 16 characters
+    date: str = ""  # date of issue
     creator: str = ""
     approver: str = ""
     title: str = ""

@@ -23,72 +23,36 @@ _PLAIN = re.compile("[-+., /0-9:A-Z_a-z]*")
 
 @dataclass(frozen=True, slots=True)
 class MapMarker:
-    """One thing on the road that vehicles detect: a plate, a sign, a CERPM, or one magnet.
+    """One thing on the road that vehicles detect: a plate, a sign, a CERPM, or one magnet."""
 
-    Attributes
-    ----------
-    id : str
-        Unique in the map.
-    family : str
-        ``plate``, ``magnet``, ``cerpm`` or ``fiducial``.
-    code : str
-        What a vehicle reads.
-    lon_deg, lat_deg : float
-        Of its centre, WGS 84. [deg]
-    height_m : float or None
-        Of its centre, in the datum of the map. [m]
-    heading_deg : float or None
-        Direction of travel, clockwise from true north. [deg]
-    kind : str
-        Within the family: scheme of a plate, ``line`` or ``information`` of a magnet, side of a CERPM.
-    side_m : float or None
-        Outer edge of a square face; None for what is a point in a map. [m]
-    upright : bool
-        Whether a square face stands and faces the traffic; it lies with its upper edge forward otherwise.
-    grade, crossfall : float
-        Rise of the road in the direction of the heading, and to its left. [-]
-    vertical_datum : str or None
-        Of the height; None where it is that of the map, or where there is no height.
-    """
-
-    id: str
-    family: str
-    code: str
+    id: str  # unique in the map
+    family: str  # ``plate``, ``magnet``, ``cerpm`` or ``fiducial``
+    code: str  # what a vehicle reads
+    # `lon_deg`, `lat_deg`: [deg] of its centre, WGS 84
     lon_deg: float
     lat_deg: float
-    height_m: float | None = None
-    heading_deg: float | None = None
-    kind: str = ""
-    side_m: float | None = None
+    height_m: float | None = None  # [m] of its centre, in the datum of the map
+    heading_deg: float | None = None  # [deg] direction of travel, clockwise from true north
+    kind: str = ""  # within the family: scheme of a plate, ``line`` or ``information`` of a magnet, side of a CERPM
+    side_m: float | None = None  # [m] outer edge of a square face; None for what is a point in a map
+    # whether a square face stands and faces the traffic; it lies with its upper edge forward otherwise
     upright: bool = False
+    # `grade`, `crossfall`: [-] rise of the road in the direction of the heading, and to its left
     grade: float = 0.0
     crossfall: float = 0.0
-    vertical_datum: str | None = None
+    vertical_datum: str | None = None  # of the height; None where it is that of the map, or where there is no height
 
 
 @dataclass(frozen=True, slots=True)
 class HdMap:
-    """Content of an HD map.
-
-    Attributes
-    ----------
-    name : str
-    lanes : tuple of Lane
-    markers : tuple of MapMarker
-    events : tuple of RoadEvent
-        Of which the stop lines are written.
-    urban : bool
-        Whether the roads are in a town.
-    vertical_datum : str or None
-        Of the heights; None where it is unknown.
-    """
+    """Content of an HD map."""
 
     name: str
     lanes: tuple[Lane, ...]
     markers: tuple[MapMarker, ...]
-    events: tuple[RoadEvent, ...] = ()
-    urban: bool = False
-    vertical_datum: str | None = None
+    events: tuple[RoadEvent, ...] = ()  # of which the stop lines are written
+    urban: bool = False  # whether the roads are in a town
+    vertical_datum: str | None = None  # of the heights; None where it is unknown
 
 
 def map_of_plan(plan: Plan) -> HdMap:

@@ -29,18 +29,10 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(7)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profile:
-    """Cubic polynomials along a line, each in the distance from its start.
+    """Cubic polynomials along a line, each in the distance from its start."""
 
-    Attributes
-    ----------
-    s : ndarray, shape (P,)
-        Starts. [m]
-    coefficients : ndarray, shape (P, 4)
-        a, b, c, d of a + b x + c x^2 + d x^3.
-    """
-
-    s: Floats
-    coefficients: Floats
+    s: Floats  # shape (P,): [m] starts
+    coefficients: Floats  # shape (P, 4): a, b, c, d of a + b x + c x^2 + d x^3
 
     def at(self, s: Floats) -> Floats:
         """Values at distances, shape (K,)."""

@@ -57,20 +57,13 @@ DrawTradeOff = Callable[[Sequence[TradeOffPoint], str], str]
 
 @dataclass(frozen=True, slots=True)
 class OutputOptions:
-    """How a plan is handed out.
+    """How a plan is handed out."""
 
-    Attributes
-    ----------
-    crs, unit : str, optional
-        Of the stakeout; see `plan_stakeout`.
-    drawings : DrawingOptions
-    draw_trade_off : callable, optional
-        Draws the trade-off of an optimised plan as SVG; without, there is no picture of it.
-    """
-
+    # `crs`, `unit`: of the stakeout; see `plan_stakeout`
     crs: str | None = None
     unit: str | None = None
     drawings: DrawingOptions = field(default_factory=DrawingOptions)
+    # draws the trade-off of an optimised plan as SVG; without, there is no picture of it
     draw_trade_off: DrawTradeOff | None = None
 
 
@@ -203,18 +196,10 @@ class PackagePart:
 
 @dataclass(frozen=True, slots=True)
 class PackageOptions:
-    """How a plan is handed out.
-
-    Attributes
-    ----------
-    outputs : OutputOptions
-    formats : tuple of ArtworkFormat
-        Files of each plate.
-    artwork : ArtworkOptions
-    """
+    """How a plan is handed out."""
 
     outputs: OutputOptions = field(default_factory=OutputOptions)
-    formats: tuple[ArtworkFormat, ...] = (ArtworkFormat.PDF, ArtworkFormat.SVG)
+    formats: tuple[ArtworkFormat, ...] = (ArtworkFormat.PDF, ArtworkFormat.SVG)  # files of each plate
     artwork: ArtworkOptions = field(default_factory=ArtworkOptions)
 
 

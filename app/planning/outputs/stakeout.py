@@ -39,41 +39,23 @@ _MAX_LON_SPAN_DEG = 6.0  # of a road in one zone; source: as for exports, a zone
 
 @dataclass(frozen=True, slots=True)
 class StakePoint:
-    """One point.
+    """One point."""
 
-    Attributes
-    ----------
-    name : str
-        Number of the marker; of a tag's magnets with a letter, e.g. ``12A``.
-    kind : str
-        Key in `CODES`.
-    marker : PlannedMarker
-    lon_deg, lat_deg : float
-        WGS 84. [deg]
-    east, north : float
-        In the crew's system and unit.
-    height : float or None
-        In the crew's unit.
-    bearing_deg : float or None
-        In which a plate's upper edge and a lying magnet's north pole point, clockwise from grid north; None without
-        one. [deg]
-    detail : str
-        What is set there, without commas.
-    station : str
-        Displayed station.
-    """
-
-    name: str
-    kind: str
+    name: str  # number of the marker; of a tag's magnets with a letter, e.g. ``12A``.
+    kind: str  # key in `CODES`
     marker: PlannedMarker
+    # `lon_deg`, `lat_deg`: [deg] WGS 84
     lon_deg: float
     lat_deg: float
+    # `east`, `north`: in the crew's system and unit
     east: float
     north: float
-    height: float | None
+    height: float | None  # in the crew's unit
+    # [deg] in which a plate's upper edge and a lying magnet's north pole point, clockwise from grid north; None without
+    # one
     bearing_deg: float | None
-    detail: str
-    station: str
+    detail: str  # what is set there, without commas
+    station: str  # displayed station
 
     @property
     def code(self) -> str:
@@ -90,29 +72,14 @@ class StakePoint:
 
 @dataclass(frozen=True, slots=True)
 class Stakeout:
-    """All points of a plan.
-
-    Attributes
-    ----------
-    plan : Plan
-    crs : str
-        ``EPSG:code``.
-    crs_name : str
-    unit : str
-        Of coordinates and heights: ``m``, ``ft-intl`` or ``ft-us``.
-    accuracy_m : float
-        Stated accuracy of the transformation from WGS 84. [m]
-    note : str
-        The transformation.
-    points : tuple of StakePoint
-    """
+    """All points of a plan."""
 
     plan: Plan
-    crs: str
+    crs: str  # ``EPSG:code``
     crs_name: str
-    unit: str
-    accuracy_m: float
-    note: str
+    unit: str  # of coordinates and heights: ``m``, ``ft-intl`` or ``ft-us``
+    accuracy_m: float  # [m] stated accuracy of the transformation from WGS 84
+    note: str  # the transformation
     points: tuple[StakePoint, ...]
 
 

@@ -45,20 +45,11 @@ class LanePiece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BesideLane:
-    """A lane beside a reference, with its edges.
-
-    Attributes
-    ----------
-    lane : Lane
-    along_m : ndarray, shape (N,)
-        Nearest `Reference.along_m` of each sample; NaN where too far. [m]
-    edges_deg : tuple of three (lon, lat), shape (N,) each
-        Centre line, left and right edge.
-    """
+    """A lane beside a reference, with its edges."""
 
     lane: Lane
-    along_m: Floats
-    edges_deg: tuple[tuple[Floats, Floats], ...]
+    along_m: Floats  # shape (N,): [m] nearest `Reference.along_m` of each sample; NaN where too far
+    edges_deg: tuple[tuple[Floats, Floats], ...]  # shape (N,) each: centre line, left and right edge
 
     @classmethod
     def of(cls, lane: Lane, along_m: Floats) -> BesideLane:
@@ -69,37 +60,19 @@ class BesideLane:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """A lane that strips are cut along, towards growing stations.
-
-    Attributes
-    ----------
-    road : Alignment
-    lane : Lane
-    along_m : ndarray, shape (N,)
-        Distance along the lane from its end of the lower station. [m]
-    distance_m : ndarray, shape (N,)
-        True distance along the road's reference line. [m]
-    lon_deg, lat_deg : ndarray, shape (N,)
-        Longitudes without jumps.
-    station_m : ndarray, shape (N,)
-        Displayed stations, as on signs. [m]
-    lanes : tuple of BesideLane
-        Itself first.
-    markers : ndarray of int, shape (M,)
-        Indices of the markers that its strips show, by `marker_along_m`.
-    marker_along_m : ndarray, shape (M,)
-    """
+    """A lane that strips are cut along, towards growing stations."""
 
     road: Alignment
     lane: Lane
-    along_m: Floats
-    distance_m: Floats
+    along_m: Floats  # shape (N,): [m] distance along the lane from its end of the lower station
+    distance_m: Floats  # shape (N,): [m] True distance along the road's reference line
+    # `lon_deg`, `lat_deg`: shape (N,): longitudes without jumps
     lon_deg: Floats
     lat_deg: Floats
-    station_m: Floats
-    lanes: tuple[BesideLane, ...]
-    markers: Indices
-    marker_along_m: Floats
+    station_m: Floats  # shape (N,): [m] displayed stations, as on signs
+    lanes: tuple[BesideLane, ...]  # itself first
+    markers: Indices  # shape (M,): indices of the markers that its strips show, by `marker_along_m`
+    marker_along_m: Floats  # shape (M,)
 
     def round_stations(self, step_m: float) -> tuple[Floats, Floats]:
         """`along_m` of the displayed stations that are multiples of a step, and these stations, shape (K,) each."""
@@ -119,34 +92,18 @@ class Reference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strip:
-    """One stretch on paper; x to the right with growing stations, y up, from the middle of its row.
+    """One stretch on paper; x to the right with growing stations, y up, from the middle of its row."""
 
-    Attributes
-    ----------
-    number : int
-        From 1.
-    reference : Reference
-    from_m, to_m : float
-        `Reference.along_m` of the match lines. [m]
-    scale : int
-        Denominator.
-    origin_deg : (lon, lat)
-    bearing_deg : float
-        Of the x axis, clockwise from true north.
-    shift_mm : (x, y)
-        Of the origin on paper.
-    continued_left, continued_right : bool
-        Whether the strip before or after it is along the same reference.
-    """
-
-    number: int
+    number: int  # from 1
     reference: Reference
+    # `from_m`, `to_m`: [m] `Reference.along_m` of the match lines
     from_m: float
     to_m: float
-    scale: int
+    scale: int  # Denominator
     origin_deg: tuple[float, float]
-    bearing_deg: float
-    shift_mm: tuple[float, float]
+    bearing_deg: float  # of the x axis, clockwise from true north
+    shift_mm: tuple[float, float]  # of the origin on paper
+    # `continued_left`, `continued_right`: whether the strip before or after it is along the same reference
     continued_left: bool
     continued_right: bool
 

@@ -55,17 +55,11 @@ _KEY_MM = (24.0, 47.0)  # left and top of the key
 
 @dataclass(frozen=True, slots=True)
 class DrawingOptions:
-    """How drawings are made.
+    """How drawings are made."""
 
-    Attributes
-    ----------
-    block : TitleBlock
-        Owner, number, date and persons; title and number follow from the plan where they are empty.
-    scale : int or None
-        Denominator, one of `app.planning.outputs.strip_layout.SCALES`; chosen by the number of sheets if None.
-    """
-
+    # owner, number, date and persons; title and number follow from the plan where they are empty
     block: TitleBlock = field(default_factory=TitleBlock)
+    # Denominator, one of `app.planning.outputs.strip_layout.SCALES`; chosen by the number of sheets if None
     scale: int | None = None
 
 

@@ -33,30 +33,16 @@ _APPROACH_M = (
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A place for one marker on a lane.
+    """A place for one marker on a lane."""
 
-    Attributes
-    ----------
-    chainage_m, offset_m : float
-        Along the centre line, and from it, left positive; of a tag its first magnet. [m]
-    purpose : Purpose
-    event : RoadEvent or None
-        What it stands ahead of.
-    meaning : Meaning or None
-        Of a tag.
-    side : LaneSide
-        Of the boundary or the painted line on which it stands.
-    style : BoundaryStyle
-        Of the painted line.
-    """
-
+    # `chainage_m`, `offset_m`: [m] along the centre line, and from it, left positive; of a tag its first magnet
     chainage_m: float
     offset_m: float
     purpose: Purpose
-    event: RoadEvent | None = None
-    meaning: Meaning | None = None
-    side: LaneSide = LaneSide.UNKNOWN
-    style: BoundaryStyle = BoundaryStyle.UNKNOWN
+    event: RoadEvent | None = None  # what it stands ahead of
+    meaning: Meaning | None = None  # of a tag
+    side: LaneSide = LaneSide.UNKNOWN  # of the boundary or the painted line on which it stands
+    style: BoundaryStyle = BoundaryStyle.UNKNOWN  # of the painted line
 
 
 def distance_ahead_m(lane: Lane, event_m: float, rule: Ahead) -> float:

@@ -59,14 +59,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class DesignSpeed:
-    """Pass for which a print must be readable.
-
-    Attributes
-    ----------
-    camera : CameraRules
-    speed_mps : float
-        [m/s]
-    """
+    """Pass for which a print must be readable."""
 
     camera: CameraRules
     speed_mps: float
@@ -74,36 +67,21 @@ class DesignSpeed:
 
 @dataclass(frozen=True, slots=True)
 class PrintPrediction:
-    """Predicted reading of a printed plate.
+    """Predicted reading of a printed plate."""
 
-    Attributes
-    ----------
-    readable_frames : float
-        Mean frames of a pass in which a unit is a pixel high or more.
-    passes, frames, read : int
-        Passes and frames that were simulated with the plate's measured face, and frames that were read.
-    read_alone : int
-        Frames that were read without the registry.
-    wrong : int
-        Frames in which other digits were read.
-    height_ratio : float
-        How much higher a unit's image must be than a faultless plate's.
-    read_rate, faultless_read_rate : float
-        Probability that a pass reads this plate, and a faultless one.
-    white_reflectance : float
-        That was assumed.
-    """
-
-    readable_frames: float
+    readable_frames: float  # mean frames of a pass in which a unit is a pixel high or more
+    # `passes`, `frames`, `read`: passes and frames that were simulated with the plate's measured face, and frames that
+    # were read
     passes: int
     frames: int
     read: int
-    read_alone: int
-    wrong: int
-    height_ratio: float
+    read_alone: int  # frames that were read without the registry
+    wrong: int  # frames in which other digits were read
+    height_ratio: float  # how much higher a unit's image must be than a faultless plate's
+    # `read_rate`, `faultless_read_rate`: probability that a pass reads this plate, and a faultless one
     read_rate: float
     faultless_read_rate: float
-    white_reflectance: float = WHITE_REFLECTANCE
+    white_reflectance: float = WHITE_REFLECTANCE  # that was assumed
 
     @property
     def will_be_read(self) -> bool:
@@ -151,17 +129,11 @@ def predict_print(
 
 @dataclass(slots=True)
 class PassesRead:
-    """Frames of simulated passes.
+    """Frames of simulated passes."""
 
-    Attributes
-    ----------
-    passes : list of list of (float, bool)
-        Of each frame of each pass: height of a unit's image [px], and whether it was read with the registry.
-    alone, wrong : int
-        Frames that were read without the registry, and those in which other digits were read.
-    """
-
+    # of each frame of each pass: height of a unit's image [px], and whether it was read with the registry
     passes: list[list[tuple[float, bool]]] = field(default_factory=list)
+    # `alone`, `wrong`: frames that were read without the registry, and those in which other digits were read
     alone: int = 0
     wrong: int = 0
 

@@ -41,32 +41,20 @@ def normal_quadrature() -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class PlateModel:
-    """Read rate of plates in frames of one pass.
+    """Read rate of plates in frames of one pass."""
 
-    Attributes
-    ----------
-    slope, unit_px : float
-        Log-odds of reading a frame rise by the slope with the logarithm of a unit's height; they are 0 at this height
-        without blur. [1, px]
-    blur_slope : float
-        By how much the logarithm of that height rises with each unit of motion blur.
-    spread : float
-        Standard deviation of the log-odds between passes: light, sensor, state of the plate.
-    sharp, blur_limit : float
-        Log-odds that a pass can be read at all, without blur, and by how much a unit of blur lowers them.
-    fix_rms_m : float
-        Error of a vehicle's position from the nearest frame, horizontal, with an exact survey. [m]
-    exposures_s : tuple of float
-        The camera exposes at least for one of these, all equally likely; empty: as its rules state. [s]
-    """
-
+    # `slope`, `unit_px`: Log-odds of reading a frame rise by the slope with the logarithm of a unit's height; they are
+    # 0 at this height without blur. [1, px]
     slope: float
     unit_px: float
-    blur_slope: float
-    spread: float
+    blur_slope: float  # by how much the logarithm of that height rises with each unit of motion blur
+    spread: float  # standard deviation of the log-odds between passes: light, sensor, state of the plate
+    # `sharp`, `blur_limit`: Log-odds that a pass can be read at all, without blur, and by how much a unit of blur
+    # lowers them
     sharp: float
     blur_limit: float
-    fix_rms_m: float
+    fix_rms_m: float  # [m] error of a vehicle's position from the nearest frame, horizontal, with an exact survey
+    # [s] the camera exposes at least for one of these, all equally likely; empty: as its rules state
     exposures_s: tuple[float, ...] = ()
 
     def pass_log_odds(self, unit_px: Floats, blur_units: npt.ArrayLike) -> Floats:
@@ -81,19 +69,15 @@ class PlateModel:
 
 @dataclass(frozen=True, slots=True)
 class MagnetModel:
-    """Read rate of a tag or of a line's magnet: log-odds linear in clearance and curvature.
+    """Read rate of a tag or of a line's magnet: log-odds linear in clearance and curvature."""
 
-    Attributes
-    ----------
-    at_16_cm, per_metre, per_curvature : float
-        Log-odds at a clearance of 0.16 m, and by how much they change with clearance [1/m] and curvature [m].
-    fix_share, fix_rms_m : float
-        Share of read tags that fix the position, and its error with an exact survey, horizontal. [1, m]
-    """
-
+    # `at_16_cm`, `per_metre`, `per_curvature`: [m] Log-odds at a clearance of 0.16 m, and by how much they change with
+    # clearance [1/m] and curvature
     at_16_cm: float
     per_metre: float
     per_curvature: float
+    # `fix_share`, `fix_rms_m`: share of read tags that fix the position, and its error with an exact survey,
+    # horizontal. [1, m]
     fix_share: float = 0.0
     fix_rms_m: float = 0.0
 
@@ -107,31 +91,17 @@ class MagnetModel:
 
 @dataclass(frozen=True, slots=True)
 class PathModel:
-    """Root mean square distance of the path from the lane's centre line, of drives with an RTK receiver.
+    """Root mean square distance of the path from the lane's centre line, of drives with an RTK receiver."""
 
-    Attributes
-    ----------
-    exact_markers_m : float
-        With markers that are exactly surveyed, 15 m apart, at 15 m/s. [m]
-    marker_gain : float
-        What markers that are off by a distance on each axis add in square, as a share of that distance, there.
-    spacing_power, speed_power : float
-        Exponents of these two.
-    exact_share : float
-        Share of the squared error of the spline through exact markers that remains.
-    end_gain_m : float
-        Length of lane at each of its ends that would double the squared error there. [m]
-    worst_share : float
-        Mean greatest distance along 500 m, over the root mean square.
-    """
-
-    exact_markers_m: float
+    exact_markers_m: float  # [m] with markers that are exactly surveyed, 15 m apart, at 15 m/s
+    # what markers that are off by a distance on each axis add in square, as a share of that distance, there
     marker_gain: float
+    # `spacing_power`, `speed_power`: Exponents of these two
     spacing_power: float
     speed_power: float
-    exact_share: float
-    end_gain_m: float
-    worst_share: float
+    exact_share: float  # share of the squared error of the spline through exact markers that remains
+    end_gain_m: float  # [m] length of lane at each of its ends that would double the squared error there
+    worst_share: float  # mean greatest distance along 500 m, over the root mean square
 
     def rms_of(
         self, survey_rmse_m: float, spacing_m: Floats, speed_mps: Floats, exact_rms_m: Floats, ends_per_m: Floats
@@ -307,25 +277,15 @@ def line_rates(lane: Lane, chainages_m: npt.ArrayLike, clearance_m: float) -> Fl
 
 
 class Stretches(NamedTuple):
-    """Equal stretches of a lane with CERPMs, each of shape (S,).
+    """Equal stretches of a lane with CERPMs, each of shape (S,)."""
 
-    Attributes
-    ----------
-    spacing_m : ndarray
-        Mean distance between pairs. [m]
-    speed_mps : ndarray
-        Mean design speed. [m/s]
-    exact_rms_m, exact_worst_m : ndarray
-        Distances of a cubic spline through the exact pairs of the lane from its centre line. [m]
-    ends_per_m : ndarray
-        Ends of the lane in the stretch over its length. [1/m]
-    """
-
-    spacing_m: Floats
-    speed_mps: Floats
+    spacing_m: Floats  # [m] mean distance between pairs
+    speed_mps: Floats  # [m/s] mean design speed
+    # `exact_rms_m`, `exact_worst_m`: [m] distances of a cubic spline through the exact pairs of the lane from its
+    # centre line
     exact_rms_m: Floats
     exact_worst_m: Floats
-    ends_per_m: Floats
+    ends_per_m: Floats  # [1/m] ends of the lane in the stretch over its length
 
 
 def lane_stretches(lane: Lane, chainages_m: Floats) -> Stretches:
@@ -376,26 +336,15 @@ class ViewReading(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """A picture and what was read in it.
-
-    Attributes
-    ----------
-    jpeg : bytes
-    corners_px : tuple of (x, y)
-        Outer corners of the plate, clockwise from the triangle's; empty where it is not in view. [px]
-    reading : ViewReading
-        Read from the picture alone; or only by a vehicle that knows the plate and its neighbours; or not.
-    confidence : float
-        Of the reading, 0 to 1.
-    exposure_s : float
-        Of the camera; by night at least as long as the light requires. [s]
-    """
+    """A picture and what was read in it."""
 
     jpeg: bytes
+    # [px] outer corners of the plate, clockwise from the triangle's; empty where it is not in view
     corners_px: tuple[tuple[float, float], ...]
+    # read from the picture alone; or only by a vehicle that knows the plate and its neighbours; or not
     reading: ViewReading
-    confidence: float
-    exposure_s: float
+    confidence: float  # of the reading, 0 to 1
+    exposure_s: float  # [s] of the camera; by night at least as long as the light requires
 
 
 def check_view_size(rules: CameraRules) -> None:
@@ -426,65 +375,34 @@ _PASS_GRID_M = 0.02  # [m] between distances at which the view is computed; sour
 
 @dataclass(frozen=True, slots=True)
 class PassFrame:
-    """One frame of a pass.
+    """One frame of a pass."""
 
-    Attributes
-    ----------
-    ahead_m : float
-        From the camera to the plate's centre, along the road. [m]
-    unit_px : float
-        Height of a unit's image. [px]
-    plate_width_px, plate_height_px : float
-        Extent of the plate's image. [px]
-    blur_px : float
-        How far the plate's image moves during the exposure. [px]
-    read_probability : float
-        Of reading this frame by day, in mean circumstances.
-    """
-
-    ahead_m: float
-    unit_px: float
+    ahead_m: float  # [m] from the camera to the plate's centre, along the road
+    unit_px: float  # [px] height of a unit's image
+    # `plate_width_px`, `plate_height_px`: [px] extent of the plate's image
     plate_width_px: float
     plate_height_px: float
-    blur_px: float
-    read_probability: float
+    blur_px: float  # [px] how far the plate's image moves during the exposure
+    read_probability: float  # of reading this frame by day, in mean circumstances
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPass:
-    """A pass over a plate at even speed on a flat and straight road.
+    """A pass over a plate at even speed on a flat and straight road."""
 
-    Attributes
-    ----------
-    step_m : float
-        That the vehicle advances from frame to frame. [m]
-    near_m, far_m : float or None
-        Nearest and farthest distance at which a unit is `MIN_UNIT_PX` high or more and the plate is whole in view;
-        None where it never is. [m]
-    readable_frames : float
-        Mean number of frames of a pass between these two.
-    best_unit_px : float
-        Greatest height of a unit's image. [px]
-    blur_m, blur_units : float
-        Distance driven during the exposure, and as a share of the pitch of the units. [m, 1]
-    frames : tuple of PassFrame
-        Those between these two, far to near.
-    listed_every : int
-        `frames` has one of so many.
-    read_rates : dict of str to float
-        Probability that a pass reads the plate, by condition.
-    """
-
-    step_m: float
+    step_m: float  # [m] that the vehicle advances from frame to frame
+    # `near_m`, `far_m`: [m] nearest and farthest distance at which a unit is `MIN_UNIT_PX` high or more and the plate
+    # is whole in view; None where it never is
     near_m: float | None
     far_m: float | None
-    readable_frames: float
-    best_unit_px: float
+    readable_frames: float  # mean number of frames of a pass between these two
+    best_unit_px: float  # [px] greatest height of a unit's image
+    # `blur_m`, `blur_units`: distance driven during the exposure, and as a share of the pitch of the units. [m, 1]
     blur_m: float
     blur_units: float
-    frames: tuple[PassFrame, ...]
-    listed_every: int
-    read_rates: dict[str, float]
+    frames: tuple[PassFrame, ...]  # those between these two, far to near
+    listed_every: int  # `frames` has one of so many
+    read_rates: dict[str, float]  # probability that a pass reads the plate, by condition
 
 
 def camera_pass(geometry: PlateGeometry, rules: CameraRules, speed_mps: float, left_m: float = 0.0) -> CameraPass:

@@ -52,26 +52,15 @@ _MIN_ACCURACY_M = 1e-3  # [m] of a survey, so that its weight is finite; source:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LanePass:
-    """A drive along a stretch of a lane.
-
-    Attributes
-    ----------
-    lane : Lane
-    from_m, to_m : float
-        Of the lane, in which errors count. [m]
-    markers : sequence of (PlannedMarker, float, float)
-        CERPMs within reach of the radio, with chainage and offset on the lane; missing ones are left out. [m]
-    own : frozenset of int
-        Registry numbers of those that are registered on the boundaries of the lane: the path is fitted to them.
-    radio : Radio
-    speed_m_s, survey_rmse_m : float
-    rng : numpy.random.Generator
-    """
+    """A drive along a stretch of a lane."""
 
     lane: Lane
+    # `from_m`, `to_m`: [m] of the lane, in which errors count
     from_m: float
     to_m: float
+    # [m] CERPMs within reach of the radio, with chainage and offset on the lane; missing ones are left out
     markers: Sequence[tuple[PlannedMarker, float, float]]
+    # registry numbers of those that are registered on the boundaries of the lane: the path is fitted to them
     own: frozenset[int]
     radio: Radio
     speed_m_s: float
@@ -221,32 +210,17 @@ _HEADING_STD_DEG = 0.1  # [deg] of a tag's surveyed direction; source: TAG_BEARI
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MagnetPass:
-    """A drive over a stretch of a lane with magnets.
-
-    Attributes
-    ----------
-    lane : Lane
-    from_m, to_m : float
-        Of the lane, without lead and tail. [m]
-    tag : PlannedMarker or None
-        The tag that is driven over.
-    lines : sequence of (PlannedMarker, float, float)
-        Line magnets near by with chainage and offset on this lane. [m]
-    nearby : sequence of PlannedMarker
-        Tags that the vehicle looks for.
-    left_m : float
-        Of the vehicle from the lane's centre. [m]
-    speed_m_s, clearance_m, survey_rmse_m : float
-    seed : tuple of int
-    """
+    """A drive over a stretch of a lane with magnets."""
 
     lane: Lane
+    # `from_m`, `to_m`: [m] of the lane, without lead and tail
     from_m: float
     to_m: float
-    tag: PlannedMarker | None
+    tag: PlannedMarker | None  # the tag that is driven over
+    # [m] line magnets near by with chainage and offset on this lane
     lines: Sequence[tuple[PlannedMarker, float, float]]
-    nearby: Sequence[PlannedMarker]
-    left_m: float
+    nearby: Sequence[PlannedMarker]  # tags that the vehicle looks for
+    left_m: float  # [m] of the vehicle from the lane's centre
     speed_m_s: float
     clearance_m: float
     survey_rmse_m: float

@@ -124,44 +124,25 @@ _SLOWER = 0.25  # of the speed, to find out whether speed is the cause; source: 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlatePass:
-    """A pass over a plate, with everything drawn but phase, sway and noise.
+    """A pass over a plate, with everything drawn but phase, sway and noise."""
 
-    Attributes
-    ----------
-    marker : PlannedMarker
-        With a PlannedPlate.
-    lane : Lane
-    camera : Camera
-    conditions, fair : Conditions
-        Those of the pass, and the fair ones of the same drive, for causes.
-    parts : frozenset of Condition
-    speed_m_s, left_m, rotation_deg : float
-        As in `Drive`.
-    fps : float
-    codebook : sequence of PlateCode
-        Of the plates near by.
-    survey_error_m : ndarray, shape (2,)
-        East and north of the registered from the true position. [m]
-    survey_rmse_m : float
-    noise_seed : tuple of int
-    bends, grades : bool
-        Whether the lane's curvature and grade are simulated.
-    """
-
-    marker: PlannedMarker
+    marker: PlannedMarker  # with a PlannedPlate
     lane: Lane
     camera: Camera
+    # `conditions`, `fair`: those of the pass, and the fair ones of the same drive, for causes
     conditions: Conditions
     fair: Conditions
     parts: frozenset[Condition]
+    # `speed_m_s`, `left_m`, `rotation_deg`: as in `Drive`
     speed_m_s: float
     fps: float
     left_m: float
     rotation_deg: float
-    codebook: Sequence[PlateCode]
-    survey_error_m: Floats
+    codebook: Sequence[PlateCode]  # of the plates near by
+    survey_error_m: Floats  # shape (2,): [m] east and north of the registered from the true position
     survey_rmse_m: float
     noise_seed: tuple[int, ...]
+    # `bends`, `grades`: whether the lane's curvature and grade are simulated
     bends: bool = True
     grades: bool = True
 
@@ -174,24 +155,13 @@ class PlatePass:
 
 @dataclass(slots=True)
 class FramesRead:
-    """Frames of a pass.
+    """Frames of a pass."""
 
-    Attributes
-    ----------
-    readable, seen, read : int
-        Frames in which a unit is a pixel high or more; of them, those that were rendered, and those that were read.
-    fix_m : list of float or None
-        Error of the most accurate fix along and across the lane. [m]
-    wrong : list of str
-        Digits that are not there.
-    frames : list of (float, bool)
-        Of those rendered: height of a unit's image [px], and whether it was read.
-    """
-
-    readable: int = 0
-    read: int = 0
-    fix_m: list[float] | None = None
-    wrong: list[str] = field(default_factory=list)
+    readable: int = 0  # frames in which a unit is a pixel high or more
+    read: int = 0  # frames that were read
+    fix_m: list[float] | None = None  # [m] error of the most accurate fix along and across the lane
+    wrong: list[str] = field(default_factory=list)  # digits that are not there
+    # of those rendered: height of a unit's image [px], and whether it was read
     frames: list[tuple[float, bool]] = field(default_factory=list)
 
     @property

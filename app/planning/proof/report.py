@@ -105,29 +105,16 @@ def parse_conditions(text: str) -> frozenset[Condition]:
 
 @dataclass(frozen=True, slots=True)
 class ProofUnit:
-    """A part of the proof that is computed apart from the others, in any order and in any process.
-
-    Attributes
-    ----------
-    kind : UnitKind
-    drive : int
-        From 0.
-    lane : str
-    markers : tuple of int
-        Numbers of the plates or tags that are driven over; empty for the others.
-    from_m, to_m : float
-        Stretch of the lane that is driven for line magnets and CERPMs. [m]
-    weight : tuple of float
-        Of each marker: how many of its stratum it stands for; one value for a stretch.
-    """
+    """A part of the proof that is computed apart from the others, in any order and in any process."""
 
     kind: UnitKind
-    drive: int
+    drive: int  # from 0
     lane: str
-    markers: tuple[int, ...] = ()
+    markers: tuple[int, ...] = ()  # numbers of the plates or tags that are driven over; empty for the others
+    # `from_m`, `to_m`: [m] stretch of the lane that is driven for line magnets and CERPMs
     from_m: float = 0.0
     to_m: float = 0.0
-    weight: tuple[float, ...] = (1.0,)
+    weight: tuple[float, ...] = (1.0,)  # of each marker: how many of its stratum it stands for; one value for a stretch
 
     @property
     def key(self) -> str:
@@ -138,18 +125,10 @@ class ProofUnit:
 
 @dataclass(frozen=True, slots=True)
 class DriveTerms:
-    """What is the same along one drive.
-
-    Attributes
-    ----------
-    drive : int
-    condition : str
-        As in the terms.
-    camera : CameraRules
-    """
+    """What is the same along one drive."""
 
     drive: int
-    condition: str
+    condition: str  # as in the terms
     camera: CameraRules
 
 
@@ -179,34 +158,19 @@ def drive_terms(plan: Plan, terms: ProofTerms, drive: int) -> DriveTerms:
 
 
 class MarkerPass(TypedDict):
-    """One pass of one drive over one marker.
+    """One pass of one drive over one marker."""
 
-    Attributes
-    ----------
-    marker : int
-        Number in the plan.
-    weight : float
-        How many markers of its stratum it stands for.
-    lost : bool
-        It is missing in this drive.
-    readable, seen, read : int
-        Of plates: frames in which it is in view and a unit is a pixel high or more; of them, those that were rendered
-        (no more than it takes to read it in `plates.min_frames`), and those in which it was read. Of magnets: 1, 1,
-        and whether it was read.
-    fix_m : list of float or None
-        Error of the vehicle's position along and across the lane. [m]
-    cause : str or None
-        Why it was not read.
-    """
-
-    marker: int
-    weight: float
-    lost: bool
+    marker: int  # number in the plan
+    weight: float  # how many markers of its stratum it stands for
+    lost: bool  # it is missing in this drive
+    # `readable`, `seen`, `read`: of plates: frames in which it is in view and a unit is a pixel high or more; of them,
+    # those that were rendered (no more than it takes to read it in `plates.min_frames`), and those in which it was
+    # read. Of magnets: 1, 1, and whether it was read.
     readable: int
     seen: int
     read: int
-    fix_m: list[float] | None
-    cause: str | None
+    fix_m: list[float] | None  # [m] error of the vehicle's position along and across the lane
+    cause: str | None  # why it was not read
 
 
 class WrongReading(TypedDict):
@@ -217,66 +181,36 @@ class WrongReading(TypedDict):
 
 
 class LanePath(TypedDict):
-    """Path of one drive along a stretch of lane with CERPMs, against the true centre line.
+    """Path of one drive along a stretch of lane with CERPMs, against the true centre line."""
 
-    Attributes
-    ----------
-    places : int
-        Places of the true centre line between the first and the last marker.
-    covered : int
-        Of them, those within 1 m of the path.
-    square_sum_m2, worst_m : float
-        Of the distances of the covered places from the path. [m2, m]
-    worst_at_m : float
-        Chainage of the greatest distance. [m]
-    heard, markers : int
-        Markers that were received and verified, of those along the stretch.
-    left_out : list of int
-        Numbers of markers that the path leaves out.
-    refusal : str or None
-        Why there is no path.
-    """
-
-    places: int
-    covered: int
+    places: int  # places of the true centre line between the first and the last marker
+    covered: int  # of them, those within 1 m of the path
+    # `square_sum_m2`, `worst_m`: of the distances of the covered places from the path. [m2, m]
     square_sum_m2: float
     worst_m: float
-    worst_at_m: float
+    worst_at_m: float  # [m] chainage of the greatest distance
+    # `heard`, `markers`: markers that were received and verified, of those along the stretch
     heard: int
     markers: int
-    left_out: list[int]
-    refusal: str | None
+    left_out: list[int]  # numbers of markers that the path leaves out
+    refusal: str | None  # why there is no path
 
 
 class UnitResult(TypedDict):
-    """Result of one unit.
+    """Result of one unit."""
 
-    Attributes
-    ----------
-    key : str
-        Of the unit.
-    kind, drive, lane
-        As in the unit.
-    condition, camera : str
-        Of the drive.
-    weight : float
-        Of a stretch: how many of its kind it stands for.
-    passes : list of MarkerPass
-    wrong : list of WrongReading
-    path : LanePath or None
-        Of a lane with CERPMs.
-    """
-
-    key: str
+    key: str  # of the unit
+    # `kind`, `drive`, `lane`: as in the unit
     kind: str
     drive: int
     lane: str
+    # `condition`, `camera`: of the drive
     condition: str
     camera: str
-    weight: float
+    weight: float  # of a stretch: how many of its kind it stands for
     passes: list[MarkerPass]
     wrong: list[WrongReading]
-    path: LanePath | None
+    path: LanePath | None  # of a lane with CERPMs
 
 
 # === Results of all units -> the report of a proof.
@@ -289,24 +223,16 @@ ALL = "all"
 
 @dataclass(frozen=True, slots=True)
 class ReadRate:
-    """Share of passes in which markers of one kind were read, weighted by strata.
+    """Share of passes in which markers of one kind were read, weighted by strata."""
 
-    Attributes
-    ----------
-    kind : str
-        ``plates``, ``tags`` or ``line``.
-    condition : str
-    passes, read, lost : int
-        Passes, those in which the marker was read, those in which it was missing.
-    rate, low, high : float
-        Share read of all passes, and its 95 % interval (Wilson, with the effective number of passes after Kish).
-    """
-
-    kind: str
+    kind: str  # ``plates``, ``tags`` or ``line``
     condition: str
+    # `passes`, `read`, `lost`: passes, those in which the marker was read, those in which it was missing
     passes: int
     read: int
     lost: int
+    # `rate`, `low`, `high`: share read of all passes, and its 95 % interval (Wilson, with the effective number of
+    # passes after Kish)
     rate: float
     low: float
     high: float
@@ -314,24 +240,9 @@ class ReadRate:
 
 @dataclass(frozen=True, slots=True)
 class MarkerProof:
-    """What the drives show about one marker.
+    """What the drives show about one marker."""
 
-    Attributes
-    ----------
-    number, code, kind, lane, chainage_m, station_m, lon_deg, lat_deg
-        Of the plan.
-    passes, read, lost, wrong : int
-        Passes; those in which it was read; was missing; in which something was read that is not there.
-    rate, low, high : float or None
-        Share read of the passes in which it was there, and its 95 % interval; None without such a pass.
-    fix_rms_m : float or None
-        Of the vehicle's position, horizontal. [m]
-    weak : bool
-        Read less often than `weak_below`.
-    cause : str or None
-        The most frequent cause of a miss.
-    """
-
+    # `number`, `code`, `kind`, `lane`, `chainage_m`, `station_m`, `lon_deg`, `lat_deg`: of the plan
     number: int
     code: str
     kind: str
@@ -340,86 +251,62 @@ class MarkerProof:
     station_m: float
     lon_deg: float
     lat_deg: float
+    # `passes`, `read`, `lost`, `wrong`: passes; those in which it was read; was missing; in which something was read
+    # that is not there
     passes: int
     read: int
     lost: int
     wrong: int
+    # `rate`, `low`, `high`: share read of the passes in which it was there, and its 95 % interval; None without such a
+    # pass
     rate: float | None
     low: float | None
     high: float | None
-    fix_rms_m: float | None
-    weak: bool
-    cause: str | None
+    fix_rms_m: float | None  # [m] of the vehicle's position, horizontal
+    weak: bool  # read less often than `weak_below`
+    cause: str | None  # the most frequent cause of a miss
 
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """One drive on one lane.
-
-    Attributes
-    ----------
-    drive : int
-    lane, condition, camera : str
-    passes, read, fixes, wrong : int
-        Markers passed, read, with a position of the vehicle; wrong readings.
-    fix_rms_m, fix_worst_m : float or None
-        Errors of the positions, horizontal. [m]
-    longest_gap_m, gap_from_m : float or None
-        Longest way without a position, the lane's ends included, and where it begins; None without plates and tags. [m]
-    gap_estimated : bool
-        Plates and tags that were not driven over count as read at the drive's rate.
-    path_rms_m, path_worst_m, path_worst_at_m, path_coverage : float or None
-        Of the path from CERPMs: distances of the centre line from it, and the share of it that has a path. [m, m, m, 1]
-    refusals : tuple of str
-        Why stretches have no path.
-    """
+    """One drive on one lane."""
 
     drive: int
     lane: str
     condition: str
     camera: str
+    # `passes`, `read`, `fixes`, `wrong`: markers passed, read, with a position of the vehicle; wrong readings
     passes: int
     read: int
     fixes: int
     wrong: int
+    # `fix_rms_m`, `fix_worst_m`: [m] errors of the positions, horizontal
     fix_rms_m: float | None
     fix_worst_m: float | None
+    # `longest_gap_m`, `gap_from_m`: [m] longest way without a position, the lane's ends included, and where it begins;
+    # None without plates and tags
     longest_gap_m: float | None
     gap_from_m: float | None
-    gap_estimated: bool
+    gap_estimated: bool  # plates and tags that were not driven over count as read at the drive's rate
+    # `path_rms_m`, `path_worst_m`, `path_worst_at_m`, `path_coverage`: of the path from CERPMs: distances of the centre
+    # line from it, and the share of it that has a path. [m, m, m, 1]
     path_rms_m: float | None
     path_worst_m: float | None
     path_worst_at_m: float | None
     path_coverage: float | None
-    refusals: tuple[str, ...] = ()
+    refusals: tuple[str, ...] = ()  # why stretches have no path
 
 
 @dataclass(frozen=True, slots=True)
 class ProofReport:
-    """What simulated vehicles read of a plan.
+    """What simulated vehicles read of a plan."""
 
-    Attributes
-    ----------
-    plan : str
-        Its name.
-    terms : ProofTerms
-    complete : bool
-        All units were computed.
-    rates : tuple of ReadRate
-        By kind, over all drives first and then by condition.
-    markers : tuple of MarkerProof
-        Those that were driven over, by number.
-    drives : tuple of DriveResult
-        By drive and lane.
-    wrong : tuple of (drive, marker, text)
-    """
-
-    plan: str
+    plan: str  # its name
     terms: ProofTerms
-    complete: bool
-    rates: tuple[ReadRate, ...]
-    markers: tuple[MarkerProof, ...]
-    drives: tuple[DriveResult, ...]
+    complete: bool  # all units were computed
+    rates: tuple[ReadRate, ...]  # by kind, over all drives first and then by condition
+    markers: tuple[MarkerProof, ...]  # those that were driven over, by number
+    drives: tuple[DriveResult, ...]  # by drive and lane
     wrong: tuple[tuple[int, int, str], ...]
 
     @property

@@ -31,18 +31,10 @@ _M_PER_DEG = 111_195.0  # [m/deg] on a sphere of 6371 km, the Earth's mean radiu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DenseLine:
-    """A line of the file with vertices at most 50 m apart, in the coordinates of the file.
+    """A line of the file with vertices at most 50 m apart, in the coordinates of the file."""
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (M, 3)
-        Longitudes do not jump at the antimeridian.
-    index : ndarray, shape (M,)
-        Numbers of the file's vertices from 0, with fractions between them.
-    """
-
-    vertices: Floats
-    index: Floats
+    vertices: Floats  # shape (M, 3): longitudes do not jump at the antimeridian
+    index: Floats  # shape (M,): numbers of the file's vertices from 0, with fractions between them
 
 
 def densify(vertices: Floats, *, geographic: bool, unit_m: float, name: str) -> DenseLine:
@@ -95,31 +87,21 @@ def _check_vertices(vertices: Floats, geographic: bool, name: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundLine:
-    """A line in WGS 84 by its pieces: vertices that stand twice are dropped.
+    """A line in WGS 84 by its pieces: vertices that stand twice are dropped."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg, height_m : ndarray, shape (K + 1,)
-        Vertices; longitudes do not jump.
-    start_index, end_index : ndarray, shape (K,)
-        Numbers of the file's vertices at the start and the end of each piece, with fractions.
-    east_m, north_m : ndarray, shape (K,)
-        Of each piece, at true scale. [m]
-    chainage_m : ndarray, shape (K + 1,)
-        True distance of the vertices on the ellipsoid. [m]
-    dropped : int
-        Vertices of the file that stood twice.
-    """
-
+    # `lon_deg`, `lat_deg`, `height_m`: shape (K + 1,): vertices; longitudes do not jump
     lon_deg: Floats
     lat_deg: Floats
     height_m: Floats
+    # `start_index`, `end_index`: shape (K,): numbers of the file's vertices at the start and the end of each piece,
+    # with fractions
     start_index: Floats
     end_index: Floats
+    # `east_m`, `north_m`: shape (K,): [m] of each piece, at true scale
     east_m: Floats
     north_m: Floats
-    chainage_m: Floats
-    dropped: int
+    chainage_m: Floats  # shape (K + 1,): [m] True distance of the vertices on the ellipsoid
+    dropped: int  # vertices of the file that stood twice
 
     @property
     def length_m(self) -> float:

@@ -255,23 +255,14 @@ _CUT_STEP_M = 0.5  # [m] between cuts of a lane with boundaries; source: the sag
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Centre:
-    """Samples of a centre line at even steps, each of shape (N,).
-
-    Attributes
-    ----------
-    index : ndarray
-        Numbers of the vertices that values belong to, with fractions.
-    direction_rad : ndarray
-        Anticlockwise from east.
-    width_m : ndarray or None
-    """
+    """Samples of a centre line at even steps, each of shape (N,)."""
 
     chainage_m: Floats
     lon_deg: Floats
     lat_deg: Floats
     height_m: Floats
-    index: Floats
-    direction_rad: Floats
+    index: Floats  # numbers of the vertices that values belong to, with fractions
+    direction_rad: Floats  # anticlockwise from east
     curvature_per_m: Floats
     width_m: Floats | None = None
 

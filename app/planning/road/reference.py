@@ -37,48 +37,28 @@ _MIN_CONFIDENCE = 70  # [%] of pyproj's match with an EPSG code, as for surveys 
 
 @dataclass(frozen=True, slots=True)
 class PlacedRoad:
-    """Positions of vertices, and how they were found; NaN where a position cannot be placed.
+    """Positions of vertices, and how they were found; NaN where a position cannot be placed."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg, height_m : ndarray, shape (N,)
-    crs, realization, epoch, transform_accuracy_m
-        As in `app.planning.alignment.Alignment`.
-    surveyed : bool
-    note : str or None
-        Why positions are unfit for localization.
-    """
-
+    # `lon_deg`, `lat_deg`, `height_m`: shape (N,)
     lon_deg: Floats
     lat_deg: Floats
     height_m: Floats
+    # `crs`, `realization`, `epoch`, `transform_accuracy_m`: as in `app.planning.alignment.Alignment`
     crs: str
     realization: str | None
     epoch: float | None
     transform_accuracy_m: float | None
     surveyed: bool
-    note: str | None
+    note: str | None  # why positions are unfit for localization
 
 
 @dataclass(frozen=True, slots=True)
 class RoadReference:
-    """Reference system of a file's coordinates.
+    """Reference system of a file's coordinates."""
 
-    Attributes
-    ----------
-    name : str
-        ``EPSG:code``, ``OGC:CRS84``, or a WKT or PROJ string; ``local`` with an origin.
-    geographic : bool
-    unit_m : float
-        Length of the coordinates' unit; 1 for degrees. [m]
-    height_unit_m : float
-        [m]
-    declaration : AlignmentDeclaration
-    """
-
-    name: str
+    name: str  # ``EPSG:code``, ``OGC:CRS84``, or a WKT or PROJ string; ``local`` with an origin
     geographic: bool
-    unit_m: float
+    unit_m: float  # [m] length of the coordinates' unit; 1 for degrees
     height_unit_m: float
     declaration: AlignmentDeclaration
 

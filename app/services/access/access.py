@@ -141,22 +141,11 @@ def check_agency_name(name: str, *, field: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """An authenticated caller.
+    """An authenticated caller."""
 
-    Attributes
-    ----------
-    agency_id : str
-        Whose rows it works on.
-    key_id : str
-        Who it is: the same for keys that replace one another.
-    label : str
-        What histories call it.
-    scope : Scope
-    """
-
-    agency_id: str
-    key_id: str
-    label: str
+    agency_id: str  # whose rows it works on
+    key_id: str  # who it is: the same for keys that replace one another
+    label: str  # what histories call it
     scope: Scope
 
     def require(self, allowed: Collection[Scope]) -> None:

@@ -34,19 +34,11 @@ MAX_OVERLAP = timedelta(days=30)
 
 @dataclass(frozen=True, slots=True)
 class NewKey:
-    """What a key shall be.
-
-    Attributes
-    ----------
-    label : str
-        What histories call its holder.
-    expires_at : datetime or None
-        None: it does not expire.
-    """
+    """What a key shall be."""
 
     scope: Scope
-    label: str
-    expires_at: datetime | None = None
+    label: str  # what histories call its holder
+    expires_at: datetime | None = None  # None: it does not expire
 
 
 class Keys:

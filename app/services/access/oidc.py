@@ -29,18 +29,13 @@ _ALGORITHMS = {("RSA", None): "RS256", ("EC", "P-256"): "ES256", ("OKP", "Ed2551
 
 @dataclass(frozen=True, slots=True)
 class Issuer:
-    """Issuer whose tokens are accepted, and the claims that are read.
+    """Issuer whose tokens are accepted, and the claims that are read."""
 
-    Attributes
-    ----------
-    issuer, audience : str
-        Required value of `iss`, and a value that `aud` must contain.
-    agency_claim, scope_claim : str
-        Claims that name the agency and the scope; a.b is b inside of a, where there is no claim a.b itself.
-    """
-
+    # `issuer`, `audience`: required value of `iss`, and a value that `aud` must contain
     issuer: str
     audience: str
+    # `agency_claim`, `scope_claim`: claims that name the agency and the scope; a.b is b inside of a, where there is no
+    # claim a.b itself
     agency_claim: str
     scope_claim: str
 

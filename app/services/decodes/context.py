@@ -38,32 +38,17 @@ class DecodeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class DecodeRules:
-    """What uploads may cost.
-
-    Attributes
-    ----------
-    images : ImageLimits
-    archives : ArchiveLimits
-    videos : VideoLimits
-    traces : TraceLimits
-    packets : PacketLimits
-    immediate_trace_bytes : int
-        Recordings and packet logs up to this size are decoded while the caller waits, larger ones become jobs. [byte]
-    frames_in_flight : int
-        Frames of one archive that are decoded at the same time.
-    progress_every : timedelta
-        Shortest time between two reports of a job's progress.
-    idempotency_ttl : timedelta
-    """
+    """What uploads may cost."""
 
     images: ImageLimits = field(default_factory=ImageLimits)
     archives: ArchiveLimits = field(default_factory=ArchiveLimits)
     videos: VideoLimits = field(default_factory=VideoLimits)
     traces: TraceLimits = field(default_factory=TraceLimits)
     packets: PacketLimits = field(default_factory=PacketLimits)
+    # [byte] recordings and packet logs up to this size are decoded while the caller waits, larger ones become jobs
     immediate_trace_bytes: int = 8 * 1024**2
-    frames_in_flight: int = 2
-    progress_every: timedelta = timedelta(seconds=1)
+    frames_in_flight: int = 2  # frames of one archive that are decoded at the same time
+    progress_every: timedelta = timedelta(seconds=1)  # shortest time between two reports of a job's progress
     idempotency_ttl: timedelta = timedelta(hours=24)
 
 
@@ -84,24 +69,12 @@ _EPOCH_S = 1e9
 
 @dataclass(frozen=True, slots=True)
 class DecodeTimes:
-    """What the times of a decode count from.
+    """What the times of a decode count from."""
 
-    Attributes
-    ----------
-    clock : str
-        ``utc``: seconds since 1970-01-01 UTC; ``recording``: of the recording.
-    zero_s : float
-        Added to times of a trace or of a video's frames. [s]
-    captured_s : float or None
-        When the upload was taken, by its context. [s]
-    alone : bool
-        The upload is a single frame, which was taken then.
-    """
-
-    clock: Literal["utc", "recording"]
-    zero_s: float = 0.0
-    captured_s: float | None = None
-    alone: bool = False
+    clock: Literal["utc", "recording"]  # ``utc``: seconds since 1970-01-01 UTC; ``recording``: of the recording
+    zero_s: float = 0.0  # [s] added to times of a trace or of a video's frames
+    captured_s: float | None = None  # [s] when the upload was taken, by its context
+    alone: bool = False  # the upload is a single frame, which was taken then
 
     def trace_s(self, t_s: float) -> float:
         """Time of a sample. [s]"""
@@ -290,21 +263,11 @@ class CameraSetup:
 
 @dataclass(frozen=True, slots=True)
 class ContextInput:
-    """The context as it was sent with an upload, before its vehicle's profile completes it.
+    """The context as it was sent with an upload, before its vehicle's profile completes it."""
 
-    Attributes
-    ----------
-    stated : dict
-        Members of the context that were sent and nothing else.
-    vehicle : str or None
-        Name or id of the vehicle.
-    file_name : str
-        Of the file; empty where it has none.
-    """
-
-    stated: dict[str, Any] = field(default_factory=dict)
-    vehicle: str | None = None
-    file_name: str = ""
+    stated: dict[str, Any] = field(default_factory=dict)  # members of the context that were sent and nothing else
+    vehicle: str | None = None  # name or id of the vehicle
+    file_name: str = ""  # of the file; empty where it has none
 
 
 @dataclass(frozen=True, slots=True)

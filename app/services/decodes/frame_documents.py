@@ -78,21 +78,13 @@ class SeenPlateDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class DriveNotes:
-    """What is to be known about the frames of a drive as a whole.
+    """What is to be known about the frames of a drive as a whole."""
 
-    Attributes
-    ----------
-    warnings, gaps, plates
-        As in `FramesResult`.
-    searched : int or None
-        Frames of a video, of which only those with readings are listed.
-    receiver : ReceiverPositions or None
-    """
-
+    # `warnings`, `gaps`, `plates`: as in `FramesResult`
     warnings: Sequence[str] = ()
     gaps: Sequence[GapDocument] = ()
     plates: Sequence[SeenPlateDocument] = ()
-    searched: int | None = None
+    searched: int | None = None  # frames of a video, of which only those with readings are listed
     receiver: ReceiverPositions | None = None
 
 

@@ -116,29 +116,17 @@ class FrameListTask(Task[FrameLists]):
 
 @dataclass(frozen=True, slots=True)
 class FramePose:
-    """Where the vehicle was when a frame was taken, by anything but the frame.
+    """Where the vehicle was when a frame was taken, by anything but the frame."""
 
-    Attributes
-    ----------
-    source : str
-        ``list``, ``track`` or ``context``.
-    lon_deg, lat_deg : float
-        WGS 84. [deg]
-    heading_deg, accuracy_m : float or None
-        Clockwise from true north; standard deviation of the position. [deg, m]
-    speed_m_s : float or None
-        [m/s]
-    radius_m : float
-        That holds the vehicle with near certainty. [m]
-    """
-
-    source: str
+    source: str  # ``list``, ``track`` or ``context``
+    # `lon_deg`, `lat_deg`: [deg] WGS 84
     lon_deg: float
     lat_deg: float
+    # `heading_deg`, `accuracy_m`: clockwise from true north; standard deviation of the position. [deg, m]
     heading_deg: float | None
     accuracy_m: float | None
     speed_m_s: float | None
-    radius_m: float
+    radius_m: float  # [m] that holds the vehicle with near certainty
 
     @property
     def coarse_position(self) -> CoarsePosition:
@@ -382,20 +370,12 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class TrackPoint:
-    """A position of the vehicle.
+    """A position of the vehicle."""
 
-    Attributes
-    ----------
-    time_s : float or None
-        By the decode's clock. [s]
-    source : str
-        ``fix``, ``pose``, ``motion`` or ``receiver``.
-    """
-
-    time_s: float | None
+    time_s: float | None  # [s] by the decode's clock
     lon_deg: float
     lat_deg: float
-    source: str
+    source: str  # ``fix``, ``pose``, ``motion`` or ``receiver``
     heading_deg: float | None = None
     sigma_m: float | None = None
 

@@ -271,30 +271,15 @@ RUN_BYTES = 8 * 1024**2
 
 @dataclass(frozen=True, slots=True)
 class ArchiveFrame:
-    """A frame that was inspected.
+    """A frame that was inspected."""
 
-    Attributes
-    ----------
-    index : int
-        Number of its file in the archive.
-    name : str
-    moment : FrameMoment
-    picture : FramePicture or None
-        None where an error keeps it from the decoder processes.
-    search : FrameSearch
-    nearby : NearbyMarkers
-    pixels : int
-        [px]
-    error : WaymarkError or None
-    """
-
-    index: int
+    index: int  # number of its file in the archive
     name: str
     moment: FrameMoment
-    picture: FramePicture | None = None
+    picture: FramePicture | None = None  # None where an error keeps it from the decoder processes
     search: FrameSearch = field(default_factory=lambda: FrameSearch({}))
     nearby: NearbyMarkers = field(default_factory=NearbyMarkers)
-    pixels: int = 0
+    pixels: int = 0  # [px]
     error: WaymarkError | None = None
 
 

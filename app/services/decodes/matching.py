@@ -119,29 +119,14 @@ COARSE_HEADING_RMSE_DEG = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """Where the vehicle is.
-
-    Attributes
-    ----------
-    vehicle : VehicleFix
-    grade : LocalizationGrade
-        Of the plates' positions; UNFIT where there is a reason against the match.
-    notes : tuple of str
-        Why it is unfit for localization, and what was assumed.
-    has_height : bool
-        Whether the plates' heights are known.
-    marker_ids : tuple of str
-        The plates it rests on.
-    epoch : float or None
-        Of its position in the ITRF; None where a plate's position has no epoch. [decimal year]
-    """
+    """Where the vehicle is."""
 
     vehicle: VehicleFix
-    grade: LocalizationGrade
-    notes: tuple[str, ...]
-    has_height: bool
-    marker_ids: tuple[str, ...]
-    epoch: float | None
+    grade: LocalizationGrade  # of the plates' positions; UNFIT where there is a reason against the match
+    notes: tuple[str, ...]  # why it is unfit for localization, and what was assumed
+    has_height: bool  # whether the plates' heights are known
+    marker_ids: tuple[str, ...]  # the plates it rests on
+    epoch: float | None  # [decimal year] of its position in the ITRF; None where a plate's position has no epoch
 
 
 def fix_from_match(
@@ -318,22 +303,12 @@ def registered_tag(stored: MarkerRow, epoch: float) -> RegisteredTag:
 
 @dataclass(frozen=True)
 class KnownMarkers:
-    """What the registry knows of the markers that packets claim to be from.
+    """What the registry knows of the markers that packets claim to be from."""
 
-    Attributes
-    ----------
-    rows : dict of int to MarkerRow
-        By number.
-    agency_key : bytes or None
-    earlier_spans : dict of int to list of SequenceSpan
-    last_span : int
-        Newest row among these spans: who writes more must see the same.
-    """
-
-    rows: dict[int, MarkerRow]
+    rows: dict[int, MarkerRow]  # by number
     agency_key: bytes | None
     earlier_spans: dict[int, list[SequenceSpan]]
-    last_span: int
+    last_span: int  # newest row among these spans: who writes more must see the same
 
     @cached_property
     def cerpms(self) -> KnownCerpms:

@@ -57,21 +57,11 @@ if TYPE_CHECKING:  # they load numba, and every decoder process loads this modul
 
 @dataclass(frozen=True, slots=True)
 class FramePicture:
-    """One frame to load.
+    """One frame to load."""
 
-    Attributes
-    ----------
-    file : SpooledFile
-        JPEG or PNG.
-    thermal : bool
-    thermal_range : (float, float) or None
-        Counts that become 0 and 255 in a 16-bit thermal frame. [counts]
-    limits : ImageLimits
-    """
-
-    file: SpooledFile
+    file: SpooledFile  # JPEG or PNG
     thermal: bool = False
-    thermal_range: tuple[float, float] | None = None
+    thermal_range: tuple[float, float] | None = None  # [counts] counts that become 0 and 255 in a 16-bit thermal frame
     limits: ImageLimits = field(default_factory=ImageLimits)
 
 
@@ -84,37 +74,23 @@ class FrameSearch:
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """What a decoder process found in a frame.
-
-    Attributes
-    ----------
-    header : ImageHeader
-    readings : tuple of FrameReading
-    load_ms, decode_ms : float
-        Time spent on the picture's codec and on the markers. [ms]
-    """
+    """What a decoder process found in a frame."""
 
     header: ImageHeader
     readings: tuple[FrameReading, ...]
+    # `load_ms`, `decode_ms`: [ms] time spent on the picture's codec and on the markers
     load_ms: float
     decode_ms: float
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTask(Task[FrameResult]):
-    """One frame to decode, in two steps: the picture is loaded while the caller still finds out what to look for.
-
-    Attributes
-    ----------
-    picture : FramePicture
-    search : Future of FrameSearch
-        The caller sets it.
-    """
+    """One frame to decode, in two steps: the picture is loaded while the caller still finds out what to look for."""
 
     is_long: ClassVar[bool] = False
 
     picture: FramePicture
-    search: Future[FrameSearch] = field(default_factory=Future)
+    search: Future[FrameSearch] = field(default_factory=Future)  # the caller sets it
 
     def steps(self) -> tuple[object, ...]:
         """The picture, then the search."""
@@ -126,10 +102,6 @@ class FrameRunTask(Task[tuple[FrameResult | WaymarkError, ...]]):
     """Several frames to decode one after the other, so that their processes are handed work less often.
 
     The result has the error of each frame that cannot be read. A frame that stops the process stops the whole run.
-
-    Attributes
-    ----------
-    frames : tuple of (FramePicture, FrameSearch)
     """
 
     is_long: ClassVar[bool] = False
@@ -139,19 +111,13 @@ class FrameRunTask(Task[tuple[FrameResult | WaymarkError, ...]]):
 
 @dataclass(frozen=True, slots=True)
 class AnnotationTask(Task[bytes]):
-    """A frame to draw its readings on.
-
-    Attributes
-    ----------
-    suffix : str
-        ``png`` or ``jpg``.
-    """
+    """A frame to draw its readings on."""
 
     is_long: ClassVar[bool] = False
 
     file: SpooledFile
     outlines: tuple[Outline, ...]
-    suffix: str
+    suffix: str  # ``png`` or ``jpg``
     thermal: bool = False
     thermal_range: tuple[float, float] | None = None
     limits: ImageLimits = field(default_factory=ImageLimits)
@@ -162,71 +128,40 @@ class AnnotationTask(Task[bytes]):
 
 @dataclass(frozen=True, slots=True)
 class IndexVideoTask(Task[VideoIndex]):
-    """A video whose frames are to be listed.
-
-    Attributes
-    ----------
-    file : VideoFile
-    limits : VideoLimits
-    rate_hz : float or None
-        Frames a second of a stream without times. [Hz]
-    """
+    """A video whose frames are to be listed."""
 
     file: VideoFile
     limits: VideoLimits = field(default_factory=VideoLimits)
-    rate_hz: float | None = None
+    rate_hz: float | None = None  # [Hz] frames a second of a stream without times
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentTask(Task["SegmentResult"]):
-    """A segment of a video to decode.
-
-    Attributes
-    ----------
-    index : VideoIndex
-    number : int
-        Of the segment.
-    by_family : mapping of str to object
-        What to look for, as in `FrameSearch`.
-    thermal : bool
-    speeds : tuple of (float, float)
-        Speed of the vehicle at times of the video. [s, m/s]
-    """
+    """A segment of a video to decode."""
 
     index: VideoIndex
-    number: int
-    by_family: Mapping[str, object]
+    number: int  # of the segment
+    by_family: Mapping[str, object]  # what to look for, as in `FrameSearch`
     thermal: bool = False
-    speeds: tuple[tuple[float, float], ...] = ()
+    speeds: tuple[tuple[float, float], ...] = ()  # speed of the vehicle at times of the video. [s, m/s]
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentResult:
-    """What a segment shows.
+    """What a segment shows."""
 
-    Attributes
-    ----------
-    width_px, height_px : int
-        Of the upright frames; 0 if no frame could be decoded. [px]
-    frames, decoded : int
-        Frames that were searched, and those that went through the whole plate decoder.
-    damaged, other_size : int
-        Frames that could not be decoded, or that have another size than the video.
-    plates : tuple of FoundPlate
-    others : mapping of int to tuple of FrameReading
-        Readings of other families by frame.
-    load_ms, decode_ms : float
-        Time spent on the video's codec and on the search. [ms]
-    """
-
+    # `width_px`, `height_px`: [px] of the upright frames; 0 if no frame could be decoded
     width_px: int
     height_px: int
+    # `frames`, `decoded`: frames that were searched, and those that went through the whole plate decoder
     frames: int
     decoded: int
+    # `damaged`, `other_size`: frames that could not be decoded, or that have another size than the video
     damaged: int
     other_size: int
     plates: tuple[FoundPlate, ...]
-    others: Mapping[int, tuple[FrameReading, ...]]
+    others: Mapping[int, tuple[FrameReading, ...]]  # readings of other families by frame
+    # `load_ms`, `decode_ms`: [ms] time spent on the video's codec and on the search
     load_ms: float
     decode_ms: float
 
@@ -268,31 +203,17 @@ class SamplesDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class SamplesTask(Task[SamplesDocument]):
-    """Samples of a recording to read.
+    """Samples of a recording to read."""
 
-    Attributes
-    ----------
-    name : str
-        Of the file.
-    file : SpooledFile
-    declared : mapping
-        The declaration that came with the upload.
-    series : tuple of str
-        ``vertical`` and ``forward`` are the largest change on any sensor of the array, ``s3_x`` is an axis of a sensor.
-    from_s, to_s : float or None
-        Of the recording; None for its ends. [s]
-    points : int
-        Of each series at most.
-    limits : TraceLimits
-    """
-
-    name: str
+    name: str  # of the file
     file: SpooledFile
-    declared: Mapping[str, Any]
+    declared: Mapping[str, Any]  # the declaration that came with the upload
+    # ``vertical`` and ``forward`` are the largest change on any sensor of the array, ``s3_x`` is an axis of a sensor
     series: tuple[str, ...] = DEFAULT_SERIES
+    # `from_s`, `to_s`: [s] of the recording; None for its ends
     from_s: float | None = None
     to_s: float | None = None
-    points: int = 100_000
+    points: int = 100_000  # of each series at most
     limits: TraceLimits = field(default_factory=TraceLimits)
 
 
@@ -328,27 +249,14 @@ class PacketsDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class VideoFrameTask(Task[bytes]):
-    """A frame of a video to draw its readings on.
-
-    Attributes
-    ----------
-    file : VideoFile
-    number : int
-        Of the frame.
-    outlines : tuple of Outline
-    suffix : str
-        ``png`` or ``jpg``.
-    limits : VideoLimits
-    rate_hz : float or None
-        Frames a second of a stream without times. [Hz]
-    """
+    """A frame of a video to draw its readings on."""
 
     file: VideoFile
-    number: int
+    number: int  # of the frame
     outlines: tuple[Outline, ...]
-    suffix: Literal["png", "jpg"]
+    suffix: Literal["png", "jpg"]  # ``png`` or ``jpg``
     limits: VideoLimits = field(default_factory=VideoLimits)
-    rate_hz: float | None = None
+    rate_hz: float | None = None  # [Hz] frames a second of a stream without times
     is_long: ClassVar[bool] = True
 
 
@@ -361,71 +269,38 @@ MAX_REACH_M = 20_000.0
 
 @dataclass(frozen=True, slots=True)
 class TraceTerms:
-    """A declaration as the readers and the decoder know it.
-
-    Attributes
-    ----------
-    bar : MagnetometerBar
-    declaration : TraceDeclaration
-    formats : tuple of TagFormat
-        Tags to look for where the registry has none near by.
-    method : str
-        ``matched``, or ``metro`` for the paper's pipeline.
-    reach_m : float
-        How far from the coarse position the drive may lead. [m]
-    """
+    """A declaration as the readers and the decoder know it."""
 
     bar: MagnetometerBar
     declaration: TraceDeclaration
-    formats: tuple[TagFormat, ...] = ()
-    method: str = TRACE_METHODS[0]
-    reach_m: float = 2000.0
+    formats: tuple[TagFormat, ...] = ()  # tags to look for where the registry has none near by
+    method: str = TRACE_METHODS[0]  # ``matched``, or ``metro`` for the paper's pipeline
+    reach_m: float = 2000.0  # [m] how far from the coarse position the drive may lead
 
 
 @dataclass(frozen=True, slots=True)
 class TraceMotion:
-    """Speed and heading over a recording, at even times.
+    """Speed and heading over a recording, at even times."""
 
-    Attributes
-    ----------
-    start_s, step_s : float
-        Trace time of the first value, which is that of the first sample, and the time between two. [s]
-    speed_m_s, heading_deg : tuple of float
-        Empty where the recording has none; NaN where it has none near by. [m/s, deg]
-    """
-
+    # `start_s`, `step_s`: [s] trace time of the first value, which is that of the first sample, and the time between
+    # two
     start_s: float
     step_s: float
+    # `speed_m_s`, `heading_deg`: empty where the recording has none; NaN where it has none near by. [m/s, deg]
     speed_m_s: tuple[float, ...] = ()
     heading_deg: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class TraceResult:
-    """What a decoder process found in a recording.
+    """What a decoder process found in a recording."""
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        In the order of their completion.
-    report : TraceReport
-        About reading the files.
-    length_m : float
-        Driven, by the vehicle's speed. [m]
-    version : str
-        Of the decoder.
-    plot : bytes
-        SVG.
-    load_ms, decode_ms : float
-        Time spent on reading the files and on the magnets. [ms]
-    motion : TraceMotion
-    """
-
-    findings: tuple[Finding, ...]
-    report: TraceReport
-    length_m: float
-    version: str
-    plot: bytes
+    findings: tuple[Finding, ...]  # in the order of their completion
+    report: TraceReport  # about reading the files
+    length_m: float  # [m] driven, by the vehicle's speed
+    version: str  # of the decoder
+    plot: bytes  # SVG
+    # `load_ms`, `decode_ms`: [ms] time spent on reading the files and on the magnets
     load_ms: float
     decode_ms: float
     motion: TraceMotion
@@ -442,24 +317,15 @@ class TraceTask(Task[TraceResult]):
 
     Attributes
     ----------
-    name : str
-        Of the file.
     data : bytes
         A file, or a ZIP of the files of one recording.
-    declared : dict
-        The declaration as it was sent; see `trace_terms`.
-    tags : tuple of str
-        Texts of the information tags that are registered near by.
-    formats : tuple of TagFormat
-        Used where there are none.
-    limits : TraceLimits
     """
 
-    name: str
+    name: str  # of the file
     file: SpooledFile
-    declared: Mapping[str, Any]
-    tags: tuple[str, ...] = ()
-    formats: tuple[TagFormat, ...] = ()
+    declared: Mapping[str, Any]  # the declaration as it was sent; see `trace_terms`
+    tags: tuple[str, ...] = ()  # texts of the information tags that are registered near by
+    formats: tuple[TagFormat, ...] = ()  # used where there are none
     limits: TraceLimits = field(default_factory=TraceLimits)
 
 
@@ -549,163 +415,78 @@ PREDICTIVE, NO_CHECK = "predictive", "none"
 
 @dataclass(frozen=True, slots=True)
 class PacketTerms:
-    """A declaration as the readers and the decoder know it.
-
-    Attributes
-    ----------
-    packets : PacketDeclaration
-    poses : PoseDeclaration
-    files : mapping of str to str
-        Kind of a file by its name, where its content does not show it.
-    freshness : FreshnessRules
-    lane : LaneRules
-    method : str
-        ``waymark``, or ``paper`` for section 2.2 of the CERPM paper.
-    accept_clear : bool
-        Use markers whose packets were received in clear only, without a tag.
-    controller : Controller or None
-        Of the check of steering; none is made without.
-    signal : SignalRules
-        With the figures of the receiver that were declared.
-    """
+    """A declaration as the readers and the decoder know it."""
 
     packets: PacketDeclaration
     poses: PoseDeclaration
-    files: Mapping[str, str]
+    files: Mapping[str, str]  # kind of a file by its name, where its content does not show it
     freshness: FreshnessRules
     lane: LaneRules
-    method: str
-    accept_clear: bool
-    controller: Controller | None
-    signal: SignalRules
+    method: str  # ``waymark``, or ``paper`` for section 2.2 of the CERPM paper
+    accept_clear: bool  # use markers whose packets were received in clear only, without a tag
+    controller: Controller | None  # of the check of steering; none is made without
+    signal: SignalRules  # with the figures of the receiver that were declared
 
 
 @dataclass(frozen=True, slots=True)
 class DriveFiles:
-    """What the files of a drive hold.
+    """What the files of a drive hold."""
 
-    Attributes
-    ----------
-    packets : list of ReceivedPacket
-        Of all packet logs; entries go on counting from file to file.
-    track : PoseTrack or None
-    reports : dict of str to LogReport
-        About reading each file.
-    frame : (str, ImageHeader) or None
-        Name and header of the camera frame.
-    load_ms : float
-        [ms]
-    driven_m : float or None
-        Along the track. [m]
-    """
-
-    packets: list[ReceivedPacket]
+    packets: list[ReceivedPacket]  # of all packet logs; entries go on counting from file to file
     track: PoseTrack | None
-    reports: dict[str, LogReport]
-    frame: tuple[str, ImageHeader] | None
+    reports: dict[str, LogReport]  # about reading each file
+    frame: tuple[str, ImageHeader] | None  # name and header of the camera frame
     load_ms: float
-    driven_m: float | None = None
+    driven_m: float | None = None  # [m] along the track
 
 
 @dataclass(frozen=True, slots=True)
 class DriveTask(Task[DriveFiles]):
-    """The files of one drive to read.
+    """The files of one drive to read."""
 
-    Attributes
-    ----------
-    name : str
-        Of the file.
-    file : SpooledFile
-        A packet log, or a ZIP of packet logs, poses and a camera frame.
-    declared : mapping
-        The declaration as it was sent; see `packet_terms`.
-    packets : PacketLimits
-    images : ImageLimits
-    """
-
-    name: str
-    file: SpooledFile
-    declared: Mapping[str, Any]
+    name: str  # of the file
+    file: SpooledFile  # a packet log, or a ZIP of packet logs, poses and a camera frame
+    declared: Mapping[str, Any]  # the declaration as it was sent; see `packet_terms`
     packets: PacketLimits = field(default_factory=PacketLimits)
     images: ImageLimits = field(default_factory=ImageLimits)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneResult:
-    """The lane and what follows from it.
-
-    Attributes
-    ----------
-    lane : Lane
-    steering : SteeringCheck or str or None
-        The check, or why it could not be made.
-    overlay : LaneOverlay or None
-    plot : bytes
-        SVG.
-    decode_ms : float
-        [ms]
-    """
+    """The lane and what follows from it."""
 
     lane: Lane
-    steering: SteeringCheck | str | None
+    steering: SteeringCheck | str | None  # the check, or why it could not be made
     overlay: LaneOverlay | None
-    plot: bytes
+    plot: bytes  # SVG
     decode_ms: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneTask(Task[LaneResult]):
-    """Verified markers to estimate a lane through.
-
-    Attributes
-    ----------
-    markers : LaneMarkers
-    left_out : tuple of (int, float, float, str)
-        Markers that were left out before: number, longitude and latitude that they claim [deg], and why.
-    track : PoseTrack or None
-    terms : PacketTerms
-    strengths : (ndarray, ndarray)
-        Distance and RSSI of accepted packets. [m, dBm]
-    path_loss : (float, float) or None
-        Fitted: level at 1 m and exponent. [dBm, 1]
-    camera : Camera or None
-        Of the frame to draw the lane over.
-    pose : (float, float, float) or None
-        Longitude, latitude and heading of the vehicle when it was taken. [deg]
-    """
+    """Verified markers to estimate a lane through."""
 
     markers: LaneMarkers
+    # markers that were left out before: number, longitude and latitude that they claim [deg], and why
     left_out: tuple[tuple[int, float, float, str], ...]
     track: PoseTrack | None
     terms: PacketTerms
-    strengths: tuple[Any, Any]
-    path_loss: tuple[float, float] | None
-    camera: Camera | None
-    pose: tuple[float, float, float] | None
+    strengths: tuple[Any, Any]  # distance and RSSI of accepted packets. [m, dBm]
+    path_loss: tuple[float, float] | None  # fitted: level at 1 m and exponent. [dBm, 1]
+    camera: Camera | None  # of the frame to draw the lane over
+    pose: tuple[float, float, float] | None  # [deg] longitude, latitude and heading of the vehicle when it was taken
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OverlayTask(Task[bytes]):
-    """A lane to draw over the camera frame of an upload.
-
-    Attributes
-    ----------
-    file : SpooledFile
-        The upload.
-    frame : str
-        Name of the picture in it.
-    overlay : LaneOverlay
-    suffix : str
-        ``png`` or ``jpg``.
-    images : ImageLimits
-    """
+    """A lane to draw over the camera frame of an upload."""
 
     is_long: ClassVar[bool] = False
 
-    file: SpooledFile
-    frame: str
+    file: SpooledFile  # the upload
+    frame: str  # name of the picture in it
     overlay: LaneOverlay
-    suffix: str
+    suffix: str  # ``png`` or ``jpg``
     images: ImageLimits = field(default_factory=ImageLimits)
 
 
@@ -796,18 +577,10 @@ def _clock(declared: Mapping[str, Any]) -> LogClock:
 
 @dataclass(frozen=True, slots=True)
 class FrameTerms:
-    """What is declared of the frames of a drive.
+    """What is declared of the frames of a drive."""
 
-    Attributes
-    ----------
-    rate_hz : float or None
-        Frames a second. [Hz]
-    poses : PoseDeclaration
-        Of a list of frames, or of a track beside them.
-    """
-
-    rate_hz: float | None = None
-    poses: PoseDeclaration = field(default_factory=PoseDeclaration)
+    rate_hz: float | None = None  # [Hz] frames a second
+    poses: PoseDeclaration = field(default_factory=PoseDeclaration)  # of a list of frames, or of a track beside them
 
 
 def frame_terms(declared: Mapping[str, Any]) -> FrameTerms:

@@ -247,34 +247,19 @@ SignalT_co = TypeVar("SignalT_co", covariant=True)
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """A file with its context.
-
-    Attributes
-    ----------
-    agency_id : str
-    author : Author
-        Who uploaded it.
-    file : SpooledFile
-    context : DecodeContext
-    received_at : datetime
-    wait_s : float
-        How long to wait for a decoder process. [s]
-    report_progress : callable
-        Called with the frames that are done, and all, by handlers that work for long; what it raises stops the decode.
-    report_part : callable
-        Called as `report_progress`, and with the result so far, which is stored; what it raises stops the decode.
-    again_id : str or None
-        Id of the stored decode that is decoded again, to compare; nothing of that is stored with it.
-    """
+    """A file with its context."""
 
     agency_id: str
-    author: Author
+    author: Author  # who uploaded it
     file: SpooledFile
     context: DecodeContext
     received_at: datetime
-    wait_s: float = 0.0
+    wait_s: float = 0.0  # [s] how long to wait for a decoder process
+    # called with the frames that are done, and all, by handlers that work for long; what it raises stops the decode
     report_progress: Callable[[int, int], None] = lambda _done, _total: None
+    # called as `report_progress`, and with the result so far, which is stored; what it raises stops the decode
     report_part: Callable[[int, int, FramesResult], None] = lambda _done, _total, _part: None
+    # id of the stored decode that is decoded again, to compare; nothing of that is stored with it
     again_id: str | None = None
 
     @property
@@ -285,26 +270,14 @@ class Upload:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """An upload that was decoded and matched, ready to be stored.
+    """An upload that was decoded and matched, ready to be stored."""
 
-    Attributes
-    ----------
-    document
-        The result.
-    observations : sequence of NewObservation
-    unregistered : sequence of NewUnregistered
-        Markers that were read where none is registered.
-    spans : sequence of dict
-        Transmissions of CERPMs that were received.
-    incidents : mapping of str to mapping
-        What the audit log records about the upload: details by action.
-    """
-
-    document: FramesResult | TraceResultDocument | PacketsResult
+    document: FramesResult | TraceResultDocument | PacketsResult  # the result
     observations: Sequence[NewObservation] = ()
-    spans: Sequence[dict[str, Any]] = ()
+    spans: Sequence[dict[str, Any]] = ()  # transmissions of CERPMs that were received
+    # what the audit log records about the upload: details by action
     incidents: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
-    unregistered: Sequence[NewUnregistered] = ()
+    unregistered: Sequence[NewUnregistered] = ()  # markers that were read where none is registered
 
 
 class OutdatedMatch(Exception):
@@ -457,13 +430,11 @@ class NewRecord:
 
     Attributes
     ----------
-    response : DecodeDocument
-        The decode, once it is stored.
     replayed : bool
         Another request with the same Idempotency-Key was faster; nothing was stored.
     """
 
-    response: DecodeDocument
+    response: DecodeDocument  # the decode, once it is stored
 
     def __init__(
         self, caller: Caller, handler: UploadHandler[Any], upload: Upload, clock: Clock,

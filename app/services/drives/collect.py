@@ -30,19 +30,11 @@ _IN_USE = ("active", "surveyed", "built")
 
 @dataclass(frozen=True, slots=True)
 class DecodeClock:
-    """A decode of a drive, and what is declared of its clock.
-
-    Attributes
-    ----------
-    decode_id : str
-    clock : str
-        Its name; decodes with the same name share a clock.
-    offset_s, sigma_s : float
-        What is to be added to its times, and how far that may be off. [s]
-    """
+    """A decode of a drive, and what is declared of its clock."""
 
     decode_id: str
-    clock: str
+    clock: str  # its name; decodes with the same name share a clock
+    # `offset_s`, `sigma_s`: [s] what is to be added to its times, and how far that may be off
     offset_s: float = 0.0
     sigma_s: float = DEFAULT_CLOCK_SIGMA_S
 

@@ -318,25 +318,13 @@ def time_text(seconds: float) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackTask(Task["WrittenTrack"]):
-    """What is known of a drive.
-
-    Attributes
-    ----------
-    name : str
-    given : TrackInput
-    rules : TrackRules
-    left_out : tuple of LeftOutMarker
-        Before the track was estimated.
-    on_lane : tuple of LeftOutMarker
-        CERPMs whose path was used.
-    warnings : tuple of str
-    """
+    """What is known of a drive."""
 
     name: str
     given: TrackInput
     rules: TrackRules
-    left_out: tuple[LeftOutMarker, ...] = ()
-    on_lane: tuple[LeftOutMarker, ...] = ()
+    left_out: tuple[LeftOutMarker, ...] = ()  # before the track was estimated
+    on_lane: tuple[LeftOutMarker, ...] = ()  # CERPMs whose path was used
     warnings: tuple[str, ...] = ()
 
 

@@ -38,24 +38,13 @@ _COLLECTED, _WRITTEN = 0.1, 0.9
 
 @dataclass(frozen=True, slots=True)
 class NewDrive:
-    """A drive to make.
-
-    Attributes
-    ----------
-    decodes : tuple of DecodeClock
-    name : str or None
-    vehicle : str or None
-        Name or id.
-    rules : TrackRules
-    use_unfit : bool
-        Use positions that are not for localization, too.
-    """
+    """A drive to make."""
 
     decodes: tuple[DecodeClock, ...]
     name: str | None
-    vehicle: str | None
+    vehicle: str | None  # name or id
     rules: TrackRules
-    use_unfit: bool
+    use_unfit: bool  # use positions that are not for localization, too
 
 
 class Drives:

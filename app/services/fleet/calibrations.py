@@ -36,24 +36,12 @@ _BUSY_WAIT_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTask(Task[CameraCalibration]):
-    """Photos of a board to calibrate a camera with.
+    """Photos of a board to calibrate a camera with."""
 
-    Attributes
-    ----------
-    photos : tuple of (str, SpooledFile)
-        Names and contents; a ZIP stands for the photos in it.
-    board : CalibrationBoard
-    coefficients : int or None
-        Of the distortion.
-    images : ImageLimits
-        Of each photo.
-    archives : ArchiveLimits
-    """
-
-    photos: tuple[tuple[str, SpooledFile], ...]
+    photos: tuple[tuple[str, SpooledFile], ...]  # names and contents; a ZIP stands for the photos in it
     board: CalibrationBoard
-    coefficients: int | None = None
-    images: ImageLimits = field(default_factory=ImageLimits)
+    coefficients: int | None = None  # of the distortion
+    images: ImageLimits = field(default_factory=ImageLimits)  # of each photo
     archives: ArchiveLimits = field(default_factory=lambda: ArchiveLimits(members=MAX_PHOTOS))
 
 

@@ -60,18 +60,10 @@ Object = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Inherited:
-    """A context after its vehicle's profile was put behind it.
+    """A context after its vehicle's profile was put behind it."""
 
-    Attributes
-    ----------
-    context : dict
-        As `DecodeContext.document` writes it, without what is nobody's.
-    sources : dict of str to str
-        Path of each member to ``upload``, ``vehicle`` or ``default``.
-    """
-
-    context: Object
-    sources: dict[str, str]
+    context: Object  # as `DecodeContext.document` writes it, without what is nobody's
+    sources: dict[str, str]  # path of each member to ``upload``, ``vehicle`` or ``default``
 
 
 def check_profile(profile: Mapping[str, Any]) -> None:
@@ -198,18 +190,10 @@ _CALIBRATED = ("width_px", "height_px", *INTRINSICS, "distortion")
 
 @dataclass(frozen=True, slots=True)
 class VehicleChange:
-    """What to change of a vehicle.
+    """What to change of a vehicle."""
 
-    Attributes
-    ----------
-    values : dict
-        Of name, status and note; what is not in it stays.
-    profile : dict
-        Sections to replace, each as a whole; a section that is None is taken out.
-    reason : str or None
-    """
-
-    values: dict[str, Any] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)  # of name, status and note; what is not in it stays
+    # sections to replace, each as a whole; a section that is None is taken out
     profile: dict[str, Any] = field(default_factory=dict)
     reason: str | None = None
 

@@ -55,20 +55,13 @@ _ON_ROAD = frozenset({"built", "surveyed", "active", "suspect"})
 
 @dataclass(frozen=True, slots=True)
 class VehicleView:
-    """Where the vehicle of a frame was by its own position, and its camera.
+    """Where the vehicle of a frame was by its own position, and its camera."""
 
-    Attributes
-    ----------
-    lon_deg, lat_deg, heading_deg : float
-        [deg]
-    sigma_m : float
-        Of the position, each axis. [m]
-    """
-
+    # `lon_deg`, `lat_deg`, `heading_deg`: [deg]
     lon_deg: float
     lat_deg: float
     heading_deg: float
-    sigma_m: float
+    sigma_m: float  # [m] of the position, each axis
     camera: Camera
 
     def place_m(self, row: MarkerRow) -> tuple[float, float]:

@@ -60,18 +60,10 @@ class EvidenceDocument(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class FrameHealth:
-    """What one frame shows of the health of markers.
+    """What one frame shows of the health of markers."""
 
-    Attributes
-    ----------
-    of_readings : tuple of dict
-        Evidence of each reading; empty where there is none.
-    in_view : mapping of str to dict
-        Evidence of markers that are in view at a readable size, whether they were read or not.
-    unregistered : tuple of NewUnregistered
-    """
-
-    of_readings: tuple[dict[str, Any], ...] = ()
+    of_readings: tuple[dict[str, Any], ...] = ()  # evidence of each reading; empty where there is none
+    # evidence of markers that are in view at a readable size, whether they were read or not
     in_view: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     unregistered: tuple[NewUnregistered, ...] = ()
 
@@ -151,22 +143,11 @@ CAMERA, BAR, RADIO = "camera", "bar", "radio"
 
 @dataclass(frozen=True, slots=True)
 class ObservedDrive:
-    """What one decode observed.
-
-    Attributes
-    ----------
-    decode_id : str
-    sensor : str
-        `CAMERA`, `BAR` or `RADIO`.
-    vehicle : str
-        Id of the vehicle, else of the holder of the key.
-    observations : sequence of NewObservation
-    unregistered : sequence of NewUnregistered
-    """
+    """What one decode observed."""
 
     decode_id: str
-    sensor: str
-    vehicle: str
+    sensor: str  # `CAMERA`, `BAR` or `RADIO`
+    vehicle: str  # id of the vehicle, else of the holder of the key
     observations: Sequence[NewObservation]
     unregistered: Sequence[NewUnregistered] = ()
 

@@ -230,14 +230,7 @@ _BUSY_WAIT_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class PlateDraft:
-    """A plate that is asked about.
-
-    Attributes
-    ----------
-    code : CodeInput
-    geometry : PlateGeometry
-    position : PositionIn or None
-    """
+    """A plate that is asked about."""
 
     code: CodeInput
     geometry: PlateGeometry
@@ -246,20 +239,11 @@ class PlateDraft:
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """A camera that passes a plate.
-
-    Attributes
-    ----------
-    camera : CameraRules
-    speed_kmh : float
-        [km/h]
-    left_m : float
-        Plate's centre left of the camera's path. [m]
-    """
+    """A camera that passes a plate."""
 
     camera: CameraRules
     speed_kmh: float
-    left_m: float
+    left_m: float  # [m] plate's centre left of the camera's path
 
 
 @dataclass(frozen=True, slots=True)

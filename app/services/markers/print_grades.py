@@ -23,25 +23,14 @@ _SIGNATURE_BYTES = 16
 
 @dataclass(frozen=True, slots=True)
 class PrintDeclaration:
-    """What is declared of a photo.
+    """What is declared of a photo."""
 
-    Attributes
-    ----------
-    marker_id : str or None
-        The registered plate that was printed; without it, `code` and `geometry` may say what it should be.
-    code : PlateCode or None
-    geometry : PlateGeometry or None
-    camera : CameraRules
-        Of the vehicles.
-    speed_kmh : float
-        Design speed. [km/h]
-    """
-
+    # the registered plate that was printed; without it, `code` and `geometry` may say what it should be
     marker_id: str | None
     code: PlateCode | None
     geometry: PlateGeometry | None
-    camera: CameraRules
-    speed_kmh: float
+    camera: CameraRules  # of the vehicles
+    speed_kmh: float  # [km/h] design speed
 
 
 class PrintGrades:

@@ -39,22 +39,14 @@ _SPEAKERS = (Scope.PLANNER, Scope.ADMIN)
 
 @dataclass(frozen=True, slots=True)
 class CerpmPayload:
-    """The bytes of one transmission.
-
-    Attributes
-    ----------
-    number, sequence : int
-    payload, key : bytes
-        The message, and the marker's own key, which never goes out with it.
-    note : str or None
-        What is wrong with the marker's position.
-    """
+    """The bytes of one transmission."""
 
     number: int
     sequence: int
+    # `payload`, `key`: the message, and the marker's own key, which never goes out with it
     payload: bytes
     key: bytes
-    note: str | None
+    note: str | None  # what is wrong with the marker's position
 
 
 class ExplainedDocument(TypedDict):

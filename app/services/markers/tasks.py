@@ -25,16 +25,10 @@ Files = list[tuple[str, bytes]]
 
 @dataclass(frozen=True, slots=True)
 class DrawPlateTask(Task[tuple[Files, dict[str, Any]]]):
-    """A plate to draw, to prove and to write: its files, and its entry in the manifest.
-
-    Attributes
-    ----------
-    name : str
-        Of the files, without extension.
-    """
+    """A plate to draw, to prove and to write: its files, and its entry in the manifest."""
 
     order: PlateOrder
-    name: str
+    name: str  # of the files, without extension
     options: BundleOptions
 
 
@@ -51,51 +45,25 @@ class WriteSheetsTask(Task[Files]):
 
 @dataclass(frozen=True, slots=True)
 class GradedPhoto:
-    """The grade of a photo.
-
-    Attributes
-    ----------
-    document : PrintGradeDocument
-    pdf : bytes
-        Empty unless it was asked for.
-    """
+    """The grade of a photo."""
 
     document: PrintGradeDocument
-    pdf: bytes = b""
+    pdf: bytes = b""  # empty unless it was asked for
 
 
 @dataclass(frozen=True, slots=True)
 class PrintGradeTask(Task[GradedPhoto]):
-    """A photo of a printed plate to grade.
-
-    Attributes
-    ----------
-    photo : SpooledFile
-        JPEG or PNG.
-    at : datetime
-        Of the request.
-    code : PlateCode or None
-        What the plate should be; None: what the photo shows.
-    geometry : PlateGeometry or None
-        Of the drawing.
-    marker_id : str or None
-        Where the code and the geometry are from.
-    camera : CameraRules
-    speed_kmh : float
-        Design speed. [km/h]
-    as_pdf : bool
-    limits : ImageLimits
-    """
+    """A photo of a printed plate to grade."""
 
     is_long: ClassVar[bool] = False
 
-    photo: SpooledFile
-    at: datetime
-    code: PlateCode | None
-    geometry: PlateGeometry | None
-    marker_id: str | None
+    photo: SpooledFile  # JPEG or PNG
+    at: datetime  # of the request
+    code: PlateCode | None  # what the plate should be; None: what the photo shows
+    geometry: PlateGeometry | None  # of the drawing
+    marker_id: str | None  # where the code and the geometry are from
     camera: CameraRules
-    speed_kmh: float
+    speed_kmh: float  # [km/h] design speed
     as_pdf: bool = False
     limits: ImageLimits = field(default_factory=ImageLimits)
 
@@ -105,19 +73,7 @@ class PrintGradeTask(Task[GradedPhoto]):
 
 @dataclass(frozen=True, slots=True)
 class CameraViewTask(Task[CameraView]):
-    """A plate to render as a camera sees it, and to decode.
-
-    Attributes
-    ----------
-    code : PlateCode
-    geometry : PlateGeometry
-    camera : CameraRules
-    speed_mps : float
-        [m/s]
-    ahead_m, left_m : float
-        The plate's centre from the camera. [m]
-    condition : Condition
-    """
+    """A plate to render as a camera sees it, and to decode."""
 
     is_long: ClassVar[bool] = False
 
@@ -125,6 +81,7 @@ class CameraViewTask(Task[CameraView]):
     geometry: PlateGeometry
     camera: CameraRules
     speed_mps: float
+    # `ahead_m`, `left_m`: [m] the plate's centre from the camera
     ahead_m: float
     left_m: float
     condition: Condition

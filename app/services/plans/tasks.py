@@ -333,21 +333,11 @@ class ProveUnitTask(Task[UnitResult]):
 
 @dataclass(frozen=True, slots=True)
 class WrittenProof:
-    """A finished proof.
+    """A finished proof."""
 
-    Attributes
-    ----------
-    report : bytes
-        JSON, as `app.planning.proof.report.report_document` makes it, compressed by zlib.
-    table : bytes
-        CSV with the markers that were driven over, compressed by zlib.
-    summary : dict
-        What the plan's document shows, as `ProofFigures`.
-    """
-
-    report: bytes
-    table: bytes
-    summary: dict[str, Any]
+    report: bytes  # JSON, as `app.planning.proof.report.report_document` makes it, compressed by zlib
+    table: bytes  # CSV with the markers that were driven over, compressed by zlib
+    summary: dict[str, Any]  # what the plan's document shows, as `ProofFigures`
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,67 +392,34 @@ MapForm = Literal["osm", "xodr"]
 
 @dataclass(frozen=True, slots=True)
 class WriteMapTask(Task[bytes]):
-    """An HD map to write: a road, and the markers near it.
-
-    Attributes
-    ----------
-    road : RoadFile
-    form : str
-        ``osm`` for lanelet2, ``xodr`` for OpenDRIVE.
-    markers : tuple of MarkerRow
-        Of the registry; those that are farther from the road are left out.
-    within_m : float
-        Greatest distance of a marker from the centre line of a lane. [m]
-    """
+    """An HD map to write: a road, and the markers near it."""
 
     road: RoadFile
-    form: MapForm
-    markers: tuple[MarkerRow, ...]
-    within_m: float
+    form: MapForm  # ``osm`` for lanelet2, ``xodr`` for OpenDRIVE
+    markers: tuple[MarkerRow, ...]  # of the registry; those that are farther from the road are left out
+    within_m: float  # [m] greatest distance of a marker from the centre line of a lane
 
 
 @dataclass(frozen=True, slots=True)
 class MadePlan:
-    """A plan that was placed and checked.
+    """A plan that was placed and checked."""
 
-    Attributes
-    ----------
-    document : bytes
-        As `app.planning.outputs.plan_document.write_plan` writes it, compressed by zlib.
-    summary : dict
-        What lists and the plan's page show.
-    numbers : tuple of (family, code)
-        Codes that no other marker may have.
-    features : Columns
-        The markers for GIS clients.
-    """
-
-    document: bytes
-    summary: dict[str, Any]
-    numbers: tuple[tuple[str, str], ...]
-    features: Columns
+    document: bytes  # as `app.planning.outputs.plan_document.write_plan` writes it, compressed by zlib
+    summary: dict[str, Any]  # what lists and the plan's page show
+    numbers: tuple[tuple[str, str], ...]  # codes that no other marker may have
+    features: Columns  # the markers for GIS clients
 
 
 @dataclass(frozen=True, slots=True)
 class MakePlanTask(Task[MadePlan]):
-    """A plan to place and to check.
-
-    Attributes
-    ----------
-    taken : frozenset of int
-        Registry numbers that other markers have.
-    existing : tuple of ExistingMarker
-        Markers of the registry near the road.
-    codebook : dict or None
-        Document of the agency's codebook.
-    """
+    """A plan to place and to check."""
 
     road: RoadFile
     rules: dict[str, Any]
     name: str
-    taken: frozenset[int] = frozenset()
-    existing: tuple[ExistingMarker, ...] = ()
-    codebook: dict[str, Any] | None = None
+    taken: frozenset[int] = frozenset()  # registry numbers that other markers have
+    existing: tuple[ExistingMarker, ...] = ()  # markers of the registry near the road
+    codebook: dict[str, Any] | None = None  # document of the agency's codebook
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,16 +434,8 @@ class WritePlanFileTask(Task[bytes]):
 
 @dataclass(frozen=True, slots=True)
 class CompareTask(Task[AsBuiltDocument]):
-    """A committed plan to compare with the markers that it became.
-
-    Attributes
-    ----------
-    document : bytes
-    built : tuple of BuiltRow
-    existing : tuple of ExistingMarker
-        Other markers of the registry near the road.
-    """
+    """A committed plan to compare with the markers that it became."""
 
     document: bytes
     built: tuple[BuiltRow, ...]
-    existing: tuple[ExistingMarker, ...]
+    existing: tuple[ExistingMarker, ...]  # other markers of the registry near the road

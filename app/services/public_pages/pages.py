@@ -216,18 +216,11 @@ JPEG_QUALITY = 85
 
 @dataclass(frozen=True, slots=True)
 class ReportPhotoTask(Task[bytes]):
-    """A photo to decode and to write again as a JPEG: upright, smaller, and without metadata.
-
-    Attributes
-    ----------
-    photo : SpooledFile
-        JPEG or PNG.
-    limits : ImageLimits
-    """
+    """A photo to decode and to write again as a JPEG: upright, smaller, and without metadata."""
 
     is_long: ClassVar[bool] = False
 
-    photo: SpooledFile
+    photo: SpooledFile  # JPEG or PNG
     limits: ImageLimits
 
 

@@ -49,23 +49,14 @@ _LOG = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class SentReport:
-    """A damage report as it was sent and checked.
+    """A damage report as it was sent and checked."""
 
-    Attributes
-    ----------
-    form_nonce : str
-        Of the token of the form.
-    photo : SpooledFile or None
-    language : str
-        Of the page.
-    """
-
-    form_nonce: str
+    form_nonce: str  # of the token of the form
     kind: ReportKind
     text: str | None
     photo: SpooledFile | None
     email: str | None
-    language: str
+    language: str  # of the page
 
 
 class DamageReports:

@@ -34,23 +34,14 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class LinesInput:
-    """The axis of a road as it was sent.
+    """The axis of a road as it was sent."""
 
-    Attributes
-    ----------
-    parts : tuple of lines of points
-        Longitude and latitude [deg], or easting and northing in the unit of the CRS.
-    crs, realization, epoch
-        As of a marker's position; WGS 84 without.
-    several : bool
-        It came as a MultiLineString.
-    """
-
-    parts: tuple[tuple[Point, ...], ...]
+    parts: tuple[tuple[Point, ...], ...]  # longitude and latitude [deg], or easting and northing in the unit of the CRS
+    # `crs`, `realization`, `epoch`: as of a marker's position; WGS 84 without
     crs: str | None = None
     realization: str | None = None
     epoch: float | None = None
-    several: bool = False
+    several: bool = False  # it came as a MultiLineString
 
 
 @dataclass(frozen=True, slots=True)

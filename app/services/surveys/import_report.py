@@ -238,23 +238,14 @@ class ImportInput:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What an import has found and stored.
-
-    Attributes
-    ----------
-    request, survey, faults
-    good : ndarray of int
-        Indices of the rows that are stored, or would be.
-    stored : int
-    grid, comparison
-        Their documents.
-    """
+    """What an import has found and stored."""
 
     request: ImportInput
     survey: GeoreferencedSurvey
     faults: Faults
-    good: Rows
+    good: Rows  # indices of the rows that are stored, or would be
     stored: int
+    # `grid`, `comparison`: their documents
     grid: LocalGridDocument | None
     comparison: ComparisonDocument | None
 

@@ -75,34 +75,20 @@ _CURE = "delete open uploads with DELETE /v1/uploads/{id}, or ask the operator f
 
 @dataclass(frozen=True, slots=True)
 class UploadRules:
-    """Limits of one upload.
+    """Limits of one upload."""
 
-    Attributes
-    ----------
-    max_bytes : int
-        Largest file. [byte]
-    expiry : timedelta
-        Time from the last part until an upload that is not complete is deleted.
-    """
-
-    max_bytes: int = 4 * 1024**3
-    expiry: timedelta = timedelta(hours=24)
+    max_bytes: int = 4 * 1024**3  # [byte] largest file
+    expiry: timedelta = timedelta(hours=24)  # time from the last part until an upload that is not complete is deleted
 
 
 @dataclass(frozen=True, slots=True)
 class QuotaRules:
-    """Limits; 0 is none.
+    """Limits; 0 is none."""
 
-    Attributes
-    ----------
-    key_bytes, agency_bytes : int
-        Most bytes of stored uploads, of those in progress too. [byte]
-    key_open, agency_open : int
-        Most uploads in progress.
-    """
-
+    # `key_bytes`, `agency_bytes`: [byte] most bytes of stored uploads, of those in progress too
     key_bytes: int = 0
     agency_bytes: int = 0
+    # `key_open`, `agency_open`: most uploads in progress
     key_open: int = 0
     agency_open: int = 0
 

@@ -58,20 +58,11 @@ _LOG = structlog.get_logger(__name__)
 
 @dataclass(slots=True)
 class Grant:
-    """The right of one request to write an upload.
+    """The right of one request to write an upload."""
 
-    Attributes
-    ----------
-    row : UploadRow
-        As it was when the right was given; `received` is kept up to date.
-    lock_id : str
-    received : int
-        [byte]
-    """
-
-    row: UploadRow
+    row: UploadRow  # as it was when the right was given; `received` is kept up to date
     lock_id: str
-    received: int
+    received: int  # [byte]
 
 
 class Uploads:

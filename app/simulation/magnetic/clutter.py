@@ -20,17 +20,10 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """An object beside or in the road.
+    """An object beside or in the road."""
 
-    Attributes
-    ----------
-    kind : str
-        A key of `KINDS`.
-    chainage_m, left_m : float
-        Its middle. [m]
-    """
-
-    kind: str
+    kind: str  # a key of `KINDS`
+    # `chainage_m`, `left_m`: [m] its middle
     chainage_m: float
     left_m: float
 

@@ -83,22 +83,16 @@ disc. Source: Abramowitz and Stegun 1964, 25.4.61."""
 class Cylinder:
     """Size of a magnet that is magnetised along its axis.
 
-    Attributes
-    ----------
-    diameter_m, length_m : float
-        Above 0, at most 0.5 m. [m]
-    sunk_m : float
-        How much lower its centre lies than that of METRO's magnet, which lies on the road. [m]
-
     Raises
     ------
     InvalidParameter
         A value is outside its limits.
     """
 
+    # `diameter_m`, `length_m`: [m] above 0, at most 0.5 m
     diameter_m: float
     length_m: float
-    sunk_m: float = 0.0
+    sunk_m: float = 0.0  # [m] how much lower its centre lies than that of METRO's magnet, which lies on the road
 
     def __post_init__(self) -> None:
         for name, low in (("diameter_m", 1e-4), ("length_m", 1e-4), ("sunk_m", 0.0)):

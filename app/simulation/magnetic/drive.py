@@ -31,22 +31,11 @@ _STEP_S = 0.005  # [s] of the motion; source: by hand, well below the 9 to 13 Hz
 
 @dataclass(frozen=True, slots=True)
 class Wheel:
-    """A front wheel as dipoles in its belt, which turn with it: many harmonics of its rotation.
+    """A front wheel as dipoles in its belt, which turn with it: many harmonics of its rotation."""
 
-    Attributes
-    ----------
-    axle_m : tuple of float
-        Middle of the wheel in the vehicle frame. [m]
-    radius_m : float
-        Of the belt and of rolling. [m]
-    moment_am2 : float
-        Typical moment of each of the dipoles. [A m2]
-    dipoles : int
-    """
-
-    axle_m: tuple[float, float, float]
-    radius_m: float = 0.31
-    moment_am2: float = 0.15
+    axle_m: tuple[float, float, float]  # [m] middle of the wheel in the vehicle frame
+    radius_m: float = 0.31  # [m] of the belt and of rolling
+    moment_am2: float = 0.15  # [A m2] Typical moment of each of the dipoles
     dipoles: int = 5
 
     def table_ut(self, points_m: Floats, rng: np.random.Generator, size: int = 1024) -> Floats:
@@ -68,25 +57,13 @@ class Wheel:
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A car with a bar under its front bumper.
-
-    Attributes
-    ----------
-    bar : MagnetometerBar
-    clearance_m : float
-        Of the array above the road at rest. [m]
-    wheels : tuple of Wheel
-    roughness : float
-        1 an ordinary road, 3 a rough one: scales pitch, roll and bounce.
-    pitch_centre_m : float
-        Distance from the bar back to the axis of pitch. [m]
-    """
+    """A car with a bar under its front bumper."""
 
     bar: MagnetometerBar
-    clearance_m: float = 0.16
+    clearance_m: float = 0.16  # [m] of the array above the road at rest
     wheels: tuple[Wheel, ...] = ()
-    roughness: float = 1.0
-    pitch_centre_m: float = 1.9
+    roughness: float = 1.0  # 1 an ordinary road, 3 a rough one: scales pitch, roll and bounce
+    pitch_centre_m: float = 1.9  # [m] distance from the bar back to the axis of pitch
 
     @classmethod
     def compact(
@@ -106,29 +83,15 @@ class Vehicle:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """How it is driven.
+    """How it is driven."""
 
-    Attributes
-    ----------
-    speed_m_s : float
-        Cruising speed. [m/s]
-    speeds : sequence of (chainage_m, speed_m_s)
-        Speeds to reach at chainages, linear in between; overrides the cruising speed. [m, m/s]
-    hunting : float
-        Standard deviation of slow changes of speed, share of it.
-    left_m : float
-        Offset from the lane's centre. [m]
-    lefts : sequence of (chainage_m, left_m)
-        Offsets at chainages, smooth in between; added to the offset. [m]
-    weave_m, weave_period_s : float
-        Amplitude and period of weaving. [m, s]
-    """
-
-    speed_m_s: float = 30 * MPH
+    speed_m_s: float = 30 * MPH  # [m/s] Cruising speed
+    # speeds to reach at chainages, linear in between; overrides the cruising speed. [m, m/s]
     speeds: Sequence[tuple[float, float]] = ()
-    hunting: float = 0.01
-    left_m: float = 0.0
-    lefts: Sequence[tuple[float, float]] = ()
+    hunting: float = 0.01  # standard deviation of slow changes of speed, share of it
+    left_m: float = 0.0  # [m] offset from the lane's centre
+    lefts: Sequence[tuple[float, float]] = ()  # [m] offsets at chainages, smooth in between; added to the offset
+    # `weave_m`, `weave_period_s`: Amplitude and period of weaving. [m, s]
     weave_m: float = 0.05
     weave_period_s: float = 9.0
 
@@ -229,61 +192,36 @@ _BLOCK = 8192  # samples that are rendered at a time; bounds the memory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Everything about a drive but its noise.
-
-    Attributes
-    ----------
-    road : Road
-    tags : sequence of PlacedTag
-        Information tags.
-    lines : sequence of RoadMagnet
-        Magnets of lines.
-    clutter : sequence of Clutter
-    wrong_way : bool
-        Driven against the direction of legal travel: chainages then count along the drive, and tags are met backwards.
-    magnet_shape : Cylinder or None
-        Size of the magnets; None for point dipoles.
-    spheroid_iron : bool
-        Clutter of spheroids that the earth's field magnetises (`spheroids`) in place of dipoles.
-    """
+    """Everything about a drive but its noise."""
 
     road: Road
     vehicle: Vehicle
     course: Course = field(default_factory=Course)
-    tags: Sequence[PlacedTag] = ()
-    lines: Sequence[RoadMagnet] = ()
+    tags: Sequence[PlacedTag] = ()  # information tags
+    lines: Sequence[RoadMagnet] = ()  # magnets of lines
     clutter: Sequence[Clutter] = ()
     spread: Spread = field(default_factory=Spread)
     chip: Chip = field(default_factory=Chip)
     can: CanBus = field(default_factory=CanBus)
+    # driven against the direction of legal travel: chainages then count along the drive, and tags are met backwards
     wrong_way: bool = False
     earth_ut: tuple[float, float, float] = EARTH_UT
     moment_am2: float = MOMENT_AM2
-    magnet_shape: Cylinder | None = None
+    magnet_shape: Cylinder | None = None  # size of the magnets; None for point dipoles
+    # clutter of spheroids that the earth's field magnetises (`spheroids`) in place of dipoles
     spheroid_iron: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class TrueMagnet:
-    """A magnet when the bar is over it.
+    """A magnet when the bar is over it."""
 
-    Attributes
-    ----------
-    t_s : float
-        Time at which it is level with the bar. [s]
-    lateral_cm : float
-        On the bar, left positive. [cm]
-    polarity : Polarity
-        As the driver meets it: flipped for phi = 0 on the wrong way.
-    speed_m_s, clearance_m : float
-        At that time. [m/s, m]
-    """
-
-    t_s: float
-    lateral_cm: float
-    polarity: Polarity
+    t_s: float  # [s] time at which it is level with the bar
+    lateral_cm: float  # [cm] on the bar, left positive
+    polarity: Polarity  # as the driver meets it: flipped for phi = 0 on the wrong way
     orientation: Orientation
     tag: int
+    # `speed_m_s`, `clearance_m`: at that time. [m/s, m]
     speed_m_s: float
     clearance_m: float
 

@@ -23,50 +23,33 @@ Floats = npt.NDArray[np.float64]
 class Chip:
     """A magnetometer and the loop that reads it (formats of the METRO array: OSR 0, DIG_FILT 2, GAIN_SEL 7, RES 0).
 
-    Attributes
-    ----------
-    rate_hz : float
-        Samples a second. [Hz]
-    noise_ut, count_ut : tuple of float
-        Standard deviation of a sample and size of a count, for x, y, z. [uT]
-    offset_ut, gain, misalignment_deg, soft_iron : float
-        Spread of the offset, of the gain, of each axis's direction, and of what the car's iron adds to the earth's
-        field, share of it. [uT, 1, deg, 1]
-    axis_delay_s : tuple of float
-        Axes are converted one after the other. [s]
-    jitter : float
-        Spread of the interval, share of it; one in a thousand is three times as long.
-    stale, spikes : float
-        Odds that a sensor repeats its last sample, or sends one that is far off.
-    range_ut : float
-        Largest field that an axis shows, its offset included: stronger ones saturate. [uT]
-    cross_axis, gain_error : float
-        Spread of the entries beside and on the diagonal of a 3x3 matrix about the identity, which mixes the axes of
-        each sensor after `gain` and `misalignment_deg`.
-    stamp_jitter_s : float
-        Spread of the true times of samples about the recorded ones. [s]
-
     Notes
     -----
     The last four are off by default. They draw from a generator of their own, spawned from the drive's, so that all
     else in a drive stays the same with and without them.
     """
 
-    rate_hz: float = 350.0
+    rate_hz: float = 350.0  # [Hz] samples a second
+    # `noise_ut`, `count_ut`: [uT] standard deviation of a sample and size of a count, for x, y, z
     noise_ut: tuple[float, float, float] = (1.5, 1.5, 1.9)
     count_ut: tuple[float, float, float] = (0.150, 0.150, 0.242)
+    # `offset_ut`, `gain`, `misalignment_deg`, `soft_iron`: spread of the offset, of the gain, of each axis's direction,
+    # and of what the car's iron adds to the earth's field, share of it. [uT, 1, deg, 1]
     offset_ut: float = 200.0
     gain: float = 0.02
     misalignment_deg: float = 1.5
     soft_iron: float = 0.05
-    axis_delay_s: tuple[float, float, float] = (0.0, 0.00045, 0.0009)
-    jitter: float = 0.03
+    axis_delay_s: tuple[float, float, float] = (0.0, 0.00045, 0.0009)  # [s] axes are converted one after the other
+    jitter: float = 0.03  # spread of the interval, share of it; one in a thousand is three times as long
+    # `stale`, `spikes`: odds that a sensor repeats its last sample, or sends one that is far off
     stale: float = 1e-3
     spikes: float = 2e-4
-    range_ut: float = math.inf
+    range_ut: float = math.inf  # [uT] largest field that an axis shows, its offset included: stronger ones saturate
+    # `cross_axis`, `gain_error`: spread of the entries beside and on the diagonal of a 3x3 matrix about the identity,
+    # which mixes the axes of each sensor after `gain` and `misalignment_deg`
     cross_axis: float = 0.0
     gain_error: float = 0.0
-    stamp_jitter_s: float = 0.0
+    stamp_jitter_s: float = 0.0  # [s] spread of the true times of samples about the recorded ones
 
     def sample_times_s(self, end_s: float, rng: np.random.Generator) -> Floats:
         """Times of the samples from 0 to the end."""
@@ -118,25 +101,16 @@ class Chip:
 
 @dataclass(frozen=True, slots=True)
 class CanBus:
-    """Speed and heading as a vehicle sends them.
+    """Speed and heading as a vehicle sends them."""
 
-    Attributes
-    ----------
-    speed_hz, heading_hz : float
-        Rates. [Hz]
-    speed_latency_s, heading_latency_s : float
-        Age of a value when it is stamped. [s]
-    speed_scale : float
-        Share by which it shows too much.
-    speed_count_m_s, heading_count_deg : float
-        Smallest steps. [m/s, deg]
-    """
-
+    # `speed_hz`, `heading_hz`: [Hz] rates
     speed_hz: float = 10.0
     heading_hz: float = 100.0
+    # `speed_latency_s`, `heading_latency_s`: [s] age of a value when it is stamped
     speed_latency_s: float = 0.05
     heading_latency_s: float = 0.02
-    speed_scale: float = 0.01
+    speed_scale: float = 0.01  # share by which it shows too much
+    # `speed_count_m_s`, `heading_count_deg`: smallest steps. [m/s, deg]
     speed_count_m_s: float = 0.01 / 3.6
     heading_count_deg: float = 0.1
 

@@ -57,21 +57,14 @@ class Road:
 
 @dataclass(frozen=True, slots=True)
 class RoadMagnet:
-    """A magnet as designed: where, and which way its north pole points in the direction of legal travel.
+    """A magnet as designed: where, and which way its north pole points in the direction of legal travel."""
 
-    Attributes
-    ----------
-    chainage_m, left_m : float
-        Along the lane and left of its centre. [m]
-    tag : int
-        Number of the information tag that it belongs to, -1 for a line's magnet.
-    """
-
+    # `chainage_m`, `left_m`: [m] along the lane and left of its centre
     chainage_m: float
     left_m: float
     polarity: Polarity
     orientation: Orientation
-    tag: int = -1
+    tag: int = -1  # number of the information tag that it belongs to, -1 for a line's magnet
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,20 +78,11 @@ class PlacedTag:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Standard deviations between a magnet as designed and as it lies.
+    """Standard deviations between a magnet as designed and as it lies."""
 
-    Attributes
-    ----------
-    moment : float
-        Share of the moment.
-    tilt_deg : float
-        About each of two axes. [deg]
-    placement_m, depth_m : float
-        Along and across; up and down. [m]
-    """
-
-    moment: float = 0.03
-    tilt_deg: float = 3.0
+    moment: float = 0.03  # share of the moment
+    tilt_deg: float = 3.0  # [deg] about each of two axes
+    # `placement_m`, `depth_m`: [m] along and across; up and down
     placement_m: float = 0.002
     depth_m: float = 0.003
 

@@ -29,27 +29,16 @@ _SPHERE_ASPECT = 1.001
 
 @dataclass(frozen=True, slots=True)
 class Spheroid:
-    """A body of iron with one long axis, in lane coordinates (along, left, up).
-
-    Attributes
-    ----------
-    centre_m : tuple of float
-        [m]
-    axis : tuple of float
-        Unit vector along its long axis.
-    half_length_m, half_width_m : float
-        Semi-axes; the first is not the shorter one. [m]
-    permanent_am : tuple of float
-        Permanent magnetisation as seen from outside, along, left and up. [A/m]
-    susceptibility : float
-        Of the iron; for a hull or a frame, the iron's times the share of the volume that it fills.
-    """
+    """A body of iron with one long axis, in lane coordinates (along, left, up)."""
 
     centre_m: tuple[float, float, float]
-    axis: tuple[float, float, float]
+    axis: tuple[float, float, float]  # unit vector along its long axis
+    # `half_length_m`, `half_width_m`: [m] Semi-axes; the first is not the shorter one
     half_length_m: float
     half_width_m: float
+    # [A/m] Permanent magnetisation as seen from outside, along, left and up
     permanent_am: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # of the iron; for a hull or a frame, the iron's times the share of the volume that it fills
     susceptibility: float = STEEL_SUSCEPTIBILITY
 
     @property

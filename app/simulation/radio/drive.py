@@ -39,27 +39,18 @@ _SPEED_SD, _SPEED_LENGTH_M = 0.05, 60.0  # share and length [m] of uneven speed;
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """Habits of a driver.
+    """Habits of a driver."""
 
-    Attributes
-    ----------
-    speed_m_s : float
-        On straights; in bends limited by 2.5 m/s2 of lateral acceleration. [m/s]
-    wander_sd_m, wander_time_s : float
-        Slow wander about the driver's usual offset in the lane. [m, s]
-    habit_sd_m : float
-        Of that offset, from drive to drive: with the wander, 0.18 m RMS. [m]
-    cut_m2 : float
-        Offset towards the inside of bends per curvature, mean of drives; its standard deviation is as large. [m2]
-    lead_m : float
-        Driven straight on before the lane begins and after it ends. [m]
-    """
-
+    # [m/s] on straights; in bends limited by 2.5 m/s2 of lateral acceleration
     speed_m_s: float = 25 * MPH  # [m/s] source: the posted limit of the benchmark's lanes
+    # `wander_sd_m`, `wander_time_s`: slow wander about the driver's usual offset in the lane. [m, s]
     wander_sd_m: float = 0.15  # [m] source: assumed, no measurement kept
     wander_time_s: float = 2.5  # [s] source: assumed, no measurement kept
+    # [m] of that offset, from drive to drive: with the wander, 0.18 m RMS
     habit_sd_m: float = 0.09  # [m] source: assumed, no measurement kept
+    # [m2] offset towards the inside of bends per curvature, mean of drives; its standard deviation is as large
     cut_m2: float = 1.0  # [m2] source: assumed, no measurement kept
+    # [m] driven straight on before the lane begins and after it ends
     lead_m: float = 40.0  # [m] source: assumed, no measurement kept
 
 
@@ -67,24 +58,18 @@ class Driver:
 class Multipath:
     """Errors by reflected signals: coloured noise, and steps when a reflection appears and when it goes.
 
-    Attributes
-    ----------
-    sd_m, time_s : float
-        Coloured noise of each axis: standard deviation and time constant. [m, s]
-    step_sd_m : float
-        Of a step, each axis. [m]
-    steps_per_min, step_time_s : float
-        Reflections that appear in a minute, and how long one lasts on average. [1/min, s]
-
     Raises
     ------
     InvalidParameter
         A value is negative, or a time is below 0.1 s.
     """
 
+    # `sd_m`, `time_s`: coloured noise of each axis: standard deviation and time constant. [m, s]
     sd_m: float = 0.05  # [m] source: Groves, Principles of GNSS, 2nd ed. 2013, 9.3: a quarter of a wavelength at most
     time_s: float = 3.0  # [s] source: assumed; multipath of a moving receiver changes within seconds
+    # [m] of a step, each axis
     step_sd_m: float = 0.3  # [m] source: assumed, a few decimetres
+    # `steps_per_min`, `step_time_s`: reflections that appear in a minute, and how long one lasts on average. [1/min, s]
     steps_per_min: float = 3.0  # [1/min] source: assumed
     step_time_s: float = 6.0  # [s] source: assumed, 70 m of driving beside a reflecting wall or vehicle
 
@@ -98,34 +83,17 @@ class Multipath:
 
 @dataclass(frozen=True, slots=True)
 class SatelliteReceiver:
-    """A satellite receiver: errors of each axis.
+    """A satellite receiver: errors of each axis."""
 
-    Attributes
-    ----------
-    white_sd_m : float
-        From fix to fix. [m]
-    slow_sd_m, slow_time_s : float
-        Slow errors, as of multipath and troposphere: size and time constant. [m, s]
-    heading_sd_deg : float
-        Of a heading; half of it is as slow. [deg]
-    reported_accuracy_m : float
-        As reported by the receiver; NaN if it reports none. [m]
-    rate_hz : float
-        Rate of fixes. [Hz]
-    lost : float
-        Share of fixes that are missing.
-    multipath : Multipath or None
-        Further errors, which the reported accuracy does not know.
-    """
-
-    white_sd_m: float
+    white_sd_m: float  # [m] from fix to fix
+    # `slow_sd_m`, `slow_time_s`: slow errors, as of multipath and troposphere: size and time constant. [m, s]
     slow_sd_m: float
     slow_time_s: float
-    heading_sd_deg: float
-    reported_accuracy_m: float
-    rate_hz: float = 10.0
-    lost: float = 0.01
-    multipath: Multipath | None = None
+    heading_sd_deg: float  # [deg] of a heading; half of it is as slow
+    reported_accuracy_m: float  # [m] as reported by the receiver; NaN if it reports none
+    rate_hz: float = 10.0  # [Hz] rate of fixes
+    lost: float = 0.01  # share of fixes that are missing
+    multipath: Multipath | None = None  # further errors, which the reported accuracy does not know
 
     @classmethod
     def rtk(cls, rate_hz: float = 20.0) -> SatelliteReceiver:
@@ -140,28 +108,16 @@ class SatelliteReceiver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """A vehicle on a lane, every 50 ms.
+    """A vehicle on a lane, every 50 ms."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (T,)
-        Since 1970-01-01 UTC. [s]
-    chainage_m, left_m : ndarray, shape (T,)
-        Of the vehicle along the lane, below 0 before it begins, and left of its centre. [m]
-    point_m : ndarray, shape (T, 2)
-        East and north. [m]
-    yaw_rad : ndarray, shape (T,)
-        Anticlockwise from east. [rad]
-    speed_m_s : ndarray, shape (T,)
-        [m/s]
-    """
-
-    time_s: Floats
+    time_s: Floats  # shape (T,): [s] since 1970-01-01 UTC
+    # `chainage_m`, `left_m`: shape (T,): [m] of the vehicle along the lane, below 0 before it begins, and left of its
+    # centre
     chainage_m: Floats
     left_m: Floats
-    point_m: Floats
-    yaw_rad: Floats
-    speed_m_s: Floats
+    point_m: Floats  # shape (T, 2): [m] east and north
+    yaw_rad: Floats  # shape (T,): [rad] anticlockwise from east
+    speed_m_s: Floats  # shape (T,) [m/s]
 
 
 def drive_lane(lane: TrueLane, driver: Driver, rng: np.random.Generator, *, start_s: float = 1.78e9) -> Drive:
@@ -324,33 +280,19 @@ _SNR_SD_DB = 0.5  # [dB] of a reported SNR; source: assumed, no measurement kept
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedDrive:
-    """A packet log and the vehicle's track, with the truth about both.
+    """A packet log and the vehicle's track, with the truth about both."""
 
-    Attributes
-    ----------
-    packets : tuple of ReceivedPacket
-        In the order received.
-    track : PoseTrack
-        On the same clock.
-    drive : Drive
-        True positions of the vehicle.
-    sent : Transmissions
-        All of them.
-    distance_m, strength_dbm : ndarray, shape (K,)
-        Distance of each transmission from the vehicle, and strength at its receiver. [m, dBm]
-    sender : ndarray of int, shape (len(packets),)
-        Index of the installed marker that sent each packet.
-    transmission : ndarray of int, shape (len(packets),)
-        Index of each packet in `sent`.
-    """
-
-    packets: tuple[ReceivedPacket, ...]
-    track: PoseTrack
-    drive: Drive
-    sent: Transmissions
+    packets: tuple[ReceivedPacket, ...]  # in the order received
+    track: PoseTrack  # on the same clock
+    drive: Drive  # True positions of the vehicle
+    sent: Transmissions  # all of them
+    # `distance_m`, `strength_dbm`: shape (K,): distance of each transmission from the vehicle, and strength at its
+    # receiver. [m, dBm]
     distance_m: Floats
     strength_dbm: Floats
+    # shape (len(packets),): index of the installed marker that sent each packet
     sender: Ints = field(default_factory=lambda: np.zeros(0, int))
+    # shape (len(packets),): index of each packet in `sent`
     transmission: Ints = field(default_factory=lambda: np.zeros(0, int))
 
 

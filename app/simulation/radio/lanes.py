@@ -28,25 +28,16 @@ _MAX_TURN_RAD = 2.2  # [rad] of the direction against the first one, so that lan
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueLane:
-    """The truth about a lane.
+    """The truth about a lane."""
 
-    Attributes
-    ----------
-    origin : tuple of float
-        lon_deg, lat_deg, height_m of the local frame.
-    chainage_m : ndarray, shape (N,)
-        Along the centre line, even steps. [m]
-    centre_m, left_m, right_m : ndarray, shape (N, 2)
-        East and north; the centre is halfway between the boundaries. [m]
-    yaw_rad, curvature_1pm : ndarray, shape (N,)
-        Anticlockwise from east, unwrapped; positive to the left. On lanes from polylines, over a Gaussian of 2.2 m.
-    """
-
-    origin: Origin
-    chainage_m: Floats
+    origin: Origin  # lon_deg, lat_deg, height_m of the local frame
+    chainage_m: Floats  # shape (N,): [m] along the centre line, even steps
+    # `centre_m`, `left_m`, `right_m`: shape (N, 2): [m] east and north; the centre is halfway between the boundaries
     centre_m: Floats
     left_m: Floats
     right_m: Floats
+    # `yaw_rad`, `curvature_1pm`: shape (N,): anticlockwise from east, unwrapped; positive to the left. On lanes from
+    # polylines, over a Gaussian of 2.2 m.
     yaw_rad: Floats
     curvature_1pm: Floats
 
@@ -228,56 +219,36 @@ MICHIGAN: Origin = (-83.7, 42.3, 250.0)
 
 @dataclass(frozen=True, slots=True)
 class RoadShape:
-    """A lane of two bends, whose boundaries part where lanes open, merge or shift. Angles are of the centre line.
+    """A lane of two bends, whose boundaries part where lanes open, merge or shift. Angles are of the centre line."""
 
-    Attributes
-    ----------
-    length_m : float
-        Of the centre line before boundaries part. [m]
-    radius_m, turn_deg, clothoid_m : float
-        Of the first bend: at its tightest, its direction after it against before, and of each of its clothoids.
-        Above 180 degrees a hairpin. [m, deg, m]
-    second_radius_m, second_turn_deg : float
-        Of a bend to the other side after it. [m, deg]
-    straight_m : float
-        Before the first bend and between the two. [m]
-    turns_left : bool
-        The first bend.
-    width_m : float
-        On straights. [m]
-    widening_m2 : float
-        Extra width in bends is this over the radius. [m2]
-    extra_m, extra_start, extra_length_m, taper_m : float
-        Extra width on one side: how much, where its taper begins as a share of the length, how long it keeps its
-        width, and the length of a taper. [m, 1, m, m]
-    extra_on_left, extra_stays : bool
-        Its side, and whether it goes on to the end: without it, it ends in a taper too.
-    shift_m, shift_length_m, shift_start : float
-        Both boundaries shift to the left by so much, over a length, from a share of the lane's length on. [m, m, 1]
-    heading_deg : float
-        Of the first straight. [deg]
-    """
-
-    length_m: float = 400.0
+    length_m: float = 400.0  # [m] of the centre line before boundaries part
+    # `radius_m`, `turn_deg`, `clothoid_m`: of the first bend: at its tightest, its direction after it against before,
+    # and of each of its clothoids. Above 180 degrees a hairpin. [m, deg, m]
     radius_m: float = 200.0
     turn_deg: float = 40.0
     clothoid_m: float = 30.0
+    # `second_radius_m`, `second_turn_deg`: of a bend to the other side after it. [m, deg]
     second_radius_m: float = 300.0
     second_turn_deg: float = 30.0
-    straight_m: float = 60.0
-    turns_left: bool = True
-    width_m: float = 3.3
-    widening_m2: float = 0.0
+    straight_m: float = 60.0  # [m] before the first bend and between the two
+    turns_left: bool = True  # the first bend
+    width_m: float = 3.3  # [m] on straights
+    widening_m2: float = 0.0  # [m2] extra width in bends is this over the radius
+    # `extra_m`, `extra_start`, `extra_length_m`, `taper_m`: extra width on one side: how much, where its taper begins
+    # as a share of the length, how long it keeps its width, and the length of a taper. [m, 1, m, m]
     extra_m: float = 0.0
     extra_start: float = 0.5
     extra_length_m: float = 60.0
     taper_m: float = 40.0
+    # `extra_on_left`, `extra_stays`: its side, and whether it goes on to the end: without it, it ends in a taper too
     extra_on_left: bool = False
     extra_stays: bool = False
+    # `shift_m`, `shift_length_m`, `shift_start`: both boundaries shift to the left by so much, over a length, from a
+    # share of the lane's length on. [m, m, 1]
     shift_m: float = 0.0
     shift_length_m: float = 40.0
     shift_start: float = 0.3
-    heading_deg: float = 30.0
+    heading_deg: float = 30.0  # [deg] of the first straight
 
     def __post_init__(self) -> None:
         for one in fields(self):
@@ -358,32 +329,16 @@ _PLACING_SD_M = 0.01  # [m] of placing a marker, each axis; source: assumed, no 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstalledMarkers:
-    """Markers of a lane, by chainage.
+    """Markers of a lane, by chainage."""
 
-    Attributes
-    ----------
-    number : ndarray of int, shape (N,)
-        Within the agency.
-    side : ndarray of int, shape (N,)
-        True `LaneSide`, whatever the marker sends.
-    chainage_m : ndarray, shape (N,)
-        Along the lane's centre line. [m]
-    point_m : ndarray, shape (N, 2)
-        True position: east and north. [m]
-    lon_deg, lat_deg : ndarray, shape (N,)
-        Surveyed position, in steps of 1e-7 degrees. [deg]
-    broadcast_side : ndarray of int, shape (N,)
-        `LaneSide` that it is programmed with.
-    speed_limit : SpeedLimit or None
-    """
-
-    number: Ints
-    side: Ints
-    chainage_m: Floats
-    point_m: Floats
+    number: Ints  # shape (N,): within the agency
+    side: Ints  # shape (N,): True `LaneSide`, whatever the marker sends
+    chainage_m: Floats  # shape (N,): [m] along the lane's centre line
+    point_m: Floats  # shape (N, 2): [m] True position: east and north
+    # `lon_deg`, `lat_deg`: shape (N,): [deg] surveyed position, in steps of 1e-7 degrees
     lon_deg: Floats
     lat_deg: Floats
-    broadcast_side: Ints
+    broadcast_side: Ints  # shape (N,): `LaneSide` that it is programmed with
     speed_limit: SpeedLimit | None = None
 
     def __len__(self) -> int:

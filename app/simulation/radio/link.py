@@ -36,19 +36,6 @@ _VACUUM_F_M = 8.8541878128e-12  # [F/m] permittivity of vacuum; source: CODATA 2
 class TwoRay:
     """Direct and reflected ray between a marker and an antenna, both vertically polarised.
 
-    Attributes
-    ----------
-    antenna_m, marker_m : float
-        Heights above the road, 0.01 to 30. [m]
-    frequency_hz : float
-        100 MHz to 10 GHz. [Hz]
-    permittivity : float
-        Relative permittivity of the road, 1 to 100.
-    conductivity_s_m : float
-        Of the road, 0 to 10. [S/m]
-    near_dbm : float
-        Level at 50 m along the road: the CERPM paper's by default. [dBm]
-
     Raises
     ------
     InvalidParameter
@@ -61,12 +48,13 @@ class TwoRay:
     of distance. The surface wave, which fills up the field below a tenth of a metre, is left out.
     """
 
+    # `antenna_m`, `marker_m`: [m] heights above the road, 0.01 to 30
     antenna_m: float = ANTENNA_M
     marker_m: float = _MARKER_M
-    frequency_hz: float = _FREQUENCY_HZ
-    permittivity: float = _PERMITTIVITY
-    conductivity_s_m: float = _CONDUCTIVITY_S_M
-    near_dbm: float = NEAR_DBM
+    frequency_hz: float = _FREQUENCY_HZ  # [Hz] 100 MHz to 10 GHz
+    permittivity: float = _PERMITTIVITY  # relative permittivity of the road, 1 to 100
+    conductivity_s_m: float = _CONDUCTIVITY_S_M  # [S/m] of the road, 0 to 10
+    near_dbm: float = NEAR_DBM  # [dBm] level at 50 m along the road: the CERPM paper's by default
 
     def __post_init__(self) -> None:
         check_between("two_ray.antenna_m", self.antenna_m, 0.01, 30.0, "m")
@@ -117,17 +105,13 @@ around the vehicle."""
 class AntennaPattern:
     """Gain of a vehicle's antenna by azimuth: 0 dB but for Gaussian notches.
 
-    Attributes
-    ----------
-    notches : tuple of Notch
-        Each with a depth of 0 to 60 dB and a width (standard deviation) of 1 to 180 degrees.
-
     Raises
     ------
     InvalidParameter
         A depth or a width is outside its limits.
     """
 
+    # each with a depth of 0 to 60 dB and a width (standard deviation) of 1 to 180 degrees
     notches: tuple[Notch, ...] = _NOTCHES
 
     def __post_init__(self) -> None:
@@ -162,47 +146,28 @@ _PREAMBLE_TAIL_SYMBOLS = 4.25  # source: SX1276 data sheet, 4.1.1.7
 
 @dataclass(frozen=True, slots=True)
 class Radio:
-    """Transmission, propagation and reception of markers' packets.
+    """Transmission, propagation and reception of markers' packets."""
 
-    Attributes
-    ----------
-    spreading_factor : int
-        7 to 12.
-    bandwidth_hz : int
-        125, 250 or 500 kHz. [Hz]
-    interval_s, jitter : float
-        Between transmissions of a marker, and the maximum share of it by which each is early or late, below half. [s]
-    payload_bytes : int
-        [bytes]
-    preamble_symbols : int
-        Programmed length.
-    lock_symbols : float
-        Of the preamble's end that the receiver needs undisturbed to lock (Bor et al. 2016: five).
-    capture_db : float
-        By how much a packet must be above the sum of all others to be read; infinite: never read. [dB]
-    shadow_sd_db, shadow_length_m : float
-        Of shadowing, and its correlation length along the vehicle's way (Gudmundson 1991). [dB, m]
-    fading_sd_db : float
-        Of fading from packet to packet. [dB]
-    two_ray : TwoRay or None
-        Mean strength by two rays; None for log-distance.
-    antenna_pattern : AntennaPattern or None
-        Of the vehicle's antenna; None if it is alike in all directions.
-    """
-
-    spreading_factor: int = 7
-    bandwidth_hz: int = 500_000
+    spreading_factor: int = 7  # 7 to 12
+    bandwidth_hz: int = 500_000  # [Hz] 125, 250 or 500 kHz
+    # `interval_s`, `jitter`: [s] between transmissions of a marker, and the maximum share of it by which each is early
+    # or late, below half
     interval_s: float = 2.0  # [s] source: by hand, no measurement kept
     jitter: float = 0.1  # source: by hand, no measurement kept
-    payload_bytes: int = MESSAGE_BYTES
-    preamble_symbols: int = 8
+    payload_bytes: int = MESSAGE_BYTES  # [bytes]
+    preamble_symbols: int = 8  # programmed length
+    # of the preamble's end that the receiver needs undisturbed to lock (Bor et al. 2016: five).
     lock_symbols: float = 5.0  # source: Bor et al. 2016, section 4
+    # [dB] by how much a packet must be above the sum of all others to be read; infinite: never read
     capture_db: float = 6.0  # [dB] source: Bor et al. 2016, section 4
+    # `shadow_sd_db`, `shadow_length_m`: of shadowing, and its correlation length along the vehicle's way (Gudmundson
+    # 1991). [dB, m]
     shadow_sd_db: float = 4.0  # [dB] source: assumed, no measurement kept
     shadow_length_m: float = 25.0  # [m] source: assumed, no measurement kept
+    # [dB] of fading from packet to packet
     fading_sd_db: float = 2.0  # [dB] source: assumed, no measurement kept
-    two_ray: TwoRay | None = None
-    antenna_pattern: AntennaPattern | None = None
+    two_ray: TwoRay | None = None  # mean strength by two rays; None for log-distance
+    antenna_pattern: AntennaPattern | None = None  # of the vehicle's antenna; None if it is alike in all directions
 
     def __post_init__(self) -> None:
         check_modulation(self.spreading_factor, self.bandwidth_hz)
@@ -243,21 +208,11 @@ class Radio:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transmissions:
-    """Transmissions of markers, by time.
+    """Transmissions of markers, by time."""
 
-    Attributes
-    ----------
-    sender : ndarray of int, shape (K,)
-        Index of the marker.
-    sequence : ndarray of int, shape (K,)
-        Of its message.
-    start_s : ndarray, shape (K,)
-        [s]
-    """
-
-    sender: Ints
-    sequence: Ints
-    start_s: Floats
+    sender: Ints  # shape (K,): index of the marker
+    sequence: Ints  # shape (K,): of its message
+    start_s: Floats  # shape (K,) [s]
 
 
 def mean_rssi_dbm(distance_m: npt.ArrayLike) -> Floats:

@@ -32,16 +32,10 @@ _STYLES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cubics:
-    """A value along the road: cubics in the distance from the start of each, ``a b c d``; zero without any.
+    """A value along the road: cubics in the distance from the start of each, ``a b c d``; zero without any."""
 
-    Attributes
-    ----------
-    starts : ndarray, shape (n,)
-    abcd : ndarray, shape (n, 4)
-    """
-
-    starts: Floats
-    abcd: Floats
+    starts: Floats  # shape (n,)
+    abcd: Floats  # shape (n, 4)
 
     def at(self, s: Floats, lookup: Floats) -> tuple[Floats, Floats, Floats]:
         """Value and first two derivatives at s, by the cubics that apply at `lookup`, the first one before it."""
@@ -55,27 +49,14 @@ class Cubics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaneRecord:
-    """One lane of a section.
+    """One lane of a section."""
 
-    Attributes
-    ----------
-    id : int
-        Negative right of the reference line.
-    drivable : bool
-    width : Cubics
-        In s of the road. [m]
-    marks : list of (s, (inner, outer))
-        Paint of the outer border from s on: style of the line nearer to the reference line, and of the other one.
-    speeds : list of (s, speed)
-        Limit from s on, NaN: none. [m/s]
-    predecessor, successor : int or None
-    """
-
-    id: int
+    id: int  # negative right of the reference line
     drivable: bool
-    width: Cubics
+    width: Cubics  # [m] in s of the road
+    # paint of the outer border from s on: style of the line nearer to the reference line, and of the other one
     marks: list[tuple[float, tuple[BoundaryStyle, BoundaryStyle]]]
-    speeds: list[tuple[float, float]]
+    speeds: list[tuple[float, float]]  # [m/s] limit from s on, NaN: none
     predecessor: int | None
     successor: int | None
 
@@ -91,40 +72,23 @@ class Section:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Road:
-    """One road.
+    """One road."""
 
-    Attributes
-    ----------
-    id, name, place : str
-        `place` names it in errors.
-    junction : str or None
-        Junction that the road is part of.
-    ends_at_junction, starts_at_junction : bool
-    left_hand : bool
-        Whether right lanes run against s.
-    curve : Curve
-    offset, elevation, superelevation : Cubics
-        [m], [m], [rad]
-    sections : tuple of Section
-    speeds : list of (s, speed)
-        [m/s]
-    element : Element
-    warnings : list of str
-    """
-
+    # `id`, `name`, `place`: `place` names it in errors
     id: str
     name: str
     place: str
-    junction: str | None
+    junction: str | None  # junction that the road is part of
     starts_at_junction: bool
     ends_at_junction: bool
-    left_hand: bool
+    left_hand: bool  # whether right lanes run against s
     curve: Curve
+    # `offset` [m], `elevation` [m] and `superelevation` [rad] of s
     offset: Cubics
     elevation: Cubics
     superelevation: Cubics
     sections: tuple[Section, ...]
-    speeds: list[tuple[float, float]]
+    speeds: list[tuple[float, float]]  # [m/s]
     element: ET.Element
     warnings: list[str]
 
@@ -339,20 +303,11 @@ Values = tuple[Floats, Floats, Floats]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """One lane, with what places events on it.
-
-    Attributes
-    ----------
-    geometry : LaneGeometry
-    ids : list of (start, end, id)
-        Its lane numbers between distances along the road. [m]
-    forward : bool
-        Whether vehicles drive in the direction of s.
-    """
+    """One lane, with what places events on it."""
 
     geometry: LaneGeometry
-    ids: list[tuple[float, float, int]]
-    forward: bool
+    ids: list[tuple[float, float, int]]  # [m] its lane numbers between distances along the road
+    forward: bool  # whether vehicles drive in the direction of s
 
     def point_at(self, s: float) -> tuple[float, float] | None:
         """Place on the centre line at a distance along the road; None beyond its ends. [m]"""
