@@ -12,17 +12,8 @@ from fastapi import FastAPI
 from prometheus_client import CollectorRegistry
 
 from app import __version__
-from app.api import access as agencies
-from app.api import access as audit
-from app.api import access as keys
-from app.api import access as me
-from app.api import drives, fleet, health, reprocessing, roads, uploads
-from app.api import jobs as events
-from app.api import jobs as files
-from app.api import jobs as job_routes
-from app.api import jobs as webhooks
+from app.api import access, drives, fleet, health, jobs, reprocessing, roads, uploads
 from app.api.decodes import decodes
-from app.api.decodes import decodes as decode_details
 from app.api.http import system, ui
 from app.api.http.compression import Compressed
 from app.api.http.limits import Budget, RateLimit, Slots
@@ -76,29 +67,29 @@ ROUTERS = (
     plans.proof_router,
     plans.package_router,
     plans.job_router,
-    job_routes.router,
-    files.file_router,
-    webhooks.webhook_router,
-    events.event_router,
+    jobs.router,
+    jobs.file_router,
+    jobs.webhook_router,
+    jobs.event_router,
     reprocessing.router,
     reprocessing.decode_versions,
     codebooks.router,
     codebooks.draft_router,
     decodes.router,
-    decode_details.detail_router,
+    decodes.detail_router,
     uploads.router,
     drives.router,
     surveys.import_router,
     surveys.export_router,
     fleet.snapshot_router,
-    audit.audit_router,
+    access.audit_router,
     fleet.vehicle_router,
     fleet.calibration_router,
-    keys.key_router,
-    agencies.agency_router,
+    access.key_router,
+    access.agency_router,
     damage_reports.settings_router,
     damage_reports.router,
-    me.me_router,
+    access.me_router,
     system.page_settings_router,
     system.server_settings_router,
 )
@@ -117,8 +108,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
         openapi_url=None,  # app/api/http/ui.py has the document and the pages about it
         lifespan=lambda _app: _running(settings, outside, use_cases),
     )
-    for name, use_case in use_cases.items():
-        setattr(app.state, name, use_case)
+    app.state.use_cases = use_cases
     app.state.database = outside.database
     app.state.spool = outside.spool
     app.state.public_limits = public_limits(
@@ -133,7 +123,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
             "storage": lambda: _find_storage_fault(outside),
         }
     )
-    app.state.streams = Streams(use_cases["all_jobs"].watched, use_cases["agency_events"].newest_of)
+    app.state.streams = Streams(use_cases.all_jobs.watched, use_cases.agency_events.newest_of)
     app.state.metrics = CollectorRegistry()
     app.state.metrics.register(ProcessMetrics(outside.database, outside.pool, utc_now))
     app.state.page_settings = page_settings_of(settings, __version__)
@@ -144,7 +134,7 @@ def create_app(settings: Settings, *, decode: DecodePlates = decode_plates) -> F
     budget = Budget(settings.key_processor_s_per_min, settings.agency_processor_s_per_min)
     if isinstance(outside.queue, LocalQueue):  # with a broker, jobs run in other processes
         outside.queue.charge = budget.charge_job
-    _add_guard(app, settings, app.state.access, budget)
+    _add_guard(app, settings, use_cases.access, budget)
     app.add_middleware(Observed, registry=app.state.metrics)
     return app
 
@@ -164,11 +154,9 @@ def _find_folder_fault(outside: Outside) -> str | None:
 
 
 @asynccontextmanager
-async def _running(settings: Settings, outside: Outside, use_cases: UseCases) -> AsyncIterator[None]:
+async def _running(settings: Settings, outside: Outside, cases: UseCases) -> AsyncIterator[None]:
     """The time between the server's start and its end."""
-    jobs, access, unused_blobs = use_cases["jobs"], use_cases["access"], use_cases["unused_blobs"]
-    control = _control(outside.database, use_cases)
-    upload_cases = use_cases["uploads"]
+    control = _control(outside.database, cases)
     outside.database.open()
     try:
         outside.database.migrate()
@@ -177,16 +165,15 @@ async def _running(settings: Settings, outside: Outside, use_cases: UseCases) ->
         left_out = [
             *_try_to_write("blobs", outside.blobs.open),
             *_try_to_write("spool", lambda: outside.spool.open(alone=settings.is_embedded)),
-            *_try_to_write("admin key", lambda: _show_once(access.ensure_first_key(_admin_key(settings)))),
+            *_try_to_write("admin key", lambda: _show_once(cases.access.ensure_first_key(_admin_key(settings)))),
         ]
         if settings.warm_decoders:
             outside.pool.warm()
-        outside.queue.open(jobs)
+        outside.queue.open(cases.jobs)
         if control is not None:
             left_out += _try_to_write("socket of commands", control.open)
-        delivery, job_files = use_cases["webhook_delivery"], use_cases["job_files"]
         if settings.is_embedded:
-            left_out += _try_to_write("locks of uploads", upload_cases.release_all)
+            left_out += _try_to_write("locks of uploads", cases.uploads.release_all)
         fault = _find_folder_fault(outside)
         if left_out or fault:
             _LOG.error(
@@ -194,13 +181,13 @@ async def _running(settings: Settings, outside: Outside, use_cases: UseCases) ->
                 fault=fault, left_out=left_out,
             )  # fmt: skip
         async with (
-            _each_minute(access.write_uses),
-            _each(timedelta(days=1), unused_blobs.try_to_delete, stop=unused_blobs.stop),
-            _each(timedelta(days=1), delivery.delete_old, stop=delivery.stop),
-            _each(timedelta(days=1), job_files.try_to_delete_expired, stop=job_files.stop),
-            _each(timedelta(seconds=1), delivery.try_to_work, stop=delivery.stop),
-            _each(timedelta(days=1), use_cases["damage_reports"].try_to_delete_old_contacts, stop=_nothing),
-            _each(timedelta(minutes=1), upload_cases.try_to_tidy, stop=upload_cases.stop),
+            _each_minute(cases.access.write_uses),
+            _each(timedelta(days=1), cases.unused_blobs.try_to_delete, stop=cases.unused_blobs.stop),
+            _each(timedelta(days=1), cases.webhook_delivery.delete_old, stop=cases.webhook_delivery.stop),
+            _each(timedelta(days=1), cases.job_files.try_to_delete_expired, stop=cases.job_files.stop),
+            _each(timedelta(seconds=1), cases.webhook_delivery.try_to_work, stop=cases.webhook_delivery.stop),
+            _each(timedelta(days=1), cases.damage_reports.try_to_delete_old_contacts, stop=_nothing),
+            _each(timedelta(minutes=1), cases.uploads.try_to_tidy, stop=cases.uploads.stop),
         ):
             yield
     finally:
@@ -211,14 +198,12 @@ async def _running(settings: Settings, outside: Outside, use_cases: UseCases) ->
         outside.database.close()
 
 
-def _control(database: Database, use_cases: UseCases) -> ControlServer | None:
+def _control(database: Database, cases: UseCases) -> ControlServer | None:
     """What carries out commands; those for PostgreSQL open the database themselves."""
     if database.path is None:
         return None
-    cases = OperatorCases(
-        database, utc_now, use_cases["access"], lambda: use_cases["imports"], lambda: use_cases["exports"]
-    )
-    return ControlServer(database.path, cases)
+    operator = OperatorCases(database, utc_now, cases.access, lambda: cases.imports, lambda: cases.exports)
+    return ControlServer(database.path, operator)
 
 
 def _add_routes(app: FastAPI) -> None:

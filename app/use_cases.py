@@ -1,8 +1,8 @@
-"""The use cases of the server and of `waymark worker`, by the names under which routes ask for them."""
+"""The use cases of the server and of `waymark worker`: app/wiring.py makes them, and routes ask for them by name."""
 
 from __future__ import annotations
 
-from typing import TypedDict
+from dataclasses import dataclass
 
 from app.services.access.access import Access
 from app.services.access.audit import AuditLog
@@ -44,9 +44,11 @@ from app.services.uploads.uploads import Uploads
 from app.services.webhooks import WebhookDelivery, Webhooks
 
 
-class AccessUseCases(TypedDict):
-    """Permissions, keys and the audit log."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UseCases:
+    """All use cases. A route asks for one with `app.api.http.dependencies.use_case`."""
 
+    # permissions, keys and the audit log
     access: Access
     agencies: Agencies
     audit: AuditLog
@@ -54,10 +56,7 @@ class AccessUseCases(TypedDict):
     keys: Keys
     vehicles: Vehicles
 
-
-class MarkerUseCases(TypedDict):
-    """The registry: markers, roads and codebooks, and what is read of them."""
-
+    # the registry: markers, roads and codebooks, and what is read of them
     bulk_markers: BulkMarkers
     codebooks: Codebooks
     features: Features
@@ -70,26 +69,17 @@ class MarkerUseCases(TypedDict):
     searches: Searches
     snapshots: Snapshots
 
-
-class ImportUseCases(TypedDict):
-    """Surveys, at once and as jobs."""
-
+    # surveys, at once and as jobs
     imports: Imports
     import_jobs: ImportJobs
 
-
-class PlateUseCases(TypedDict):
-    """Artwork, prints and cameras."""
-
+    # artwork, prints and cameras
     artworks: Artworks
     calibrations: Calibrations
     plate_drafts: PlateDrafts
     print_grades: PrintGrades
 
-
-class DecodeUseCases(TypedDict):
-    """Uploads and what is decoded of them."""
-
+    # uploads and what is decoded of them
     decode_details: DecodeDetails
     decode_outputs: DecodeOutputs
     decodes: Decodes
@@ -98,10 +88,7 @@ class DecodeUseCases(TypedDict):
     unused_blobs: UnusedBlobs
     uploads: Uploads
 
-
-class PlanUseCases(TypedDict):
-    """Roads to plan and their plans."""
-
+    # roads to plan and their plans
     alignments: Alignments
     packages: Packages
     plan_jobs: PlanJobs
@@ -110,45 +97,23 @@ class PlanUseCases(TypedDict):
     plans: Plans
     proofs: Proofs
 
-
-class FileUseCases(TypedDict):
-    """Jobs of every kind, and those that write files."""
-
+    # jobs of every kind, and those that write files
     all_jobs: AllJobs
     artwork_jobs: ArtworkJobs
     export_jobs: ExportJobs
     exports: Exports
     job_files: JobFiles
 
-
-class WebhookUseCases(TypedDict):
-    """Events and the webhooks that deliver them."""
-
+    # events and the webhooks that deliver them
     agency_events: AgencyEvents
     webhook_delivery: WebhookDelivery
     webhooks: Webhooks
 
-
-class PublicUseCases(TypedDict):
-    """The pages that need no key."""
-
+    # the pages that need no key
     damage_reports: DamageReports
     form_tokens: FormTokens
     public_pages: PublicPages
 
-
-class UseCases(
-    AccessUseCases,
-    MarkerUseCases,
-    ImportUseCases,
-    PlateUseCases,
-    DecodeUseCases,
-    PlanUseCases,
-    FileUseCases,
-    WebhookUseCases,
-    PublicUseCases,
-):
-    """All use cases."""
-
+    # jobs of all kinds, and what agencies may store
     jobs: Jobs
     quotas: Quotas

@@ -76,18 +76,7 @@ from app.storage.blobs import Blobs, S3Parts
 from app.storage.keys import load_master_key, load_signing_keys
 from app.storage.spool import Spool
 from app.storage.webhook_sender import WebhookSender
-from app.use_cases import (
-    AccessUseCases,
-    DecodeUseCases,
-    FileUseCases,
-    ImportUseCases,
-    MarkerUseCases,
-    PlanUseCases,
-    PlateUseCases,
-    PublicUseCases,
-    UseCases,
-    WebhookUseCases,
-)
+from app.use_cases import UseCases
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,185 +118,113 @@ def _job_queue(settings: Settings) -> JobEngine:
 
 
 def make_use_cases(settings: Settings, outside: Outside, decode: DecodePlates) -> UseCases:
-    """The use cases by the names under which routes ask for them."""
-    ttl = timedelta(hours=settings.idempotency_ttl_h)
+    """The use cases of the server and of `waymark worker`."""
+    database, blobs, pool, queue = outside.database, outside.blobs, outside.pool, outside.queue
+    clock, ttl, workers = utc_now, timedelta(hours=settings.idempotency_ttl_h), settings.decode_workers
     master_key = lru_cache(lambda: load_master_key(settings.resolved_master_key_file))
     secrets = AgencySecrets(master_key)
-    quotas = _quotas(settings, outside.database)
-    access = _access_use_cases(settings, outside, secrets, ttl)
-    imports = _import_use_cases(settings, outside, ttl)
-    decodes = _decode_use_cases(settings, outside, secrets, quotas)
-    plans = _plan_use_cases(settings, outside, ttl)
-    files = _file_use_cases(settings, outside, ttl)
-    handlers = _job_handlers(access, imports, decodes, plans, files)
-    return {
-        "jobs": Jobs(outside.database, utc_now, handlers, outside.queue),
-        "quotas": quotas,
-        **access,
-        **_marker_use_cases(settings, outside, secrets, ttl),
-        **imports,
-        **_plate_use_cases(settings, outside, decode, ttl),
-        **decodes,
-        **plans,
-        **files,
-        **_webhook_use_cases(settings, outside, secrets),
-        **_public_use_cases(settings, outside, quotas, master_key),
-    }
-
-
-def _job_handlers(
-    access: AccessUseCases, imports: ImportUseCases, decodes: DecodeUseCases, plans: PlanUseCases, files: FileUseCases
-) -> dict[JobKind, JobHandler]:
-    """What runs the jobs of each kind."""
-    return {
-        JobKind.AUDIT: access["audit_verifications"],
-        JobKind.DECODE: decodes["decodes"],
-        JobKind.IMPORT: imports["import_jobs"],
-        JobKind.PLAN: plans["plan_making"],
-        JobKind.PROOF: plans["proofs"],
-        JobKind.PACKAGE: plans["packages"],
-        JobKind.ARTWORK: files["artwork_jobs"],
-        JobKind.EXPORT: files["export_jobs"],
-        JobKind.REPROCESS: decodes["reprocessings"],
-        JobKind.DRIVE: decodes["drives"],
-    }
-
-
-def _access_use_cases(settings: Settings, outside: Outside, secrets: AgencySecrets, ttl: timedelta) -> AccessUseCases:
-    """Permissions, keys and the audit log."""
-    database = outside.database
-    access = Access(database, utc_now, _token_check(settings))
-    return {
-        "access": access,
-        "agencies": Agencies(database, utc_now, secrets, ttl),
-        "audit": AuditLog(database),
-        "audit_verifications": AuditVerifications(database, utc_now, outside.queue, idempotency_ttl=ttl),
-        "keys": Keys(database, utc_now, access),
-        "vehicles": Vehicles(database, utc_now, ttl),
-    }
-
-
-def _marker_use_cases(settings: Settings, outside: Outside, secrets: AgencySecrets, ttl: timedelta) -> MarkerUseCases:
-    """The registry: markers, roads and codebooks, and what is read of them."""
-    database = outside.database
-    markers = Markers(database, utc_now, marker_rules(settings))
-    return {
-        "bulk_markers": BulkMarkers(database, utc_now, markers, ttl),
-        "codebooks": Codebooks(database, utc_now, ttl),
-        "features": Features(database, utc_now),
-        "layouts": Layouts(database),
-        "maintenance": Maintenance(database, utc_now, markers),
-        "markers": markers,
-        "observations": Observations(database),
-        "programs": CerpmPrograms(database, utc_now, secrets),
-        "roads": Roads(database, utc_now, settings.crs_accuracy_m, ttl),
-        "searches": Searches(database),
-        "snapshots": Snapshots(database, utc_now, partial(load_signing_keys, settings.resolved_signing_key_file)),
-    }
-
-
-def _import_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> ImportUseCases:
-    """Surveys, at once and as jobs."""
-    imports = Imports(outside.database, utc_now, outside.pool, marker_rules(settings))
-    jobs = ImportJobs(outside.database, utc_now, outside.blobs, outside.queue, imports=imports, idempotency_ttl=ttl)
-    return {"imports": imports, "import_jobs": jobs}
-
-
-def _plate_use_cases(settings: Settings, outside: Outside, decode: DecodePlates, ttl: timedelta) -> PlateUseCases:
-    """Artwork, prints and cameras."""
-    database, pool, read, images = outside.database, outside.pool, _face_reader(decode), _decode_rules(settings).images
-    return {
-        "artworks": Artworks(database, public_url=settings.qr_code_url, read=read),
-        "calibrations": Calibrations(database, utc_now, pool, images, ttl),
-        "plate_drafts": PlateDrafts(pool, read=read, crs_accuracy_m=settings.crs_accuracy_m),
-        "print_grades": PrintGrades(database, utc_now, pool, images),
-    }
-
-
-def _decode_use_cases(settings: Settings, outside: Outside, secrets: AgencySecrets, quotas: Quotas) -> DecodeUseCases:
-    """Uploads and what is decoded of them."""
-    database, blobs, pool, queue = outside.database, outside.blobs, outside.pool, outside.queue
-    rules = _decode_rules(settings)
-    handlers = _handlers(database, pool, secrets, rules)
-    decodes = Decodes(database, utc_now, blobs=blobs, quotas=quotas, queue=queue, handlers=handlers, rules=rules)
-    parts = UploadRules(settings.max_resumable_bytes, timedelta(hours=settings.upload_expiry_h))
-    return {
-        "decode_details": DecodeDetails(database, blobs=blobs, processes=pool, rules=rules),
-        "decode_outputs": DecodeOutputs(database, blobs=blobs, processes=pool, rules=rules),
-        "decodes": decodes,
-        "drives": Drives(database, utc_now, blobs, pool, queue, idempotency_ttl=rules.idempotency_ttl),
-        "reprocessings": Reprocessings(database, utc_now, blobs, queue, decodes),
-        "unused_blobs": UnusedBlobs(database, utc_now, blobs, alone=settings.is_embedded),
-        "uploads": Uploads(
-            database, utc_now, blobs=blobs, spool=outside.spool, s3=S3Parts(settings.resolved_blobs_url),
-            decodes=decodes, quotas=quotas, rules=parts,
-        ),
-    }  # fmt: skip
-
-
-def _webhook_use_cases(settings: Settings, outside: Outside, secrets: AgencySecrets) -> WebhookUseCases:
-    """Events and the webhooks that deliver them."""
+    quotas = _quotas(settings, database)
     sender = WebhookSender(loopback=settings.webhooks_to_loopback)
-    return {
-        "agency_events": AgencyEvents(outside.database),
-        "webhook_delivery": WebhookDelivery(outside.database, utc_now, secrets, sender),
-        "webhooks": Webhooks(outside.database, utc_now, secrets, sender.check_url),
+    read_face, decode_rules = _face_reader(decode), _decode_rules(settings)
+    access = Access(database, clock, _token_check(settings))
+    audits = AuditVerifications(database, clock, queue, idempotency_ttl=ttl)
+
+    markers = Markers(database, clock, marker_rules(settings))
+    imports = Imports(database, clock, pool, marker_rules(settings))
+    import_jobs = ImportJobs(database, clock, blobs, queue, imports=imports, idempotency_ttl=ttl)
+
+    handlers = _upload_handlers(database, pool, secrets, decode_rules)
+    decodes = Decodes(database, clock, blobs=blobs, quotas=quotas, queue=queue, handlers=handlers, rules=decode_rules)
+    drives = Drives(database, clock, blobs, pool, queue, idempotency_ttl=ttl)
+    reprocessings = Reprocessings(database, clock, blobs, queue, decodes)
+    resumable = UploadRules(settings.max_resumable_bytes, timedelta(hours=settings.upload_expiry_h))
+
+    plans = Plans(database, clock, blobs, pool, marker_rules(settings))
+    plan_making = PlanMaking(database, clock, queue, plans=plans, idempotency_ttl=ttl)
+    proofs = Proofs(database, clock, blobs, pool, queue, in_flight=workers, idempotency_ttl=ttl)
+    packages = Packages(database, clock, blobs, pool, queue, in_flight=workers, idempotency_ttl=ttl)
+
+    all_jobs = AllJobs(database, clock)
+    job_files = JobFiles(database, clock, blobs, all_jobs)
+    exports = Exports(database, ExportProcesses(settings.decode_memory_bytes).write)
+    export_jobs = ExportJobs(database, clock, queue, exports, job_files, ttl)
+    artwork_jobs = ArtworkJobs(
+        database, clock, pool, queue, job_files,
+        public_url=settings.qr_code_url, in_flight=workers, idempotency_ttl=ttl,
+    )  # fmt: skip
+    job_handlers: dict[JobKind, JobHandler] = {
+        JobKind.AUDIT: audits,
+        JobKind.DECODE: decodes,
+        JobKind.IMPORT: import_jobs,
+        JobKind.PLAN: plan_making,
+        JobKind.PROOF: proofs,
+        JobKind.PACKAGE: packages,
+        JobKind.ARTWORK: artwork_jobs,
+        JobKind.EXPORT: export_jobs,
+        JobKind.REPROCESS: reprocessings,
+        JobKind.DRIVE: drives,
     }
-
-
-def _public_use_cases(
-    settings: Settings, outside: Outside, quotas: Quotas, master_key: Callable[[], bytes]
-) -> PublicUseCases:
-    """The pages that need no key."""
-    photo_limits = ImageLimits(pixels=settings.max_image_pixels, file_bytes=settings.max_report_photo_bytes)
-    return {
-        "damage_reports": DamageReports(
-            outside.database,
-            utc_now,
-            outside.blobs,
-            outside.pool,
-            quotas,
-            images=photo_limits,
+    return UseCases(
+        access=access,
+        agencies=Agencies(database, clock, secrets, ttl),
+        audit=AuditLog(database),
+        audit_verifications=audits,
+        keys=Keys(database, clock, access),
+        vehicles=Vehicles(database, clock, ttl),
+        bulk_markers=BulkMarkers(database, clock, markers, ttl),
+        codebooks=Codebooks(database, clock, ttl),
+        features=Features(database, clock),
+        layouts=Layouts(database),
+        maintenance=Maintenance(database, clock, markers),
+        markers=markers,
+        observations=Observations(database),
+        programs=CerpmPrograms(database, clock, secrets),
+        roads=Roads(database, clock, settings.crs_accuracy_m, ttl),
+        searches=Searches(database),
+        snapshots=Snapshots(database, clock, partial(load_signing_keys, settings.resolved_signing_key_file)),
+        imports=imports,
+        import_jobs=import_jobs,
+        artworks=Artworks(database, public_url=settings.qr_code_url, read=read_face),
+        calibrations=Calibrations(database, clock, pool, decode_rules.images, ttl),
+        plate_drafts=PlateDrafts(pool, read=read_face, crs_accuracy_m=settings.crs_accuracy_m),
+        print_grades=PrintGrades(database, clock, pool, decode_rules.images),
+        decode_details=DecodeDetails(database, blobs=blobs, processes=pool, rules=decode_rules),
+        decode_outputs=DecodeOutputs(database, blobs=blobs, processes=pool, rules=decode_rules),
+        decodes=decodes,
+        drives=drives,
+        reprocessings=reprocessings,
+        unused_blobs=UnusedBlobs(database, clock, blobs, alone=settings.is_embedded),
+        uploads=Uploads(
+            database, clock, blobs=blobs, spool=outside.spool, s3=S3Parts(settings.resolved_blobs_url),
+            decodes=decodes, quotas=quotas, rules=resumable,
+        ),
+        alignments=Alignments(
+            database, clock, blobs, pool, accuracy_m=settings.crs_accuracy_m, idempotency_ttl=ttl
+        ),
+        packages=packages,
+        plan_jobs=PlanJobs(database, clock),
+        plan_making=plan_making,
+        plan_previews=PlanPreviews(plans, plan_making),
+        plans=plans,
+        proofs=proofs,
+        all_jobs=all_jobs,
+        artwork_jobs=artwork_jobs,
+        export_jobs=export_jobs,
+        exports=exports,
+        job_files=job_files,
+        agency_events=AgencyEvents(database),
+        webhook_delivery=WebhookDelivery(database, clock, secrets, sender),
+        webhooks=Webhooks(database, clock, secrets, sender.check_url),
+        damage_reports=DamageReports(
+            database, clock, blobs, pool, quotas,
+            images=ImageLimits(pixels=settings.max_image_pixels, file_bytes=settings.max_report_photo_bytes),
             contact_days=settings.report_contact_days,
         ),
-        "form_tokens": FormTokens(master_key, utc_now),
-        "public_pages": PublicPages(outside.database, utc_now),
-    }
-
-
-def _plan_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> PlanUseCases:
-    """Roads to plan and their plans."""
-    stores = (outside.database, utc_now, outside.blobs, outside.pool)
-    plan_cases = Plans(*stores, marker_rules(settings))
-    making = PlanMaking(outside.database, utc_now, outside.queue, plans=plan_cases, idempotency_ttl=ttl)
-    workers = settings.decode_workers
-    return {
-        "alignments": Alignments(*stores, accuracy_m=settings.crs_accuracy_m, idempotency_ttl=ttl),
-        "packages": Packages(*stores, outside.queue, in_flight=workers, idempotency_ttl=ttl),
-        "plan_jobs": PlanJobs(outside.database, utc_now),
-        "plan_making": making,
-        "plan_previews": PlanPreviews(plan_cases, making),
-        "plans": plan_cases,
-        "proofs": Proofs(*stores, outside.queue, in_flight=workers, idempotency_ttl=ttl),
-    }
-
-
-def _file_use_cases(settings: Settings, outside: Outside, ttl: timedelta) -> FileUseCases:
-    """Jobs of every kind, and those that write files."""
-    database, queue = outside.database, outside.queue
-    jobs = AllJobs(database, utc_now)
-    exports = Exports(database, ExportProcesses(settings.decode_memory_bytes).write)
-    files = JobFiles(database, utc_now, outside.blobs, jobs)
-    return {
-        "all_jobs": jobs,
-        "artwork_jobs": ArtworkJobs(
-            database, utc_now, outside.pool, queue, files,
-            public_url=settings.qr_code_url, in_flight=settings.decode_workers, idempotency_ttl=ttl,
-        ),
-        "export_jobs": ExportJobs(database, utc_now, queue, exports, files, ttl),
-        "exports": exports,
-        "job_files": files,
-    }  # fmt: skip
+        form_tokens=FormTokens(master_key, clock),
+        public_pages=PublicPages(database, clock),
+        jobs=Jobs(database, clock, job_handlers, queue),
+        quotas=quotas,
+    )  # fmt: skip
 
 
 def marker_rules(settings: Settings) -> MarkerRules:
@@ -350,7 +267,7 @@ def _decode_pool(settings: Settings, decode: DecodePlates) -> DecodePool:
     )
 
 
-def _handlers(
+def _upload_handlers(
     database: Database, pool: DecodePool, secrets: AgencySecrets, rules: DecodeRules
 ) -> tuple[UploadHandler[Any], ...]:
     """Kinds of uploads; the first one that accepts an upload decodes it."""

@@ -49,7 +49,7 @@ def running_worker(
             field="WAYMARK_BROKER_URL",
             cure="set WAYMARK_BROKER_URL=amqp://..., or use waymark serve alone, which runs the jobs itself",
         )
-    jobs = make_use_cases(settings, outside, decode)["jobs"]
+    jobs = make_use_cases(settings, outside, decode).jobs
     worker = CeleryWorker(outside.queue, names, concurrency)
     try:
         _wait_for_database(outside.database)

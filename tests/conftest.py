@@ -114,7 +114,7 @@ class LiveServer:
 
     def agency(self, name: str, scope: Scope = Scope.PLANNER) -> httpx.Client:
         """A client of an agency, which is created if need be."""
-        return self.client(self.app.state.access.create_key(name, scope, label=f"{name} {scope}"))
+        return self.client(self.app.state.use_cases.access.create_key(name, scope, label=f"{name} {scope}"))
 
 
 @contextmanager
@@ -282,7 +282,7 @@ def verified_server(folder: Path, database_url: str) -> Iterator[LiveServer]:
     with LiveServer(create_app(settings)) as running:
         yield running
         with across_agencies():
-            faults = [(name, fault) for name, _, found in running.app.state.audit.verify() for fault in found]
+            faults = [(name, fault) for name, _, found in running.app.state.use_cases.audit.verify() for fault in found]
         assert faults == [], "what the tests did is not as its history says"
 
 

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Body, Depends, Path, Query, Request, Response
 from pydantic import AfterValidator, ConfigDict, Field
 from typing_extensions import TypedDict
 
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, PageSize, Text, Whole, use_cases
+from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, PageSize, Text, Whole, use_case
 from app.api.http.permissions import PERMISSIONS, PUBLIC
 from app.api.http.problems import problem_responses
 from app.api.http.responses import Time, created_response, document_response, json_response, page_response
@@ -56,7 +56,7 @@ async def get_entry_filter(
 def list_audit_entries(
     request: Request,
     caller: Caller,
-    log: Annotated[AuditLog, use_cases("audit")],
+    log: Annotated[AuditLog, use_case(lambda cases: cases.audit)],
     wanted: Annotated[EntryFilter, Depends(get_entry_filter)],
     limit: PageSize = 100,
     after: Annotated[int, Query(ge=0, lt=2**53, description="Last number of the page before.")] = 0,
@@ -83,7 +83,7 @@ def list_audit_entries(
 def post_verification(
     wanted: Annotated[VerificationInput, Body(examples=[{}])],
     caller: Caller,
-    verifications: Annotated[AuditVerifications, use_cases("audit_verifications")],
+    verifications: Annotated[AuditVerifications, use_case(lambda cases: cases.audit_verifications)],
     idempotency: Idempotency,
 ) -> Response:
     """Compute every hash of the agency's log and of its markers' versions again, as a job."""
@@ -97,7 +97,7 @@ def post_verification(
 def get_verification(
     verification_id: Annotated[Identifier, Path(description="Id of the verification's job.")],
     caller: Caller,
-    verifications: Annotated[AuditVerifications, use_cases("audit_verifications")],
+    verifications: Annotated[AuditVerifications, use_case(lambda cases: cases.audit_verifications)],
 ) -> Response:
     """A verification with its progress, and what it found once it is done."""
     document = verifications.get(caller, verification_id)
@@ -154,7 +154,7 @@ class RotationIn(StrictModel):
     )
 
 
-Service = Annotated[Keys, use_cases("keys")]
+Service = Annotated[Keys, use_case(lambda cases: cases.keys)]
 
 
 @key_router.post("", status_code=201, responses=document_response(NewKeyDocument, status=201))
@@ -211,7 +211,7 @@ class MeDocument(TypedDict):
 
 
 @me_router.get("", responses=document_response(MeDocument))
-def get_me(caller: Caller, access: Annotated[Access, use_cases("access")]) -> Response:
+def get_me(caller: Caller, access: Annotated[Access, use_case(lambda cases: cases.access)]) -> Response:
     """The holder of the key or token of this request."""
     allowed = [route for route, scopes in PERMISSIONS.items() if scopes != PUBLIC and caller.scope in scopes]
     document = MeDocument(
@@ -229,7 +229,7 @@ def get_me(caller: Caller, access: Annotated[Access, use_cases("access")]) -> Re
 
 agency_router = APIRouter(prefix="/v1/agencies", tags=["access"], route_class=StrictRoute)
 
-AgenciesService = Annotated[Agencies, use_cases("agencies")]
+AgenciesService = Annotated[Agencies, use_case(lambda cases: cases.agencies)]
 
 
 class AgencyIn(StrictModel):

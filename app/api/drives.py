@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict, Field
 
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, PageSize, Text, use_cases
+from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, PageSize, Text, use_case
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -120,7 +120,7 @@ class DriveIn(StrictModel):
 router = APIRouter(prefix="/v1/drives", tags=["drives"], route_class=StrictRoute)
 
 DriveId = Annotated[Identifier, Path(description="Id of the drive.")]
-Drives = Annotated[DrivesService, use_cases("drives")]
+Drives = Annotated[DrivesService, use_case(lambda cases: cases.drives)]
 
 
 @router.post(

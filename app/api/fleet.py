@@ -22,7 +22,7 @@ from app.api.http.dependencies import (
     Text,
     Version,
     Whole,
-    use_cases,
+    use_case,
 )
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -144,7 +144,7 @@ async def get_asked(request: Request, idempotency_key: IdempotencyKeyHeader = No
         yield _Asked(tuple(photos), await read_declaration(CalibrationIn, text, "declaration"), key)
 
 
-CalibrationService = Annotated[Calibrations, use_cases("calibrations")]
+CalibrationService = Annotated[Calibrations, use_case(lambda cases: cases.calibrations)]
 Asked = Annotated[_Asked, Depends(get_asked)]
 
 
@@ -331,7 +331,7 @@ vehicle_router = APIRouter(prefix="/v1/vehicles", tags=["fleet"], route_class=St
 
 VehicleId = Annotated[Identifier, Path(description="Id of the vehicle.")]
 KeyId = Annotated[Text, Path(min_length=1, max_length=200, description="Id of the key, as GET /v1/keys lists it.")]
-VehicleService = Annotated[Vehicles, use_cases("vehicles")]
+VehicleService = Annotated[Vehicles, use_case(lambda cases: cases.vehicles)]
 
 
 @vehicle_router.post(
@@ -417,7 +417,7 @@ def delete_vehicle_key(vehicle_id: VehicleId, key_id: KeyId, caller: Caller, veh
 
 
 snapshot_router = APIRouter(prefix="/v1/snapshots", tags=["snapshots"], route_class=StrictRoute)
-Snapshots = Annotated[SnapshotsService, use_cases("snapshots")]
+Snapshots = Annotated[SnapshotsService, use_case(lambda cases: cases.snapshots)]
 
 
 @snapshot_router.get("", responses={**file_response([MEDIA_TYPE], "See docs/snapshots.md"), **problem_responses()})

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.http.dependencies import AfterLink, Caller, MarkerId, PageSize, SentVersion, Text, use_cases
+from app.api.http.dependencies import AfterLink, Caller, MarkerId, PageSize, SentVersion, Text, use_case
 from app.api.http.problems import problem_responses
 from app.api.http.responses import cursor_of, document_response, file_response, json_response, page_response
 from app.api.http.strict_json import StrictRoute
@@ -27,7 +27,7 @@ router = APIRouter(prefix="/v1", tags=["maintenance"], route_class=StrictRoute)
 
 MEDIA_TYPES = {"geojson": "application/geo+json", "csv": "text/csv"}
 ItemId = Annotated[Identifier, Path(description="Id of the item.")]
-Maintenance = Annotated[MaintenanceService, use_cases("maintenance")]
+Maintenance = Annotated[MaintenanceService, use_case(lambda cases: cases.maintenance)]
 
 
 async def get_item_filter(

@@ -12,12 +12,12 @@ from typing import Annotated, Generic, Protocol, TypeVar
 import anyio
 import structlog
 from anyio import to_thread
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from app.api.http import event_stream
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_cases
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
 from app.api.http.event_stream import EventStream, LastEventId, ServerEvent, StreamPlaces
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -223,13 +223,22 @@ class Streams:
         self.agencies = Watch(read_newest)
 
 
+async def get_streams(request: Request) -> Streams:
+    """The streams of the server."""
+    streams: Streams = request.app.state.streams
+    return streams
+
+
+SharedStreams = Annotated[Streams, Depends(get_streams)]
+
+
 # === /v1/jobs: work that goes on after its request was answered, of every kind.
 
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=StrictRoute)
 
 JobId = Annotated[Identifier, Path(description="Id of the job.")]
-Service = Annotated[AllJobs, use_cases("all_jobs")]
+Service = Annotated[AllJobs, use_case(lambda cases: cases.all_jobs)]
 
 
 @router.get("", responses=document_response(JobPage))
@@ -279,7 +288,7 @@ async def get_job_events(
     job_id: JobId,
     caller: Caller,
     jobs: Service,
-    streams: Annotated[Streams, use_cases("streams")],
+    streams: SharedStreams,
     last_event_id: LastEventId = None,
 ) -> Response:
     """The progress of a job as server-sent events, until it ends: `done`, `total`, `rate_per_s` and `progress`.
@@ -345,7 +354,7 @@ def queued_job(job: JobDocument, replayed: bool) -> Response:
 def get_job_result(
     job_id: Annotated[Identifier, Path(description="Id of the job.")],
     caller: Caller,
-    files: Annotated[JobFiles, use_cases("job_files")],
+    files: Annotated[JobFiles, use_case(lambda cases: cases.job_files)],
     if_none_match: IfNoneMatch = None,
 ) -> Response:
     """The file of a job that writes one: artwork or an export. It is kept for seven days; then 404."""
@@ -367,7 +376,7 @@ def get_job_result(
 event_router = APIRouter(prefix="/v1/events", tags=["events"], route_class=StrictRoute)
 
 _MAX_DIGITS = 18
-EventService = Annotated[AgencyEvents, use_cases("agency_events")]
+EventService = Annotated[AgencyEvents, use_case(lambda cases: cases.agency_events)]
 
 
 @event_router.get(
@@ -385,7 +394,7 @@ async def get_events(
     request: Request,
     caller: Caller,
     events: EventService,
-    streams: Annotated[Streams, use_cases("streams")],
+    streams: SharedStreams,
     after: Annotated[int | None, Query(ge=0, lt=10**18, description="Id of the last event that was seen.")] = None,
     limit: PageSize = 100,
     last_event_id: LastEventId = None,
@@ -438,7 +447,7 @@ webhook_router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"], route_class
 
 WebhookId = Annotated[Identifier, Path(description="Id of the webhook.")]
 DeliveryId = Annotated[Identifier, Path(description="Id of the delivery, the header `webhook-id`.")]
-WebhookService = Annotated[Webhooks, use_cases("webhooks")]
+WebhookService = Annotated[Webhooks, use_case(lambda cases: cases.webhooks)]
 
 
 class WebhookIn(StrictModel):

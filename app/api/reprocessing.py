@@ -8,7 +8,7 @@ from fastapi import APIRouter, Path, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
-from app.api.http.dependencies import Caller, Identifier, LastId, Number, PageSize, Text, use_cases
+from app.api.http.dependencies import Caller, Identifier, LastId, Number, PageSize, Text, use_case
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     Time,
@@ -38,7 +38,7 @@ router = APIRouter(prefix="/v1/reprocessings", tags=["reprocessing"], route_clas
 decode_versions = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
 
 ReprocessingId = Annotated[Identifier, Path(description="Id of the reprocessing.")]
-Service = Annotated[Reprocessings, use_cases("reprocessings")]
+Service = Annotated[Reprocessings, use_case(lambda cases: cases.reprocessings)]
 
 
 class ReprocessingIn(StrictModel):

@@ -18,7 +18,7 @@ from app.api.http.dependencies import (
     PageSize,
     Text,
     Version,
-    use_cases,
+    use_case,
 )
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -179,7 +179,7 @@ _MetresQuery = Annotated[float | None, Query(ge=-1e8, le=1e8, allow_inf_nan=Fals
 _OfVersion = Annotated[
     int | None, Query(alias="version", ge=1, lt=2**31, description="On an earlier version of the road.")
 ]
-Roads = Annotated[RoadsService, use_cases("roads")]
+Roads = Annotated[RoadsService, use_case(lambda cases: cases.roads)]
 
 
 @router.post(

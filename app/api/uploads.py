@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from app.api.decodes.schemas import ContextIn
 from app.api.decodes.uploads import context_of, with_vehicle
 from app.api.http.bodies import append, finish, media_type_of, read_declaration, spool_of
-from app.api.http.dependencies import Caller, Identifier, use_cases
+from app.api.http.dependencies import Caller, Identifier, use_case
 from app.api.http.problems import BodyRefused, Described, problem_responses, reference
 from app.api.http.responses import BINARY, document_response, json_response
 from app.api.http.strict_json import StrictRoute
@@ -265,7 +265,7 @@ def _blocks(file: SpooledFile) -> Iterator[bytes]:
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"], route_class=StrictRoute)
 
-Service = Annotated[UploadsService, use_cases("uploads")]
+Service = Annotated[UploadsService, use_case(lambda cases: cases.uploads)]
 UploadId = Annotated[Identifier, Path(description="Id of the upload.")]
 _NO_CONTENT: Described = {204: {"description": "Done"}}
 _OPTIONS: Described = {200: {"description": "Tus-Version, Tus-Extension, Tus-Max-Size and Tus-Checksum-Algorithm"}}

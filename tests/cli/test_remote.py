@@ -143,7 +143,7 @@ def test_a_running_decode_shows_its_result_so_far(
 ) -> None:
     monkeypatch.setattr(archive_handler, "PART_EVERY", timedelta(0))
     monkeypatch.setattr(frame_runs, "RUN_FRAMES", 1)
-    decodes, seen, steps = server.app.state.decodes, [], []
+    decodes, seen, steps = server.app.state.use_cases.decodes, [], []
     keep_part = decodes._keep_part
     handler = next(handler for handler in decodes._handlers if handler.kind == "archive")
     monkeypatch.setattr(handler, "_rules", replace(handler._rules, progress_every=timedelta(0)))

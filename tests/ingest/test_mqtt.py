@@ -56,7 +56,7 @@ def road(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LiveServer,
     """A server with markers along a lane, and a vehicle's key."""
     settings = Settings(data_dir=tmp_path_factory.mktemp("mqtt") / "var", admin_key=ADMIN_KEY, decode_workers=1)
     with LiveServer(create_app(settings, decode=standin.decode)) as server, server.client() as client:
-        key = server.app.state.access.create_key("default", Scope.VEHICLE, "receivers")
+        key = server.app.state.use_cases.access.create_key("default", Scope.VEHICLE, "receivers")
         yield server, client, build_lane(client, np.random.default_rng(1950)), key
 
 

@@ -337,7 +337,7 @@ def test_the_settings_in_use_are_for_admins(
     page.locator("tr", has_text="WAYMARK_MAX_IMPORT_BYTES").wait_for()
     expect(page.locator("tr", has_text="WAYMARK_MAX_IMPORT_BYTES")).to_contain_text("256\u00a0MiB")
     expect(page.locator("main")).to_contain_text("SQLite")
-    viewer = new_page(server.app.state.access.create_key("default", Scope.VIEWER, "reader"))
+    viewer = new_page(server.app.state.use_cases.access.create_key("default", Scope.VIEWER, "reader"))
     page = viewer.open("/operations/settings")
     page.get_by_text("Admins can change this").wait_for()
     expect(page.get_by_role("heading", name="Settings in use")).to_have_count(0)

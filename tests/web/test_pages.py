@@ -143,7 +143,7 @@ def test_without_a_key_one_signs_in_and_out(new_page: OpenPage, server: LiveServ
 def test_a_viewer_is_offered_what_a_viewer_may(new_page: OpenPage, server: LiveServer, ids: dict[str, str]) -> None:
     from app.services.access.access import Scope
 
-    key = server.app.state.access.create_key("default", Scope.VIEWER, "reader")
+    key = server.app.state.use_cases.access.create_key("default", Scope.VIEWER, "reader")
     watched = new_page(key)
     page = watched.open(f"/markers/{ids['plate']}?view=table")
     page.locator(".panel .facts").first.wait_for()
@@ -161,7 +161,7 @@ def test_what_a_vehicle_may_not_see_is_refused_and_said(
     """A key with the fewest permissions: every page ends loading, and says what is refused."""
     from app.services.access.access import Scope
 
-    watched = new_page(server.app.state.access.create_key("default", Scope.VEHICLE, "a bus"))
+    watched = new_page(server.app.state.use_cases.access.create_key("default", Scope.VEHICLE, "a bus"))
     for path in PAGES:
         watched.open(path.format(**ids))
         wait_until_quiet(watched)

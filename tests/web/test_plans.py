@@ -57,7 +57,7 @@ def plans(server: LiveServer, alignment: dict[str, Any]) -> tuple[str, str]:
 
 def planner(server: LiveServer, label: str) -> str:
     """A key of a planner."""
-    return str(server.app.state.access.create_key("default", Scope.PLANNER, label))
+    return str(server.app.state.use_cases.access.create_key("default", Scope.PLANNER, label))
 
 
 def strip_text(watched: Watched, start: str) -> str:
@@ -325,7 +325,7 @@ def test_a_running_proof_is_followed_after_a_reload_and_cancelled(
         def submit(self, *_: Any) -> None:
             """Leave it waiting."""
 
-    monkeypatch.setattr(server.app.state.proofs, "_queue", Held())
+    monkeypatch.setattr(server.app.state.use_cases.proofs, "_queue", Held())
     page = watched.open(f"/plans/{plans[0]}?tab=proof")
     page.get_by_role("button", name="Start the proof").click()
     page.get_by_text("Waiting").wait_for()
@@ -453,7 +453,7 @@ def test_a_line_is_drawn_on_the_map_and_becomes_a_road(watched: Watched, alignme
 def test_a_viewer_sees_a_plan_and_changes_nothing(
     new_page: OpenPage, server: LiveServer, plans: tuple[str, str]
 ) -> None:
-    key = server.app.state.access.create_key("default", Scope.VIEWER, "reader of plans")
+    key = server.app.state.use_cases.access.create_key("default", Scope.VIEWER, "reader of plans")
     watched = new_page(key, size=PHONE)
     page = watched.open(f"/plans/{plans[0]}")
     page.locator(".plan-view .strip").wait_for()

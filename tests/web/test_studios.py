@@ -265,7 +265,7 @@ def test_the_capacity_follows_the_format_and_a_codebook_is_made(watched: Watched
 
 
 def test_a_viewer_sees_drawings_but_registers_nothing(new_page: OpenPage, server: LiveServer) -> None:
-    key = server.app.state.access.create_key("default", Scope.VIEWER, "drawer")
+    key = server.app.state.use_cases.access.create_key("default", Scope.VIEWER, "drawer")
     watched = new_page(key)
     page = watched.open("/studio/plates")
     page.locator(".plate-drawing").wait_for()

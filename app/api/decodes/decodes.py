@@ -9,7 +9,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from app.api.decodes.schemas import CONTEXT_EXAMPLE, ContextIn
 from app.api.decodes.uploads import RAW_TYPES, Upload
 from app.api.http.bodies import form_body
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_cases
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, use_case
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
@@ -48,8 +48,8 @@ _BODY = form_body(
     {"file": "frame.jpg", "context": CONTEXT_EXAMPLE},
     **{kind: {"schema": _JSON_BODY if kind == "application/json" else BINARY} for kind in RAW_TYPES},
 )
-Decodes = Annotated[DecodesService, use_cases("decodes")]
-Outputs = Annotated[DecodeOutputs, use_cases("decode_outputs")]
+Decodes = Annotated[DecodesService, use_case(lambda cases: cases.decodes)]
+Outputs = Annotated[DecodeOutputs, use_case(lambda cases: cases.decode_outputs)]
 
 
 @router.post(
@@ -189,7 +189,7 @@ def get_annotated(
 
 detail_router = APIRouter(prefix="/v1/decodes", tags=["decodes"], route_class=StrictRoute)
 
-Details = Annotated[DecodeDetails, use_cases("decode_details")]
+Details = Annotated[DecodeDetails, use_case(lambda cases: cases.decode_details)]
 _FILE_MEDIA_TYPES = {"geojson": "application/geo+json", "csv": "text/csv", "gpx": "application/gpx+xml"}
 
 

@@ -83,7 +83,7 @@ async def get_upload(
 
 async def check_quota(request: Request) -> None:
     """Refuse a body beyond the quota of its key before it is read, by its Content-Length."""
-    quotas: Quotas = request.app.state.quotas
+    quotas: Quotas = request.app.state.use_cases.quotas
     caller, size = caller_of(request), int(request.headers.get("content-length", "0"))
     try:
         if quotas.is_known(caller):

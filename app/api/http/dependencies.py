@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import Depends, Path, Query, Request
@@ -17,6 +18,7 @@ from app.families.documents import Whole as Whole
 from app.services.access.access import Caller as CallerValue
 from app.services.idempotency import IdempotencyKey
 from app.services.markers.markers import Markers as MarkersService
+from app.use_cases import UseCases
 
 MAX_IDEMPOTENCY_KEY = 200
 
@@ -27,11 +29,11 @@ AfterVersion = Annotated[int, Query(ge=0, lt=2**31, description="Last version of
 AfterLink = Annotated[Text | None, Query(max_length=100, description="As the link to the next page has it.")]
 
 
-def use_cases(name: str) -> Any:
-    """A dependency: the object that the app has under this name in its state."""
+def use_case(find: Callable[[UseCases], object]) -> Any:
+    """A dependency: one of the server's use cases, as in `use_case(lambda cases: cases.plans)`."""
 
-    async def get(request: Request) -> Any:  # async: a plain function would cost a hop to a thread
-        return getattr(request.app.state, name)
+    async def get(request: Request) -> object:  # async: a plain function would cost a hop to a thread
+        return find(request.app.state.use_cases)
 
     return Depends(get)
 
@@ -133,7 +135,7 @@ def _query_names(dependant: Dependant) -> set[str]:
 
 
 Caller = Annotated[CallerValue, Depends(get_caller)]
-Markers = Annotated[MarkersService, use_cases("markers")]
+Markers = Annotated[MarkersService, use_case(lambda cases: cases.markers)]
 Idempotency = Annotated[IdempotencyKey | None, Depends(get_idempotency_key)]
 Version = Annotated[int | None, Depends(get_version)]
 SentVersion = Annotated[int | None, Depends(find_version)]

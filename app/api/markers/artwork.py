@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field, JsonValue
 
-from app.api.http.dependencies import Caller, Idempotency, MarkerId, Number, use_cases
+from app.api.http.dependencies import Caller, Idempotency, MarkerId, Number, use_case
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     BINARY,
@@ -71,7 +71,7 @@ _HEADERS = {
     "Waymark-Proof": "What the decoder read from the drawing.",
     "Waymark-QR-Code": '`public-page`: the QR code opens the public page. `none; reason="..."`: there is none.',
 }
-ArtworkService = Annotated[Artworks, use_cases("artworks")]
+ArtworkService = Annotated[Artworks, use_case(lambda cases: cases.artworks)]
 
 
 @router.get(
@@ -124,7 +124,7 @@ def post_artwork(
     wanted: ArtworkIn,
     caller: Caller,
     artworks: ArtworkService,
-    jobs: Annotated[ArtworkJobs, use_cases("artwork_jobs")],
+    jobs: Annotated[ArtworkJobs, use_case(lambda cases: cases.artwork_jobs)],
     idempotency: Idempotency,
     prefer: Prefer = None,
 ) -> Response:
@@ -173,7 +173,7 @@ def get_layout(
     marker_id: MarkerId,
     form: SheetFormat,
     caller: Caller,
-    layouts: Annotated[Layouts, use_cases("layouts")],
+    layouts: Annotated[Layouts, use_case(lambda cases: cases.layouts)],
     if_none_match: IfNoneMatch = None,
 ) -> Response:
     """Drilling sheet of a magnet marker: holes with polarity and orientation, checks, materials and costs."""
@@ -212,7 +212,7 @@ class ProgramsIn(SelectionIn):
     with_keys: Flag = Field(False, description="With the markers' own keys; takes an admin's key.")
 
 
-Programs = Annotated[CerpmPrograms, use_cases("programs")]
+Programs = Annotated[CerpmPrograms, use_case(lambda cases: cases.programs)]
 
 
 @program_router.get(

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict, Field, JsonValue
 
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, Text, Whole, use_cases
+from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, Text, Whole, use_case
 from app.api.http.responses import (
     NOT_MODIFIED,
     IfNoneMatch,
@@ -140,7 +140,7 @@ class MeaningsIn(StrictModel):
 router = APIRouter(prefix="/v1/codebooks", tags=["codebooks"], route_class=StrictRoute)
 
 CodebookId = Annotated[Identifier, Path(description="Id of the codebook.")]
-Service = Annotated[Codebooks, use_cases("codebooks")]
+Service = Annotated[Codebooks, use_case(lambda cases: cases.codebooks)]
 
 
 @router.post("", status_code=201, responses=document_response(CodebookDocument, 409, status=201, description="Made"))

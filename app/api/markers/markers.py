@@ -30,7 +30,7 @@ from app.api.http.dependencies import (
     PageSize,
     Text,
     Version,
-    use_cases,
+    use_case,
 )
 from app.api.http.permissions import PERMISSIONS
 from app.api.http.problems import (
@@ -240,7 +240,7 @@ def get_marker_version(
 observation_router = APIRouter(prefix="/v1/markers/{marker_id}/observations", tags=["markers"], route_class=StrictRoute)
 
 
-Observations = Annotated[ObservationsService, use_cases("observations")]
+Observations = Annotated[ObservationsService, use_case(lambda cases: cases.observations)]
 
 
 @observation_router.get("", responses=document_response(ObservationPage, 404))
@@ -345,7 +345,7 @@ class RefusedItems(Problem):
     report: BulkReport
 
 
-Bulk = Annotated[BulkMarkersService, use_cases("bulk_markers")]
+Bulk = Annotated[BulkMarkersService, use_case(lambda cases: cases.bulk_markers)]
 
 
 @bulk_router.post(

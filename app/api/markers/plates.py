@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import ConfigDict, Field, JsonValue
 
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, read_declaration
-from app.api.http.dependencies import Caller, Identifier, Number, Text, use_cases
+from app.api.http.dependencies import Caller, Identifier, Number, Text, use_case
 from app.api.http.problems import problem_responses
 from app.api.http.responses import BINARY, document_response, file_response, json_response
 from app.api.http.strict_json import StrictRoute
@@ -120,7 +120,7 @@ _VIEW_HEADERS = {
         "Outer corners of the plate, clockwise from the triangle's: `x,y x,y x,y x,y`; empty if it is not in view. [px]"
     ),
 }
-Drafts = Annotated[PlateDrafts, use_cases("plate_drafts")]
+Drafts = Annotated[PlateDrafts, use_case(lambda cases: cases.plate_drafts)]
 
 
 @draft_router.post("", responses=document_response(PlateDraftDocument))
@@ -283,7 +283,7 @@ async def get_asked(request: Request) -> AsyncIterator[_Asked]:
         yield _Asked(photo.spooled, (await read_declaration(PrintGradeIn, text, "declaration")).given())
 
 
-Service = Annotated[PrintGrades, use_cases("print_grades")]
+Service = Annotated[PrintGrades, use_case(lambda cases: cases.print_grades)]
 Asked = Annotated[_Asked, Depends(get_asked)]
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import ConfigDict, Field, model_validator
 
-from app.api.http.dependencies import AfterLink, Caller, Identifier, LastId, Number, PageSize, Text, use_cases
+from app.api.http.dependencies import AfterLink, Caller, Identifier, LastId, Number, PageSize, Text, use_case
 from app.api.http.responses import checked_id, cursor_of, document_response, json_response, page_response, parse_time
 from app.api.http.strict_json import AnyPolygon, GeoLineIn, StrictRoute
 from app.errors import InvalidParameter
@@ -189,7 +189,7 @@ class SearchIn(StrictModel):
 
 router = APIRouter(prefix="/v1/markers", tags=["markers"], route_class=StrictRoute)
 
-Searches = Annotated[SearchesService, use_cases("searches")]
+Searches = Annotated[SearchesService, use_case(lambda cases: cases.searches)]
 
 
 @dataclass(frozen=True, slots=True)

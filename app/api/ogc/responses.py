@@ -17,7 +17,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from typing_extensions import TypedDict
 
-from app.api.http.dependencies import use_cases
+from app.api.http.dependencies import use_case
 from app.api.ogc.query import (
     OF_ITEM,
     ONLY_FORMAT,
@@ -415,7 +415,7 @@ async def get_base_url(request: FastapiRequest) -> str:
 
 EditableCollection = Annotated[Collection, Depends(get_editable_collection)]
 FeatureId = Annotated[str, Depends(get_feature_id)]
-FeaturesService = Annotated[Features, use_cases("features")]
+FeaturesService = Annotated[Features, use_case(lambda cases: cases.features)]
 ItemsQueryOf = Annotated[ItemsQuery, Depends(get_items_query)]
 ItemQueryOf = Annotated[ItemQuery, Depends(get_item_query)]
 BaseUrl = Annotated[str, Depends(get_base_url)]

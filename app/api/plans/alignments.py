@@ -19,7 +19,7 @@ from app.api.http.bodies import (
     read_text,
     received_form,
 )
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_cases
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, use_case
 from app.api.http.problems import problem_responses, reference
 from app.api.http.responses import (
     BINARY,
@@ -59,7 +59,7 @@ _BODY = form_body(
 )
 
 AlignmentId = Annotated[Identifier, Path(description="Id of the alignment.")]
-Service = Annotated[Alignments, use_cases("alignments")]
+Service = Annotated[Alignments, use_case(lambda cases: cases.alignments)]
 
 
 @dataclass(frozen=True, slots=True)

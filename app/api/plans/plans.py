@@ -18,7 +18,7 @@ from app.api.http.dependencies import (
     PageSize,
     Text,
     Version,
-    use_cases,
+    use_case,
 )
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
@@ -83,7 +83,7 @@ def post_plan_preview(
     request: Request,
     wanted: PlanPreviewIn,
     caller: Caller,
-    previews: Annotated[PlanPreviews, use_cases("plan_previews")],
+    previews: Annotated[PlanPreviews, use_case(lambda cases: cases.plan_previews)],
     after: Annotated[int, Query(ge=0, le=10**7, description="Markers of the pages before.")] = 0,
     limit: Annotated[int, Query(ge=1, le=MAX_MARKERS)] = 1000,
 ) -> Response:
@@ -107,7 +107,7 @@ def _schema() -> bytes:
 job_router = APIRouter(prefix="/v1/plan-jobs", tags=["plans"], route_class=StrictRoute)
 
 JobId = Annotated[Identifier, Path(description="Id of the job.")]
-JobService = Annotated[PlanJobs, use_cases("plan_jobs")]
+JobService = Annotated[PlanJobs, use_case(lambda cases: cases.plan_jobs)]
 
 
 def queued_response(job: PlanJobDocument, replayed: bool) -> Response:
@@ -154,7 +154,7 @@ router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
 FOLLOWS_MARKERS = ("committed", "built", "surveyed")
 """Statuses that change when markers do, without a new version of the plan."""
 PlanId = Annotated[Identifier, Path(description="Id of the plan.")]
-Service = Annotated[Plans, use_cases("plans")]
+Service = Annotated[Plans, use_case(lambda cases: cases.plans)]
 
 
 @router.post(
@@ -170,7 +170,7 @@ def post_plan(
     wanted: PlanIn,
     caller: Caller,
     plans: Service,
-    making: Annotated[PlanMaking, use_cases("plan_making")],
+    making: Annotated[PlanMaking, use_case(lambda cases: cases.plan_making)],
     idempotency: Idempotency,
     prefer: Prefer = None,
 ) -> Response:
@@ -235,7 +235,7 @@ def get_plan_file(
     name: Annotated[Text, Path(max_length=60, examples=["bill.csv"])],
     caller: Caller,
     plans: Service,
-    proofs: Annotated[Proofs, use_cases("proofs")],
+    proofs: Annotated[Proofs, use_case(lambda cases: cases.proofs)],
     crs: Annotated[Text | None, Query(max_length=64, description="CRS of the stakeout.")] = None,
     unit: Annotated[Literal["m", "ft-us", "ft-intl"] | None, Query(description="Unit of the stakeout.")] = None,
 ) -> Response:
@@ -283,7 +283,7 @@ def get_as_built(plan_id: PlanId, caller: Caller, plans: Service) -> Response:
 
 package_router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
 
-PackageService = Annotated[Packages, use_cases("packages")]
+PackageService = Annotated[Packages, use_case(lambda cases: cases.packages)]
 
 
 @package_router.post(
@@ -328,7 +328,7 @@ def get_package(
 
 proof_router = APIRouter(prefix="/v1/plans", tags=["plans"], route_class=StrictRoute)
 
-ProofService = Annotated[Proofs, use_cases("proofs")]
+ProofService = Annotated[Proofs, use_case(lambda cases: cases.proofs)]
 
 
 @proof_router.post(

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import ConfigDict, Field
 
-from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, Version, use_cases
+from app.api.http.dependencies import Caller, Identifier, LastId, PageSize, Text, Version, use_case
 from app.api.http.problems import problem_responses
 from app.api.http.responses import (
     NOT_MODIFIED,
@@ -34,7 +34,7 @@ from app.services.public_pages.reports import DamageReports
 router = APIRouter(prefix="/v1/damage-reports", tags=["public pages"], route_class=StrictRoute)
 
 ReportId = Annotated[Identifier, Path(description="Id of the report.")]
-Service = Annotated[DamageReports, use_cases("damage_reports")]
+Service = Annotated[DamageReports, use_case(lambda cases: cases.damage_reports)]
 _PHOTO_HEADERS = {"Content-Security-Policy": "default-src 'none'; sandbox"}
 
 
@@ -121,7 +121,7 @@ def reject_damage_report(rejection: RejectionIn, report_id: ReportId, caller: Ca
 
 settings_router = APIRouter(prefix="/v1/public-page", tags=["public pages"], route_class=StrictRoute)
 
-Pages = Annotated[PublicPages, use_cases("public_pages")]
+Pages = Annotated[PublicPages, use_case(lambda cases: cases.public_pages)]
 
 
 class PublicPageIn(StrictModel):

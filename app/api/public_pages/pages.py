@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Annotated, Any, cast
 
 from anyio import to_thread
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from app.api.http.bodies import FORM, received_form
-from app.api.http.dependencies import use_cases
+from app.api.http.dependencies import use_case
 from app.api.http.problems import problem_responses
 from app.api.http.responses import BINARY, json_response
 from app.api.http.strict_json import StrictRoute
@@ -61,11 +61,25 @@ class FormLimits:
 
 MarkerAddress = Annotated[str, Path(description="Id of the marker, as the QR code on the plate has it.")]
 Lang = Annotated[str | None, Query(description="`en` or `de`; otherwise Accept-Language decides.")]
-Pages = Annotated[PublicPages, use_cases("public_pages")]
-Reports = Annotated[DamageReports, use_cases("damage_reports")]
-Tokens = Annotated[FormTokens, use_cases("form_tokens")]
-Limits = Annotated[PublicLimits, use_cases("public_limits")]
-Form = Annotated[FormLimits, use_cases("form_limits")]
+
+
+async def get_public_limits(request: Request) -> PublicLimits:
+    """How often the pages may be asked for."""
+    limits: PublicLimits = request.app.state.public_limits
+    return limits
+
+
+async def get_form_limits(request: Request) -> FormLimits:
+    """What a damage report may hold."""
+    limits: FormLimits = request.app.state.form_limits
+    return limits
+
+
+Pages = Annotated[PublicPages, use_case(lambda cases: cases.public_pages)]
+Reports = Annotated[DamageReports, use_case(lambda cases: cases.damage_reports)]
+Tokens = Annotated[FormTokens, use_case(lambda cases: cases.form_tokens)]
+Limits = Annotated[PublicLimits, Depends(get_public_limits)]
+Form = Annotated[FormLimits, Depends(get_form_limits)]
 
 _HTML: dict[str, Any] = {"text/html": {"schema": {"type": "string"}}}
 

@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 from pydantic import ConfigDict, Field
 
 from app.api.http.bodies import DeclaredForm, SpooledPart, form_body, idempotency_of, read_declaration
-from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, PageSize, Text, use_cases
+from app.api.http.dependencies import Caller, Idempotency, Identifier, LastId, Number, PageSize, Text, use_case
 from app.api.http.problems import FieldError, Problem, problem_responses, report_problem
 from app.api.http.responses import (
     BINARY,
@@ -101,8 +101,8 @@ async def get_asked(
 
 
 Asked = Annotated[_Asked, Depends(get_asked)]
-Imports = Annotated[ImportsService, use_cases("imports")]
-Jobs = Annotated[ImportJobs, use_cases("import_jobs")]
+Imports = Annotated[ImportsService, use_case(lambda cases: cases.imports)]
+Jobs = Annotated[ImportJobs, use_case(lambda cases: cases.import_jobs)]
 
 
 @import_router.post(
@@ -187,7 +187,7 @@ export_router = APIRouter(prefix="/v1/exports", tags=["exports"], route_class=St
 
 ExportFormat = Literal["csv", "geojson", "gpkg", "shapefile", "kml", "landxml", "dxf"]
 _Measure = Annotated[float, Field(strict=True, ge=-1e8, le=1e8, allow_inf_nan=False)]
-Exports = Annotated[ExportsService, use_cases("exports")]
+Exports = Annotated[ExportsService, use_case(lambda cases: cases.exports)]
 
 
 class ExportIn(StrictModel):
@@ -223,7 +223,7 @@ class ExportIn(StrictModel):
 def post_export(
     wanted: ExportIn,
     caller: Caller,
-    jobs: Annotated[ExportJobs, use_cases("export_jobs")],
+    jobs: Annotated[ExportJobs, use_case(lambda cases: cases.export_jobs)],
     idempotency: Idempotency,
 ) -> Response:
     """Write markers into a file as a job; the file is at its `links.result` for seven days."""

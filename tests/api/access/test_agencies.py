@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.both_databases]
 
 @pytest.fixture
 def operator(server: LiveServer) -> Iterator[httpx.Client]:
-    with server.client(server.app.state.access.create_operator_key("ops")) as client:
+    with server.client(server.app.state.use_cases.access.create_operator_key("ops")) as client:
         yield client
 
 
@@ -72,7 +72,7 @@ def test_a_repeated_request_gets_the_same_key_which_is_stored_encrypted(
         assert connection.execute(count).scalar_one() == 1
     assert stored["id"] == first["id"]
     assert first["admin_key"]["key"] not in str(stored)
-    with server.client(server.app.state.access.create_operator_key("other")) as other:
+    with server.client(server.app.state.use_cases.access.create_operator_key("other")) as other:
         refused(other.post("/v1/agencies", json={"name": "East"}, headers=key), 409, field="name")
 
 
@@ -95,7 +95,7 @@ def test_a_name_is_given_once_and_pages_list_all(server: LiveServer, operator: h
     first = _created(operator, "Once")
     refused(operator.post("/v1/agencies", json={"name": "Once"}), 409, field="name")
     others = [_created(operator, f"Page {number}")["id"] for number in range(3)]
-    assert server.app.state.access.create_key("Once", Scope.VIEWER, "by command")
+    assert server.app.state.use_cases.access.create_key("Once", Scope.VIEWER, "by command")
     seen, url = [], "/v1/agencies?limit=2"
     while url:
         page = operator.get(url)

@@ -161,7 +161,7 @@ def test_the_audit_log_names_keys_and_who_made_them(server: LiveServer, admin: h
     made = _made(admin, label="crew 7", scope="surveyor")
     newer = admin.post(f"/v1/keys/{made['id']}/rotate", json={}).json()
     assert admin.delete(f"/v1/keys/{made['id']}").status_code == 204
-    caller = server.app.state.access.authenticate(admin.headers["authorization"].split()[1])
+    caller = server.app.state.use_cases.access.authenticate(admin.headers["authorization"].split()[1])
     with server.app.state.database.read() as connection:
         entries = list_entries(connection, caller.agency_id)[1:]  # the first is the admin's own key
     assert {entry.key_id for entry in entries} == {caller.key_id}

@@ -190,7 +190,7 @@ def test_a_job_has_its_effect_once_however_often_it_runs(
     answer = post_frame(client, pack({"a.png": GOOD, "b.png": GOOD}), near(plate))
     decode = wait_for(client, answer.headers["location"])
     counts = stored.counts()
-    server.app.state.jobs.run_job(decode["id"])
+    server.app.state.use_cases.jobs.run_job(decode["id"])
     assert stored.counts() == counts
     assert client.get(answer.headers["location"]).json() == decode
 

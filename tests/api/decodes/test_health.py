@@ -120,12 +120,12 @@ def _check_offset(item: dict[str, Any]) -> None:
 def _check_recomputed(server: LiveServer, client: httpx.Client) -> None:
     """The states that grew with the uploads are those that follow from the stored observations."""
     key = client.headers["authorization"].split()[1]
-    agency_id = server.app.state.access.authenticate(key).agency_id
+    agency_id = server.app.state.use_cases.access.authenticate(key).agency_id
     columns = marker_health.c
     query = sa.select(columns.subject, columns.passes, columns.ratios, columns.state).order_by(columns.subject)
     with server.app.state.database.write() as connection:
         grown = connection.execute(query.where(columns.agency_id == agency_id)).all()
-        recompute_health(connection, agency_id, server.app.state.maintenance._clock())
+        recompute_health(connection, agency_id, server.app.state.use_cases.maintenance._clock())
         again = connection.execute(query.where(columns.agency_id == agency_id)).all()
     assert grown == again
     assert len(grown) > PLATES

@@ -282,7 +282,7 @@ def test_forged_and_replayed_packets_are_refused_and_move_nothing(road: tuple[ht
 @pytest.mark.slow
 def test_forged_tags_are_limited_and_in_the_audit_log(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
     """One entry for an upload, whatever it contains; the limit is of the key, not of its agency."""
-    handler = next(handler for handler in server.app.state.decodes._handlers if handler.kind == "packets")
+    handler = next(handler for handler in server.app.state.use_cases.decodes._handlers if handler.kind == "packets")
     monkeypatch.setattr(handler, "_invalid_tags", InvalidTagLimit(10))
     name = f"guessed roads {next(_AGENCIES)}"
     with server.agency(name, Scope.ADMIN) as admin, server.agency(name, Scope.VEHICLE) as vehicle:

@@ -54,7 +54,7 @@ def client(server: LiveServer) -> Iterator[httpx.Client]:
 
 
 def caller_of(server: LiveServer, client: httpx.Client) -> Caller:
-    caller: Caller = server.app.state.access.authenticate(client.headers["authorization"].split()[1])
+    caller: Caller = server.app.state.use_cases.access.authenticate(client.headers["authorization"].split()[1])
     return caller
 
 
@@ -286,7 +286,7 @@ def test_an_idempotency_key_makes_one_drive(server: LiveServer, client: httpx.Cl
     assert client.get(path).status_code == 404
     if stored is not None:
         with pytest.raises(Exception, match=r"\w"):
-            server.app.state.drives._blobs.get(stored["keys"]["track.csv"])
+            server.app.state.use_cases.drives._blobs.get(stored["keys"]["track.csv"])
 
 
 def test_bad_drives_name_the_decode_the_field_and_the_cure(server: LiveServer, client: httpx.Client) -> None:

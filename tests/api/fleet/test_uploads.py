@@ -247,7 +247,7 @@ def test_a_key_speaks_for_its_vehicle(server: LiveServer) -> None:
     camera = CAMERA_IN | {"width_px": 96, "height_px": 64}
     with server.agency(agency, Scope.ADMIN) as admin, server.agency(agency, Scope.VEHICLE) as on_board:
         mine, other = _vehicle(admin, "A", camera=camera), _vehicle(admin, "B", camera=camera)
-        key_id = server.app.state.access.authenticate(on_board.headers["authorization"].split()[1]).key_id
+        key_id = server.app.state.use_cases.access.authenticate(on_board.headers["authorization"].split()[1]).key_id
         assert "vehicle" not in _send(on_board, _grey_png()).json()["context"]
         path = f"/v1/vehicles/{mine['id']}/keys/{key_id}"
         assert admin.put(path).status_code == 200

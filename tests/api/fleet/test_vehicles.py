@@ -167,7 +167,7 @@ def test_a_bad_body_is_a_problem(client: httpx.Client, body: str, field: str | N
 def test_keys_speak_for_one_vehicle(server: LiveServer) -> None:
     with server.agency("keys of a fleet", Scope.ADMIN) as admin:
         vehicle, other = _new_vehicle(admin, name="A"), _new_vehicle(admin, name="B")
-        access = server.app.state.access
+        access = server.app.state.use_cases.access
         caller = access.authenticate(access.create_key("keys of a fleet", Scope.VEHICLE, "on board"))
         path = f"/v1/vehicles/{vehicle['id']}/keys/{caller.key_id}"
         for _ in range(2):  # a second time changes nothing

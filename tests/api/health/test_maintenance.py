@@ -39,7 +39,7 @@ def owner(server: LiveServer) -> Iterator[httpx.Client]:
 
 def _agency_id(server: LiveServer, client: httpx.Client) -> str:
     key = client.headers["authorization"].split()[1]
-    return str(server.app.state.access.authenticate(key).agency_id)
+    return str(server.app.state.use_cases.access.authenticate(key).agency_id)
 
 
 def _plate(client: httpx.Client, lon_deg: float, **more: Any) -> dict[str, Any]:

@@ -135,11 +135,11 @@ def test_requests_end_when_their_clients_leave(fresh_server: LiveServer, further
     """Also where the client sent a further request, which keeps uvicorn from reading the end of the connection."""
     state = fresh_server.app.state
     for use_case, call, path in (
-        (state.searches, "page", "/v1/markers"),
-        (state.features, "page", "/ogc/collections/markers/items"),
-        (state.features, "tile", "/ogc/collections/markers/tiles/WebMercatorQuad/0/0/0"),
-        (state.snapshots, "make", "/v1/snapshots?bbox=8,48,9,50"),
-        (state.exports, "stream", "/v1/exports/csv"),
+        (state.use_cases.searches, "page", "/v1/markers"),
+        (state.use_cases.features, "page", "/ogc/collections/markers/items"),
+        (state.use_cases.features, "tile", "/ogc/collections/markers/tiles/WebMercatorQuad/0/0/0"),
+        (state.use_cases.snapshots, "make", "/v1/snapshots?bbox=8,48,9,50"),
+        (state.use_cases.exports, "stream", "/v1/exports/csv"),
     ):
         endless = _Endless(state.database)
         setattr(use_case, call, endless)
@@ -167,7 +167,7 @@ def test_a_response_that_nobody_reads_ends_without_a_line_in_the_log(
         finally:
             ended.set()
 
-    fresh_server.app.state.exports.stream = chunks
+    fresh_server.app.state.use_cases.exports.stream = chunks
     with (
         fresh_server.client() as client,
         client.stream("GET", "/v1/exports/csv", headers={"Accept-Encoding": "identity"}) as response,

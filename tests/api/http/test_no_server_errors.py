@@ -40,7 +40,7 @@ class Fuzzed:
 
     def __init__(self, server: LiveServer) -> None:
         self._url = server.url
-        key = server.app.state.access.create_key("an agency for fuzzing", Scope.ADMIN, label="fuzz")
+        key = server.app.state.use_cases.access.create_key("an agency for fuzzing", Scope.ADMIN, label="fuzz")
         self._headers = {"Authorization": f"Bearer {key}"}
         self.statements = 0
         self._dialect = server.app.state.database.engine.dialect.name

@@ -204,7 +204,7 @@ KEYLESS = ("no key", "unknown", "revoked", "expired")
 @pytest.fixture(scope="module")
 def keys(server: LiveServer) -> dict[str, str | None]:
     """A key of each kind, all of one agency."""
-    access = server.app.state.access
+    access = server.app.state.use_cases.access
     made: dict[str, str | None] = {scope: access.create_key("matrix", scope, scope) for scope in AGENCY_SCOPES}
     made[Scope.OPERATOR] = access.create_operator_key("operator")
     made |= {kind: access.create_key("matrix", Scope.ADMIN, kind) for kind in KEYLESS}
@@ -295,8 +295,8 @@ def things(server: LiveServer) -> dict[str, list[str]]:
         upload = owner.post("/v1/uploads", headers={**TUS, "Upload-Length": "9"}).headers["Location"].rsplit("/", 1)[1]
     state = server.app.state
     sent = SentReport("00" * 12, "loose", None, SpooledFile.of(jpeg()), "reporter@example.org", "en")
-    report = state.damage_reports.submit(state.public_pages.read(suspect), sent)
-    access = server.app.state.access
+    report = state.use_cases.damage_reports.submit(state.use_cases.public_pages.read(suspect), sent)
+    access = server.app.state.use_cases.access
     caller = access.authenticate(owner.headers["authorization"].split()[1])
     calibration = {"id": "019cb624-0000-7000-8000-00000000cccc", "who": "w", "result": CALIBRATED}
     with server.app.state.database.write() as connection:  # from photos it takes long

@@ -103,14 +103,14 @@ def test_exports_are_jobs_whose_files_expire(
     refused(client.get(f"/v1/jobs/{empty['id']}/result"), 409, "conflict")
     for wrong in ({}, {"format": "csv", "bbox": [5, 5, 4, 4]}, {"format": "csv", "from_m": 3}, {"format": "x"}):
         refused(client.post("/v1/exports", json=wrong), 422)
-    files = server.app.state.job_files
-    key = [key for key in server.app.state.unused_blobs._blobs.list_keys() if key.startswith("results/")]
+    files = server.app.state.use_cases.job_files
+    key = [key for key in server.app.state.use_cases.unused_blobs._blobs.list_keys() if key.startswith("results/")]
     monkeypatch.setattr(files, "_clock", lambda: datetime.now(UTC) + KEPT - timedelta(hours=1))
     assert files.delete_expired() == 0
     monkeypatch.setattr(files, "_clock", lambda: datetime.now(UTC) + KEPT + timedelta(hours=1))
     assert files.delete_expired() >= 1
     assert files.delete_expired() == 0
-    left = list(server.app.state.unused_blobs._blobs.list_keys())
+    left = list(server.app.state.use_cases.unused_blobs._blobs.list_keys())
     assert key
     assert not set(key) & set(left)
     refused(client.get(job["links"]["result"]), 404, "not-found")

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.both_databases
 
 
 def whoami(server: LiveServer, client: httpx.Client) -> Any:
-    return server.app.state.access.authenticate(client.headers["authorization"].split()[1])
+    return server.app.state.use_cases.access.authenticate(client.headers["authorization"].split()[1])
 
 
 def add(server: LiveServer, client: httpx.Client, kind: JobKind = JobKind.PLAN, **values: Any) -> JobRow:

@@ -95,10 +95,10 @@ def at_home(_host: str, _port: int) -> list[str]:
 def worker(server: LiveServer, clock: list[datetime], monkeypatch: pytest.MonkeyPatch) -> Iterator[WebhookDelivery]:
     """Deliveries by the test: those of the server itself rest. Names lead to this machine."""
     state = server.app.state
-    monkeypatch.setattr(state.webhook_delivery, "work", lambda: 0)
-    monkeypatch.setattr(state.webhooks, "_check_url", lambda _url: None)
+    monkeypatch.setattr(state.use_cases.webhook_delivery, "work", lambda: 0)
+    monkeypatch.setattr(state.use_cases.webhooks, "_check_url", lambda _url: None)
     sender = WebhookSender(at_home, loopback=True, total_s=5.0)
-    yield WebhookDelivery(state.database, lambda: clock[0], state.webhooks._secrets, sender)
+    yield WebhookDelivery(state.database, lambda: clock[0], state.use_cases.webhooks._secrets, sender)
     with across_agencies(), state.database.write() as connection:
         connection.execute(webhook_deliveries.delete())
         connection.execute(webhook_table.delete())

@@ -25,7 +25,7 @@ def marker_id(server: LiveServer, client: httpx.Client, place: Callable[[], dict
     """A marker with 12 observations: three frames of each of four decodes, a minute apart, two at the same time."""
     marker: str = client.post("/v1/markers", json={"position": place()}).json()["id"]
     agency = client.headers["Authorization"].removeprefix("Bearer ")
-    agency_id = server.app.state.access.authenticate(agency).agency_id
+    agency_id = server.app.state.use_cases.access.authenticate(agency).agency_id
     with server.app.state.database.write() as connection:
         get_marker(connection, agency_id, marker)
         for k, what in enumerate(WHATS):

@@ -30,7 +30,7 @@ Gdal = Callable[..., Any]
 @pytest.fixture(scope="module")
 def road(server: LiveServer) -> str:
     """The key of an agency with twelve markers."""
-    key = str(server.app.state.access.create_key("gis", Scope.PLANNER, label="gis"))
+    key = str(server.app.state.use_cases.access.create_key("gis", Scope.PLANNER, label="gis"))
     with server.client(key) as client:
         for k, (lon, lat) in enumerate(ROW):
             add(client, lon, lat, road=f"A{k % 3}", measure_m=float(k), position={"height_m": 3.25})
@@ -171,7 +171,7 @@ def test_owslib_reads_and_filters(owslib: Features) -> None:
 
 def test_owslib_edits(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("owslib.ogcapi.REQUEST_HEADERS", {"Accept": "application/json"})
-    key = str(server.app.state.access.create_key("owslib", Scope.PLANNER, label="owslib"))
+    key = str(server.app.state.use_cases.access.create_key("owslib", Scope.PLANNER, label="owslib"))
     headers = {"X-API-Key": key, "Content-Type": "application/geo+json"}  # OWSLib would say text/xml
     client = Features(f"{server.url}/ogc", headers=headers)
     point = {"type": "Point", "coordinates": [12.5, 55.5]}

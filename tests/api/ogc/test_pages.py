@@ -191,7 +191,7 @@ def browser(tmp_path: Path, require_tool: Callable[..., str]) -> Iterator[Browse
 
 
 def test_a_browser_shows_the_pages_with_a_password(server: LiveServer, browser: Browser, tmp_path: Path) -> None:
-    key = str(server.app.state.access.create_key("of the pages", Scope.PLANNER, label="pages"))
+    key = str(server.app.state.use_cases.access.create_key("of the pages", Scope.PLANNER, label="pages"))
     with server.client(key) as client:
         for k, (lon, lat) in enumerate(ROW):
             add(client, lon, lat, road=EVIL, measure_m=float(k))

@@ -208,7 +208,7 @@ def test_other_agencies_and_vehicles_see_none(
 @pytest.fixture
 def planner_key(server: LiveServer, start: tuple[float, float]) -> str:
     """The key of an agency with one plan."""
-    key = str(server.app.state.access.create_key(f"gdal plans {start[1]}", Scope.PLANNER, label="gdal"))
+    key = str(server.app.state.use_cases.access.create_key(f"gdal plans {start[1]}", Scope.PLANNER, label="gdal"))
     with server.client(key) as client:
         make(client, start, "for GDAL")
     return key

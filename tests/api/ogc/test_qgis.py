@@ -40,7 +40,7 @@ def qgis(server: LiveServer, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     """What a session of QGIS found, with the features as the server has them."""
     _require_qgis()
     folder = tmp_path_factory.mktemp("qgis")
-    key = str(server.app.state.access.create_key("with QGIS", Scope.PLANNER, label="QGIS"))
+    key = str(server.app.state.use_cases.access.create_key("with QGIS", Scope.PLANNER, label="QGIS"))
     with server.client(key) as client:
         for k in range(25):
             member = {"family": "cerpm", "side": "left"} if k % 2 else {}

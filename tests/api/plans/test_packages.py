@@ -44,7 +44,7 @@ def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
             queued.append(job_id)
 
-    monkeypatch.setattr(server.app.state.packages, "_queue", Held())
+    monkeypatch.setattr(server.app.state.use_cases.packages, "_queue", Held())
     return queued
 
 
@@ -63,7 +63,7 @@ class Watched:
 
 
 def blobs_of(server: LiveServer) -> set[Path]:
-    folder = server.app.state.packages._blobs._folder
+    folder = server.app.state.use_cases.packages._blobs._folder
     return set((folder / "packages").rglob("*/*"))
 
 
@@ -113,7 +113,7 @@ def test_an_interrupted_or_cancelled_package_leaves_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     url = f"/v1/plans/{plan['id']}/package"
-    packages, jobs = server.app.state.packages, server.app.state.jobs
+    packages, jobs = server.app.state.use_cases.packages, server.app.state.use_cases.jobs
     processes, before = packages._processes, blobs_of(server)
     job = client.post(url, json={}).json()
     refused(client.post(url, json={}), 409, field="plan_id")

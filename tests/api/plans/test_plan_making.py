@@ -64,9 +64,9 @@ def test_a_job_that_is_run_twice_makes_one_plan(
         def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
             queued.append(job_id)
 
-    monkeypatch.setattr(server.app.state.plan_making, "_queue", Held())
+    monkeypatch.setattr(server.app.state.use_cases.plan_making, "_queue", Held())
     job = client.post("/v1/plans", json=body, headers=LATER).json()
-    plans, jobs = server.app.state.plans, server.app.state.jobs
+    plans, jobs = server.app.state.use_cases.plans, server.app.state.use_cases.jobs
     processes = plans._processes
 
     class Stopping:

@@ -64,7 +64,7 @@ def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
             queued.append(job_id)
 
-    monkeypatch.setattr(server.app.state.proofs, "_queue", Held())
+    monkeypatch.setattr(server.app.state.use_cases.proofs, "_queue", Held())
     return queued
 
 
@@ -90,7 +90,7 @@ def test_a_checked_plan_is_proved_and_its_report_is_the_same_for_the_same_seed(
     server: LiveServer, client: httpx.Client, plan: dict[str, Any]
 ) -> None:
     url = f"/v1/plans/{plan['id']}"
-    folder = server.app.state.proofs._blobs._folder / "proofs"
+    folder = server.app.state.use_cases.proofs._blobs._folder / "proofs"
     before = len(list(folder.rglob("*/*")))
     assert (plan["status"], plan["proof"]) == ("checked", None)
     refused(client.get(f"{url}/proof"), 404, field="plan_id")
@@ -156,7 +156,7 @@ def test_an_interrupted_proof_does_not_drive_finished_units_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     job = prove_plan(client, plan).json()
-    proofs, jobs = server.app.state.proofs, server.app.state.jobs
+    proofs, jobs = server.app.state.use_cases.proofs, server.app.state.use_cases.jobs
     processes = proofs._processes
 
     def stop_after_one(count: int) -> None:
@@ -192,17 +192,17 @@ def test_a_proof_goes_on_after_a_restart_of_the_server(
     )  # fmt: skip
     with LiveServer(create_app(settings)) as first, first.client() as client:
         plan = make_plan(client, PLATES)
-        proofs = first.app.state.proofs
+        proofs = first.app.state.use_cases.proofs
 
         def stop(count: int) -> None:
             if count == 2:
-                first.app.state.proofs._processes._processes.close()  # as the server does when it stops
+                first.app.state.use_cases.proofs._processes._processes.close()  # as the server does when it stops
 
         proofs._processes = Watched(proofs._processes, stop)
         location = prove_plan(client, plan).headers["Location"]
         wait_until(lambda: client.get(location).json()["steps_done"] == 2, "two units")
     app = create_app(settings)
-    app.state.proofs._processes = rest = Watched(app.state.proofs._processes)
+    app.state.use_cases.proofs._processes = rest = Watched(app.state.use_cases.proofs._processes)
     with LiveServer(app) as second, second.client() as client:
         job = finished(client, location)
         assert (job["state"], job["steps_done"], rest.units) == ("done", 3, 1)
@@ -220,9 +220,9 @@ def test_a_cancelled_proof_stops_and_leaves_the_plan(
     with server.agency("provers of others") as other:
         refused(other.post(f"/v1/plan-jobs/{queued['id']}/cancel"), 404)
     assert client.post(f"/v1/plan-jobs/{queued['id']}/cancel").json()["state"] == "cancelled"
-    server.app.state.jobs.run_job(queued["id"])
+    server.app.state.use_cases.jobs.run_job(queued["id"])
     job = prove_plan(client, plan).json()
-    proofs = server.app.state.proofs
+    proofs = server.app.state.use_cases.proofs
 
     def cancel(count: int) -> None:
         if count == 1:
@@ -230,7 +230,7 @@ def test_a_cancelled_proof_stops_and_leaves_the_plan(
 
     watched = Watched(proofs._processes, cancel)
     monkeypatch.setattr(proofs, "_processes", watched)
-    server.app.state.jobs.run_job(job["id"])
+    server.app.state.use_cases.jobs.run_job(job["id"])
     ended = client.get(f"/v1/plan-jobs/{job['id']}").json()
     assert (ended["state"], ended["result"], ended["cancel_requested"]) == ("cancelled", None, True)
     assert watched.units < 4
@@ -249,7 +249,7 @@ def test_a_plan_that_was_changed_meanwhile_is_not_proved(
 ) -> None:
     url = f"/v1/plans/{plan['id']}"
     job = prove_plan(client, plan).json()
-    proofs = server.app.state.proofs
+    proofs = server.app.state.use_cases.proofs
 
     def change(count: int) -> None:
         if count == 1:
@@ -257,7 +257,7 @@ def test_a_plan_that_was_changed_meanwhile_is_not_proved(
             assert client.patch(url, json={"rules": closer}, headers=FIRST).status_code == 200
 
     monkeypatch.setattr(proofs, "_processes", Watched(proofs._processes, change))
-    server.app.state.jobs.run_job(job["id"])
+    server.app.state.use_cases.jobs.run_job(job["id"])
     ended = client.get(f"/v1/plan-jobs/{job['id']}").json()
     assert (ended["state"], ended["result"]["outdated"], ended["result"]["plan_version"]) == ("done", True, 1)
     changed = client.get(url).json()
@@ -271,13 +271,13 @@ def test_a_new_name_in_the_meantime_does_not_matter_and_an_approval_stays(
     url = f"/v1/plans/{plan['id']}"
     job = prove_plan(client, plan).json()
     client.patch(url, json={"name": f"{plan['name']} renamed"}, headers=FIRST)
-    server.app.state.jobs.run_job(job["id"])
+    server.app.state.use_cases.jobs.run_job(job["id"])
     proved = client.get(url).json()
     assert (proved["status"], proved["version"]) == ("proved", 3)
     job = client.post(f"{url}/proof", json=TERMS, headers={"If-Match": '"3"'}).json()
     with server.agency(_agency_of(server, client)) as colleague:
         assert colleague.post(f"{url}/approve", headers={"If-Match": '"3"'}).status_code == 200
-    server.app.state.jobs.run_job(job["id"])
+    server.app.state.use_cases.jobs.run_job(job["id"])
     approved = client.get(url).json()
     assert (approved["status"], approved["proof"]["job_id"]) == ("approved", job["id"])
     history = client.get(f"{url}/versions").json()["items"]
@@ -285,7 +285,7 @@ def test_a_new_name_in_the_meantime_does_not_matter_and_an_approval_stays(
 
 
 def _agency_of(server: LiveServer, client: httpx.Client) -> str:
-    caller = server.app.state.access.authenticate(client.headers["authorization"].split()[1])
+    caller = server.app.state.use_cases.access.authenticate(client.headers["authorization"].split()[1])
     with server.app.state.database.read() as connection:
         name: str = connection.execute(sa.select(agencies.c.name).where(agencies.c.id == caller.agency_id)).scalar_one()
     return name
@@ -303,7 +303,7 @@ def test_a_draft_stays_a_draft_and_a_wrong_reading_takes_the_proof_back(
     plan = make_plan(client, PLATES | blurred)
     url = f"/v1/plans/{plan['id']}"
     assert plan["status"] == ("checked" if wrong else "draft")
-    proofs = server.app.state.proofs
+    proofs = server.app.state.use_cases.proofs
     processes = proofs._processes
 
     class Misreading:
@@ -315,7 +315,7 @@ def test_a_draft_stays_a_draft_and_a_wrong_reading_takes_the_proof_back(
     for version, misread in ((1, False), (2, True)):
         monkeypatch.setattr(proofs, "_processes", Misreading() if misread else processes)
         job = client.post(f"{url}/proof", json=TERMS, headers={"If-Match": f'"{version}"'}).json()
-        server.app.state.jobs.run_job(job["id"])
+        server.app.state.use_cases.jobs.run_job(job["id"])
         proved = client.get(url).json()
         if not wrong:
             assert proved["status"] == "draft"

@@ -33,7 +33,7 @@ def release(admin: httpx.Client, fields: list[str], *, damage_reports: bool | No
 def old_token(server: LiveServer, marker_id: str, age_s: float = 60.0) -> str:
     """A token of a form that was opened some time ago."""
     at = datetime.now(UTC) - timedelta(seconds=age_s)
-    return str(server.app.state.form_tokens.issue(marker_id, at))
+    return str(server.app.state.use_cases.form_tokens.issue(marker_id, at))
 
 
 def send_report(

@@ -76,7 +76,7 @@ def test_a_report_is_received_and_its_sender_thanked(
     assert expected.items() <= report.items()
     assert "a@b.example" not in str(report)
     assert owner.get(f"/v1/damage-reports/{report['id']}").json() == report
-    agency_id = server.app.state.public_pages.read(marker["id"]).agency_id
+    agency_id = server.app.state.use_cases.public_pages.read(marker["id"]).agency_id
     with server.app.state.database.read() as connection:
         newest = list_events(connection, agency_id, limit=1000)[-1]
     assert (newest.kind, newest.subject_id) == ("report.received", report["id"])
@@ -259,7 +259,7 @@ def test_an_accepted_report_becomes_an_item_of_the_work_list(
     assert actions[-4:] == [
         "damage-report.accepted", "damage-report.accepted", "marker.changed", "maintenance.approved",
     ]  # fmt: skip
-    agency_id = server.app.state.public_pages.read(marker["id"]).agency_id
+    agency_id = server.app.state.use_cases.public_pages.read(marker["id"]).agency_id
     with server.app.state.database.read() as connection:
         kinds = [event.kind for event in list_events(connection, agency_id, limit=1000)]
     assert kinds[-4:] == ["maintenance.opened", "report.decided", "report.decided", "maintenance.decided"]
@@ -315,7 +315,7 @@ def test_a_contact_is_kept_apart_and_deleted(
         "damage-report.contact-deleted"
     )
     # and after some time by the server
-    cases, database = server.app.state.damage_reports, server.app.state.database
+    cases, database = server.app.state.use_cases.damage_reports, server.app.state.database
     with across_agencies():
         assert cases.delete_old_contacts() == 0
         old = datetime.now(UTC) - timedelta(days=91)

@@ -130,7 +130,7 @@ def test_what_changed_is_reported_and_becomes_current_when_accepted(
 def test_criteria_choose_the_uploads(
     server: LiveServer, admin: httpx.Client, place: Callable[[], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server.app.state.reprocessings._queue, "submit", lambda *_: None)
+    monkeypatch.setattr(server.app.state.use_cases.reprocessings._queue, "submit", lambda *_: None)
     first, second = place(), place()
     decode, other = upload(admin, first), upload(admin, second)
     rewrite(server, other, lambda result: None)
@@ -156,12 +156,12 @@ def test_a_shard_goes_on_where_it_was_killed_and_can_be_cancelled(
     server: LiveServer, admin: httpx.Client, place: Callable[[], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     state = server.app.state
-    monkeypatch.setattr(state.reprocessings._queue, "submit", lambda *_: None)
+    monkeypatch.setattr(state.use_cases.reprocessings._queue, "submit", lambda *_: None)
     monkeypatch.setattr(module, "SHARD", 2)
     uploads = [upload(admin, place()) for _ in range(3)]
     run = admin.post("/v1/reprocessings", json={}).json()
     assert run["shards"] == {"queued": 2}
-    decode_again, asked = state.decodes.decode_again, []
+    decode_again, asked = state.use_cases.decodes.decode_again, []
 
     class Killed(BaseException):
         pass
@@ -174,18 +174,18 @@ def test_a_shard_goes_on_where_it_was_killed_and_can_be_cancelled(
             raise UnreadableUpload("it is not what it was")
         return decode_again(agency_id, decode_id)
 
-    monkeypatch.setattr(state.decodes, "decode_again", killed_at_the_second)
+    monkeypatch.setattr(state.use_cases.decodes, "decode_again", killed_at_the_second)
     jobs = [job["id"] for job in admin.get("/v1/jobs?kind=reprocess").json()["items"]][::-1]
     with pytest.raises(Killed):
-        state.jobs.run_job(jobs[0])
+        state.use_cases.jobs.run_job(jobs[0])
     assert admin.get(run["links"]["self"]).json()["done"] == 1
     with across_agencies(), state.database.write() as connection:  # the lease of the process that was killed ends
         connection.execute(sa.update(jobs_table).values(lease_until=None).where(jobs_table.c.id == jobs[0]))
-    state.jobs.run_job(jobs[0])
+    state.use_cases.jobs.run_job(jobs[0])
     assert asked == [uploads[0]["id"], uploads[1]["id"], uploads[1]["id"]]
     assert admin.get(f"/v1/jobs/{jobs[0]}").json()["links"]["result"] == run["links"]["self"]
     refused(admin.post(f"{run['links']['self']}/accept"), 409, "conflict")
-    state.jobs.run_job(jobs[1])
+    state.use_cases.jobs.run_job(jobs[1])
     run = admin.get(run["links"]["self"]).json()
     assert (run["state"], run["summary"]["failed"], run["summary"]["same"]) == ("ready", 1, 2)
     (failed,) = admin.get(run["links"]["report"]).json()["items"]

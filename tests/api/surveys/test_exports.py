@@ -162,7 +162,7 @@ def test_files_of_several_pages_hold_every_value(
     monkeypatch.setattr(exports, "_PAGE", 2)
     monkeypatch.setattr(formats, "_GIS_PAGE", 2)
     monkeypatch.setattr(
-        server.app.state.exports, "_write", formats.write_file
+        server.app.state.use_cases.exports, "_write", formats.write_file
     )  # other processes have another _GIS_PAGE
     low = {"family": "cerpm", "position": {"lon_deg": -77.15, "lat_deg": -1e-9}, "road": "Straße =1"}
     assert client.post("/v1/markers", json=low).status_code == 201

@@ -42,7 +42,7 @@ def waiting(server: LiveServer, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         def submit(self, job_id: str, agency_id: str, kind: JobKind) -> None:
             queued.append(job_id)
 
-    monkeypatch.setattr(server.app.state.import_jobs, "_queue", Held())
+    monkeypatch.setattr(server.app.state.use_cases.import_jobs, "_queue", Held())
     return queued
 
 
@@ -87,7 +87,7 @@ def test_jobs_are_listed_newest_first(server: LiveServer, client: httpx.Client, 
 
 def _finished_here(server: LiveServer, client: httpx.Client, answer: httpx.Response) -> str:
     import_id: str = answer.json()["id"]
-    server.app.state.jobs.run_job(import_id)
+    server.app.state.use_cases.jobs.run_job(import_id)
     assert client.get(f"/v1/imports/{import_id}").json()["state"] == "done"
     return import_id
 
@@ -100,7 +100,7 @@ def test_one_that_waits_never_starts(server: LiveServer, client: httpx.Client, w
     cancelled = _cancel(client, job["id"])
     assert (cancelled.status_code, cancelled.json()["state"]) == (200, "cancelled")
     assert cancelled.json()["finished_at"] is not None
-    server.app.state.jobs.run_job(job["id"])
+    server.app.state.use_cases.jobs.run_job(job["id"])
     assert _markers(client) == []
     assert client.get(f"/v1/imports/{job['id']}").json() == cancelled.json()
     assert _cancel(client, job["id"]).json() == cancelled.json()
@@ -111,7 +111,7 @@ def test_one_that_runs_stops_before_it_stores(
     server: LiveServer, client: httpx.Client, waiting: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = _send(client, _csv(), DEGREES, **LATER).json()
-    processes, asked = server.app.state.imports._processes, []
+    processes, asked = server.app.state.use_cases.imports._processes, []
 
     class Slow:
         def submit(self, task: Any, *, wait_s: float = 0.0) -> Any:
@@ -119,8 +119,8 @@ def test_one_that_runs_stops_before_it_stores(
             asked.append(_cancel(client, job["id"]))
             return pending
 
-    monkeypatch.setattr(server.app.state.imports, "_processes", Slow())
-    server.app.state.jobs.run_job(job["id"])
+    monkeypatch.setattr(server.app.state.use_cases.imports, "_processes", Slow())
+    server.app.state.use_cases.jobs.run_job(job["id"])
     assert (asked[0].status_code, asked[0].json()["state"]) == (200, "running")
     assert asked[0].json()["cancel_requested"]
     ended = client.get(f"/v1/imports/{job['id']}").json()
@@ -142,7 +142,7 @@ def test_one_that_stores_says_that_it_is_too_late(
         store(*given)
 
     monkeypatch.setattr(imports._Running, "store", slow)
-    server.app.state.jobs.run_job(job["id"])
+    server.app.state.use_cases.jobs.run_job(job["id"])
     asked.append(_cancel(client, job["id"]))
     assert [answer.status_code for answer in asked] == [409, 409]
     assert [answer.json()["detail"] for answer in asked] == [
@@ -165,11 +165,11 @@ def test_one_that_was_storing_when_the_server_stopped_goes_on(
 
     monkeypatch.setattr(imports._Running, "store", broken)
     with pytest.raises(Unavailable):
-        server.app.state.jobs.run_job(job["id"])
+        server.app.state.use_cases.jobs.run_job(job["id"])
     assert _markers(client) == []
     assert client.get(f"/v1/imports/{job['id']}").json()["state"] == "queued"
     assert _cancel(client, job["id"]).status_code == 409
     assert client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 409
     monkeypatch.setattr(imports._Running, "store", store)
-    server.app.state.jobs.run_job(job["id"])
+    server.app.state.use_cases.jobs.run_job(job["id"])
     assert client.get(f"/v1/imports/{job['id']}").json()["report"]["stored"] == 8

@@ -370,7 +370,7 @@ def test_a_large_file_becomes_a_job_and_runs_once(server: LiveServer, client: ht
     blank = b"\n" * (8 * 2**20)  # empty lines count for nothing but bytes
     job = _finished(client, _send(client, _csv(20) + blank, DEGREES))
     assert job["report"]["stored"] == 20
-    jobs = server.app.state.jobs
+    jobs = server.app.state.use_cases.jobs
     jobs.run_job(job["id"])  # once more, as after a crash
     assert client.get(f"/v1/imports/{job['id']}").json() == job
     assert len(_markers(client)) == 20

@@ -58,7 +58,7 @@ def test_tuspy_uploads_in_parts_and_gets_a_decode(server: LiveServer, client: ht
         assert row.context["heading_deg"] == 10
         parts = connection.execute(sa.select(upload_parts).where(upload_parts.c.upload_id == place[-36:])).all()
         assert parts == []
-    with server.app.state.decodes._blobs.opened(row.upload_key) as file:
+    with server.app.state.use_cases.decodes._blobs.opened(row.upload_key) as file:
         assert file.read() == data
     document = client.get(place).json()
     assert (document["state"], document["decode_id"]) == ("done", decode["id"])
@@ -223,7 +223,7 @@ def test_termination_deletes_what_arrived(server: LiveServer, client: httpx.Clie
         ).scalar_one()
     assert client.delete(place, headers=TUS).status_code == 204
     assert client.head(place, headers=TUS).status_code == 404
-    assert key not in set(server.app.state.decodes._blobs.list_keys())
+    assert key not in set(server.app.state.use_cases.decodes._blobs.list_keys())
 
 
 def test_an_upload_expires(server: LiveServer, client: httpx.Client) -> None:
@@ -233,7 +233,7 @@ def test_an_upload_expires(server: LiveServer, client: httpx.Client) -> None:
         row = sa.update(uploads).where(uploads.c.id == place[-36:])
         connection.execute(row.values(expires_at=datetime.now(UTC) - timedelta(seconds=1)))
     assert append(client, place, 10, b"x").status_code == 410
-    server.app.state.uploads.tidy()
+    server.app.state.use_cases.uploads.tidy()
     assert client.head(place, headers=TUS).status_code == 410
     with server.app.state.database.read() as connection:
         found = connection.execute(sa.select(upload_parts).where(upload_parts.c.upload_id == place[-36:])).all()
@@ -245,8 +245,8 @@ def test_a_complete_upload_is_finished_by_the_next_server(server: LiveServer, cl
     data = zip_of_frames()
     place = start(client, len(data)).headers["Location"]
     append(client, place, 0, data[:20])
-    cases = server.app.state.uploads
-    caller = server.app.state.access.authenticate(client.headers["Authorization"].split()[1])
+    cases = server.app.state.use_cases.uploads
+    caller = server.app.state.use_cases.access.authenticate(client.headers["Authorization"].split()[1])
     grant = cases.begin(caller, place[-36:], 20, None)
     cases.save(grant, SpooledFile.of(data[20:]))
     cases.end(grant)

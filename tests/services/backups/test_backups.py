@@ -154,7 +154,7 @@ def test_drill_backup_under_load_restore_elsewhere(tmp_path: Path, new_database_
             assert client.get(f"/v1/alignments/{road_id}").status_code == 200
         with across_agencies(), server.app.state.database.read() as connection:
             referred = set(blob_references(connection))
-            assert [fault for _, _, found in server.app.state.audit.verify() for fault in found] == []
+            assert [fault for _, _, found in server.app.state.use_cases.audit.verify() for fault in found] == []
         store = elsewhere.data_dir / "blobs"
         present = {str(file.relative_to(store)) for file in store.glob("*/*/*")}
         assert len(referred) >= len(before[1])
@@ -170,7 +170,7 @@ def small(tmp_path: Path) -> Settings:
         register(client)
         with across_agencies(), server.app.state.database.write() as connection:
             key = "decodes/ab/" + "ab" * 16
-            add_row_with_blob(connection, server.app.state.unused_blobs._blobs, key)
+            add_row_with_blob(connection, server.app.state.use_cases.unused_blobs._blobs, key)
     return settings
 
 
