@@ -27,7 +27,7 @@ from app.demo.drive import drive_over, list_plates
 from app.demo.server import LocalServer
 from app.markers.plate import PlateCode, PlateGeometry
 from app.simulation.plate_face import PlateLook
-from app.simulation.printed_plate import PrintFaults, Stain, photograph_print, printed_face
+from benchmarks.scenes.printed_plate import PrintFaults, Stain, photograph_print, printed_face
 from guide.build import ROOT, build_guide
 from tests.browser import Browser
 from tests.tours import read_blocks

@@ -15,11 +15,11 @@ import numpy.typing as npt
 from app.geodesy import enu_from_heading, enu_from_wgs84, wgs84_from_enu
 from app.markers.plate import PlateCode, PlateScheme, recommended_geometry
 from app.sensors.camera import Camera
+from app.simulation.backgrounds import road_background, road_photos
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Drive, draw_daylight, drive_over_plate
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import PlateScene, face_truth
-from app.simulation.thermal import road_background, road_photos
 
 # === A lane's boundaries -> places on its centre line.
 

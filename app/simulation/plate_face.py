@@ -191,42 +191,6 @@ def grid_face(cells: npt.ArrayLike, side_m: float, wear: PlateWear, rng: np.rand
     return Face(side_m, _worn(crisp, wear, side_m * 1000, rng), emission)
 
 
-@dataclass(frozen=True, slots=True)
-class PlateWarmth:
-    """Temperature of a plate's parts above the road's. [K]
-
-    The red triangle and the green squares carry heaters like the dark units.
-    """
-
-    dark_k: float = 12.0
-    light_k: float = 1.0
-    gap_k: float = 1.5
-    marker_k: float = 12.0
-    spread_mm: float = 4.0
-
-
-def warm_face(code: PlateCode, geometry: PlateGeometry, warmth: PlateWarmth, rng: np.random.Generator) -> Face:
-    """Face of a heated plate for a thermal camera: its emission is temperature above the road's. [K]
-
-    Parameters
-    ----------
-    code : PlateCode
-        Of the geometry's size.
-    geometry : PlateGeometry
-    warmth : PlateWarmth
-    rng : numpy.random.Generator
-        Draws how unevenly the heaters work (10 %).
-    """
-    size = round(geometry.side_mm)
-    shares = material_shares(code, geometry, size)
-    levels = (warmth.gap_k, warmth.dark_k, warmth.light_k, warmth.marker_k, warmth.marker_k, warmth.light_k)
-    temperature = np.tensordot(shares, np.array(levels, np.float32), axes=(0, 0))
-    uneven = 1 + 0.2 * (smooth_noise((size, size), size / 6, rng) - 0.5)
-    spread = cv2.GaussianBlur((temperature * uneven).astype(np.float32), (0, 0), warmth.spread_mm)
-    nothing = np.zeros((size, size, 3), np.float32)
-    return Face(geometry.side_mm / 1000, nothing, np.repeat(spread[..., None], 3, axis=2))
-
-
 def material_shares(code: PlateCode, geometry: PlateGeometry, size: int) -> FloatArray:
     """Share of each texel that is gap, dark, light, red, green, free half of the triangle's cell.
 

@@ -18,11 +18,12 @@ from app.lanes.estimate import fit_lane
 from app.sensors.pose_track import ReceivedPacket
 from app.simulation.radio.attacks import forge_packets, number_entries, replay_packets
 from app.simulation.radio.drive import SimulatedDrive, drive_past, marker_message
-from app.simulation.radio.lanes import InstalledMarkers, RoadShape, lane_of_shape, make_lane
+from app.simulation.radio.lanes import InstalledMarkers, make_lane
 from app.simulation.radio.link import Radio, mean_rssi_dbm, receive_transmissions, send_beacons
 from app.simulation.steering import PoseNoise, check_steering
 from benchmarks.cerpm import scenes
 from benchmarks.cerpm.paths import Result, met, runs_of
+from benchmarks.scenes.road_shapes import RoadShape, lane_of_shape
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "cerpm.csv"
 _DAY_S = 86_400.0

@@ -18,19 +18,12 @@ from app.planning.cerpm_placement import place_markers
 from app.plots.lane import picture_of_lane, plot_lane
 from app.sensors.pose_track import PoseTrack
 from app.simulation.radio.drive import Driver, SatelliteReceiver, drive_lane, drive_past, observe_track
-from app.simulation.radio.lanes import (
-    InstalledMarkers,
-    RoadShape,
-    TrueLane,
-    install_markers,
-    lane_of_shape,
-    lose_row,
-    lose_share,
-)
+from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lose_row, lose_share
 from app.simulation.radio.link import Radio
 from benchmarks.cerpm.path_errors import TOLERANCE_M, PlaceErrors, place_errors
 from benchmarks.cerpm.scenes import LIMIT, ROUTE_NAMES, keys_for, markers_from_merged, route, sign
 from benchmarks.hunt.scenes import Bound, Kind, Outcome, Parameters, switch
+from benchmarks.scenes.road_shapes import RoadShape, lane_of_shape
 
 _GREEN_BOOK = "AASHTO Green Book 2018, table 3-7: 21 m at 30 km/h; hairpins and junctions are tighter"
 _BY_HAND = "by hand"

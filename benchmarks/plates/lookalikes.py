@@ -12,7 +12,8 @@ import segno
 
 from app.sensors.camera import Camera
 from app.simulation.plate_face import Face, PlateWear, grid_face
-from app.simulation.plate_scene import PlacedFace, decoy_plate
+from app.simulation.plate_scene import PlacedFace
+from benchmarks.scenes.distractors import decoy_plate
 
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]

@@ -15,7 +15,7 @@ from app.markers.print_grade import PrintGrade, PrintParameterName
 from app.planning.predict.printed_plate import DesignSpeed, PassesRead, read_passes
 from app.planning.rules import CameraRules
 from app.simulation.plate_face import Colour, PlateLook, draw_look
-from app.simulation.printed_plate import PrintFaults, Stain, photograph_print, printed_face
+from benchmarks.scenes.printed_plate import PrintFaults, Stain, photograph_print, printed_face
 
 SPEED_MPS = 60 / 3.6
 PHOTO_PX = (2016, 1512)

@@ -21,20 +21,18 @@ from app.simulation.conditions import (
     Conditions,
     Drive,
     draw_daylight,
-    draw_occluder,
-    draw_place,
     draw_shadow,
     draw_stress,
-    draw_thermal,
     draw_wear,
     drive_over_plate,
-    scene_under,
 )
-from app.simulation.plate_face import Face, plate_face, warm_face
-from app.simulation.plate_scene import Air, PlateScene, draw_distractor_faces, face_truth, paint_distractors
-from app.simulation.thermal import render_thermal_scene
+from app.simulation.plate_face import Face, plate_face
+from app.simulation.plate_scene import Air, PlateScene, face_truth
 from benchmarks.plates.views import draw_background, draw_camera
 from benchmarks.plates.without_plate import DRAW_WITHOUT_PLATE
+from benchmarks.scenes.distractors import draw_distractor_faces, paint_distractors
+from benchmarks.scenes.places import draw_occluder, draw_place, scene_under
+from benchmarks.scenes.thermal import draw_thermal, render_thermal_scene, warm_face
 
 Image = npt.NDArray[np.uint8]
 HERE = Path(__file__).parent.parent

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.camera import Camera
-from app.simulation.thermal import road_background
+from app.simulation.backgrounds import road_background
 
 Image = npt.NDArray[np.uint8]
 BACKGROUNDS = Path(__file__).parent.parent / "backgrounds"

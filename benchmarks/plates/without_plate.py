@@ -7,10 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from app.simulation.conditions import Conditions, draw_daylight, draw_stress, scene_under
-from app.simulation.plate_scene import PlacedFace, PlateScene, draw_distractor_faces, paint_distractors
+from app.simulation.conditions import Conditions, draw_daylight, draw_stress
+from app.simulation.plate_scene import PlacedFace, PlateScene
 from benchmarks.plates.lookalikes import draw_flat, paint_upright
 from benchmarks.plates.views import draw_background, draw_camera, draw_crop
+from benchmarks.scenes.distractors import draw_distractor_faces, paint_distractors
+from benchmarks.scenes.places import scene_under
 
 Image = npt.NDArray[np.uint8]
 Drawn = tuple[PlateScene, Image, Conditions]

@@ -28,6 +28,7 @@ from app.markers.magnet import InformationTag, parse_tag
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.planning.cerpm_placement import place_markers
 from app.sensors.camera import Camera
+from app.simulation.backgrounds import road_background, road_photos
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import draw_daylight
 from app.simulation.magnetic.drive import Course, Scene, Vehicle, drive_course, simulate_drive
@@ -38,7 +39,6 @@ from app.simulation.plate_scene import PlacedFace, PlateScene
 from app.simulation.radio.drive import Drive, SatelliteReceiver, drive_past, observe_track
 from app.simulation.radio.lanes import InstalledMarkers, TrueLane, install_markers, lane_between
 from app.simulation.radio.link import Radio
-from app.simulation.thermal import road_background, road_photos
 
 Floats = npt.NDArray[np.float64]
 

@@ -24,14 +24,15 @@ from app.decoders.plate.reader import DEFAULT_GEOMETRIES
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.sensors.camera import Camera
+from app.simulation.backgrounds import road_background
 from app.simulation.camera import render_plate_scene
-from app.simulation.conditions import Conditions, draw_daylight, draw_place, draw_shadow, draw_stress, scene_under
+from app.simulation.conditions import Conditions, draw_daylight, draw_shadow, draw_stress
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import FaceTruth
-from app.simulation.thermal import road_background
 from benchmarks.plates.sets import Job, Shot, shoot
 from benchmarks.plates.tables import table
 from benchmarks.plates.views import read_photos
+from benchmarks.scenes.places import draw_place, scene_under
 
 Image = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]

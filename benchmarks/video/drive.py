@@ -18,11 +18,11 @@ import numpy as np
 
 from app.markers.plate import PlateCode, PlateGeometry, PlateScheme
 from app.sensors.camera import Camera
+from app.simulation.backgrounds import moving_backgrounds, road_photos
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Conditions, draw_daylight, draw_stress
 from app.simulation.plate_face import plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene, face_truth
-from app.simulation.thermal import moving_backgrounds, road_photos
 
 LOOP_FRAMES = 16
 """[frames] of moving road before it begins again. Source: chosen by hand, for memory."""

@@ -8,9 +8,9 @@ import pytest
 from app.errors import InvalidParameter
 from app.lanes.estimate import fit_lane
 from app.simulation.radio.drive import SatelliteReceiver
-from app.simulation.radio.lanes import RoadShape, lane_of_shape
 from benchmarks.cerpm import scenes
 from benchmarks.cerpm.path_errors import path_errors
+from benchmarks.scenes.road_shapes import RoadShape, lane_of_shape
 
 SHAPES = {
     "turning lane": RoadShape(extra_m=3.4, extra_start=0.3, taper_m=25.0),

@@ -8,8 +8,8 @@ import pytest
 from app.lanes.estimate import fit_lane
 from app.lanes.lane_path import compare_with_track
 from app.simulation.radio.drive import SatelliteReceiver
-from app.simulation.radio.lanes import RoadShape, lane_of_shape
 from benchmarks.cerpm import scenes
+from benchmarks.scenes.road_shapes import RoadShape, lane_of_shape
 
 BENDY = RoadShape(turn_deg=90.0, radius_m=80.0, second_turn_deg=60.0, second_radius_m=60.0, straight_m=30.0)
 

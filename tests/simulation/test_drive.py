@@ -11,26 +11,14 @@ import pytest
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
 from app.sensors.camera import Camera
+from app.simulation.backgrounds import road_background
 from app.simulation.camera import render_plate_scene
-from app.simulation.conditions import (
-    Drive,
-    draw_daylight,
-    draw_place,
-    draw_stress,
-    draw_thermal,
-    drive_over_plate,
-    scene_under,
-)
-from app.simulation.plate_face import Face, PlateWarmth, PlateWear, plate_face, warm_face
-from app.simulation.plate_scene import (
-    PlacedFace,
-    PlateScene,
-    decoy_plate,
-    draw_distractor_faces,
-    face_truth,
-    paint_distractors,
-)
-from app.simulation.thermal import ThermalSensor, render_thermal_scene, road_background
+from app.simulation.conditions import Drive, draw_daylight, draw_stress, drive_over_plate
+from app.simulation.plate_face import Face, PlateWear, plate_face
+from app.simulation.plate_scene import PlacedFace, PlateScene, face_truth
+from benchmarks.scenes.distractors import decoy_plate, draw_distractor_faces, paint_distractors
+from benchmarks.scenes.places import draw_place, scene_under
+from benchmarks.scenes.thermal import PlateWarmth, ThermalSensor, draw_thermal, render_thermal_scene, warm_face
 
 CAMERA = Camera.from_field_of_view(1920, 1080, 70.0)
 CODE = PlateCode("023792168411")

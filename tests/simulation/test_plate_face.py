@@ -7,7 +7,8 @@ import pytest
 
 from app.errors import InvalidParameter
 from app.markers.plate import PlateCode, PlateGeometry
-from app.simulation.plate_face import PlateLook, PlateWarmth, PlateWear, draw_look, grid_face, plate_face, warm_face
+from app.simulation.plate_face import PlateLook, PlateWear, draw_look, grid_face, plate_face
+from benchmarks.scenes.thermal import PlateWarmth, warm_face
 
 LOOK = PlateLook()
 

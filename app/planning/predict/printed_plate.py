@@ -35,11 +35,11 @@ from app.planning.predict.rates import (
 from app.planning.proof.plates import draw_drive, draw_plate
 from app.planning.proof.report import Condition
 from app.planning.rules import CameraRules, PredictionRules
+from app.simulation.backgrounds import road_background, road_photos
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import Conditions, Drive, drive_over_plate
 from app.simulation.plate_face import Face, plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene, face_truth
-from app.simulation.thermal import road_background, road_photos
 
 WHITE_REFLECTANCE = 0.75
 """[1] assumed for the plate's white, which a photo does not show. Source: `PlateLook.light`."""

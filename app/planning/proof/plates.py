@@ -24,6 +24,7 @@ from app.planning.plan import PlannedMarker, PlannedPlate
 from app.planning.proof.report import Condition, MarkerPass, WrongReading
 from app.planning.rules import CameraRules
 from app.sensors.camera import Camera
+from app.simulation.backgrounds import road_background, road_photos
 from app.simulation.camera import render_plate_scene
 from app.simulation.conditions import (
     Conditions,
@@ -36,7 +37,6 @@ from app.simulation.conditions import (
 )
 from app.simulation.plate_face import PlateWear, plate_face
 from app.simulation.plate_scene import Air, PlateScene, Shadow, face_truth
-from app.simulation.thermal import road_background, road_photos
 
 # === Light, weather, camera and state of a plate in a simulated drive.
 

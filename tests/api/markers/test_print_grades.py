@@ -19,7 +19,7 @@ import pytest
 
 from app.markers.plate import PlateCode, PlateScheme
 from app.services.access.access import Scope
-from app.simulation.printed_plate import PrintFaults
+from benchmarks.scenes.printed_plate import PrintFaults
 from tests.conftest import LiveServer
 from tests.decoders.plate.print_photos import CODE, photo_of, pixels
 from tests.formats.pictures import huge_png

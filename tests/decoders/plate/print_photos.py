@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from app.markers.plate import PlateCode, PlateGeometry
 from app.simulation.plate_face import PlateLook
-from app.simulation.printed_plate import PrintFaults, photograph_print, printed_face
+from benchmarks.scenes.printed_plate import PrintFaults, photograph_print, printed_face
 
 GEOMETRY = PlateGeometry()
 CODE = PlateCode("023792168411")

@@ -13,10 +13,11 @@ import numpy.typing as npt
 
 from app.markers.plate import PlateCode, PlateGeometry
 from app.sensors.camera import Camera
+from app.simulation.backgrounds import road_background
 from app.simulation.camera import RenderedFrame, render_plate_scene
-from app.simulation.plate_face import Face, PlateLook, PlateWarmth, PlateWear, plate_face, warm_face
+from app.simulation.plate_face import Face, PlateLook, PlateWear, plate_face
 from app.simulation.plate_scene import PlacedFace, PlateScene, Sensor
-from app.simulation.thermal import ThermalSensor, render_thermal_scene, road_background
+from benchmarks.scenes.thermal import PlateWarmth, ThermalSensor, render_thermal_scene, warm_face
 
 Image = npt.NDArray[np.uint8]
 BACKGROUNDS = Path(__file__).parents[3] / "benchmarks" / "backgrounds"

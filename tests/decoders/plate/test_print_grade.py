@@ -18,7 +18,7 @@ from app.markers.print_grade import PrintParameterName as Name
 from app.markers.reading import PlateOutcome
 from app.simulation.plate_face import PlateLook
 from app.simulation.plate_scene import Shadow
-from app.simulation.printed_plate import PrintFaults, Stain
+from benchmarks.scenes.printed_plate import PrintFaults, Stain
 from tests.decoders.plate.print_photos import CODE, GEOMETRY, LOOK, photo_of, pixels
 
 pytestmark = pytest.mark.slow

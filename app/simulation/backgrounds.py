@@ -1,8 +1,7 @@
-"""Scene to thermal frame: temperatures instead of light, a slow sensor, one channel."""
+"""Road photos as another camera would see them: the road is projected to the ground and rendered again."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources import files
 
@@ -11,12 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from app.sensors.camera import Camera
-from app.simulation.camera import NO_SHADE, RenderedFrame, blurred, encode_jpeg, gather_faces, list_windows, pixel_rays
-from app.simulation.plate_face import smooth_noise
-from app.simulation.plate_scene import PlateScene, face_truth
-
-# === Road photos as another camera would see them: the road is projected to the ground and rendered again.
-
 
 Image = npt.NDArray[np.uint8]
 _PHOTO_HORIZON = 0.585  # of the photo's height: dash cameras of the photos used look almost level
@@ -109,91 +102,3 @@ def _photo_points(
     share = np.clip((-rays[..., 2] / rays[..., 0] - 0.01) / 0.03, 0, 1)[..., None]
     points = (share * ground + (1 - share) * far).astype(np.float32)
     return np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
-
-
-# === Scene to thermal frame.
-
-
-FloatArray = npt.NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class ThermalSensor:
-    """Uncooled bolometer.
-
-    Parameters
-    ----------
-    lag_s : float
-        Thermal time constant of a pixel: it forgets exponentially, which draws a trail. [s]
-    blur_px : float
-        Standard deviation of the lens's Gaussian point spread. [px]
-    netd_k : float
-        Noise, and a tenth of it as fixed stripes of columns. [K]
-    span_k : float
-        Temperatures that the 256 grey levels cover. [K]
-    road_k : float
-        Standard deviation of the road's own differences. [K]
-    jpeg_quality : int or None
-        None keeps the frame as it is.
-    """
-
-    lag_s: float = 0.01
-    blur_px: float = 1.2
-    netd_k: float = 0.06
-    span_k: float = 25.0
-    road_k: float = 0.8
-    jpeg_quality: int | None = None
-
-
-def render_thermal_scene(
-    scene: PlateScene, sensor: ThermalSensor, background: Image | None, rng: np.random.Generator
-) -> RenderedFrame:
-    """Render one thermal frame, shape (H, W), white hot.
-
-    Parameters
-    ----------
-    scene : PlateScene
-        Its faces' emission is temperature above the road's [K]; light, air and the photographic sensor don't count.
-        The instant of the frame takes the place of mid-exposure.
-    sensor : ThermalSensor
-    background : ndarray of uint8, shape (H, W, 3), or None
-        Photo whose brightness stands for what the sun has warmed.
-    rng : numpy.random.Generator
-        Draws the noise and the road's temperatures.
-    """
-    shape = (scene.camera.height_px, scene.camera.width_px)
-    scene = replace(scene, exposure_s=8 * sensor.lag_s)
-    temperature = _road(shape, sensor, background, rng)
-    truths = tuple(face_truth(scene, placed) for placed in scene.faces)
-    for window, members in list_windows(scene, truths):
-        dark = [np.zeros(3, np.float32)] * len(members)
-        warmth, cover = gather_faces(
-            scene, members, dark, window, pixel_rays(scene, window), NO_SHADE, lag_s=sensor.lag_s
-        )
-        kept = temperature[window.slices] * (1 - np.minimum(cover, 1))
-        temperature[window.slices] = kept + warmth[..., 0]
-    image = _grey(blurred(temperature, sensor.blur_px), sensor, rng)
-    if sensor.jpeg_quality is None:
-        return RenderedFrame(image, b"", truths)
-    jpeg = encode_jpeg(image, sensor.jpeg_quality)
-    return RenderedFrame(np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8), jpeg.tobytes(), truths)
-
-
-def _road(
-    shape: tuple[int, int], sensor: ThermalSensor, background: Image | None, rng: np.random.Generator
-) -> FloatArray:
-    """Temperatures of the road relative to its mean. [K]"""
-    field = smooth_noise(shape, shape[1] / 8, rng) - 0.5
-    field = field + 0.5 * (smooth_noise(shape, 12, rng) - 0.5)
-    if background is not None:
-        grey = cv2.resize(cv2.cvtColor(background, cv2.COLOR_BGR2GRAY), (shape[1], shape[0])).astype(np.float32)
-        field = field + (grey - grey.mean()) / max(float(grey.std()), 1.0) * 0.3
-    return np.asarray(field * (sensor.road_k / max(float(field.std()), 1e-6)), np.float32)
-
-
-def _grey(temperature: FloatArray, sensor: ThermalSensor, rng: np.random.Generator) -> Image:
-    """Noise and the linear range of grey levels, the road's mean at a third of it."""
-    noise = rng.standard_normal(temperature.shape, dtype=np.float32)
-    stripes = 0.1 * rng.standard_normal((1, temperature.shape[1]), dtype=np.float32)
-    noisy = temperature + np.float32(sensor.netd_k) * (noise + stripes)
-    return np.asarray(np.clip(85.5 + noisy * (255 / sensor.span_k), 0, 255), np.uint8)
