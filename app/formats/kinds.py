@@ -15,8 +15,8 @@ from app.formats.surveys.read import SURVEY_FORMATS
 from app.formats.traces.declaration import TraceLimits
 from app.formats.traces.formats import TRACE_FORMATS
 from app.formats.traces.parts import open_parts
-from app.formats.video import EXPECTED as VIDEOS
-from app.formats.video import detect_video, holds_video
+from app.formats.video_file import EXPECTED as VIDEOS
+from app.formats.video_file import detect_video, holds_video
 
 FORMATS: tuple[Format[object], ...] = (
     *FRAME_FORMATS,

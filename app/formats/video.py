@@ -1,28 +1,38 @@
-"""Videos: which files are videos, what they hold, and their frames."""
+"""The frames of a video: listed without decoding it, and decoded."""
 
 from __future__ import annotations
 
-import io
 import math
 import struct
-import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from enum import StrEnum
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError, is_exhausted
-from app.formats.bags.messages import detect_bag
-from app.formats.format import ArchiveLimits, SpooledFile, count_members, is_archive, list_names, read_members
-from app.formats.frame_list import is_beside_frames
-from app.sensors.pose_track import PoseTrack
+from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, is_exhausted
+from app.formats.bags.drive import index_bag, read_pictures
+from app.formats.video_file import (
+    BAGS,
+    EXPECTED,
+    FIELD,
+    PictureFrame,
+    Pixels,
+    ReadReport,
+    VideoFile,
+    VideoGap,
+    VideoIndex,
+    VideoKind,
+    VideoLimits,
+    VideoSegment,
+    as_uint8,
+    cut_segments,
+    find_time_gaps,
+)
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -32,267 +42,14 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 
-# === Containers of videos, recognised by their first bytes and opened with one fixed demuxer each.
-#
-# A demuxer that is chosen by content may follow a playlist to another file. Here the first bytes choose one of three
-# demuxers, none of which opens other files, and the file is read through an object of ours, not by its name.
-
-
-FIELD = "file"
-EXPECTED = "MP4 or MOV (H.264, H.265, MPEG-4), AVI or raw stream (MJPEG), MCAP, ROS 2 bag (.db3) or ROS 1 bag"
-_PICTURE_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
-"""Major brands of pictures in the container of MP4. Source: ISO/IEC 23008-12, section 10."""
-_OPTIONS = {"protocol_whitelist": "none", "enable_drefs": "0", "use_absolute_path": "0"}
-"""No demuxer opens anything but the file that it was given."""
-
-
-class VideoKind(StrEnum):
-    """Containers that are read."""
-
-    MP4 = "mp4"
-    AVI = "avi"
-    MJPEG = "mjpeg"
-    MCAP = "mcap"
-    ROS1 = "ros1"
-    ROS2_SQLITE = "ros2-sqlite"
-    """Bags: their pictures are read by `app.formats.bags`, not by a demuxer."""
-
-
-BAGS = (VideoKind.MCAP, VideoKind.ROS1, VideoKind.ROS2_SQLITE)
-_DEMUXERS = {VideoKind.MP4: "mov", VideoKind.AVI: "avi", VideoKind.MJPEG: "mjpeg"}
-
-
-def detect_video(head: bytes, *, is_stream: bool = False) -> VideoKind | None:
-    """The kind of a video by its first bytes; None if it is none.
-
-    Parameters
-    ----------
-    head : bytes
-        At least the first 12.
-    is_stream : bool
-        Whether a JPEG is declared to be the first of a stream of pictures.
-    """
-    if head[4:8] == b"ftyp" and head[8:12] not in _PICTURE_BRANDS:
-        return VideoKind.MP4
-    if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
-        return VideoKind.AVI
-    bag = detect_bag(head)
-    if bag is not None:
-        return VideoKind(bag)
-    return VideoKind.MJPEG if is_stream and head[:3] == b"\xff\xd8\xff" else None
-
-
-@dataclass(frozen=True, slots=True)
-class VideoFile:
-    """A video, or the part of a file that is one."""
-
-    file: SpooledFile
-    kind: VideoKind
-    # `offset`, `size`: [byte] of the video in the file; size 0 is all that follows
-    offset: int = 0
-    size: int = 0
-
-    @contextmanager
-    def open(self) -> Iterator[InputContainer]:
-        """Open the container.
-
-        Raises
-        ------
-        UnreadableUpload
-            It is damaged, or it is another kind of file.
-        """
-        import av
-        from av.error import FFmpegError
-
-        with self.file.open() as whole, _Part(whole, self.offset, self.size) as part:
-            try:
-                # fixed: PyAV must not choose the demuxer by the content
-                container = av.open(part, "r", format=_DEMUXERS[self.kind], options=dict(_OPTIONS))
-            except (FFmpegError, ValueError, IndexError) as error:
-                raise UnreadableUpload(
-                    f"the {self.kind.upper()} has no index that can be read: it is damaged or cut off",
-                    field=FIELD,
-                    limit=EXPECTED,
-                    cure="send the file whole; a recorder that lost power writes no index (moov), repair it first",
-                ) from error
-            with container:
-                yield container
-
-
-class _Part(io.RawIOBase):
-    """A part of an open file as a file."""
-
-    def __init__(self, whole: BinaryIO, offset: int, size: int) -> None:
-        super().__init__()
-        self._whole, self._offset = whole, offset
-        end = whole.seek(0, io.SEEK_END)
-        self._size = min(size, end - offset) if size else end - offset
-        self._at = 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
-        self._at = max(start + offset, 0)
-        return self._at
-
-    def read(self, size: int = -1) -> bytes:
-        left = max(self._size - self._at, 0)
-        self._whole.seek(self._offset + self._at)
-        data = self._whole.read(left if size < 0 else min(size, left))
-        self._at += len(data)
-        return data
-
-
-# === A video in a ZIP archive, beside the vehicle's track: it is read where it lies, without being unpacked.
-
-
-_BAG_SUFFIXES = (".db3", ".mcap", ".bag")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", *_BAG_SUFFIXES)
-"""Names of videos in an archive; the content decides what they are."""
-_LOCAL_HEADER_BYTES = 30  # PKWARE APPNOTE, section 4.3.7
-
-
-@dataclass(frozen=True, slots=True)
-class PackedVideo:
-    """A video of an archive, and the files beside it: name and content of each."""
-
-    name: str
-    video: VideoFile
-    beside: tuple[tuple[str, bytes], ...]
-
-
-def holds_video(file: SpooledFile) -> bool:
-    """Whether a file is an archive in which a name is that of a video."""
-    if not is_archive(file.head()):
-        return False
-    try:
-        return any(name.lower().endswith(VIDEO_SUFFIXES) for name in list_names(file))
-    except WaymarkError:
-        return False
-
-
-def open_packed_video(file: SpooledFile, limits: ArchiveLimits) -> PackedVideo:
-    """The only video of an archive.
-
-    Raises
-    ------
-    UnreadableUpload, UploadTooLarge
-        As `count_members`.
-    UnsupportedUpload
-        There are several videos, or the video is compressed, encrypted, or of another kind.
-    """
-    count_members(file, limits)
-    with file.open() as stream, zipfile.ZipFile(stream) as archive:
-        videos = [info for info in archive.infolist() if info.filename.lower().endswith(VIDEO_SUFFIXES)]
-        if len(videos) != 1:
-            raise UnsupportedUpload(
-                f"the archive holds {len(videos)} videos", field=FIELD, limit="one video beside a track",
-                cure="send each video in an archive of its own",
-            )  # fmt: skip
-        info = videos[0]
-        if info.filename.lower().endswith(_BAG_SUFFIXES):
-            raise UnsupportedUpload(
-                "a bag in an archive is not read", field=FIELD, limit="a bag as it is",
-                cure="send the .db3, .mcap or .bag file itself; metadata.yaml is not needed",
-            )  # fmt: skip
-        if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
-            raise UnsupportedUpload(
-                "the video is compressed in the archive, or encrypted", field=FIELD, limit="stored as it is",
-                cure="pack it without compression, e.g. zip -0",
-            )  # fmt: skip
-        stream.seek(info.header_offset)
-        header = stream.read(_LOCAL_HEADER_BYTES)
-        if len(header) < _LOCAL_HEADER_BYTES or header[:4] != b"PK\x03\x04":
-            raise UnsupportedUpload("the archive's directory is damaged", field=FIELD, cure="pack it again")
-        name_bytes, extra_bytes = struct.unpack_from("<HH", header, 26)
-        offset = info.header_offset + _LOCAL_HEADER_BYTES + name_bytes + extra_bytes
-        stream.seek(offset)
-        kind = detect_video(stream.read(16))
-    if kind is None or info.file_size <= 0 or offset + info.file_size > file.size:
-        raise UnsupportedUpload("the file that is named as a video is none", field=FIELD, limit="MP4, MOV or AVI")
-    beside = tuple((m.name, m.data) for m in read_members(file, limits, only=is_beside_frames) if m.error is None)
-    return PackedVideo(info.filename[-120:], VideoFile(file, kind, offset, info.file_size), beside)
-
-
-# === What a video holds, without decoding it: its frames with their times, its gaps, and where decoding can begin.
+# === What a video holds, without decoding it.
 
 
 CODECS = ("h264", "hevc", "mpeg4", "mjpeg")
 """Codecs that are decoded."""
-SEGMENT_S = 10.0
-"""[s] of a video that one task decodes. Source: chosen by hand: progress and cancelling every few seconds."""
-GAP_S, GAP_FACTOR = 1.0, 5.0
-"""[s, 1] as in `app.services.decodes.frame_poses`."""
 MAX_RATE_HZ = 1000.0
 """[Hz] frames a second beyond which the times are not those of a camera: recorders that know none write one unit of
 time for each frame. Source: that of `frames.rate_hz`."""
-
-
-@dataclass(frozen=True, slots=True)
-class VideoLimits:
-    """What a video may be."""
-
-    pixels: int = 4096 * 2304  # [px] of a frame; 4096 x 2304
-    side_min_px: int = 64
-    frames: int = 500_000
-    streams: int = 16
-    # `duration_s`, `key_frame_s`: [s] length, and longest time between two frames at which decoding can begin
-    duration_s: float = 4 * 3600.0
-    key_frame_s: float = 60.0
-
-
-@dataclass(frozen=True, slots=True)
-class VideoGap:
-    """Frames that are missing between two frames; None at an end of the video."""
-
-    after_frame: int | None
-    before_frame: int | None
-    seconds: float | None
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class VideoSegment:
-    """A stretch that begins where decoding can begin."""
-
-    # `first`, `end`: its frames: numbers in the order of their times, the end is not included
-    first: int
-    end: int
-    # where decoding has to begin: at the key frame before, where frames are counted (`is_counted`). None: at the first.
-    decode_from: int | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class VideoIndex:
-    """The frames of a video."""
-
-    file: VideoFile
-    codec: str
-    # `width_px`, `height_px`: [px] as coded, before a rotation
-    width_px: int
-    height_px: int
-    # shape (frames,): the container's times in the order of presentation, or numbers of frames where it has none
-    stamps: npt.NDArray[np.int64]
-    time_s: npt.NDArray[np.float64]  # shape (frames,): [s] after the first frame
-    segments: tuple[VideoSegment, ...]
-    created_at: datetime | None  # by the container
-    gaps: tuple[VideoGap, ...]
-    warnings: tuple[str, ...]
-    has_clock: bool = False  # whether `created_at` is the time of the first frame by the recorder's clock
-    track: PoseTrack | None = None  # of the vehicle, where the recording has one
-
-    @property
-    def duration_s(self) -> float:
-        """From the first frame to the last. [s]"""
-        return float(self.time_s[-1])
 
 
 def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: float | None = None) -> VideoIndex:
@@ -318,8 +75,6 @@ def index_video(file: VideoFile, limits: VideoLimits | None = None, *, rate_hz: 
     """
     limits = limits or VideoLimits()
     if file.kind in BAGS:
-        from app.formats.bags.drive import index_bag
-
         return index_bag(file, limits)
     if file.kind is VideoKind.MJPEG and rate_hz is None:
         raise InvalidParameter(
@@ -464,17 +219,6 @@ def _created_at(container: InputContainer) -> datetime | None:
     return at if 2000 <= at.year < 2100 else None
 
 
-def find_time_gaps(time_s: npt.NDArray[np.float64]) -> list[VideoGap]:
-    """Gaps between the times of successive frames."""
-    steps = np.diff(time_s)
-    usual_s = float(np.median(steps)) if len(steps) else 0.0
-    reason = "no frames in between: the recording or its clock jumped"
-    return [
-        VideoGap(int(k), int(k) + 1, round(float(steps[k]), 3), reason)
-        for k in np.flatnonzero(steps > max(GAP_S, GAP_FACTOR * usual_s))
-    ]
-
-
 def _find_gaps(time_s: npt.NDArray[np.float64], expected_s: float | None, missing: int) -> list[VideoGap]:
     gaps = find_time_gaps(time_s)
     usual_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
@@ -486,31 +230,12 @@ def _find_gaps(time_s: npt.NDArray[np.float64], expected_s: float | None, missin
     return gaps
 
 
-def cut_segments(
-    time_s: npt.NDArray[np.float64], keys: npt.NDArray[np.bool_], limits: VideoLimits
-) -> tuple[VideoSegment, ...]:
-    """Segments of about `SEGMENT_S`; frames before the first key frame go with it, the decoder leaves them out."""
-    starts = [0]
-    for k in np.flatnonzero(keys):
-        if time_s[k] - time_s[starts[-1]] >= SEGMENT_S:
-            starts.append(int(k))
-    ends = [*starts[1:], len(time_s)]
-    longest_s = max(float(time_s[end - 1] - time_s[start]) for start, end in zip(starts, ends, strict=True))
-    if longest_s > SEGMENT_S + limits.key_frame_s and not math.isclose(longest_s, 0.0):
-        raise UnsupportedUpload(
-            f"{longest_s:.0f} s of the video have no key frame", field=FIELD, limit=f"{limits.key_frame_s:g} s",
-            cure="record or convert it with a key frame every few seconds, e.g. ffmpeg -g 60",
-        )  # fmt: skip
-    return tuple(VideoSegment(start, end) for start, end in zip(starts, ends, strict=True))
-
-
 # === Frames of a video: decoded on one thread, in the order of their times, turned upright once.
 
 
 _COPY_PX = (16, 16)
 _PLANAR = ("yuv420p", "yuvj420p")
 _ROTATIONS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
-Pixels = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -534,12 +259,12 @@ class DecodedFrame:
         frame = self._frame
         if frame.format.name not in _PLANAR or frame.width % 2 or frame.height % 2:
             full = self.bgr()
-            return _uint8(cv2.resize(full, (full.shape[1] // 2, full.shape[0] // 2), interpolation=cv2.INTER_AREA))
+            return as_uint8(cv2.resize(full, (full.shape[1] // 2, full.shape[0] // 2), interpolation=cv2.INTER_AREA))
         half = (frame.width // 2, frame.height // 2)
         luma = cv2.resize(_plane(frame, 0), half, interpolation=cv2.INTER_AREA)
         # OpenCV's order is luma, red, blue difference; full range: that of the search makes no difference
         merged = cv2.merge([luma, _plane(frame, 2), _plane(frame, 1)])
-        return self._upright(_uint8(cv2.cvtColor(merged, cv2.COLOR_YCrCb2BGR)))
+        return self._upright(as_uint8(cv2.cvtColor(merged, cv2.COLOR_YCrCb2BGR)))
 
     def bgr(self) -> Pixels:
         """Blue, green, red, shape (H, W, 3)."""
@@ -551,48 +276,13 @@ class DecodedFrame:
 
     def _converted(self, form: str) -> Pixels:
         # `to_ndarray(format=...)` makes a converter with a thread for each core for every frame
-        return _uint8(self._reformatter.reformat(self._frame, format=form, threads=1).to_ndarray())
+        return as_uint8(self._reformatter.reformat(self._frame, format=form, threads=1).to_ndarray())
 
     def _upright(self, pixels: Pixels) -> Pixels:
-        return _uint8(cv2.rotate(pixels, _ROTATIONS[self.rotation_deg])) if self.rotation_deg else pixels
-
-
-@dataclass(frozen=True, slots=True)
-class PictureFrame:
-    """One picture of a bag, as `DecodedFrame`."""
-
-    number: int
-    time_s: float
-    _pixels: Pixels
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Width and height. [px]"""
-        return self._pixels.shape[1], self._pixels.shape[0]
-
-    def half_bgr(self) -> Pixels:
-        """The picture at half resolution."""
-        size = (self._pixels.shape[1] // 2, self._pixels.shape[0] // 2)
-        return _uint8(cv2.resize(self._pixels, size, interpolation=cv2.INTER_AREA))
-
-    def bgr(self) -> Pixels:
-        """Blue, green, red."""
-        return self._pixels
-
-    def grey(self) -> Pixels:
-        """Grey levels."""
-        return _uint8(cv2.cvtColor(self._pixels, cv2.COLOR_BGR2GRAY))
+        return as_uint8(cv2.rotate(pixels, _ROTATIONS[self.rotation_deg])) if self.rotation_deg else pixels
 
 
 AnyFrame = DecodedFrame | PictureFrame
-
-
-@dataclass(slots=True)
-class ReadReport:
-    """Frames of a segment that are not among those that were read: together they are all of the segment."""
-
-    damaged: int = 0  # frames that could not be decoded
-    other_size: int = 0  # frames that have another size than the video
 
 
 def read_frames(index: VideoIndex, segment: VideoSegment, report: ReadReport, *, beyond: int = 0) -> Iterator[AnyFrame]:
@@ -616,8 +306,6 @@ def read_frames(index: VideoIndex, segment: VideoSegment, report: ReadReport, *,
     """
     last = min(segment.end + beyond, len(index.stamps))
     if index.file.kind in BAGS:
-        from app.formats.bags.drive import read_pictures
-
         yield from read_pictures(index, segment, report, last)
         return
     from av.video.reformatter import VideoReformatter
@@ -759,7 +447,3 @@ def _plane(frame: VideoFrame, number: int) -> Pixels:
     plane: Any = frame.planes[number]
     rows: npt.NDArray[Any] = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
     return rows[: plane.height, : plane.width]
-
-
-def _uint8(pixels: Any) -> Pixels:
-    return np.asarray(pixels, np.uint8)

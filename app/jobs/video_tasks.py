@@ -19,7 +19,8 @@ from app.families.plate.plates import PLATE
 from app.formats.frame_list import is_frame_list, read_frame_list
 from app.formats.poses import read_poses
 from app.formats.traces.read import read_trace
-from app.formats.video import AnyFrame, ReadReport, VideoIndex, index_video, read_frames
+from app.formats.video import AnyFrame, index_video, read_frames
+from app.formats.video_file import ReadReport, VideoIndex
 from app.jobs.frame_tasks import memory_is_the_limit
 from app.plots.annotated_frame import draw_outlines, encode_picture
 from app.plots.trace import largest_change

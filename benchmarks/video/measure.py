@@ -16,7 +16,7 @@ from app.decoders.plate.video_search import FoundPlate
 from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
-from app.formats.video import VideoFile, VideoKind
+from app.formats.video_file import VideoFile, VideoKind
 from app.jobs.video_tasks import decode_segment, index_frames
 from app.markers.plate import EXPECTED_GEOMETRIES, PlateCode
 from app.sensors.camera import Camera

@@ -18,7 +18,7 @@ from app.decoders.plate.reader import decode_plates
 from app.families.plate.frames import PlateSearch
 from app.families.plate.plates import PLATE
 from app.formats.format import SpooledFile
-from app.formats.video import VideoFile, VideoKind
+from app.formats.video_file import VideoFile, VideoKind
 from app.jobs.decoder_process import ProcessIdTask
 from app.jobs.pool import DecodePool
 from app.markers.plate import EXPECTED_GEOMETRIES

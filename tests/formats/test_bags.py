@@ -16,7 +16,8 @@ from app.formats.bags import messages as bag_messages
 from app.formats.format import SpooledFile
 from app.formats.traces.declaration import AxisConvention, TraceDeclaration
 from app.formats.traces.read import read_trace
-from app.formats.video import ReadReport, VideoFile, VideoIndex, VideoKind, detect_video, index_video, read_frames
+from app.formats.video import index_video, read_frames
+from app.formats.video_file import ReadReport, VideoFile, VideoIndex, VideoKind, detect_video
 from tests.formats.pictures import jpeg
 from tests.machine import require_module
 

@@ -18,7 +18,8 @@ import pytest
 
 from app.errors import InvalidParameter, UnreadableUpload, UnsupportedUpload, UploadTooLarge, WaymarkError
 from app.formats.format import ArchiveLimits, SpooledFile
-from app.formats.video import (
+from app.formats.video import index_video, read_frames
+from app.formats.video_file import (
     ReadReport,
     VideoFile,
     VideoIndex,
@@ -27,9 +28,7 @@ from app.formats.video import (
     VideoSegment,
     detect_video,
     holds_video,
-    index_video,
     open_packed_video,
-    read_frames,
 )
 
 WIDTH, HEIGHT = 160, 120

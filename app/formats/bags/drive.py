@@ -18,7 +18,7 @@ from app.formats.format import SpooledFile
 from app.formats.images import ImageLimits, inspect_image, load_image
 from app.formats.logs import LogReport
 from app.formats.poses import PosePoint, track_of
-from app.formats.video import (
+from app.formats.video_file import (
     PictureFrame,
     ReadReport,
     VideoFile,

@@ -14,7 +14,7 @@ from app.formats.format import ArchiveLimits
 from app.formats.images import ImageHeader, ImageLimits, check_thermal_range
 from app.formats.packets.rows import PacketLimits
 from app.formats.traces.declaration import TraceLimits
-from app.formats.video import VideoLimits
+from app.formats.video_file import VideoLimits
 from app.geodesy import check_lon_lat
 from app.registry.decodes import DecodeRow
 from app.sensors.camera import Camera

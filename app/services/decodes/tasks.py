@@ -37,7 +37,7 @@ from app.formats.traces.declaration import (
     TraceLimits,
     TraceReport,
 )
-from app.formats.video import VideoFile, VideoIndex, VideoLimits
+from app.formats.video_file import VideoFile, VideoIndex, VideoLimits
 from app.lanes.types import Lane, LaneMarkers, LaneRules
 from app.plots.annotated_frame import Outline
 from app.sensors.camera import Camera

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from app.families.family import FrameReading, Nearby, distance_to_row
 from app.formats.format import ArchiveLimits, Member, SpooledFile
 from app.formats.images import ImageHeader, ImageKind
-from app.formats.video import (
+from app.formats.video_file import (
     VideoFile,
     VideoIndex,
     VideoKind,
