@@ -3,7 +3,6 @@
 import { html } from "htm/preact";
 import { useCallback, useEffect, useRef, useState } from "preact/hooks";
 
-import { Problem } from "../api/client.js";
 import { t } from "../texts/index.js";
 import { ProblemBox } from "./problem.js";
 
@@ -58,14 +57,3 @@ export function Empty({ title, children }) {
 
 /** @param {unknown} error */
 export const isAborted = (error) => error instanceof DOMException && error.name === "AbortError";
-
-/**
- * An error as a problem document.
- *
- * @param {unknown} error
- * @returns {import("../api/client.js").ProblemDocument}
- */
-export function documentOf(error) {
-  if (error instanceof Problem) return error.document;
-  return { title: t("problem.page"), detail: String(error) };
-}

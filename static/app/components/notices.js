@@ -4,7 +4,8 @@ import { signal } from "@preact/signals";
 import { html } from "htm/preact";
 
 import { t } from "../texts/index.js";
-import { documentOf, isAborted } from "./load.js";
+import { isAborted } from "./load.js";
+import { documentOf } from "./problem.js";
 
 const SHOWN_MS = 8000;
 

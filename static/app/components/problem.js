@@ -3,9 +3,9 @@
 import { html } from "htm/preact";
 import { useEffect, useRef } from "preact/hooks";
 
+import { Problem } from "../api/client.js";
 import { t } from "../texts/index.js";
 import { Facts } from "./facts.js";
-import { documentOf } from "./load.js";
 
 /**
  * @param {{ error: unknown, retry?: () => void }} props
@@ -60,3 +60,14 @@ export function fieldErrors(error) {
  * @param {import("./form.js").Values} values Of the form.
  */
 export const isAtField = (errors, values) => Object.entries(errors).some(([path, text]) => text && path in values);
+
+/**
+ * An error as a problem document.
+ *
+ * @param {unknown} error
+ * @returns {import("../api/client.js").ProblemDocument}
+ */
+export function documentOf(error) {
+  if (error instanceof Problem) return error.document;
+  return { title: t("problem.page"), detail: String(error) };
+}

@@ -4,8 +4,9 @@ import { html } from "htm/preact";
 import { useEffect, useState } from "preact/hooks";
 
 import { api, ok } from "../api/client.js";
+import { MENU } from "../menu.js";
 import { match, path, query } from "../router.js";
-import { MENU, ROUTES } from "../routes.js";
+import { ROUTES } from "../routes.js";
 import { key, may, me, pageSettings, signOut } from "../session.js";
 import { LANGUAGES, language, t, textOr, useLanguage } from "../texts/index.js";
 import { Empty } from "./load.js";
@@ -100,7 +101,7 @@ function Menu() {
   })}${pageSettings.value?.guide && html`<a class="menu-link" href="/guide/" data-native>${t("shell.guide")}</a>`}<a class="menu-link" href="/docs" data-native>API</a>`;
 }
 
-/** @param {{ title: string, entries: import("../routes.js").Entry[], current: boolean }} props */
+/** @param {{ title: string, entries: import("../menu.js").Entry[], current: boolean }} props */
 function MenuGroup({ title, entries, current }) {
   const [open, setOpen] = useState(false);
   useEffect(() => setOpen(false), [path.value]);

@@ -5,7 +5,7 @@ import { html } from "htm/preact";
 import { api, page, request } from "../api/client.js";
 import { Shown, useLoad } from "../components/load.js";
 import { number } from "../format.js";
-import { MENU } from "../routes.js";
+import { MENU } from "../menu.js";
 import { may, me } from "../session.js";
 import { t } from "../texts/index.js";
 
