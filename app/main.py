@@ -178,8 +178,9 @@ async def _running(settings: Settings, outside: Outside, cases: UseCases) -> Asy
         if left_out or fault:
             _LOG.error(
                 "the disk is full or read-only: reads are served, writes are refused until that has changed",
-                fault=fault, left_out=left_out,
-            )  # fmt: skip
+                fault=fault,
+                left_out=left_out,
+            )
         async with (
             _each_minute(cases.access.write_uses),
             _each(timedelta(days=1), cases.unused_blobs.try_to_delete, stop=cases.unused_blobs.stop),

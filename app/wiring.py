@@ -149,9 +149,8 @@ def make_use_cases(settings: Settings, outside: Outside, decode: DecodePlates) -
     exports = Exports(database, ExportProcesses(settings.decode_memory_bytes).write)
     export_jobs = ExportJobs(database, clock, queue, exports, job_files, ttl)
     artwork_jobs = ArtworkJobs(
-        database, clock, pool, queue, job_files,
-        public_url=settings.qr_code_url, in_flight=workers, idempotency_ttl=ttl,
-    )  # fmt: skip
+        database, clock, pool, queue, job_files, public_url=settings.qr_code_url, in_flight=workers, idempotency_ttl=ttl
+    )
     job_handlers: dict[JobKind, JobHandler] = {
         JobKind.AUDIT: audits,
         JobKind.DECODE: decodes,

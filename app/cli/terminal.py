@@ -140,9 +140,7 @@ def _make_bars() -> Bars:
                 "  ".join(filter(None, (amount(task.completed, task.total, unit), speed(rate, task.total, unit))))
             )
 
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), Counts(), TimeRemainingColumn(),
-    )  # fmt: skip
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), Counts(), TimeRemainingColumn())
     return Bars(*columns, console=Console(stderr=True))
 
 

@@ -109,9 +109,10 @@ class ProcessMetrics(Collector):
             used.add_metric((name, "idle"), pool.checkedin())
             most.add_metric((name,), pool.size() + max(0, pool._max_overflow))
         waiting = GaugeMetricFamily(
-            "waymark_database_writers_waiting", "Transactions of this process that wait to write",
+            "waymark_database_writers_waiting",
+            "Transactions of this process that wait to write",
             value=self._database.waiting_writers,
-        )  # fmt: skip
+        )
         yield from (used, most, waiting)
 
 

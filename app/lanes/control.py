@@ -144,8 +144,9 @@ def _check_turns(points: Floats, chainage: Floats, field: str) -> None:
     pieces = max(int(chainage[-1] / _TURN_OVER_M), 2)
     at = np.linspace(0.0, chainage[-1], pieces + 1)
     chords = np.column_stack([np.diff(np.interp(at, chainage, points[:, k])) for k in (0, 1)])
-    turned = np.arctan2(chords[:-1, 0] * chords[1:, 1] - chords[:-1, 1] * chords[1:, 0],
-                        np.sum(chords[:-1] * chords[1:], axis=1))  # fmt: skip
+    turned = np.arctan2(
+        chords[:-1, 0] * chords[1:, 1] - chords[:-1, 1] * chords[1:, 0], np.sum(chords[:-1] * chords[1:], axis=1)
+    )
     worst = int(np.abs(turned).argmax())
     turn_deg = abs(math.degrees(turned[worst]))
     if turn_deg > MAX_TURN_DEG:

@@ -440,7 +440,7 @@ WIDTH_MODELS: tuple[WidthModel, ...] = (
     {"width_sd_m": 0.25, "width_length_m": 60.0, "opens": False},
     {"width_sd_m": 1.0, "width_length_m": 40.0, "opens": True},
     {"width_sd_m": 2.5, "width_length_m": 40.0, "opens": True},
-)  # fmt: skip
+)
 """Candidates for the width of a lane with two known sides: as painted, or with lanes that open and merge. Source: by
 hand, the roads of decision record 0016."""
 BENDS = (0.0005, 0.0015, 0.003, 0.006, 0.015)

@@ -112,9 +112,10 @@ class SmoothLine:
         # cubic Hermite interpolation between stations
         a, b, h = p[i], p[i + 1], self._step_m
         point = (
-            a * ((1 + 2 * u) * (1 - u) ** 2) + b * (u * u * (3 - 2 * u))
+            a * ((1 + 2 * u) * (1 - u) ** 2)
+            + b * (u * u * (3 - 2 * u))
             + h * (t[i] * (u * (1 - u) ** 2) + t[i + 1] * (u * u * (u - 1)))
-        )  # fmt: skip
+        )
         beyond = station_m - np.clip(station_m, 0, self.length_m)
         return point + tangent * beyond[:, None], tangent
 

@@ -13,28 +13,28 @@ import scipy
 from app.lanes.smooth_line import plane_from_wgs84
 from app.lanes.types import Lane, LaneMarkers
 from app.plots.axes import (
-    BLUE,  # fmt: skip
-    GREEN,  # fmt: skip
-    GREY,  # fmt: skip
-    ORANGE,  # fmt: skip
-    RED,  # fmt: skip
-    Panel,  # fmt: skip
-    Scale,  # fmt: skip
-    area,  # fmt: skip
-    circle,  # fmt: skip
-    cross,  # fmt: skip
-    dots,  # fmt: skip
-    heading,  # fmt: skip
-    nice_step,  # fmt: skip
-    outlined,  # fmt: skip
-    picture,  # fmt: skip
-    polylines,  # fmt: skip
-    shape,  # fmt: skip
-    spans,  # fmt: skip
-    stroke,  # fmt: skip
-    text,  # fmt: skip
-    thin,  # fmt: skip
-    ticks,  # fmt: skip
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    Panel,
+    Scale,
+    area,
+    circle,
+    cross,
+    dots,
+    heading,
+    nice_step,
+    outlined,
+    picture,
+    polylines,
+    shape,
+    spans,
+    stroke,
+    text,
+    thin,
+    ticks,
 )
 from app.sensors.pose_track import PoseTrack
 
@@ -405,10 +405,11 @@ def _strip_panel(lane: LanePicture, panel: Panel) -> list[str]:
     dash = "6 4" if along.last - along.first < _LONG_M else ""
     lines = [
         *area(left, right),
-        *polylines(left, _SIDE_COLOURS[1], 1.2), *polylines(right, _SIDE_COLOURS[2], 1.2),
+        *polylines(left, _SIDE_COLOURS[1], 1.2),
+        *polylines(right, _SIDE_COLOURS[2], 1.2),
         *polylines(px(*_beside(lane, thin(lane.track_m)).T), _TRACK, 1.2, dash),
         panel.line_across(panel.middle, _CENTRE, 1.5),
-    ]  # fmt: skip
+    ]
     parts = [panel.frame(), *panel.clipped("strip", lines)]
     step = 1 if half_m < 4 else 2
     for tick in range(-int(half_m), int(half_m) + 1):

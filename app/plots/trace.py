@@ -29,7 +29,7 @@ from app.plots.axes import (
     stroke,
     text,
     ticks,
-)  # fmt: skip
+)
 from app.sensors.magnetometer_bar import MagnetometerBar, MagnetTrace
 
 Floats = npt.NDArray[np.float64]

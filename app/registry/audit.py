@@ -516,9 +516,7 @@ class _Version(NamedTuple):
 
 
 _V = marker_versions.c
-_VERSION = (
-    *(_V[name] for name in _Version._fields[:7]), sa.cast(_V.marker, sa.Text).label("text"), _V.sha256
-)  # fmt: skip
+_VERSION = (*(_V[name] for name in _Version._fields[:7]), sa.cast(_V.marker, sa.Text).label("text"), _V.sha256)
 
 
 def _check_versions(connection: sa.Connection, agency_id: str, report: ChainReport) -> Iterator[Fault]:

@@ -163,9 +163,8 @@ def find_job_about(
 
 
 def record_progress(
-    connection: sa.Connection, job_id: str, progress: float,
-    *, steps: tuple[int, int] | None = None, kept: bool = False,
-) -> bool:  # fmt: skip
+    connection: sa.Connection, job_id: str, progress: float, *, steps: tuple[int, int] | None = None, kept: bool = False
+) -> bool:
     """Record how far a running job is. Returns False if it was cancelled or is gone, so that it has to stop.
 
     Parameters

@@ -105,9 +105,8 @@ def count_jobs(connection: sa.Connection, reprocessing_id: str) -> dict[str, int
 def cancel_jobs(connection: sa.Connection, agency_id: str, reprocessing_id: str, now: datetime) -> None:
     """Ask the shards of a reprocessing to stop."""
     query = sa.select(jobs.c.id).where(
-        jobs.c.subject_id == reprocessing_id, jobs.c.kind == JobKind.REPROCESS,
-        jobs.c.state.in_(("queued", "running")),
-    )  # fmt: skip
+        jobs.c.subject_id == reprocessing_id, jobs.c.kind == JobKind.REPROCESS, jobs.c.state.in_(("queued", "running"))
+    )
     for job_id in list(connection.execute(query).scalars()):
         request_cancel(connection, agency_id, job_id, now)
 

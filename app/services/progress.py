@@ -53,9 +53,7 @@ def _about_plan(end: str) -> Callable[[JobRow], str | None]:
 
 
 RULES: dict[str, JobRules] = {
-    JobKind.DECODE: JobRules(
-        _EVERYBODY, _EVERYBODY - {Scope.VIEWER}, lambda job: f"/v1/decodes/{job.id}"
-    ),
+    JobKind.DECODE: JobRules(_EVERYBODY, _EVERYBODY - {Scope.VIEWER}, lambda job: f"/v1/decodes/{job.id}"),
     JobKind.IMPORT: JobRules(_SURVEYORS, _SURVEYORS, lambda job: f"/v1/imports/{job.id}", SETTLED),
     JobKind.PLAN: JobRules(_READERS, _PLANNERS, _about_plan("")),
     JobKind.PROOF: JobRules(_READERS, _PLANNERS, _about_plan("/proof")),
@@ -65,13 +63,11 @@ RULES: dict[str, JobRules] = {
     JobKind.REPROCESS: JobRules(
         frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), lambda job: f"/v1/reprocessings/{job.subject_id}"
     ),
-    JobKind.DRIVE: JobRules(
-        _EVERYBODY, _EVERYBODY - {Scope.VIEWER}, lambda job: f"/v1/drives/{job.id}"
-    ),
+    JobKind.DRIVE: JobRules(_EVERYBODY, _EVERYBODY - {Scope.VIEWER}, lambda job: f"/v1/drives/{job.id}"),
     JobKind.AUDIT: JobRules(
         frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), lambda job: f"/v1/audit/verifications/{job.id}"
     ),
-}  # fmt: skip
+}
 _OTHERS = JobRules(frozenset({Scope.ADMIN}), frozenset({Scope.ADMIN}), lambda _job: None)
 
 
@@ -207,9 +203,8 @@ class AgencyEvents:
         kinds = visible_kinds(caller)
         with self._database.read() as connection:
             rows = store.list_events(
-                connection, caller.agency_id,
-                after=after, job_kinds=kinds, holder_id=caller.own_key_id, limit=limit,
-            )  # fmt: skip
+                connection, caller.agency_id, after=after, job_kinds=kinds, holder_id=caller.own_key_id, limit=limit
+            )
         return [cast("EventDocument", row._asdict()) for row in rows]
 
     def newest_of(self, agency_ids: Sequence[str]) -> dict[str, int]:
@@ -298,11 +293,7 @@ class AllJobs:
 
 def _visible(connection: sa.Connection, caller: Caller, job_id: str) -> JobRow:
     job = registry_jobs.find_job(connection, caller.agency_id, job_id)
-    if (
-        job is None
-        or caller.scope not in rules_of(job.kind).readers
-        or caller.own_key_id not in (None, job.holder_id)
-    ):  # fmt: skip
+    if job is None or caller.scope not in rules_of(job.kind).readers or caller.own_key_id not in (None, job.holder_id):
         raise NotFound(f"there is no job {job_id}", field="job_id", cure="GET /v1/jobs lists yours")
     return job
 

@@ -467,9 +467,10 @@ class Reprocessings:
                 )  # fmt: skip
             if store.is_outdated(connection, reprocessing_id):
                 raise Conflict(
-                    "some of these decodes were changed by another reprocessing since", field="reprocessing_id",
+                    "some of these decodes were changed by another reprocessing since",
+                    field="reprocessing_id",
                     cure="start another one",
-                )  # fmt: skip
+                )
             count = store.accept(connection, reprocessing_id, caller.label, now)
             log_change(connection, caller, "reprocessing.accepted", now=now, subject=reprocessing_id, decodes=count)
             return self._document(connection, REPROCESSINGS.get(connection, caller.agency_id, reprocessing_id))

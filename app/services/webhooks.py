@@ -174,9 +174,10 @@ class Webhooks:
         with self._database.write() as connection:
             if store.count_webhooks(connection, agency_id) >= MAX_WEBHOOKS:
                 raise Conflict(
-                    f"the agency has {MAX_WEBHOOKS} webhooks", limit=f"{MAX_WEBHOOKS} of an agency",
+                    f"the agency has {MAX_WEBHOOKS} webhooks",
+                    limit=f"{MAX_WEBHOOKS} of an agency",
                     cure="delete one that is not needed",
-                )  # fmt: skip
+                )
             row = WebhookRow(
                 webhook_id, agency_id, url, list(dict.fromkeys(events)), sealed, "active", None,
                 newest_event(connection, agency_id), None, caller.label, now,
@@ -435,9 +436,7 @@ class WebhookDelivery:
 
 def is_wanted(kind: str, wanted: list[str]) -> bool:
     """Whether a kind of events is among those of a webhook."""
-    return any(
-        one in ("*", kind) or (one.endswith(".*") and kind.startswith(one[:-1])) for one in wanted
-    )  # fmt: skip
+    return any(one in ("*", kind) or (one.endswith(".*") and kind.startswith(one[:-1])) for one in wanted)
 
 
 def delay_s(attempts: int) -> float:

@@ -522,8 +522,8 @@ def _evaluate(
     rates = np.diff(steer_deg, prepend=steer_deg[0]) / STEP_S
     lateral = speed**2 * np.abs(np.tan(wheel)) / vehicle.wheelbase_m
     trace = SteeringTrace(
-        time_s, front, rear, heading_deg, speed, rows[:, 4], steer_deg, rows[:, 6], rows[:, 7], errors[:, 0],
-    )  # fmt: skip
+        time_s, front, rear, heading_deg, speed, rows[:, 4], steer_deg, rows[:, 6], rows[:, 7], errors[:, 0]
+    )
     return SteeringCheck(
         controller=law,
         rms_m=math.sqrt(mean(errors[:, 0] ** 2, along)),

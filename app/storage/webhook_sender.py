@@ -141,10 +141,11 @@ def _check_host(host: str, in_brackets: bool, *, loopback: bool) -> None:
 
 def _refused(why: str) -> InvalidParameter:
     return InvalidParameter(
-        f"the URL cannot be used: {why}", field="url",
+        f"the URL cannot be used: {why}",
+        field="url",
         limit=f"https://HOST[:PORT]/PATH at a public address, ASCII, {MAX_URL} characters, port 443 or one above 1023",
         cure="give the https address at which the receiver can be reached from the internet",
-    )  # fmt: skip
+    )
 
 
 def resolve(host: str, port: int) -> list[str]:
@@ -227,13 +228,13 @@ class WebhookSender:
         sent = {**headers, "Host": parts.netloc, "Content-Type": "application/json", "User-Agent": "Waymark-Webhooks/1"}
         async with (
             httpx.AsyncClient(
-                verify=self._context, follow_redirects=False, trust_env=False,
+                verify=self._context,
+                follow_redirects=False,
+                trust_env=False,
                 timeout=self._total_s,
             ) as client,
-            client.stream(
-                "POST", pinned, content=body, headers=sent, extensions={"sni_hostname": host}
-            ) as response,
-        ):  # fmt: skip
+            client.stream("POST", pinned, content=body, headers=sent, extensions={"sni_hostname": host}) as response,
+        ):
             read = 0
             async for part in response.aiter_raw():
                 read += len(part)

@@ -216,7 +216,7 @@ def find_duplicates(
                 message = f"{marker} is registered{shown}, {metres:.2f} m from this row"
                 yield Fault(
                     int(rows[k]) + 1, "position", "already_registered", message, _CURE, Severity.REFUSED, changes
-                )  # fmt: skip
+                )
                 break
 
 

@@ -157,10 +157,11 @@ def _local(table: SurveyTable, control: ControlPoint, row: int | None) -> comple
         return complex(control.local_easting, control.local_northing)
     if row is None or not np.isfinite(table.first[row] + table.second[row]):
         raise InvalidParameter(
-            f"the control point {control.point[:40]!r} is not in the file", field=_FIELD,
+            f"the control point {control.point[:40]!r} is not in the file",
+            field=_FIELD,
             limit="a row with its number and coordinates",
             cure="declare its local_easting and local_northing, or the column of the point numbers",
-        )  # fmt: skip
+        )
     return complex(table.first[row], table.second[row])
 
 
@@ -294,9 +295,7 @@ def without_rows(table: SurveyTable, rows: Sequence[int]) -> SurveyTable:
     table.faults.leave_out(rows)
     indices = [row - 1 for row in rows if row <= table.rows]
     height = None if table.height is None else _without(table.height, indices)
-    return replace(
-        table, first=_without(table.first, indices), second=_without(table.second, indices), height=height
-    )  # fmt: skip
+    return replace(table, first=_without(table.first, indices), second=_without(table.second, indices), height=height)
 
 
 def _without(values: Floats, indices: Sequence[int]) -> Floats:

@@ -42,9 +42,9 @@ def collect_track(
 ) -> Track:  # fmt: skip
     """The track with all that belongs to it."""
     states = smoothed.states
-    offsets = np.array([
-        float(states[0, entry.place]) if entry.place >= 0 else entry.clock.offset_s for entry in segments
-    ])  # fmt: skip
+    offsets = np.array(
+        [float(states[0, entry.place]) if entry.place >= 0 else entry.clock.offset_s for entry in segments]
+    )
     fix_time = np.array([fix.time_s for fix in fixes]) + offsets[segment_of]
     margin = 1.0 + 3.0 * max(clock.sigma_s for clock in declared)
     first, last = base.start_s + margin, base.start_s + base.step_s * (base.count - 1) - margin

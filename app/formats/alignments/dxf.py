@@ -89,8 +89,9 @@ def read_dxf(data: bytes) -> AlignmentFile:
     if unit is None:
         notes.append("the DXF states no unit ($INSUNITS); that of the CRS is used, or metres")
     if others:
-        notes.append(f"{len(others)} splines and ellipses are left out, the first on layer {others[0]}; export them as "
-                    "polylines")  # fmt: skip
+        notes.append(
+            f"{len(others)} splines and ellipses are left out, the first on layer {others[0]}; export them as polylines"
+        )
     features = list(_features(paths, labels, unit_m or 1.0))
     return assemble_road("dxf", features, unit_m=unit_m, warnings=notes)
 

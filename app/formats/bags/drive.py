@@ -126,9 +126,10 @@ def read_fields(file: SpooledFile, sensors: int, max_rows: int) -> BagFields:
             raise InvalidParameter(
                 f"the bag has {len(names)} topics of magnetic fields, and {sensors} sensors are declared; "
                 f"it has {describe_topics(bag.topics)}",
-                field="sensors", limit="one topic of sensor_msgs/MagneticField for each sensor",
+                field="sensors",
+                limit="one topic of sensor_msgs/MagneticField for each sensor",
                 cure="declare the bar's sensors, bar.sensors, in the order of the topics' names",
-            )  # fmt: skip
+            )
         series = [_read(bag, name, _field, max_rows) for name in names]
         speeds = sorted((topic.name, topic.type_name) for topic in bag.topics if topic.type_name in _SPEEDS)
         speed = _read(bag, speeds[0][0], lambda m: [_SPEEDS[speeds[0][1]](m)], max_rows) if speeds else None
@@ -259,13 +260,14 @@ def _choose_topic(bag: Bag) -> tuple[Topic, list[str]]:
 def _without_pictures(topics: list[Topic]) -> InvalidParameter:
     has_fields = any(topic.type_name in FIELDS for topic in topics)
     return InvalidParameter(
-        f"the bag has no pictures; it has {describe_topics(topics)}", field=FIELD,
+        f"the bag has no pictures; it has {describe_topics(topics)}",
+        field=FIELD,
         limit="topics of sensor_msgs/CompressedImage or sensor_msgs/Image, and for the track sensor_msgs/NavSatFix; "
         "sensor_msgs/MagneticField where a trace is declared",
         cure="declare the trace in the context: trace with bar and axes"
         if has_fields
         else "record the topic of compressed pictures, e.g. /camera/image_raw/compressed",
-    )  # fmt: skip
+    )
 
 
 def _read_track(bag: Bag, warnings: list[str]) -> PoseTrack | None:

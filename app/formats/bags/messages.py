@@ -191,10 +191,11 @@ def _check_chunks(chunks: list[Any], stream: BinaryIO) -> None:
     packed, expanded = (sum(getattr(chunk, size) for chunk in chunks) for size in _SIZES)
     if expanded > MAX_CHUNK_BYTES + MAX_EXPANSION * packed:
         raise UploadTooLarge(
-            f"the bag's chunks expand from {packed} to {expanded} bytes", field=FIELD,
+            f"the bag's chunks expand from {packed} to {expanded} bytes",
+            field=FIELD,
             limit=f"{MAX_EXPANSION} times their size, and {MAX_CHUNK_BYTES} bytes",
             cure="record compressed pictures and no constant data",
-        )  # fmt: skip
+        )
 
 
 @contextmanager

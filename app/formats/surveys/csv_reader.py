@@ -312,9 +312,8 @@ def read_csv(data: bytes, declaration: ImportDeclaration) -> SourceTable:
         value = f"{lines.comments} lines left out"
         detected.append(Detected("comments", value, f"they begin with {' or '.join(_COMMENTS)}"))
     return SourceTable(
-        "csv", header.names, table, faults=header.faults, detected=tuple(detected),
-        has_names=not header.last_takes_rest,
-    )  # fmt: skip
+        "csv", header.names, table, faults=header.faults, detected=tuple(detected), has_names=not header.last_takes_rest
+    )
 
 
 def _detect_delimiter(utf8: bytes, declaration: ImportDeclaration) -> str:

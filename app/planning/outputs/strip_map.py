@@ -34,7 +34,7 @@ from app.planning.outputs.drawing_sheet import (
     draw_plate,
     draw_scale_bar,
     draw_title_block,
-)  # fmt: skip
+)
 from app.planning.outputs.strip_drawing import ROW_HEIGHT_MM, StripDrawing, StripPlace
 from app.planning.outputs.strip_layout import Strip, cut_strips
 from app.planning.plan import Plan

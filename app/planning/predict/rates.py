@@ -112,7 +112,7 @@ class PathModel:
             math.hypot(self.exact_markers_m, self.marker_gain * sigma)
             * (spacing_m / _SPACING_UNIT_M) ** self.spacing_power
             * (np.maximum(speed_mps, 1.0) / _SPEED_UNIT_MPS) ** self.speed_power
-        )  # fmt: skip
+        )
         return np.asarray(np.sqrt(own**2 * (1.0 + self.end_gain_m * ends_per_m) + self.exact_share * exact_rms_m**2))
 
 

@@ -39,9 +39,7 @@ from app.services.ports import Clock
 
 ItemStatus = Literal["open", "approved", "dismissed"]
 Outcome = Literal["suspect", "retired", "resurvey", "none"]
-What = Literal[
-    "missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "wrong-way-driver", "reported"
-]  # fmt: skip
+What = Literal["missing", "moved", "cloned", "wrong-way", "fading", "unregistered", "wrong-way-driver", "reported"]
 
 
 class UploadLink(TypedDict):

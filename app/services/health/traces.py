@@ -80,9 +80,7 @@ def packet_evidence(read: ReadPackets, row: MarkerRow, kind: Disagreement | None
     lon_deg, lat_deg = claimed_place(number, read)
     if lon_deg is not None and lat_deg is not None:
         east, north, _up = enu_from_wgs84(lon_deg, lat_deg, 0.0, (row.lon_deg, row.lat_deg, 0.0))
-        evidence |= {
-            "offset_m": (float(east), float(north)), "sigma_m": MESSAGE_SIGMA_M, "offset_is_absolute": True,
-        }  # fmt: skip
+        evidence |= {"offset_m": (float(east), float(north)), "sigma_m": MESSAGE_SIGMA_M, "offset_is_absolute": True}
     evidence["expected"] = _expected(row, files.track)
     return rounded({**evidence, **_quality(profile)})
 
@@ -116,7 +114,7 @@ def _left_of_vehicle_m(row: MarkerRow, track: PoseTrack) -> float | None:
     beside = slice(nearest - 1, nearest + 2)
     east, north, _up = enu_from_wgs84(
         track.lon_deg[beside], track.lat_deg[beside], 0.0, (row.lon_deg, row.lat_deg, 0.0)
-    )  # fmt: skip
+    )
     ahead = np.array([east[2] - east[0], north[2] - north[0]])
     length_m = float(np.hypot(*ahead))
     return float(ahead[1] * east[1] - ahead[0] * north[1]) / length_m if length_m > 0.0 else None
@@ -438,9 +436,8 @@ def _passed_probability(first: TagFix, second: TagFix, gap_m: float, tag: Regist
     share = np.linspace(0.0, 1.0, 201)[:, None]
     starts, ends = (chord_m * _direction(fix.heading_deg) for fix in (first, second))
     path = (
-        (share**3 - 2 * share**2 + share) * starts + (3 * share**2 - 2 * share**3) * end
-        + (share**3 - share**2) * ends
-    )  # fmt: skip
+        (share**3 - 2 * share**2 + share) * starts + (3 * share**2 - 2 * share**3) * end + (share**3 - share**2) * ends
+    )
     nearest = int(np.argmin(np.linalg.norm(path - there, axis=1)))
     if not 2 <= nearest <= len(path) - 3:
         return 0.0

@@ -295,9 +295,10 @@ def _photo_key(row: ReportRow) -> str:
     key = row.report.photo_key
     if key is None:
         raise NotFound(
-            f"the damage report {row.report.id} has no photo", field="report_id",
+            f"the damage report {row.report.id} has no photo",
+            field="report_id",
             cure="has_photo of the report is true if there is one",
-        )  # fmt: skip
+        )
     return key
 
 

@@ -162,9 +162,7 @@ def _whole(text: str) -> bool:
 def _outline(road: Road, item: ET.Element, place: str) -> tuple[tuple[float, float], Floats | None]:
     """Extent along the road, and closed ring of an object, None where it has no area."""
     s, t = attribute(item, "s", place), attribute(item, "t", place, 0.0)
-    corners = [
-        (attribute(c, "s", place), attribute(c, "t", place)) for c in _corners(item, "cornerRoad")
-    ]  # fmt: skip
+    corners = [(attribute(c, "s", place), attribute(c, "t", place)) for c in _corners(item, "cornerRoad")]
     local = [(attribute(c, "u", place), attribute(c, "v", place)) for c in _corners(item, "cornerLocal")]
     if not corners and not local:
         length, width = attribute(item, "length", place, 0.0) / 2.0, attribute(item, "width", place, 0.0) / 2.0

@@ -205,10 +205,8 @@ def _sections(road: ET.Element, place: str, end: float) -> tuple[Section, ...]:
     for element, start, stop in zip(elements, starts, [*starts, end][1:], strict=True):
         if stop - start > GAP_WARNING_M:
             lanes = [
-                _lane(lane, place, start)
-                for side in ("left", "right")
-                for lane in element.iterfind(f"{side}/lane")
-            ]  # fmt: skip
+                _lane(lane, place, start) for side in ("left", "right") for lane in element.iterfind(f"{side}/lane")
+            ]
             centre = [_lane(lane, place, start) for lane in element.iterfind("center/lane")]
             found.append(Section(max(start, 0.0), stop, {lane.id: lane for lane in centre[:1] + lanes}))
     return tuple(found)
