@@ -10,6 +10,8 @@ import tempfile
 import time
 
 import cv2
+import numpy as np
+import numpy.typing as npt
 
 from app.decoders.plate.reader import decode_plates
 from app.encoders.plate import BundleOptions, PlateOrder, write_bundle
@@ -33,7 +35,7 @@ def list_orders(count: int) -> list[PlateOrder]:
     return orders
 
 
-def read_face(image: object, geometry: PlateGeometry) -> list[PlateReading]:
+def read_face(image: npt.NDArray[np.uint8], geometry: PlateGeometry) -> list[PlateReading]:
     """The decoder as the service hands it to the proof."""
     return decode_plates(image, geometries=(geometry,))
 

@@ -54,6 +54,7 @@ def main() -> None:
         small = _recoded(frame.jpeg, 1.0, 62)
         (IMAGES / "frame.jpg").write_bytes(small)
         (IMAGES / "frame.json").write_text(json.dumps(frame.context, indent=2) + "\n")
+        parts: dict[str, tuple[str, bytes] | tuple[str, bytes, str]]
         parts = {"file": ("frame.jpg", small, "image/jpeg"), "context": ("c", json.dumps(frame.context).encode())}
         decode = client.post("/v1/decodes", files=parts).raise_for_status().json()
         print(decode["summary"]["text"], markers[0]["position"], markers[0]["heading_deg"])
@@ -126,14 +127,14 @@ def _write_trace() -> None:
 
 
 def _recoded(jpeg: bytes, scale: float, quality: int) -> bytes:
-    pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    pixels = np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR))
     smaller = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return bytes(cv2.imencode(".jpg", smaller, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 
 
 def _write_plate(client: httpx.Client, marker_id: str) -> None:
     png = client.get(f"/v1/markers/{marker_id}/artwork.png", params={"resolution_dpi": 72}).raise_for_status().content
-    pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    pixels = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))
     scale = 640 / pixels.shape[0]
     smaller = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(IMAGES / "plate.png"), smaller)

@@ -42,7 +42,7 @@ def ecef_from_wgs84(lon_deg: Floats, lat_deg: Floats) -> Floats:
 
 
 def enu_from_wgs84(
-    lon_deg: npt.ArrayLike, lat_deg: npt.ArrayLike, height_m: float, origin: tuple[float, float, float]
+    lon_deg: npt.ArrayLike, lat_deg: npt.ArrayLike, height_m: npt.ArrayLike, origin: tuple[float, float, float]
 ) -> npt.NDArray[np.float64]:
     """East, north, up from an origin (lon_deg, lat_deg, ellipsoidal height_m), shape (3,) or (3, K). [m]"""
     return np.array(pymap3d.geodetic2enu(lat_deg, lon_deg, height_m, origin[1], origin[0], origin[2]), dtype=float)

@@ -96,7 +96,7 @@ class FaultServer:
     def kill(self) -> list[psutil.Process]:
         """Kill the server at once; returns the children that it had."""
         assert self.process is not None
-        children = psutil.Process(self.pid).children(recursive=True)
+        children: list[psutil.Process] = psutil.Process(self.pid).children(recursive=True)
         self.process.kill()
         self.process.wait(_WITHIN_S)
         return children

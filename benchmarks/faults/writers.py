@@ -171,8 +171,12 @@ class PlanCommits:
     def __call__(self, seed: random.Random) -> WriteRequest:
         """The first request: the road."""
         name = f"road {seed.getrandbits(64):x}"
-        form = {"file": ("road.geojson", _road(seed)), "declaration": {"name": name}}
-        return WriteRequest("/v1/alignments", **form, then=lambda road: self._plan(name, road["id"]))
+        return WriteRequest(
+            "/v1/alignments",
+            file=("road.geojson", _road(seed)),
+            declaration={"name": name},
+            then=lambda road: self._plan(name, road["id"]),
+        )
 
     def _plan(self, name: str, alignment_id: str) -> WriteRequest:
         rules = {"version": 1, "plates": {"spacing_m": 100}}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import product
 from zlib import crc32
 
 import numpy as np
@@ -83,9 +84,9 @@ def simulate(scene: Scene, seed: int, fault_share: float = 0.06, only_vehicle: b
         road, is_wrong_way = int(rng.integers(scene.roads)), number in wrong_way
         passes = _drive(scene, rng, markers, vehicles, road, vehicle, at_s, is_wrong_way)
         evidences, found = [], False
-        for name, record in zip(FAMILIES, own[vehicle], strict=True):  # each sensor makes its own upload
+        for name, vehicle_state in zip(FAMILIES, own[vehicle], strict=True):  # each sensor makes its own upload
             part = [(place, one) for place, one in passes if one.family == name]
-            judged = judge_drive([one for _place, one in part], record, at_s)
+            judged = judge_drive([one for _place, one in part], vehicle_state, at_s)
             found |= judged.wrong_way and not judged.only_one
             evidences += [(place, evidence) for (place, _), evidence in zip(part, judged.evidence, strict=True)]
         _count_incident(outcome, found, is_wrong_way, passes)
@@ -132,8 +133,8 @@ def _count_incident(outcome: Outcome, found: bool, is_wrong_way: bool, passes: l
 
 
 def _collect(outcome: Outcome, markers: Markers, records: dict[tuple[int, int], _Record]) -> None:
-    for key in np.ndindex(markers.fault.shape):
-        fault, record = markers.fault[key], records[key]
+    for key in product(*map(range, markers.fault.shape)):
+        fault, record = str(markers.fault[key]), records[key[0], key[1]]
         outcome.healthy += not fault
         if fault:
             found = record.suspected.get(fault)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -300,12 +300,12 @@ def web_mercator(survey: Survey, _rng: np.random.Generator) -> Made:
 
 
 _ANY = EVIDENCE
-_DEGREES = {"k": ("EPSG:4326",), "t": ("EPSG:4326",)}
-_METRES = {"k": ("EPSG:25832", "EPSG:32632"), "t": ("EPSG:26918", "EPSG:6347")}
-_FEET = {"t": ("EPSG:6593",)}
-_OLD = {"k": ("EPSG:25832",), "t": ("EPSG:26918",)}
-_ZONES = {"k": ("EPSG:25832", "EPSG:32632"), "t": ("EPSG:26918",)}
-KINDS: dict[str, tuple[Plant, dict[str, tuple[str, ...]] | None, tuple[str, ...]]] = {
+_DEGREES: Mapping[str, tuple[str, ...]] = {"k": ("EPSG:4326",), "t": ("EPSG:4326",)}
+_METRES: Mapping[str, tuple[str, ...]] = {"k": ("EPSG:25832", "EPSG:32632"), "t": ("EPSG:26918", "EPSG:6347")}
+_FEET: Mapping[str, tuple[str, ...]] = {"t": ("EPSG:6593",)}
+_OLD: Mapping[str, tuple[str, ...]] = {"k": ("EPSG:25832",), "t": ("EPSG:26918",)}
+_ZONES: Mapping[str, tuple[str, ...]] = {"k": ("EPSG:25832", "EPSG:32632"), "t": ("EPSG:26918",)}
+KINDS: dict[str, tuple[Plant, Mapping[str, tuple[str, ...]] | None, tuple[str, ...]]] = {
     "swapped axes": (swapped_axes, None, _ANY),
     "wrong sign": (wrong_sign, _DEGREES, _ANY),
     "neighbouring zone": (wrong_zone, _ZONES, _ANY),

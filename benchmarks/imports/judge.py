@@ -22,7 +22,7 @@ from app.formats.surveys.read import read_survey
 from app.jobs.tasks import SameProcess
 from app.registry.database import Database
 from app.services.access.access import Access, Caller, Scope
-from app.services.surveys.import_report import ImportInput
+from app.services.surveys.import_report import ImportInput, ImportReport
 from app.services.surveys.imports import Imports
 from app.surveys.georeference import east_north_m, georeference_survey
 from benchmarks.imports.faults import Planted
@@ -57,7 +57,9 @@ class Judge:
         if survey.registered:
             lines = ["number,lon,lat,height", *(",".join(map(repr, map(_plain, row))) for row in survey.registered)]
             # the survey's coordinates are made by PROJ's null shifts: what is registered is in the datum of the survey
-            crs = ":".join(CRS(survey.crs).geodetic_crs.to_2d().to_authority())
+            geodetic = CRS(survey.crs).geodetic_crs
+            assert geodetic is not None
+            crs = ":".join(geodetic.to_2d().to_authority() or ())
             declaration = ImportDeclaration(
                 crs=crs, family="cerpm", vertical_datum="ellipsoid", columns={"code": "number"}, status="active"
             )
@@ -76,7 +78,7 @@ class Judge:
         refused = any(fault["severity"] == "refused" for fault in report["faults"])
         return refused, Counter(report["counts"])
 
-    def store(self, caller: Caller, given: ImportInput) -> tuple[dict[str, Any], bool]:
+    def store(self, caller: Caller, given: ImportInput) -> tuple[ImportReport, bool]:
         """Import a file."""
         return self._imports.run(caller, given)
 

@@ -48,7 +48,7 @@ def detector(family: TagFamily) -> cv2.aruco.ArucoDetector:
 def reads_tag(family: TagFamily, number: int, image: npt.NDArray[np.uint8], truth: FaceTruth) -> bool:
     """Whether the detector names this tag at its place."""
     corners, numbers, _ = detector(family).detectMarkers(image)
-    if numbers is None:
+    if not len(corners):
         return False
     centre, reach = truth.corners_px.mean(axis=0), max(truth.width_px, truth.height_px) / 2
     return any(

@@ -177,7 +177,7 @@ def _count(frames: Sequence[list[PlateReading]], code: PlateCode, truths: Sequen
 
 def schemes_table(records: Sequence[SchemeRecord]) -> str:
     """Frames read and wrong readings of each scheme under each kind of light and dirt, and the worst drives."""
-    rows = []
+    rows: list[tuple[object, ...]] = []
     for name in (*SCHEME_SETS, "all"):
         mine = [r for r in records if name in (r.drive.set_name, "all")]
         for scheme in dict.fromkeys(r.name for r in mine):
@@ -193,11 +193,11 @@ def schemes_table(records: Sequence[SchemeRecord]) -> str:
             shown = (f"{sum(one.read for one in way)} / {sum(len(one.wrong) for one in way)}" for way in ways)
             lost = " / ".join(_lost(ways[k]) for k in (0, 2, 3))
             rows.append((*head, *shown, place, lost))
-    head = (
+    titles = (
         "set", "scheme", "frames", "alone / wrong", "tentative / wrong", "with the drive's frames / wrong",
         "with registry / wrong", "worst drive alone", "drives lost alone / with its frames / with registry",
     )  # fmt: skip
-    return table(head, rows)
+    return table(titles, rows)
 
 
 def wrong_readings(records: Sequence[SchemeRecord]) -> Iterator[str]:

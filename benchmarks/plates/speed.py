@@ -14,7 +14,7 @@ import numpy.typing as npt
 from app.decoders.plate.reader import decode_plates
 from app.formats.images import load_image
 from benchmarks.plates.peers import FAMILIES, TagFamily, detector, tag_face
-from benchmarks.plates.sets import Job, Shot, replace_face, shoot
+from benchmarks.plates.sets import Job, Shot, Unseen, replace_face, shoot
 from benchmarks.plates.stages import measure_stages
 
 Image = npt.NDArray[np.uint8]
@@ -49,13 +49,14 @@ def measure_speed(seed: int, frames: int) -> tuple[list[Timing], list[StageTimin
     The times of the decoder's stages are of a second run of the same frames.
     """
     cv2.setNumThreads(1)
-    groups = {
+    groups: dict[str, list[Shot | Unseen]] = {
         "plate in clear light": list(_trial_shots(seed, frames)),
         "plate in shade": list(shoot(Job("dapple", 0, seed, frames))),
         "no plate": list(shoot(Job("free", 0, seed, 4 * frames)))[0::4],
         "no plate, clutter": list(shoot(Job("free", 1, seed, 4 * frames)))[3::4],
     }
-    timings, stages = [], []
+    timings: list[Timing] = []
+    stages: list[StageTiming] = []
     for name, shots in groups.items():
         seen = [shot for shot in shots if isinstance(shot, Shot)]
         timings += _measure(name, seen, seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import ModuleType
@@ -40,13 +40,13 @@ def measure_stages(images: list[Image]) -> dict[str, float]:
         decode = clock(REST, reader.decode_plates)
         for image in images:
             decode(image)
-    return {stage: 1000 * total / len(images) for stage, total in seconds.most_common()}
+    return {stage: 1000 * total / len(images) for stage, total in sorted(seconds.items(), key=lambda item: -item[1])}
 
 
 @contextmanager
-def _clocks() -> Iterator[tuple[Counter[str], Callable[[str, Callable[..., Any]], Callable[..., Any]]]]:
+def _clocks() -> Iterator[tuple[dict[str, float], Callable[[str, Callable[..., Any]], Callable[..., Any]]]]:
     """All stages under clocks: their seconds so far, and the function that puts another one under a clock."""
-    seconds: Counter[str] = Counter()
+    seconds: dict[str, float] = defaultdict(float)
     within: list[float] = []  # seconds in the stages that each of those that run has called
 
     def clock(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:

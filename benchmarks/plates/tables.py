@@ -43,10 +43,10 @@ def trials_table(records: Sequence[Record]) -> str:
                 + (f", {trial.height_m:g} m" if trial.height_m != 1.57 else "")
                 + (f", {trial.illumination}" if trial.illumination != "daylight" else ""),
                 _round(_scaled(mine) / len(seeds)),
-                _round(np.mean(decoded)),
+                _round(float(np.mean(decoded))),
                 _round(min(decoded)),
                 sum(len(r.wrong) for r in mine),
-                _round(np.mean(known)),
+                _round(float(np.mean(known))),
                 sum(len(r.wrong_known) for r in mine),
                 f"{trial.frames_decoded} of {trial.frames_detected}",
                 f"{np.mean(decoded) / trial.frames_decoded:.1f}",

@@ -51,7 +51,8 @@ def draw_crop(camera: Camera, rng: np.random.Generator) -> Image:
     part = photo[top : top + height, left : left + width]
     if rng.random() < 0.5:
         part = part[:, ::-1]
-    part = cv2.resize(np.ascontiguousarray(part), (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR)
+    size_px = (camera.width_px, camera.height_px)
+    part = np.asarray(cv2.resize(np.ascontiguousarray(part), size_px, interpolation=cv2.INTER_LINEAR), np.uint8)
     gain = rng.uniform(0.7, 1.3, 3) * rng.uniform(0.6, 1.3)
     table = np.clip(np.arange(256)[:, None] * gain + rng.uniform(-20, 20), 0, 255).astype(np.uint8)
     hsv = cv2.cvtColor(cv2.LUT(part, table[:, None, :].reshape(256, 1, 3)), cv2.COLOR_BGR2HSV)

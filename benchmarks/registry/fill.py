@@ -62,7 +62,7 @@ class Network:
         rng = np.random.default_rng(seed)
         places = np.column_stack((self.lon_deg, self.lat_deg))
         chosen = places[rng.integers(0, len(places), count)]
-        far = cKDTree(places).query(chosen, k=features, p=np.inf)[0][:, -1]
+        far = np.asarray(cKDTree(places).query(chosen, k=features, p=np.inf)[0])[:, -1]
         return [
             (lon - d, lat - d, lon + d, lat + d) for (lon, lat), d in zip(chosen.tolist(), far.tolist(), strict=True)
         ]

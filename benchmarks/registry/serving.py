@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from app.registry.features import TILE_FIELDS
-from app.services.markers.features import FIELDS
+from app.registry.features import FIELDS, TILE_FIELDS
 from benchmarks.registry.fill import Network
 from benchmarks.registry.load import ask, fetch
 from benchmarks.registry.servers import cpu_s, tipg, waymark

@@ -90,7 +90,7 @@ def euros_per_thousand_hours(trace_s_per_h: float) -> float:
 
 # --- the database -----------------------------------------------------------------------------------------------------
 
-_RESULT = {"frames": [{"index": k, "readings": [], "fix": None, "warnings": []} for k in range(10)]}
+_RESULT: dict[str, Any] = {"frames": [{"index": k, "readings": [], "fix": None, "warnings": []} for k in range(10)]}
 
 
 def _store_decodes(url: str, agency_id: str, seconds: float, barrier: Any, counts: Any) -> None:

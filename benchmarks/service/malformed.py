@@ -38,7 +38,7 @@ GOAL_MIB = 1536.0
 JOB_LIMIT_S = 330.0
 """Longest time of a job. [s] Source: `trace_timeout_s`, and a tenth for its start."""
 _RAW = {"Content-Type": "application/octet-stream"}
-_CONTEXTS = {"traces": {"trace": {}}, "packets": {"packets": {}}}
+_CONTEXTS: dict[str, dict[str, dict[str, object]]] = {"traces": {"trace": {}}, "packets": {"packets": {}}}
 
 
 @dataclass(slots=True)
@@ -165,6 +165,7 @@ def _send(client: httpx.Client, kind: str, data: bytes, number: int, found: Outc
 def _post(client: httpx.Client, kind: str, data: bytes) -> httpx.Response:
     if kind in ("surveys", "alignments"):
         declaration: dict[str, Any] = {"name": os.urandom(6).hex()} if kind == "alignments" else {"dry_run": True}
+        parts: dict[str, tuple[str | None, bytes | str] | tuple[str | None, bytes | str, str]]
         parts = {"file": ("file", data), "declaration": (None, json.dumps(declaration), "application/json")}
         return client.post("/v1/imports" if kind == "surveys" else "/v1/alignments", files=parts)
     headers = {**_RAW, "Waymark-Context": json.dumps(_CONTEXTS.get(kind, {}))}

@@ -171,6 +171,9 @@ def _find_rabbitmq() -> str | None:
     return next(iter(sorted(glob.glob(_RABBITMQ), reverse=True)), None) or shutil.which("rabbitmq-server")
 
 
-def _find_postgresql(program: str) -> str | None:
+def _find_postgresql(program: str) -> str:
     folders = sorted(glob.glob(_POSTGRESQL), reverse=True)
-    return next(filter(None, (shutil.which(program, path=folder) for folder in (*folders, None))), None)
+    found = next(filter(None, (shutil.which(program, path=folder) for folder in (*folders, None))), None)
+    if found is None:
+        raise FileNotFoundError(f"{program} of PostgreSQL is not installed")
+    return found

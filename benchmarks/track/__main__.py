@@ -36,7 +36,9 @@ def main() -> int:
     rng = np.random.default_rng(arguments.seed)
     inputs = {"all three families": _all, "bar alone: tags, speed, heading": _bar, "camera alone: plates": _camera}
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in inputs}
-    nees, offsets, used, lost, seconds = [], [], 0, 0, []
+    nees: list[float] = []
+    offsets: list[tuple[float, float]] = []
+    used, lost, seconds = 0, 0, []
     wrong_total, good_total, observed = 0, 0, 0
     for seed in range(arguments.seed, arguments.seed + count):
         drive = simulate(seed)
@@ -59,8 +61,8 @@ def main() -> int:
                 lost += not is_wrong and not result.used
     _print_errors(errors, count, arguments.seed)
     difference, sigma = np.array(offsets).T
-    low, high = chi2.ppf([0.025, 0.975], 2 * count) / count
-    offset_low, offset_high = chi2.ppf([0.025, 0.975], count) / count
+    low, high = (float(chi2.ppf(level, 2 * count)) / count for level in (0.025, 0.975))
+    offset_low, offset_high = (float(chi2.ppf(level, count)) / count for level in (0.025, 0.975))
     squares = float(np.mean((difference / sigma) ** 2))
     print(f"""
 | figure | value | goal |

@@ -114,8 +114,10 @@ def _speeds(rng: np.random.Generator, bends: Floats, length_m: float) -> tuple[F
         k = int(where)
         where += float(by_place[k] + (where - k) * (by_place[k + 1] - by_place[k])) * STEP_S
         chainage.append(where)
-    along = np.array(chainage)
-    return along, np.gradient(along, STEP_S), STEP_S * np.arange(along.size)
+    along: Floats = np.array(chainage)
+    speed: Floats = np.gradient(along, STEP_S)
+    time_s: Floats = STEP_S * np.arange(along.size, dtype=np.float64)
+    return along, speed, time_s
 
 
 def _drive_along(rng: np.random.Generator, speed: Floats, psi: Floats) -> tuple[Floats, Floats]:

@@ -43,6 +43,7 @@ def upload(client: httpx.Client, recorded: Recorded, name: str) -> dict[str, Any
     """A decode of one of a vehicle's files, once it is done."""
     data, context = recorded.uploads[name]
     text = json.dumps(context)
+    parts: dict[str, tuple[str | None, bytes | str, str]]
     parts = {"file": (f"{name}.zip", data, "application/zip"), "context": (None, text, "application/json")}
     return _ended(client, f"/v1/decodes/{checked(client.post('/v1/decodes', files=parts)).json()['id']}")
 

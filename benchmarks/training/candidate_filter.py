@@ -152,7 +152,7 @@ def regress(features: Floats, is_plate: npt.NDArray[np.bool_]) -> Floats:
 
 def roc_rows(log_odds: Floats, is_plate: npt.NDArray[np.bool_], limits: Sequence[float]) -> list[tuple[object, ...]]:
     """Plates lost and others kept by each limit."""
-    rows = []
+    rows: list[tuple[object, ...]] = []
     for limit in limits:
         lost = int((log_odds[is_plate] < limit).sum())
         kept = float((log_odds[~is_plate] >= limit).mean())

@@ -181,12 +181,12 @@ def main() -> None:
     true = right[test]
     rows = [(p, int(true[odds >= p].sum()), int(true.sum()), int((~true[odds >= p]).sum())) for p in THRESHOLDS]
     print(table(("from probability", "right", "of", "wrong"), rows))
-    rows = [
+    calibration = [
         (f"{low:g} to {high:g}", int(one.sum()), f"{odds[one].mean():.4f}", f"{true[one].mean():.4f}")
         for low, high in pairwise(BINS)
         if (one := (odds >= low) & (odds < high)).any()
     ]
-    print(table(("probability", "dipoles", "mean", "right"), rows))
+    print(table(("probability", "dipoles", "mean", "right"), calibration))
 
 
 if __name__ == "__main__":

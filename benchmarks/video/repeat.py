@@ -12,7 +12,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import psutil  # type: ignore[import-untyped]
+import psutil
 
 from app.decoders.plate.reader import decode_plates
 from app.families.plate.frames import PlateSearch

@@ -68,8 +68,16 @@ def _plate_model(t: Floats) -> PlateModel:
 
 
 def _rounded_plates(model: PlateModel, fix_rms_m: float, exposures_s: tuple[float, ...]) -> PlateModel:
-    values = (model.slope, model.unit_px, model.blur_slope, model.spread, model.sharp, model.blur_limit)
-    return PlateModel(*(round(value, 4) for value in values), round(fix_rms_m, 4), exposures_s)
+    return PlateModel(
+        slope=round(model.slope, 4),
+        unit_px=round(model.unit_px, 4),
+        blur_slope=round(model.blur_slope, 4),
+        spread=round(model.spread, 4),
+        sharp=round(model.sharp, 4),
+        blur_limit=round(model.blur_limit, 4),
+        fix_rms_m=round(fix_rms_m, 4),
+        exposures_s=exposures_s,
+    )
 
 
 def fit_tags(seen: Sequence[TagPassSeen]) -> MagnetModel:
@@ -135,6 +143,8 @@ def fit_path(seen: Sequence[PathSeen]) -> PathModel:
     found = minimize(loss, start, method="Nelder-Mead", options={"maxfev": 6000, "xatol": 1e-4, "fatol": 1e-4})
     best = model(found.x)
     worst = float(np.mean([one.worst_m / one.rms_m for one in seen]))
-    values = (best.exact_markers_m, best.marker_gain, best.spacing_power, best.speed_power, best.exact_share)
-    values = (*values, best.end_gain_m, worst)
+    values = (
+        best.exact_markers_m, best.marker_gain, best.spacing_power, best.speed_power, best.exact_share,
+        best.end_gain_m, worst,
+    )  # fmt: skip
     return PathModel(*(round(value, 5) for value in values))
